@@ -128,10 +128,8 @@ def _keep_compiled() -> None:
         # user's folder is the user's own already.
         if hasattr(os, "getuid"):
             if held.st_uid != os.getuid() or held.st_mode & 0o022:
-                told = (
-                    f"{folder} is not yours alone: it is not used, and starts are slower; delete it"
-                )
-                print(_checks.printable(told), file=sys.stderr)
+                told = "is not yours alone: it is not used, and starts are slower; delete it"
+                print(_checks.printable(f"{folder} {told}"), file=sys.stderr)
                 return
             folder.chmod(0o700)
     except (OSError, RuntimeError):
@@ -272,9 +270,8 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], list[Any], rj.identif
     channels = _channels(options, rates, options.unit or layout.unit)
     wheels = [cli_spec.wheel(text) for text in options.wheel]
     if options.model in ("tensor", "principal") and not wheels:
-        raise LogError(
-            f"--model {options.model}: free motion shows ratios only; a scale needs a --wheel"
-        )
+        words = "free motion shows ratios only; a scale needs a --wheel"
+        raise LogError(f"--model {options.model}: {words}")
     if "delay" in options.free and not wheels:
         raise LogError("--free delay: that of a --wheel, and there is none")
     how: dict[str, Any] = dict(time=time, time_unit=options.time_unit or layout.time_unit)

@@ -85,10 +85,9 @@ def numbers(value: Any, name: str, unit: str = "") -> Array:
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
-        found = f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
-        raise TypeError(
-            f"{name}: wanted an array of numbers, got {type(value).__name__}{found}"
-        ) from error
+        found = type(value).__name__
+        found += f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name}: wanted an array of numbers, got {found}") from error
     if isinstance(value, np.ndarray) and value.dtype == np.float64 and array.dtype != np.float64:
         _warn_of_lost_digits()
     if jnp.issubdtype(array.dtype, jnp.integer):

@@ -87,9 +87,8 @@ def mesh_file(
     try:
         import trimesh
     except ImportError as error:
-        raise ImportError(
-            'mesh_file: reading meshes needs trimesh: pip install "rigidjax[mesh]"'
-        ) from error
+        words = 'mesh_file: reading meshes needs trimesh: pip install "rigidjax[mesh]"'
+        raise ImportError(words) from error
     surface = trimesh.load_mesh(path)
     if not isinstance(surface, trimesh.Trimesh) or len(surface.faces) == 0:
         raise ValueError(f"mesh_file: {path!r} holds no triangles")

@@ -39,12 +39,8 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     >>> round(float(unpack(vector).mass), 12)
     2.0
     """
-    if not isinstance(body, MassProperties):
-        raise TypeError(
-            f"pack: wanted MassProperties, got {type(body).__name__}; for an Inertia use "
-            "pack_second_moment(body.second_moment), or pack_shape for its ratios alone"
-        )
-    _checks.single(body, MassProperties, "body")
+    hint = "for an Inertia use pack_second_moment(body.second_moment), or pack_shape"
+    _checks.single(body, MassProperties, "body", hint=hint)
     alpha = _hold(0.5 * jnp.log(body.mass), jnp.expm1)
     shape = _factors(body.second_moment / body.mass)
     return jnp.concatenate([alpha[None], shape, body.com])

@@ -73,9 +73,8 @@ class MovingFrame(eqx.Module):
         t = _checks.time(t)
         one = jnp.ones_like(t)
         rate, rate_change = jax.jvp(self.angular_velocity, (t,), (one,))
-        (origin, velocity), (_, acceleration) = jax.jvp(
-            lambda s: jax.jvp(self.place, (s,), (one,)), (t,), (one,)
-        )
+        twice = jax.jvp(lambda s: jax.jvp(self.place, (s,), (one,)), (t,), (one,))
+        (origin, velocity), (_, acceleration) = twice
         return Instant(self.matrix(t), rate, rate_change, origin, velocity, acceleration)
 
     def angular_velocity(self, t: ScalarLike) -> Vec3:

@@ -126,9 +126,8 @@ def drift(
     _checks.instance(turning, HasSpin, "ys", wanted="states with a leading time axis")
     for leaf in jax.tree.leaves(ys):
         if leaf.shape[:1] != ts.shape:
-            raise ValueError(
-                f"ys: wanted one row for each of {ts.shape[0]} times, got shape {leaf.shape}"
-            )
+            words = f"ys: wanted one row for each of {ts.shape[0]} times"
+            raise ValueError(f"{words}, got shape {leaf.shape}")
     at_all = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
     kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(turning)
     spin = jax.vmap(lambda t, y: _spin_size(body, y, torque, t))(ts, ys)

@@ -52,11 +52,9 @@ def family(
     held = 0.5 * values if hold == "period" else values
     numbers, left = _at_values(scene, start, held, index, correction.usual_tolerance(start))
     where = lambda i: f" at {hold} = {values[i]:.9g}"  # noqa: E731
-    advice = (
-        "; take smaller steps, or the family turns back there: hold another of x, z, vy, period, "
-    )
+    advice = "; take smaller steps, or the family turns back there: hold another of x, z, vy, "
     lost = _lost(start, numbers, left)
-    return _found(numbers, lost, where, "family: lost", advice + "or use follow")
+    return _found(numbers, lost, where, "family: lost", advice + "period, or use follow")
 
 
 def _lost(start: Array, numbers: Array, left: Array) -> Array:
@@ -78,9 +76,7 @@ def _found(
 @eqx.filter_jit
 def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: float) -> Any:
     free = np.delete(np.arange(4), index)
-    still = jax.tree.map(
-        lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, scene
-    )
+    still = jax.tree.map(lambda n: lax.stop_gradient(n) if eqx.is_array(n) else n, scene)
 
     def step(last: Array, value: Scalar) -> Any:
         # The start of Newton's method has no derivative: the orbit found does not depend on it.
@@ -91,9 +87,8 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
         return numbers, (numbers, left)
 
     # A first correction: its tangent is wanted at an orbit, not at a guess.
-    found, _ = correction.corrected(
-        index, tolerance, still, start[free], lax.stop_gradient(start[index])
-    )
+    held_now = lax.stop_gradient(start[index])
+    found, _ = correction.corrected(index, tolerance, still, start[free], held_now)
     _, out = lax.scan(step, correction.together(found, start[index], index), held)
     return out
 

@@ -107,10 +107,8 @@ def guess(
     y_rate = y_rate + ax * (b33 * x2 + b34 * z2)
     z = az - 2 * d21 * ax * az + az * (d32 * x2 - d31 * z2)
     centre, zero = points(mu)[point - 1, 0], jnp.zeros_like(x)
-    place = jnp.stack([centre + unit * x, zero, unit * z])
-    return PeriodicOrbit(
-        Point(place, jnp.stack([zero, unit * sweep * y_rate, zero])), 2 * math.pi / sweep
-    )
+    place, speed = jnp.stack([centre + unit * x, zero, unit * z]), unit * sweep * y_rate
+    return PeriodicOrbit(Point(place, jnp.stack([zero, speed, zero])), 2 * math.pi / sweep)
 
 
 def _amplitude(value: ScalarLike | None) -> Scalar:

@@ -51,9 +51,8 @@ class Film(eqx.Module):
         suffix = path.suffix.lower()
         kinds = (".gif", ".html", ".mp4") if self.kind == "gif" else (".html",)
         if suffix not in kinds:
-            raise ValueError(
-                f"save: wanted a name that ends in {' or '.join(kinds)}, got {path.name}"
-            )
+            wanted = " or ".join(kinds)
+            raise ValueError(f"save: wanted a name that ends in {wanted}, got {path.name}")
         if suffix == ".mp4":
             _to_mp4(self.data, path)
         elif suffix == ".html" and self.kind == "gif":
@@ -183,9 +182,8 @@ def player(
     try:
         import viser
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "rigidjax.plot.player needs viser: pip install 'rigidjax[view]'"
-        ) from error
+        words = "rigidjax.plot.player needs viser: pip install 'rigidjax[view]'"
+        raise ModuleNotFoundError(words) from error
     import rich
 
     # Viser records the commands to a server; no client has to connect to it.

@@ -22,9 +22,8 @@ def pyplot() -> Any:
     try:
         import matplotlib.pyplot as plt
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "rigidjax.plot needs matplotlib: pip install 'rigidjax[view]'"
-        ) from error
+        words = "rigidjax.plot needs matplotlib: pip install 'rigidjax[view]'"
+        raise ModuleNotFoundError(words) from error
     return plt
 
 

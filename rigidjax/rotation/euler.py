@@ -198,10 +198,8 @@ def _unknown(sequence: object, reason: str) -> str:
 def _angles(angles: Vec3Like) -> Vec3:
     angles = turn(_checks.floating(angles, (3,), "angles"), "angles")
     if _checks.known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
-        words = (
-            f"angles {angles.tolist()} rad are over four turns: are they degrees? use jnp.deg2rad"
-        )
-        warnings.warn(words, stacklevel=3)
+        words = "are over four turns: are they degrees? use jnp.deg2rad"
+        warnings.warn(f"angles {angles.tolist()} rad {words}", stacklevel=3)
     return angles
 
 

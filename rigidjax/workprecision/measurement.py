@@ -216,10 +216,8 @@ def _timed(jobs: list[_Job], rounds: int) -> None:
 
 
 def _finished(job: _Job) -> Record:
-    low, middle, high = np.percentile(job.times[1:], [25, 50, 75])
-    return dataclasses.replace(
-        job.record, time=float(middle), time_low=float(low), time_high=float(high)
-    )
+    low, middle, high = (float(p) for p in np.percentile(job.times[1:], [25, 50, 75]))
+    return dataclasses.replace(job.record, time=middle, time_low=low, time_high=high)
 
 
 def long_drift(

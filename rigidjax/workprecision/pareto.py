@@ -21,9 +21,8 @@ def front(records: Iterable[Record]) -> list[Record]:
     records = [r for r in listed(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
     if len(kinds) > 1:
-        raise ValueError(
-            f"front: wanted records of one scene and kind, got {sorted(kinds)}; pick them first"
-        )
+        words = f"front: wanted records of one scene and kind, got {sorted(kinds)}"
+        raise ValueError(f"{words}; pick them first")
     curves = [[r for r in records if r.label == n] for n in dict.fromkeys(r.label for r in records)]
     best: list[Record] = []
     for record in sorted(records, key=lambda r: (r.time, r.error)):
@@ -120,11 +119,9 @@ def _choice(here: list[Record], scene: str, error: float) -> Choice:
     if elsewhere[1] >= best[1]:
         elsewhere = "", math.nan
     default = "closed form" if any(r.method == "closed form" for r in here) else "simulate"
-    default_slope = min(
-        (t for n, t in slopes.items() if n.split(", ")[0] == default), default=math.nan
-    )
-    default_time = values.get(default, math.nan)
-    return Choice(scene, error, *best, *first(slopes), default_time, default_slope, *elsewhere)
+    its = [t for n, t in slopes.items() if n.split(", ")[0] == default]
+    defaults = values.get(default, math.nan), min(its, default=math.nan)
+    return Choice(scene, error, *best, *first(slopes), *defaults, *elsewhere)
 
 
 def quickest(records: Iterable[Record], kind: str, error: float) -> dict[str, float]:

@@ -90,11 +90,9 @@ class Scene(eqx.Module):
                 "Scene: wanted an Inertia with an Attitude, or None with a Point, got "
                 f"{type(self.body).__name__} with {type(self.state0).__name__}"
             )
-        if not isinstance(self.state0, Attitude | Point):
-            raise TypeError(
-                f"Scene: wanted an Attitude or a Point, got {type(self.state0).__name__}: errors "
-                "are told as angles between attitudes, or as distances"
-            )
+        hint = "errors are told as angles between attitudes, or as distances"
+        wanted = "an Attitude or a Point"
+        _checks.instance(self.state0, (Attitude, Point), "state0", wanted=wanted, hint=hint)
         if self.body is not None:
             _checks.single(self.body, Inertia, "body", hint="or None with a Point")
         _checks.positive(self.end, "end", "an end > 0, s")

@@ -39,9 +39,7 @@ class Chebyshev(eqx.Module):
     ):
         rows = _checks.numbers(coefficients, "coefficients")
         if rows.ndim != 3 or 0 in rows.shape:
-            raise ValueError(
-                f"coefficients: wanted (intervals, k, terms), got the shape {rows.shape}"
-            )
+            raise ValueError(f"coefficients: wanted (intervals, k, terms), got {rows.shape}")
         dtype = jnp.result_type(float)
         self.coefficients = _checks.finite(rows, "coefficients").astype(dtype)
         self.start, step = _checks.given(start, (), "start"), _checks.given(step, (), "step")

@@ -171,9 +171,8 @@ def _rows(
         lines = "n times go with n rows (constant pieces: Pulses)"
         pieces = "n constant pieces have n + 1 edges (Tabulated draws lines between n rows)"
         advice = pieces if extra else lines
-        raise ValueError(
-            f"{other}: wanted {count - extra} rows of 3, got shape {rows.shape}; {advice}"
-        )
+        words = f"{other}: wanted {count - extra} rows of 3"
+        raise ValueError(f"{words}, got shape {rows.shape}; {advice}")
     times, rows = _checks.finite(times, name), _checks.finite(rows, other)
     ordered = _checks.namespace(times).asarray(times)
     falling = ordered[1:] <= ordered[:-1]
