@@ -7,7 +7,8 @@ loaded when they are asked for. Most programs begin with `simulate`.
 
 Every function raises `TypeError` for an argument of another type (also half precision) and
 `ValueError` for a wrong shape; docstrings list the other errors. Under `jit` they are errors of
-`equinox`. Examples know `import rigidjax as rj` and `import jax.numpy as jnp`.
+`equinox`. A container of many states or bodies has leading axes, the same in all of its parts;
+functions and methods take one. Examples know `import rigidjax as rj` and `import jax.numpy as jnp`.
 """
 
 import importlib

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
+import numpy as np
 
 import rigidjax as rj
 from rigidjax import _checks
@@ -127,10 +128,8 @@ def _keep_compiled() -> None:
         # user's folder is the user's own already.
         if hasattr(os, "getuid"):
             if held.st_uid != os.getuid() or held.st_mode & 0o022:
-                told = (
-                    f"{folder} is not yours alone: it is not used, and starts are slower; delete it"
-                )
-                print(_checks.printable(told), file=sys.stderr)
+                told = "is not yours alone: it is not used, and starts are slower; delete it"
+                print(_checks.printable(f"{folder} {told}"), file=sys.stderr)
                 return
             folder.chmod(0o700)
     except (OSError, RuntimeError):
@@ -271,9 +270,8 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], list[Any], rj.identif
     channels = _channels(options, rates, options.unit or layout.unit)
     wheels = [cli_spec.wheel(text) for text in options.wheel]
     if options.model in ("tensor", "principal") and not wheels:
-        raise LogError(
-            f"--model {options.model}: free motion shows ratios only; a scale needs a --wheel"
-        )
+        words = "free motion shows ratios only; a scale needs a --wheel"
+        raise LogError(f"--model {options.model}: {words}")
     if "delay" in options.free and not wheels:
         raise LogError("--free delay: that of a --wheel, and there is none")
     how: dict[str, Any] = dict(time=time, time_unit=options.time_unit or layout.time_unit)
@@ -349,12 +347,12 @@ def _write(
     def drawn() -> None:
         rj.plot.fit(found, index=0, title=names[0], **units).savefig(figure, dpi=130)
 
-    def numbers() -> None:
-        report.write_json(found, options.json, read, more)
-
-    wanted = {"figure": (figure, drawn), "numbers": (options.json, numbers)}
-    wanted |= {"report": (options.report, page)}
-    kept = [_made(what, path, make) for what, (path, make) in wanted.items() if path is not None]
+    numbers = functools.partial(report.write_json, found, options.json, read, more)
+    wanted = (
+        ("figure", figure, drawn), ("numbers", options.json, numbers),
+        ("report", options.report, page),
+    )  # fmt: skip
+    kept = [_made(what, path, make) for what, path, make in wanted if path is not None]
     if "interrupted" in found.status:
         _error("interrupted (Ctrl-C): not all starts were made, see the status")
         return 130
@@ -373,17 +371,14 @@ def _made(what: str, path: Path, make: Callable[[], Any]) -> bool:
 
 
 def _figures(found: Any, names: list[str], units: dict[str, str]) -> list[Any]:
-    def left_over() -> Any:
-        return rj.plot.residuals(found, time_unit=units.get("time_unit", "s")).flat[0].figure
-
-    def body() -> Any:
-        return rj.plot.inertia_ellipsoid(found)[0].figure
-
     figures, fit = [], functools.partial(rj.plot.fit, found, **units)
     logs = [functools.partial(fit, index=i, title=name) for i, name in enumerate(names[:12])]
-    for make in (*logs, left_over, body):
+    time_unit = units.get("time_unit", "s")
+    left_over = functools.partial(rj.plot.residuals, found, time_unit=time_unit)
+    for make in (*logs, left_over, functools.partial(rj.plot.inertia_ellipsoid, found)):
         try:
-            figures.append(make())
+            drawn = make()
+            figures.append(drawn.flat[0].figure if isinstance(drawn, np.ndarray) else drawn)
         except Exception as error:
             _error(f"a figure is left out: {type(error).__name__}: {error}")
     return figures

@@ -86,10 +86,9 @@ def numbers(value: Any, name: str, unit: str = "") -> Array:
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
-        found = f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
-        raise TypeError(
-            f"{name}: wanted an array of numbers, got {type(value).__name__}{found}"
-        ) from error
+        found = type(value).__name__
+        found += f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name}: wanted an array of numbers, got {found}") from error
     if isinstance(value, np.ndarray) and value.dtype == np.float64 and array.dtype != np.float64:
         _warn_of_lost_digits()
     if jnp.issubdtype(array.dtype, jnp.integer):
@@ -104,9 +103,9 @@ def numbers(value: Any, name: str, unit: str = "") -> Array:
 def _in_si(value: Any, name: str, wanted: str = "") -> Any:
     """Quantities of astropy or pint as numbers in SI; other values as they are."""
     if isinstance(value, (list, tuple)):
-        if not _has_units(value):
-            return value
-        return type(value)(_in_si(item, name, wanted) for item in value)
+        items = [_in_si(item, name, wanted) for item in value]
+        same = all(a is b for a, b in zip(items, value, strict=True))
+        return value if same else type(value)(items)
     unit = getattr(value, "unit", getattr(value, "units", None))
     if unit is None or isinstance(value, jax.Array):
         return value
@@ -133,12 +132,6 @@ def _dimension(value: Any, unit: Any) -> dict[str, Any] | None:
     base = unit.decompose()
     parts = zip(base.bases, base.powers, strict=True)
     return {str(part.name): power for part, power in parts if part.name != "rad"}
-
-
-def _has_units(values: Any) -> bool:
-    if isinstance(values, (list, tuple)):
-        return any(_has_units(value) for value in values)
-    return hasattr(values, "unit") or hasattr(values, "units")
 
 
 def same_batch(**arrays: tuple[Array, int]) -> None:

@@ -115,12 +115,9 @@ def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude)
     >>> spatial_angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), turned)[2]
     Array(-3., dtype=float64)
     """
-    if not isinstance(state, HasAttitude):
-        raise TypeError(
-            f"spatial_angular_momentum: wanted a state with an attitude (.q), got "
-            f"{type(state).__name__}; in the body frame use angular_momentum"
-        )
-    _checks.single(state, HasAttitude, "state")
+    hint = "in the body frame use angular_momentum"
+    wanted = "a state with an attitude (.q)"
+    _checks.single(state, HasAttitude, "state", wanted=wanted, hint=hint)
     momentum = quaternion.rotate(state.q, angular_momentum(body, state))
     if isinstance(body, MassProperties) and isinstance(state, HasPose):
         momentum = momentum + body.mass * cross(state.x, state.v)

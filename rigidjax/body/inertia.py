@@ -41,10 +41,9 @@ class Inertia(eqx.Module):
     """The inertia tensor I of a body about the point it turns about.
 
     **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor checks shape and dtype only;
-    `from_tensor`, `from_principal` and `from_second_moment` also check that the body is real. A
-    container of many bodies has leading axes; methods take one body. `scale` "arbitrary" if only
-    the ratios of the components are known, as after a fit of free motion: `simulate` then warns of
-    torques, and `shifted` raises `ValueError`.
+    `from_tensor`, `from_principal` and `from_second_moment` also check that the body is real.
+    `scale` "arbitrary" if only the ratios of the components are known, as after a fit of free
+    motion: `simulate` then warns of torques, and `shifted` raises `ValueError`.
 
     The object stores I, not 𝔖: `from_tensor` changes no digit, and the small moment of a rod keeps
     all its digits. Source: notes, eqs 76–78.
@@ -172,12 +171,10 @@ class MassProperties(eqx.Module):
 
     **Arguments:** `mass` m, kg; `com` (3,) centre of mass c, m, body frame (from the body's
     origin); `second_moment` (3, 3) 𝔖 **about the centre of mass**, kg m², body axes (notes, eq 60).
-    Known values are checked; for traced ones call `checked`. A container of many bodies has leading
-    axes; methods take one body.
+    Known values are checked; for traced ones call `checked`.
 
-    **Raises:** `ValueError` for leading axes that differ (a body has one mass, not one for each
-    axis), a mass that is not positive, a centre of mass that is not finite, a second moment that is
-    not symmetric and positive semi-definite.
+    **Raises:** `ValueError` for a mass that is not positive, a centre of mass that is not finite, a
+    second moment that is not symmetric and positive semi-definite.
 
     >>> MassProperties(2.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -195,15 +192,12 @@ class MassProperties(eqx.Module):
         if isinstance(second_moment, Inertia):
             words = "second_moment: wanted 𝔖 about the centre of mass, got an Inertia"
             raise TypeError(f"{words}; give its .second_moment")
-        second_moment = _checks.floating(
-            second_moment, (3, 3), "second_moment", batched=True, unit="kg m²"
-        )
-        _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(second_moment, 2))
-        dtype = jnp.result_type(mass, com, second_moment)
+        s = _checks.floating(second_moment, (3, 3), "second_moment", batched=True, unit="kg m²")
+        _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(s, 2))
+        dtype = jnp.result_type(mass, com, s)
         self.mass = validation.mass_of_a_body(mass.astype(dtype))
         self.com = _checks.if_known(_checks.finite, com.astype(dtype), "com")
-        second_moment = second_moment.astype(dtype)
-        self.second_moment = _checks.if_known(validation.real_second_moment, second_moment)
+        self.second_moment = _checks.if_known(validation.real_second_moment, s.astype(dtype))
 
     @property
     def inertia(self) -> Inertia:
@@ -251,9 +245,8 @@ class MassProperties(eqx.Module):
         >>> body.shifted([0.0, 1.0, 0.0]).com
         Array([1., 1., 0.], dtype=float64)
         """
-        return MassProperties(
-            self.mass, self.com + _checks.floating(r, (3,), "r"), self.second_moment
-        )
+        com = self.com + _checks.floating(r, (3,), "r")
+        return MassProperties(self.mass, com, self.second_moment)
 
     def rotated(self, q: Quaternion) -> "MassProperties":
         """The body turned about its origin by `q` (4,) unit, active: `c → R c`, `𝔖 → R 𝔖 Rᵀ`.
@@ -263,9 +256,8 @@ class MassProperties(eqx.Module):
         Array([-1.,  0.,  0.], dtype=float64)
         """
         m = quaternion.to_matrix(validation.unit_quaternion(q))
-        return MassProperties(
-            self.mass, apply(m, self.com), product(m, product(self.second_moment, m.T))
-        )
+        second_moment = product(m, product(self.second_moment, m.T))
+        return MassProperties(self.mass, apply(m, self.com), second_moment)
 
     def __add__(self, other: "MassProperties") -> "MassProperties":
         """Two bodies as one, in the same axes: `𝔖 = 𝔖a + 𝔖b + (ma mb / m) d dᵀ`, d = cb − ca.
@@ -317,8 +309,5 @@ def _joined(body, mass, com, second_moment):
     # From the heavier one: a light and distant part moves the centre little.
     heavy = body.mass >= mass
     moved = jnp.where(heavy, mass, -body.mass) / total * d
-    return MassProperties(
-        total,
-        jnp.where(heavy, body.com, com) + moved,
-        body.second_moment + second_moment + (body.mass * (mass / total)) * outer(d, d),
-    )
+    both = body.second_moment + second_moment + (body.mass * (mass / total)) * outer(d, d)
+    return MassProperties(total, jnp.where(heavy, body.com, com) + moved, both)

@@ -17,8 +17,7 @@ ROUNDED = 1e-6
 
 
 def read_inertials(path: str | Path) -> dict[str, MassProperties]:
-    """The bodies with inertia in a URDF or MuJoCo XML file, by name, in the frame of the link or
-    body.
+    """The bodies with inertia in a URDF or MuJoCo XML file, by name, in their own frames.
 
     URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`, `inertia`. MuJoCo: `<inertial>` with
     `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`; an inertia that MuJoCo would compute from
@@ -53,8 +52,7 @@ def write_inertials(
 
     **Arguments:** `path` of the new file; `bodies` name → `MassProperties`, in the frames of the
     file's links or bodies; `source` the file to copy; its other content does not change.
-    **Raises:** `ValueError` as `read_inertials`, and for a name that is not in the file;
-    `TypeError` for anything but `MassProperties`.
+    **Raises:** `ValueError` as `read_inertials`, and for a name that is not in the file.
 
     >>> write_inertials("new.urdf", {}, "old.urdf")
     Traceback (most recent call last):

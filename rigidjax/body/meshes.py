@@ -51,11 +51,14 @@ def mesh(
     _checks.if_known(_checks.sign, density, "density", "a positive number, kg/m³")
 
     centre = jax.lax.stop_gradient(corners.mean(axis=0))
-    volume, com = _volume_and_centroid(corners - centre[None, :], faces)
-    volume = _outward(volume, corners, faces)
+    six, (a, b, c) = _tetrahedra(corners - centre[None, :], faces)
+    com = (six[:, None] * (a + b + c)).sum(axis=0) / (4.0 * six.sum())
+    volume = _outward(six.sum() / 6.0, corners, faces)
     # About the centre of mass itself: nothing is subtracted afterwards.
-    second = _second_moment(corners - (centre + com)[None, :], faces)
-    return MassProperties(density * volume, centre + com, density * second)
+    six, (a, b, c) = _tetrahedra(corners - (centre + com)[None, :], faces)
+    rows = (a, b, c, a + b + c)
+    entries = ((six * sum(r[:, i] * r[:, j] for r in rows)).sum() / 120.0 for i, j in PAIRS)
+    return MassProperties(density * volume, centre + com, density * from_components(*entries))
 
 
 def mesh_file(
@@ -84,9 +87,8 @@ def mesh_file(
     try:
         import trimesh
     except ImportError as error:
-        raise ImportError(
-            'mesh_file: reading meshes needs trimesh: pip install "rigidjax[mesh]"'
-        ) from error
+        words = 'mesh_file: reading meshes needs trimesh: pip install "rigidjax[mesh]"'
+        raise ImportError(words) from error
     surface = trimesh.load_mesh(path)
     if not isinstance(surface, trimesh.Trimesh) or len(surface.faces) == 0:
         raise ValueError(f"mesh_file: {path!r} holds no triangles")
@@ -94,31 +96,10 @@ def mesh_file(
     return mesh(corners, np.asarray(surface.faces), density)
 
 
-def _volume_and_centroid(corners, faces):
-    a, b, c = (corners[faces[:, k]] for k in range(3))
-    six = _six_volumes(a, b, c)
-    total = six.sum()
-    return total / 6.0, (six[:, None] * (a + b + c)).sum(axis=0) / (4.0 * total)
-
-
-def _second_moment(corners, faces):
-    a, b, c = (corners[faces[:, k]] for k in range(3))
-    six = _six_volumes(a, b, c)
-    s = a + b + c
-
-    def entry(i, j):
-        corner = a[:, i] * a[:, j] + b[:, i] * b[:, j] + c[:, i] * c[:, j]
-        return (six * (s[:, i] * s[:, j] + corner)).sum() / 120.0
-
-    return from_components(*(entry(i, j) for i, j in PAIRS))
-
-
-def _six_volumes(a, b, c):
-    return (
-        a[:, 0] * (b[:, 1] * c[:, 2] - b[:, 2] * c[:, 1])
-        + a[:, 1] * (b[:, 2] * c[:, 0] - b[:, 0] * c[:, 2])
-        + a[:, 2] * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
-    )
+def _tetrahedra(corners: Array, faces: Array) -> tuple[Array, list[Array]]:
+    """Six volumes (m,) of the tetrahedra from the origin to the faces, and their three corners."""
+    a, b, c = rows = [corners[faces[:, k]] for k in range(3)]
+    return (a * jnp.cross(b, c)).sum(axis=1), rows
 
 
 def _outward(volume, corners, faces):
@@ -161,8 +142,7 @@ def faces_of(faces: Any, n: int) -> Array:
     twice = counts > 1
     if alone.any():
         lonely = edges[np.argmax(alone)]
-        turned = np.isin(number[alone], unique[twice]).any()
-        if turned:
+        if np.isin(number[alone], unique[twice]).any():
             raise ValueError(
                 f"mesh: its faces disagree about which side is outside: two of them run along the "
                 f"edge {_tuple(lonely)} in the same direction; turn one of them round"

@@ -39,15 +39,11 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     >>> round(float(unpack(vector).mass), 12)
     2.0
     """
-    if not isinstance(body, MassProperties):
-        raise TypeError(
-            f"pack: wanted MassProperties, got {type(body).__name__}; for an Inertia use "
-            "pack_second_moment(body.second_moment), or pack_shape for its ratios alone"
-        )
-    _checks.single(body, MassProperties, "body")
-    half_log_mass = 0.5 * jnp.log(body.mass)
+    hint = "for an Inertia use pack_second_moment(body.second_moment), or pack_shape"
+    _checks.single(body, MassProperties, "body", hint=hint)
+    alpha = _hold(0.5 * jnp.log(body.mass), jnp.expm1)
     shape = _factors(body.second_moment / body.mass)
-    return jnp.concatenate([_reach(half_log_mass)[None], shape, body.com])
+    return jnp.concatenate([alpha[None], shape, body.com])
 
 
 def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
@@ -61,9 +57,9 @@ def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     Array([2., 2., 2.], dtype=float64)
     """
     v = _checks.floating(vector, (10,), "vector")
-    size = jnp.exp(2.0 * _hold(_hold(v[0]) + v[1]))
-    mass = jnp.exp(2.0 * _hold(v[0]))
-    return MassProperties(mass, v[7:10], 3.0 * size * _shape(v[2:7]))
+    alpha = _hold(v[0])
+    size = 3.0 * jnp.exp(2.0 * _hold(alpha + v[1]))
+    return MassProperties(jnp.exp(2.0 * alpha), v[7:10], size * _shape(v[2:7]))
 
 
 def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
@@ -90,8 +86,7 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
 
 
 def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
-    """Five unconstrained numbers of a second moment up to its scale: free motion depends only on
-    them.
+    """Five unconstrained numbers of a second moment up to its scale, which free motion shows.
 
     **Arguments:** `second_moment` (3, 3) 𝔖, positive semi-definite, any units. **Returns** (5,)
     `(d1, d2, s12, s23, s13)`: the root √𝔖 scaled to trace 3 is `1 + V`, where V is symmetric with
@@ -127,7 +122,8 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
     s = 0.5 * jnp.stack([(i[1] - i[0]) + i[2], (i[2] - i[1]) + i[0], (i[0] - i[2]) + i[1]])
     total = _not_a_point(s[0] + s[1] + s[2])
     root = jnp.sqrt(jnp.maximum(s / total, 0.0))
-    return jnp.stack([_radius(total), *(3.0 * root[:2] / (root[0] + root[1] + root[2]) - 1.0)])
+    size = _hold(0.5 * jnp.log(total / 3.0), jnp.expm1)
+    return jnp.stack([size, *(3.0 * root[:2] / (root[0] + root[1] + root[2]) - 1.0)])
 
 
 def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
@@ -147,11 +143,10 @@ def flat_bend(
 ) -> Float[Array, "3 5"]:
     """Rows b (3, 5): the chart's curvature adds Σ b bᵀ to the second derivative of a misfit.
 
-    Near a flat body the least second moment is a square, λ = a² with a number a of the chart. A
-    misfit that decreases towards λ < 0 has its minimum at a = 0, and products of first derivatives
-    do not show this curvature. With n the axis of a, `d²λ = 2 |dA n|²`; the derivative of the
-    misfit by λ is the part along n nᵀ of its derivative by the root A. The rows are zero for a body
-    that is not flat, or another misfit.
+    Near a flat body the least second moment is a square, λ = a² with a number a of the chart.
+    Products of first derivatives do not show its curvature `d²λ = 2 |dA n|²`, n the axis of a. The
+    misfit's derivative by λ is the part along n nᵀ of that by the root A. The rows are zero for a
+    body that is not flat, and for a misfit that does not decrease towards λ < 0.
 
     **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the misfit's derivative by it.
 
@@ -210,7 +205,8 @@ def _factors(s: Mat3) -> Float[Array, "6"]:
     total = _not_a_point(s[0, 0] + s[1, 1] + s[2, 2])
     root = _root(real_second_moment(s) / total)
     v = 3.0 * root / (root[0, 0] + root[1, 1] + root[2, 2]) - jnp.eye(3, dtype=s.dtype)
-    return jnp.stack([_radius(total), v[0, 0], v[1, 1], v[0, 1], v[1, 2], v[0, 2]])
+    size = _hold(0.5 * jnp.log(total / 3.0), jnp.expm1)
+    return jnp.stack([size, v[0, 0], v[1, 1], v[0, 1], v[1, 2], v[0, 2]])
 
 
 @jax.custom_jvp
@@ -229,26 +225,13 @@ def _root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
     return root, jnp.linalg.solve(sums, tangents[0].reshape(9)).reshape(3, 3)
 
 
-def _radius(total: Scalar) -> Scalar:
-    return _reach(0.5 * jnp.log(total / 3.0))
-
-
 def _not_a_point(total: Scalar) -> Scalar:
     words = "pack: the second moment is zero: a point has no shape"
     return _checks.refuse(total, ~(total > 0), words)
 
 
-def _hold(exponent: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The exponent, which grows only logarithmically beyond the range of the dtype."""
-    return _bent(exponent, jnp.log1p)
-
-
-def _reach(exponent: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The inverse of `_hold`."""
-    return _bent(exponent, jnp.expm1)
-
-
-def _bent(exponent: Float[Array, "*n"], bend: Callable[[Array], Array]) -> Float[Array, "*n"]:
+def _hold(exponent: Array, bend: Callable[[Array], Array] = jnp.log1p) -> Array:
+    """The exponent, bent to a logarithm beyond the range of the dtype; `expm1` is the inverse."""
     limit = 31.0 if exponent.dtype == jnp.float32 else 330.0
     beyond = jnp.maximum(jnp.abs(exponent) - limit, 0.0)
     return jnp.where(beyond > 0, jnp.sign(exponent) * (limit + bend(beyond)), exponent)

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import Numbers, Vector
 from rigidjax.body.inertia import MassProperties
-from rigidjax.body.symmetric3 import from_components
+from rigidjax.body.symmetric3 import PAIRS, from_components
 from rigidjax.rotation.linalg3 import determinant
 
 
@@ -20,8 +20,8 @@ def points(
     """The body made of point masses: `𝔖 = Σ m (r − c)(r − c)ᵀ` (notes, eq 60).
 
     **Arguments:** `masses` (n,) kg, none negative; `positions` (n, 3) m, body frame, at any
-    distance from the origin: they are shifted to the centre first. **Raises:** `ValueError` for
-    shapes that do not match, a negative mass, or NaN.
+    distance from the origin: they are shifted to the centre first. **Raises:** `ValueError` for a
+    negative mass.
 
     >>> points([1.0, 1.0], [[1.0, 0, 0], [-1.0, 0, 0]]).inertia.moments
     Array([0., 2., 2.], dtype=float64)
@@ -45,7 +45,7 @@ def voxels(
     It is exact for that density: each cell adds its own `m h²/12`. **Arguments:** `density` (nx,
     ny, nz) kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, m; `corner` (3,)
     of cell [0, 0, 0] with the smallest x, y, z, m, body frame. **Raises:** `ValueError` for a
-    negative density, or NaN.
+    negative density.
 
     >>> voxels(jnp.ones((1, 2, 3)), [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]).com
     Array([0.5, 1. , 1.5], dtype=float64)
@@ -71,11 +71,10 @@ def quadrature(
 ) -> MassProperties:
     """The body that fills a parametrised volume: `∫ ρ(r(u)) |∂r/∂u| d³u` over the unit cube.
 
-    `order` Gauss–Legendre points in each direction are exact for polynomials of degree
-    `2·order − 1`. It is differentiable in all numbers of `density` and `place`. **Arguments:**
-    `density` ρ, from r (3,) m to kg/m³; `place` from u (3,) in [0, 1]³ to r (3,) m, body frame, one
-    to one inside; `order`. **Raises:** `ValueError` for an order below 1, NaN, or a result that is
-    no body.
+    `order` Gauss–Legendre points in each direction are exact for polynomials of degree `2·order −
+    1`. It is differentiable in all numbers of `density` and `place`. **Arguments:** `density` ρ,
+    from r (3,) m to kg/m³; `place` from u (3,) in [0, 1]³ to r (3,) m, body frame, one to one
+    inside; `order`. **Raises:** `ValueError` for a result that is no body.
 
     >>> body = quadrature(lambda r: jnp.ones(()), lambda u: u * jnp.array([1.0, 2.0, 3.0]), 2)
     >>> round(float(body.mass), 12), round(float(body.com[2]), 12)
@@ -109,10 +108,5 @@ def summed(masses: Float[Array, "n"], positions: Float[Array, "n 3"]) -> MassPro
     mass = masses.sum()
     com = (masses[:, None] * from_start).sum(axis=0) / mass
     d = from_start - com[None, :]
-    x, y, z = d[:, 0], d[:, 1], d[:, 2]
-    mx, my, mz = masses * x, masses * y, masses * z
-    second = from_components(
-        (mx * x).sum(), (my * y).sum(), (mz * z).sum(),
-        (mx * y).sum(), (mx * z).sum(), (my * z).sum(),
-    )  # fmt: skip
+    second = from_components(*((masses * d[:, i] * d[:, j]).sum() for i, j in PAIRS))
     return MassProperties(mass, start + com, second)

@@ -7,7 +7,6 @@ symmetric top, and in JAX also for distinct moments above 1e16 kg m² (jax#669).
 import itertools
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +91,7 @@ def _eigensystem_jvp(primals, tangents):
 
 
 def _sweep(_, state):
-    values, opposite, axes = state
+    values, opposite, axes = map(list, state)
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         d, e = values[j] - values[i], 2.0 * opposite[k]
@@ -100,25 +99,24 @@ def _sweep(_, state):
         t = jnp.where(size > 0, jnp.where(d < 0, -e, e) / jnp.where(size > 0, size, 1.0), 0.0)
         c = 1.0 / jnp.sqrt(1.0 + t * t)
         s = t * c
-        values = _with(values, {i: values[i] - 0.5 * t * e, j: values[j] + 0.5 * t * e})
+        values[i], values[j] = values[i] - 0.5 * t * e, values[j] + 0.5 * t * e
         x, y = opposite[j], opposite[i]  # the entries (k, i) and (k, j)
-        opposite = _with(opposite, {k: jnp.zeros_like(e), j: c * x - s * y, i: s * x + c * y})
-        u, v = axes[i], axes[j]
-        low = tuple(c * p - s * q for p, q in zip(u, v, strict=True))
-        high = tuple(s * p + c * q for p, q in zip(u, v, strict=True))
-        axes = _with(axes, {i: low, j: high})
-    return values, opposite, axes
+        opposite[k], opposite[j], opposite[i] = jnp.zeros_like(e), c * x - s * y, s * x + c * y
+        pairs = list(zip(axes[i], axes[j], strict=True))
+        axes[i] = tuple(c * p - s * q for p, q in pairs)
+        axes[j] = tuple(s * p + c * q for p, q in pairs)
+    return tuple(values), tuple(opposite), tuple(axes)
 
 
 def _ascending(values, axes):
     """Sort by exchanges; each exchange reverses one axis, so that they stay right-handed."""
+    values, axes = list(values), list(axes)
     for i, j in ((0, 1), (1, 2), (0, 1)):
-        wrong = values[i] > values[j]
-        low = jnp.where(wrong, values[j], values[i])
-        high = jnp.where(wrong, values[i], values[j])
-        u = tuple(jnp.where(wrong, q, p) for p, q in zip(axes[i], axes[j], strict=True))
-        v = tuple(jnp.where(wrong, -p, q) for p, q in zip(axes[i], axes[j], strict=True))
-        values, axes = _with(values, {i: low, j: high}), _with(axes, {i: u, j: v})
+        a, b, wrong = values[i], values[j], values[i] > values[j]
+        values[i], values[j] = jnp.where(wrong, b, a), jnp.where(wrong, a, b)
+        pairs = list(zip(axes[i], axes[j], strict=True))
+        axes[i] = tuple(jnp.where(wrong, q, p) for p, q in pairs)
+        axes[j] = tuple(jnp.where(wrong, -p, q) for p, q in pairs)
     return values, axes
 
 
@@ -128,10 +126,6 @@ def _nearest_signs(axes) -> Mat3:
     traces = jnp.stack([d0 + d1 + d2, d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1])
     signs = jnp.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], traces.dtype)
     return jnp.stack([jnp.stack(axis) for axis in axes], axis=1) * signs[jnp.argmax(traces)][None]
-
-
-def _with(values: tuple[Any, ...], changed: dict[int, Any]) -> tuple[Any, ...]:
-    return tuple(changed[k] if k in changed else v for k, v in enumerate(values))
 
 
 def _quaternion_near_identity(m: Mat3) -> Quat:

@@ -18,9 +18,8 @@ def times_power_of_two(x: Float[Array, "..."], n: Int[Array, ""]) -> Float[Array
     """`x 2ⁿ`, |n| ≤ 2044 (float32: 252), exact with its derivatives if it is a normal number."""
     half = n // 2
     # XLA would multiply the two together first where it knows n.
-    first, second = jax.lax.optimization_barrier(
-        (_power_of_two(half, x.dtype), _power_of_two(n - half, x.dtype))
-    )
+    both = _power_of_two(half, x.dtype), _power_of_two(n - half, x.dtype)
+    first, second = jax.lax.optimization_barrier(both)
     return x * first * second
 
 

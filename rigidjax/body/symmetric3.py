@@ -5,7 +5,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax._types import Mat3
-from rigidjax.rotation.linalg3 import apply as apply, entries, product as product
+from rigidjax.rotation.linalg3 import (
+    apply as apply,
+    cofactors,
+    determinant,
+    entries,
+    product as product,
+)
 
 
 @jax.custom_jvp
@@ -15,23 +21,15 @@ def inverse(a: Mat3) -> Mat3:
     The matrix is divided by its trace first: 1e-20 or 1e37 kg m² neither underflow nor overflow. A
     zero moment gives infinities; `Inertia.invertible` refuses it in words.
     """
+    # One split: indexed, each entry is a kernel.
     xx, _, _, _, yy, _, _, _, zz = entries(a)
     scale = xx + yy + zz
-    # One split, and one concatenation in the gradient: indexed, each entry is a kernel.
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = entries(a / scale)
-    c00 = yy * zz - yz * zy
-    c01 = yz * zx - yx * zz
-    c02 = yx * zy - yy * zx
-    c11 = xx * zz - xz * zx
-    c12 = xy * zx - xx * zy
-    c22 = xx * yy - xy * yx
-    determinant = xx * c00 + xy * c01 + xz * c02
-    return from_components(c00, c11, c22, c01, c02, c12) / determinant / scale
+    unit = a / scale
+    return cofactors(unit) / determinant(unit) / scale
 
 
 @inverse.defjvp
 def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
-    # −A⁻¹ dA A⁻¹: two products, where the cofactors' own derivative is nine sums of nine.
     (a,), (da,) = primals, tangents
     out = inverse(a)
     scale = a[0, 0] + a[1, 1] + a[2, 2]

@@ -16,7 +16,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from rigidjax.elliptic.arguments import Real, Result, common
-from rigidjax.elliptic.carlson_r import change, r_integral, scale_of
+from rigidjax.elliptic.carlson_r import change, nan_below_zero, r_integral, scale_of
 
 # Steps after which the series is exact for ratios over the whole range of the dtype.
 _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}
@@ -148,8 +148,5 @@ def _lambda(x: Any, y: Any, z: Any) -> Any:
 
 def _domain(value: Any, arguments: Any) -> Any:
     """Infinity if two arguments are 0, NaN if one is negative or NaN, else the value."""
-    zeros, wrong = jnp.zeros_like(value), jnp.zeros_like(value, dtype=bool)
-    for a in arguments:
-        zeros = zeros + jnp.where(a == 0, 1, 0).astype(zeros.dtype)
-        wrong = wrong | ~(a >= 0)
-    return jnp.where(wrong, jnp.nan, jnp.where(zeros >= 2, jnp.inf, value))
+    x, y, z = (a == 0 for a in arguments)
+    return nan_below_zero(jnp.where((x & y) | (y & z) | (z & x), jnp.inf, value), arguments)

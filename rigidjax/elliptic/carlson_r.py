@@ -60,10 +60,7 @@ def r_integral(powers: tuple[float, ...], arguments: tuple[Result, ...]) -> Resu
     value = product.sum(0) * step * unit**excess
     value = _divide(value, scale, excess)
     value = jnp.where(at_zero > 0, value, jnp.inf)
-    negative = jnp.zeros_like(value, dtype=bool)
-    for a in arguments:
-        negative = negative | ~(a >= 0)
-    return jnp.where(negative, jnp.nan, value)
+    return nan_below_zero(value, arguments)
 
 
 @partial(r_integral.defjvp, symbolic_zeros=True)
@@ -80,6 +77,12 @@ def change(powers: tuple[float, ...], arguments: Any, directions: Any) -> Any:
             raised = (*powers[:i], powers[i] + 1, *powers[i + 1 :])
             tangent = tangent - powers[i] * r_integral(raised, arguments) * direction
     return tangent
+
+
+def nan_below_zero(value: Any, arguments: Any) -> Any:
+    """NaN if an argument is negative or NaN, else the value."""
+    good = functools.reduce(jnp.logical_and, (a >= 0 for a in arguments))
+    return jnp.where(good, value, jnp.nan)
 
 
 def scale_of(arguments: Any) -> Any:

@@ -23,7 +23,8 @@ from jax.custom_derivatives import SymbolicZero
 
 from rigidjax.elliptic.arguments import Real, Result, common, complementary, exact_complement
 from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, near_one
-from rigidjax.elliptic.legendre import MEAN_STEPS, complete, half_turns, integral
+from rigidjax.elliptic.legendre import complete, integral, means
+from rigidjax.rotation.stumpff import half_turns, parity
 
 # Below this cn and dn, integrals over sd² depend on their ratio only (to the floor squared).
 _FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
@@ -38,7 +39,7 @@ def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Re
 
     **Returns:** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech, sech
     (DLMF 22.5.3–4); m < 0 and m > 1 follow from DLMF 22.17. Derivatives of every order by u (DLMF
-    22.13(i)), m and m1 are exact. **Raises:** `ValueError` if m + m1 ≠ 1.
+    22.13(i)), m and m1 are exact.
 
     >>> [round(float(x), 12) for x in sncndn(1.0, 0.5)]
     [0.803001824896, 0.595976567672, 0.823161001632]
@@ -52,15 +53,14 @@ def am(u: Real, m: Real, m1: Real | None = None) -> Result:
     """Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad: the inverse of F(φ|m) for m ≤ 1.
 
     **Arguments:** as `sncndn`. **Returns:** φ (DLMF 22.16.1–3). For m ≤ 1 it grows by π in each
-    half period 2K, without jumps; for m > 1 it oscillates within |φ| ≤ arcsin(1/√m). **Raises:** as
-    `sncndn`.
+    half period 2K, without jumps; for m > 1 it oscillates within |φ| ≤ arcsin(1/√m).
 
     >>> round(float(am(1.0, 0.5)), 12)
     0.932315079884
     """
     u, m, m1 = common(u=u, **complementary("m", m, m1))
     s, c, _, turns = _functions(u, exact_complement(m, m1), m1)
-    sign = _parity(turns)
+    sign = parity(turns)
     return jnp.arctan2(sign * s, sign * c) + math.pi * turns
 
 
@@ -82,15 +82,15 @@ def _functions(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any, Any]:
 @jax.custom_jvp
 def _core(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
     """sn, cn, dn for m ≤ 1, as functions of u and m1; m must be the complement of m1."""
-    turns, angle, lows, highs, mean = _turns(u, m1)
-    sign = _parity(turns)
+    turns, angle, rows = _turns(u, m1)
+    sign = parity(turns)
     theta = jnp.abs(angle)
     # Bulirsch's recursion carries cot²φ: let it not overflow, neither at 0 nor at a half period.
     tiny = jnp.abs(u) * jnp.maximum(1, jnp.sqrt(m1)) < float(jnp.finfo(u.dtype).eps) ** (1 / 3)
     safe = jnp.maximum(theta, float(jnp.finfo(u.dtype).tiny) ** 0.4)
     a = jnp.cos(safe) / jnp.sin(safe)
-    c, d = mean * a, jnp.ones_like(u)
-    for low, high in zip(lows[::-1], highs[::-1], strict=True):
+    c, d = rows[-1][0] * a, jnp.ones_like(u)
+    for low, high in rows[-2::-1]:
         a, c = a * c, c * d
         d = (high + a) / (low + a)
         a = c / low
@@ -163,7 +163,7 @@ def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
     """The derivatives by φ times dn X; X is Carlson's R_D of u reduced by half periods."""
     s, c, d = _core(u, m, m1)
     turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
-    sign = _parity(turns)
+    sign = parity(turns)
     # X ~ 1/dn² must not overflow. If cn and dn are minute it depends, but for that factor, on
     # their ratio only (to the floor squared): raise both.
     up = jnp.maximum(1, _FLOOR[np.dtype(u.dtype)] / jax.lax.stop_gradient(d))
@@ -175,18 +175,8 @@ def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
     return c * d * x, -s * d * x * up, -(0.5 * s * s / d + m * s * c * x) * up
 
 
-def _turns(u: Any, m1: Any) -> tuple[Any, Any, list[Any], list[Any], Any]:
-    """Half periods n in u, the rest as an angle πr/2K, the two rows of means, agm(1, √m1)."""
-    a, b = jnp.ones_like(m1), jnp.sqrt(jnp.where(m1 == 0, 1, m1))
-    lows, highs = [], []
-    for _ in range(MEAN_STEPS[np.dtype(m1.dtype)]):
-        lows.append(a)
-        highs.append(b)
-        a, b = 0.5 * (a + b), jnp.sqrt(a * b)
-    turns, angle = half_turns(u * a)
-    return jnp.where(m1 == 0, 0, turns), angle, lows, highs, a
-
-
-def _parity(turns: Any) -> Any:
-    """(−1)ⁿ."""
-    return 1 - 2 * (turns - 2 * jnp.floor(0.5 * turns))
+def _turns(u: Any, m1: Any) -> tuple[Any, Any, list[tuple[Any, Any]]]:
+    """Half periods n in u, the rest as an angle πr/2K, the means of 1 and √m1."""
+    rows = means(jnp.where(m1 == 0, 1, m1))
+    turns, angle = half_turns(u * rows[-1][0])
+    return jnp.where(m1 == 0, 0, turns), angle, rows

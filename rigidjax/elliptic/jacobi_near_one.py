@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rigidjax.elliptic.arguments import Result
+from rigidjax.rotation.stumpff import parity
 
 # The nome is below 0.0066 there: a few images, and two terms of its own series, are enough.
 LARGEST_M1 = 0.1
@@ -52,17 +53,14 @@ def near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
     # tanh, less its limits ±1 on either side, which cancel in pairs.
     tangent = jnp.where(offset == 0, -side * (1 - z * z), side * 2 * z * z) / (1 + z * z)
 
-    alternating = 1 - 2 * (image - 2 * jnp.floor(0.5 * image))
-    sine = rate / root * (alternating * tangent).sum(-1)
-    cosine = rate / root * (alternating * hyperbolic).sum(-1)
+    sine = rate / root * (parity(image) * tangent).sum(-1)
+    cosine = rate / root * (parity(image) * hyperbolic).sum(-1)
     return jnp.where(u < 0, -sine, sine), cosine, rate * hyperbolic.sum(-1)
 
 
 @jax.custom_jvp
 def _power_exp(p: Any, y: Any, n: Any) -> Any:
-    """pⁿ e^y. For n = 1 its second derivative by p is exactly 0; by exp(y + n ln p) it would be a
-    difference of large numbers.
-    """
+    """pⁿ e^y. For n = 1 its second derivative by p is exactly 0; that of exp(y + n ln p) is not."""
     return jnp.exp(y + jnp.where(n == 0, 0, n * jnp.log(p)))
 
 

@@ -21,15 +21,10 @@ from jax.custom_derivatives import SymbolicZero
 from rigidjax.elliptic.arguments import Real, Result, common, complementary
 from rigidjax.elliptic.carlson import rd, rf
 from rigidjax.elliptic.carlson_r import r_integral
+from rigidjax.rotation.stumpff import half_turns
 
 # Steps after which a and b agree to √eps for b/a down to the square root of the least number.
-MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
-
-# π in three parts, the first two of 28 (float64) or 10 (float32) bits.
-PI_PARTS = {
-    np.dtype("float64"): (3.141592651605606, 1.9841871479187034e-09, 1.1442377452219664e-17),
-    np.dtype("float32"): (3.140625, 0.0009670257568359375, 6.278329465203569e-07),
-}
+_MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
 
 
 def ellipk(m: Real, m1: Real | None = None) -> Result:
@@ -37,8 +32,7 @@ def ellipk(m: Real, m1: Real | None = None) -> Result:
 
     **Arguments:** `m` < 1 the parameter k² (not the modulus k), also negative; 1 gives infinity, a
     larger m NaN. `m1` = 1 − m: give it if m is so near 1 that 1 − m loses digits. Value and
-    derivative then depend on m1 alone. **Returns:** π/(2 agm(1, √m1)) (DLMF 19.8.5). **Raises:**
-    `ValueError` if m + m1 ≠ 1.
+    derivative then depend on m1 alone. **Returns:** π/(2 agm(1, √m1)) (DLMF 19.8.5).
 
     >>> round(float(ellipk(1.0, 1e-30)), 12)
     35.925070756031
@@ -51,8 +45,7 @@ def ellipe(m: Real, m1: Real | None = None) -> Result:
     """Complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
 
     **Arguments:** `m` ≤ 1 the parameter k² (a larger one gives NaN); `m1` as for `ellipk`.
-    **Returns:** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms. **Raises:** as
-    `ellipk`.
+    **Returns:** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms.
 
     >>> float(ellipe(1.0))
     1.0
@@ -67,7 +60,7 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
     **Arguments:** `n` < 1 the characteristic (DLMF's α²): 1 gives infinity, a larger n NaN (not the
     principal value); `m` < 1 the parameter k²; `m1` = 1 − m and `n1` = 1 − n as for `ellipk`. The
     order is Wolfram's and mpmath's. **Returns:** DLMF 19.2.8 as one integral with a positive
-    integrand, accurate to round-off for any n < 1. **Raises:** as `ellipk`.
+    integrand, accurate to round-off for any n < 1.
 
     >>> round(float(ellippi(0.5, 0.5)), 12)
     2.701287762095
@@ -81,7 +74,7 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
 
     **Arguments:** `phi` the amplitude, rad, any size; `m` the parameter k² with m sin²φ < 1 (else
     NaN); `m1` as for `ellipk`. **Returns:** DLMF 19.25.5 in Carlson's R_F after reduction to |φ| ≤
-    π/2 (DLMF 19.2.10). **Raises:** as `ellipk`.
+    π/2 (DLMF 19.2.10).
 
     >>> round(float(ellipf(1.0, 0.5)), 12)
     1.083216772845
@@ -95,8 +88,7 @@ def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
 
     **Arguments:** `phi` the amplitude, rad, any size; `m` ≤ 1 the parameter k² (a larger one gives
     NaN); `m1` as for `ellipk`. **Returns:** DLMF 19.25.9 or 19.25.10 in Carlson's integrals,
-    whichever has positive terms, after reduction to |φ| ≤ π/2 (DLMF 19.2.10). **Raises:** as
-    `ellipk`.
+    whichever has positive terms, after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
 
     >>> round(float(ellipeinc(1.0, 0.5)), 12)
     0.927329883624
@@ -113,7 +105,7 @@ def ellippiinc(
     **Arguments:** `n` the characteristic with n sin²φ < 1; `phi` the amplitude, rad, any size; `m`
     the parameter k² with m sin²φ < 1 (beyond either bound: NaN); `m1` = 1 − m and `n1` = 1 − n as
     for `ellipk`. The order is Wolfram's and mpmath's. **Returns:** DLMF 19.2.7 as one integral
-    after reduction to |φ| ≤ π/2 (19.2.10). **Raises:** as `ellipk`.
+    after reduction to |φ| ≤ π/2 (19.2.10).
 
     >>> round(float(ellippiinc(0.5, 1.0, 0.5)), 12)
     1.288978174245
@@ -170,11 +162,18 @@ def complete(orders: tuple[int, int, int], m1: Any, n1: Any = None) -> Any:
     return integral(orders, one, jnp.zeros_like(m1), m1, one if n1 is None else n1)
 
 
+def means(m1: Any) -> list[tuple[Any, Any]]:
+    """The pairs (a, b) of arithmetic and geometric means, from (1, √m1) to their common value."""
+    rows = [(jnp.ones_like(m1), jnp.sqrt(m1))]
+    for _ in range(_MEAN_STEPS[np.dtype(m1.dtype)]):
+        a, b = rows[-1]
+        rows.append((0.5 * (a + b), jnp.sqrt(a * b)))
+    return rows
+
+
 @jax.custom_jvp
 def _complete_first(m1: Any) -> Any:
-    a, b = jnp.ones_like(m1), jnp.sqrt(m1)
-    for _ in range(MEAN_STEPS[np.dtype(m1.dtype)]):
-        a, b = 0.5 * (a + b), jnp.sqrt(a * b)
+    a, b = means(m1)[-1]
     return jnp.where(m1 == 0, jnp.inf, math.pi / (a + b))
 
 
@@ -208,16 +207,6 @@ def _incomplete(orders: tuple[int, int, int], phi: Any, m1: Any, n1: Any = None)
     near = turns == 0
     one = jnp.ones_like(m1)
     safe_m1, safe_n1 = jnp.where(near, one, m1), jnp.where(near, one, n1)
-    if orders == (0, 0, 0):
-        whole = _complete_first(safe_m1)
-    else:
-        whole = complete(orders, safe_m1, safe_n1)
+    first = orders == (0, 0, 0)
+    whole = _complete_first(safe_m1) if first else complete(orders, safe_m1, safe_n1)
     return part + jnp.where(near, 0, 2 * turns * whole)
-
-
-def half_turns(angle: Any) -> tuple[Any, Any]:
-    """(n, r) with angle = nπ + r, |r| ≤ π/2; the tangent of r is that of the angle."""
-    turns = jax.lax.stop_gradient(jnp.round(angle * (1 / math.pi)))
-    # Cody & Waite 1980: n × head and n × middle are exact, so that r keeps the digits of the angle.
-    head, middle, tail = PI_PARTS[np.dtype(angle.dtype)]
-    return turns, ((angle - turns * head) - turns * middle) - turns * tail

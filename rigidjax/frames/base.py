@@ -45,8 +45,7 @@ class AbstractScene(eqx.Module):
         return Point(y.v, self.acceleration(t, y))
 
     def drift(self, ts: Float[Array, " times"], ys: Any) -> dict[str, Scalar]:
-        """The largest departure of each conserved quantity of `ys` at `ts` (T,) from its first
-        value.
+        """The largest change of each conserved quantity of `ys` at `ts` (T,) from its first value.
 
         >>> still = Point(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
         >>> float(rj.scenes.earth(0.8).drift(jnp.arange(2.0), still)["jacobi"])

@@ -128,8 +128,7 @@ class Foucault(AbstractScene):
     def state(
         self, east: ScalarLike, north: ScalarLike, east_speed: ScalarLike, north_speed: ScalarLike
     ) -> Point:
-        """The bob below the pivot at a horizontal place, m, within the string, with a velocity,
-        m/s.
+        """The bob below the pivot at a horizontal place, m, within the string; speeds in m/s.
 
         >>> foucault(0.5, 10.0).state(6.0, 0.0, 4.0, 0.0).v.tolist()
         [4.0, 0.0, 3.0]

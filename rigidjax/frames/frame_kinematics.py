@@ -10,8 +10,7 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class Instant(eqx.Module):
-    """The position, rotation and motion of a moving frame S' at one time; `MovingFrame.at(t)` makes
-    it.
+    """Position, rotation and motion of a moving frame S' at one time, by `MovingFrame.at(t)`.
 
     **Fields:** `rotation` M (3, 3), S' → S; `rate` Ω (3,), rad/s, and `rate_change` dΩ/dt (3,),
     rad/s², both in the axes of S'; `origin`, `origin_velocity`, `origin_acceleration` of S', (3,),
@@ -108,8 +107,7 @@ def _can_travel(state: Any) -> None:
             f"with all four (Rigid), got {type(state).__name__}"
             + (alone if hasattr(state, "omega") else "")
         )
-    hint = "a frame carries one state at one time, batch with "
-    hint += "jax.vmap(frame.to_inertial)(states, times)"
+    hint = "one state at one time; batch with jax.vmap(frame.to_inertial)(states, times)"
     for name, size in (("x", 3), ("v", 3), ("q", 4), ("omega", 3)):
         if hasattr(state, name):
             _checks.floating(getattr(state, name), (size,), name, hint=hint)

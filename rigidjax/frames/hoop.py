@@ -113,5 +113,5 @@ def turntable(rate: ScalarLike, growth: ScalarLike = 0.0) -> InFrame:
     """
     rate = _checks.finite(_checks.floating(rate, (), "rate"), "rate")
     growth = _checks.finite(_checks.floating(growth, (), "growth"), "growth")
-    axis = jnp.stack([jnp.zeros_like(rate), jnp.zeros_like(rate), jnp.ones_like(rate)])
-    return InFrame(MovingFrame(AboutAxis(axis, _Angle(rate, growth))))
+    up = jnp.eye(3, dtype=rate.dtype)[2]
+    return InFrame(MovingFrame(AboutAxis(up, _Angle(rate, growth))))

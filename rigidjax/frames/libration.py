@@ -43,8 +43,7 @@ def libration(rate: ScalarLike) -> BodyInFrame:
     [0.0, 0.0, 0.0]
     """
     n = _checks.finite(_checks.floating(rate, (), "rate"), "rate")
-    normal = jnp.stack([jnp.zeros_like(n), jnp.zeros_like(n), n])
-    return BodyInFrame(MovingFrame(Uniform(normal)), Tide(n))
+    return BodyInFrame(MovingFrame(Uniform(n * jnp.eye(3, dtype=n.dtype)[2])), Tide(n))
 
 
 def libration_integral(state: Any, body: Any, rate: ScalarLike) -> Scalar:

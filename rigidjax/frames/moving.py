@@ -62,8 +62,7 @@ class MovingFrame(eqx.Module):
 
     def matrix(self, t: ScalarLike) -> Mat3:
         """M(t) (3, 3), S' → S (notes, eq 85)."""
-        t = _checks.time(t)
-        return rotation_models.matrix(self.rotation, t)
+        return rotation_models.matrix(self.rotation, _checks.time(t))
 
     def at(self, t: ScalarLike) -> Instant:
         """The frame at time `t`, s: M, Ω, dΩ/dt, and the origin with its two derivatives.
@@ -74,9 +73,8 @@ class MovingFrame(eqx.Module):
         t = _checks.time(t)
         one = jnp.ones_like(t)
         rate, rate_change = jax.jvp(self.angular_velocity, (t,), (one,))
-        (origin, velocity), (_, acceleration) = jax.jvp(
-            lambda s: jax.jvp(self.place, (s,), (one,)), (t,), (one,)
-        )
+        twice = jax.jvp(lambda s: jax.jvp(self.place, (s,), (one,)), (t,), (one,))
+        (origin, velocity), (_, acceleration) = twice
         return Instant(self.matrix(t), rate, rate_change, origin, velocity, acceleration)
 
     def angular_velocity(self, t: ScalarLike) -> Vec3:
@@ -119,21 +117,15 @@ class MovingFrame(eqx.Module):
         return self.at(t).from_inertial(state)
 
     def centrifugal(self, x: Vector, t: ScalarLike) -> Vec3:
-        """Centrifugal acceleration −Ω × (Ω × x') (3,), m/s², axes of S' (notes, eq 91), of a place
-        `x`, m.
-        """
+        """Acceleration −Ω × (Ω × x') (3,), m/s², axes of S' (notes, eq 91), at `x` (3,), m."""
         return self.at(t).centrifugal(x)
 
     def coriolis(self, v: Vector, t: ScalarLike) -> Vec3:
-        """Coriolis acceleration −2 Ω × v' (3,), m/s², axes of S' (notes, eq 91), of a velocity `v`,
-        m/s.
-        """
+        """Acceleration −2 Ω × v' (3,), m/s², axes of S' (notes, eq 91), at `v` (3,), m/s."""
         return self.at(t).coriolis(v)
 
     def euler_acceleration(self, x: Vector, t: ScalarLike) -> Vec3:
-        """Euler acceleration −dΩ/dt × x' (3,), m/s², axes of S' (eq 91, "inercial"), of a place
-        `x`, m.
-        """
+        """Acceleration −dΩ/dt × x' (3,), m/s², axes of S' (eq 91, "inercial"), at `x` (3,), m."""
         return self.at(t).euler_acceleration(x)
 
     def translation(self, t: ScalarLike) -> Vec3:

@@ -14,9 +14,7 @@ class Point(eqx.Module):
     """Position and velocity of a particle, in the frame of its scene.
 
     **Arguments:** `x` (3,) position, m; `v` (3,) its velocity **in that frame**, m/s. Scenes with
-    units of their own (the restricted three-body problem) say so. A container of many states has
-    leading axes; functions take one state. Source: notes, eq 84 (x, and ẋ). **Raises:**
-    `ValueError` for leading axes that differ.
+    units of their own (the restricted three-body problem) say so. Source: notes, eq 84 (x, and ẋ).
 
     >>> Point([1.0, 0, 0], [0.0, 2, 0]).v.shape
     (3,)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Mat3, Vec3
 from rigidjax.rotation import linalg3, quaternion, so3
-from rigidjax.rotation.validation import near_unit, tolerance
+from rigidjax.rotation.validation import near_unit, rotation_matrix
 
 
 class Uniform(eqx.Module):
@@ -88,10 +88,4 @@ def matrix(rotation: Any, t: Array) -> Mat3:
         q = _checks.floating(value, (4,), "rotation").astype(t.dtype)
         return quaternion.to_matrix(quaternion.normalise(near_unit(q, "rotation", 1e-3)))
     m = _checks.floating(value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)")
-    if _checks.known(m):
-        off = jnp.max(jnp.abs(linalg3.product(m.T, m) - jnp.eye(3, dtype=m.dtype)))
-        words = "rotation: Mᵀ M is not 1, so this is no rotation"
-        _checks.refuse(m, ~(off < tolerance(m.dtype)), words)
-        left = linalg3.determinant(m) < 0
-        _checks.refuse(m, left, "rotation: left-handed axes, det = −1 (notes, eq 10)")
-    return m.astype(t.dtype)
+    return _checks.if_known(rotation_matrix, m, "rotation").astype(t.dtype)

@@ -21,7 +21,7 @@ class Coordinates(eqx.Module):
     """The state of a Lagrangian system: coordinates and their rates.
 
     **Arguments:** `q` (n,) generalised coordinates, in the Lagrangian's units; `rate` (n,) dq/dt,
-    per second. A container of many states has leading axes; functions take one state.
+    per second.
 
     >>> Coordinates([0.1, 0.2], [0.0, 1.0]).rate.shape
     (2,)
@@ -83,8 +83,7 @@ def equations_of_motion(
     `diffrax.ODETerm`. It solves for up to three coordinates by cofactors, for more by LU
     (`lineax`). Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after eq 57.
 
-    **Raises:** `TypeError` for anything but functions; `ValueError` if L is not one number. A
-    singular ∂²L/∂q̇∂q̇ (a singular chart, a coordinate without mass) gives infinities or NaN.
+    A singular ∂²L/∂q̇∂q̇ (a singular chart, a coordinate without mass) gives infinities or NaN.
 
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
     >>> pendulum(0.0, Coordinates([jnp.pi / 2], [0.0])).rate
@@ -135,8 +134,7 @@ class EulerAngleTop(eqx.Module):
 
 
 def to_attitude(y: Coordinates) -> Attitude:
-    """Attitude and body rate of `y`, 3-1-3 Euler angles, rad, and rates, rad/s (notes, eqs 33,
-    81–83).
+    """Attitude and body rate of `y`, 3-1-3 Euler angles, rad, and rates (notes, eqs 33, 81–83).
 
     >>> to_attitude(Coordinates([0.0, 0.0, 0.0], [0.0, 0.0, 2.0])).omega.tolist()
     [0.0, 0.0, 2.0]

@@ -24,8 +24,7 @@ def energy(
     torque: Torque | None = None,
     t: ScalarLike = 0.0,
 ) -> Scalar:
-    """Kinetic energy plus the potential energy of every torque and force, J:
-    `½ m |v|² + ½ Ω·IΩ + U`.
+    """Kinetic energy and the potential of each torque and force, J: `½ m |v|² + ½ Ω·IΩ + U`.
 
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for torques that depend on
     time. Wheels add no energy, except for `ReactionWheels`. Under a torque with states of its own
@@ -127,9 +126,8 @@ def drift(
     _checks.instance(turning, HasSpin, "ys", wanted="states with a leading time axis")
     for leaf in jax.tree.leaves(ys):
         if leaf.shape[:1] != ts.shape:
-            raise ValueError(
-                f"ys: wanted one row for each of {ts.shape[0]} times, got shape {leaf.shape}"
-            )
+            words = f"ys: wanted one row for each of {ts.shape[0]} times"
+            raise ValueError(f"{words}, got shape {leaf.shape}")
     at_all = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
     kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(turning)
     spin = jax.vmap(lambda t, y: _spin_size(body, y, torque, t))(ts, ys)

@@ -40,9 +40,7 @@ class Coupled(eqx.Module):
 
 
 class CoupledEquations(eqx.Module):
-    """The equations of a body (`field`) and of its torques' states as a vector field
-    `f(t, y, args)`.
-    """
+    """The equations of a body, `field`, and of its torques' states as one vector field."""
 
     field: Callable[..., Any]
     body: Any

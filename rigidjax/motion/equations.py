@@ -24,8 +24,7 @@ _HINT = "Inertia.from_tensor takes a matrix; from MassProperties pass .inertia"
 class Spin(eqx.Module):
     """The state of a turning body without its attitude: the body rate alone.
 
-    **Arguments:** `omega` (3,) angular velocity Ω in the body frame, rad/s (notes, eq 49). A
-    container of many states has leading axes; functions take one state.
+    **Arguments:** `omega` (3,) angular velocity Ω in the body frame, rad/s (notes, eq 49).
 
     >>> Spin([1.0, 0.0, 0.0]).omega.shape
     (3,)
@@ -43,9 +42,8 @@ class Attitude(eqx.Module):
     """The state of a body that turns: attitude and body rate.
 
     **Arguments:** `q` (4,) unit quaternion (w, x, y, z), **scalar first**, body → world (the `M` of
-    the notes, eq 8); `omega` (3,) Ω in the body frame, rad/s. A container of many states has
-    leading axes; functions take one state. **Raises:** `ValueError` for leading axes that differ.
-    `simulate` and `rigidjax.exact.free_body` check that `q` is a unit quaternion.
+    the notes, eq 8); `omega` (3,) Ω in the body frame, rad/s. `simulate` and
+    `rigidjax.exact.free_body` check that `q` is a unit quaternion.
 
     >>> Attitude([1.0, 0, 0, 0], [0.0, 0, 1]).q.shape
     (4,)
@@ -63,13 +61,11 @@ class Attitude(eqx.Module):
 
 
 class Rigid(eqx.Module):
-    """The state of a body that moves: place and velocity of its centre of mass, attitude, body
-    rate.
+    """The state of a body that moves: its place and velocity, attitude and body rate.
 
-    **Arguments:** `x` (3,) position of the centre of mass, m, world frame (the `X` of the notes,
-    eq 1); `v` (3,) its velocity, m/s, world frame; `q` (4,) unit quaternion (w, x, y, z), scalar
-    first, body → world; `omega` (3,) Ω in the body frame, rad/s. A container of many states has
-    leading axes; functions take one state. **Raises:** `ValueError` for leading axes that differ.
+    **Arguments:** `x` (3,) position of the centre of mass, m, world frame (the `X` of the notes, eq
+    1); `v` (3,) its velocity, m/s, world frame; `q` (4,) unit quaternion (w, x, y, z), scalar
+    first, body → world; `omega` (3,) Ω in the body frame, rad/s.
 
     >>> Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1]).v.shape
     (3,)

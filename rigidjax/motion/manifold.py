@@ -23,7 +23,7 @@ from rigidjax.rotation.linalg3 import components
 
 def dimension(state: Any) -> int:
     """The size of a change of `state`: one less than its numbers for each quaternion."""
-    return sum(_sizes(state))
+    return max((place.stop for place in _places(state)), default=0)
 
 
 def names(state: Any) -> tuple[str, ...]:
@@ -34,16 +34,14 @@ def names(state: Any) -> tuple[str, ...]:
 
 def parts(state: Any, change: Float[Array, "*batch n"]) -> dict[str, Float[Array, "*batch _"]]:
     """The numbers of each leaf in a change, by name; a quaternion has three."""
-    return dict(zip(names(state), _cut(state, change), strict=True))
+    cut = (change[..., place] for place in _places(state))
+    return dict(zip(names(state), cut, strict=True))
 
 
 def turns(state: Any) -> tuple[slice, ...]:
     """The places of the rotation vectors in a change, one for each quaternion."""
-    sizes, end, out = _sizes(state), 0, []
-    for size, turned in zip(sizes, _turned(state), strict=True):
-        end += size
-        out += [slice(end - size, end)] if turned else []
-    return tuple(out)
+    pairs = zip(_places(state), _turned(state), strict=True)
+    return tuple(place for place, turned in pairs if turned)
 
 
 def plus(state: Any, change: Float[Array, " n"]) -> Any:
@@ -100,20 +98,12 @@ def _turned(state: Any) -> list[bool]:
     return out
 
 
-def _sizes(state: Any) -> list[int]:
-    leaves = jax.tree.leaves(state)
-    return [
-        math.prod(jnp.shape(leaf)) - turned
-        for leaf, turned in zip(leaves, _turned(state), strict=True)
-    ]
-
-
-def _cut(state: Any, change: Array) -> list[Array]:
-    """The numbers of each leaf."""
-    out, begin = [], 0
-    for size in _sizes(state):
-        out.append(change[..., begin : begin + size])
-        begin += size
+def _places(state: Any) -> list[slice]:
+    """The places of the numbers of each leaf in a change."""
+    end, out = 0, []
+    for leaf, turned in zip(jax.tree.leaves(state), _turned(state), strict=True):
+        begin, end = end, end + math.prod(jnp.shape(leaf)) - turned
+        out.append(slice(begin, end))
     return out
 
 
@@ -123,11 +113,10 @@ def _leaf_by_leaf(
     of_quaternion: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> Any:
-    leaves, tree = jax.tree.flatten(state)
-    out = [
-        of_quaternion(leaf, part) if turned else of_others(leaf, part.reshape(jnp.shape(leaf)))
-        for leaf, part, turned in zip(leaves, _cut(state, change), _turned(state), strict=True)
-    ]
+    (leaves, tree), out = jax.tree.flatten(state), []
+    for leaf, place, turned in zip(leaves, _places(state), _turned(state), strict=True):
+        part = change[place] if turned else change[place].reshape(jnp.shape(leaf))
+        out.append(of_quaternion(leaf, part) if turned else of_others(leaf, part))
     return jax.tree.unflatten(tree, out)
 
 

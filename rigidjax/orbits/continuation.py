@@ -1,6 +1,6 @@
 """Families of periodic orbits: continuation by the orbit's derivatives, stability, branches."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -51,16 +51,10 @@ def family(
     values = values.astype(start.dtype)
     held = 0.5 * values if hold == "period" else values
     numbers, left = _at_values(scene, start, held, index, correction.usual_tolerance(start))
+    where = lambda i: f" at {hold} = {values[i]:.9g}"  # noqa: E731
+    advice = "; take smaller steps, or the family turns back there: hold another of x, z, vy, "
     lost = _lost(start, numbers, left)
-    where = ""
-    if _checks.known(lost) and bool(lost.any()):
-        where = f" at {hold} = {float(values[np.argmax(np.asarray(lost))]):.9g}"
-    words = (
-        f"family: lost{where}; take smaller steps, or the family turns back there: hold another of "
-    )
-    words += "x, z, vy, period, or use follow"
-    numbers = _checks.refuse(numbers, lost.any(), words)
-    return jax.vmap(orbit_of)(numbers)
+    return _found(numbers, lost, where, "family: lost", advice + "period, or use follow")
 
 
 def _lost(start: Array, numbers: Array, left: Array) -> Array:
@@ -70,12 +64,19 @@ def _lost(start: Array, numbers: Array, left: Array) -> Array:
     return ~((left <= correction.usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
 
 
+def _found(
+    numbers: Array, lost: Array, where: Callable[[int], str], what: str, advice: str
+) -> PeriodicOrbit:
+    """The members, unless one was lost; a known one is named by `where` of its number."""
+    known = _checks.known(lost) and bool(lost.any())
+    words = what + (where(int(np.argmax(np.asarray(lost)))) if known else "") + advice
+    return jax.vmap(orbit_of)(_checks.refuse(numbers, lost.any(), words))
+
+
 @eqx.filter_jit
 def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: float) -> Any:
     free = np.delete(np.arange(4), index)
-    still = jax.tree.map(
-        lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, scene
-    )
+    still = jax.tree.map(lambda n: lax.stop_gradient(n) if eqx.is_array(n) else n, scene)
 
     def step(last: Array, value: Scalar) -> Any:
         # The start of Newton's method has no derivative: the orbit found does not depend on it.
@@ -86,9 +87,8 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
         return numbers, (numbers, left)
 
     # A first correction: its tangent is wanted at an orbit, not at a guess.
-    found, _ = correction.corrected(
-        index, tolerance, still, start[free], lax.stop_gradient(start[index])
-    )
+    held_now = lax.stop_gradient(start[index])
+    found, _ = correction.corrected(index, tolerance, still, start[free], held_now)
     _, out = lax.scan(step, correction.together(found, start[index], index), held)
     return out
 
@@ -149,11 +149,8 @@ def follow(
     moved = jnp.diff(jnp.concatenate([start[None], numbers]), axis=0)
     far = jnp.sqrt(jnp.sum(moved * moved, axis=1)) > 2 * jnp.abs(length)
     lost = _lost(start, numbers, left) | far
-    where = ""
-    if _checks.known(lost) and bool(lost.any()):
-        where = f" after {int(np.argmax(np.asarray(lost)))} of {count} members"
-    numbers = _checks.refuse(numbers, lost.any(), f"follow: lost{where}; take smaller steps")
-    return jax.vmap(orbit_of)(numbers)
+    where = lambda i: f" after {i} of {count} members"  # noqa: E731
+    return _found(numbers, lost, where, "follow: lost", "; take smaller steps")
 
 
 @eqx.filter_jit
@@ -216,37 +213,32 @@ def bifurcation(
     doi:10.1007/BF01358403; Robin and Markellos 1980, doi:10.1007/BF01231183. **Raises:**
     `ValueError` if the value does not lie between, or the indices are complex.
     """
+    from scipy.optimize import brentq
+
     place = named(hold)
     if isinstance(index, bool) or index not in (0, 1):
         raise ValueError(f"index: wanted 0 or 1, which of the two stability indices, got {index!r}")
     value = _checks.number(value, "value")
     if not np.isfinite(value):
         raise ValueError(f"value: wanted a finite number, got {value}")
-    ends = [np.asarray(crossing(one)) for one in (orbit, other)]
+    a, b = (float(crossing(one)[place]) for one in (orbit, other))
     left, right = (scene.periodic_orbit(one, hold=hold) for one in (orbit, other))
-    low, high = (_index(scene, one, index) - value for one in (left, right))
+    found = {a: left, b: right}
+
+    def off(held: float) -> float:
+        if held not in found:
+            share = (held - a) / (b - a)
+            guess = jax.tree.map(lambda x, y: (1 - share) * x + share * y, left, right)
+            found[held] = scene.periodic_orbit(guess, hold=hold)
+        away = _index(scene, found[held], index) - value
+        return away if abs(away) > 1e-12 * max(1.0, abs(value)) else 0.0
+
+    low, high = off(a), off(b)
     if not low * high <= 0:
         ends = f"{low + value:.6g} at one orbit, {high + value:.6g} at the other"
         raise ValueError(f"bifurcation: the index is {ends}: {value:g} does not lie between")
-    a, b = float(ends[0][place]), float(ends[1][place])
-    width = abs(b - a)
-    found, at_found = (left, low) if abs(low) < abs(high) else (right, high)
-    for _ in range(_MOST):
-        if abs(b - a) <= 1e-13 * max(1.0, width) or at_found == 0:
-            break
-        part = low / (low - high)
-        middle = a + (b - a) * min(max(part, 1e-3), 1 - 1e-3)
-        share = (middle - a) / (b - a)
-        guess = jax.tree.map(lambda x, y, s=share: (1 - s) * x + s * y, left, right)
-        found = scene.periodic_orbit(guess, hold=hold)
-        at_found = _index(scene, found, index) - value
-        if abs(at_found) < 1e-12 * max(1.0, abs(value)):
-            break
-        if at_found * high > 0:
-            b, right, high, low = middle, found, at_found, 0.5 * low
-        else:
-            a, left, low, high = middle, found, at_found, 0.5 * high
-    return found
+    root: Any = brentq(off, a, b, xtol=1e-13 * max(1.0, abs(b - a)), maxiter=_MOST)
+    return found[root]
 
 
 def _index(scene: Any, orbit: PeriodicOrbit, index: int) -> float:

@@ -1,6 +1,7 @@
 """The circular restricted three-body problem, and its limit near the small body: Hill's problem."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +13,12 @@ from rigidjax.frames.point import Point, require_point
 from rigidjax.orbits import richardson
 from rigidjax.orbits.differential_correction import PeriodicOrbit
 from rigidjax.orbits.reversible_scene import AbstractReversible
-from rigidjax.orbits.state_transition import smallest_distance
 from rigidjax.rotation.linalg3 import components
+
+
+def smallest_distance(dtype: Any) -> float:
+    """The distance at which an attraction is known only to eps/r = eps^0.6: eps^0.4."""
+    return float(jnp.finfo(dtype).eps) ** 0.4
 
 
 class ThreeBody(AbstractReversible):
@@ -45,9 +50,7 @@ class ThreeBody(AbstractReversible):
         return jnp.stack([2 * vy + x - a1 * first - a2 * second, y - 2 * vx - pull * y, -pull * z])
 
     def potential(self, x: Vector) -> Scalar:
-        """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ at `x` (3,) (Szebehely 1967, sec. 1.5, without his
-        constant).
-        """
+        """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ at `x` (3,) (Szebehely, sec. 1.5, no constant)."""
         x = _checks.floating(x, (3,), "x")
         r1, r2 = self.distances(x)
         mu = self.mu.astype(x.dtype)
@@ -70,9 +73,7 @@ class ThreeBody(AbstractReversible):
         return self.speed_squared(state.x, 0.0) - jnp.sum(state.v * state.v)
 
     def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:
-        """|v|² = 2U(x) − C at a place `x` (3,) for C = `jacobi`; negative where no such particle
-        is.
-        """
+        """|v|² = 2U(x) − C at `x` (3,) for C = `jacobi`; negative where no such particle comes."""
         u = self.potential(x)
         return 2 * u - _checks.floating(jacobi, (), "jacobi").astype(u.dtype)
 
@@ -81,8 +82,7 @@ class ThreeBody(AbstractReversible):
         xs: Float[ArrayLike, " columns"] | Sequence[float],
         ys: Float[ArrayLike, " rows"] | Sequence[float],
     ) -> Float[Array, "rows columns"]:
-        """2U on a grid of the plane z = 0, rows along y; a particle with constant C stays where 2U
-        ≥ C.
+        """2U on a grid of the plane z = 0, rows along y; a particle of constant C stays at 2U ≥ C.
 
         **Arguments:** `xs`, `ys` places along the axes. `matplotlib.pyplot.contour(xs, ys, grid,
         levels=[C])` draws the curve of zero velocity (Szebehely 1967, sec. 4.7).
@@ -101,13 +101,9 @@ class ThreeBody(AbstractReversible):
         along = jax.vmap(value, (0, None))
         return jax.vmap(along, (None, 0))(columns, rows.astype(columns.dtype))
 
-    def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
-        return {"jacobi": self.jacobi_constant(state)}
-
     def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
         """Distances from the two bodies, and the distances of a collision, which ends a run."""
-        first, second = self.distances(state.x)
-        gaps = jnp.stack([first, second])
+        gaps = jnp.stack(self.distances(state.x))
         return gaps, jnp.maximum(self.radii.astype(gaps.dtype), smallest_distance(gaps.dtype))
 
     @property
@@ -207,9 +203,6 @@ class Hill(AbstractReversible):
         x, y, z = components(state.x)
         speed = jnp.sum(state.v * state.v)
         return 3 * x * x - z * z + 2 / jnp.sqrt(x * x + y * y + z * z) - speed
-
-    def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
-        return {"jacobi": self.jacobi_constant(state)}
 
     def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
         """Distance from the small body, and the distance of a collision, which ends a run."""

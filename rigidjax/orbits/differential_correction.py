@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,8 +13,8 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
+from rigidjax.frames.base import AbstractScene
 from rigidjax.frames.point import Point
-from rigidjax.orbits.state_transition import flow
 from rigidjax.rotation.linalg3 import components
 
 _NAMES = ("x", "z", "vy", "period")
@@ -23,8 +24,7 @@ MAX_STEPS = 25
 class PeriodicOrbit(eqx.Module):
     """A periodic orbit: a state on it, and its period.
 
-    **Arguments:** `state` a `Point`; `period` its period, in the scene's unit of time. A container
-    of many orbits has the same leading axes in both.
+    **Arguments:** `state` a `Point`; `period` its period, in the scene's unit of time.
 
     >>> float(PeriodicOrbit(Point([0.9, 0, 0], [0.0, -0.5, 0]), 3.0).period)
     3.0
@@ -78,10 +78,8 @@ def periodic_orbit(
     found = together(unknown, numbers[index], index)
     # A half period of zero solves the equations of every start.
     ratio = found[3] / numbers[3]
-    words = (
-        "periodic_orbit: Newton's method went from the guess to an orbit of less than half or more "
-    )
-    words += "than twice its period; start nearer"
+    words = "periodic_orbit: Newton's method went from the guess to an orbit of less than half or "
+    words += "more than twice its period; start nearer"
     found = _checks.refuse(found, ~((ratio > 0.5) & (ratio < 2)), words)
     return orbit_of(found)
 
@@ -115,7 +113,7 @@ def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
 
 def together(unknown: Float[Array, "3"], held: Scalar, index: int) -> Float[Array, "4"]:
     """The four numbers of a crossing, with the held one in its place among the others."""
-    parts = [unknown[0], unknown[1], unknown[2]]
+    parts = list(unknown)
     parts.insert(index, held)
     return jnp.stack(parts)
 
@@ -125,20 +123,55 @@ def usual_tolerance(numbers: Array) -> float:
     return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
 
 
+def solved(
+    scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **how: Any
+) -> dfx.Solution:
+    """The motion from 0 to `t`, with derivatives in forward mode; `how` as for `diffeqsolve`."""
+    motion = dfx.ODETerm(scene.field), dfx.Dopri8(), jnp.zeros_like(t), t, None, state
+    how |= dict(adjoint=dfx.ForwardMode(), max_steps=100_000, throw=False)
+    how["stepsize_controller"] = dfx.PIDController(rtol=rtol, atol=atol)
+    return dfx.diffeqsolve(*motion, **how)
+
+
+@eqx.filter_jit
+def after(
+    scene: AbstractScene, numbers: Float[Array, "6"], t: Array, *, rtol: float, atol: float
+) -> Float[Array, "6"]:
+    """(x, v) a time `t` after `numbers`; an error if the solve fails."""
+    out = solved(scene, Point(numbers[:3], numbers[3:]), t.astype(numbers.dtype), rtol, atol)
+    end: Any = out.result.error_if(out.ys, out.result != dfx.RESULTS.successful)
+    return jnp.concatenate([end.x[0], end.v[0]])
+
+
+def transition(
+    scene: Any, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
+) -> Float[Array, "6 6"]:
+    """The state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) of `state`, by forward mode."""
+    _checks.instance(state, Point, "state", wanted="a Point(x, v)")
+    t = _checks.finite(_checks.floating(t, (), "t"), "t")
+    return _transition(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
+
+
+@eqx.filter_jit
+def _transition(scene: Any, numbers: Array, t: Array, rtol: float, atol: float) -> Array:
+    # The tangents are solved along with the motion.
+    return jax.jacfwd(lambda n: after(scene, n, t, rtol=rtol, atol=atol))(numbers)
+
+
 def miss(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
     """y, v_x and v_z at the half period: an orbit is periodic if they vanish."""
     orbit = orbit_of(numbers)
     tight = float(jnp.finfo(numbers.dtype).eps)
-    end = flow(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight, throw=False)
-    return jnp.stack([end.x[1], end.v[0], end.v[2]])
+    out = solved(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight)
+    end: Any = out.ys
+    left = jnp.stack([end.x[0, 1], end.v[0, 0], end.v[0, 2]])
+    return jnp.where(out.result == dfx.RESULTS.successful, left, jnp.nan)
 
 
 def value_and_jacobian(f: Any, x: Array) -> tuple[Array, Array]:
     """f(x) and its Jacobian from one pass in forward mode."""
-    value, columns = jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 1))(
-        jnp.eye(x.shape[0], dtype=x.dtype)
-    )
-    return value, columns
+    along = jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 1))
+    return along(jnp.eye(x.shape[0], dtype=x.dtype))
 
 
 def newton(f: Any, x: Array, tolerance: float) -> Array:

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.frames.point import Point
-from rigidjax.orbits import continuation, state_transition
-from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing
+from rigidjax.orbits import continuation
+from rigidjax.orbits.differential_correction import PeriodicOrbit, after, crossing, solved
 from rigidjax.solve.run import Ends
 
 # A motion backwards in time is the mirror image in y → −y: x, y, z, vx, vy, vz.
@@ -99,7 +99,7 @@ def _branch(
     # The mirror turns the unstable manifold into the stable one, and the phase round.
     turned = phase if which == "unstable" else -phase
     turned = turned - lax.stop_gradient(jnp.floor(turned))
-    later = partial(state_transition.after, scene, t=turned * orbit.period, **_TIGHT)
+    later = partial(after, scene, t=turned * orbit.period, **_TIGHT)
     start = jnp.concatenate([orbit.state.x, orbit.state.v])
     there, along = jax.jvp(later, (start,), (vector,))
     numbers = there + side * distance * along / jnp.sqrt(jnp.sum(along * along))
@@ -182,8 +182,7 @@ def manifold_start(
 
 def _positive(value: ScalarLike, name: str, dtype: Any) -> Array:
     found = _checks.floating(value, (), name)
-    found = found if dtype is None else found.astype(dtype)
-    return _checks.refuse(found, ~(found > 0), f"{name}: wanted a positive number")
+    return _checks.sign(found if dtype is None else found.astype(dtype), name, "a positive number")
 
 
 @eqx.filter_jit
@@ -197,7 +196,7 @@ def _paths(scene: Any, starts: Point, ts: Array, which: str) -> Point:
 
     def path(start: Point) -> Point:
         how = dict(saveat=dfx.SaveAt(ts=ts), event=dfx.Event(Ends(scene)))
-        out = state_transition.solved(scene, seen(start), ts[-1], 1e-11, 1e-12, **how)
+        out = solved(scene, seen(start), ts[-1], 1e-11, 1e-12, **how)
         there: Any = jnp.isfinite(jnp.asarray(out.ts))[:, None]
         ys: Any = jax.tree.map(lambda leaf: jnp.where(there, leaf, jnp.nan), out.ys)
         return jax.vmap(seen)(ys)

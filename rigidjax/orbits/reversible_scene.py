@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from rigidjax import _checks
-from rigidjax._types import ScalarLike
+from rigidjax._types import Scalar, ScalarLike
 from rigidjax.frames.base import AbstractScene
 from rigidjax.frames.point import Point
-from rigidjax.orbits import continuation, differential_correction, manifolds, state_transition
+from rigidjax.orbits import continuation, differential_correction, manifolds
 from rigidjax.orbits.differential_correction import PeriodicOrbit
 
 
@@ -24,6 +24,13 @@ class AbstractReversible(AbstractScene):
     @abc.abstractmethod
     def approach(self, t: ScalarLike, state: Point) -> tuple[Array, Array]:
         """Distances from the bodies (k,), and the distances at which a run ends as a collision."""
+
+    @abc.abstractmethod
+    def jacobi_constant(self, state: Point) -> Scalar:
+        """Jacobi's constant C of a state."""
+
+    def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
+        return {"jacobi": self.jacobi_constant(state)}
 
     def ends(self, t: ScalarLike, state: Point) -> Bool[Array, ""]:
         """Whether the particle has collided with one of the bodies."""
@@ -39,15 +46,6 @@ class AbstractReversible(AbstractScene):
         which = f"body {int(near.argmin()) + 1} of the scene"
         return f"collision with {which} at t = {when:.9g}, distance {near.min():.3g}"
 
-    def transition(
-        self, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
-    ) -> Float[Array, "6 6"]:
-        """The state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) of `state`, by forward mode."""
-        _checks.instance(state, Point, "state", wanted="a Point(x, v)")
-        t = _checks.finite(_checks.floating(t, (), "t"), "t")
-        numbers = jnp.concatenate([state.x, state.v])
-        return state_transition.transition(self, numbers, t, rtol=rtol, atol=atol)
-
     def monodromy(self, orbit: PeriodicOrbit) -> Float[Array, "6 6"]:
         """The transition matrix over one period; its eigenvalues are 1, 1 and pairs λ, 1/λ."""
         return self.transition(orbit.state, orbit.period)
@@ -62,6 +60,7 @@ class AbstractReversible(AbstractScene):
         return continuation.stability_indices(self.monodromy(orbit))
 
     # Functions whose first argument is the scene.
+    transition = differential_correction.transition
     periodic_orbit = differential_correction.periodic_orbit
     family = continuation.family
     family_slope = continuation.family_slope

@@ -15,16 +15,10 @@ from rigidjax.orbits.differential_correction import PeriodicOrbit
 def points(mu: Scalar) -> Float[Array, "5 3"]:
     """L1 … L5 (5, 3) of 0 < μ ≤ ½ by Euler's quintics (Szebehely 1967, sec. 4.4), rotating axes."""
     between, beyond, opposite = distances(mu)
-    zero = jnp.zeros_like(mu)
-    height = jnp.full_like(mu, 0.75**0.5)
-    rows = [
-        [1 - mu - between, zero, zero],
-        [1 - mu + beyond, zero, zero],
-        [-mu - opposite, zero, zero],
-        [0.5 - mu, height, zero],
-        [0.5 - mu, -height, zero],
-    ]
-    return jnp.stack([jnp.stack(row) for row in rows])
+    half = 0.5 - mu
+    x = jnp.stack([1 - mu - between, 1 - mu + beyond, -mu - opposite, half, half])
+    y = jnp.asarray([0.0, 0.0, 0.0, 0.75**0.5, -(0.75**0.5)], x.dtype)
+    return jnp.stack([x, y, jnp.zeros_like(x)], axis=1)
 
 
 def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
@@ -113,10 +107,8 @@ def guess(
     y_rate = y_rate + ax * (b33 * x2 + b34 * z2)
     z = az - 2 * d21 * ax * az + az * (d32 * x2 - d31 * z2)
     centre, zero = points(mu)[point - 1, 0], jnp.zeros_like(x)
-    place = jnp.stack([centre + unit * x, zero, unit * z])
-    return PeriodicOrbit(
-        Point(place, jnp.stack([zero, unit * sweep * y_rate, zero])), 2 * math.pi / sweep
-    )
+    place, speed = jnp.stack([centre + unit * x, zero, unit * z]), unit * sweep * y_rate
+    return PeriodicOrbit(Point(place, jnp.stack([zero, speed, zero])), 2 * math.pi / sweep)
 
 
 def _amplitude(value: ScalarLike | None) -> Scalar:

@@ -21,6 +21,9 @@ from rigidjax.plot.style import COLOURS, attitudes, cube, matrices, plain, pyplo
 # Corners of the cube, and its faces in pairs across x, y, z, seen from outside counter-clockwise.
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+# The colours of the faces: pale on the negative side of an axis.
+_FULL = np.array([[int(c[k : k + 2], 16) / 255 for k in (1, 3, 5)] for c in COLOURS[:3]])
+SHADES = np.stack([0.4 * _FULL + 0.6, _FULL], axis=1).reshape(6, 3)
 
 
 class Film(eqx.Module):
@@ -48,9 +51,8 @@ class Film(eqx.Module):
         suffix = path.suffix.lower()
         kinds = (".gif", ".html", ".mp4") if self.kind == "gif" else (".html",)
         if suffix not in kinds:
-            raise ValueError(
-                f"save: wanted a name that ends in {' or '.join(kinds)}, got {path.name}"
-            )
+            wanted = " or ".join(kinds)
+            raise ValueError(f"save: wanted a name that ends in {wanted}, got {path.name}")
         if suffix == ".mp4":
             _to_mp4(self.data, path)
         elif suffix == ".html" and self.kind == "gif":
@@ -100,8 +102,7 @@ def tumble(
     **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, with less
     than a quarter turn from one to the next; `seconds` of the film, by default the duration of the
     motion, 20 at most; `fps` pictures a second; `size` px of a side; `title`. **Returns** a `Film`,
-    shown by a notebook; `.save(path)`. **Raises** `ValueError` for a batch, other lengths or
-    numbers that are not positive; `TypeError` for states without an attitude.
+    shown by a notebook; `.save(path)`. **Raises** `ValueError` for numbers that are not positive.
 
     >>> body = rj.shapes.box(1.0, [0.1, 0.2, 0.3])
     >>> sol = rj.simulate(body.inertia, rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 0.5, 1.0])
@@ -112,7 +113,7 @@ def tumble(
     _checks.single(body, (Inertia, MassProperties), "body")
     moments, q = evenly(ts, states, pictures)
     size = _checks.whole(size, "size", 64)
-    half, turn = box_of(body)
+    corners, tip, reach = _box(body)
     pyplot()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -123,24 +124,18 @@ def tumble(
     figure = Figure(figsize=(3.6, 3.6), dpi=size / 3.6)
     canvas = FigureCanvasAgg(figure)
     ax: Any = figure.add_axes((0.0, 0.08, 0.86, 0.84), projection="3d")
-    corners = (CORNERS * half) @ turn.T
-    m = matrices(q)
-    longest = np.argmax(half)
     # At every given state: at the pictures alone the path would be a zigzag.
-    when = np.asarray(ts, dtype=float)
-    tips = matrices(attitudes(states)) @ turn[:, longest] * half[longest]
-    reach = float(np.linalg.norm(half))
+    when, tips = np.asarray(ts, dtype=float), matrices(attitudes(states)) @ tip
     unit = ", m" if isinstance(body, MassProperties) else ""
     cube(ax, reach, (f"x{unit}", f"y{unit}", f"z{unit}"))
     solid = Poly3DCollection([], edgecolor="0.2", linewidths=0.8, alpha=0.85)
     ax.add_collection3d(solid)
     (trail,) = ax.plot([], [], [], color="0.3", lw=0.9)
-    colours = [shade for axis in range(3) for shade in _shades(COLOURS[axis])]
     shots = []
-    for moment, rotation in zip(moments, m, strict=True):
+    for moment, rotation in zip(moments, matrices(q), strict=True):
         placed = corners @ rotation.T
         solid.set_verts([placed[list(face)] for face in FACES])
-        solid.set_facecolor(colours)
+        solid.set_facecolor(SHADES)
         trail.set_data_3d(*tips[when <= moment].T)
         ax.set_title(plain(f"{title}  t = {moment:.3g} s".strip()), fontsize=10)
         canvas.draw()
@@ -165,12 +160,6 @@ def _length(ts: Any, seconds: float | int | None, fps: float | int) -> tuple[flo
     return seconds, max(round(seconds * _checks.positive(fps, "fps")), 2)
 
 
-def _shades(colour: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """A colour for the face on the negative side of an axis, pale, and for the other."""
-    full = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
-    return tuple(0.4 * full + 0.6), tuple(full)
-
-
 def player(
     body: Inertia | MassProperties,
     ts: Float[ArrayLike, " times"],
@@ -189,13 +178,12 @@ def player(
     """
     seconds, pictures = _length(ts, seconds, fps)
     _, q = evenly(ts, states, pictures)
-    half, turn = box_of(body)
+    box = _box(body)
     try:
         import viser
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "rigidjax.plot.player needs viser: pip install 'rigidjax[view]'"
-        ) from error
+        words = "rigidjax.plot.player needs viser: pip install 'rigidjax[view]'"
+        raise ModuleNotFoundError(words) from error
     import rich
 
     # Viser records the commands to a server; no client has to connect to it.
@@ -204,7 +192,7 @@ def player(
     try:
         server = viser.ViserServer(host="127.0.0.1", verbose=False)
         try:
-            page = _record(server, half, turn, q, seconds)
+            page = _record(server, *box, q, seconds)
         finally:
             server.stop()
     finally:
@@ -212,27 +200,19 @@ def player(
     return Film(page.encode("utf-8"), "html", height)
 
 
-def _record(server: Any, half: np.ndarray, turn: np.ndarray, q: np.ndarray, seconds: float) -> str:
+def _record(server: Any, corners: Any, tip: Any, reach: float, q: Any, seconds: float) -> str:
     scene = server.scene
-    reach = float(np.linalg.norm(half))
     scene.set_up_direction("+z")
     server.initial_camera.position = tuple(1.8 * reach * np.array([1.0, -1.2, 0.7]))
     server.initial_camera.look_at = (0.0, 0.0, 0.0)
     scene.add_frame("/world", axes_length=1.1 * reach, axes_radius=0.008 * reach)
     attitude = scene.add_frame("/body", show_axes=False, wxyz=tuple(q[0]))
-    corners = ((CORNERS * half) @ turn.T).astype(np.float32)
-    shades = [shade for colour in COLOURS[:3] for shade in _shades(colour)]
-    for side, ((a, b, c, d), shade) in enumerate(zip(FACES, shades, strict=True)):
-        scene.add_mesh_simple(
-            f"/body/side{side}",
-            vertices=corners,
-            faces=np.array([(a, b, c), (a, c, d)], dtype=np.uint32),
-            color=tuple(round(255 * part) for part in shade),
-            flat_shading=True,
-            side="double",
-        )
-    longest = np.argmax(half)
-    tips = (matrices(q) @ turn[:, longest] * half[longest]).astype(np.float32)
+    for side, ((a, b, c, d), shade) in enumerate(zip(FACES, SHADES, strict=True)):
+        faces = np.array([(a, b, c), (a, c, d)], dtype=np.uint32)
+        how = dict(color=tuple(round(255 * part) for part in shade), flat_shading=True)
+        place = f"/body/side{side}"
+        scene.add_mesh_simple(place, corners.astype(np.float32), faces, side="double", **how)
+    tips = (matrices(q) @ tip).astype(np.float32)
     lines = np.stack([tips[:-1], tips[1:]], axis=1)
     scene.add_line_segments("/trail", points=lines, colors=(90, 90, 90), thickness=0.01 * reach)
     recording = server.get_scene_serializer()
@@ -254,6 +234,14 @@ def evenly(ts: Any, states: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
     when = np.linspace(t[0], t[-1], count)
     between = np.stack([np.interp(when, t, column) for column in q.T], axis=-1)
     return when, between / np.linalg.norm(between, axis=1, keepdims=True)
+
+
+def _box(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray, float]:
+    """The corners (8, 3) of the body's box, the end (3,) of its longest axis, its half diagonal."""
+    half, turn = box_of(body)
+    longest = np.argmax(half)
+    corners = (CORNERS * half) @ turn.T
+    return corners, turn[:, longest] * half[longest], float(np.linalg.norm(half))
 
 
 def box_of(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:

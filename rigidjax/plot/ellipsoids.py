@@ -31,8 +31,8 @@ def inertia_ellipsoid(
 
     **Arguments:** `body` an `Inertia`, a `MassProperties` or a `rigidjax.identify.Fit`; `truth` a
     body to compare with, as a broken line; `samples` the number of thin lines; `title`; `ax` three
-    axes. **Returns** the axes (3,), planes xy, xz and yz of the body frame. **Raises** `TypeError`
-    for another type, `ValueError` for a body without extension.
+    axes. **Returns** the axes (3,), planes xy, xz and yz of the body frame. **Raises** `ValueError`
+    for a body without extension.
 
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
     ['x, m', 'x, m', 'y, m']
@@ -64,10 +64,8 @@ def _given(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
     if isinstance(body, Inertia | MassProperties):
         return _checks.single(body, (Inertia, MassProperties), "body"), None
     if not hasattr(body, "parameters") or not hasattr(body, "problem"):
-        found = _checks.kind(body)
-        raise TypeError(
-            f"inertia_ellipsoid: wanted an Inertia, a MassProperties or a Fit, got {found}"
-        )
+        words = "inertia_ellipsoid: wanted an Inertia, a MassProperties or a Fit, got "
+        raise TypeError(words + _checks.kind(body))
     if isinstance(body.body, dict):
         words = "wanted one body, got a Fit of several: give fit.body[name]"
         raise ValueError(f"inertia_ellipsoid: {words}")
@@ -111,8 +109,7 @@ def _shape(body: Inertia | MassProperties) -> Any:
 
 def _outline(shape: np.ndarray, i: int, j: int) -> np.ndarray:
     """The silhouette of r·A⁻¹r = 1 on a coordinate plane: the ellipse of the 2 × 2 block of A."""
-    block = shape[np.ix_((i, j), (i, j))]
-    values, vectors = np.linalg.eigh(block)
+    values, vectors = np.linalg.eigh(shape[np.ix_((i, j), (i, j))])
     angle = np.linspace(0, 2 * np.pi, 121)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     return vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * circle)

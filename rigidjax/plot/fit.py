@@ -29,18 +29,14 @@ def fit(
     plt = pyplot()
     seconds = unit(time_unit, TIMES, "time_unit")
     rate = unit(rate_unit, RATES, "rate_unit")
-    index = of_fit(found, index)
-    record = found.problem.recordings[index]
-    left = [e if found.problem.count == 1 else e[index] for e in found.residuals]
-    left = [np.asarray(e)[: record.t.shape[0]] for e in left]
-    t = np.asarray(record.t) / seconds
+    record, left, _ = of_fit(found, index)
     count = len(record.readings)
     size, how = (max(6.2 * count, 7.5), 6), dict(squeeze=False, layout="constrained")
     figure, axes = plt.subplots(2, count, figsize=size, sharex=True, height_ratios=(2, 1), **how)
-    dense = _between(found, index)
+    dense = _between(found, record, index)
     for column, (reading, errors) in enumerate(zip(record.readings, left, strict=True)):
         upper, lower = axes[:, column]
-        _one_sensor(upper, lower, t, reading, errors, dense, seconds, rate, rate_unit)
+        _one_sensor(upper, lower, record.t, reading, errors, dense, (seconds, rate, rate_unit))
         lower.axhline(0, color="0.6", lw=0.8)
         lower.set_xlabel(f"time, {time_unit}")
         upper.margins(x=0.02, y=0.2)
@@ -51,34 +47,24 @@ def fit(
     return figure
 
 
-def _between(found: Any, index: int) -> tuple[np.ndarray, Any] | None:
+def _between(found: Any, record: Any, index: int) -> tuple[np.ndarray, Any] | None:
     """Times and states between sparse samples of a free body, for a smooth line; else `None`."""
-    problem = found.problem
-    record = problem.recordings[index]
+    problem, body, state0 = found.problem, found.body, found.state0
     if problem.torque is not None or record.t.shape[0] > 300:
         return None
-    state0 = found.state0
     if problem.count > 1:
         state0 = jax.tree.map(lambda leaf: leaf[index], state0)
-    dense = jnp.linspace(record.t[0], record.t[-1], 800)
-    body = found.body
     if isinstance(body, dict):
         body = body[problem.of[index]]
+    dense = jnp.linspace(record.t[0], record.t[-1], 800)
     return np.asarray(dense), simulate(body, state0, dense).ys
 
 
 def _one_sensor(
-    upper: Any,
-    lower: Any,
-    t: np.ndarray,
-    reading: Any,
-    errors: np.ndarray,
-    dense: tuple[np.ndarray, Any] | None,
-    seconds: float,
-    rate: float,
-    rate_unit: str,
+    upper: Any, lower: Any, ts: Any, reading: Any, errors: np.ndarray, dense: Any, units: Any
 ) -> None:
-    seen, sensor = reading.seen, reading.sensor
+    (seconds, rate, rate_unit), seen, sensor = units, reading.seen, reading.sensor
+    t = np.asarray(ts) / seconds
     values = np.asarray(reading.values).reshape(len(t), -1)
     names: tuple[str, ...] = ("x", "y", "z")[: values.shape[1]]
     scale, unit, line_t = 1.0, sensor.unit, t

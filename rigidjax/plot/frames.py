@@ -29,8 +29,7 @@ def frames(
     **Arguments:** `frame` the `MovingFrame`; `ts` (T,); `inside` the path in the moving frame, a
     `Point` with a leading time axis (`frame.from_inertial` makes it from the other); `plane` two of
     `xyz`; `unit` of length; `marks` places at rest in the frame, name → (3,); `title`; `ax` two
-    axes. **Returns** the axes (2,). **Raises** `ValueError` for an unknown plane, other lengths, or
-    a batch.
+    axes. **Returns** the axes (2,).
 
     >>> turntable = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
     >>> ts = jnp.linspace(0.0, 3.0, 20)

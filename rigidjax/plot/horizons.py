@@ -8,12 +8,8 @@ import numpy as np
 from rigidjax import _checks
 from rigidjax.plot.style import COLOURS, plain, several_axes
 
-_KINDS = {
-    "x": "position, m",
-    "v": "velocity, m/s",
-    "q": "attitude, rad",
-    "omega": "body rate, rad/s",
-}
+_KINDS = {"x": "position, m", "v": "velocity, m/s", "q": "attitude, rad"}
+_KINDS["omega"] = "body rate, rad/s"
 _MEASURES = {
     "mean_absolute": "mean |error| of a component",
     "mean_norm": "mean length of the error",
@@ -36,9 +32,8 @@ def horizons(
     between samples, for a scale of time instead of steps; `measure` `mean_absolute` (of a
     component), `mean_norm` or `rms` (of the vector); `title`; `ax` one for each kind. Both scales
     are linear, since errors start at zero. **Returns** the axes, one for each of position,
-    velocity, attitude, body rate in the state. **Raises** `TypeError` for anything but errors by
-    horizon; `ValueError` for none, for kinds that differ, an unknown measure, a step that is not
-    positive, another number of axes.
+    velocity, attitude, body rate in the state. **Raises** `ValueError` for none, for kinds that
+    differ, a step that is not positive.
 
     >>> t = np.arange(8.0)
     >>> cut = rj.identify.windows(t, rj.Spin(np.ones((8, 3)) * t[:, None]), length=3)
@@ -50,10 +45,8 @@ def horizons(
         raise ValueError("found: wanted at least one Horizons, got none")
     for one in named.values():
         if not all(hasattr(one, name) for name in ("steps", *_MEASURES)) or isinstance(one, type):
-            found = _checks.kind(one)
-            raise TypeError(
-                f"found: wanted a Horizons of rigidjax.identify, or some by name, got {found}"
-            )
+            words = "found: wanted a Horizons of rigidjax.identify, or some by name, got "
+            raise TypeError(words + _checks.kind(one))
     _checks.word(measure, tuple(_MEASURES), "measure")
     scale = 1.0 if step is None else _checks.positive(step, "step", "a positive time, s")
     kinds = [kind for kind in _KINDS if kind in getattr(next(iter(named.values())), measure)]

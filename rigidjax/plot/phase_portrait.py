@@ -32,9 +32,8 @@ def phase_portrait(
 
     **Arguments:** `inertia` about the pivot; `top` weight and place of the centre of mass, which is
     on the axis of symmetry; `states` of one body with a leading time axis; `levels` the number of
-    thin curves; `title`; `ax`. **Returns** the axes. **Raises** `ValueError` without
-    symmetry about the axis through the centre of mass, without weight, and for a batch; `TypeError`
-    for states without an attitude.
+    thin curves; `title`; `ax`. **Returns** the axes. **Raises** `ValueError` without symmetry about
+    the axis through the centre of mass, and without weight.
 
     >>> body = rj.Inertia.from_principal(2.0, 2.0, 1.0)
     >>> top = rj.torques.HeavyTop(1.0, [0.0, 0, 1.0], [0, 0, -9.81])

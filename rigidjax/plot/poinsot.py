@@ -19,8 +19,7 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
 
     A dot marks the start, a triangle the end; the path behind the sphere is faint. **Arguments:**
     `states` of one body with a leading time axis; `title`; `ax` your 3-D axes; set their view
-    before the call (`view_init`). **Returns** the axes. **Raises** `TypeError` for states without
-    an attitude or flat axes, `ValueError` for a batch.
+    before the call (`view_init`). **Returns** the axes.
 
     >>> sol = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 3.0),
     ...                   rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 1.0, 2.0])
@@ -29,10 +28,10 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     """
     m = style.matrices(style.attitudes(states))
     ax = style.solid_axes(ax)
-    style.globe(ax, (1.0, 1.0, 1.0), "0.8", 0.12)
+    style.globe(ax, "0.8", 0.12)
     for axis, colour in enumerate(COLOURS[:3]):
         path = m[:, :, axis]
-        style.around_ball(ax, path, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
+        style.around_ball(ax, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
         ax.plot(*path[:1].T, color=colour, marker="o", ms=6, ls="")
         ax.plot(*path[-1:].T, color=colour, marker="^", ms=7, ls="")
     # Of no axis: grey.
@@ -56,7 +55,7 @@ def polhode(
 
     **Arguments:** `inertia`; `states` of one body with a leading time axis; `energies` the number
     of thin lines; `title`; `ax` your 3-D axes. **Returns** the axes. **Raises** `ValueError` for a
-    body at rest, a zero moment or a batch; `TypeError` for flat axes.
+    body at rest or a zero moment.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Spin([0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])
@@ -81,18 +80,18 @@ def polhode(
     # The order is set here. matplotlib takes one depth for a whole surface, and would draw the
     # sphere over the path.
     ax.computed_zorder = False
-    style.globe(ax, (1.0, 1.0, 1.0), COLOURS[5], 0.15)
-    style.cage(ax, np.sqrt(twice_energy * i), COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
+    style.globe(ax, COLOURS[5], 0.15)
+    semi_axes = np.sqrt(twice_energy * i)
+    # By meridians and parallels: its inside stays visible.
+    how: dict[str, Any] = dict(color=COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
+    ax.plot_wireframe(*(semi_axes[:, None, None] * style.ball()), rstride=4, cstride=6, **how)
     # All energies are equal if all moments are equal: there are no lines to draw.
     if i[2] - i[0] > 1e-9 * i[2]:
         _others(ax, i, energies)
-    hidden = {"alpha": 1.0, "ls": (0, (1, 1)), "lw": 1.8}
-    style.around_ball(
-        ax, pi, pi, behind=hidden, color=COLOURS[1], lw=2.6, label="this motion", zorder=5
-    )
+    how = dict(behind={"ls": (0, (1, 1)), "lw": 1.8}, label="this motion", zorder=5)
+    style.around_ball(ax, pi, color=COLOURS[1], lw=2.6, **how)
     ax.plot(*pi[:1].T, color=COLOURS[1], marker="o", ms=6, ls="", label="start", zorder=6)
-    reach = max(1.0, float(np.sqrt(twice_energy * i).max()))
-    style.cube(ax, reach, ("Π₁ / h", "Π₂ / h", "Π₃ / h"))
+    style.cube(ax, max(1.0, float(semi_axes.max())), ("Π₁ / h", "Π₂ / h", "Π₃ / h"))
     handles, names = ax.get_legend_handles_labels()
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -104,32 +103,27 @@ def polhode(
     return ax
 
 
-def _about_middle(around: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """`on_sphere` with the pole along the middle axis."""
-    return style.on_sphere(around, down)[[1, 2, 0]]
-
-
 def _others(ax: Any, i: np.ndarray, energies: int) -> None:
     """Curves of equal energy on the unit momentum sphere."""
     import contourpy
 
+    def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
+        # The pole along the axis of the middle moment: no family of loops goes round it.
+        return style.on_sphere(around, down)[[1, 2, 0]]
+
     inverse = 1 / i
-    # The pole of the grid along the axis of the middle moment: no family of loops goes round it.
     around, down = np.linspace(0, 2 * np.pi, 181), np.linspace(0, np.pi, 91)
-    level = np.einsum("i,ijk->jk", inverse, _about_middle(around, down[:, None]) ** 2)
+    level = np.einsum("i,ijk->jk", inverse, on_sphere(around, down[:, None]) ** 2)
     lines = contourpy.contour_generator(around, down, level)
-    for value in np.linspace(inverse[2], inverse[0], energies + 2)[1:-1]:
-        _curves(ax, lines.lines(value), lw=0.6, color="0.35", zorder=3)
+    values = np.linspace(inverse[2], inverse[0], energies + 2)[1:-1]
+    drawn: list[Any] = [(value, dict(lw=0.6, color="0.35", zorder=3)) for value in values]
     if min(i[1] - i[0], i[2] - i[1]) > 1e-9 * i[2]:
         how = dict(lw=1.2, color="0.1", ls="--", label="separatrix", zorder=4)
-        _curves(ax, lines.lines(inverse[1]), **how)
-
-
-def _curves(ax: Any, curves: Any, **how: Any) -> None:
-    for curve in curves:
-        path = _about_middle(*np.asarray(curve).T).T
-        style.around_ball(ax, path, path, **how)
-        how.pop("label", None)
+        drawn.append((inverse[1], how))
+    for value, how in drawn:
+        for curve in lines.lines(value):
+            style.around_ball(ax, on_sphere(*np.asarray(curve).T).T, **how)
+            how.pop("label", None)
 
 
 def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
@@ -138,8 +132,7 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     The motion must be free: the part of ω along the momentum is then 2T/h and constant. The circles
     are the least and the largest distance of this motion. **Arguments:** `inertia`; `states`
     (`Attitude`) of one body with a leading time axis; `title`; `ax`. **Returns** the axes.
-    **Raises** `ValueError` for a body at rest, a batch, or a momentum that turned by more than 1e-3
-    rad; `TypeError` for states without an attitude.
+    **Raises** `ValueError` for a body at rest, and a momentum that turned by more than 1e-3 rad.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], [0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])
@@ -156,10 +149,8 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     up = momenta[0] / size[0]
     turned = np.linalg.norm(np.cross(momenta, up), axis=1) / size
     if turned.max() > 1e-3:
-        words = (
-            f"herpolhode: the angular momentum turned by {turned.max():.2g} rad: a torque acts, "
-        )
-        raise ValueError(words + "and there is no invariable plane")
+        words = f"herpolhode: the angular momentum turned by {turned.max():.2g} rad: "
+        raise ValueError(words + "a torque acts, and there is no invariable plane")
     first = omega[0] - (omega[0] @ up) * up
     if np.linalg.norm(first) < 1e-9 * np.linalg.norm(omega[0]):
         # A spin about a principal axis: any direction across will do.

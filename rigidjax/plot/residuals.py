@@ -22,8 +22,7 @@ def residuals(
     spectrum is a motion or a torque that the model lacks.
 
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`,
-    `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes. **Raises**
-    `ValueError` for an unknown unit, a missing recording, or axes of another shape.
+    `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
 
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
@@ -33,18 +32,12 @@ def residuals(
     'lag, samples'
     """
     seconds = unit(time_unit, TIMES, "time_unit")
-    index = of_fit(found, index)
-    record = found.problem.recordings[index]
-    several = found.problem.count > 1
+    record, left, noises = of_fit(found, index)
     count = len(record.readings)
     ax = several_axes(ax, (count, 4), nrows=count, ncols=4, figsize=(14, 3.1 * count))
     t = np.asarray(record.t) / seconds
-    for row, reading, errors, noise in zip(
-        ax, record.readings, found.residuals, found.noise, strict=True
-    ):
-        one = np.asarray(errors[index] if several else errors)[: t.size]
-        sigma = np.asarray(noise[index] if several else noise)
-        _one_sensor(row, t, one / sigma, np.asarray(reading.seen))
+    for row, reading, errors, noise in zip(ax, record.readings, left, noises, strict=True):
+        _one_sensor(row, t, errors / noise, np.asarray(reading.seen))
         row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
         row[0].set_xlabel(f"time, {time_unit}")
         row[3].set_xlabel(f"frequency, {'Hz' if time_unit == 's' else f'1/{time_unit}'}")

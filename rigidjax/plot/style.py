@@ -22,9 +22,8 @@ def pyplot() -> Any:
     try:
         import matplotlib.pyplot as plt
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "rigidjax.plot needs matplotlib: pip install 'rigidjax[view]'"
-        ) from error
+        words = "rigidjax.plot needs matplotlib: pip install 'rigidjax[view]'"
+        raise ModuleNotFoundError(words) from error
     return plt
 
 
@@ -33,8 +32,8 @@ def unit(name: str, known: dict[str, float], what: str) -> float:
     return known[_checks.word(name, tuple(known), what)]
 
 
-def of_fit(found: Any, index: Any) -> int:
-    """The recording of a fit; raises in words if it is no fit, or has no such recording."""
+def of_fit(found: Any, index: Any) -> tuple[Any, list[np.ndarray], list[np.ndarray]]:
+    """A recording of a fit, residuals and noise of its sensors; raises in words if it has none."""
     if np.shape(getattr(found, "chi2", 0.0)) != ():
         raise ValueError("found: wanted one Fit, got one with leading axes; draw them one by one")
     wanted = ("problem", "parameters", "residuals")
@@ -43,7 +42,9 @@ def of_fit(found: Any, index: Any) -> int:
     index, count = _checks.whole(index, "index", 0), found.problem.count
     if index >= count:
         raise ValueError(f"index: wanted one of {count} recordings, from 0, got {index}")
-    return index
+    record, which = found.problem.recordings[index], ... if count == 1 else index
+    errors = [np.asarray(e[which])[: record.t.shape[0]] for e in found.residuals]
+    return record, errors, [np.asarray(noise[which]) for noise in found.noise]
 
 
 def flat_axes(ax: Any, **how: Any) -> Any:
@@ -53,10 +54,10 @@ def flat_axes(ax: Any, **how: Any) -> Any:
     return pyplot().subplots(layout="constrained", **{"figsize": (6.4, 4.4), **how})[1]
 
 
-def solid_axes(ax: Any, **how: Any) -> Any:
+def solid_axes(ax: Any) -> Any:
     """The 3-D axes given, or a figure with its own; `TypeError` for flat ones."""
     if ax is None:
-        figure = pyplot().figure(layout="constrained", **{"figsize": (6.0, 5.6), **how})
+        figure = pyplot().figure(layout="constrained", figsize=(6.0, 5.6))
         return figure.add_subplot(projection="3d")
     if not hasattr(ax, "zaxis"):
         raise TypeError("ax: wanted 3-D axes, got flat ones; make them with projection='3d'")
@@ -100,12 +101,12 @@ def rows(values: Any, width: int, name: str) -> np.ndarray:
     return out
 
 
-def attitudes(states: Any, name: str = "states") -> np.ndarray:
+def attitudes(states: Any) -> np.ndarray:
     """Quaternions (T, 4) of states; `TypeError` for states without them."""
     if not hasattr(states, "q"):
         found = type(states).__name__
-        raise TypeError(f"{name}: wanted states with an attitude (Attitude, Rigid), got {found}")
-    return rows(states.q, 4, f"{name}.q")
+        raise TypeError(f"states: wanted states with an attitude (Attitude, Rigid), got {found}")
+    return rows(states.q, 4, "states.q")
 
 
 def matrices(q: np.ndarray) -> np.ndarray:
@@ -121,21 +122,13 @@ def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
 
 
 def around_ball(
-    ax: Any,
-    path: np.ndarray,
-    normals: np.ndarray,
-    *,
-    behind: dict[str, Any] | None = None,
-    **how: Any,
+    ax: Any, path: np.ndarray, *, behind: dict[str, Any] | None = None, **how: Any
 ) -> None:
-    """A line `path` (T, 3) on a ball with outward `normals`, in the style `behind` where hidden."""
+    """A line `path` (T, 3) on the unit sphere, in the style `behind` where hidden."""
     up, around = np.radians(ax.elev), np.radians(ax.azim)
     eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
-    front = normals @ eye > 0
-    label = how.pop("label", None)
-    alpha = how.pop("alpha", 1.0)
-    hidden = {"alpha": 0.25 * alpha, **(behind or {})}
-    for seen, more in ((front, {"alpha": alpha, "label": label}), (~front, hidden)):
+    front, label = path @ eye > 0, how.pop("label", None)
+    for seen, more in ((front, {"label": label}), (~front, behind or {"alpha": 0.25})):
         # One point over the edge on both sides, so that no gap opens between the two.
         wide = seen | np.roll(seen, 1) | np.roll(seen, -1)
         wide[0], wide[-1] = seen[0], seen[-1]
@@ -143,21 +136,14 @@ def around_ball(
         ax.plot(*line.T, **{**how, **more})
 
 
-def globe(ax: Any, semi_axes: Any, colour: str, alpha: float) -> None:
-    """An ellipsoid along the axes, translucent."""
-    shape = _ellipsoid(semi_axes)
-    ax.plot_surface(*shape, color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1)
+def ball() -> np.ndarray:
+    """A grid (3, 49, 25) on the unit sphere."""
+    return on_sphere(np.linspace(0, 2 * np.pi, 49)[:, None], np.linspace(0, np.pi, 25))
 
 
-def cage(ax: Any, semi_axes: Any, colour: str, **how: Any) -> None:
-    """An ellipsoid along the axes by meridians and parallels: its inside stays visible."""
-    shape = _ellipsoid(semi_axes)
-    ax.plot_wireframe(*shape, color=colour, rstride=4, cstride=6, **how)
-
-
-def _ellipsoid(semi_axes: Any) -> np.ndarray:
-    ball = on_sphere(np.linspace(0, 2 * np.pi, 49)[:, None], np.linspace(0, np.pi, 25))
-    return np.asarray(semi_axes)[:, None, None] * ball
+def globe(ax: Any, colour: str, alpha: float) -> None:
+    """The unit sphere, translucent."""
+    ax.plot_surface(*ball(), color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1)
 
 
 def cube(ax: Any, reach: float, labels: tuple[str, str, str]) -> None:

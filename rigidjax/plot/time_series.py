@@ -30,7 +30,7 @@ def motion(
     `attitude` its form: `quaternion` (w, x, y, z), `axes` (the height of each body axis along world
     z) or `angles` (3-1-3, notes eq 31, deg); `time_unit` `s`, `min`, `h`, `day`; `rate_unit`
     `rad/s`, `deg/s`, `rpm`, `deg/day`; `title`; `ax` two axes (one for a `Spin`). **Returns** the
-    axes, (2,) or (1,). **Raises** `ValueError` for an unknown unit, or a batch instead of one body.
+    axes, (2,) or (1,).
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Spin([0, 1, 0.1]), [0.0, 1.0, 2.0])

@@ -3,7 +3,7 @@
 A sequence is three letters; the angles have its order, and all are active, in radians. **Capitals
 are intrinsic**: each turn is about the moved axis, and M = R_1(a) R_2(b) R_3(c) (notes, eqs 12,
 27–31). **Lower case is extrinsic**: each turn is about a fixed axis of the world, and M = R_3(c)
-R_2(b) R_1(a). SciPy uses the same letters.
+R_2(b) R_1(a). SciPy uses the same letters. **Raises:** `ValueError` for an unknown sequence.
 
 **The singular case** ("gimbal lock") is a middle angle of 0 or π if the first and the last letter
 agree, and of ±π/2 if all three differ. Only the sum or the difference of the outer angles is then
@@ -32,8 +32,8 @@ _MANY_TURNS = 8 * np.pi
 def to_quaternion(angles: Vec3Like, sequence: str = "ZXZ") -> Quat:
     """The unit quaternion, body → world, of three Euler angles.
 
-    **Arguments:** `angles` (3,), rad, in the order of `sequence`. **Raises:** `ValueError` for an
-    unknown sequence. **Warns** if a known angle is beyond four turns: it may be in degrees.
+    **Arguments:** `angles` (3,), rad, in the order of `sequence`. **Warns** if a known angle is
+    beyond four turns: it may be in degrees.
 
     >>> to_quaternion(jnp.array([0.0, jnp.pi, 0.0])).round(12).tolist()
     [0.0, 1.0, 0.0, 0.0]
@@ -47,7 +47,6 @@ def to_matrix(angles: Vec3Like, sequence: str = "ZXZ") -> Mat3:
     """The rotation matrix, body → world, of three Euler angles (notes, eqs 31, 33 for "ZXZ").
 
     **Arguments:** `angles` (3,), rad, in the order of `sequence`: (φ, θ, ψ) for "ZXZ".
-    **Raises:** `ValueError` for an unknown sequence.
 
     >>> to_matrix(jnp.array([0.0, jnp.pi / 2, 0.0]), "ZXZ").round(12)[1].tolist()
     [0.0, 0.0, -1.0]
@@ -60,8 +59,7 @@ def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
 
     **Arguments:** `matrix` (3, 3) rotation, body → world; values are not checked (`so3.check`).
     **Returns:** (3,): outer angles in (−π, π], the middle one in [0, π] if the first and the last
-    letter agree, else in [−π/2, π/2]. The last is 0 in the singular case. **Raises:** `ValueError`
-    for an unknown sequence.
+    letter agree, else in [−π/2, π/2]. The last is 0 in the singular case.
 
     >>> angles = jnp.array([0.3, 0.2, 0.1])
     >>> bool(abs(from_matrix(to_matrix(angles, "xyz"), "xyz") - angles).max() < 1e-15)
@@ -71,12 +69,11 @@ def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
 
 
 def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
-    """The Euler angles of a quaternion, rad, in the order of `sequence`; the same bits for q and
-    −q.
+    """The Euler angles of a quaternion, rad, in the order of `sequence`; the same bits for −q.
 
-    **Arguments:** `q` (4,) of any length, body → world. **Raises:** `ValueError` for zero, NaN or
-    an unknown sequence. Half the sum and half the difference of the outer angles come from two
-    atan2, so that the matrix keeps all its digits near the singular case (Bernardes & Viollet 2022,
+    **Arguments:** `q` (4,) of any length, body → world. **Raises:** `ValueError` for zero or NaN.
+    Half the sum and half the difference of the outer angles come from two atan2, so that the matrix
+    keeps all its digits near the singular case (Bernardes & Viollet 2022,
     doi:10.1371/journal.pone.0276302).
 
     >>> from_quaternion(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
@@ -133,8 +130,7 @@ def rates_to_omega(
     """Angular velocity from Euler angles and their rates (notes, eqs 80–83 for "ZXZ" and "body").
 
     **Arguments:** `angles` (3,), rad, and `rates` (3,), rad/s, in the order of `sequence`; `frame`
-    of the result. **Returns:** (3,) rad/s. **Raises:** `ValueError` for an unknown sequence or
-    frame.
+    of the result, (3,), rad/s.
 
     >>> rates_to_omega(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 2.0]
@@ -159,8 +155,7 @@ def omega_to_rates(
 
     **Arguments:** `angles` (3,), rad, in the order of `sequence`; `omega` (3,), rad/s, in `frame`.
     **Returns:** (3,) rad/s. In the singular case (`is_singular`) the last rate is 0, and the part
-    of `omega` that no rates give is dropped. **Raises:** `ValueError` for an unknown sequence or
-    frame.
+    of `omega` that no rates give is dropped.
 
     >>> omega_to_rates(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 2.0]
@@ -203,10 +198,8 @@ def _unknown(sequence: object, reason: str) -> str:
 def _angles(angles: Vec3Like) -> Vec3:
     angles = turn(_checks.floating(angles, (3,), "angles"), "angles")
     if _checks.known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
-        words = (
-            f"angles {angles.tolist()} rad are over four turns: are they degrees? use jnp.deg2rad"
-        )
-        warnings.warn(words, stacklevel=3)
+        words = "are over four turns: are they degrees? use jnp.deg2rad"
+        warnings.warn(f"angles {angles.tolist()} rad {words}", stacklevel=3)
     return angles
 
 

@@ -51,9 +51,8 @@ def project(matrix: Mat3Like) -> Mat3:
         # For the matrix over its largest entry: its own determinant may overflow.
         found = np.linalg.det(np.asarray(matrix) / size)
         if found <= 0:
-            raise ValueError(
-                f"matrix: left-handed frame or singular, det = {found:.3g}; no rotation is nearest"
-            )
+            words = f"left-handed frame or singular, det = {found:.3g}; no rotation is nearest"
+            raise ValueError(f"matrix: {words}")
     return nearest(matrix)
 
 

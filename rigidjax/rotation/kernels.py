@@ -58,14 +58,9 @@ def matrix_to_quaternion(m: Mat3) -> Quat:
     return jnp.stack([scale * part for part in row])
 
 
-@_compiled
-def quaternion_to_vector(q: Quat) -> Vec3:
-    """The shortest rotation vector of either sign of q."""
-    return _log(q)
-
-
 @jax.custom_jvp
 def _log(q: Quat) -> Vec3:
+    """The shortest rotation vector of either sign of q."""
     w, x, y, z = parts = components(near_one(*components(q)) * q)
     n2 = x * x + y * y + z * z
     # tan of the half angle is n/|w|, of the quarter n/a, of the eighth n/b: nothing cancels.
@@ -92,6 +87,9 @@ def _log_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     twice = cross_components(vs, across)
     g = inverse_kernel(dot_components(vs, vs))
     return v, jnp.stack([turn[i] + 0.5 * across[i] + g * twice[i] for i in range(3)])
+
+
+quaternion_to_vector = _compiled(_log)
 
 
 @_compiled
@@ -122,8 +120,8 @@ def square4(q: Sequence[Scalar]) -> Scalar:
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
 
 
-def product4(p: Sequence[Scalar], q: Sequence[Scalar]) -> tuple[Scalar, ...]:
-    """The quaternion product p q of four scalars each."""
+def product4(p: Any, q: Any) -> tuple[Any, ...]:
+    """The quaternion product p q of four scalars each, of JAX or NumPy."""
     a, b, c, d = p
     e, f, g, h = q
     return (

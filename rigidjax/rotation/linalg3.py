@@ -103,8 +103,7 @@ def basis(dtype: Any = float) -> Float[Array, "3 3 3"]:
 
 
 def product(a: Mat3Like, b: Mat3Like) -> Mat3:
-    """Matrix product of `a`, `b` (3, 3) on components: full precision on every device, cheap in
-    gradients.
+    """Matrix product of `a`, `b` (3, 3) on components, in full precision on every device.
 
     >>> product(jnp.eye(3), 2.0 * jnp.eye(3)).tolist()
     [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]

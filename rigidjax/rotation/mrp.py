@@ -41,8 +41,7 @@ def to_quaternion(sigma: Vec3Like) -> Quat:
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
-    """The parameters, |σ| ≤ 1, of a rotation `matrix` (3, 3), body → world, unchecked
-    (`so3.check`).
+    """The parameters, |σ| ≤ 1, of a rotation `matrix` (3, 3), body → world, unchecked.
 
     >>> from_matrix(jnp.eye(3)).tolist()
     [0.0, 0.0, 0.0]

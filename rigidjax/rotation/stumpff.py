@@ -18,12 +18,16 @@ from jaxtyping import Array, Float
 
 # The largest argument of `arctan_ratio`, tan²(π/8).
 _REACH = math.tan(math.pi / 8) ** 2
+# π in three parts, the first two of 28 (float64) or 10 (float32) bits.
+_PI_PARTS = {
+    np.dtype("float64"): (3.141592651605606, 1.9841871479187034e-09, 1.1442377452219664e-17),
+    np.dtype("float32"): (3.140625, 0.0009670257568359375, 6.278329465203569e-07),
+}
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)! for t = θ² ≥ 0 (Battin 1999, eq 4.80 and
-    problem).
+    """Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)! for t = θ² ≥ 0 (Battin 1999, eq 4.80).
 
     c_0 is cos θ, c_1 sin θ/θ, c_2 (1 − cos θ)/θ², c_3 (θ − sin θ)/θ³. Values and derivatives of
     every order are right to a few units of round-off of 1/k!.
@@ -65,27 +69,28 @@ def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
     limit = (math.pi / 2) ** 2
     far = t > limit
     theta = jnp.sqrt(jnp.where(far, t, 1))
-    turns = jnp.round(theta * (1 / math.pi))
-    head, tail = _split_pi(t.dtype)
-    # turns × head is exact (Cody & Waite 1980), so the remainder is as good as θ itself.
-    remainder = (theta - turns * head) - turns * tail
+    turns, remainder = half_turns(theta)
     # A θ beyond 1/ε is only round-off: stay in the range of the polynomials.
     remainder = jnp.clip(remainder, -2.0, 2.0)
     value = _polynomial(k, jnp.where(far, remainder * remainder, t), limit)
     value = value * jnp.where(far, remainder, 1) if k else value
     # The sign enters by a division, not a product: XLA on CPU computes a quotient once, but repeats
     # a polynomial for each use.
-    sign = 1 - 2 * (turns - 2 * jnp.floor(0.5 * turns))
+    sign = parity(turns)
     return value / jnp.where(far, sign * theta if k else sign, 1)
 
 
-def _split_pi(dtype: Any) -> tuple[float, float]:
-    """π = head + tail; head times a whole number is exact."""
-    bits = 20 if dtype == jnp.float64 else 10
-    head = float(np.floor(math.pi * 2.0 ** (jnp.finfo(dtype).nmant - bits)))
-    head *= 2.0 ** (bits - jnp.finfo(dtype).nmant)
-    # π − head in float64, with the digits of π that float64 has not.
-    return head, (math.pi - head) + 1.2246467991473532e-16
+def half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """(n, r) with angle = nπ + r, |r| ≤ π/2; the tangent of r is that of the angle."""
+    turns = jax.lax.stop_gradient(jnp.round(angle * (1 / math.pi)))
+    # Cody & Waite 1980: n × head and n × middle are exact, so that r keeps the digits of the angle.
+    head, middle, tail = _PI_PARTS[np.dtype(angle.dtype)]
+    return turns, ((angle - turns * head) - turns * middle) - turns * tail
+
+
+def parity(n: Float[Array, "..."]) -> Float[Array, "..."]:
+    """(−1)ⁿ."""
+    return 1 - 2 * (n - 2 * jnp.floor(0.5 * n))
 
 
 def _polynomial(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, "..."]:

@@ -55,10 +55,8 @@ def rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*
         det = (rows[0] * xp.cross(rows[1], rows[2])).sum(-1)
         gram = (values[..., :, :, None] * values[..., :, None, :]).sum(-3)
     found = f", det = {det.min():.4g}" if known else ""
-    words = (
-        f"{name}: left-handed frame{found}; a rotation has det = +1 (an axis flipped or swapped?)"
-    )
-    m = _checks.refuse(m, (det < 0).any(), words)
+    words = f"left-handed frame{found}; a rotation has det = +1 (an axis flipped or swapped?)"
+    m = _checks.refuse(m, (det < 0).any(), f"{name}: {words}")
     error = abs(gram - xp.eye(3, dtype=values.dtype).reshape((1,) * (values.ndim - 2) + (3, 3)))
     limit = tolerance(values.dtype)
     found = f" is {error.max():.3g}" if known else " is too large"

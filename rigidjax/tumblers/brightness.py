@@ -81,9 +81,7 @@ def mesh(
     both = (lit > 0) & (seen > 0) & (size > 0)
     # Dark faces must not reach the derivative.
     length = jnp.sqrt(jnp.where(both, size, 1.0))
-    sent = law.per_area(
-        jnp.where(both, lit, length) / length, jnp.where(both, seen, length) / length
-    )
+    sent = law.per_area(*(jnp.where(both, cosine, length) / length for cosine in (lit, seen)))
     return jnp.where(both, 0.5 * length * sent, 0.0).sum()
 
 

@@ -99,6 +99,14 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
     return jax.lax.map(one, pairs, batch_size=BATCH)
 
 
+def remainder(rows: Array, z: Array) -> tuple[Float[Array, ""], Float[Array, " k"]]:
+    """The least |z − cᵀ rows|² of rows (k, T), and c."""
+    gram, side = rows @ rows.T, rows @ z
+    gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(side.size, dtype=z.dtype)
+    c = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(gram), side)
+    return jnp.sum(z * z) - side @ c, c
+
+
 def filled(rows: np.ndarray) -> np.ndarray:
     """Rows repeated up to one of few lengths: fewer programs to compile."""
     size = FEW if len(rows) <= FEW else -(-len(rows) // MANY) * MANY

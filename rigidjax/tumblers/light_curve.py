@@ -22,17 +22,10 @@ from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, one_problem
 from rigidjax.identify.quantities import carried, quantities, values_and_slopes
 from rigidjax.identify.result import Fit
-from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot
-from rigidjax.tumblers.search import (
-    MAGNITUDE,
-    descended,
-    noise_of,
-    relative_flux,
-    starts_of,
-)
-from rigidjax.tumblers.sensor import Brightness
+from rigidjax.tumblers.search import MAGNITUDE, descended, noise_of, relative_flux, starts_of
+from rigidjax.tumblers.sensor import Brightness, half_way
 from rigidjax.tumblers.two_frequencies import TwoFrequencies, two_frequencies
 
 # Motions are the same if both periods and both ratios of moments differ by less than this, or by
@@ -147,9 +140,9 @@ def fit_light_curve(
     reading = _only(problem)
     _checks.whole(count, "count", 1)
     _checks.positive(tolerance, "tolerance")
+    say = lambda line: None  # noqa: E731
     if progress is not None:
-        _checks.function(progress, "progress", "of a line of text, such as print")
-    say = progress if progress is not None else lambda line: None
+        say = _checks.function(progress, "progress", "of a line of text, such as print")
     t, flux, noise = relative_flux(problem, reading)
     squares, spread = flux**2, None if noise is None else 2.0 * flux * noise
     found = two_frequencies(t, squares, spread, shortest=shortest, count=count)
@@ -200,10 +193,8 @@ def _read(parameters: Parameters, problem: Problem) -> tuple[Array, Array]:
     inertia = Inertia(tensor_of(body))
     omega = parameters.own.spin[0] * problem.reference.rate[0]
     moments, momentum = inertia.moments, apply(inertia.tensor, omega)
-    rotation = exact.body_period(inertia, omega)
-    precession = exact.precession_period(inertia, omega)
-    ratios = moments[:2] / moments[2]
-    numbers = jnp.log(jnp.stack([rotation, precession, ratios[0], ratios[1]]))
+    both = exact.body_period(inertia, omega), exact.precession_period(inertia, omega)
+    numbers = jnp.log(jnp.concatenate([jnp.stack(both), moments[:2] / moments[2]]))
     return numbers, dot(momentum, momentum) / dot(omega, momentum) / moments[1]
 
 
@@ -217,9 +208,8 @@ def _alias(problem: Problem, parameters: Parameters, cost: float) -> Alias:
     numbers, middle = (np.asarray(v) for v in _read(parameters, problem))
     rotation, precession, *ratios = np.exp(numbers)
     mode = "long" if middle < 1 else "short"
-    return Alias(
-        parameters, cost, float(rotation), float(precession), mode, np.array(ratios), False
-    )
+    found = float(rotation), float(precession), mode, np.array(ratios)
+    return Alias(parameters, cost, *found, explains=False)
 
 
 def _aliases(problem: Problem, ends: list[Tried]) -> list[Alias]:
@@ -248,15 +238,12 @@ def _same(a: Alias, b: Alias, near: np.ndarray) -> bool:
 def _half_way(parameters: Parameters, problem: Problem) -> Float[Array, "times 3"]:
     """Directions half way between sun and observer, body frame."""
     body, state0 = problem.unpack(parameters)
-    inertia = Inertia(tensor_of(body))
-    motion, t = exact.FreeBody(inertia, state0), problem.records.t[0]
+    motion, t = exact.FreeBody(Inertia(tensor_of(body)), state0), problem.records.t[0]
     sensor = padding.one(problem.records.readings[0], 0).sensor
 
     def at(now: Array) -> Array:
-        sides = (vector_at(side, now, "") for side in (sensor.sun, sensor.observer))
-        middle = sum(side / jnp.sqrt(dot(side, side)) for side in sides)
         state: Any = motion(now - t[0])
-        return quaternion.rotate_inverse(state.q, middle / jnp.sqrt(dot(middle, middle)))
+        return quaternion.rotate_inverse(state.q, half_way(sensor, now))
 
     return jax.vmap(at)(t)
 

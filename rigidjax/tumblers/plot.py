@@ -32,11 +32,10 @@ def light_curve(
     shows the cycle.
 
     **Arguments:** `ts` (T,) s; `values` (T,) readings, NaN for a gap; `periods` s, one or several,
-    or none; `model` (T,) the prediction of a motion at `ts`, such as
-    `values − fit.residuals[0][:, 0]`, or `None`; `quantity` `mag` (bright is up) or `flux`;
-    `time_unit` `s`, `min`, `h`, `day`; `title`; `ax` one axes and one more for each period, or
-    `None` for new ones. **Returns** the axes (1 + periods,). **Raises** `ValueError` for shapes
-    that differ, an unknown unit, a period that is not positive.
+    or none; `model` (T,) the prediction of a motion at `ts`, such as `values − fit.residuals[0][:,
+    0]`, or `None`; `quantity` `mag` (bright is up) or `flux`; `time_unit` `s`, `min`, `h`, `day`;
+    `title`; `ax` one axes and one more for each period, or `None` for new ones. **Returns** the
+    axes (1 + periods,). **Raises** as `rigidjax.plot`.
 
     >>> t = np.linspace(0.0, 7200.0, 50)
     >>> light_curve(t, 15 + 0.1 * np.cos(2 * np.pi * t / 3600), 3600.0)[1].get_xlabel()

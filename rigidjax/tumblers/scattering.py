@@ -154,8 +154,7 @@ def _excess(w: Array, rest: Array) -> Array:
 
 
 def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """`∫ μ₀ μ dA` over the lit and visible part, as an integral over normals: dA = det E/(n·En)²
-    dn.
+    """`∫ μ₀ μ dA` over the lit and visible part, over normals: dA = det E/(n·En)² dn.
 
     Over all that is lit, with μ < 0 on its hidden part, it is `sun·T observer`, where
     `T = π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 on (both are one Gaussian integral). So
@@ -214,18 +213,16 @@ def _across_the_lune(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Sc
     angle = angle + first
     c, s = jnp.cos(angle), jnp.sin(angle)
     # With a = c edge + s sun: a·Ea, a·E pole, and the determinant of E on the plane of both.
-    along = c * c * dot(edge, e_edge) + s * (
-        2.0 * c * dot(sun, e_edge) + s * dot(sun, apply(shape, sun))
-    )
+    mixed = 2.0 * c * dot(sun, e_edge) + s * dot(sun, apply(shape, sun))
+    along = c * c * dot(edge, e_edge) + s * mixed
     tilt = c * dot(edge, e_pole) + s * dot(sun, e_pole)
     d = c * c * d0 + s * (2.0 * c * d1 + s * d2)
     root = jnp.sqrt(d)
     e = jax.lax.complex(root / along, -tilt / along)
     square = e * e
     excess = _excess(1.0 - square, square)
-    inner = (e + e * (1.0 - square) * excess).real * dot(pole, e_pole) / root + (
-        square * excess
-    ).real
+    inner = (e + e * (1.0 - square) * excess).real * dot(pole, e_pole) / root
+    inner = inner + (square * excess).real
     return jnp.sum(weight * s * jnp.sin(width - angle) * inner / d)
 
 

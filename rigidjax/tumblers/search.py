@@ -14,9 +14,9 @@ from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.levenberg_marquardt import CAREFUL, Settings, search
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.tumblers import starts
+from rigidjax.tumblers.sensor import half_way
 from rigidjax.tumblers.two_frequencies import TwoFrequencies, padded
 
 # Starts of the first round, its steps; those that go on, and how far.
@@ -27,9 +27,7 @@ DIFFERENCE = 1e-6
 MAGNITUDE = 0.4 * np.log(10.0)
 
 
-def relative_flux(
-    problem: Problem, reading: Any
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def relative_flux(problem: Problem, reading: Any) -> tuple[np.ndarray, np.ndarray, Any]:
     """Times since the first, s, fluxes relative to their mean and their noise."""
     t = np.asarray(problem.records.t[0])
     keep, sensor = reading.seen, reading.sensor
@@ -57,10 +55,7 @@ def starts_of(
     sensor = reading.sensor
     sigma = np.ones(t.shape) if spread is None else spread
     light = padded(t, squares, 1.0 / sigma)
-    middle = problem.records.t[0][0] + 0.5 * t[-1]
-    sides = [np.asarray(vector_at(s, middle, "")) for s in (sensor.sun, sensor.observer)]
-    half_way = sum(v / np.linalg.norm(v) for v in sides)
-    half_way = half_way / np.linalg.norm(half_way)
+    middle = np.asarray(half_way(sensor, problem.records.t[0][0] + 0.5 * t[-1]))
     order, areas = np.arange(3), None
     if sensor.semi_axes is not None:
         axes = np.asarray(sensor.semi_axes)
@@ -69,14 +64,13 @@ def starts_of(
     best_of, others = [], []
     for pair in found.frequencies[:used]:
         for mode in starts.MODES:
-            some = starts.candidates(pair, mode, light, half_way, areas, 3)
+            some = starts.candidates(pair, mode, light, middle, areas, 3)
             # One start for each mode of each pair: a grid alone cannot decide between them.
             best_of += some[: len(starts.ABOUT)]
             others += some[len(starts.ABOUT) :]
-    best_of.sort(key=lambda one: one.misfit)
-    others.sort(key=lambda one: one.misfit)
     chunks = max(1, -(-len(best_of) // FIRST))
-    all_of = (best_of + others)[: chunks * FIRST]
+    in_order = [one for some in (best_of, others) for one in sorted(some, key=lambda c: c.misfit)]
+    all_of = in_order[: chunks * FIRST]
     # The rotation whose columns are the body's axes of ascending moments.
     turn = np.eye(3)[:, order]
     turn = turn * np.array([1.0, 1.0, np.linalg.det(turn)])

@@ -9,14 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, Scalar
-from rigidjax.identify.sensors.base import (
-    AbstractSensor,
-    SensorInput,
-    deviations,
-    optional,
-    required,
-)
+from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
+from rigidjax.identify.sensors import base
+from rigidjax.identify.sensors.base import AbstractSensor, SensorInput
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import determinant, dot
@@ -47,8 +42,7 @@ class Brightness(AbstractSensor):
     and difference. A `fit` assumes an ellipsoid; `fit_light_curve` allows for other shapes. Source:
     as `rigidjax.tumblers.brightness`; for tumblers Kaasalainen 2001, A&A 376:302,
     doi:10.1051/0004-6361:20010935. **Raises** `ValueError` for a direction of length zero, a noise
-    or semi-axis that is not positive, a wrong shape, NaN; `TypeError` for arguments of another
-    type.
+    or semi-axis that is not positive.
 
     >>> Brightness([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], noise=0.02, unit="mag").components
     1
@@ -84,20 +78,18 @@ class Brightness(AbstractSensor):
         offset: Any = None,
     ):
         self.sun, self.observer = _source(sun, "sun"), _source(observer, "observer")
-        self.scattering, self.noise = law_of(scattering), deviations(1)(noise)
+        self.scattering, self.noise = law_of(scattering), base.deviations(1)(noise)
         self.unit = _checks.word(unit, UNITS, "unit")
         usual = 1.0 if unit == "flux" else 0.0
-        found = required("level", ())(usual if level is None else level)
+        found = base.required("level", ())(usual if level is None else level)
         if unit == "flux":
             found = _checks.refuse(found, ~(found > 0), "level: wanted a positive flux")
         self.level = found
         if semi_axes is not None:
-            semi_axes = _checks.floating(semi_axes, (3,), "semi_axes").astype(
-                jnp.result_type(float)
-            )
+            semi_axes = _checks.floating(semi_axes, (3,), "semi_axes").astype(float)
             semi_axes = _checks.sign(semi_axes, "semi_axes", "three positive lengths")
         self.semi_axes = semi_axes
-        self.offset = optional("offset", ())(offset)
+        self.offset = base.optional("offset", ())(offset)
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
         return (reading - self.predicted(now))[None]
@@ -108,11 +100,8 @@ class Brightness(AbstractSensor):
         if self.semi_axes is not None:
             shape = jnp.diag(self.semi_axes * self.semi_axes)
         shape = shape / jnp.trace(shape)
-        sides = ((self.sun, "sun"), (self.observer, "observer"))
-        away = (vector_at(side, now.t, name).astype(now.state.q.dtype) for side, name in sides)
-        sun, observer = (
-            quaternion.rotate_inverse(now.state.q, v / jnp.sqrt(dot(v, v))) for v in away
-        )
+        q = now.state.q
+        sun, observer = (quaternion.rotate_inverse(q, v) for v in sides(self, now.t, q.dtype))
         seen = self.scattering.of_ellipsoid(shape, sun, observer)
         relative = seen / (math.pi * jnp.cbrt(determinant(shape)))
         if self.unit == "flux":
@@ -137,9 +126,24 @@ class Brightness(AbstractSensor):
         noise = np.std(values) if self.noise is None else np.asarray(self.noise)[0]
         wrong = values < 0 if self.unit == "flux" else np.zeros(values.shape, bool)
         wrong = wrong & (np.abs(values) > 10 * noise)
-        return wrong, (
-            "the flux at index {index} is far below zero; magnitudes are read with unit='mag'"
-        )
+        words = "the flux at index {index} is far below zero; magnitudes are read with unit='mag'"
+        return wrong, words
+
+
+def sides(sensor: Brightness, t: ScalarLike, dtype: Any = None) -> list[Vec3]:
+    """The unit vectors to sun and observer at `t`, world frame."""
+    away = vector_at(sensor.sun, t, "sun"), vector_at(sensor.observer, t, "observer")
+    return [_unit(v if dtype is None else v.astype(dtype)) for v in away]
+
+
+def half_way(sensor: Brightness, t: ScalarLike) -> Vec3:
+    """The unit vector half way between sun and observer at `t`, world frame."""
+    sun, observer = sides(sensor, t)
+    return _unit(sun + observer)
+
+
+def _unit(v: Vec3) -> Vec3:
+    return v / jnp.sqrt(dot(v, v))
 
 
 def _source(source: Any, name: str) -> Any:

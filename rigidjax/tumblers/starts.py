@@ -20,7 +20,8 @@ from rigidjax import exact
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion import Attitude
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.linalg3 import cross
+from rigidjax.rotation.kernels import product4
+from rigidjax.tumblers.lattice_series import remainder
 
 # Semi-axes of the grid: b/a and c/b; phases in half a rotation.
 MIDDLE, SHORT, PHASES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9), (0.5, 0.65, 0.8, 0.93), 12
@@ -38,22 +39,8 @@ class Candidate(NamedTuple):
     misfit: float
 
 
-def bodies_of_grid() -> tuple[np.ndarray, np.ndarray]:
-    """Semi-axes and moments (S, 3) of uniform ellipsoids, each over its largest."""
-    b, ratio = np.meshgrid(MIDDLE, SHORT, indexing="ij")
-    semi_axes = np.stack([np.ones(b.size), b.ravel(), (b * ratio).ravel()], axis=1)
-    second = semi_axes**2
-    moments = second.sum(axis=1, keepdims=True) - second
-    return semi_axes, moments / moments[:, 2:]
-
-
 def candidates(
-    pair: np.ndarray,
-    mode: str,
-    light: Any,
-    half_way: np.ndarray,
-    areas: np.ndarray | None,
-    count: int,
+    pair: np.ndarray, mode: str, light: Any, half_way: np.ndarray, areas: Any, count: int
 ) -> list[Candidate]:
     """The best of the grid whose precession and rotation have these frequencies, in order.
 
@@ -62,7 +49,11 @@ def candidates(
     `half_way` (3,) in the world frame; `areas` M (3,) of a known ellipsoid, or `None`; `count` of
     bodies.
     """
-    semi_axes, moments = bodies_of_grid()
+    b, ratio = np.meshgrid(MIDDLE, SHORT, indexing="ij")
+    semi_axes = np.stack([np.ones(b.size), b.ravel(), (b * ratio).ravel()], axis=1)
+    second = semi_axes**2
+    moments = second.sum(axis=1, keepdims=True) - second
+    moments = moments / moments[:, 2:]
     forms = (np.prod(semi_axes, axis=1, keepdims=True) / semi_axes) ** 2
     if areas is not None:
         forms = np.broadcast_to(areas, forms.shape)
@@ -77,32 +68,26 @@ def candidates(
         if not np.isfinite(least[k]):
             continue
         at = k, phase[k]
-        placed = (_times(q0, q[at]) for q0 in _placed(sides[at], half_way))
+        placed = (np.array(product4(q0, q[at])) for q0 in _placed(sides[at], half_way))
         out += [Candidate(moments[k], one, omega[at], float(least[k])) for one in placed]
     return out
 
 
-def _placed(side: np.ndarray, half_way: np.ndarray) -> list[np.ndarray]:
+def _placed(side: np.ndarray, half_way: np.ndarray) -> list[tuple[Any, ...]]:
     """Turns (4,) from the frame of the momentum to the world, by the best n nᵀ of rank one."""
     xx, yy, zz, xy, xz, yz = side
     _, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     n = axes[:, -1]
-    first = _between(n, half_way)
+    first = _turn(n, half_way if n @ half_way >= 0 else -half_way, np)
     halves = [0.5 * angle for angle in ABOUT]
-    about = [np.concatenate([[np.cos(half)], np.sin(half) * half_way]) for half in halves]
-    return [_times(one, first) for one in about]
+    about = [(np.cos(half), *(np.sin(half) * half_way)) for half in halves]
+    return [product4(one, first) for one in about]
 
 
-def _between(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """The shortest turn that takes u to v or to −v, whichever is nearer."""
-    v = v if u @ v >= 0 else -v
-    q = np.concatenate([[1.0 + u @ v], np.cross(u, v)])
-    return q / np.linalg.norm(q)
-
-
-def _times(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    w, v = p[0] * q[0] - p[1:] @ q[1:], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
-    return np.concatenate([[w], v])
+def _turn(u: Any, v: Any, xp: Any) -> Any:
+    """The shortest turn (4,) that takes one unit vector to another, which is not opposite to it."""
+    q = xp.concatenate([1.0 + (u * v).sum()[None], xp.cross(u, v)])
+    return q / xp.sqrt((q * q).sum())
 
 
 def _rate(moments: Array, d: Array) -> Float[Array, "3"]:
@@ -112,31 +97,16 @@ def _rate(moments: Array, d: Array) -> Float[Array, "3"]:
     return jnp.stack([jnp.sqrt(x), jnp.zeros_like(x), jnp.sqrt(1.0 - x)]) / moments
 
 
-def _along_z(momentum: Array) -> Float[Array, "4"]:
-    """An attitude in which the momentum (3,), body frame, is along z."""
-    u = momentum / jnp.sqrt(jnp.sum(momentum * momentum))
-    # Never opposite: the parts of `_rate` are positive.
-    z = jnp.zeros_like(u).at[2].set(1.0)
-    q = jnp.concatenate([1.0 + u[2:], cross(u, z)])
-    return q / jnp.sqrt(jnp.sum(q * q))
-
-
-def periods(moments: Array, omega: Array) -> tuple[Array, Array]:
-    """Body period and mean precession period, s, of principal moments (3,)."""
-    body = Inertia(jnp.diag(moments))
-    return exact.body_period(body, omega), exact.precession_period(body, omega)
-
-
 def _energy(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array, Array]:
     """A rate whose periods have this ratio, its precession period, and whether there is one."""
-    pure = jnp.where(long, moments[0], moments[2])
+    body, pure = Inertia(jnp.diag(moments)), jnp.where(long, moments[0], moments[2])
 
     def halved(_: Any, tried: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high, *_ = tried
         part = 0.5 * (low + high)
         omega = _rate(moments, pure + part * (moments[1] - pure))
-        rotation, precession = periods(moments, omega)
-        quotient = precession / rotation / ratio
+        precession = exact.precession_period(body, omega)
+        quotient = precession / exact.body_period(body, omega) / ratio
         low, high = jnp.where(quotient > 1, part, low), jnp.where(quotient > 1, high, part)
         return low, high, omega, precession, quotient
 
@@ -155,14 +125,15 @@ def _grid(
 ) -> tuple[Array, Array, Array, Array]:
     """Misfits (S, phases), n nᵀ times the level (…, 6), attitudes (…, 4) and rates (…, 3)."""
     ratio = 0.5 * pair[1] / pair[0]
-    z = squares * weights
-    total = jnp.sum(z * z)
 
     def shape(given: tuple[Array, Array]) -> Any:
         body, form = given
         omega, precession, exists = _energy(body, ratio, long)
         omega = omega * (precession * pair[0])
-        motion = exact.FreeBody(Inertia(jnp.diag(body)), Attitude(_along_z(body * omega), omega))
+        h = body * omega
+        # Its momentum is along z of the world; not opposite, as the parts of `_rate` are positive.
+        q = _turn(h / jnp.sqrt(jnp.sum(h * h)), jnp.eye(3, dtype=h.dtype)[2], jnp)
+        motion = exact.FreeBody(Inertia(jnp.diag(body)), Attitude(q, omega))
 
         def phase(part: Array) -> Any:
             since = part / pair[1]
@@ -180,12 +151,8 @@ def _grid(
             # The first state beside the others: by itself the motion would be compiled again.
             states: Any = jax.vmap(motion)(since + jnp.concatenate([jnp.zeros(1, t.dtype), t]))
             rows = jax.vmap(row)(states.q[1:]).T * weights[None, :]
-            gram = rows @ rows.T
-            gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(6, dtype=t.dtype)
-            side = rows @ z
-            n = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(gram), side)
-            misfit = jnp.where(exists, total - side @ n, jnp.inf)
-            return misfit, n, states.q[0], states.omega[0]
+            misfit, n = remainder(rows, squares * weights)
+            return jnp.where(exists, misfit, jnp.inf), n, states.q[0], states.omega[0]
 
         parts = jnp.arange(PHASES, dtype=t.dtype) / PHASES
         return jax.lax.map(phase, parts)

@@ -16,6 +16,7 @@ from rigidjax.tumblers.lattice_series import (
     Sums,
     filled,
     misfits_of,
+    remainder,
     side_peaks,
     sums,
 )
@@ -30,11 +31,12 @@ TRIED = 2
 LARGEST, MOST = 1e100, 1e5
 # Programs are compiled for times in multiples of so many.
 BLOCK = 256
-
 # Pairs nearer than this, in 1/span, count as one.
 NEAR = 0.25
 # Pairs whose aliases are tried, in at most so many rounds.
 SEEDS, ROUNDS = 16, 3
+# A pair and its eight neighbours, in steps.
+AROUND = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
 
 
 class TwoFrequencies(eqx.Module):
@@ -83,8 +85,7 @@ def two_frequencies(
 
     Source: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021 (with all |j| and
     |k| up to one order); the linear fit is that of Lomb 1976, doi:10.1007/BF00648343, for many
-    lines. **Raises:** `ValueError` for wrong shapes, times that do not increase, NaN, too few
-    values.
+    lines. **Raises:** `ValueError` for times that do not increase, NaN, too few values.
 
     >>> t = np.linspace(0.0, 60.0, 300)
     >>> y = 1 + np.cos(2 * np.pi * 0.4 * t) + 0.5 * np.cos(2 * np.pi * 0.7 * t + 1.0)
@@ -118,8 +119,7 @@ def two_frequencies(
             f"values: wanted numbers, noise and their ratios up to {LARGEST:.0e}, since their "
             f"squares are added, got {worst:.3g}; give both in another unit"
         )
-    span = float(t[-1] - t[0])
-    typical = float(np.median(np.diff(t)))
+    span, typical = float(t[-1] - t[0]), float(np.median(np.diff(t)))
     least = 4.0 * typical if shortest is None else _checks.positive(shortest, "shortest")
     if span / least > MOST:
         words = f"{least:.3g} s, and a light curve of {span:.3g} s"
@@ -163,21 +163,13 @@ def _spectrum(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Ar
     """The frequency of the strongest line, and its curve with a constant."""
     x, z, w = jnp.asarray(x), jnp.asarray(z), jnp.asarray(w)
 
-    def one(f: Array) -> tuple[Array, Array]:
+    def rows(f: Array) -> Array:
         angle = 2.0 * math.pi * f * x
-        plain = jnp.stack([jnp.ones_like(x), jnp.cos(angle), jnp.sin(angle)])
-        rows = plain * w[None, :]
-        gram = rows @ rows.T
-        gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(3, dtype=x.dtype)
-        side = rows @ z
-        c = jnp.linalg.solve(gram, side)
-        return jnp.sum(z * z) - side @ c, c
+        return jnp.stack([jnp.ones_like(x), jnp.cos(angle), jnp.sin(angle)])
 
-    left, c = jax.lax.map(one, grid, batch_size=BATCH)
+    left, c = jax.lax.map(lambda f: remainder(rows(f) * w[None], z), grid, batch_size=BATCH)
     best = jnp.argmin(left)
-    angle = 2.0 * math.pi * grid[best] * x
-    curve = c[best, 0] + c[best, 1] * jnp.cos(angle) + c[best, 2] * jnp.sin(angle)
-    return grid[best], curve
+    return grid[best], c[best] @ rows(grid[best])
 
 
 def _scan(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
@@ -198,9 +190,7 @@ def _scan(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.nd
 
 
 def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
-    """Pairs (M, 2) that may fit the same readings: moved by side peaks or half of them, and
-    related.
-    """
+    """Pairs (M, 2) that may fit the same readings: moved by (half of) side peaks, and related."""
     moves = np.unique(np.concatenate([[0.0], *((p, -p, p / 2, -p / 2) for p in peaks)]))
     first, second = pairs.T[:, :, None]
     moved = [
@@ -218,11 +208,9 @@ def with_aliases(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The pairs, and aliases of the best of them, in rounds until no better one is found."""
     peaks = side_peaks(table, highest)
-    around = 0.2 * np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
     for _ in range(ROUNDS):
         seeds = pairs[distinct(pairs, misfits, SEEDS)]
-        more = aliases_of(seeds, peaks)
-        more = (more[:, None] + around).reshape(-1, 2)
+        more = (aliases_of(seeds, peaks)[:, None] + 0.2 * AROUND).reshape(-1, 2)
         more = more[((more > 0.5) & (more < highest)).all(axis=1)]
         if not len(more):
             break
@@ -248,14 +236,12 @@ def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
 
 def refined(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
     """Descend from neighbour to neighbour; the steps become shorter if no neighbour is lower."""
-    steps = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
     size = np.full(len(pairs), 0.08)
     least = np.full(len(pairs), np.inf)
     for _ in range(9):
-        around = pairs[:, None] + size[:, None, None] * steps
+        around = pairs[:, None] + size[:, None, None] * AROUND
         found = misfits_of(table, around.reshape(-1, 2), order).reshape(len(pairs), -1)
-        best = found.argmin(axis=1)
-        least = found.min(axis=1)
-        pairs = pairs + size[:, None] * steps[best]
+        best, least = found.argmin(axis=1), found.min(axis=1)
+        pairs = pairs + size[:, None] * AROUND[best]
         size = np.where(best == 4, 0.4 * size, size)
     return pairs, least

@@ -7,17 +7,10 @@
 from rigidjax._names import show
 from rigidjax.workprecision.chart import draw as draw
 from rigidjax.workprecision.jax_methods import diffrax_method as diffrax_method
-from rigidjax.workprecision.measurement import (
-    measure as measure,
-)
-from rigidjax.workprecision.pareto import (
-    choose as choose,
-    table as table,
-)
+from rigidjax.workprecision.measurement import measure as measure
+from rigidjax.workprecision.pareto import choose as choose, table as table
 from rigidjax.workprecision.peers import methods as methods
-from rigidjax.workprecision.scene import (
-    Scene as Scene,
-)
+from rigidjax.workprecision.scene import Scene as Scene
 from rigidjax.workprecision.standard_scenes import scenes as scenes
 
 show(__name__)

@@ -12,7 +12,6 @@ from rigidjax.workprecision import chart, pareto
 from rigidjax.workprecision.measurement import in_float32, long_drift, measure
 from rigidjax.workprecision.peers import methods
 from rigidjax.workprecision.record import Record, kept, moved, read_csv, write_csv
-from rigidjax.workprecision.scene import Method
 from rigidjax.workprecision.standard_scenes import scenes
 
 STORED = Path("tests/workprecision/record.csv")
@@ -97,7 +96,12 @@ def run(options: argparse.Namespace) -> int:
     except (OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    return 0 if before is None else _compared(records, before)
+    if before is None:
+        return 0
+    wrong, paced = moved(records, before)
+    lines = [*(f"moved: {line}" for line in wrong), *(f"time: {line}" for line in paced)]
+    print("\n".join(lines or ["nothing moved"]))
+    return 1 if wrong else 0
 
 
 def _measured(options: argparse.Namespace) -> list[Record]:
@@ -116,18 +120,14 @@ def _measured(options: argparse.Namespace) -> list[Record]:
         alone = options.no_peers or options.float32
         chosen = [m for m in methods() if not (alone and m.group == "peer")]
         if quick:
-            chosen = [smaller(m) for m in chosen if m.name in SMALL]
+            chosen = [m for m in chosen if m.name in SMALL]
+            slopes = [{n: m.gradients[n] for n in SMALL[m.name]} for m in chosen]
+            chosen = [m._replace(gradients=s) for m, s in zip(chosen, slopes, strict=True)]
         graded = not options.no_gradients and (name in GRADED or bool(options.scene))
         scene, thin = scenes()[name](), 4 if quick else options.thin
         scene = in_float32(scene, graded) if options.float32 else scene
         found += measure(scene, chosen, gradients=graded, progress=say, thin=thin)
     return found
-
-
-def smaller(method: Method) -> Method:
-    """The method with only the adjoints of a quick run."""
-    kept = {n: make for n, make in method.gradients.items() if n in SMALL[method.name]}
-    return method._replace(gradients=kept)
 
 
 def summary(records: Iterable[Record]) -> str:
@@ -160,15 +160,8 @@ def _cell(seconds: float) -> str:
 
 
 def _drifts(scene: str, records: list[Record]) -> list[str]:
-    lines = [f"\n{scene}: largest drift of energy, of momentum along gravity; s"]
-    return lines + [
+    head = f"\n{scene}: largest drift of energy, of momentum along gravity; s"
+    return [head] + [
         f"  {r.label:38s} h = {r.setting:<5g} {r.energy:10.1e} {r.momentum:10.1e} {r.time:10.2f}"
         for r in records
     ]
-
-
-def _compared(records: list[Record], before: list[Record]) -> int:
-    wrong, paced = moved(records, before)
-    lines = [*(f"moved: {line}" for line in wrong), *(f"time: {line}" for line in paced)]
-    print("\n".join(lines or ["nothing moved"]))
-    return 1 if wrong else 0

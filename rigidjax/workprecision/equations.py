@@ -108,9 +108,8 @@ def foucault(constants: Any, sqrt: Any) -> Callable[[Number, Any], Any]:
         ax = square * px + 2 * (wu * vy - wn * vz)
         ay = square * py - along * wn - 2 * wu * vx
         az = square * pz - along * wu + 2 * wn * vx - g
-        pull = (px * ax + py * ay + pz * az + vx * vx + vy * vy + vz * vz) / (
-            px * px + py * py + pz * pz
-        )
+        pull = px * ax + py * ay + pz * az + vx * vx + vy * vy + vz * vz
+        pull = pull / (px * px + py * py + pz * pz)
         return vx, vy, vz, ax - pull * px, ay - pull * py, az - pull * pz
 
     return rates
@@ -127,13 +126,8 @@ def three_body(constants: Any, sqrt: Any) -> Callable[[Number, Any], Any]:
         flat = py * py + pz * pz
         ra, rb = da * da + flat, db * db + flat
         ka, kb = nu / (ra * sqrt(ra)), mu / (rb * sqrt(rb))
-        return (
-            vx,
-            vy,
-            vz,
-            px + 2 * vy - ka * da - kb * db,
-            py - 2 * vx - (ka + kb) * py,
-            -(ka + kb) * pz,
-        )
+        pull = ka + kb
+        ax = px + 2 * vy - ka * da - kb * db
+        return vx, vy, vz, ax, py - 2 * vx - pull * py, -pull * pz
 
     return rates

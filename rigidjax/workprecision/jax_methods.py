@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax.exact import FreeBody
 from rigidjax.solve import adaptive, equations_of_motion, fixed, simulate, solvers
-from rigidjax.workprecision.scene import Method, Ready, Run, Scene
+from rigidjax.workprecision.scene import Method, Ready, Scene
 
 TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 EIGHT = (40, 60, 80, 120, 170, 240, 340, 480, 680, 1000)
@@ -37,10 +37,10 @@ def compiled(scene: Scene, flow: Flow) -> Ready:
     # Moving a number to the device takes as long as some runs.
     there: dict[float, Any] = {}
 
-    def run(setting: float) -> Run:
+    def run(setting: float) -> tuple[Any, Any]:
         if setting not in there:
             there[setting] = jnp.asarray(float(setting), numbers.dtype)
-        return Run(*jax.block_until_ready(ready(numbers, there[setting])))
+        return jax.block_until_ready(ready(numbers, there[setting]))
 
     return Ready(run, spent, held)
 
@@ -64,19 +64,15 @@ def _closed(scene: Scene) -> Flow | None:
     return flow_of(scene, run) if scene.torque is None and scene.body is not None else None
 
 
-def _simulate(scene: Scene, wanted: Callable[[Any], dict[str, Any]] | None = None) -> Flow | None:
+def _simulate(scene: Scene, accuracy: bool = False) -> Flow | None:
     """`simulate` with its defaults, but for the tolerance: traced, so that one program does."""
 
     def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
-        how = dict(rtol=setting, atol=1e-3 * setting) if wanted is None else wanted(setting)
+        how = dict(accuracy=setting) if accuracy else dict(rtol=setting, atol=1e-3 * setting)
         out = simulate(body, start, ts, scene.torque, throw=False, max_steps=MOST, **how)
         return out.ys, out.stats["num_steps"]
 
     return None if scene.torque is None else flow_of(scene, run)
-
-
-def _to_accuracy(setting: Any) -> dict[str, Any]:
-    return {"accuracy": setting}
 
 
 def _adaptive(scene: Scene, solver: Any) -> Flow:
@@ -205,7 +201,7 @@ def methods_in_jax() -> list[Method]:
     return [
         _ours("closed form", (0.0,), _closed, MODES),
         _ours("simulate", TOLERANCES, _simulate, MODES),
-        _ours("simulate, accuracy", TOLERANCES, partial(_simulate, wanted=_to_accuracy)),
+        _ours("simulate, accuracy", TOLERANCES, partial(_simulate, accuracy=True)),
         _ours("DormandPrince8", TOLERANCES, partial(_adaptive, solver=eight), MODES),
         _ours("Tsitouras5", TOLERANCES, partial(_adaptive, solver=five)),
         *(

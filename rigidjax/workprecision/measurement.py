@@ -21,7 +21,7 @@ from rigidjax.solve import fixed, solvers
 from rigidjax.workprecision import peers as known
 from rigidjax.workprecision.jax_methods import equal_steps
 from rigidjax.workprecision.record import Record
-from rigidjax.workprecision.scene import Method, Ready, Reference, Run, Scene, distance
+from rigidjax.workprecision.scene import Method, Ready, Reference, Scene, distance
 
 # Runs longer than this, s, are timed three times, those shorter than SHORT thrice as often.
 LONG, SHORT = 0.5, 0.02
@@ -39,8 +39,6 @@ RUNS = {
     "DormandPrince8": (0.1, solvers.DormandPrince8),
     "RungeKutta4": (0.02, solvers.RungeKutta4),
 }
-
-
 _PARTS = ("body", "state0", "torque")
 
 
@@ -97,10 +95,7 @@ def measure(
 def worked_out(scene: Scene, gradients: bool = True) -> Reference:
     """A reference for a scene without one: order 8 with fixed steps, and with half as many.
 
-    Its error is their difference, no less than a hundred units of round-off: far above what the
-    stored references have.
-
-    **Arguments:** `scene`; `gradients` whether the gradient is worked out, too.
+    Its error is their difference, no less than a hundred units of round-off.
     """
     counts = (4000, 2000)
     numbers, scale = scene.numbers, max(1.0, _turn(scene) / 50)
@@ -121,14 +116,7 @@ def worked_out(scene: Scene, gradients: bool = True) -> Reference:
 
 
 def in_float32(scene: Scene, gradients: bool = True) -> Scene:
-    """The scene in single precision; the reference is worked out in double for its rounded numbers.
-
-    **Arguments:** `scene` in float64; `gradients` whether the gradient is worked out, too.
-
-    >>> from rigidjax.workprecision import scenes
-    >>> in_float32(scenes()["heavy-top"](), gradients=False).numbers.dtype
-    dtype('float32')
-    """
+    """The scene in single precision; the reference is that of its rounded numbers, in double."""
 
     def cast(given: Scene, dtype: Any) -> Scene:
         def one(a: Any) -> Any:
@@ -160,40 +148,34 @@ def _settings(scene: Scene, method: Method, thin: int) -> list[float]:
 def _looked_at(
     scene: Scene, method: Method, adjoint: str, setting: float, ready: Ready, right: Reference
 ) -> list[_Job]:
-    run = ready.run(setting)
+    ready.run(setting)
     begin = time.perf_counter()
-    run = ready.run(setting)
+    end, steps = ready.run(setting)
     first = time.perf_counter() - begin
-    errors = (_gradient_errors if adjoint else _errors)(scene, run, right)
+    errors = (_gradient_errors if adjoint else _errors)(scene, end, right)
     if not errors["error"] < WRONG:
         return []
     record = Record(
         scene.name, method.name, method.group, "gradient" if adjoint else "value", adjoint,
-        setting, steps=float(run.steps), compile=ready.compile, memory=ready.memory, **errors,
+        setting, steps=float(steps), compile=ready.compile, memory=ready.memory, **errors,
     )  # fmt: skip
     return [_Job(record, ready, [first])]
 
 
-def _errors(scene: Scene, run: Run, right: Reference) -> dict[str, float]:
-    error, rate = distance(scene, run.numbers, right.end)
-    energy, momentum = drifts(scene, np.asarray(run.numbers))
+def _errors(scene: Scene, end: Any, right: Reference) -> dict[str, float]:
+    error, rate = distance(scene, end, right.end)
+    energy, momentum = drifts(scene, np.asarray(end))
     return {"error": error, "error_rate": rate, "energy": energy, "momentum": momentum}
 
 
-def _gradient_errors(scene: Scene, run: Run, right: Reference) -> dict[str, float]:
-    found, wanted = np.asarray(run.numbers, float), np.asarray(right.gradient)
+def _gradient_errors(scene: Scene, slope: Any, right: Reference) -> dict[str, float]:
+    found, wanted = np.asarray(slope, float), np.asarray(right.gradient)
 
     def off(part: slice) -> float:
-        return float(
-            np.linalg.norm(found[part] - wanted[part]) / max(np.linalg.norm(wanted[part]), 1e-300)
-        )
+        miss, size = np.linalg.norm(found[part] - wanted[part]), np.linalg.norm(wanted[part])
+        return float(miss / max(size, 1e-300))
 
-    blocks = scene.blocks
-    names = ("inertia", "omega0", "q0") if scene.body is not None else ("", "v0", "x0")
-    parts = {
-        key: off(blocks[name]) if name else float("nan")
-        for key, name in zip(("by_inertia", "by_rate", "by_attitude"), names, strict=True)
-    }
+    parts = {key: off(part) for key, part in scene.blocks.items()}
     return {"error": off(slice(None)), **parts}
 
 
@@ -234,10 +216,8 @@ def _timed(jobs: list[_Job], rounds: int) -> None:
 
 
 def _finished(job: _Job) -> Record:
-    low, middle, high = np.percentile(job.times[1:], [25, 50, 75])
-    return dataclasses.replace(
-        job.record, time=float(middle), time_low=float(low), time_high=float(high)
-    )
+    low, middle, high = (float(p) for p in np.percentile(job.times[1:], [25, 50, 75]))
+    return dataclasses.replace(job.record, time=middle, time_low=low, time_high=high)
 
 
 def long_drift(
@@ -250,13 +230,8 @@ def long_drift(
 
     There are two records for each method, of the first hundredth of the run and of all of it. The
     drift is bounded if they agree; it grows with time if the second is a hundred times the first.
-    `setting` is the length of a step, s; there is no error of the attitude (the motion forgets its
-    start long before), `error` is the energy's. Timed once: it is a run of seconds.
-
-    **Arguments:** `steps` how many; `only` names of methods, all by default; `progress` is told a
-    line now and then.
-
-    **Raises:** `ValueError` for a method that is not among them, or too few steps to look at.
+    `setting` is the length of a step, s; `error` is the energy's (the motion forgets its start long
+    before the end).
 
     >>> [record.steps for record in long_drift(10_000, ["RungeKutta4"])]
     [100.0, 10000.0]

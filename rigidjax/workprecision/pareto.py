@@ -16,22 +16,13 @@ def front(records: Iterable[Record]) -> list[Record]:
     """The records of one scene and kind on the Pareto front of error and time.
 
     A record is compared with the curves of the others, log–log between their settings, not only
-    with the measured points. Give records of one scene, and of values or
-    gradients only. **Returns** the records by falling error.
-
-    **Raises:** `ValueError` for a mixture.
-
-    >>> slow = Record("scene", "slow", "jax", "value", "", 1e-6, error=1e-6, time=2.0)
-    >>> quick = Record("scene", "quick", "jax", "value", "", 1e-6, error=1e-6, time=1.0)
-    >>> [record.method for record in front([slow, quick])]
-    ['quick']
+    with the measured points. The records come by falling error.
     """
     records = [r for r in listed(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
     if len(kinds) > 1:
-        raise ValueError(
-            f"front: wanted records of one scene and kind, got {sorted(kinds)}; pick them first"
-        )
+        words = f"front: wanted records of one scene and kind, got {sorted(kinds)}"
+        raise ValueError(f"{words}; pick them first")
     curves = [[r for r in records if r.label == n] for n in dict.fromkeys(r.label for r in records)]
     best: list[Record] = []
     for record in sorted(records, key=lambda r: (r.time, r.error)):
@@ -44,8 +35,6 @@ def front(records: Iterable[Record]) -> list[Record]:
 
 def first_answers(records: Iterable[Record]) -> list[Record]:
     """The same records with the time that a first answer takes: compiling and one run.
-
-    A method without compilation, or with an unknown time of it, counts with its run alone.
 
     >>> cold = Record("scene", "method", "ours", "value", "", 1e-6, time=1e-3, compile=2.0)
     >>> first_answers([cold])[0].time
@@ -61,13 +50,7 @@ def first_answers(records: Iterable[Record]) -> list[Record]:
 def time_to(records: Iterable[Record], error: float) -> float:
     """Time, s, that the method of these records takes to an error, between its settings in log–log.
 
-    It is the coarsest setting's time if the error is smaller there already, and NaN if the method
-    never gets to the error.
-
-    >>> rough = Record("scene", "method", "jax", "value", "", 1e-2, error=1e-2, time=1.0)
-    >>> fine = Record("scene", "method", "jax", "value", "", 1e-4, error=1e-4, time=4.0)
-    >>> round(time_to([rough, fine], 1e-3), 6)
-    2.0
+    It is the coarsest setting's if the error is smaller there already, NaN if it is never reached.
     """
     error = _checks.positive(error, "error")
     rungs = sorted((r for r in listed(records) if r.error == r.error), key=lambda r: r.time)
@@ -136,11 +119,9 @@ def _choice(here: list[Record], scene: str, error: float) -> Choice:
     if elsewhere[1] >= best[1]:
         elsewhere = "", math.nan
     default = "closed form" if any(r.method == "closed form" for r in here) else "simulate"
-    default_slope = min(
-        (t for n, t in slopes.items() if n.split(", ")[0] == default), default=math.nan
-    )
-    default_time = values.get(default, math.nan)
-    return Choice(scene, error, *best, *first(slopes), default_time, default_slope, *elsewhere)
+    its = [t for n, t in slopes.items() if n.split(", ")[0] == default]
+    defaults = values.get(default, math.nan), min(its, default=math.nan)
+    return Choice(scene, error, *best, *first(slopes), *defaults, *elsewhere)
 
 
 def quickest(records: Iterable[Record], kind: str, error: float) -> dict[str, float]:

@@ -13,97 +13,114 @@ import jax.numpy as jnp
 import numpy as np
 
 from rigidjax import _checks
+from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.workprecision.jax_methods import methods_in_jax
-from rigidjax.workprecision.scene import Method, Ready, Run, Scene
+from rigidjax.workprecision.scene import Method, Ready, Scene
 
 TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
 TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
 
 
-def _start(scene: Scene) -> np.ndarray:
-    return np.asarray(scene.flat(scene.state0), float)
-
-
-def _rates(scene: Scene, **how: Any) -> Any:
+def _rates(scene: Scene, numbers: np.ndarray, **how: Any) -> Any:
     """The plain equations on floats."""
-    if scene.plain is None:
-        return None
-    return scene.plain(tuple(map(float, scene.numbers)), math.sin, math.cos, math.sqrt, **how)
+    plain: Any = scene.plain
+    return plain(tuple(map(float, numbers)), math.sin, math.cos, math.sqrt, **how)
 
 
-def _solver(scene: Scene, f: Any, warm: float) -> Ready:
+def _written_out(scene: Scene) -> bool:
+    return scene.plain is not None
+
+
+def _weighed(scene: Scene) -> bool:
+    return scene.notes is not None and "com" in scene.notes and scene.body is not None
+
+
+def _in_double(scene: Scene) -> bool:
+    # To import gradsolve sets JAX to float64.
+    return scene.plain is not None and scene.numbers.dtype == jnp.float64
+
+
+def _peer(module: str, can: Callable[[Scene], bool] = _written_out) -> Callable[[Any], Any]:
+    """A method's `value` of `make(scene, numbers, start, module) → run`, timed without imports."""
+
+    def wrapped(make: Callable[[Scene, np.ndarray, np.ndarray, Any], Any]) -> Any:
+        def ready(scene: Scene) -> Ready | None:
+            if not can(scene):
+                return None
+            numbers, start = (np.asarray(v) for v in (scene.numbers, scene.flat(scene.state0)))
+            loaded = importlib.import_module(module)
+            begin = time.perf_counter()
+            run = make(scene, numbers, start.astype(float), loaded)
+            return Ready(run, time.perf_counter() - begin)
+
+        return ready
+
+    return wrapped
+
+
+def _stepped(end: float, start: np.ndarray, f: Any) -> Any:
     from scipy.integrate import DOP853
 
-    start = _start(scene)
-
-    def run(setting: float) -> Run:
+    def run(setting: float) -> tuple[Any, Any]:
         # The stepper itself: solve_ivp would keep every step.
-        stepper = DOP853(f, 0.0, start, scene.end, rtol=setting, atol=1e-3 * setting)
+        stepper = DOP853(f, 0.0, start, end, rtol=setting, atol=1e-3 * setting)
         steps = 0
         while stepper.status == "running":
             stepper.step()
             steps += 1
-        return Run(stepper.y, steps)
+        return stepper.y, steps
 
-    return Ready(run, warm)
-
-
-def _scipy(scene: Scene) -> Ready | None:
-    rates = _rates(scene)
-    return None if rates is None else _solver(scene, lambda t, y: np.array(rates(t, y)), 0.0)
+    return run
 
 
-def _numba(scene: Scene) -> Ready | None:
-    numba: Any = importlib.import_module("numba")
+@_peer("scipy.integrate")
+def _scipy(scene: Scene, numbers: np.ndarray, start: np.ndarray, _: Any) -> Any:
+    rates = _rates(scene, numbers)
+    return _stepped(scene.end, start, lambda t, y: np.array(rates(t, y)))
 
-    begin = time.perf_counter()
-    rates = _rates(scene, wrap=numba.njit)
-    if rates is None:
-        return None
+
+@_peer("numba")
+def _numba(scene: Scene, numbers: np.ndarray, start: np.ndarray, numba: Any) -> Any:
+    rates = _rates(scene, numbers, wrap=numba.njit)
 
     @numba.njit
     def f(t: Any, y: Any) -> Any:
         return np.array(rates(t, y))
 
-    f(0.0, _start(scene))
-    return _solver(scene, f, time.perf_counter() - begin)
+    f(0.0, start)
+    return _stepped(scene.end, start, f)
 
 
-def _mujoco(scene: Scene) -> Ready | None:
+@_peer("mujoco", _weighed)
+def _mujoco(scene: Scene, numbers: np.ndarray, start: np.ndarray, mujoco: Any) -> Any:
     """A body on a ball joint, MuJoCo's own Runge–Kutta 4; tops and free bodies only."""
-    if scene.notes is None or "com" not in scene.notes or scene.body is None:
-        return None
-    mujoco: Any = importlib.import_module("mujoco")
-
-    mass, com = scene.notes["mass"], np.asarray(scene.notes["com"])
-    about = np.asarray(scene.body.tensor) - mass * (com @ com * np.eye(3) - np.outer(com, com))
-    full = [about[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+    notes, body = scene.notes, scene.body
+    assert notes is not None and body is not None
+    mass, com = notes["mass"], np.asarray(notes["com"])
+    about = np.asarray(body.tensor) - mass * (com @ com * np.eye(3) - np.outer(com, com))
 
     def words(values: Any) -> str:
         return " ".join(repr(float(v)) for v in values)
 
-    begin = time.perf_counter()
     model: Any = mujoco.MjModel.from_xml_string(
-        f'<mujoco><option integrator="RK4" gravity="{words(scene.notes["gravity"])}"/><worldbody>'
+        f'<mujoco><option integrator="RK4" gravity="{words(notes["gravity"])}"/><worldbody>'
         f'<body><joint type="ball" damping="0"/><inertial pos="{words(com)}" mass="{mass}" '
-        f'fullinertia="{words(full)}"/></body></worldbody></mujoco>'
+        f'fullinertia="{words(about[at] for at in PAIRS)}"/></body></worldbody></mujoco>'
     )
     data: Any = mujoco.MjData(model)
     # It would write a file into the folder one works in where a step is too long.
     mujoco.set_mju_user_warning(lambda message: None)
-    spent = time.perf_counter() - begin
-    start = _start(scene)
 
-    def run(setting: float) -> Run:
+    def run(setting: float) -> tuple[Any, Any]:
         mujoco.mj_resetData(model, data)
         count = round(scene.end / setting)
         model.opt.timestep = scene.end / count
         data.qpos[:], data.qvel[:] = start[:4], start[4:]
         mujoco.mj_step(model, data, nstep=count)
-        return Run(np.concatenate([data.qpos, data.qvel]), count)
+        return np.concatenate([data.qpos, data.qvel]), count
 
-    return Ready(run, spent)
+    return run
 
 
 def _system(scene: Scene, hy: Any, numbers: Any) -> Any:
@@ -114,67 +131,51 @@ def _system(scene: Scene, hy: Any, numbers: Any) -> Any:
     return list(zip(variables, rates, strict=True))
 
 
-def _steppers(hy: Any, scene: Scene, system: Any, **how: Any) -> Callable[[float], Any]:
-    """Tolerance → its stepper at the start. Order and code follow from it: each is compiled."""
+def _propagated(hy: Any, end: float, start: np.ndarray, system: Any, **how: Any) -> Any:
+    """Tolerance → the state at the end, steps. Order and code follow from it: each is compiled."""
     made: dict[float, Any] = {}
 
-    def stepper_of(setting: float) -> Any:
+    def run(setting: float) -> tuple[Any, Any]:
         if setting not in made:
-            stepper = hy.taylor_adaptive(system, _start(scene), tol=setting, **how)
+            stepper = hy.taylor_adaptive(system, start, tol=setting, **how)
             made[setting] = stepper, stepper.state.copy()
         stepper, first = made[setting]
         stepper.state[:], stepper.time = first, 0.0
-        return stepper
+        steps = stepper.propagate_until(end)[3]
+        return stepper.state.copy(), steps
 
-    return stepper_of
-
-
-def _taylor(scene: Scene) -> Ready | None:
-    if scene.plain is None:
-        return None
-    hy: Any = importlib.import_module("heyoka")
-    stepper_of = _steppers(hy, scene, _system(scene, hy, list(map(float, scene.numbers))))
-    begin = time.perf_counter()
-    stepper_of(TAYLOR[0])
-    spent = time.perf_counter() - begin
-
-    def run(setting: float) -> Run:
-        stepper = stepper_of(setting)
-        steps = stepper.propagate_until(scene.end)[3]
-        return Run(stepper.state.copy(), steps)
-
-    return Ready(run, spent)
+    run(TAYLOR[2])
+    return run
 
 
-def _varied(scene: Scene) -> Ready | None:
+@_peer("heyoka")
+def _taylor(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> Any:
+    system = _system(scene, hy, list(map(float, numbers)))
+    return _propagated(hy, scene.end, start, system)
+
+
+@_peer("heyoka")
+def _varied(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> Any:
     """Variational equations by the initial state and the inertia, contracted with the scalar's."""
-    if scene.plain is None:
-        return None
-    hy: Any = importlib.import_module("heyoka")
-    numbers = np.asarray(scene.numbers)
     size = 6 if scene.body is not None else 0
     symbols = [hy.par[i] for i in range(size)] or list(numbers)
     system = _system(scene, hy, [*symbols, *numbers[size:]] if size else symbols)
     flavour = hy.var_args.vars | hy.var_args.params if size else hy.var_args.vars
-    begin = time.perf_counter()
     varied = hy.var_ode_sys(system, flavour, order=1)
-    stepper_of = _steppers(hy, scene, varied, pars=numbers[:size], compact_mode=True)
-    stepper_of(TAYLOR[2])
-    spent = time.perf_counter() - begin
-    n = len(_start(scene))
+    end_of = _propagated(hy, scene.end, start, varied, pars=numbers[:size], compact_mode=True)
+    n = len(start)
     chain = np.asarray(jax.jacfwd(lambda p: scene.flat(scene.assembled(p)[1]))(scene.numbers))
     pull = jax.jit(jax.grad(scene.loss))
 
-    def run(setting: float) -> Run:
-        stepper = stepper_of(setting)
-        steps = stepper.propagate_until(scene.end)[3]
-        slope = np.asarray(pull(stepper.state[:n])) @ stepper.state[n:].reshape(n, -1)
+    def run(setting: float) -> tuple[Any, Any]:
+        state, steps = end_of(setting)
+        slope = np.asarray(pull(state[:n])) @ state[n:].reshape(n, -1)
         # By the initial state, carried on to the numbers of the scene; then by the parameters.
         found = slope[:n] @ chain
         found[:size] += slope[n : n + size]
-        return Run(found, steps)
+        return found, steps
 
-    return Ready(run, spent)
+    return run
 
 
 class _Ensemble:
@@ -182,17 +183,12 @@ class _Ensemble:
 
     is_stiff, t0 = False, 0.0
 
-    @staticmethod
-    def can(scene: Scene) -> bool:
-        # To import it sets JAX to float64.
-        return scene.plain is not None and scene.numbers.dtype == jnp.float64
-
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any):
         # One scene is recorded by NumPy otherwise, a thousand times as slowly.
         os.environ.setdefault("GRADSOLVE_RECORDER", "jax")
-        self.module: Any = importlib.import_module("gradsolve")
-        self.name, self.plain, self.t1 = scene.name, scene.plain, scene.end
-        self.start, self.numbers = _start(scene)[None], np.asarray(scene.numbers)[None]
+        self.module, self.plain = module, scene.plain
+        self.name, self.t1 = scene.name, scene.end
+        self.start, self.numbers = start[None], numbers[None]
         self.dim = self.start.shape[1]
 
     def f_jax(self, t: Any, y: Any, p: Any) -> Any:
@@ -204,26 +200,22 @@ class _Ensemble:
         return getattr(self.module, name)(self, self.start, self.numbers, **how)
 
 
-def _recorded(scene: Scene) -> Ready | None:
-    if not _Ensemble.can(scene):
-        return None
-    ensemble = _Ensemble(scene)
-    begin = time.perf_counter()
-    ensemble.call("solve", TOLERANCES[0])
-    spent = time.perf_counter() - begin
+@_peer("gradsolve", _in_double)
+def _recorded(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any) -> Any:
+    ensemble = _Ensemble(scene, numbers, start, module)
 
-    def run(setting: float) -> Run:
+    def run(setting: float) -> tuple[Any, Any]:
         found = ensemble.call("solve", setting)
-        return Run(found.y_final[0], int(found.accepted_steps[0]))
+        return found.y_final[0], int(found.accepted_steps[0])
 
-    return Ready(run, spent)
+    run(TOLERANCES[0])
+    return run
 
 
-def _replayed(scene: Scene) -> Ready | None:
+@_peer("gradsolve", _in_double)
+def _replayed(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any) -> Any:
     """The gradient through recorded steps; they are recorded once, and not timed."""
-    if not _Ensemble.can(scene):
-        return None
-    ensemble = _Ensemble(scene)
+    ensemble = _Ensemble(scene, numbers, start, module)
     made: dict[float, Any] = {}
 
     def gradient_of(setting: float) -> Any:
@@ -231,21 +223,19 @@ def _replayed(scene: Scene) -> Ready | None:
         count = int(ensemble.call("solve", setting).accepted_steps[0])
 
         def loss(numbers: Any) -> Any:
-            start = scene.flat(scene.assembled(numbers)[1])
-            return scene.loss(end(start[None], numbers[None])[0])
+            first = scene.flat(scene.assembled(numbers)[1])
+            return scene.loss(end(first[None], numbers[None])[0])
 
         return jax.jit(jax.grad(loss)).lower(scene.numbers).compile(), count
 
-    def run(setting: float) -> Run:
+    def run(setting: float) -> tuple[Any, Any]:
         if setting not in made:
             made[setting] = gradient_of(setting)
         gradient, count = made[setting]
-        return Run(jax.block_until_ready(gradient(scene.numbers)), count)
+        return jax.block_until_ready(gradient(scene.numbers)), count
 
-    begin = time.perf_counter()
     run(TOLERANCES[0])
-    spent = time.perf_counter() - begin
-    return Ready(run, spent)
+    return run
 
 
 def methods_outside() -> list[Method]:
@@ -259,10 +249,9 @@ def methods_outside() -> list[Method]:
         "numba": Method("scipy DOP853, numba", "peer", TOLERANCES, _numba),
         "mujoco": Method("MuJoCo RK4", "peer", STEPS, _mujoco),
         "heyoka": Method("heyoka Taylor", "peer", TAYLOR, _taylor, {"variational": _varied}),
-        "gradsolve": Method(
-            "gradsolve Vern7", "peer", TOLERANCES, _recorded, {"replay": _replayed}
-        ),
     }
+    replay = Method("gradsolve Vern7", "peer", TOLERANCES, _recorded, {"replay": _replayed})
+    peers["gradsolve"] = replay
     return [method for name, method in peers.items() if importlib.util.find_spec(name)]
 
 

@@ -73,18 +73,7 @@ def listed(records: Iterable[Record], name: str = "records") -> list[Record]:
 
 
 def write_csv(records: Iterable[Record], path: str | Path) -> None:
-    """Keep records in a file, one line each under a header; NaN is left empty.
-
-    **Arguments:** `records`; `path` of the file, written over.
-
-    **Raises:** `OSError` if the file cannot be written.
-
-    >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp()) / "records.csv"
-    >>> write_csv([Record("a", "b", "ours", "value", "", 1e-6, error=1e-7)], path)
-    >>> read_csv(path)[0].error
-    1e-07
-    """
+    """Keep records in a file, one line each under a header; NaN is left empty."""
     with Path(path).open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(field.name for field in dataclasses.fields(Record))
@@ -93,25 +82,13 @@ def write_csv(records: Iterable[Record], path: str | Path) -> None:
 
 
 def read_csv(path: str | Path) -> list[Record]:
-    """The records of a file that `write_csv` wrote.
-
-    **Arguments:** `path` of the file.
-
-    **Raises:** `ValueError` for another file, with what it lacks; `OSError` where there is none.
-
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_csv([], folder + "/records.csv")
-    ...     read_csv(folder + "/records.csv")
-    []
-    """
+    """The records of a file that `write_csv` wrote; `ValueError` for another file."""
     with Path(path).open(newline="") as file:
         rows, names = csv.DictReader(file), [field.name for field in dataclasses.fields(Record)]
         lacks = set(names) - set(rows.fieldnames or ())
         if lacks:
-            raise ValueError(
-                f"{path}: wanted the columns of a file of records, lacks {', '.join(sorted(lacks))}"
-            )
+            words = f"{path}: wanted the columns of a file of records, lacks "
+            raise ValueError(words + ", ".join(sorted(lacks)))
         return [
             Record(**{n: row[n] if n in _WORDS else float(row[n] or "nan") for n in names})  # pyright: ignore
             for row in rows
@@ -127,15 +104,9 @@ def _written(value: object) -> str:
 def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str], list[str]]:
     """The differences of two tables in words: (changed errors or steps, changed times).
 
-    Lines that both have are compared, without peers: an error more than three times as
-    large or as small, steps by more than 2 %; and the median time over that of `diffrax Dopri8` on
-    the same scene, each at its finest common settings, by more than a factor of 2.
-
-    **Arguments:** `records` as measured now; `stored` those to compare with.
-
-    >>> was = Record("s", "m", "ours", "value", "", 1e-6, error=1e-7, steps=100.0)
-    >>> moved([was], [was])
-    ([], [])
+    Lines that both have are compared, without peers: an error more than three times as large or as
+    small, steps by more than 2 %; and the median time over that of `diffrax Dopri8` on the same
+    scene, at common settings, by more than a factor of 2.
     """
     records, stored = listed(records), listed(stored, "stored")
     now = {_key(r): r for r in records if r.group != "peer"}
@@ -156,21 +127,13 @@ def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str
     before, after = _ratios(then, set(now)), _ratios(now, set(then))
     for label, ratio in after.items():
         if label in before and not 1 / SLOWER <= ratio / before[label] <= SLOWER:
-            scene, kind, method = label
-            paced.append(
-                f"{scene}, {kind}, {method}: time over {BASE}'s was {before[label]:.2g}, is "
-                f"{ratio:.2g}"
-            )
+            change = f"was {before[label]:.2g}, is {ratio:.2g}"
+            paced.append(f"{', '.join(label)}: time over {BASE}'s {change}")
     return wrong, paced
 
 
 def kept(records: Iterable[Record]) -> list[Record]:
-    """The contents of a stored table: no peers, no absolute times but multiples of the base's
-    median.
-
-    >>> kept([Record("s", BASE, "jax", "value", "", 1e-6, error=1e-7, time=3.0)])[0].time
-    1.0
-    """
+    """The contents of a stored table: no peers, times as multiples of the base's median."""
     records = [r for r in records if r.group != "peer"]
     middle = _middles(records)
     bases = [middle.get((r.scene, "value", BASE), math.nan) for r in records]

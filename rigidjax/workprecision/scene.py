@@ -7,12 +7,14 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia
+from rigidjax.body.symmetric3 import PAIRS, from_components
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude
 from rigidjax.rotation import quaternion
@@ -41,17 +43,13 @@ class Reference(NamedTuple):
 
 
 @functools.cache
-def _answers() -> dict[str, Any]:
-    folder = resources.files("rigidjax.workprecision")
-    return json.loads(folder.joinpath("references.json").read_text())
-
-
 def stored(name: str) -> Reference | None:
     """The stored answer to the standard scene of this name, if there is one.
 
     They are made by `tests/workprecision/make_references.py` at 40 digits and rounded to float64.
     """
-    row = _answers().get(name)
+    file = resources.files("rigidjax.workprecision").joinpath("references.json")
+    row = json.loads(file.read_text()).get(name)
     if row is None:
         return None
     end, slope = (tuple(map(float, row[key])) for key in ("end", "gradient"))
@@ -92,11 +90,9 @@ class Scene(eqx.Module):
                 "Scene: wanted an Inertia with an Attitude, or None with a Point, got "
                 f"{type(self.body).__name__} with {type(self.state0).__name__}"
             )
-        if not isinstance(self.state0, Attitude | Point):
-            raise TypeError(
-                f"Scene: wanted an Attitude or a Point, got {type(self.state0).__name__}: errors "
-                "are told as angles between attitudes, or as distances"
-            )
+        hint = "errors are told as angles between attitudes, or as distances"
+        wanted = "an Attitude or a Point"
+        _checks.instance(self.state0, (Attitude, Point), "state0", wanted=wanted, hint=hint)
         if self.body is not None:
             _checks.single(self.body, Inertia, "body", hint="or None with a Point")
         _checks.positive(self.end, "end", "an end > 0, s")
@@ -106,41 +102,36 @@ class Scene(eqx.Module):
         """The variables of gradients: Ixx Iyy Izz Ixy Ixz Iyz, Ω0, q0 (13), or x0, v0 (6)."""
         if self.body is None:
             return jnp.concatenate([self.state0.x, self.state0.v])  # pyright: ignore
-        t = self.body.tensor
-        entries = jnp.stack([t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2]])
+        entries = jnp.stack([self.body.tensor[at] for at in PAIRS])
         state: Any = self.state0
         return jnp.concatenate([entries, state.omega, state.q])
 
     @property
     def blocks(self) -> dict[str, slice]:
-        """The parts of `numbers`."""
+        """The parts of `numbers`, by the name of the error of a gradient by them in a `Record`."""
         if self.body is None:
-            return {"x0": slice(0, 3), "v0": slice(3, 6)}
-        return {"inertia": slice(0, 6), "omega0": slice(6, 9), "q0": slice(9, 13)}
+            return {"by_attitude": slice(0, 3), "by_rate": slice(3, 6)}
+        return {"by_inertia": slice(0, 6), "by_rate": slice(6, 9), "by_attitude": slice(9, 13)}
 
     def assembled(self, numbers: Float[Array, " parameters"]) -> tuple[Any, Any]:
         """Body and initial state of these `numbers`."""
         if self.body is None:
             return None, Point(numbers[:3], numbers[3:])
-        xx, yy, zz, xy, xz, yz = (numbers[i] for i in range(6))
-        rows = [jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])]
-        q = quaternion.normalise(numbers[9:])
-        return Inertia(jnp.stack(rows)), Attitude(q, numbers[6:9])
+        tensor = from_components(*(numbers[i] for i in range(6)))
+        return Inertia(tensor), Attitude(quaternion.normalise(numbers[9:]), numbers[6:9])
 
     def flat(self, state: Any) -> Float[Array, " state"]:
         """A state as one vector, (7,) or (6,)."""
-        parts = (state.x, state.v) if self.body is None else (state.q, state.omega)
-        return jnp.concatenate(parts)
+        return jnp.concatenate(jax.tree.leaves(state))
 
     @property
     def size(self) -> tuple[float, float]:
         """The scales of errors of the halves of the state: 1 rad and |Ω0|, or lengths."""
+        state: Any = self.state0
         if self.body is None:
-            state: Any = self.state0
             length = float(np.linalg.norm(state.x))
             return length, max(float(np.linalg.norm(state.v)), length / self.end)
-        turning: Any = self.state0
-        return 1.0, float(np.linalg.norm(turning.omega))
+        return 1.0, float(np.linalg.norm(state.omega))
 
     def loss(self, end: Float[Array, " state"]) -> Float[Array, ""]:
         """The scalar whose gradient is compared, of a state as one vector."""
@@ -167,31 +158,19 @@ def distance(scene: Scene, end: Any, right: Any) -> tuple[float, float]:
     return angle, float(np.linalg.norm(end[4:] - right[4:])) / two
 
 
-class Run(NamedTuple):
-    """The result of one run.
-
-    **Fields:** `numbers` the last state (or the gradient) as one vector; `steps` taken.
-
-    >>> float(Run([0.0, 1.0], 12).steps)
-    12.0
-    """
-
-    numbers: Any
-    steps: float
-
-
 class Ready(NamedTuple):
     """A method prepared for a scene.
 
-    **Fields:** `run` setting → `Run`, complete when it returns; `compile` s that making it took,
-    `memory` bytes of temporaries, each NaN where unknown.
+    **Fields:** `run` setting → (the last state, or the gradient, as one vector; steps taken),
+    complete when it returns; `compile` s that making it took, `memory` bytes of temporaries, each
+    NaN where unknown.
 
-    >>> ready = Ready(lambda setting: Run([0.0, 1.0], 1 / setting))
-    >>> ready.run(1e-2).steps, ready.compile
+    >>> ready = Ready(lambda setting: ([0.0, 1.0], 1 / setting))
+    >>> ready.run(1e-2)[1], ready.compile
     (100.0, nan)
     """
 
-    run: Callable[[float], Run]
+    run: Callable[[float], tuple[Any, Any]]
     compile: float = float("nan")
     memory: float = float("nan")
 
@@ -206,7 +185,7 @@ class Method(NamedTuple):
     of 50 rad, to be scaled to the scene.
 
     >>> import numpy as np
-    >>> ready = Ready(lambda setting: Run(np.ones(7), 0))
+    >>> ready = Ready(lambda setting: (np.ones(7), 0))
     >>> guess = Method("a guess", "peer", (1e-3,), lambda scene: ready)
     >>> guess.gradients
     {}

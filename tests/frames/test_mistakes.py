@@ -36,7 +36,7 @@ MOON = orbits.cr3bp(0.0121505856)
         (lambda: AboutAxis([1.0, 0, 0], 2.0), TypeError, "angle: wanted a function of time"),
         (lambda: MovingFrame(lambda t: np.zeros(4)).matrix(0.0), ValueError, "unit quaternion"),
         (lambda: MovingFrame(lambda t: NAN * np.ones(4)).matrix(0.0), ValueError, "unit quat"),
-        (lambda: MovingFrame(lambda t: NAN * np.eye(3)).matrix(0.0), ValueError, "no rotation"),
+        (lambda: MovingFrame(lambda t: NAN * np.eye(3)).matrix(0.0), ValueError, "rotation: contains NaN"),
         (lambda: MovingFrame(Uniform(np.ones(3)), rate=[1.0]), TypeError, "rate: wanted a functi"),
         (lambda: MovingFrame(Uniform(np.ones(3)), lambda t: jnp.zeros(2)).at(0.0), ValueError, "origin: wanted shape"),
         (lambda: FRAME.at([0.0, 1.0]), ValueError, r"t: wanted shape \(\)"),

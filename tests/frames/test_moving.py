@@ -308,8 +308,8 @@ FLIPPED = np.diag([1.0, 1, -1])
 MISTAKES = [
     (lambda: MovingFrame(np.eye(3)), TypeError, r"function of time .* got ndarray; .*Uniform"),
     (lambda: MovingFrame(Uniform([0.0, 0, 1]), np.zeros(3)), TypeError, "origin: wanted a function"),
-    (lambda: MovingFrame(lambda t: FLIPPED).matrix(0.0), ValueError, "left-handed axes, det = −1"),
-    (lambda: MovingFrame(lambda t: 2 * np.eye(3)).matrix(0.0), ValueError, "this is no rotation"),
+    (lambda: MovingFrame(lambda t: FLIPPED).matrix(0.0), ValueError, "rotation: left-handed frame, det = -1"),
+    (lambda: MovingFrame(lambda t: 2 * np.eye(3)).matrix(0.0), ValueError, "rotation: not orthogonal"),
     (lambda: MovingFrame(lambda t: np.ones(3)).matrix(0.0), ValueError, r"wanted a matrix or a qu"),
     (lambda: MovingFrame(Uniform([0.0, 0, 1])).to_inertial(rj.Spin([0.0, 0, 1]), 0.0), TypeError, "rate alone"),
     (lambda: MovingFrame(Uniform([0.0, 0, 1])).to_inertial(Point(np.ones((4, 3)), np.ones((4, 3))), 0.0), ValueError, "batch with jax.vmap"),

@@ -27,7 +27,7 @@ from rigidjax.workprecision import (
 from rigidjax.workprecision.measurement import in_float32, long_drift, worked_out
 from rigidjax.workprecision.pareto import front, time_to
 from rigidjax.workprecision.record import Record, moved, read_csv, write_csv
-from rigidjax.workprecision.scene import Method, Ready, Run, distance
+from rigidjax.workprecision.scene import Method, Ready, distance
 
 NAMES = list(scenes())
 
@@ -130,7 +130,7 @@ def test_a_scene_and_a_method_of_ones_own():
         [rj.quaternion.multiply(exact[:4], rj.quaternion.exp(jnp.array([3e-9, 0, 0]))), slowed]
     )
     np.testing.assert_allclose(distance(scene, off, exact)[0], 3e-9, rtol=1e-6)
-    guess = Method("a guess", "peer", (1e-3,), lambda scene: Ready(lambda setting: Run(off, 1.0)))
+    guess = Method("a guess", "peer", (1e-3,), lambda scene: Ready(lambda setting: (off, 1.0)))
     chosen = [m for m in methods("jax") if m.name == "diffrax Tsit5"]
     found = measure(scene, chosen, peers=[guess], gradients=False, thin=5, rounds=1)
     assert {r.method for r in found} == {"diffrax Tsit5", "a guess"}

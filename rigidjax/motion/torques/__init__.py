@@ -1,10 +1,7 @@
 """Torques and forces. Each declares the smallest state that it acts on."""
 
 from rigidjax._names import show
-from rigidjax.motion.torques.base import (
-    AbstractTorque as AbstractTorque,
-    Wrench as Wrench,
-)
+from rigidjax.motion.torques.base import AbstractTorque as AbstractTorque, Wrench as Wrench
 from rigidjax.motion.torques.chebyshev import Chebyshev as Chebyshev
 from rigidjax.motion.torques.composite import (
     ChangingInertia as ChangingInertia,

@@ -12,16 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import (
-    HasAttitude,
-    HasPose,
-    HasSpin,
-    Scalar,
-    ScalarLike,
-    Vec3,
-    Vec3Like,
-    Vector,
-)
+from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of as tensor_of
 from rigidjax.motion.torques.states import Frozen, require_frozen
 
@@ -186,9 +177,7 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
 def act(
     law: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> tuple[Vec3 | None, Vec3]:
-    """Force on the centre of mass (N, world frame; or `None`) and torque about it (N m, body
-    frame).
-    """
+    """Force on the centre of mass (N, world frame, or `None`), and torque about it (body frame)."""
     require_scene(law, state, body)
     dtype = state.omega.dtype
     t = _checks.floating(t, (), "t").astype(dtype)
@@ -208,17 +197,21 @@ def act(
     return None, value.astype(dtype)
 
 
-# The parts of the next larger state, and its name.
-_HIGHER = {"q": "Attitude(q, omega)", "x": "Rigid(x, v, q, omega)", "v": "Rigid(x, v, q, omega)"}
+# What a part of a state is called, and the state that has it.
+_HIGHER = {
+    "q": ("attitude", "Attitude(q, omega)"),
+    "x": ("position", "Rigid(x, v, q, omega)"),
+    "v": ("velocity", "Rigid(x, v, q, omega)"),
+}
 
 
 def lacking(who: str, wrong: AttributeError) -> str | None:
     """The message if a user's function reads a part that its state does not have; else `None`."""
     if wrong.name not in _HIGHER or not isinstance(wrong.obj, HasSpin):
         return None
-    what = {"q": "attitude", "x": "position", "v": "velocity"}[wrong.name]
+    what, higher = _HIGHER[wrong.name]
     has_none = f"the {what}, and {type(wrong.obj).__name__} has none"
-    return f"{who} looks at state.{wrong.name}, {has_none}: start from {_HIGHER[wrong.name]}"
+    return f"{who} looks at state.{wrong.name}, {has_none}: start from {higher}"
 
 
 def one_law(law: Any) -> None:
@@ -251,22 +244,19 @@ def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Arr
     return _checks.floating(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
-def vector(name: str, *, hint: str = "") -> Callable[[Vector], Array]:
+def vector(name: str, *, hint: str = "") -> Callable[[Any], Array]:
     """A converter to a field of three numbers, for `equinox.field(converter=…)`."""
-
-    def converted(value: Vector) -> Array:
-        return _checks.given(value, (3,), name, hint=hint)
-
-    return converted
+    return lambda value: _checks.given(value, (3,), name, hint=hint)
 
 
-def number(name: str) -> Callable[[ScalarLike], Array]:
+def number(name: str) -> Callable[[Any], Array]:
     """A converter to a field of one number."""
+    return lambda value: _checks.given(value, (), name)
 
-    def converted(value: ScalarLike) -> Array:
-        return _checks.given(value, (), name)
 
-    return converted
+def source(name: str) -> Callable[[Any], Any]:
+    """A converter to a field that is a vector, or a function of time to one."""
+    return lambda value: constant_or_callable(value, name)
 
 
 def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
@@ -319,7 +309,7 @@ def each(value: Any, count: int, name: str) -> Array:
     return _checks.given(value, (count,) if _checks.numbers(value, name).ndim else (), name)
 
 
-def length_or_zero(v: Vec3Like) -> Scalar:
+def length_or_zero(v: Vec3) -> Scalar:
     """|v|, with derivative 0 at v = 0, as a factor of |v| v."""
     v = _checks.floating(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]

@@ -20,9 +20,8 @@ class Chebyshev(eqx.Module):
     the layout of JPL's ephemerides. All may be traced.
 
     A place at any time for `GravityGradient` and `Tide`, without a loss of digits of the table. NaN
-    outside of the intervals. Sum by Clenshaw's recurrence (1955, Mathematical Tables 9:118).
-
-    **Raises:** `ValueError` for a wrong shape, NaN, a step that is not positive.
+    outside of the intervals. **Raises:** `ValueError` for a step that is not positive. Sum by
+    Clenshaw's recurrence (1955, Mathematical Tables 9:118).
 
     >>> Chebyshev(0.0, 2.0, [[[1.0, 0.0, 1.0]]])(2.0)  # 1 + T₂(1)
     Array([2.], dtype=float64)
@@ -40,9 +39,7 @@ class Chebyshev(eqx.Module):
     ):
         rows = _checks.numbers(coefficients, "coefficients")
         if rows.ndim != 3 or 0 in rows.shape:
-            raise ValueError(
-                f"coefficients: wanted (intervals, k, terms), got the shape {rows.shape}"
-            )
+            raise ValueError(f"coefficients: wanted (intervals, k, terms), got {rows.shape}")
         dtype = jnp.result_type(float)
         self.coefficients = _checks.finite(rows, "coefficients").astype(dtype)
         self.start, step = _checks.given(start, (), "start"), _checks.given(step, (), "step")

@@ -43,10 +43,7 @@ class InSpace(base.OfTime):
 
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True
-    torque: eqx.Module | Float[Array, "3"]
-
-    def __init__(self, torque: object):
-        self.torque = base.constant_or_callable(torque, "torque")
+    torque: eqx.Module | Float[Array, "3"] = eqx.field(converter=base.source("torque"))
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
         return quaternion.rotate_inverse(state.q, base.vector_at(self.torque, t, "torque"))

@@ -14,6 +14,8 @@ from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross, dot
 
+_NONE: Any = (0.0, 0.0, 0.0)
+
 
 class UniformGravity(base.AbstractForce):
     """Uniform acceleration: `F = m g`, no torque about the centre, `U = −m g·x`.
@@ -98,8 +100,8 @@ class Drag(base.AbstractForce):
     feels: ClassVar[type] = HasPose
     steady: ClassVar[bool] = True
     coefficient: Float[Array, ""] = eqx.field(converter=base.number("coefficient"))
-    centre: Float[Array, "3"] = eqx.field(converter=base.vector("centre"), default=(0.0, 0.0, 0.0))
-    wind: Float[Array, "3"] = eqx.field(converter=base.vector("wind"), default=(0.0, 0.0, 0.0))
+    centre: Float[Array, "3"] = eqx.field(converter=base.vector("centre"), default=_NONE)
+    wind: Float[Array, "3"] = eqx.field(converter=base.vector("wind"), default=_NONE)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         u = state.v - self.wind
@@ -185,11 +187,9 @@ class BodyDrag(base.AbstractForce):
     feels: ClassVar[type] = HasPose
     steady: ClassVar[bool] = True
     linear: Float[Array, "3"] = eqx.field(converter=base.vector("linear"))
-    quadratic: Float[Array, "3"] = eqx.field(
-        converter=base.vector("quadratic"), default=(0.0, 0.0, 0.0)
-    )
-    centre: Float[Array, "3"] = eqx.field(converter=base.vector("centre"), default=(0.0, 0.0, 0.0))
-    wind: Float[Array, "3"] = eqx.field(converter=base.vector("wind"), default=(0.0, 0.0, 0.0))
+    quadratic: Float[Array, "3"] = eqx.field(converter=base.vector("quadratic"), default=_NONE)
+    centre: Float[Array, "3"] = eqx.field(converter=base.vector("centre"), default=_NONE)
+    wind: Float[Array, "3"] = eqx.field(converter=base.vector("wind"), default=_NONE)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         u = quaternion.rotate_inverse(state.q, state.v - self.wind)

@@ -59,9 +59,8 @@ class Delayed(eqx.Module):
     that is exact, too. The first sample also holds before its time, the last one after it. `Linear`
     and `Series` can be delayed anywhere.
 
-    **Raises:** `TypeError` for a source that cannot be called, or that has states (delay its input:
-    `Lagged(Delayed(u, d), T)`); `ValueError` for a delay that is not finite, or as long as the
-    record.
+    **Raises:** `TypeError` for a source that has states (delay its input: `Lagged(Delayed(u, d),
+    T)`); `ValueError` for a delay as long as the record.
 
     >>> float(Delayed(rj.torques.Held([0.0, 1.0, 2.0], [5.0, 6.0, 7.0]), 0.7)(1.5))
     5.0
@@ -109,10 +108,7 @@ class Lagged(eqx.Module):
     **Arguments:** `source` u, a function of time such as `Held(times, values)`, or `Input("u")`;
     `time` T, s, > 0: one number, or one a channel, which may be free in a fit; `start` y at the
     start, `None` for u at the start. If u jumps from 0 to 1, y is `1 − exp(−t/T)` (Åström and
-    Murray, Feedback Systems).
-
-    **Raises:** `TypeError` for a source that cannot be called; `ValueError` for a known time that
-    is not positive, or wrong shapes.
+    Murray, Feedback Systems). **Raises:** `ValueError` for a known time that is not positive.
 
     >>> push = rj.torques.InSpace(Lagged(lambda t: jnp.array([0.0, 0.0, 1.0]), 0.5, jnp.zeros(3)))
     >>> body, start = rj.Inertia(jnp.eye(3)), rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
@@ -143,10 +139,8 @@ class Lagged(eqx.Module):
     def rate(self, t: ScalarLike, own: Array, state: Any, body: Any) -> Array:
         """dy/dt, in the source's unit per second."""
         wanted = _checks.numbers(self.source(t), "source(t)").astype(own.dtype)
-        if jnp.shape(wanted) != jnp.shape(own):
-            raise ValueError(
-                f"Lagged: start has the shape {jnp.shape(own)}, the source {jnp.shape(wanted)}"
-            )
+        if wanted.shape != own.shape:
+            raise ValueError(f"Lagged: start has the shape {own.shape}, the source {wanted.shape}")
         return (wanted - own) / self.time
 
     def __call__(self, t: ScalarLike, own: Array) -> Array:
@@ -197,9 +191,7 @@ def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
         found = values[node.name]
         return found if callable(found) else _Now(jnp.asarray(found))
 
-    return jax.tree.map(
-        value, law, is_leaf=lambda node: isinstance(node, Input) or _is_delayed(node)
-    )
+    return jax.tree.map(value, law, is_leaf=lambda n: isinstance(n, Input) or _is_delayed(n))
 
 
 def _is_delayed(node: Any) -> bool:

@@ -160,9 +160,7 @@ def _line(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar) -> A
 def _rows(
     name: str, times: Any, other: str, values: Any, extra: int | None = None
 ) -> tuple[Array, Array]:
-    """Times and rows of one precision, checked. With `extra` there are so many more times than
-    rows, and a row has 3 numbers.
-    """
+    """Times and rows, checked. `extra`: so many more times than rows, and rows of 3 numbers."""
     times, rows = _checks.rows(times, (), name), _checks.numbers(values, other)
     count = times.shape[0]
     if count < 2:
@@ -173,9 +171,8 @@ def _rows(
         lines = "n times go with n rows (constant pieces: Pulses)"
         pieces = "n constant pieces have n + 1 edges (Tabulated draws lines between n rows)"
         advice = pieces if extra else lines
-        raise ValueError(
-            f"{other}: wanted {count - extra} rows of 3, got shape {rows.shape}; {advice}"
-        )
+        words = f"{other}: wanted {count - extra} rows of 3"
+        raise ValueError(f"{words}, got shape {rows.shape}; {advice}")
     times, rows = _checks.finite(times, name), _checks.finite(rows, other)
     ordered = _checks.namespace(times).asarray(times)
     falling = ordered[1:] <= ordered[:-1]

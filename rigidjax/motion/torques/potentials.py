@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasPose, Scalar, ScalarLike, Vec3, Vector
+from rigidjax._types import HasAttitude, HasPose, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
 from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
@@ -149,10 +149,8 @@ def _slopes(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
         k = 2 * n - 1
         (re, im), following = here[n - 1], []
         for m in range(n):
-            (a, b), (p, q), left = here[m], before[m], n - m
-            following.append(
-                ((k * z * a - (n + m - 1) * p) / left, (k * z * b - (n + m - 1) * q) / left)
-            )
+            pairs = zip(here[m], before[m], strict=True)
+            following.append(tuple((k * z * a - (n + m - 1) * p) / (n - m) for a, p in pairs))
         top = k * (x * re - y * im), k * (x * im + y * re)
         before, here = [*here, (zero, zero)], [*following, top, (zero, zero)]
     return out
@@ -185,12 +183,8 @@ class MagneticDipole(base.OfTime):
 
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True
-    moment: Float[Array, "3"]
-    field: eqx.Module | Float[Array, "3"]
-
-    def __init__(self, moment: Vector, field: object):
-        self.moment = _checks.given(moment, (3,), "moment")
-        self.field = base.constant_or_callable(field, "field")
+    moment: Float[Array, "3"] = eqx.field(converter=base.vector("moment"))
+    field: eqx.Module | Float[Array, "3"] = eqx.field(converter=base.source("field"))
 
     @property
     def axis(self) -> Vec3 | None:
@@ -214,8 +208,7 @@ class FromPotential(base.AbstractTorque):
 
     **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world. The
     torque about body axis i is `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about it.
-    Source: Landau and Lifshitz, Mechanics, §34. **Raises:** `TypeError` for anything but a
-    function, `ValueError` for a U that is not a number.
+    Source: Landau and Lifshitz, Mechanics, §34.
 
     >>> class Spring(eqx.Module):
     ...     k: Array

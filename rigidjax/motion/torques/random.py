@@ -19,7 +19,7 @@ class RandomTorque(AbstractTorque):
     `simulate` and a fit of `rigidjax.identify` use its mean, zero. `rigidjax.estimate` uses the
     noise: `sample` draws a motion, `filter`, `smooth` and `log_likelihood` allow for it. Add it to
     other torques by `Sum`. Source: Gelb, Applied Optimal Estimation (1974), §3.6. **Raises:**
-    `ValueError` for a density below zero, NaN or a wrong shape.
+    `ValueError` for a density below zero.
 
     >>> RandomTorque(1e-4).density
     Array([0.0001, 0.0001, 0.0001], dtype=float64)
@@ -45,7 +45,7 @@ class CorrelatedTorque(AbstractTorque):
 
     `simulate` and a fit use its mean, zero; see `RandomTorque`. The state of a filter contains the
     torque. Source: Uhlenbeck and Ornstein 1930, doi:10.1103/PhysRev.36.823. **Raises:**
-    `ValueError` for a density below zero, a time that is not positive, NaN or a wrong shape.
+    `ValueError` for a density below zero, a time that is not positive.
 
     >>> CorrelatedTorque(2e-4, 0.5).deviation
     Array([0.01414214, 0.01414214, 0.01414214], dtype=float64)

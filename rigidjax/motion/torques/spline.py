@@ -29,7 +29,7 @@ class Series(eqx.Module):
     knot": de Boor, A Practical Guide to Splines, ch. IV).
 
     **Raises:** `ValueError` (`equinox` error under `jit`) for fewer than four samples, lengths that
-    differ, NaN, uneven times; `TypeError` for anything but numbers.
+    differ, NaN, uneven times.
 
     >>> Series([0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 4.0, 9.0])(1.5)
     Array(2.25, dtype=float64)

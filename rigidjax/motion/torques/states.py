@@ -64,7 +64,13 @@ def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
     queue = list(own)
     if not queue and not has_states(law):
         return law
-    frozen = _visit(law, lambda node: queue.pop(0) if queue else _missing(node))
+
+    def own_of(node: Any) -> Any:
+        if not queue:
+            raise ValueError(f"own: no states for {type(node).__name__}")
+        return queue.pop(0)
+
+    frozen = _visit(law, own_of)
     if queue:
         raise ValueError(f"own: the torque has {len(own) - len(queue)} with states, got {len(own)}")
     return frozen
@@ -133,7 +139,3 @@ def _stop(node: Any) -> bool:
 
 def _numbers(tree: Any, name: str, dtype: Any) -> Any:
     return jax.tree.map(lambda leaf: _checks.numbers(leaf, name).astype(dtype), tree)
-
-
-def _missing(node: Any) -> Any:
-    raise ValueError(f"own: no states for {type(node).__name__}")

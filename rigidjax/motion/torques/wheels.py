@@ -156,9 +156,7 @@ class ReactionWheels(base.AbstractTorque):
     jump_times = property(base.jumps_of_parts)
 
     def without_wheels(self, body: Body) -> Body:
-        """The `body` (`Inertia` or `MassProperties`, wheels locked) without their moments,
-        `I − Σ J a aᵀ`.
-        """
+        """The `body`, an `Inertia` or `MassProperties` with locked wheels, less `Σ J a aᵀ`."""
         _checks.single(body, (Inertia, MassProperties), "body")
         rows = (j * outer(a, a) for j, a in zip(self.inertia, self.axes, strict=True))
         taken = sum(rows, jnp.zeros((3, 3), self.axes.dtype))
@@ -173,8 +171,7 @@ class ReactionWheels(base.AbstractTorque):
 
     def torques_of(self, t: ScalarLike, own: Array, state: HasSpin) -> Float[Array, " wheels"]:
         """The torque of motor and bearing on each wheel about its axis, (R,), N m."""
-        speeds = self.speeds_of(own, state)
-        t = _checks.floating(t, (), "t")
+        speeds, t = self.speeds_of(own, state), _checks.floating(t, (), "t")
         count, total = self.inertia.shape[0], jnp.zeros_like(speeds)
         if self.motor is not None:
             total = total + base.vector_at(self.motor, t, "motor", count).astype(total.dtype)
