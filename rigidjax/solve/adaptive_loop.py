@@ -17,8 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool
 
-from rigidjax.solve.batching import Arrays
-from rigidjax.solve.components import lift
+from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, nested, stages, weights
 from rigidjax.solve.tableaus import Tableau
 
@@ -427,7 +426,7 @@ def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
     """The state at a time `t` (*bodies) in a step."""
     theta = ((t - step.t) / jnp.where(step.h == 0, 1, step.h)).astype(slopes.dtype)
     # Weights of the slopes are one number a stage; the rows F_r would be n.
-    rows = weights(method.tableau, slopes.dtype, slopes.shape[1]).dense
+    rows = weights(method.tableau, slopes.dtype).dense
     shares = nested(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
     rise = jnp.sum(shares[None] * slopes, 1)
     return method.project(step.y + lift(step.h.astype(rise.dtype), rise) * rise)

@@ -31,8 +31,7 @@ from rigidjax.solve.adaptive_loop import (
     times_of,
     unpacked,
 )  # fmt: skip
-from rigidjax.solve.batching import Arrays
-from rigidjax.solve.components import lift
+from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Step, stages
 
 

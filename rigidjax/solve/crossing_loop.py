@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.solve.adaptive_loop import Run, at, controlled
-from rigidjax.solve.components import lift
+from rigidjax.solve.batching import lift
 from rigidjax.solve.runge_kutta import Step
 
 # Newton's guesses in a step, from then on halves; and how often a step is taken again for a turn.

@@ -24,6 +24,7 @@ from rigidjax import _checks, _show
 from rigidjax._types import ScalarLike
 from rigidjax.motion.manifold import minus, names, parts
 from rigidjax.solve import validation
+from rigidjax.solve.linear_map import as_known
 from rigidjax.solve.run import Free, Loop, Setup, solve
 
 # Order 8 makes that 1.6 times the steps.
@@ -262,7 +263,8 @@ def _as_solved(loop: Loop, state0: Any, ts: Array, ys: Any) -> Any:
 @_as_solved.def_jvp
 def _(primals: Any, tangents: Any) -> Any:
     states = lambda *args: solve(*args)[0]  # noqa: E731
-    return primals[3], eqx.filter_jvp(states, primals[:3], tangents[:3])[1]
+    ys, along = eqx.filter_jvp(states, primals[:3], tangents[:3])
+    return as_known(primals[3], ys), along
 
 
 def _at(loop: Loop, rtol: Any) -> Loop:
