@@ -283,9 +283,10 @@ def start(method: Method, constants: Arrays, run: Run) -> LoopState:
     sound = jnp.all(jnp.isfinite(f0) & jnp.isfinite(y0), 0)
     sound = sound & jnp.isfinite(t0) & jnp.isfinite(run.stops[-1])
     h = jnp.where(sound, jnp.where(jnp.isnan(run.h0), h, run.h0), jnp.nan)
-    h = lax.stop_gradient(_unless_halted(method, t0, y0, h))
+    if method.halt is not None:
+        h = jnp.where(method.halt(t0, y0), HALTED, h)
     zero = jnp.zeros(t0.shape, jnp.int32)
-    return LoopState(y0, t0, h, zero, zero, zero)
+    return LoopState(y0, t0, lax.stop_gradient(h), zero, zero, zero)
 
 
 def going(method: Method, run: Run, loop: LoopState, until: Array | None) -> Array:
@@ -318,8 +319,8 @@ def _attempt(
     good, following = controlled(norm, method.tableau.order, loop.t, h, own, last, length)
     accept = moving & good
     following = jnp.where(moving, following, own)
-    if until is None:
-        following = jnp.where(accept, _unless_halted(method, late, y, following), following)
+    if until is None and method.halt is not None:
+        following = jnp.where(accept & method.halt(late, y), HALTED, following)
     reached = accept & last & ~cut
     after = LoopState(
         y=jnp.where(lift(accept, y), y, loop.y),
@@ -334,24 +335,16 @@ def _attempt(
     return after, jnp.concatenate([jnp.stack(head), loop.y])
 
 
-def _unless_halted(method: Method, t: Array, y: Array, h: Array) -> Array:
-    if method.halt is None:
-        return h
-    return jnp.where(method.halt(t, y), jnp.full_like(h, HALTED), h)
-
-
 def recorded(
     method: Method, constants: Arrays, run: Run, loop: LoopState, rows: Rows, until: Any
 ) -> tuple[LoopState, Rows, Array]:
     """The loop from here until the rows are full; and the number of rows."""
     many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))
-
     room = rows.shape[0] - (_MORE if until is None else 0) - _MOST
-    none = jnp.zeros((), jnp.int32)
 
-    def more(most: int, state: Any) -> Array:
-        loop, _, count = state
-        return jnp.any(going(method, run, loop, until)) & (count < most)
+    def filled(body: Callable[..., Any], loop: LoopState, rows: Rows, most: int) -> Any:
+        on = lambda state: jnp.any(going(method, run, state[0], until)) & (state[2] < most)  # noqa: E731
+        return lax.while_loop(on, body, (loop, rows, jnp.zeros((), jnp.int32)))
 
     def attempt(state: Any) -> Any:
         loop, few, k = state
@@ -360,11 +353,10 @@ def recorded(
 
     def block(state: Any) -> Any:
         loop, rows, count = state
-        few = jnp.zeros((many, *rows.shape[1:]), rows.dtype)
-        loop, few, k = lax.while_loop(partial(more, many), attempt, (loop, few, none))
+        loop, few, k = filled(attempt, loop, jnp.zeros((many, *rows.shape[1:]), rows.dtype), many)
         return loop, lax.dynamic_update_slice_in_dim(rows, few, count, 0), count + k
 
-    return lax.while_loop(partial(more, room), block, (loop, rows, none))
+    return filled(block, loop, rows, room)
 
 
 def segment(rows: Rows, end: Array, count: Array) -> Segment:
