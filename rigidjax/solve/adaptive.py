@@ -14,10 +14,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax.motion.equations import on_the_group
-from rigidjax.solve import adaptive_loop, adjoint
+from rigidjax.solve import adaptive_loop, adjoint, validation
 from rigidjax.solve.adaptive_loop import HALTED, LoopState, Method, Record, Run, outcome
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
-from rigidjax.solve.components import one_dtype
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import linear_map, refuse
 
@@ -50,22 +49,16 @@ def adaptive(
     jumps: Array | None = None,
     halt: Callable[..., Any] | None = None,
 ) -> Found:
-    """The states at `ts`, with adaptive steps.
-
-    The norm, the control of the step (integral, safety 0.9) and the first step are those of
-    `diffrax.PIDController`.
+    """The states at `ts`, with adaptive steps, controlled as by `diffrax.PIDController`.
 
     **Arguments:** `solver` an explicit method of this package; `field` a vector field
     `f(t, y, args)` as of `equations_of_motion`; `ts` (T,) s; `y0` the state at `ts[0]`; `rtol`,
     `atol` scalars; `dt0` the first step, s, or `None`; `jumps` times, s, in any order, at which the
     field jumps: steps end there; `halt(t, y)` a condition, tested after each step, that ends the
-    run. Derivatives are by all numbers of the field, `ts`, `jumps` and
-    `y0`, lengths of steps held; not by tolerances.
+    run. Derivatives are by all numbers of the field, `ts`, `jumps` and `y0`, lengths of steps held.
 
-    **Returns** the states `ys`, of the type of `y0`, with a leading time axis, `num_steps`,
-    `num_rejected`, `result`, `last_time` and state `last` (`Found`). A run that needs more than
-    `max_steps`, is halted, or meets a NaN that no shorter step avoids, ends early: its `result`
-    says so, and the states not reached are NaN.
+    **Returns** a `Found`. A run that needs more than `max_steps`, is halted, or meets a NaN that no
+    shorter step avoids, ends early: its `result` says so, and the states not reached are NaN.
 
     **Raises:** `TypeError` for a state of several dtypes, or of another than `ts`.
 
@@ -76,8 +69,7 @@ def adaptive(
     >>> adaptive(solver, field, ts, start, rtol=1e-9, atol=1e-9).ys.q[1, 3]
     Array(0.47942554, dtype=float64)
     """
-    if ts.dtype != (dtype := one_dtype(y0, "state")):
-        raise TypeError(f"ts: wanted times of the dtype of the state, {dtype}, got {ts.dtype}")
+    validation.one_dtype((ts, y0), "ts, y0")
     numbers, tree = ravel_pytree(y0)
     functions: list[Any] = [lambda t, y: ravel_pytree(field(t, tree(y), None))[0]]
     if halt is not None:
@@ -93,7 +85,7 @@ def adaptive(
     if jumps is not None and jumps.size:
         inside = jnp.clip(jnp.sort(jumps.astype(ts.dtype)), ts[0], ts[-1])
         stops = jnp.concatenate([inside, stops])
-    rtol, atol = (jnp.asarray(a, dtype) for a in (rtol, atol))
+    rtol, atol = (jnp.asarray(a, ts.dtype) for a in (rtol, atol))
     h0 = jnp.asarray(jnp.nan if dt0 is None else dt0, ts.dtype)
     run = Run(ts[0], stops, ts[1:-1], numbers, rtol, atol, h0)
     between, end = _solved(method, smooth, constants, run)
@@ -121,7 +113,7 @@ def _solved(
     method: Method, smooth: list[bool], constants: Arrays, run: Run
 ) -> tuple[Array, LoopState]:
     """The states between, and the end; `smooth` says which of the constants have derivatives."""
-    # The states between and at the end are what has derivatives.
+    # The first two results, the states between and at the end, have derivatives.
     number, ends, head = len(constants), 2, 1 + len(LoopState._fields)
 
     def mapped(program: Any, linear: int, *args: Any) -> Arrays:

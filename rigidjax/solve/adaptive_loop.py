@@ -1,13 +1,11 @@
 """Adaptive steps, for one body or many, with the states at any times. Bodies are in the last axis.
 
 For saved states and derivatives the steps are recorded in segments: the start of each is kept, and
-the steps of the last one; derivatives run the others once more. The loop does not look at the times
-that are asked for. Its steps with such times in them are taken once more: many of one body side by
-side, or one of each of many bodies.
+the steps of the last one; derivatives run the others once more. Steps with saved times in them are
+taken once more after each segment.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -24,7 +22,7 @@ from rigidjax.solve.tableaus import Tableau
 # diffrax inherits it from optimistix, where type checkers do not follow.
 NONFINITE: Any = dfx.RESULTS.nonfinite
 
-# The defaults of diffrax.PIDController: the same steps, so that figures can be compared.
+# The defaults of diffrax.PIDController.
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 
 # Steps in a segment, rejected ones included.
@@ -120,10 +118,7 @@ class Segment(NamedTuple):
 
 
 def times_of(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
-    """Start, length and end of the steps of rows (4 + n, *bodies).
-
-    The start moves with the stop before it, the length of a step that ends on a stop with both.
-    """
+    """Start, length and end of the steps of rows (4 + n, *bodies); they move with the stops."""
     t, h, kind, stop = lax.stop_gradient(rows[:HEAD])
     stop, last = stop.astype(jnp.int32), kind == LAST
     begun = at(jnp.concatenate([run.t0[None], run.stops]), stop)
@@ -140,7 +135,7 @@ def at(a: Array, index: Array) -> Array:
     if count == 1:
         return jnp.broadcast_to(a[0], index.shape)
     index = jnp.clip(index, 0, count - 1)
-    # It is quicker to add up so few rows than to look for one, also in derivatives.
+    # Quicker than to look for one of so few rows, also in derivatives.
     if count <= 8:
         each = jnp.arange(count, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
         return jnp.sum(jnp.where(each == index[None], a, 0), 0)
@@ -181,8 +176,8 @@ def controlled(
 ) -> tuple[Array, Array]:
     """Whether a step is accepted, and the next one: 0 where none is left to try, NaN after a NaN.
 
-    `norm` as of `tried`; `kept` what the controller had wanted before a step was cut short as the
-    `last` before a stop; `length` of the run, whose round-off counts where that of `t` vanishes.
+    `norm` as of `tried`; `kept` the step wanted before it was cut short as the `last` before a
+    stop; `length` of the run, whose round-off counts where that of `t` vanishes.
     """
     norm, h, kept = lax.stop_gradient((norm, h, kept))
     good = norm < 1
@@ -241,7 +236,7 @@ def first_step(method: Method, constants: Arrays, run: Run) -> tuple[Array, Arra
 
 
 def value(method: Method, constants: Arrays, run: Run) -> LoopState:
-    """The end of a run without states between."""
+    """The end of a run whose states between are not asked for."""
     return lax.while_loop(
         lambda loop: jnp.any(going(method, run, loop, None)),
         lambda loop: _attempt(method, constants, run, loop, None)[0],
@@ -370,7 +365,7 @@ def saved(method: Method, constants: Arrays, run: Run, part: Segment, ys: Array)
     """`ys` (K, n, *bodies) with the states in a part of a run."""
     size, many = run.between.shape[0], run.t0.ndim > 0
     width = 1 if many else min(size, _TOGETHER)
-    # All at once: in a loop each search would be many small kernels.
+    # All at once: in a loop each would be many small kernels.
     ts = lax.stop_gradient(run.between)
     search = per_body(run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1)
     index = search(part.times, ts)
@@ -415,7 +410,6 @@ def per_body(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
-    """The state at a time `t` (*bodies) in a step."""
     theta = ((t - step.t) / jnp.where(step.h == 0, 1, step.h)).astype(slopes.dtype)
     # Weights of the slopes are one number a stage; the rows F_r would be n.
     rows = weights(method.tableau, slopes.dtype).dense

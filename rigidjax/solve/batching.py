@@ -15,13 +15,12 @@ from jaxtyping import Array
 
 Arrays = list[Any]
 
-# Bodies that go through a loop together on CPU: few, so that one step's numbers stay in the first
-# cache and no body waits long for another.
+# Bodies that go through a loop together on CPU: few, so that their numbers stay in the first cache.
 BLOCK = 16
 
 
 class Layout(NamedTuple):
-    """The axes of a program's arrays beyond those of one body."""
+    """The axes of a program's arrays beyond one body's."""
 
     bodies: bool  # a last axis
     shared: tuple[bool, ...]  # which constants have none all the same

@@ -44,12 +44,3 @@ def join(parts: Atoms, like: Any) -> Any:
         else:
             out.append(leaf)
     return jax.tree.unflatten(structure, out)
-
-
-def one_dtype(tree: Any, name: str) -> Any:
-    """The dtype of all arrays of a tree, or `TypeError`."""
-    kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(tree)}
-    if len(kinds) != 1:
-        found = ", ".join(sorted(map(str, kinds)))
-        raise TypeError(f"{name}: wanted arrays of one dtype, got {found}; convert them to one")
-    return kinds.pop()

@@ -1,19 +1,15 @@
 """Times at which a motion meets a condition: the event that ends a run, and section crossings.
 
-Crossings are found without derivatives, then corrected with them. A crossing at t* of
-g(t, y(t)) = 0 moves with every number of the scene. The motion is run again to the times found,
-which are held fixed. The rest of g there and its rates ġ and g̈ along the motion give the time and
-the state by one step of Chebyshev's method,
+Crossings are found without derivatives. For these the motion is run again to the times found, which
+are held fixed. The rest of g there and its rates ġ and g̈ along the motion give time and state by
+one step of Chebyshev's method, whose first and second derivatives are those of the crossing:
 
     τ = −(g/ġ)(1 + ½ g g̈/ġ²),   y = y* + f τ + ½ (df/dt) τ².
 
-τ is zero but for the error of dense output, and its first and second derivatives are those of the
-crossing (the error is of third order in what moves). At a touch, ġ = 0, there is none.
-
-A zero of round-off, of what the motion conserves or of a component that stays at zero, is none. Its
-ġ is not more than round-off makes of it, which is some ε (|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ), times the root
-of the number of steps. The size rᵢ of the terms of ẏᵢ is the length of the array of the state that
-i belongs to, taken of ẏ and of the change of ẏ where each y changes by the length of its array.
+A zero of round-off, of what the motion conserves or of a component that stays at zero, does not
+count. Its ġ is at most some ε (|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ), times the root of the number of steps. The
+size rᵢ of the terms of ẏᵢ is the length of the array of the state that i belongs to, taken of ẏ and
+of the change of ẏ where each y changes by the length of its array.
 """
 
 from collections.abc import Callable
@@ -158,13 +154,12 @@ def crossings(
       zeros in one step are found if the cubic through its ends, with their slopes, shows them.
     - `solver`: `None` is the closed form for a free body, else `rigidjax.solvers.DormandPrince8`;
       or an explicit method of `rigidjax.solvers`. `rtol`, `atol` as for `simulate`; a crossing is
-      as accurate as a step, that of a free body to round-off.
-    - `max_steps`: parts of steps included.
+      as accurate as a step, that of a free body to round-off. `max_steps` with parts of steps.
 
-    A start on the section does not count, and a tangential contact may be missed. A condition that
-    is always zero to round-off, such as an energy minus its value, has no crossing: a zero counts
-    if the condition goes through it 16 times as fast as round-off could make it (under a solver,
-    times the root of the number of steps). For many bodies use `jax.vmap`.
+    A start on the section does not count, and a tangential contact may be missed. A zero counts if
+    the condition goes through it 16 times as fast as round-off could make it (under a solver, times
+    the root of the number of steps): an energy minus its value has none. For many bodies use
+    `jax.vmap`.
 
     **Returns** a `Crossings`. Times and states have first and second derivatives with respect to
     all numbers of the scene, of `condition` and of `state0`, forward and reverse; near a tangential
@@ -201,7 +196,7 @@ def crossings(
 
 
 def ready(event: Event, body: Any, state0: Any, torque: Any, t: Array) -> Any:
-    """`state0` with the states of the torque, unless the condition is no number there: an error."""
+    """`state0` with the states of the torque; an error if the condition is no number there."""
     state0 = started(body, state0, torque, t)
     try:
         eqx.filter_eval_shape(value, event, body, t, state0)
@@ -235,7 +230,6 @@ def solve_until(
     setup: Free | Loop, event: Event, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
     """As `solve`, up to the event; and the event's time and state, NaN if there is none."""
-    # The run is done twice: to find the event, and up to it, with derivatives.
     state0 = on_the_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
     steps = setup.max_steps if isinstance(setup, Loop) else 1_000_000
@@ -370,7 +364,7 @@ def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[S
 
 
 def _spacing(body: Any, state0: Any, whole: Array) -> Array:
-    """A part of the time of one turn at the largest rate that energy and momentum allow."""
+    """A part of one turn at the largest rate that energy and momentum allow."""
     inertia = body if isinstance(body, Inertia) else body.inertia
     tensor, omega = lax.stop_gradient((inertia.tensor, state0.omega))
     momentum = jnp.sum(tensor * omega[None], axis=1)
@@ -434,7 +428,7 @@ def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Arra
 
 
 def _clear(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
-    """The ratio of the rate of g through zero to its round-off."""
+    """The rate of g through zero over its round-off."""
     rates, sizes = partial(section.rates, constants, s), section.sizes
     _, rate, slope = rates(y)
     shift = jax.jvp(lambda y: rates(y)[2], (y,), (_push(sizes, y),))[1]

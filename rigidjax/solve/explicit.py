@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax.motion.equations import on_the_group
-from rigidjax.solve.components import one_dtype
+from rigidjax.solve import validation
 from rigidjax.solve.runge_kutta import Step, dense_rows, error_estimate, nested, stages
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
 
@@ -60,7 +60,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> Any:
-        one_dtype(y0, "state")
+        validation.one_dtype(y0, "state")
         numbers, tree = ravel_pytree(y0)
 
         def field(_: Any, t: Any, y: Array) -> Array:
