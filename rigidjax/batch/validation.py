@@ -16,7 +16,6 @@ from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.rotation.validation import tolerance
 from rigidjax.solve import validation
-from rigidjax.solve.components import one_dtype
 
 
 class BodyBatch(NamedTuple):
@@ -54,7 +53,7 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
                 f"states0: {count} rows of omega, but {str(path[-1]).lstrip('.')} of shape "
                 f"{leaf.shape}"
             )
-    dtype = one_dtype(states0, "states0")
+    dtype = validation.one_dtype(states0, "states0")
     if not isinstance(bodies, Inertia | MassProperties):
         raise TypeError(
             f"bodies: wanted Inertia, or MassProperties for Rigid, got {type(bodies).__name__}"

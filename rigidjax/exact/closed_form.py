@@ -1,8 +1,4 @@
-"""The free motion in principal axes: values only, in components.
-
-The derivatives are in `rigidjax.exact.derivatives`; nothing here is differentiated, so signs,
-orderings and selections are allowed.
-"""
+"""The free motion in principal axes: values only, in components (`derivatives` has the rest)."""
 
 from typing import NamedTuple
 
@@ -100,8 +96,7 @@ def restored(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar]:
 def in_step(f: Elliptic, m: Modulus) -> Elliptic:
     """The larger of C² and D², computed again from the smaller: D² − C² = (p − q)S².
 
-    Each has its own error from the doublings. C and SD cancel near the middle axis, where a
-    decaying motion becomes a growing one, and only a common error cancels with them.
+    C and SD cancel near the middle axis, and only a common error of the doublings cancels with them.
     """
     gs = m.gap * f.S * f.S
     other = jnp.sqrt(jnp.where(gs > 0, f.C * f.C + gs, f.D * f.D - gs))

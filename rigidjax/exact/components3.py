@@ -1,6 +1,6 @@
 """Vectors, quaternions and symmetric matrices (11, 22, 33, 12, 13, 23) as tuples of scalars.
 
-Written on components so that XLA makes one kernel of a batch (a stacked array costs ten times it).
+XLA makes one kernel of a batch of them (stacked arrays cost ten times it).
 """
 
 from rigidjax._types import Scalar

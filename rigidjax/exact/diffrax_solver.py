@@ -14,7 +14,7 @@ from rigidjax.motion.equations import AttitudeEquations, EulerEquations
 
 
 class FreeInterpolation(dfx.AbstractLocalInterpolation):
-    """The motion between two steps, from the closed form: exact anywhere, on the group."""
+    """The motion between two steps in closed form."""
 
     t0: Any
     t1: Any
@@ -34,8 +34,8 @@ class FreeSolver(dfx.AbstractSolver):
     """A diffrax solver for torque-free spins and attitudes; its step is the closed form.
 
     Use it with `diffrax.ODETerm(rigidjax.equations_of_motion(inertia, y0))` of a `Spin` or an
-    `Attitude`, with no torque. Steps may be as long as one likes: one over the whole interval does.
-    Events, `SaveAt(ts=…, dense=True)` and every adjoint work as with any solver.
+    `Attitude`, with no torque. One step over the whole interval does. Events, dense output and
+    every adjoint work as with any solver.
 
     **Raises:** `ValueError` for another term, or one with a torque.
 

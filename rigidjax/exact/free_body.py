@@ -115,19 +115,18 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
         q(t) = q(0) ⊗ exp(½(t/I₁ − Ξ) Π) ⊗ (C, 0, −d₁₂SΠ₂(t/2)C, −d₁₃SΠ₃(t/2))/|…|   S, C, D at t/2
 
     (Jacobi 1850; Landau and Lifshitz, Mechanics, eq 37.10 for Ω; the attitude is the addition
-    theorem of the Weierstrass sigma function at the half time, proved by differentiation.) No
-    formula divides by a difference of moments, a rate or an energy: sphere, symmetric tops, plates,
+    theorem of the Weierstrass sigma function at the half time.) Sphere, symmetric tops, plates,
     spins about any axis, the separatrix and rest are ordinary points. The quaternion is continuous
-    in t (it does not jump between q and −q), has length 1, and `R(q) I Ω` is constant to round-off.
-    A traced time in which the body turns by more than 1/eps rad gives NaN.
+    in t, has length 1, and `R(q) I Ω` is constant to round-off. A traced time in which the body
+    turns by more than 1/eps rad gives NaN.
 
-    Derivatives with respect to all arguments are closed forms, correct to second order at all these
-    points: those of the motion as a function of the whole tensor (`rigidjax.exact.sigma_form`).
-    They grow with e^{λt} on an unstable axis, up to λt ≈ 150 (float32: 40).
+    Derivatives by all arguments are closed forms, correct to second order at all these points, as
+    functions of the whole tensor. They grow with e^{λt} on an unstable axis, up to λt ≈ 150
+    (float32: 40).
 
-    **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, a `Rigid`
-    state; if values are known, also for NaN, a moment that is not positive, a quaternion that is
-    not unit, and a time in which the body turns by more than 1/eps rad.
+    **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, a `Rigid`;
+    for known values also for NaN, a moment that is not positive, a quaternion that is not unit, and
+    a time in which the body turns by more than 1/eps rad.
 
     >>> import rigidjax as rj
     >>> state0 = rj.Attitude([1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1e-4])

@@ -6,14 +6,9 @@ A free body needs only the solution of
 
 with `C² = 1 − p S²`, `D² = 1 − q S²`: sn, cn, dn in a scaling that needs neither `p > q` nor
 `p, q ≠ 0`. p = q = 0 is a sphere, or rest; p = q the separatrix; q = 0 a symmetric top or a spin
-about an axis. Nothing is divided by p, q or p − q. Start from the Taylor series at `u/2^N` and
-apply the duplication formula N times (DLMF 22.6(ii)). Three things keep the digits:
-
-* p − q is a separate number: `C(2u) ∝ C⁴ − p(p − q)S⁴` keeps its digits near the separatrix,
-  whereas `1 − m` from m would lose them;
-* while S is small, `1 − C` is doubled instead, `1 − C(2u) = 2pS²D²/(C² + pS²D²)`: squaring C
-  itself would multiply its round-off by 4 at each step;
-* every denominator is a sum of two positive terms.
+about an axis. Start from the Taylor series at `u/2^N` and apply the duplication formula N times
+(DLMF 22.6(ii)). Three things keep the digits: p − q is a separate number; while S is small, `1 − C`
+is doubled instead, `1 − C(2u) = 2pS²D²/(C² + pS²D²)`; denominators are sums of positive terms.
 """
 
 import functools
@@ -56,11 +51,7 @@ class Limits(NamedTuple):
 
 
 def limits(dtype) -> Limits:
-    """`doublings` reach the longest quarter period, `ln(4/√floor)`.
-
-    `floor` is a spin about the middle axis but for 1e-32 (float32: 3e-17) of it. C⁴ must not
-    underflow: that sets `floor` and `rest` in float32.
-    """
+    """`doublings` reach the longest quarter period, `ln(4/√floor)`; C⁴ must not underflow."""
     wide = dtype == jnp.float64
     return Limits(9, 11, 1e-64, 75.0) if wide else Limits(7, 9, 1e-33, 20.0)
 
@@ -124,7 +115,7 @@ def growth(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
     """∫ S²/(1 + μS²) du = ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)) for a small S.
 
     Its power series in S, by the recurrence of Legendre's polynomials for the roots and one more
-    for 1 + μS²; the doublings multiply what it leaves out by 2^doublings.
+    for 1 + μS².
     """
     s = S * S
     e, f, w = (m.p + m.q) * s, (m.p * m.q) * (s * s), mu * s

@@ -41,9 +41,8 @@ def jacobian_and_integral(
 ) -> tuple[tuple, Six]:
     """d(Π(t) − Π(0)) by (d12, d23, k12, k13, k23, Π(0), k11, t) as three rows, and G = ∫ Π Πᵀ dt.
 
-    The relative error is small for short times, too. Off-diagonal entries must be zero. It is
-    regular at rest. `before` at half of a time that was reduced by `halves` half periods, `whole`
-    in all, its C and D as in `body`; `mean` of S².
+    Off-diagonal entries must be zero. `before` at half of a time that was reduced by `halves` half
+    periods, `whole` in all, its C and D as in `body`; `mean` of S².
     """
     d12, d13, d23 = body[:3]
     p1, p2, p3 = momentum

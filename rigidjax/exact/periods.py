@@ -20,17 +20,15 @@ from rigidjax.exact.principal_axes import into, principal_frame
 def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     """Time after which the body rates repeat: one rotation about the circulated axis.
 
-    The angular momentum circles the axis of the smallest or of the largest moment in the body
-    frame. This is the time of one round (5.41 days about the long axis for 4179 Toutatis); for a
-    spin about a stable axis the period of small wobbles. It is infinite on the separatrix, for a
-    sphere and at rest.
+    This is the time in which the angular momentum circles the axis of the smallest or largest
+    moment in the body frame (5.41 days about the long axis for 4179 Toutatis); for a spin about a
+    stable axis the period of small wobbles; infinite on the separatrix, for a sphere and at rest.
 
     **Arguments:** `inertia` of the body about its centre of mass (kg m²); `omega0` (3,) Ω at any
     moment, rad/s, body frame. **Returns** a scalar, s.
 
     `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, eᵢ the roots in `rigidjax.exact.sigma_form` (DLMF
-    19.8.5; Landau and Lifshitz, Mechanics, eq 37.11). Its derivatives are correct where it is
-    finite.
+    19.8.5; Landau and Lifshitz, Mechanics, eq 37.11).
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
@@ -45,16 +43,14 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     """Mean time in which the circulated axis turns once about the angular momentum, in space.
 
-    The axis of the smallest or largest moment, whichever the momentum circles in the body, turns
-    about the fixed angular momentum at a rate that varies within `body_period`; this is 2π over its
-    mean (7.35 days for the long axis of 4179 Toutatis). If no axis is circulated (separatrix,
-    sphere) it is the limit, `2π I₂/|L|`. It is infinite at rest.
+    The axis that the momentum circles in the body turns about the fixed angular momentum; this is
+    2π over its mean rate (7.35 days for the long axis of 4179 Toutatis). If no axis is circulated
+    (separatrix, sphere) it is the limit, `2π I₂/|L|`. It is infinite at rest.
 
     **Arguments:** as for `body_period`. **Returns** a scalar, s.
 
     The angle in one body period is `χ ∓ 2π`, χ the turn of the body about its momentum: a complete
-    integral of the third kind (DLMF 19.8.7). Its derivative is `½ T δE₂ + ½ δK:∫ΠΠᵀ dt + E₂ δT`,
-    over |Π|: see `rigidjax.exact.derivatives`.
+    integral of the third kind (DLMF 19.8.7).
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
@@ -74,7 +70,7 @@ def _checked(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
 
 @jax.jit
 def _both(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
-    """Both periods: one program, since outside of a trace each operation would be compiled."""
+    """Both periods, in one program."""
     exponent = exponent_of(omega)
     moments, axes = principal_frame(times_power_of_two(tensor, -exponent_of(tensor)))
     momentum = times(moments, into(axes, times_power_of_two(omega, -exponent)))

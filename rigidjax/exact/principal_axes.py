@@ -1,8 +1,6 @@
 """Principal axes as a fixed frame: chosen once by value, never differentiated.
 
-In this frame the inertia is diagonal in value; its off-diagonal entries are exact zeros that carry
-the tangents (`sigma_form` describes their use). No formula divides by a difference of moments, and
-no axis is differentiated.
+In this frame the off-diagonal entries of the inertia are exact zeros that carry the tangents.
 """
 
 import jax
@@ -19,8 +17,7 @@ _SWEEPS = 6
 def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
     """The inertia in its own principal axes, ascending, and those axes as columns (a rotation).
 
-    Values are Jacobi's (small moments keep their digits; a diagonal tensor stays as it is);
-    derivatives are those of `AᵀIA` with A held fixed.
+    By Jacobi's method, in which small moments keep their digits; A is held fixed in derivatives.
     """
     columns, moments = _jacobi(jax.lax.stop_gradient(tensor))
     axes = jnp.stack([jnp.stack(row) for row in columns])

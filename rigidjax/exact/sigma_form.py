@@ -19,11 +19,9 @@ which doubles as `Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u)`,
     G = ∫₀ᵗ Π Πᵀ dt = 2σ/(W det T) (adj(T)k)(adj(T)k)ᵀ − 2 adj(E₂ 1 − h² K) Y.
 
 Proof of the first: in principal axes of K it is Jacobi's solution with T = diag(D, 1, C), σ = S, by
-`E₃₃ − E₂₂ = (a₂ − a₃)(a₁h² − E₂) = p`, `E₁₁ − E₂₂ = q`; both sides turn with the axes, so it holds
-in any axes. All terms but `|…|` are polynomial in K, so a sphere or a symmetric top is an ordinary
-point, with derivatives of any order. (The second: differentiate in principal axes, axis by axis:
-with g = σ/τᵢ, g' = τⱼτₖ/τᵢ², both sides have the same derivative; the symmetric choice of the mid
-point removes the terms even in time.)
+`E₃₃ − E₂₂ = (a₂ − a₃)(a₁h² − E₂) = p`, `E₁₁ − E₂₂ = q`, and both sides turn with the axes. All terms
+but `|…|` are polynomial in K: a sphere or a symmetric top is an ordinary point. (The second:
+differentiate in principal axes: with g = σ/τᵢ, g' = τⱼτₖ/τᵢ²; the mid point removes even terms.)
 
 The axes are principal at the point of evaluation: off-diagonal entries are zeros that carry
 tangents, diagonal differences are given as accurate numbers, and each entry uses the one of its
@@ -228,8 +226,8 @@ def sigma_at(u: Scalar, v: Invariants) -> Sigma:
 def period(v: Invariants) -> Scalar:
     """The period of Π: `2π/agm(√(z − x), √(z − y))`, z the largest eigenvalue of E.
 
-    z is a simple eigenvalue, so one step of Newton's from the diagonal entry has its derivatives to
-    third order; the other two enter through symmetric functions, the first step of the mean.
+    One step of Newton's from the diagonal entry has the derivatives of z to third order; the other
+    two enter through symmetric functions, the first step of the mean.
     """
     three = v.gap > 0
     top = jnp.where(three, v.p, v.q)

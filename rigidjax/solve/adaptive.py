@@ -9,16 +9,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_derivatives import SymbolicZero
+from jax.custom_derivatives import SymbolicZero, zero_from_primal
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax.motion.equations import on_the_group
-from rigidjax.solve import adaptive_loop, adjoint
+from rigidjax.solve import adaptive_loop, adjoint, validation
 from rigidjax.solve.adaptive_loop import HALTED, LoopState, Method, Record, Run, outcome
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
-from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.linear_map import is_smooth, linear_map, no_tangent, refuse
+from rigidjax.solve.linear_map import linear_map, refuse
 
 
 class Found(NamedTuple):
@@ -49,22 +49,16 @@ def adaptive(
     jumps: Array | None = None,
     halt: Callable[..., Any] | None = None,
 ) -> Found:
-    """The states at `ts`, with adaptive steps.
-
-    The norm, the control of the step (integral, safety 0.9) and the first step are those of
-    `diffrax.PIDController`.
+    """The states at `ts`, with adaptive steps, controlled as by `diffrax.PIDController`.
 
     **Arguments:** `solver` an explicit method of this package; `field` a vector field
     `f(t, y, args)` as of `equations_of_motion`; `ts` (T,) s; `y0` the state at `ts[0]`; `rtol`,
     `atol` scalars; `dt0` the first step, s, or `None`; `jumps` times, s, in any order, at which the
     field jumps: steps end there; `halt(t, y)` a condition, tested after each step, that ends the
-    run. Derivatives are by all numbers of the field, `ts`, `jumps` and
-    `y0`, lengths of steps held; not by tolerances.
+    run. Derivatives are by all numbers of the field, `ts`, `jumps` and `y0`, lengths of steps held.
 
-    **Returns** the states `ys`, of the type of `y0`, with a leading time axis, `num_steps`,
-    `num_rejected`, `result`, `last_time` and state `last` (`Found`). A run that needs more than
-    `max_steps`, is halted, or meets a NaN that no shorter step avoids, ends early: its `result`
-    says so, and the states not reached are NaN.
+    **Returns** a `Found`. A run that needs more than `max_steps`, is halted, or meets a NaN that no
+    shorter step avoids, ends early: its `result` says so, and the states not reached are NaN.
 
     **Raises:** `TypeError` for a state of several dtypes, or of another than `ts`.
 
@@ -75,69 +69,58 @@ def adaptive(
     >>> adaptive(solver, field, ts, start, rtol=1e-9, atol=1e-9).ys.q[1, 3]
     Array(0.47942554, dtype=float64)
     """
-    numbers = flat(y0)
-    if ts.dtype != numbers.dtype:
-        raise TypeError(
-            f"adaptive: wanted times and state of one dtype, got {ts.dtype} and {numbers.dtype}"
-        )
-    like = jax.eval_shape(lambda: y0)
-    functions: list[Any] = [lambda t, y: flat(field(t, unflat(y, like), None))]
+    validation.one_dtype((ts, y0), "ts, y0")
+    numbers, tree = ravel_pytree(y0)
+    functions: list[Any] = [lambda t, y: ravel_pytree(field(t, tree(y), None))[0]]
     if halt is not None:
-        functions.append(lambda t, y: halt(t, unflat(y, like)))
+        functions.append(lambda t, y: halt(t, tree(y)))
     (of_one, *ended), constants, count = taken_out(functions, ts[0], numbers)
     # The condition that ends a run has no derivative.
-    smooth = [i < count and is_smooth(c) for i, c in enumerate(constants)]
-    project = lambda y: flat(on_the_group(unflat(y, like)))  # noqa: E731
+    smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
+    project = lambda y: ravel_pytree(on_the_group(tree(y)))[0]  # noqa: E731
+    sizes = [leaf.size for leaf in jax.tree.leaves(y0)]
     ends = ended[0] if ended else None
-    method = Method(solver.tableau, of_one, project, ends, leaf_sizes(like), max_steps)
+    method = Method(solver.tableau, of_one, project, ends, sizes, max_steps)
     stops = ts[-1:]
     if jumps is not None and jumps.size:
         inside = jnp.clip(jnp.sort(jumps.astype(ts.dtype)), ts[0], ts[-1])
         stops = jnp.concatenate([inside, stops])
-    rtol, atol = (jnp.asarray(a, numbers.dtype) for a in (rtol, atol))
+    rtol, atol = (jnp.asarray(a, ts.dtype) for a in (rtol, atol))
     h0 = jnp.asarray(jnp.nan if dt0 is None else dt0, ts.dtype)
     run = Run(ts[0], stops, ts[1:-1], numbers, rtol, atol, h0)
     between, end = _solved(method, smooth, constants, run)
     result = outcome(end.h, end.t, ts[-1], end.h == HALTED)
     last = jnp.where(end.t >= ts[-1], end.y, jnp.nan)
-    ys = jnp.concatenate([numbers[None], between, last[None]])
-    ys = jax.vmap(partial(unflat, like=y0))(ys)
-    last = unflat(lax.stop_gradient(end.y), y0)
-    return Found(ys, end.steps, end.rejected, result, end.t, last)
+    ys = jax.vmap(tree)(jnp.concatenate([numbers[None], between, last[None]]))
+    return Found(ys, end.steps, end.rejected, result, end.t, tree(lax.stop_gradient(end.y)))
 
 
 def taken_out(
     functions: list[Callable[..., Any]], *like: Any
 ) -> tuple[list[Callable[..., Any]], Arrays, int]:
     """Each function as `f(constants, *args)`; the constants of all, and how many the first has."""
-    constants: Arrays = []
-    out, counts = [], []
-    for function in functions:
-        arrays, rest = eqx.partition(eqx.filter_closure_convert(function, *like), eqx.is_array)
-        own, tree = jax.tree.flatten(arrays)
-        counts.append(len(own))
-        part = slice(len(constants), len(constants) + len(own))
-        out.append(partial(_of_constants, part, tree, rest))
-        constants += own
-    return out, constants, counts[0]
+    closed = [eqx.filter_closure_convert(function, *like) for function in functions]
+    arrays, rest = eqx.partition(closed, eqx.is_array)
+    constants, tree = jax.tree.flatten(arrays)
 
+    def outer(i: int) -> Callable[..., Any]:
+        return lambda constants, *args: eqx.combine(tree.unflatten(constants), rest)[i](*args)
 
-def _of_constants(part: slice, tree: Any, rest: Any, constants: Arrays, *args: Any) -> Any:
-    return eqx.combine(jax.tree.unflatten(tree, constants[part]), rest)(*args)
+    return [outer(i) for i in range(len(closed))], constants, len(jax.tree.leaves(arrays[0]))
 
 
 def _solved(
     method: Method, smooth: list[bool], constants: Arrays, run: Run
 ) -> tuple[Array, LoopState]:
     """The states between, and the end; `smooth` says which of the constants have derivatives."""
-    # The states between and at the end are what has derivatives.
+    # The first two results, the states between and at the end, have derivatives.
     number, ends, head = len(constants), 2, 1 + len(LoopState._fields)
 
     def mapped(program: Any, linear: int, *args: Any) -> Arrays:
         return in_lanes(partial(program, method), list(args[:number]), list(args[number:]), linear)
 
-    answer: Any = jax.custom_jvp(partial(mapped, _value, 0))
-    recorded: Any = jax.custom_jvp(partial(mapped, _recorded, 0))
+    answer: Any = jax.custom_jvp(partial(mapped, partial(_forward, False), 0))
+    recorded: Any = jax.custom_jvp(partial(mapped, partial(_forward, True), 0))
 
     def tangents_of(primals: Any, tangents: Any, pull: Any = None) -> tuple[Arrays, Arrays]:
         """The result of `recorded`, and the tangents of its states; transposed by `pull`."""
@@ -155,11 +138,11 @@ def _solved(
 
     def of_answer(primals: Any, tangents: Any) -> Any:
         found, moved = tangents_of(primals, tangents, _pulled)
-        return found[:head], [*moved, *(no_tangent(a) for a in found[ends:head])]
+        return found[:head], [*moved, *(zero_from_primal(a) for a in found[ends:head])]
 
     def of_record(primals: Any, tangents: Any) -> Any:
         found, (between, end, starts, rows) = tangents_of(primals, tangents)
-        rest = [no_tangent(a) for a in found]
+        rest = [zero_from_primal(a) for a in found]
         record = Record(*rest[head:])._replace(starts=starts, rows=rows)
         return found, [between, end, *rest[ends:head], *record]
 
@@ -176,18 +159,15 @@ def _over_bodies(method: Method, layout: Layout, constants: Arrays) -> Method:
     return method._replace(field=layout.over(method.field), project=project, halt=halt)
 
 
-def _value(method: Method, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
+def _forward(
+    record: bool, method: Method, layout: Layout, constants: Arrays, each: Arrays
+) -> Arrays:
+    """The states between and the end, with the `record` if asked for."""
     method, run = _over_bodies(method, layout, constants), Run(*each)
-    if run.between.shape[0]:
-        between, end, _ = adaptive_loop.recording(method, constants, run)
-        return [between, *end]
+    if record or run.between.shape[0]:
+        between, end, kept = adaptive_loop.recording(method, constants, run)
+        return [between, *end, *kept] if record else [between, *end]
     return [run.y0[None][:0], *adaptive_loop.value(method, constants, run)]
-
-
-def _recorded(method: Method, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
-    method = _over_bodies(method, layout, constants)
-    between, end, record = adaptive_loop.recording(method, constants, Run(*each))
-    return [between, *end, *record]
 
 
 # Which of the constants and which numbers of a run have tangents.

@@ -1,13 +1,11 @@
 """Adaptive steps, for one body or many, with the states at any times. Bodies are in the last axis.
 
 For saved states and derivatives the steps are recorded in segments: the start of each is kept, and
-the steps of the last one; derivatives run the others once more. The loop does not look at the times
-that are asked for. Its steps with such times in them are taken once more: many of one body side by
-side, or one of each of many bodies.
+the steps of the last one; derivatives run the others once more. Steps with saved times in them are
+taken once more after each segment.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -17,15 +15,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool
 
-from rigidjax.solve.batching import Arrays
-from rigidjax.solve.components import lift
+from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, nested, stages, weights
 from rigidjax.solve.tableaus import Tableau
 
 # diffrax inherits it from optimistix, where type checkers do not follow.
 NONFINITE: Any = dfx.RESULTS.nonfinite
 
-# The defaults of diffrax.PIDController: the same steps, so that figures can be compared.
+# The defaults of diffrax.PIDController.
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 
 # Steps in a segment, rejected ones included.
@@ -121,10 +118,7 @@ class Segment(NamedTuple):
 
 
 def times_of(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
-    """Start, length and end of the steps of rows (4 + n, *bodies).
-
-    The start moves with the stop before it, the length of a step that ends on a stop with both.
-    """
+    """Start, length and end of the steps of rows (4 + n, *bodies); they move with the stops."""
     t, h, kind, stop = lax.stop_gradient(rows[:HEAD])
     stop, last = stop.astype(jnp.int32), kind == LAST
     begun = at(jnp.concatenate([run.t0[None], run.stops]), stop)
@@ -141,7 +135,7 @@ def at(a: Array, index: Array) -> Array:
     if count == 1:
         return jnp.broadcast_to(a[0], index.shape)
     index = jnp.clip(index, 0, count - 1)
-    # It is quicker to add up so few rows than to look for one, also in derivatives.
+    # Quicker than to look for one of so few rows, also in derivatives.
     if count <= 8:
         each = jnp.arange(count, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
         return jnp.sum(jnp.where(each == index[None], a, 0), 0)
@@ -182,8 +176,8 @@ def controlled(
 ) -> tuple[Array, Array]:
     """Whether a step is accepted, and the next one: 0 where none is left to try, NaN after a NaN.
 
-    `norm` as of `tried`; `kept` what the controller had wanted before a step was cut short as the
-    `last` before a stop; `length` of the run, whose round-off counts where that of `t` vanishes.
+    `norm` as of `tried`; `kept` the step wanted before it was cut short as the `last` before a
+    stop; `length` of the run, whose round-off counts where that of `t` vanishes.
     """
     norm, h, kept = lax.stop_gradient((norm, h, kept))
     good = norm < 1
@@ -242,7 +236,7 @@ def first_step(method: Method, constants: Arrays, run: Run) -> tuple[Array, Arra
 
 
 def value(method: Method, constants: Arrays, run: Run) -> LoopState:
-    """The end of a run without states between."""
+    """The end of a run whose states between are not asked for."""
     return lax.while_loop(
         lambda loop: jnp.any(going(method, run, loop, None)),
         lambda loop: _attempt(method, constants, run, loop, None)[0],
@@ -284,9 +278,10 @@ def start(method: Method, constants: Arrays, run: Run) -> LoopState:
     sound = jnp.all(jnp.isfinite(f0) & jnp.isfinite(y0), 0)
     sound = sound & jnp.isfinite(t0) & jnp.isfinite(run.stops[-1])
     h = jnp.where(sound, jnp.where(jnp.isnan(run.h0), h, run.h0), jnp.nan)
-    h = lax.stop_gradient(_unless_halted(method, t0, y0, h))
+    if method.halt is not None:
+        h = jnp.where(method.halt(t0, y0), HALTED, h)
     zero = jnp.zeros(t0.shape, jnp.int32)
-    return LoopState(y0, t0, h, zero, zero, zero)
+    return LoopState(y0, t0, lax.stop_gradient(h), zero, zero, zero)
 
 
 def going(method: Method, run: Run, loop: LoopState, until: Array | None) -> Array:
@@ -319,8 +314,8 @@ def _attempt(
     good, following = controlled(norm, method.tableau.order, loop.t, h, own, last, length)
     accept = moving & good
     following = jnp.where(moving, following, own)
-    if until is None:
-        following = jnp.where(accept, _unless_halted(method, late, y, following), following)
+    if until is None and method.halt is not None:
+        following = jnp.where(accept & method.halt(late, y), HALTED, following)
     reached = accept & last & ~cut
     after = LoopState(
         y=jnp.where(lift(accept, y), y, loop.y),
@@ -335,24 +330,16 @@ def _attempt(
     return after, jnp.concatenate([jnp.stack(head), loop.y])
 
 
-def _unless_halted(method: Method, t: Array, y: Array, h: Array) -> Array:
-    if method.halt is None:
-        return h
-    return jnp.where(method.halt(t, y), jnp.full_like(h, HALTED), h)
-
-
 def recorded(
     method: Method, constants: Arrays, run: Run, loop: LoopState, rows: Rows, until: Any
 ) -> tuple[LoopState, Rows, Array]:
     """The loop from here until the rows are full; and the number of rows."""
     many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))
-
     room = rows.shape[0] - (_MORE if until is None else 0) - _MOST
-    none = jnp.zeros((), jnp.int32)
 
-    def more(most: int, state: Any) -> Array:
-        loop, _, count = state
-        return jnp.any(going(method, run, loop, until)) & (count < most)
+    def filled(body: Callable[..., Any], loop: LoopState, rows: Rows, most: int) -> Any:
+        on = lambda state: jnp.any(going(method, run, state[0], until)) & (state[2] < most)  # noqa: E731
+        return lax.while_loop(on, body, (loop, rows, jnp.zeros((), jnp.int32)))
 
     def attempt(state: Any) -> Any:
         loop, few, k = state
@@ -361,11 +348,10 @@ def recorded(
 
     def block(state: Any) -> Any:
         loop, rows, count = state
-        few = jnp.zeros((many, *rows.shape[1:]), rows.dtype)
-        loop, few, k = lax.while_loop(partial(more, many), attempt, (loop, few, none))
+        loop, few, k = filled(attempt, loop, jnp.zeros((many, *rows.shape[1:]), rows.dtype), many)
         return loop, lax.dynamic_update_slice_in_dim(rows, few, count, 0), count + k
 
-    return lax.while_loop(partial(more, room), block, (loop, rows, none))
+    return filled(block, loop, rows, room)
 
 
 def segment(rows: Rows, end: Array, count: Array) -> Segment:
@@ -379,7 +365,7 @@ def saved(method: Method, constants: Arrays, run: Run, part: Segment, ys: Array)
     """`ys` (K, n, *bodies) with the states in a part of a run."""
     size, many = run.between.shape[0], run.t0.ndim > 0
     width = 1 if many else min(size, _TOGETHER)
-    # All at once: in a loop each search would be many small kernels.
+    # All at once: in a loop each would be many small kernels.
     ts = lax.stop_gradient(run.between)
     search = per_body(run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1)
     index = search(part.times, ts)
@@ -424,10 +410,9 @@ def per_body(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
-    """The state at a time `t` (*bodies) in a step."""
     theta = ((t - step.t) / jnp.where(step.h == 0, 1, step.h)).astype(slopes.dtype)
     # Weights of the slopes are one number a stage; the rows F_r would be n.
-    rows = weights(method.tableau, slopes.dtype, slopes.shape[1]).dense
+    rows = weights(method.tableau, slopes.dtype).dense
     shares = nested(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
     rise = jnp.sum(shares[None] * slopes, 1)
     return method.project(step.y + lift(step.h.astype(rise.dtype), rise) * rise)

@@ -1,9 +1,8 @@
 """A second pass over a recorded run: for tangents and cotangents.
 
-The derivative is that of the steps taken, with fixed lengths, except that steps cut short at a stop
-follow it, as in `diffrax.RecursiveCheckpointAdjoint`. All segments but the last are run once more;
-they may take other steps between the same two ends if another program rounds differently: the
-derivative is then that of these steps, the same to the tolerance.
+The derivative is that of the steps taken, with fixed lengths; steps cut short at a stop follow it.
+All segments but the last are run once more. If another program rounds differently they may take
+other steps between the same ends: the derivative is then that of these, the same to the tolerance.
 """
 
 from functools import partial
@@ -31,8 +30,7 @@ from rigidjax.solve.adaptive_loop import (
     times_of,
     unpacked,
 )  # fmt: skip
-from rigidjax.solve.batching import Arrays
-from rigidjax.solve.components import lift
+from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Step, stages
 
 
@@ -49,8 +47,8 @@ def of_saved(
 ) -> tuple[Array | None, Step, Array]:  # fmt: skip
     """The transpose of the states at the times in a step, from number `first` to before `last`.
 
-    **Returns** `between`, if it is not `None`, with the cotangents of the times added, and those of
-    the step and its slopes. `bars` (K, n, *bodies) of all states.
+    `bars` (K, n, *bodies) are the cotangents of all states. **Returns** `between`, if it is not
+    `None`, with the cotangents of the times added, and those of the step and its slopes.
     """
     state_at, most = partial(state_in_step, method), run.between.shape[0] - 1
     pick = per_body(run, lambda a, index: a[index])
@@ -74,10 +72,7 @@ def of_saved(
 def replayed(
     method: Method, constants: Arrays, run: Run, record: Record
 ) -> tuple[Array, Array, Array, Array]:
-    """States between and at the end, starts and rows by the steps of the record, which are held.
-
-    A loop that takes its own steps again could take others, and its rows would not be these.
-    """
+    """States between and at the end, starts, rows, by the steps of the record, which are held."""
     head = record.starts.shape[1] - run.y0.shape[0]
 
     def one(i: Array, state: tuple[Array, Array, Array, Array]) -> Any:
@@ -111,8 +106,7 @@ def cotangents(
 ) -> tuple[Arrays, Run]:
     """The transpose of the tangents of `replayed`: cotangents of the constants and of the run.
 
-    `bars` are the cotangents of the states at the saved times and at the end. Times have some only
-    where `timed`.
+    `bars` are those of the states between and at the end. Times have some only where `timed`.
     """
     number, size = jnp.max(record.number), run.between.shape[0]
 

@@ -5,21 +5,22 @@ first, which is many times slower in a loop over small states; `custom_vmap` mov
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array
 
 Arrays = list[Any]
 
-# Bodies that go through a loop together on CPU: few, so that one step's numbers stay in the first
-# cache and no body waits long for another.
+# Bodies that go through a loop together on CPU: few, so that their numbers stay in the first cache.
 BLOCK = 16
 
 
 class Layout(NamedTuple):
-    """The axes of a program's arrays beyond those of one body."""
+    """The axes of a program's arrays beyond one body's."""
 
     bodies: bool  # a last axis
     shared: tuple[bool, ...]  # which constants have none all the same
@@ -44,10 +45,7 @@ def in_lanes(
     """
     was = Layout(False, (True,) * len(constants)) if layout is None else layout
     number = len(constants)
-
-    @jax.custom_batching.custom_vmap
-    def call(*args: Any) -> Arrays:
-        return _in_blocks(program, was, list(args[:number]), list(args[number:]))
+    call: Any = jax.custom_batching.custom_vmap(partial(_in_blocks, program, was, number))
 
     @call.def_vmap
     def _(size: int, batched: Any, *args: Any) -> Any:
@@ -92,7 +90,9 @@ def in_lanes(
     return call(*constants, *each)
 
 
-def _in_blocks(program: Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
+def _in_blocks(program: Program, layout: Layout, number: int, *args: Any) -> Arrays:
+    """A program of `number` constants and of bodies, so many of them at a time."""
+    constants, each = list(args[:number]), list(args[number:])
     count = each[0].shape[-1] if layout.bodies else 1
     if jax.default_backend() != "cpu" or count <= BLOCK:
         return program(layout, constants, each)
@@ -117,3 +117,8 @@ def _in_blocks(program: Program, layout: Layout, constants: Arrays, each: Arrays
         return a.reshape(*a.shape[:-2], number * size)[..., :count]
 
     return [joined(a) for a in lax.map(block, (own, [cut(a) for a in each]))]
+
+
+def lift(a: Array, like: Array) -> Array:
+    """`a` with leading axes of length 1, as many axes as `like`: last axes are those they share."""
+    return a.reshape((1,) * (like.ndim - a.ndim) + a.shape)

@@ -1,11 +1,10 @@
-"""A state as a tuple of scalars, or as one vector, and back.
+"""A state as a tuple of scalars, and back.
 
 XLA on CPU runs a loop over a tuple of scalars as one kernel and, batched, over a tuple of (N,)
 arrays in vector instructions. A loop over (7,) or (N, 7) arrays becomes many small kernels.
 """
 
 import math
-from itertools import accumulate
 from typing import Any
 
 import jax
@@ -45,36 +44,3 @@ def join(parts: Atoms, like: Any) -> Any:
         else:
             out.append(leaf)
     return jax.tree.unflatten(structure, out)
-
-
-def leaf_sizes(like: Any) -> list[int]:
-    """The number of numbers in each array."""
-    return [math.prod(jnp.shape(leaf)) for leaf in jax.tree.leaves(like)]
-
-
-def one_dtype(tree: Any, name: str, advice: str = "") -> Any:
-    """The dtype of all arrays of a tree, or `TypeError`."""
-    kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(tree)}
-    if len(kinds) != 1:
-        found = ", ".join(sorted(map(str, kinds)))
-        raise TypeError(f"{name}: wanted arrays of one dtype, got {found}{advice}")
-    return kinds.pop()
-
-
-def flat(tree: Any) -> Array:
-    """The numbers of a tree of arrays of one dtype as a vector."""
-    one_dtype(tree, "state", "; convert its arrays to one, or use a solver of diffrax")
-    return jnp.concatenate([jnp.reshape(leaf, -1) for leaf in jax.tree.leaves(tree)])
-
-
-def unflat(vector: Array, like: Any) -> Any:
-    """The tree shaped as `like` whose numbers are those of `vector`."""
-    leaves, tree = jax.tree.flatten(like)
-    pieces = jnp.split(vector, list(accumulate(leaf_sizes(like)))[:-1])
-    shaped = [piece.reshape(jnp.shape(a)) for piece, a in zip(pieces, leaves, strict=True)]
-    return jax.tree.unflatten(tree, shaped)
-
-
-def lift(a: Array, like: Array) -> Array:
-    """`a` with leading axes of length 1, as many axes as `like`: last axes are those they share."""
-    return a.reshape((1,) * (like.ndim - a.ndim) + a.shape)

@@ -1,12 +1,9 @@
-"""The zeros of a function along the motion: steps, and Newton's method within a step.
+"""The zeros of a function along the motion, by steps and Newton's method within them.
 
-A pass through the loop is one step of the method from the present state: an attempt at the next
-step, or a part of it, up to the trial time of the crossing. A crossing is therefore as accurate as
-a step. The next step starts at the crossing. The step is taken again, up to the extremum of g, in
-two cases: the cubic through both ends, with their slopes, has more zeros than their signs show; or
-g turns back before zero and the tangents at both ends do not exclude a zero.
-
-Nothing here is differentiated.
+A pass through the loop attempts the next step, or a part of it up to the trial time of a crossing,
+which is therefore as accurate as a step. A step is taken again, up to the extremum of g, if the
+cubic through both ends, with their slopes, has more zeros than their signs show, or if g turns back
+before zero and the tangents at both ends do not exclude a zero.
 """
 
 from collections.abc import Callable
@@ -18,7 +15,7 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.solve.adaptive_loop import Run, at, controlled
-from rigidjax.solve.components import lift
+from rigidjax.solve.batching import lift
 from rigidjax.solve.runge_kutta import Step
 
 # Newton's guesses in a step, from then on halves; and how often a step is taken again for a turn.

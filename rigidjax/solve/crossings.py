@@ -1,19 +1,15 @@
 """Times at which a motion meets a condition: the event that ends a run, and section crossings.
 
-Crossings are found without derivatives, then corrected with them. A crossing at t* of
-g(t, y(t)) = 0 moves with every number of the scene. The motion is run again to the times found,
-which are held fixed. The rest of g there and its rates ġ and g̈ along the motion give the time and
-the state by one step of Chebyshev's method,
+Crossings are found without derivatives. For these the motion is run again to the times found, which
+are held fixed. The rest of g there and its rates ġ and g̈ along the motion give time and state by
+one step of Chebyshev's method, whose first and second derivatives are those of the crossing:
 
     τ = −(g/ġ)(1 + ½ g g̈/ġ²),   y = y* + f τ + ½ (df/dt) τ².
 
-τ is zero but for the error of dense output, and its first and second derivatives are those of the
-crossing (the error is of third order in what moves). At a touch, ġ = 0, there is none.
-
-A zero of round-off, of what the motion conserves or of a component that stays at zero, is none. Its
-ġ is not more than round-off makes of it, which is some ε (|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ), times the root
-of the number of steps. The size rᵢ of the terms of ẏᵢ is the length of the array of the state that
-i belongs to, taken of ẏ and of the change of ẏ where each y changes by the length of its array.
+A zero of round-off, of what the motion conserves or of a component that stays at zero, does not
+count. Its ġ is at most some ε (|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ), times the root of the number of steps. The
+size rᵢ of the terms of ẏᵢ is the length of the array of the state that i belongs to, taken of ẏ and
+of the change of ẏ where each y changes by the length of its array.
 """
 
 from collections.abc import Callable
@@ -26,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
@@ -38,13 +35,12 @@ from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.base import jumps_of, lacking
 from rigidjax.solve import crossing_loop, validation
-from rigidjax.solve.adaptive import adaptive, taken_out
+from rigidjax.solve.adaptive import taken_out
 from rigidjax.solve.adaptive_loop import Method, Run, first_step, of_body, outcome, tried
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
-from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.crossing_loop import Located, Motion, Search
 from rigidjax.solve.explicit import AbstractExplicit, explicit
-from rigidjax.solve.linear_map import nan_derivatives, no_tangent
+from rigidjax.solve.linear_map import as_known, nan_derivatives
 from rigidjax.solve.run import (
     Free,
     Loop,
@@ -158,13 +154,12 @@ def crossings(
       zeros in one step are found if the cubic through its ends, with their slopes, shows them.
     - `solver`: `None` is the closed form for a free body, else `rigidjax.solvers.DormandPrince8`;
       or an explicit method of `rigidjax.solvers`. `rtol`, `atol` as for `simulate`; a crossing is
-      as accurate as a step, that of a free body to round-off.
-    - `max_steps`: parts of steps included.
+      as accurate as a step, that of a free body to round-off. `max_steps` with parts of steps.
 
-    A start on the section does not count, and a tangential contact may be missed. A condition that
-    is always zero to round-off, such as an energy minus its value, has no crossing: a zero counts
-    if the condition goes through it 16 times as fast as round-off could make it (under a solver,
-    times the root of the number of steps). For many bodies use `jax.vmap`.
+    A start on the section does not count, and a tangential contact may be missed. A zero counts if
+    the condition goes through it 16 times as fast as round-off could make it (under a solver, times
+    the root of the number of steps): an energy minus its value has none. For many bodies use
+    `jax.vmap`.
 
     **Returns** a `Crossings`. Times and states have first and second derivatives with respect to
     all numbers of the scene, of `condition` and of `state0`, forward and reverse; near a tangential
@@ -201,7 +196,7 @@ def crossings(
 
 
 def ready(event: Event, body: Any, state0: Any, torque: Any, t: Array) -> Any:
-    """`state0` with the states of the torque, unless the condition is no number there: an error."""
+    """`state0` with the states of the torque; an error if the condition is no number there."""
     state0 = started(body, state0, torque, t)
     try:
         eqx.filter_eval_shape(value, event, body, t, state0)
@@ -235,7 +230,6 @@ def solve_until(
     setup: Free | Loop, event: Event, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
     """As `solve`, up to the event; and the event's time and state, NaN if there is none."""
-    # The run is done twice: to find the event, and up to it, with derivatives.
     state0 = on_the_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
     steps = setup.max_steps if isinstance(setup, Loop) else 1_000_000
@@ -245,7 +239,7 @@ def solve_until(
     before = ~(crossed.time(ts) > crossed.time(end))
     short = jnp.concatenate([jnp.where(before, ts, end), jnp.where(met, end, ts[-1])[None]])
     ys, stats, result = solve(setup, state0, short)
-    y = flat(jax.tree.map(lambda leaf: leaf[-1], ys))
+    y = ravel_pytree(jax.tree.map(lambda leaf: leaf[-1], ys))[0]
     s, y = correction(crossed, numbers[0], crossed.time(end), y, met)
     met = met & (result == dfx.RESULTS.successful)
 
@@ -255,7 +249,7 @@ def solve_until(
 
     time, y = (jnp.where(met, leaf, jnp.nan) for leaf in (crossed.time(s), y))
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
-    out = (jax.tree.map(rows, ys), time, unflat(y, state0))
+    out = (jax.tree.map(rows, ys), time, crossed.tree(y))
     ys, time, state = nan_derivatives(out, inputs)
     return ys, stats, dfx.RESULTS.where(met, dfx.RESULTS.event_occurred, result), time, state
 
@@ -266,23 +260,41 @@ def _solved(
 ) -> Crossings:
     state0 = on_the_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
-    what = Search(event.direction, many, max_steps)
-    answer: Any = jax.custom_jvp(partial(located, crossed, what))
-
-    @answer.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        found = located(crossed, what, *primals)
-        out, moved = jax.jvp(partial(_corrected, crossed, what, found), primals, tangents)
-        rest = [no_tangent(a) for a in found[2:]]
-        return Located(*out, *found[2:]), Located(*moved, *rest)  # pyright: ignore
-
-    found = answer(numbers)
-    states = jax.vmap(partial(unflat, like=state0))(found.states)
+    found = located(crossed, Search(event.direction, many, max_steps), numbers)
+    times, states = _as_found(found.times, found.states, setup, event, state0, ts)
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
-    times, states = nan_derivatives((crossed.time(found.times), states), inputs)
+    out = crossed.time(times), jax.vmap(crossed.tree)(states)
+    times, states = nan_derivatives(out, inputs)
     result = outcome(found.h, found.t, crossed.time(ts[-1]), found.number >= many)
     result = of_body(result, setup.body)
     return Crossings(times, states, found.number, result, found.steps)
+
+
+@eqx.filter_custom_jvp
+def _as_found(times: Array, states: Array, *scene: Any) -> tuple[Array, Array]:
+    """The crossings of a `scene`: only derivatives run it once more."""
+    return times, states
+
+
+@_as_found.def_jvp
+def _(primals: Any, tangents: Any) -> Any:
+    found, scene = primals[:2], primals[2:]
+    moved, along = eqx.filter_jvp(partial(_corrected, found[0]), scene, tangents[2:])
+    return as_known(found, moved), along
+
+
+def _corrected(
+    times: Array, setup: Free | Loop, event: Event, state0: Any, ts: Array
+) -> tuple[Array, Array]:
+    """Times, in s, and states of the crossings found as functions of all numbers of the scene."""
+    crossed, (constants, *_) = section(setup, event, state0, ts)
+    there = jnp.isfinite(times)
+    last = jnp.max(jnp.where(there, times, lax.stop_gradient(crossed.time(ts[0]))))
+    s = jnp.where(there, times, last)
+    ys, *_ = solve(setup, state0, jnp.concatenate([ts[:1], crossed.time(s)]))
+    ys = jax.vmap(lambda y: ravel_pytree(y)[0])(ys)[1:]
+    times, states = jax.vmap(partial(correction, crossed, constants))(s, ys, there)
+    return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
 
 
 # Samples of a free body's condition in one turn at its largest rate.
@@ -297,11 +309,12 @@ class Section(NamedTuple):
     solver: AbstractExplicit | None  # None: the closed form
     motion: Callable[[Arrays, Array, Array], Array]  # dy/ds, or y itself in closed form
     rates: Callable[[Arrays, Array, Array], tuple[Array, Array, Array]]  # g, dg/ds, dy/ds
-    like: Any
+    tree: Callable[[Array], Any]  # the state of a vector
+    sizes: list[int]  # of the arrays of the state
     sign: Array
 
     def project(self, y: Array) -> Array:
-        return flat(on_the_group(unflat(y, self.like)))
+        return ravel_pytree(on_the_group(self.tree(y)))[0]
 
     def time(self, s: Array) -> Array:
         """Time t at s, and the other way."""
@@ -315,7 +328,7 @@ Numbers = tuple[Arrays, Run, Array]
 def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[Section, Numbers]:
     """The section between `ts[0]` and `ts[-1]`, and what it is made of."""
     condition: Any = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
-    y0, dtype = flat(state0), ts.dtype
+    (y0, tree), dtype = ravel_pytree(state0), ts.dtype
     sign = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
     way = setup.sign if isinstance(setup, Loop) else sign
     jumps = jumps_of(setup.torque).astype(dtype)
@@ -326,11 +339,11 @@ def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[S
         longest = lax.stop_gradient(jnp.asarray(event.max_step, dtype))
 
     def slope(s: Array, y: Array) -> Array:
-        return flat(field(s, unflat(y, state0), None))
+        return ravel_pytree(field(s, tree(y), None))[0]
 
     def rates(s: Array, y: Array) -> tuple[Array, Array, Array]:
         there = slope(s, y)
-        of_y = lambda s, y: condition(s, unflat(y, state0))  # noqa: E731
+        of_y = lambda s, y: condition(s, tree(y))  # noqa: E731
         return *jax.jvp(of_y, (s, y), (jnp.ones_like(s), there)), there
 
     if isinstance(setup, Loop):
@@ -339,18 +352,19 @@ def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[S
         h0 = jnp.asarray(jnp.nan if setup.dt0 is None else setup.dt0, dtype)
     else:
         solver, free = None, FreeMotion(setup.body, state0)
-        motion = lambda s, _: flat(free(sign.astype(s.dtype) * s - ts[0]))  # noqa: E731
+        motion = lambda s, _: ravel_pytree(free(sign.astype(s.dtype) * s - ts[0]))[0]  # noqa: E731
         longest = jnp.minimum(longest, _spacing(setup.body, state0, whole))
         rtol, atol, h0 = jnp.zeros((), y0.dtype), jnp.zeros((), y0.dtype), longest
     (of_motion, of_rates), constants, _ = taken_out([motion, rates], along[0], y0)
     stops = jnp.concatenate([jnp.clip(jnp.sort(jumps), along[0], along[1]), along[1:]])
-    crossed = Section(solver, of_motion, of_rates, state0, sign)
+    sizes = [leaf.size for leaf in jax.tree.leaves(state0)]
+    crossed = Section(solver, of_motion, of_rates, tree, sizes, sign)
     run = Run(along[0], stops, stops[:0], y0, rtol, atol, h0)
     return crossed, (constants, run, longest)
 
 
 def _spacing(body: Any, state0: Any, whole: Array) -> Array:
-    """A part of the time of one turn at the largest rate that energy and momentum allow."""
+    """A part of one turn at the largest rate that energy and momentum allow."""
     inertia = body if isinstance(body, Inertia) else body.inertia
     tensor, omega = lax.stop_gradient((inertia.tensor, state0.omega))
     momentum = jnp.sum(tensor * omega[None], axis=1)
@@ -383,7 +397,7 @@ def _located(
     order, still = 1, jnp.zeros_like(run.rtol)
     attempt: Any = lambda step: (motion(constants, step.end, step.y), still)  # noqa: E731
     if solver is not None:
-        method = Method(solver.tableau, motion, project, None, leaf_sizes(section.like), 0)
+        method = Method(solver.tableau, motion, project, None, section.sizes, 0)
         h0, _ = first_step(method, constants, run)
         h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), longest)
         run = run._replace(h0=h0)
@@ -392,63 +406,36 @@ def _located(
     return list(crossing_loop.locate(moving, what, run))
 
 
-def _lengths(like: Any, a: Array) -> Array:
+def _lengths(sizes: list[int], a: Array) -> Array:
     """The length of the array of a state that each number belongs to."""
-    which = np.repeat(np.arange(len(leaf_sizes(like))), leaf_sizes(like))
+    which = np.repeat(np.arange(len(sizes)), sizes)
     same = jnp.asarray(which[:, None] == which[None], a.dtype)
     return jnp.sqrt(jnp.sum(same * (a * a)[None], 1))
 
 
-def _push(like: Any, y: Array) -> Array:
+def _push(sizes: list[int], y: Array) -> Array:
     """A change of each number by the length of its array, in a direction along no body's axis."""
-    return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _lengths(like, y)
+    return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _lengths(sizes, y)
 
 
 def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Array, ...]:
     """g, dg/ds, dy/ds, and what g may be by round-off."""
     of_g = lambda s, y: section.rates(constants, s, y)[0]  # noqa: E731
-    noise = jax.jvp(of_g, (s, y), (s, _push(section.like, y)))[1]
+    noise = jax.jvp(of_g, (s, y), (s, _push(section.sizes, y)))[1]
     blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)
     g, rate, slope = section.rates(constants, s, y)
     return jnp.asarray(g), jnp.asarray(rate), slope, blur
 
 
 def _clear(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
-    """The ratio of the rate of g through zero to its round-off."""
-    rates, like = partial(section.rates, constants, s), section.like
+    """The rate of g through zero over its round-off."""
+    rates, sizes = partial(section.rates, constants, s), section.sizes
     _, rate, slope = rates(y)
-    shift = jax.jvp(lambda y: rates(y)[2], (y,), (_push(like, y),))[1]
+    shift = jax.jvp(lambda y: rates(y)[2], (y,), (_push(sizes, y),))[1]
     by_s, by_y = jax.jacfwd(lambda s, y: section.rates(constants, s, y)[0], (0, 1))(s, y)
-    sizes = _lengths(like, slope) + _lengths(like, shift)
-    terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * sizes)
+    lengths = _lengths(sizes, slope) + _lengths(sizes, shift)
+    terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * lengths)
     return jnp.abs(rate) / (jnp.finfo(y.dtype).eps * terms)
-
-
-def _corrected(
-    section: Section, what: Search, found: Located, numbers: Numbers
-) -> tuple[Array, Array]:
-    """The times and states found as functions of all numbers."""
-    constants, run, _ = numbers
-    there = jnp.arange(what.many, dtype=jnp.int32) < found.number
-    last = jnp.max(jnp.where(there, found.times, lax.stop_gradient(run.t0)))
-    ts = lax.stop_gradient(jnp.where(there, found.times, last))
-    if section.solver is None:
-        ys = jax.vmap(lambda s: section.motion(constants, s, run.y0))(ts)
-    else:
-        field = lambda s, y, args: unflat(  # noqa: E731
-            section.motion(constants, s, flat(y)), section.like
-        )
-        rtol, atol, h0 = lax.stop_gradient((run.rtol, run.atol, run.h0))
-        out = adaptive(
-            section.solver, field, jnp.concatenate([run.t0[None], ts]),
-            unflat(run.y0, section.like), rtol=rtol, atol=atol, dt0=h0, max_steps=what.max_steps,
-            jumps=run.stops[:-1],
-        )  # fmt: skip
-        ys = jax.vmap(flat)(out.ys)[1:]
-    moved = jax.vmap(partial(correction, section, constants))(ts, ys, there)
-    known = ts, lax.stop_gradient(found.states)
-    times, states = (a + (b - lax.stop_gradient(b)) for a, b in zip(known, moved, strict=True))
-    return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
 
 
 def correction(

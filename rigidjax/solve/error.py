@@ -1,9 +1,8 @@
 """How far a run is from the exact motion of its numbers: a second run and three neighbours say.
 
 The error of the *steps* is the distance to a run at a fiftieth of the tolerance, or of equal steps
-half as long. Below round-off two runs agree by luck; so the part of *round-off* is how far runs lie
-apart whose numbers differ by a unit in the last digit: these round differently at every step, and
-what they differ by has grown as a rounding error grows. Nothing about the motion is assumed.
+half as long. The part of *round-off* is how far runs lie apart whose numbers differ by a unit in
+the last digit: these round differently, and their differences grow as rounding errors do.
 """
 
 import dataclasses
@@ -24,6 +23,7 @@ from rigidjax import _checks, _show
 from rigidjax._types import ScalarLike
 from rigidjax.motion.manifold import minus, names, parts
 from rigidjax.solve import validation
+from rigidjax.solve.linear_map import as_known
 from rigidjax.solve.run import Free, Loop, Setup, solve
 
 # Order 8 makes that 1.6 times the steps.
@@ -38,11 +38,10 @@ _LOOSE = 1.5e-8
 _LOST = 0.5
 # The size below which a number does not matter, as the defaults of `rtol` and `atol` have it.
 _SMALL = 1e-3
-# Where steps leave so many times what rounding adds up to without any growth, at a tolerance so
-# far above a rounding, they do so with growth, too: both are local errors that grow alike.
-_ABOVE, _COARSE = 300.0, 1e5
-# The same for a function, of whose steps nothing is known.
-_PLAIN = 1e6
+# Local errors and roundings grow alike. Round-off does not count where steps leave so many times
+# what roundings add up to without growth (of a function: nothing is known of its steps), at a
+# tolerance so far above a rounding.
+_ABOVE, _PLAIN, _COARSE = 300.0, 1e6, 1e5
 # A search for a tolerance decreases it by so much at a time, and aims at so small a part of the
 # accuracy: errors follow the tolerance to a factor of eight. One above 0.1 rad does not.
 _FARTHEST, _AIM, _ALLOWED, _FORESEEN, _FEW = 1e-3, 20.0, 8.0, 0.1, 8
@@ -176,10 +175,9 @@ def _with_round_off(
 
 
 def _cheaper(setup: Any, start: Any, ts: Array, ys: Any, count: Array) -> tuple[Any, Any, Any]:
-    """A set-up of fewer steps that shows what roundings grow to, its run, and what to multiply by.
+    """A set-up of fewer steps, its run, and what to multiply its round-off by.
 
-    Roundings grow alike at any tolerance; what n of them add up to grows as √n. In float32 there
-    are not many fewer steps to take.
+    Roundings grow alike at any tolerance; n of them add up to √n. float32 takes few steps anyway.
     """
     if not isinstance(setup, Loop) or ts.dtype == jnp.float32:
         return setup, ys, 1.0
@@ -214,12 +212,10 @@ def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
 
 @eqx.filter_jit
 def solve_to(loop: Loop, state0: Any, ts: Array, accuracy: Array) -> tuple[Loop, Any, Any]:
-    """A run that ends with a global error of `accuracy`, if there is one.
+    """A run with a global error of `accuracy`, if there is one.
 
     The error of each run is its distance to the next, and decreases as the tolerance does.
-
-    **Returns** the loop at the tolerance found; what `solve` gives with it; the tolerance of the
-    run before, and its states.
+    **Returns** the loop at its tolerance, its result, tolerance and states of the run before.
     """
     still = _still((loop, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
@@ -262,7 +258,8 @@ def _as_solved(loop: Loop, state0: Any, ts: Array, ys: Any) -> Any:
 @_as_solved.def_jvp
 def _(primals: Any, tangents: Any) -> Any:
     states = lambda *args: solve(*args)[0]  # noqa: E731
-    return primals[3], eqx.filter_jvp(states, primals[:3], tangents[:3])[1]
+    ys, along = eqx.filter_jvp(states, primals[:3], tangents[:3])
+    return as_known(primals[3], ys), along
 
 
 def _at(loop: Loop, rtol: Any) -> Loop:
@@ -275,7 +272,7 @@ def _cuts(ts: Array) -> Array:
 
 
 def _closer(setup: Any, ts: Array) -> tuple[Any, Any, float]:
-    """The set-up of a closer run, the tolerance of the given one, and their distance's factor."""
+    """The set-up of a closer run, the tolerance of the given one, the factor of their distance."""
     eps = float(jnp.finfo(ts.dtype).eps)
     most = None if setup.max_steps is None else 4 * setup.max_steps
     if isinstance(setup, Loop):
@@ -284,28 +281,21 @@ def _closer(setup: Any, ts: Array) -> tuple[Any, Any, float]:
         atol = setup.atol * (less / rtol)
         new = dict(rtol=less, atol=atol, cuts=_cuts(ts), max_steps=most, throw=False)
         return dataclasses.replace(setup, **new), rtol, 1.0
-    found: list[Any] = []
-
-    def tighter(node: Any) -> Any:
-        if isinstance(node, dfx.PIDController):
-            found.append(node.rtol)
-            less = jnp.maximum(_CLOSER * node.rtol, _DEEPEST * eps)
-            atol = node.atol * (less / node.rtol)
-            return eqx.tree_at(lambda c: (c.rtol, c.atol), node, (less, atol))
-        return node
-
+    setup = dataclasses.replace(setup, max_steps=most, throw=False)
     pid = lambda node: isinstance(node, dfx.PIDController)  # noqa: E731
-    controller = jax.tree.map(tighter, setup.controller, is_leaf=pid)
-    new = dict(controller=controller, max_steps=most, throw=False)
-    if found:
-        return dataclasses.replace(setup, **new), jnp.asarray(found[0], ts.dtype), 1.0
+    inside: Any = lambda c: [n for n in jax.tree.leaves(c, is_leaf=pid) if pid(n)]  # noqa: E731
+    if found := inside(setup.controller):
+        less = jnp.maximum(_CLOSER * found[0].rtol, _DEEPEST * eps)
+        both = less, found[0].atol * (less / found[0].rtol)
+        where = lambda s: (inside(s.controller)[0].rtol, inside(s.controller)[0].atol)  # noqa: E731
+        return eqx.tree_at(where, setup, both), jnp.asarray(found[0].rtol, ts.dtype), 1.0
     if not isinstance(setup.controller, dfx.ConstantStepSize):
         raise TypeError(
             "error: a second run needs a diffrax.PIDController or ConstantStepSize, got "
             f"{type(setup.controller).__name__}"
         )
     # Of order 2; of a higher one it is a third too much at most.
-    return dataclasses.replace(setup, **new, dt0=0.5 * setup.dt0), jnp.zeros(()), 4 / 3
+    return dataclasses.replace(setup, dt0=0.5 * setup.dt0), jnp.zeros(()), 4 / 3
 
 
 class FunctionError(eqx.Module):
@@ -412,7 +402,7 @@ def error_of(
 
 
 def _spread(changes: Array) -> Array:
-    """The variance of runs that differ by so much from one more, which is among them."""
+    """The variance of runs that differ by so much from one more."""
     mean = jnp.sum(changes, 0, keepdims=True) / (_NEIGHBOURS + 1)
     return (jnp.sum((changes - mean) ** 2, 0) + mean[0] ** 2) / _NEIGHBOURS
 

@@ -7,11 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax.motion.equations import on_the_group
-from rigidjax.solve.components import flat, leaf_sizes, unflat
+from rigidjax.solve import validation
 from rigidjax.solve.runge_kutta import Step, dense_rows, error_estimate, nested, stages
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
 
@@ -59,19 +60,23 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> Any:
+        validation.one_dtype(y0, "state")
+        numbers, tree = ravel_pytree(y0)
+
         def field(_: Any, t: Any, y: Array) -> Array:
-            return flat(terms.vf(t, unflat(y, y0), args))
+            return ravel_pytree(terms.vf(t, tree(y), args))[0]
 
         h = jnp.asarray(terms.contr(t0, t1))
-        step = Step(jnp.asarray(t0), h, jnp.asarray(t1), flat(y0))
+        step = Step(jnp.asarray(t0), h, jnp.asarray(t1), numbers)
         there = stages(self.tableau, field, [], step)
         # Once, after the stages: inside them it changes the order (jaxsim#192).
-        y1 = on_the_group(unflat(there.end, y0))
+        y1 = on_the_group(tree(there.end))
         # Which steps are taken is no thing to differentiate: their error is below the tolerance.
-        error = error_estimate(self.tableau, leaf_sizes(y0), h, there.slopes)
+        sizes = [leaf.size for leaf in jax.tree.leaves(y0)]
+        error = lax.stop_gradient(error_estimate(self.tableau, sizes, h, there.slopes))
         rows = dense_rows(self.tableau, field, step, there.slopes)
-        dense = dict(y0=y0, coefficients=jax.vmap(lambda row: unflat(row, y0))(rows))
-        return y1, unflat(lax.stop_gradient(error), y0), dense, None, dfx.RESULTS.successful
+        dense = dict(y0=y0, coefficients=jax.vmap(tree)(rows))
+        return y1, tree(error), dense, None, dfx.RESULTS.successful
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)

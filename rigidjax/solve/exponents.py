@@ -17,7 +17,6 @@ from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.manifold import dimension, minus_small, plus
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
-from rigidjax.solve.components import flat
 from rigidjax.solve.explicit import AbstractExplicit, explicit
 
 # Neighbouring intervals are not independent: the error is that of the means of so many parts.
@@ -111,12 +110,12 @@ def lyapunov_exponents(
     many = size if number is None else _checks.whole(number, "number", 1)
     if many > size:
         raise ValueError(f"number: wanted at most {size}, one for each direction, got {many}")
-    start = flat(state0)
-    length = _checks.time(time, "time").astype(start.dtype)
+    dtype = validation.one_dtype(state0, "state0")
+    length = _checks.time(time, "time").astype(dtype)
     length = _checks.refuse(length, ~(length > 0), "time: wanted a positive time, s")
-    rtol, atol = validation.tolerances(rtol, atol, start.dtype)
+    rtol, atol = validation.tolerances(rtol, atol, dtype)
     solver = explicit(solver)
-    begin = _checks.time(t0, "t0").astype(start.dtype)
+    begin = _checks.time(t0, "t0").astype(dtype)
     shapes = eqx.filter_eval_shape(lambda t, y: field(t, y, None), begin, state0)
     wanted, found = (jax.tree.map(jnp.shape, tree) for tree in (state0, shapes))
     if jax.tree.structure(shapes) != jax.tree.structure(state0) or found != wanted:

@@ -70,10 +70,7 @@ def fixed(
 
 
 def first_rows(many: Any, one: Callable[..., Any], y: Any, rows: Any) -> Any:
-    """`rows` with the first `many` rows that `lax.scan` of `one(y, i)` stacks.
-
-    **Arguments:** `many` may be traced (no reverse mode); `one(y, i)` the next y and row i.
-    """
+    """`rows` with the first `many`, which may be traced, that `one(y, i) → (y, row)` gives."""
 
     def put(i: Array, now: tuple[Any, Any]) -> tuple[Any, Any]:
         y, row = one(now[0], i)
@@ -86,12 +83,10 @@ def first_rows(many: Any, one: Callable[..., Any], y: Any, rows: Any) -> Any:
 def step(
     stepper: AnyStepper, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None, before: int = 0
 ) -> Any:
-    """Step number `i` since `t0`; `inputs` by name (before + steps, …), of which this step has row
-    `before + i`: the first `before` rows are those before `t0`.
-    """
+    """Step number `i` since `t0`, which has row `before + i` of the `inputs` by name."""
 
     def at(i: Array) -> Array:
-        # Not t + h again and again: round-off would add up (a million steps, 1e-3 in float32).
+        # Adding h again and again would add up round-off (in a million steps 1e-3 in float32).
         return t0 + i.astype(h.dtype) * h
 
     now = jax.tree.map(lambda a: _row(a, before + i), inputs)
@@ -115,11 +110,7 @@ def step(
 def delayed_rows(
     delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: Any, before: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """The place in step `i` where each delayed input changes (m,), from 0 to 1, and its values on
-    both sides.
-
-    Beyond the rows that there are the first, or the last, holds.
-    """
+    """The place in step `i`, from 0 to 1, where each delayed input changes (m,); its two values."""
     parts, early, late = [], [], []
     for name, delay in delays:
         steps = delay.astype(h.dtype) / h

@@ -11,8 +11,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax import lax
 from jax.core import ShapedArray
+from jax.custom_derivatives import zero_from_primal
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
@@ -36,19 +37,21 @@ def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) 
     return _linear_map.bind(*given, *tangents, function=function, transposed=transposed, **how)
 
 
+def as_known(known: Any, moved: Any) -> Any:
+    """The numbers `known` with the derivatives, of every order, of the same computed anew."""
+    return jax.tree.map(lambda a, b: a + (b - lax.stop_gradient(b)), known, moved)
+
+
 def nan_derivatives(tree: Any, inputs: Any) -> Any:
     """The same numbers; one that is not finite has NaN derivatives by `inputs`, in both modes.
 
     A state that a run did not reach is NaN by a `where`, whose derivative is 0: a wrong one. A
     number that is not used has the cotangent 0 and leaves the gradient of the others as it is.
     """
-    outs, structure = jax.tree.flatten(tree)
-    whole = [is_smooth(a) for a in outs]
-    smooth = [a for a, w in zip(outs, whole, strict=True) if w]
-    anchors = [a for a in jax.tree.leaves(inputs) if eqx.is_inexact_array(a)]
-    told = iter(_with_nan(len(smooth), *smooth, *anchors))
-    outs = [next(told) if w else a for a, w in zip(outs, whole, strict=True)]
-    return jax.tree.unflatten(structure, outs)
+    smooth, rest = eqx.partition(tree, eqx.is_inexact_array)
+    outs, structure = jax.tree.flatten(smooth)
+    anchors = jax.tree.leaves(eqx.filter(inputs, eqx.is_inexact_array))
+    return eqx.combine(structure.unflatten(_with_nan(len(outs), *outs, *anchors)), rest)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -59,33 +62,19 @@ def _with_nan(count: int, *numbers: Array) -> Arrays:
 @_with_nan.defjvp
 def _(count: int, primals: Any, tangents: Any) -> Any:
     outs = list(primals[:count])
-    there = [jnp.isfinite(a) for a in outs]
-    # What the transpose has to know of the inputs is their shapes.
-    given = [*there, *[jnp.zeros_like(a) for a in primals[count:]]]
 
     def along(*args: Array) -> Arrays:
-        moved = args[len(given) : len(given) + count]
+        moved = args[count : 2 * count]
         return [jnp.where(t, m, jnp.nan) for t, m in zip(args[:count], moved, strict=True)]
 
     def back(*args: Array) -> Arrays:
-        there, inputs, bars = args[:count], args[count : len(given)], args[len(given) :]
-        bad = jnp.asarray(False)
-        for t, bar in zip(there, bars, strict=True):
-            bad = bad | jnp.any(~t & (bar != 0))
+        there, bars = args[:count], args[count:]
         kept = [jnp.where(t, bar, 0) for t, bar in zip(there, bars, strict=True)]
-        return [*kept, *[jnp.where(bad, jnp.full_like(a, jnp.nan), a) for a in inputs]]
+        bad = [jnp.any(~t & (bar != 0)) for t, bar in zip(there, bars, strict=True)]
+        lost = jnp.where(jnp.any(jnp.stack(bad)), jnp.nan, 0)
+        return [*kept, *[jnp.full(a.shape, lost, a.dtype) for a in primals[count:]]]
 
-    return outs, linear_map(along, back, given, list(tangents))
-
-
-def is_smooth(a: Any) -> bool:
-    """Whether a number may have a derivative."""
-    return bool(jnp.issubdtype(jnp.result_type(a), jnp.inexact))
-
-
-def no_tangent(a: Any) -> Any:
-    """The tangent of a number that depends on nothing."""
-    return jnp.zeros_like(a) if is_smooth(a) else np.zeros(jnp.shape(a), jax.dtypes.float0)
+    return outs, linear_map(along, back, [jnp.isfinite(a) for a in outs], list(tangents))
 
 
 _linear_map = Primitive("rigidjax_linear_map")
@@ -111,16 +100,15 @@ def _differentiated(primals: Any, tangents: Any, **params: Any) -> Any:
             t if m else jnp.zeros_like(p) for t, m, p in zip(tangents, moving, primals, strict=True)
         ]
         parts.append(_linear_map.bind(*primals[:number], *whole[number:], **params))
-    which = [m and is_smooth(p) for m, p in zip(moving[:number], primals, strict=False)]
+    which = [m and eqx.is_inexact_array(p) for m, p in zip(moving[:number], primals, strict=False)]
     if any(which):
 
         def push(*args: Any) -> Arrays:
-            given, along, rest = args[:number], args[number : len(primals)], args[len(primals) :]
-            moving = iter(rest)
-            moved = [
-                next(moving) if w else no_tangent(g) for g, w in zip(given, which, strict=True)
-            ]
-            return jax.jvp(lambda *g: function(*g, *along), tuple(given), tuple(moved))[1]
+            given, along = args[:number], args[number : len(primals)]
+            rest = iter(args[len(primals) :])
+            both = zip(given, which, strict=True)
+            moved = [next(rest) if w else zero_from_primal(g) for g, w in both]
+            return jax.jvp(lambda *g: function(*g, *along), given, tuple(moved))[1]
 
         moved = [t for t, w in zip(tangents, which, strict=False) if w]
         parts.append(linear_map(push, refuse, list(primals), moved))

@@ -1,7 +1,6 @@
-"""A step of order 4 for torques that do not depend on the attitude: Runge–Kutta, then one rotation.
+"""A step of order 4 for torques that do not depend on the attitude.
 
-Euler's equations are then closed in the body rate: the four stages carry three numbers instead of
-seven. The attitude turns once a step, by the exponential of Magnus' series.
+Four Runge–Kutta stages of the body rate alone; then one turn by the exponential of Magnus' series.
 """
 
 from collections.abc import Callable
@@ -59,10 +58,8 @@ class Magnus4(dfx.AbstractSolver):
     """Order 4 with fixed steps, for free bodies and torques of time and body rate only.
 
     It does less work, with a smaller error, than `rigidjax.solvers.RungeKutta4` at the same step,
-    and is the default of `rigidjax.batch.rollout`. The attitude keeps |q| = 1. A step should turn
-    the body by less than a radian.
-
-    Source: Magnus 1954, doi:10.1002/cpa.3160070404; see `change_and_turn`.
+    and is the default of `rigidjax.batch.rollout`. A step should turn the body by less than a
+    radian. Source: Magnus 1954, doi:10.1002/cpa.3160070404; see `change_and_turn`.
 
     **Raises:** `TypeError` for a torque that depends on the attitude, or another state.
 

@@ -27,7 +27,7 @@ class GroupInterpolation(dfx.AbstractLocalInterpolation):
 
 
 class _Build(eqx.Module):
-    """Makes a `GroupInterpolation` from a solver's dense information; compares by its class."""
+    """Makes a `GroupInterpolation` of a solver's dense information."""
 
     inner_cls: Any = eqx.field(static=True)
 
@@ -102,10 +102,9 @@ class Projected(dfx.AbstractWrappedSolver):
 class Watched(dfx.AbstractAdaptiveStepSizeController):
     """Wraps an adaptive step controller so that a run that cannot continue ends at once.
 
-    `diffrax.PIDController` tries smaller and smaller steps until `max_steps` if the vector field is
-    NaN, and all other bodies of a batch wait. Here a start without a finite derivative, or a
-    rejected step whose successor would be below a few units of round-off of the time, ends the run:
-    with `RESULTS.nonfinite` after NaN or infinity, else with `RESULTS.dt_min_reached`.
+    A start without a finite derivative, or a rejected step whose successor would be below a few
+    units of round-off of the time, ends the run: with `RESULTS.nonfinite` after NaN or infinity,
+    else with `RESULTS.dt_min_reached`. (`diffrax.PIDController` goes on until `max_steps`.)
 
     **Arguments:** `controller` any adaptive controller of diffrax.
 

@@ -44,14 +44,14 @@ class Free(eqx.Module):
 
 
 class Setup(eqx.Module):
-    """Everything about a solve but the start and the times."""
+    """A solve by diffrax: everything but the start and the times."""
 
     body: Inertia | MassProperties | None
     torque: Any
-    solver: dfx.AbstractSolver
-    controller: dfx.AbstractStepSizeController
+    solver: Any
+    controller: Any
     dt0: Any
-    adjoint: dfx.AbstractAdjoint
+    adjoint: Any
     progress_meter: dfx.AbstractProgressMeter
     max_steps: int | None = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
@@ -70,14 +70,6 @@ class Loop(eqx.Module):
     max_steps: int = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
     cuts: Array | None = None  # where a step has to end, beside the jumps of the torque
-
-
-def kept(setup: Free | Loop | Setup) -> tuple[Any, tuple[tuple[Any, ...], Any]]:
-    """A set-up as arrays and the rest, so that `jax.jit` and `jax.vmap` can return it."""
-    numbers = (jax.Array, np.ndarray, np.generic)
-    arrays, rest = eqx.partition(setup, lambda leaf: isinstance(leaf, numbers))
-    leaves, structure = jax.tree.flatten(rest)
-    return arrays, (tuple(leaves), structure)
 
 
 class Ends(eqx.Module):
@@ -219,24 +211,28 @@ def _loop(
     return out.ys, dict(zip(_COUNTS, taken, strict=True)), out.result, (last_time, out.last)
 
 
-def refuse(ys: Any, result: dfx.RESULTS) -> Any:
-    """The states `ys`, or an error in words where the run did not get to its end."""
-    ys = eqx.error_if(
-        ys,
-        result == NONFINITE,
+_WORDS = (
+    (
+        NONFINITE,
         "simulate: the motion became NaN or infinite. Is the torque finite at every time and state "
         "of the run? With fixed steps: are they short enough for this spin? throw=False keeps "
         "what came before",
-    )
-    ys = eqx.error_if(
-        ys,
-        result == dfx.RESULTS.dt_min_reached,
+    ),
+    (
+        dfx.RESULTS.dt_min_reached,
         "simulate: no step is short enough: the minimum step size, some units of round-off of the "
         "time, was reached. Does the torque jump or grow without bound? In float32 the times near "
         "1e9 s are 100 s apart: count time from a later origin, or use float64",
-    )
+    ),
+)
+
+
+def refuse(ys: Any, result: dfx.RESULTS) -> Any:
+    """The states `ys`, or an error in words where the run did not get to its end."""
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
-    ill = ill & (result != NONFINITE) & (result != dfx.RESULTS.dt_min_reached)
+    for why, words in _WORDS:
+        ys = eqx.error_if(ys, result == why, words)
+        ill = ill & (result != why)
     return result.error_if(ys, ill)
 
 

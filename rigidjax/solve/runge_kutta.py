@@ -13,8 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve.batching import Arrays
-from rigidjax.solve.components import lift
+from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.tableaus import Tableau
 
 # field(constants, t, y) → dy/dt, for t (*bodies), y (n, *bodies).
@@ -41,42 +40,36 @@ class Stages(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """The tableau as arrays."""
+    """The tableau as arrays, over all stages: those of a step, then those of dense output alone."""
 
     a: Array  # (s, s)
     b: Array  # (s,)
     c: Array
     last: Array  # whether c is 1
     dense: Array  # (r, s) the rows of dense output
+    errors: Array  # (1 or 2, s)
+    plain: int  # stages of a step
 
 
-def stage_counts(tableau: Tableau) -> tuple[int, int]:
-    """The number of stages of a step, and the number with those for dense output."""
-    whole = len(tableau.a) + 2 + len(tableau.extra_a)
-    return max(len(tableau.a), *tableau.errors[0]) + 1, whole
-
-
-def weights(tableau: Tableau, dtype: Any, count: int) -> Weights:
-    """The weights of the first `count` stages of a tableau."""
-    rows = [{}, *tableau.a, tableau.b, *tableau.extra_a]
-    c = np.array([0.0, *tableau.c, 1.0, *tableau.extra_c])[:count]
-    whole = len(rows)
-    a, b = np.stack([_row(row, whole) for row in rows]), _row(tableau.b, whole)
-    first, last = np.eye(whole)[0], np.eye(whole)[len(tableau.a) + 1]
-    more = [_row(row, whole) for row in tableau.dense]
-    dense = np.stack([b, first - b, 2 * b - first - last, *more])[:, :count]
-    a, b, nodes, dense = (jnp.asarray(w, dtype) for w in (a[:count, :count], b[:count], c, dense))
-    return Weights(a, b, nodes, jnp.asarray(c == 1.0), dense)
-
-
-def _row(row: dict[int, float], count: int) -> np.ndarray:
-    out = np.zeros(count)
-    out[list(row)] = list(row.values())
-    return out
+def weights(tableau: Tableau, dtype: Any) -> Weights:
+    c = np.array([0.0, *tableau.c, 1.0, *tableau.extra_c])
+    rows = [{}, *tableau.a, tableau.b, *tableau.extra_a, *tableau.dense, *tableau.errors]
+    table, whole = np.zeros((len(rows), c.size)), c.size
+    for into, row in zip(table, rows, strict=True):
+        into[list(row)] = list(row.values())
+    first, last = np.eye(whole)[[0, len(tableau.a) + 1]]
+    b, more = table[len(tableau.a) + 1], table[whole : len(rows) - len(tableau.errors)]
+    dense = np.stack([b, first - b, 2 * b - first - last, *more])
+    errors = table[len(rows) - len(tableau.errors) :]
+    plain = max(len(tableau.a), *tableau.errors[0]) + 1
+    a, b, nodes = (jnp.asarray(w, dtype) for w in (table[:whole], b, c))
+    dense, errors = jnp.asarray(dense, dtype), jnp.asarray(errors, dtype)
+    return Weights(a, b, nodes, jnp.asarray(c == 1.0), dense, errors, plain)
 
 
 def _sum(row: Array, slopes: Array) -> Array:
-    """Σ row_i k_i over axis 1 of k (n, s, …)."""
+    """Σ row_i k_i over axis 1 of k (n, s, …), of which there may be fewer than weights."""
+    row = row[: slopes.shape[1]]
     return jnp.sum(row.reshape(1, -1, *[1] * (slopes.ndim - 2)) * slopes, 1)
 
 
@@ -87,9 +80,9 @@ def stages(
 
     If `dense` is traced and false, its stages are the state at the start, and their slopes 0.
     """
-    plain, whole = stage_counts(tableau)
-    count, number = (whole, np.int32(whole)) if dense is not False else (plain, np.int32(plain))
-    w = weights(tableau, step.y.dtype, count)
+    w = weights(tableau, step.y.dtype)
+    count = w.plain if dense is False else w.c.size
+    number: Any = np.int32(count)
 
     def stage(i: Array, sofar: tuple[Array, Array, Array]) -> Any:
         new = _stage(w, field, constants, step, i, sofar[2])
@@ -101,7 +94,7 @@ def stages(
     if not isinstance(dense, bool):
         # Where a field may have no value at 0, a stage that is left out must be somewhere else.
         times, places = times + step.t[None], places + step.y[:, None]
-        number = jnp.where(dense, np.int32(whole), np.int32(plain))
+        number = jnp.where(dense, number, np.int32(w.plain))
     begun = (times, places, empty)
     times, places, slopes = lax.fori_loop(np.int32(0), number, stage, begun)
     h = lift(step.h.astype(step.y.dtype), step.y)
@@ -119,15 +112,14 @@ def _stage(
 
 def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
     """The rows F0, F1, … of `nested` (r, n) of one body, times the length of the step."""
-    count, whole = stage_counts(tableau)
-    w = weights(tableau, slopes.dtype, whole)
-    slopes = jnp.concatenate([slopes, jnp.zeros((slopes.shape[0], whole - count), slopes.dtype)], 1)
+    w = weights(tableau, slopes.dtype)
+    slopes = jnp.pad(slopes, ((0, 0), (0, w.c.size - w.plain)))
 
     def more(i: Array, slopes: Array) -> Array:
         slope = _stage(w, field, [], step, i, slopes)[2]
         return lax.dynamic_update_index_in_dim(slopes, slope, i, 1)
 
-    slopes = lax.fori_loop(count, whole, more, slopes)
+    slopes = lax.fori_loop(w.plain, w.c.size, more, slopes)
     return step.h.astype(slopes.dtype) * jnp.sum(w.dense[:, None] * slopes[None], 2)
 
 
@@ -148,12 +140,10 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     Two estimates e5, e3 make e5 |e5|/√(|e5|² + 0.01 |e3|²), which falls as h⁸ (Hairer, Nørsett and
     Wanner 1993, II.10). The lengths are those of each array of the state, of `sizes` numbers.
     """
-    count, dtype = slopes.shape[1], slopes.dtype
-    ones = [1] * (slopes.ndim - 2)
+    dtype, ones = slopes.dtype, [1] * (slopes.ndim - 2)
     # All sums at once: for one body each is a kernel of its own.
-    rows = [_row(row, count) for row in tableau.errors]
-    sums = jnp.asarray(np.stack(rows), dtype).reshape(len(rows), 1, count, *ones)
-    found = jnp.sum(sums * slopes[None], 2)
+    rows = weights(tableau, dtype).errors[:, : slopes.shape[1]]
+    found = jnp.sum(rows.reshape(len(rows), 1, -1, *ones) * slopes[None], 2)
     found = lift(h.astype(dtype), found) * found
     if len(rows) == 1:
         return found[0]
@@ -173,8 +163,7 @@ def pulled(
 
     `cotangent` is of the state at the end, `of_slopes` (n, s, *bodies) of all slopes.
     """
-    count = there.slopes.shape[1]
-    w = weights(tableau, step.y.dtype, count)
+    w, count = weights(tableau, step.y.dtype), there.slopes.shape[1]
     h, put = step.h.astype(step.y.dtype), lax.dynamic_update_index_in_dim
 
     def stage(i: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -198,6 +187,6 @@ def pulled(
     by_own, by_times = pull(bars if of_slopes is None else bars + of_slopes)
     by_constants = [jnp.sum(by, 0) for by in by_own]
     by_length = jnp.sum(seeds * there.slopes, (0, 1)).astype(by_times.dtype)
-    c = w.c.astype(by_times.dtype).reshape(-1, *[1] * (by_times.ndim - 1))
+    c = w.c[:count].astype(by_times.dtype).reshape(-1, *[1] * (by_times.ndim - 1))
     by_length = by_length + jnp.sum(c * by_times, 0)
     return by_constants, jnp.sum(by_times, 0), by_length, cotangent + jnp.sum(below, 1)

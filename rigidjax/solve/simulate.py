@@ -1,11 +1,12 @@
 """`simulate`: the motion of a body or a particle, saved at given times."""
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -13,14 +14,14 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame
-from rigidjax.motion.coupled import Coupled, motion_of
+from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import validation
 from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.error import foreseen_error, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected, Watched
-from rigidjax.solve.run import Free, Loop, Setup, direction, kept, refuse, refuse_ended, solve
+from rigidjax.solve.run import Free, Loop, Setup, direction, refuse, refuse_ended, solve
 from rigidjax.solve.solution import Solution, State, told
 from rigidjax.solve.splitting import AbstractSplitting
 
@@ -120,7 +121,13 @@ def simulate(
     """
     max_steps = None if max_steps is None else _checks.whole(max_steps, "max_steps", 1)
     body, state0, times = validation.scene(body, state0, ts, torque, throw)
-    _require_one(rtol is not None or atol is not None, accuracy, stepsize_controller)
+    given = rtol is not None or atol is not None
+    if stepsize_controller is not None and (given or accuracy is not None):
+        raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
+    if accuracy is not None and given:
+        raise ValueError("simulate: give either an accuracy or rtol and atol, not both")
+    if accuracy is not None and _checks.known(accuracy):
+        _checks.positive(accuracy, "accuracy")
     if stepsize_controller is None:
         rtol, atol = validation.tolerances(rtol, atol, times.dtype)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
@@ -151,25 +158,32 @@ def simulate(
             "stepsize_controller, adjoint and progress_meter to their defaults (or take a solver "
             "of rigidjax.solvers), or give diffrax.Event to diffrax.diffeqsolve"
         )
-    controller = _controller(stepsize_controller, rtol, atol, torque, times.dtype)
+    meter, control = progress_meter or NO_METER, stepsize_controller
+    setup = Setup(body, torque, solver, control, first, adjoint, meter, max_steps, throw)
+    return _solution(_completed(setup, rtol, atol, times), None, state0, times)
+
+
+def _completed(setup: Setup, rtol: Any, atol: Any, times: Array) -> Setup:
+    """A run by diffrax with what was left to its defaults."""
+    solver, control, adjoint, dt0 = setup.solver, setup.controller, setup.adjoint, setup.dt0
+    if control is None:
+        control = Watched(dfx.PIDController(rtol=rtol, atol=atol))
+        if hasattr(setup.torque, "jump_times") and (jumps := jumps_of(setup.torque)).size:
+            # An adaptive step may pass over a short pulse.
+            jumps = jnp.sort(jumps.astype(times.dtype))
+            control = dfx.ClipStepSizeController(control, jump_ts=jumps)
+    elif isinstance(control, dfx.AbstractAdaptiveStepSizeController):
+        control = Watched(control)
     # Ours project inside their one kernel; a second time outside of it breaks the kernel up.
     if not isinstance(solver, AbstractExplicit | AbstractSplitting | Projected):
         solver = SOLVER if solver is None else Projected(solver)
-    adjoint = _adjoint(controller) if adjoint is None else adjoint
-    dt0 = None if first is None else first * jnp.sign(times[-1] - times[0])
-    meter = NO_METER if progress_meter is None else progress_meter
-    setup = Setup(body, torque, solver, controller, dt0, adjoint, meter, max_steps, throw)
-    return _solution(setup, None, state0, times)
-
-
-def _require_one(given: bool, accuracy: Any, controller: Any) -> None:
-    """Refuse more than one of tolerances, accuracy and controller."""
-    if controller is not None and (given or accuracy is not None):
-        raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
-    if accuracy is not None and given:
-        raise ValueError("simulate: give either an accuracy or rtol and atol, not both")
-    if accuracy is not None and _checks.known(accuracy):
-        _checks.positive(accuracy, "accuracy")
+    if adjoint is None:
+        rtol = getattr(control, "rtol", None)
+        tight = rtol is not None and _checks.known(rtol) and float(rtol) < _TIGHT
+        adjoint = _EVERY_STEP if tight else ADJOINT
+    dt0 = None if dt0 is None else dt0 * jnp.sign(times[-1] - times[0])
+    new = dict(solver=solver, controller=control, adjoint=adjoint, dt0=dt0)
+    return dataclasses.replace(setup, **new)
 
 
 def _accurate(loop: Loop, event: Any, state0: Any, times: Array, accuracy: Any) -> Solution:
@@ -178,12 +192,6 @@ def _accurate(loop: Loop, event: Any, state0: Any, times: Array, accuracy: Any) 
     sol = _solution(found, event, state0, times, None if event is not None else run)
     error = foreseen_error(found, times, sol._states, sol.stats["num_steps"], tried)
     return told(sol, error, accuracy)
-
-
-def _adjoint(controller: dfx.AbstractStepSizeController) -> dfx.AbstractAdjoint:
-    rtol = getattr(controller, "rtol", None)
-    tight = rtol is not None and _checks.known(rtol) and float(rtol) < _TIGHT
-    return _EVERY_STEP if tight else ADJOINT
 
 
 def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None) -> Solution:
@@ -202,25 +210,9 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
         raise _checks.bare(error) from None
     if setup.throw and "ended" in stats:
         ys = refuse_ended(setup.torque, ys, stats, times)
-    own = ys.own if isinstance(ys, Coupled) else None
-    ys = motion_of(ys)
-    return Solution(times, ys, stats, result, *kept(setup), event_time, event_state, own)
-
-
-def _controller(
-    given: dfx.AbstractStepSizeController | None, rtol: Any, atol: Any, torque: Any, dtype: Any
-) -> dfx.AbstractStepSizeController:
-    if given is not None:
-        adaptive = isinstance(given, dfx.AbstractAdaptiveStepSizeController)
-        return Watched(given) if adaptive else given
-    make: Any = _watched if _checks.known((rtol, atol)) else _watched.__wrapped__
-    watched = make(rtol, atol)
-    if not hasattr(torque, "jump_times") or not jumps_of(torque).size:
-        return watched
-    # An adaptive step may pass over a short pulse.
-    return dfx.ClipStepSizeController(watched, jump_ts=jnp.sort(jumps_of(torque).astype(dtype)))
-
-
-@functools.cache
-def _watched(rtol: Any, atol: Any) -> Watched:
-    return Watched(dfx.PIDController(rtol=rtol, atol=atol))
+    motion, own = (ys.motion, ys.own) if isinstance(ys, Coupled) else (ys, None)
+    # The set-up as arrays and the rest, so that `jax.jit` and `jax.vmap` can return it.
+    arrays, rest = eqx.partition(setup, eqx.is_array)
+    leaves, structure = jax.tree.flatten(rest)
+    rest = tuple(leaves), structure
+    return Solution(times, motion, stats, result, arrays, rest, event_time, event_state, own)

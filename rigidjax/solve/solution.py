@@ -88,9 +88,8 @@ class Solution(eqx.Module, Generic[State]):
         and the norm is the largest singular value.
 
         A solver's own errors grow as much. If `growth * rtol` exceeds 1, the states have no correct
-        digit, and gradients through them mean nothing, for any adjoint: a `UserWarning` names the
-        first such time. Check it once before you differentiate through a long run; then end the
-        run earlier, or fit it in pieces (multiple shooting).
+        digit, and gradients through them mean nothing: a `UserWarning` names the first such time.
+        End the run earlier then, or fit it in pieces (multiple shooting).
 
         Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
         Ruelle 1985, doi:10.1103/RevModPhys.57.617).

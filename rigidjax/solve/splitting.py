@@ -1,8 +1,7 @@
 """Splittings on the exact free flow: free motion in closed form, torque as kicks of momentum.
 
 `A` is the free body (`rigidjax.exact`), `B` the kick `Π ← Π + c h τ(t, q)` at a fixed attitude; a
-step is `B(b1) A(a1) B(b2) … A(a1) B(b1)`, symmetric, so that it is reversible in time. Each part is
-an exact flow of its own Hamiltonian: the energy's error stays bounded with fixed steps.
+step is `B(b1) A(a1) B(b2) … A(a1) B(b1)`: symmetric, and each part an exact Hamiltonian flow.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -43,7 +42,7 @@ class Composition(NamedTuple):
 
 
 def _symmetric(order: int, flows: tuple[float, ...], kicks: tuple[float, ...]) -> Composition:
-    """The composition whose first halves these are; the middle weights make the sums 1."""
+    """The composition with these first halves; the middle weights make the sums 1."""
     if len(flows) < len(kicks):
         middle = 1 - 2 * sum(kicks)
         flows = (*flows, 0.5 - sum(flows))
@@ -55,8 +54,8 @@ def _symmetric(order: int, flows: tuple[float, ...], kicks: tuple[float, ...]) -
 
 # Strang 1968, doi:10.1137/0705041.
 STRANG = Composition(2, (1.0,), (0.5, 0.5))
-# Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, methods SRKN6b and SRKN11b. They use that
-# kicks commute with each other's commutators: true here too, as a kick depends on attitude alone.
+# Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, methods SRKN6b and SRKN11b, for kicks
+# that commute with each other's commutators: these depend on attitude alone.
 SRKN6 = _symmetric(
     4,
     numbers("0.245298957184271 0.604872665711080"),
@@ -134,10 +133,10 @@ class AbstractSplitting(dfx.AbstractSolver):
 class Splitting2(AbstractSplitting):
     """Order 2: half a kick, the exact free motion, half a kick (Strang).
 
-    It is for long runs, fixed steps and torques that are small against the free motion. The torque
-    may depend on time and attitude, not on the body rate. Without a torque, momentum in space and
-    energy are conserved to round-off. An adaptive controller destroys the bounded energy error, and
-    there is no error estimate. Dense output is on the group with the order of the method.
+    For long runs with fixed steps under torques that are small against the free motion and depend
+    on time and attitude, not on the body rate. The energy's error stays bounded; an adaptive
+    controller destroys that, and there is no error estimate. Dense output is on the group with the
+    order of the method.
 
     Source: Strang 1968, doi:10.1137/0705041, with the free flow of `rigidjax.exact.free_body`.
 

@@ -1,11 +1,8 @@
 """A fixed step of a method, a body and a torque: their interface to a loop.
 
-The numbers are carried one by one (see `components`); torques are called on arrays all the same:
-XLA sees through the stacks and slices between.
-
-A body that turns carries the momentum Π = IΩ instead of Ω, which makes each stage a third cheaper.
-Runge–Kutta methods do not notice a constant linear change of variables, so these are the steps that
-`diffrax` takes with the same solver, to round-off.
+Numbers are carried one by one (see `components`); torques are called on arrays all the same. A body
+that turns carries the momentum Π = IΩ instead of Ω, which makes each stage a third cheaper;
+Runge–Kutta methods do not notice a constant linear change of variables.
 """
 
 from collections.abc import Callable
@@ -58,7 +55,7 @@ class Carrying(NamedTuple):
     """The same steps, which carry on what the last addition lost: round-off grows as √n, not as n.
 
     Source: Kahan 1965, doi:10.1145/363707.363723; Dekker 1971, doi:10.1007/BF01397083, for
-    |change| ≤ |y|. The lost digits have no derivative: tangents are summed as without.
+    |change| ≤ |y|. The lost digits have no derivative.
     """
 
     of: Stepper
@@ -86,10 +83,7 @@ AnyStepper = Stepper | Carrying
 
 
 def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) -> AnyStepper:
-    """The stepper of a vector field under `solver`, or, for `None`, the cheapest that is right.
-
-    Many steps (`count`) carry what additions lose.
-    """
+    """The stepper of a vector field under `solver` (`None`: the cheapest) for `count` steps."""
     stepper = _stepper_of(solver, field, y0)._replace(delays=tuple(delays_of(field)))
     return Carrying(stepper) if not isinstance(count, int) or count >= _MANY else stepper
 

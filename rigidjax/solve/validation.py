@@ -62,7 +62,17 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
             f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
             + ("; pass body.inertia" if isinstance(body, MassProperties) else _body_of(body))
         )
-    _single(body, "body")
+    if body is not None:
+        _checks.single(body, type(body), "body")
+
+
+def one_dtype(tree: Any, name: str) -> Any:
+    """The dtype of all arrays of a tree, or `TypeError`."""
+    kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(tree)}
+    if len(kinds) != 1:
+        found = ", ".join(sorted(map(str, kinds)))
+        raise TypeError(f"{name}: wanted arrays of one dtype, got {found}; convert them to one")
+    return kinds.pop()
 
 
 def warn_of_scale(body: Any, torque: Any) -> None:
@@ -92,21 +102,6 @@ def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
     return possible(body, tensor, body.mass if matter else None, throw)
-
-
-# The arrays of one body or one state that are no vectors.
-_SHAPES = {"tensor": (3, 3), "mass": (), "second_moment": (3, 3), "q": (4,)}
-
-
-def _single(value: Any, name: str) -> None:
-    """Refuse leaves of another shape than that of one body: `jax.tree.map` may alter it."""
-    for path, leaf in jax.tree.leaves_with_path(value):
-        part = str(path[-1]).lstrip(".")
-        if leaf.shape != (wanted := _SHAPES.get(part, (3,))):
-            raise ValueError(
-                f"{name}: wanted one body, {part} of shape {wanted}, got {leaf.shape}; batch with "
-                "jax.vmap"
-            )
 
 
 def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
@@ -193,18 +188,14 @@ def first_step(dt0: Any, times: Array) -> Array:
 
 def start(state0: Any, throw: bool) -> Any:
     """`state0` of one body, finite, with a unit quaternion; or NaN, as for `times`."""
-    if not isinstance(state0, Spin | Attitude | Rigid | Point):
-        raise TypeError(
-            "state0: wanted Spin, Attitude or Rigid, or Point without a body, got "
-            f"{type(state0).__name__}"
-        )
-    _single(state0, "state0")
+    wanted = "Spin, Attitude or Rigid, or Point without a body"
+    _checks.single(state0, (Spin, Attitude, Rigid, Point), "state0", wanted=wanted)
     named, tree = jax.tree.flatten_with_path(state0)
     leaves = [
         _checks.finite(leaf, str(path[-1]).lstrip(".")) if throw or _checks.known(leaf) else leaf
         for path, leaf in named
     ]
-    state0 = jax.tree.unflatten(tree, leaves)
+    state0 = tree.unflatten(leaves)
     if isinstance(state0, HasAttitude):
         xp = _checks.namespace(state0.q)
         off = xp.abs(xp.sqrt(xp.sum(xp.square(state0.q))) - 1)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import once
 from systems import driven, free_body_mp
 
 import rigidjax as rj
@@ -224,6 +225,18 @@ def test_derivatives_go_through_an_accuracy():
     np.testing.assert_allclose(
         jax.jacfwd(end)(omega, accuracy=1e-9), jax.grad(end)(omega, **right), rtol=1e-7, atol=1e-7
     )
+
+
+@pytest.mark.long
+def test_second_derivatives_go_through_an_accuracy():
+    def energy(rate, **how):
+        law = rj.torques.Damping([0.1, 0.1, 0.1])
+        sol = rj.simulate(BODY, rj.Spin(rate * jnp.array([0.2, 1.0, 0.3])), [0.0, 2.0], law, **how)
+        return jnp.sum(sol.ys.omega[-1] ** 2)
+
+    bend = once(jax.hessian(lambda rate: energy(rate, accuracy=1e-9)))(1.0)
+    ends, middle = [energy(rate, rtol=1e-12) for rate in (0.98, 1.02)], energy(1.0, rtol=1e-12)
+    np.testing.assert_allclose(bend, (sum(ends) - 2 * middle) / 0.02**2, rtol=1e-3)
 
 
 def test_an_accuracy_of_the_closed_form_and_what_is_refused():
