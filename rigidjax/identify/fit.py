@@ -181,7 +181,7 @@ def _from_pieces(problem: Problem, count: int, tolerance: float, max_steps: int)
         starting_points(cut, 1, None)[0],
     )
     for width in WIDTHS:
-        narrowed = eqx.tree_at(lambda t: t.problem.links.width, task, jnp.asarray(width))
+        narrowed = eqx.tree_at(lambda t: t.problem.rows.width, task, jnp.asarray(width))
         point = least_squares(point, narrowed, whole(cut), max_steps, CAREFUL).parameters
     return joined(problem, cut, point)
 

@@ -1,22 +1,43 @@
 """Multiple shooting: a long or chaotic recording in pieces with joined ends."""
 
 import itertools
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
+from rigidjax._types import Scalar
 from rigidjax.identify import padding
 from rigidjax.identify.body_charts import Bodies
 from rigidjax.identify.parameters import Own, Parameters
-from rigidjax.identify.problem import Links, Problem, one_problem
+from rigidjax.identify.problem import Problem, Rows, one_problem
 from rigidjax.identify.recording import Reading, Recording
+from rigidjax.identify.reference_states import ReferenceStates
+from rigidjax.motion.manifold import minus
 from rigidjax.motion.torques.states import has_states
 
 # The widths of the gaps, in turn: first the pieces are nearly free, at the end they are joined.
 WIDTHS = (1.0, 1e-1, 1e-2, 1e-3)
+
+
+class Links(Rows):
+    """Pieces of a long recording: `on` (R,) one if it continues in the next, else zero; `width` the
+    standard deviation of the gap, in order-one numbers.
+    """
+
+    on: Float[Array, " records"]
+    width: Scalar
+
+    def __call__(self, problem: Problem, parameters: Parameters, ends: Any) -> Array:
+        # From a piece's end to the next one's start, in typical units; zero at the last.
+        starts = jax.vmap(ReferenceStates.moved)(problem.reference, parameters.own)
+        following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0), starts)
+        gaps = jax.vmap(minus)(ends, following) / problem.reference.units
+        return gaps * self.on[:, None] / self.width
 
 
 def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Problem:
@@ -58,7 +79,7 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
     slots = tuple(slot.alone() for slot in problem.slots)
     links = Links(jnp.ones(count).at[-1].set(0.0), jnp.asarray(float(width)))
     return eqx.tree_at(
-        lambda p: (p.reference.rate, p.slots, p.integrator, p.links),
+        lambda p: (p.reference.rate, p.slots, p.integrator, p.rows),
         cut,
         (rate, slots, problem.integrator, links),
         is_leaf=lambda node: node is None,

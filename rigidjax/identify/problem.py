@@ -1,5 +1,6 @@
 """A problem: the known and the free numbers, and the errors of a guess."""
 
+import abc
 import operator
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -42,6 +43,14 @@ from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.torques import Sum
 from rigidjax.motion.torques.base import AbstractForce, Torque, require_law
+
+
+class Rows(eqx.Module):
+    """Residuals of a fit beside those of readings and priors."""
+
+    @abc.abstractmethod
+    def __call__(self, problem: "Problem", parameters: Parameters, ends: Any) -> Array:
+        """The residuals, in standard deviations; `ends` the last states of the recordings."""
 
 
 class Problem(eqx.Module):
@@ -93,7 +102,7 @@ class Problem(eqx.Module):
     integrator: AbstractIntegrator | None
     rung: type = eqx.field(static=True)
     reference: ReferenceStates
-    links: "Links | None"
+    rows: Rows | None
 
     def __init__(
         self,
@@ -153,7 +162,7 @@ class Problem(eqx.Module):
             widest = max(float(np.diff(r.t).max()) for r in recordings)
             integrator = integrator_for(widest, 1.5 * float(np.max(self.reference.rate)))
         self.integrator = integrator
-        self.links = None
+        self.rows = None
 
     @property
     def count(self) -> int:
@@ -338,15 +347,6 @@ def _shapes(problem: Problem) -> dict[str, list[tuple[int, ...]]]:
         "own.spin": [each],
         "own.each": alone,
     }
-
-
-class Links(eqx.Module):
-    """Pieces of a long recording: `on` (R,) one if it continues in the next, else zero; `width` the
-    standard deviation of the gap, in order-one numbers.
-    """
-
-    on: Float[Array, " records"]
-    width: Scalar
 
 
 def _sorted(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:

@@ -1,24 +1,41 @@
 """Profile intervals: the range of a quantity in which the best misfit grows little."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
-from rigidjax.identify import quantities
+from rigidjax._types import Scalar
+from rigidjax.identify import padding, quantities
+from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem, Rows
 from rigidjax.identify.result import Fit, one_fit
-from rigidjax.identify.search import cost_of, misfit
-from rigidjax.identify.terms import residuals
+from rigidjax.identify.search import Task, again, cost_of
+
+# The width of a pull, in standard deviations: a stiff one makes the search slow.
+PULL = 0.3
+
+
+class Pull(Rows):
+    """A reported quantity, the one at `index`, pulled to a `target` by a residual of a `width`."""
+
+    index: Int[Array, ""]
+    target: Scalar
+    width: Scalar
+
+    def __call__(self, problem: Problem, parameters: Parameters, ends: Any) -> Array:
+        value = quantities.vector(problem, parameters)[self.index]
+        return ((value - self.target) / self.width)[None]
 
 
 def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     """The profile interval (low, high) of one reported quantity.
 
-    The other numbers are fitted again with the quantity held at a value; at the ends twice the
+    The other numbers are fitted again with the quantity at other values; at the ends twice the
     misfit has grown by the square of the quantile, `t²`, times the samples over which errors are
     autocorrelated. Trust it if the misfit is not quadratic (a weakly determined quantity, or one
     near a boundary). **Arguments:** `fit`; `name` as in `fit.interval()`; `level` the probability.
@@ -45,55 +62,42 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     wide = np.log(1e3) if quantity.positive else 1e3 * max(abs(middle), 1e-12)
     if not np.isfinite(deviation) or deviation <= 0:
         deviation = wide / 10
-    # Arrays, so as not to compile again.
-    solver = optx.LevenbergMarquardt(jnp.asarray(1e-12), jnp.asarray(1e-4))  # pyright: ignore
-    bottom = 2.0 * cost_of(fit.parameters, fit.problem, fit.noises)
+    problem, kind = padding.of_few_lengths(fit.problem), fit.problem.records.t.dtype
+    bottom = 2.0 * cost_of(fit.parameters, problem, fit.noises)
     shares = max(fit.correlation, 1.0)
     ends = []
     for side in (-1.0, 1.0):
         point = fit.parameters
 
-        def growth(steps: float, side: float = side) -> float:
+        @functools.cache
+        def pulled(steps: float, side: float = side) -> tuple[float, float]:
+            # A weak pull: its best point has the least misfit of its own value, wherever that is.
             nonlocal point
-            target = jnp.asarray(middle + side * steps * deviation)
-            point, cost = _held(point, fit, index, target, jnp.asarray(1e-3 * deviation), solver)
-            return (2.0 * float(cost) - bottom) / shares - reach**2
+            pull = middle + side * steps * deviation, PULL * deviation
+            rows = Pull(jnp.asarray(index, jnp.int32), *(jnp.asarray(x, kind) for x in pull))
+            own = eqx.tree_at(lambda p: p.rows, problem, rows, is_leaf=lambda node: node is None)
+            point = again(Tried(point), Task(own, fit.noises, 1e-4, 100)).parameters
+            grown = (2.0 * cost_of(point, problem, fit.noises) - bottom) / shares - reach**2
+            return grown, float(_value(problem, point)[index])
 
-        ends.append(_end(growth, reach, wide / deviation, side, float(middle), deviation))
+        ends.append(_end(pulled, reach, wide / deviation, side))
     low, high = (np.exp(end) if quantity.positive else end for end in ends)
     return float(low), float(high)
 
 
-def _end(
-    growth: Any, reach: float, most: float, side: float, middle: float, deviation: float
-) -> float:
+_value = eqx.filter_jit(quantities.vector)
+
+
+def _end(pulled: Any, reach: float, most: float, side: float) -> float:
     from scipy.optimize import brentq
 
     inner, outer = 0.0, reach
-    while growth(outer) < 0:
+    while pulled(outer)[0] < 0:
         inner, outer = outer, 2.0 * outer
         if outer > max(most, 4.0 * reach):
             return side * np.inf
 
-    def known(steps: float) -> float:
-        return growth(steps) if steps > 0 else -(reach**2)
+    def grown(steps: float) -> float:
+        return pulled(steps)[0] if steps > 0 else -(reach**2)
 
-    steps: Any = brentq(known, inner, outer, xtol=1e-2 * reach)
-    return middle + side * float(steps) * deviation
-
-
-@eqx.filter_jit
-def _held(
-    start: Parameters, fit: Fit, index: int, target: Array, width: Array, solver: Any
-) -> tuple[Parameters, Array]:
-    """The best point with a reported quantity held at `target`, and its misfit without the hold."""
-    whole = jnp.ones_like(fit.problem.records.t)
-    args = (fit.problem, fit.noises, whole)
-
-    def held(parameters: Parameters, _: Any) -> Any:
-        value = quantities.vector(fit.problem, parameters)[index]
-        return residuals(parameters, args), (value - target) / width
-
-    least: Any = optx.least_squares
-    out = least(held, solver, start, None, options={"jac": "fwd"}, max_steps=100, throw=False)
-    return out.value, misfit(out.value, args)
+    return pulled(brentq(grown, inner, outer, xtol=1e-2 * reach))[1]  # pyright: ignore

@@ -23,9 +23,7 @@ from rigidjax.identify.terms import (
     Noise,
     along,
     beside,
-    half_sum,
     normal_matrix,
-    residuals,
     seen,
     with_blocks,
     with_jacobian,
@@ -112,7 +110,7 @@ def _bends(problem: Problem, numbers: Array, slope: Float[Array, " n"]) -> Array
 def _as_far_as(problem: Problem, weights: Float[Array, "records times"]) -> Problem:
     """The problem, with its motion followed to the last time with weight."""
     steps = problem.integrator
-    if not isinstance(steps, FixedSteps) or problem.links is not None:
+    if not isinstance(steps, FixedSteps) or problem.rows is not None:
         return problem
     counts = jnp.any(weights > 0, axis=0)
     place = jnp.arange(counts.size, dtype=jnp.int32)
@@ -199,11 +197,6 @@ def evaluate(parameters: Parameters, problem: Problem) -> Any:
 def cost_of(parameters: Parameters, problem: Problem, noise: Noise) -> float:
     """The misfit over the whole of the records."""
     return float(_at(parameters, problem, noise).cost)
-
-
-def misfit(parameters: Parameters, args: Any) -> Float[Array, ""]:
-    """Half the sum of the squares of all residuals."""
-    return half_sum(residuals(parameters, args))
 
 
 def whole(problem: Problem) -> Float[Array, "records times"]:

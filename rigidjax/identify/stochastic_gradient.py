@@ -65,7 +65,7 @@ def descend(
         raise ValueError(
             f"Descent: wanted a batch of at most {problem.count} recordings, got {how.batch}"
         )
-    if problem.links is not None:
+    if problem.rows is not None:
         raise ValueError("Descent: pieces of one recording depend on one another; fit them at once")
     init: Any = how.optimiser.init
     point, memory = start, init(start)

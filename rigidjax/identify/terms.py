@@ -18,7 +18,6 @@ from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.identify.sensors import SensorInput
 from rigidjax.motion.coupled import motion_of
-from rigidjax.motion.manifold import minus
 
 if TYPE_CHECKING:
     from rigidjax.identify.problem import Problem
@@ -254,7 +253,7 @@ def with_rows(of: Callable[[tuple], tuple], errors: tuple, blocks: tuple) -> tup
 
 
 def beside(parameters: Parameters, problem: "Problem", ends: Any) -> tuple[Array, ...]:
-    """Residuals that are no readings: priors, and joints between pieces of one recording."""
+    """Residuals that are no readings: priors, and the problem's own rows."""
     out = []
     for slot, shared, each in by_slot(problem, parameters):
         if slot.prior is not None:
@@ -265,12 +264,8 @@ def beside(parameters: Parameters, problem: "Problem", ends: Any) -> tuple[Array
         assert not isinstance(problem.body, Bodies)
         body = problem.body.body(parameters.body)
         out.append(problem.prior.residuals(body, scaled=problem.body.unit != ""))
-    if problem.links is not None:
-        # From a piece's end to the next one's start, in typical units; zero at the last.
-        starts = jax.vmap(ReferenceStates.moved)(problem.reference, parameters.own)
-        following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0), starts)
-        gaps = jax.vmap(minus)(ends, following) / problem.reference.units
-        out.append(gaps * problem.links.on[:, None] / problem.links.width)
+    if problem.rows is not None:
+        out.append(problem.rows(problem, parameters, ends))
     return tuple(out)
 
 

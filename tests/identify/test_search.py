@@ -15,7 +15,8 @@ from rigidjax import identify
 from rigidjax.identify import levenberg_marquardt, search
 from rigidjax.identify.checkpoint import SearchState, Tried
 from rigidjax.identify.levenberg_marquardt import Search, Settings
-from rigidjax.identify.search import Task, climb, descend, horizon, misfit, settle, whole
+from rigidjax.identify.search import Task, climb, descend, horizon, settle, whole
+from rigidjax.identify.terms import half_sum, residuals
 
 TS = np.linspace(0.0, 1.0, 8)
 
@@ -138,10 +139,10 @@ def test_a_part_of_the_record_is_followed_no_further_than_that(pushed):
     start = of.start(rj.Inertia.from_principal(1.3, 1.9, 2.5))
     for weights in (part, all_of_it):
         found = searched(of, weights, once)[1]
-        cost = misfit(start, (of, noise, weights))
+        cost = half_sum(residuals(start, (of, noise, weights)))
         np.testing.assert_allclose(found.cost, cost, rtol=1e-12)
         np.testing.assert_allclose(found.first, cost, rtol=1e-12)
-        slope = jax.grad(misfit)(start, (of, noise, weights))
+        slope = jax.grad(lambda p, of=of: half_sum(residuals(p, (of, noise, weights))))(start)
         np.testing.assert_allclose(found.slope, ravel_pytree(slope)[0], rtol=1e-9)
 
 

@@ -9,8 +9,8 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.search import misfit
 from rigidjax.identify.stochastic_gradient import _misfit_of, descend, only
+from rigidjax.identify.terms import half_sum, residuals
 
 TS = jnp.linspace(0.0, 4.0, 25)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -39,7 +39,8 @@ def test_few_recordings_show_the_whole_misfit_without_bias(problem):
     point = jax.tree.map(lambda leaf: leaf + 0.1, point)
     of = eqx.filter_jit(_misfit_of)
     parts = [of(point, problem, NOISE, jnp.array([row])) for row in range(24)]
-    whole = eqx.filter_jit(misfit)(point, (problem, NOISE, jnp.ones_like(problem.records.t)))
+    args = (problem, NOISE, jnp.ones_like(problem.records.t))
+    whole = half_sum(eqx.filter_jit(residuals)(point, args))
     np.testing.assert_allclose(np.mean(parts), whole, rtol=1e-12)
 
 
@@ -89,7 +90,8 @@ def test_descent_alone_comes_near_and_a_fit_ends_at_the_bottom(problem):
     said = []
     near, _ = descend(blind, problem, NOISE, how, jax.random.key(3), said.append)
     whole = jnp.ones_like(problem.records.t)
-    before, after = (float(misfit(p, (problem, NOISE, whole))) for p in (blind, near))
+    args = (problem, NOISE, whole)
+    before, after = (float(half_sum(residuals(p, args))) for p in (blind, near))
     # 1800 readings: the bottom is at 900; descent in noise of its own stays a little above.
     assert after < 1.5 * 900 < 0.01 * before
     assert said[-1].startswith("descent 4000/4000")
