@@ -102,11 +102,8 @@ class Posterior(eqx.Module):
     Bayesian Data Analysis (2013), §11.4, 11.5.
 
     >>> import jax
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> density = rj.estimate.LogDensity(found)
+    >>> record, chart = rj.datasets.toutatis.recording(), rj.identify.PrincipalRatios()
+    >>> density = rj.estimate.LogDensity(rj.identify.fit(rj.identify.Problem(record, chart)))
     >>> noise = jax.random.normal(jax.random.key(0), (4, 200, density.size))
     >>> draws = density.x0[None, None] + 0.01 * noise
     >>> bool((Posterior(density, draws).rhat < 1.05).all())  # four chains that agree
@@ -176,15 +173,12 @@ def posterior(
     `Posterior`. **Raises** `ImportError` if blackjax is missing.
 
     >>> import jax
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> density = rj.estimate.LogDensity(found)
+    >>> record, chart = rj.datasets.toutatis.recording(), rj.identify.PrincipalRatios()
+    >>> density = rj.estimate.LogDensity(rj.identify.fit(rj.identify.Problem(record, chart)))
     >>> # Instead of Nuts(), a sampler of one's own: normal draws, which is Laplace's method.
     >>> normal = lambda key, log_density, start: jax.random.normal(key, (200, start.size))
     >>> posterior(density, jax.random.key(0), sampler=normal).x.shape
-    (4, 200, 5)
+    (4, 200, 8)
     """
     _checks.instance(density, LogDensity, "density", hint="estimate.LogDensity(fit) makes one")
     _checks.key(key)

@@ -1,8 +1,7 @@
-"""The most probable numbers of a problem, with the unknown torque integrated out.
+"""The most probable numbers of a problem, the unknown torque integrated out, and weighted draws.
 
-It also gives weighted draws from the posterior density (importance sampling). The information at
-the maximum alone gives intervals that are too narrow on short records: it fixes the torque's
-density at its most probable value, which is below its mean.
+The information at the maximum alone gives intervals that are too narrow on short records: it fixes
+the torque's density at its most probable value, which is below its mean.
 """
 
 from collections.abc import Callable
