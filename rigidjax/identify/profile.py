@@ -59,27 +59,26 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
             point, cost = _held(point, fit, index, target, jnp.asarray(1e-3 * deviation), solver)
             return (2.0 * float(cost) - bottom) / shares - reach**2
 
-        ends.append(_end(growth, reach, wide / deviation, side, float(middle), deviation))
+        ends.append(middle + side * deviation * _steps(growth, reach, wide / deviation))
     low, high = (np.exp(end) if quantity.positive else end for end in ends)
     return float(low), float(high)
 
 
-def _end(
-    growth: Any, reach: float, most: float, side: float, middle: float, deviation: float
-) -> float:
+def _steps(growth: Any, reach: float, most: float) -> float:
+    """The deviations after which `growth` is zero, infinite if it never is."""
     from scipy.optimize import brentq
 
     inner, outer = 0.0, reach
     while growth(outer) < 0:
         inner, outer = outer, 2.0 * outer
         if outer > max(most, 4.0 * reach):
-            return side * np.inf
+            return np.inf
 
     def known(steps: float) -> float:
         return growth(steps) if steps > 0 else -(reach**2)
 
     steps: Any = brentq(known, inner, outer, xtol=1e-2 * reach)
-    return middle + side * float(steps) * deviation
+    return float(steps)
 
 
 @eqx.filter_jit
@@ -87,8 +86,7 @@ def _held(
     start: Parameters, fit: Fit, index: int, target: Array, width: Array, solver: Any
 ) -> tuple[Parameters, Array]:
     """The best point with a reported quantity held at `target`, and its misfit without the hold."""
-    whole = jnp.ones_like(fit.problem.records.t)
-    args = (fit.problem, fit.noises, whole)
+    args = (fit.problem, fit.noises, jnp.ones_like(fit.problem.records.t))
 
     def held(parameters: Parameters, _: Any) -> Any:
         value = quantities.vector(fit.problem, parameters)[index]
