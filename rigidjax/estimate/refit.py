@@ -39,15 +39,6 @@ class Refit(eqx.Module):
     x, the inverse of Fisher's information there; `converged`; `draws` (m, n) and their `weights`
     (m,), which add up to 1, represent the posterior density. `effective` is the number of
     independent draws that they are worth.
-
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> best = refit(rj.estimate.LogDensity(found))
-    >>> low, high = best.interval_of(lambda point: point.state0.omega)
-    >>> bool((low < high).all())
-    True
     """
 
     density: LogDensity
@@ -134,6 +125,9 @@ def refit(
     >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
     >>> best = refit(rj.estimate.LogDensity(found))
     >>> bool(jnp.allclose(best.point.state0.omega, jnp.array([1.0, 0.1, 1.0]), atol=1e-3))
+    True
+    >>> low, high = best.interval_of(lambda point: point.state0.omega)
+    >>> bool((low < high).all())
     True
     """
     _checks.instance(density, LogDensity, "density", hint="estimate.LogDensity(fit) makes one")
