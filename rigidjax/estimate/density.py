@@ -70,13 +70,10 @@ class LogDensity(eqx.Module):
     `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are computed recording by
     recording in forward mode, also under `jax.grad`; compile it by `equinox.filter_jit(density)`.
 
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> density = LogDensity(found)
+    >>> record, chart = rj.datasets.toutatis.recording(), rj.identify.PrincipalRatios()
+    >>> density = LogDensity(rj.identify.fit(rj.identify.Problem(record, chart)))
     >>> density.size, bool(density(density.x0) > density(density.x0 + 0.1))
-    (5, True)
+    (8, True)
     """
 
     problem: Problem
@@ -120,12 +117,14 @@ class LogDensity(eqx.Module):
         self.like = (fit.parameters, factors, logs)
         self.x0 = ravel_pytree(self.like)[0]
         seen = np.asarray(fit.covariance)
-        sandwich = fit.covariance_kind.startswith("sandwich")
-        if sandwich and (process is None or not _definite(seen)):
+        if fit.covariance_kind.startswith("sandwich"):
             # The density assumes white errors: it is narrower than the fit's intervals. The
             # sandwich covariance of many recordings may be singular: no scale for a search.
-            linear = uncertainty.linearise(problem, fit.parameters, fit.noises, near=fit.near)
-            seen = uncertainty.of_white(linear).covariance
+            size = np.sqrt(np.diagonal(seen))
+            definite = np.linalg.eigvalsh(seen / np.outer(size, size)).min() > 1e-10
+            if process is None or not definite:
+                linear = uncertainty.linearise(problem, fit.parameters, fit.noises, near=fit.near)
+                seen = uncertainty.of_white(linear).covariance
         rest, total = [], 0
         for factor, reading in zip(factors, problem.records.readings, strict=True):
             rows = np.bincount(groups, np.asarray(reading.seen.sum(axis=1)))
@@ -175,12 +174,6 @@ def of_draws(
 ) -> Any:
     """`function(point)` of each draw; compiled once for a function and densities of one form."""
     return jax.vmap(lambda one: function(density.unpack(one)))(x)
-
-
-def _definite(covariance: np.ndarray) -> bool:
-    """Whether a covariance has a Cholesky factor that round-off does not decide."""
-    size = np.sqrt(np.diagonal(covariance))
-    return bool(np.linalg.eigvalsh(covariance / np.outer(size, size)).min() > 1e-10)
 
 
 class Curvature(NamedTuple):

@@ -216,7 +216,6 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     turn. **Returns** the `Belief` at `t`. **Raises:** `ValueError` for a `t` before the belief, or
     a reading with NaN, if the numbers are known.
 
-    >>> import jax
     >>> gyro = rj.identify.Gyro(0.1)
     >>> record = rj.identify.Recording([0.0, 0.1], (gyro, [[1.0, 0, 0]] * 2))
     >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
@@ -252,11 +251,10 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
 def _step(
     model: Model, sensors: Sensors, belief: Belief, t: Array, values: tuple, masks: tuple
 ) -> Belief:
-    # A finite number in the place of a missing reading keeps derivatives finite.
-    values = tuple(
-        jnp.where(mask, value, jnp.zeros_like(value).at[0].set(1)).astype(belief.root.dtype)
-        for value, mask in zip(values, masks, strict=True)
-    )
+    # A unit vector in the place of a missing reading keeps derivatives finite.
+    units = (jnp.eye(1, value.size, dtype=value.dtype).reshape(value.shape) for value in values)
+    values = tuple(map(jnp.where, masks, values, units))
+    values = tuple(value.astype(belief.root.dtype) for value in values)
     return _one(Dynamics(model, belief.x, sensors), belief, Stops(t, values, masks))[0]
 
 

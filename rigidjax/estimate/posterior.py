@@ -16,8 +16,7 @@ from rigidjax.identify.parameters import Unpacked
 # A sampler: key, log-density of z, a first z (n,) → draws (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 
-
-# Module, extra, and who asks.
+# For `_checks.library`.
 _BLACKJAX = ("blackjax", "posterior", "posterior")
 
 # The weight of the first mass matrix, in draws: it is good already if Laplace's method is.
@@ -100,17 +99,6 @@ class Posterior(eqx.Module):
     their bodies, states and values, `of(function)` any function of each. `rhat` (n,) is below 1.01
     if the chains agree, and `ess` (n,) is the number of independent draws, as in Gelman et al.,
     Bayesian Data Analysis (2013), §11.4, 11.5.
-
-    >>> import jax
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> density = rj.estimate.LogDensity(found)
-    >>> noise = jax.random.normal(jax.random.key(0), (4, 200, density.size))
-    >>> draws = density.x0[None, None] + 0.01 * noise
-    >>> bool((Posterior(density, draws).rhat < 1.05).all())  # four chains that agree
-    True
     """
 
     density: LogDensity
@@ -176,15 +164,13 @@ def posterior(
     `Posterior`. **Raises** `ImportError` if blackjax is missing.
 
     >>> import jax
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> density = rj.estimate.LogDensity(found)
+    >>> record, chart = rj.datasets.toutatis.recording(), rj.identify.PrincipalRatios()
+    >>> density = rj.estimate.LogDensity(rj.identify.fit(rj.identify.Problem(record, chart)))
     >>> # Instead of Nuts(), a sampler of one's own: normal draws, which is Laplace's method.
     >>> normal = lambda key, log_density, start: jax.random.normal(key, (200, start.size))
-    >>> posterior(density, jax.random.key(0), sampler=normal).x.shape
-    (4, 200, 5)
+    >>> drawn = posterior(density, jax.random.key(0), sampler=normal)
+    >>> drawn.x.shape, bool((drawn.rhat < 1.05).all())  # four chains that agree
+    ((4, 200, 8), True)
     """
     _checks.instance(density, LogDensity, "density", hint="estimate.LogDensity(fit) makes one")
     _checks.key(key)

@@ -1,8 +1,7 @@
-"""The most probable numbers of a problem, with the unknown torque integrated out.
+"""The most probable numbers of a problem, the unknown torque integrated out, and weighted draws.
 
-It also gives weighted draws from the posterior density (importance sampling). The information at
-the maximum alone gives intervals that are too narrow on short records: it fixes the torque's
-density at its most probable value, which is below its mean.
+The information at the maximum alone gives intervals that are too narrow on short records: it fixes
+the torque's density at its most probable value, which is below its mean.
 """
 
 from collections.abc import Callable
@@ -40,15 +39,6 @@ class Refit(eqx.Module):
     x, the inverse of Fisher's information there; `converged`; `draws` (m, n) and their `weights`
     (m,), which add up to 1, represent the posterior density. `effective` is the number of
     independent draws that they are worth.
-
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> best = refit(rj.estimate.LogDensity(found))
-    >>> low, high = best.interval_of(lambda point: point.state0.omega)
-    >>> bool((low < high).all())
-    True
     """
 
     density: LogDensity
@@ -135,6 +125,9 @@ def refit(
     >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
     >>> best = refit(rj.estimate.LogDensity(found))
     >>> bool(jnp.allclose(best.point.state0.omega, jnp.array([1.0, 0.1, 1.0]), atol=1e-3))
+    True
+    >>> low, high = best.interval_of(lambda point: point.state0.omega)
+    >>> bool((low < high).all())
     True
     """
     _checks.instance(density, LogDensity, "density", hint="estimate.LogDensity(fit) makes one")

@@ -104,12 +104,11 @@ def _with_shared(problem: Problem, found: Fit) -> Problem:
     here = problem.start()
     here = eqx.tree_at(lambda p: p.shared, here, found.parameters.shared)
     records = problem.scenes(here)
-    own = []
-    for slot in problem.slots:
-        if slot.each:
-            own.append(slot)
-        elif slot.spread is not None:
-            own.append(dataclasses.replace(slot, each=True, prior=slot.spread, spread=None))
+    own = [
+        slot if slot.each else dataclasses.replace(slot, each=True, prior=slot.spread, spread=None)
+        for slot in problem.slots
+        if slot.each or slot.spread is not None
+    ]
     return eqx.tree_at(
         lambda p: (p.body, p.records, p.slots), problem, (Known(found.body), records, tuple(own))
     )

@@ -79,20 +79,9 @@ def _split(first: str) -> tuple[list[str], str]:
 
 # All units become SI.
 UNITS = {
-    "s": 1.0,
-    "ms": 1e-3,
-    "us": 1e-6,
-    "rad/s": 1.0,
-    "deg/s": math.pi / 180,
-    "rpm": math.pi / 30,
-    "m/s2": 1.0,
-    "g": 9.80665,
-    "rad": 1.0,
-    "deg": math.pi / 180,
-    "m": 1.0,
-    "mm": 1e-3,
-    "1": 1.0,
-}
+    "s": 1.0, "ms": 1e-3, "us": 1e-6, "m": 1.0, "mm": 1e-3, "m/s2": 1.0, "g": 9.80665, "1": 1.0,
+    "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180, "rpm": math.pi / 30,
+}  # fmt: skip
 
 
 class LogError(ValueError):

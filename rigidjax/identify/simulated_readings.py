@@ -19,15 +19,13 @@ from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import simulate
 
 Body = Inertia | MassProperties
-State = Spin | Attitude | Rigid
-Times = Float[ArrayLike, " times"] | Sequence[float]
 
 
 def simulate_readings(
     sensor: AbstractSensor | Sequence[AbstractSensor],
     body: Body,
-    state0: State,
-    ts: Times,
+    state0: Spin | Attitude | Rigid,
+    ts: Float[ArrayLike, " times"] | Sequence[float],
     torque: Torque | None = None,
     *,
     key: Any = None,
@@ -35,8 +33,7 @@ def simulate_readings(
     """The readings of a sensor along a known motion, with noise: data to test a fit.
 
     The motion comes from `rigidjax.simulate`; bias, scale, mounting, clock offset, low-pass filter
-    and full scale from the sensor. The residuals of a fit with the same sensor are the noise. The
-    function is differentiable, and works under `jax.jit` and `jax.vmap`.
+    and full scale from the sensor. It may be differentiated, jitted and batched.
 
     **Arguments:** `sensor` an `AbstractSensor`, or a sequence of them along one motion; `body`,
     `state0`, `ts` (T,) s, `torque` as for `rigidjax.simulate`; `MassProperties` are allowed for all
@@ -69,10 +66,8 @@ def simulate_readings(
     states = sol.ys if sol.own is None else Coupled(sol.ys, sol.own)
     count = len(sensors)
     keys = [None] * count if key is None else jax.random.split(_checks.key(key), count)
-    out = tuple(
-        _readings(one, body, torque, sol.ts, start, states, each)
-        for one, each in zip(sensors, keys, strict=True)
-    )
+    given = body, torque, sol.ts, start, states
+    out = tuple(_readings(one, *given, key=own) for one, own in zip(sensors, keys, strict=True))
     return out if several else out[0]
 
 
@@ -84,6 +79,7 @@ def _readings(
     ts: Array,
     state0: Any,
     states: Any,
+    *,
     key: Any,
 ) -> Float[Array, "times ..."]:
     times, states, now = sensor_inputs(sensor, body, torque, ts, state0, states)

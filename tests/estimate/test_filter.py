@@ -165,6 +165,26 @@ def test_steps_one_by_one_are_the_filter(tumbling):
     np.testing.assert_allclose(belief.covariance, found.belief.covariance[2], rtol=0, atol=1e-13)
 
 
+class Speed(identify.AbstractSensor):
+    """The size of the rate, rad/s: a reading that is one number."""
+
+    reading_shape, components, unit = (), 1, "rad/s"
+    feels, noise = rj.motion.HasSpin, jnp.array([0.1])
+
+    def error(self, now, reading):
+        return (reading - jnp.linalg.norm(now.state.omega))[None]
+
+
+def test_steps_take_readings_of_one_number():
+    record = identify.Recording([0.0, 0.1], (Speed(), [1.0, 1.0]))
+    model = estimate.Model(records.BODY)
+    first = estimate.start(model, record, rj.Spin([0.0, 0.0, 1.1]), rate=0.1)
+    seen, gap = (estimate.step(model, first, 0.0, (Speed(), 1.0, seen)) for seen in (True, False))
+    np.testing.assert_allclose(gap.state.omega, first.state.omega, rtol=1e-15)
+    np.testing.assert_allclose(seen.state.omega, [0.0, 0.0, 1.05], rtol=1e-14)
+    np.testing.assert_allclose(seen.deviation, [0.1, 0.1, 0.1 / 2**0.5], rtol=1e-14)
+
+
 @pytest.mark.slow
 def test_more_steps_between_readings_change_little(tumbling):
     model, record, _, first, found = tumbling

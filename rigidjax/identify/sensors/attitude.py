@@ -137,10 +137,7 @@ class Direction(ClockedSensor):
         return (1.0 - 0.5 * square) * seen + half * (error[0] * first + error[1] * second)
 
     def _seen(self, now: SensorInput) -> Vec3:
-        seen = quaternion.rotate(quaternion.conjugate(now.state.q), self.world)
-        if self.mounting is not None:
-            seen = quaternion.rotate(quaternion.exp(-self.mounting), seen)
-        return seen
+        return quaternion.rotate_inverse(_mounted(now.state.q, self.mounting), self.world)
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         return _not_unit(values), "the direction at index {index} is not of length 1"
@@ -215,11 +212,9 @@ class Velocity(ClockedSensor):
     m, in the frame of the `MassProperties` (r is the vector to it from the centre of mass); `None`
     for the centre of mass itself; `mounting` (3,) rotation vector that turns the body's axes onto
     the sensor's, rad, for a sensor on the body, such as a Doppler log (zeros for the body's axes);
-    `None` for the world's axes, as in satellite navigation; `bias` (3,) m/s
-    or `None`; `offset` s as for `Gyro`. For a `Rigid`.
-
-    Source: velocity of a point of a rigid body, Landau and Lifshitz, Mechanics, eq 31.2. **Raises**
-    `ValueError` as `Gyro`.
+    `None` for the world's axes, as in satellite navigation; `bias` (3,) m/s or `None`; `offset` s
+    as for `Gyro`. For a `Rigid`. **Raises** `ValueError` as `Gyro`. Source: Landau and Lifshitz,
+    Mechanics, eq 31.2.
 
     >>> Velocity(noise=0.1, mounting=[0.0, 0.0, 0.0]).unit
     'm/s'
@@ -240,8 +235,7 @@ class Velocity(ClockedSensor):
             arm = now.lever(self.place)
             seen = seen + quaternion.rotate(state.q, cross(state.omega, arm))
         if self.mounting is not None:
-            turn = quaternion.multiply(state.q, quaternion.exp(self.mounting))
-            seen = quaternion.rotate_inverse(turn, seen)
+            seen = quaternion.rotate_inverse(_mounted(state.q, self.mounting), seen)
         return reading - (seen if self.bias is None else seen + self.bias)
 
 

@@ -1,6 +1,7 @@
 """A low-pass filter of readings before they were logged."""
 
 import math
+from functools import partial
 from types import NoneType
 from typing import Any
 
@@ -17,6 +18,7 @@ from rigidjax._types import Scalar, ScalarLike
 _GAP = 3.0
 # Third powers of numbers and intervals must stay within float32, too.
 _LARGEST = 1e12
+_ROOT = math.sqrt(2.0)
 
 
 class LowPass(eqx.Module):
@@ -55,15 +57,14 @@ class LowPass(eqx.Module):
         """The filtered samples.
 
         **Arguments:** `t` (T,) increasing times, s; `values` (T, k), of any unit. **Raises**
-        `ValueError` for shapes that do not agree; for times that do not increase, NaN, and numbers
-        whose cubes overflow, if they are known.
+        `ValueError` for times that do not increase, NaN, and numbers whose cubes overflow, if they
+        are known.
         """
         values = _checks.numbers(values, "values")
         if values.ndim != 2:
             raise ValueError(f"values: wanted (T, k), got shape {values.shape}")
-        t = _checks.floating(
-            t, (values.shape[0],), "t", hint="a time for each row of values"
-        ).astype(values.dtype)
+        t = _checks.floating(t, values.shape[:1], "t", hint="a time for each row of values")
+        t = t.astype(values.dtype)
         if _checks.known((t, values)):
             _within(np.asarray(t, float), np.asarray(values, float))
         if values.shape[0] < 2:
@@ -81,13 +82,12 @@ class LowPass(eqx.Module):
         chord = jnp.diff(values, axis=0) / h
         c, d = (3 * chord - 2 * before - after) / h, (before + after - 2 * chord) / h**2
         ends = (before, 2 * c, 6 * d), (after, 2 * c + 6 * d * h, 6 * d)
-        own = _first if self.order == 1 else _second
-        y0, y1, decay = own(w, values[:-1], ends[0], values[1:], ends[1])
+        y0, y1 = _own(self.order, w, values[:-1], ends[0]), _own(self.order, w, values[1:], ends[1])
         begin = y0[0]
         if gaps.size > 2:
-            first = own(w, values[:1], _begin(gaps, chord), values[:1], ends[1])[0][0]
+            first = _own(self.order, w, values[:1], _begin(gaps, chord))[0]
             begin = jnp.where(jnp.any(fresh[:3]), begin, first)
-        return _along(begin, y0, y1, decay, gaps, fresh)
+        return _along(begin, y0, y1, partial(_decay, self.order, w), gaps, fresh)
 
 
 def lowpass_of(given: Any) -> LowPass | None:
@@ -126,32 +126,22 @@ def _begin(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
     return rate[None], 2 * (one - two * (a + b))[None], 6 * two[None]
 
 
-def _first(w: Array, u0: Array, du0: Any, u1: Array, du1: Any) -> tuple[Any, Any, Any]:
-    """The answer to the cubic itself at both ends of each interval; the decay of what differs."""
-
-    def own(u: Array, du: Any) -> Array:
+def _own(order: int, w: Array, u: Array, du: Any) -> Array:
+    """The answer to the cubic itself, of value u and derivatives du: y, and ẏ/w of order 2."""
+    # By 1/(1 + x) = 1 − x + x² − x³ … and 1/(1 + √2 x + x²) = 1 − √2 x + x² + 0 x³ …
+    if order == 1:
         return (u - du[0] / w + du[1] / w**2 - du[2] / w**3)[..., None]
+    y = u - _ROOT * du[0] / w + du[1] / w**2
+    return jnp.stack([y, (du[0] - _ROOT * du[1] / w + du[2] / w**2) / w], axis=-1)
 
-    def decay(h: Array) -> Array:
+
+def _decay(order: int, w: Array, h: Array) -> Array:
+    """The share of a difference from that answer which is left after a time h."""
+    if order == 1:
         return jnp.exp(-w * h)[None, None]
-
-    return own(u0, du0), own(u1, du1), decay
-
-
-def _second(w: Array, u0: Array, du0: Any, u1: Array, du1: Any) -> tuple[Any, Any, Any]:
-    # 1/(1 + √2 x + x²) = 1 − √2 x + x² + 0 x³ …
-    root = math.sqrt(2.0)
-
-    def own(u: Array, du: Any) -> Array:
-        y = u - root * du[0] / w + du[1] / w**2
-        return jnp.stack([y, (du[0] - root * du[1] / w + du[2] / w**2) / w], axis=-1)
-
-    def decay(h: Array) -> Array:
-        a = w * h / root
-        c, s, e = jnp.cos(a), jnp.sin(a), jnp.exp(-a)
-        return e * jnp.stack([jnp.stack([c + s, root * s]), jnp.stack([-root * s, c - s])])
-
-    return own(u0, du0), own(u1, du1), decay
+    a = w * h / _ROOT
+    c, s, e = jnp.cos(a), jnp.sin(a), jnp.exp(-a)
+    return e * jnp.stack([jnp.stack([c + s, _ROOT * s]), jnp.stack([-_ROOT * s, c - s])])
 
 
 def _along(begin: Array, y0: Array, y1: Array, decay: Any, gaps: Array, fresh: Array) -> Array:
