@@ -6,7 +6,7 @@ import functools
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -352,22 +352,20 @@ def _write(
         ("figure", figure, drawn), ("numbers", options.json, numbers),
         ("report", options.report, page),
     )  # fmt: skip
-    kept = [_made(what, path, make) for what, path, make in wanted if path is not None]
+    kept = True
+    for what, path, make in wanted:
+        try:
+            if path is not None:
+                make()
+                _say(f"{what}: {path}")
+        except Exception as error:
+            # Nothing else is lost.
+            _error(f"no {what}: {path}: {type(error).__name__}: {error}")
+            kept = False
     if "interrupted" in found.status:
         _error("interrupted (Ctrl-C): not all starts were made, see the status")
         return 130
-    return 2 if not all(kept) else 0 if found.ok else 1
-
-
-def _made(what: str, path: Path, make: Callable[[], Any]) -> bool:
-    """Whether a file could be written; if not, why is said, and nothing else is lost."""
-    try:
-        make()
-    except Exception as error:
-        _error(f"no {what}: {path}: {type(error).__name__}: {error}")
-        return False
-    _say(f"{what}: {path}")
-    return True
+    return 2 if not kept else 0 if found.ok else 1
 
 
 def _figures(found: Any, names: list[str], units: dict[str, str]) -> list[Any]:

@@ -3,9 +3,6 @@
 The notes write the energy of rotation in three forms. Printed eqs 61–65 lack the factor ½ of eqs 57
 and 73–75; here all have it and agree. `kinetic_energy` of `Inertia.from_second_moment(jnp.diag(λ))`
 is eqs 73–75, in principal axes.
-
-Poinsot: in free motion the energy ellipsoid rolls on a fixed plane; the rate in the body frame
-stays on the intersection of the two ellipsoids of Ω. Source: Landau and Lifshitz, Mechanics, § 37.
 """
 
 from typing import Literal
@@ -139,7 +136,8 @@ def ellipsoid(
       m, of `MassProperties`, without a `size`. It moves exactly as the body does.
 
     **Returns** `(semi_axes, q)`: (3,) in the order of ascending moments (`"mass"`: ascending), and
-    (4,) the rotation principal axes → body axes. **Raises:** `ValueError` for another kind, a zero
+    (4,) the rotation principal axes → body axes. In free motion Ω stays on the intersection of the
+    first two (Poinsot; Landau and Lifshitz, Mechanics, § 37). **Raises:** `ValueError` for a zero
     moment or a negative number; `TypeError` for a `size` that is missing or not wanted.
 
     >>> ellipsoid(Inertia.from_principal(1.0, 2.0, 2.0), "energy", 4.0)[0]

@@ -195,7 +195,9 @@ class MassProperties(eqx.Module):
         s = _checks.floating(second_moment, (3, 3), "second_moment", batched=True, unit="kg m²")
         _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(s, 2))
         dtype = jnp.result_type(mass, com, s)
-        self.mass = validation.mass_of_a_body(mass.astype(dtype))
+        mass = _checks.if_known(validation.real_mass, mass.astype(dtype))
+        # A traced mass that no body has makes the body NaN.
+        self.mass = mass if _checks.known(mass) else jnp.where(mass > 0, mass, jnp.nan)
         self.com = _checks.if_known(_checks.finite, com.astype(dtype), "com")
         self.second_moment = _checks.if_known(validation.real_second_moment, s.astype(dtype))
 

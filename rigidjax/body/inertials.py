@@ -14,6 +14,7 @@ from rigidjax.rotation import euler, quaternion
 
 # The tolerance of the triangle inequality, since files are rounded.
 ROUNDED = 1e-6
+_KEYS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
 def read_inertials(path: str | Path) -> dict[str, MassProperties]:
@@ -102,11 +103,9 @@ def _from_urdf(inertial: Tree.Element) -> MassProperties:
     place = _numbers(origin, "xyz", 3, [0.0] * 3)
     # Fixed axes: roll about x, then pitch about y, then yaw about z.
     turn = euler.to_matrix(_numbers(origin, "rpy", 3, [0.0] * 3), "xyz")
-    parts = {key: _numbers(inertia, key, 1)[0] for key in ("ixx", "iyy", "izz")}
-    parts |= {key: _numbers(inertia, key, 1, [0.0])[0] for key in ("ixy", "ixz", "iyz")}
-    rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
-    tensor = np.array([[parts[key] for key in row] for row in rows])
-    return _body(_numbers(mass, "value", 1)[0], place, turn, tensor)
+    diagonal = [_numbers(inertia, key, 1)[0] for key in _KEYS[:3]]
+    others = [_numbers(inertia, key, 1, [0.0])[0] for key in _KEYS[3:]]
+    return _body(_numbers(mass, "value", 1)[0], place, turn, [*diagonal, *others])
 
 
 def _from_mujoco(inertial: Tree.Element) -> MassProperties:
@@ -115,17 +114,17 @@ def _from_mujoco(inertial: Tree.Element) -> MassProperties:
         raise ValueError(f"its inertial is turned by {other[0]}; wanted quat")
     q = quaternion.normalise(_numbers(inertial, "quat", 4, [1.0, 0.0, 0.0, 0.0]))
     if "fullinertia" in inertial.attrib:
-        xx, yy, zz, xy, xz, yz = _numbers(inertial, "fullinertia", 6)
-        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        six = _numbers(inertial, "fullinertia", 6)
     else:
-        tensor = np.diag(_numbers(inertial, "diaginertia", 3))
+        six = [*_numbers(inertial, "diaginertia", 3), 0.0, 0.0, 0.0]
     place = _numbers(inertial, "pos", 3, [0.0] * 3)
-    return _body(_numbers(inertial, "mass", 1)[0], place, quaternion.to_matrix(q), tensor)
+    return _body(_numbers(inertial, "mass", 1)[0], place, quaternion.to_matrix(q), six)
 
 
-def _body(mass: float, place: np.ndarray, turn: Any, tensor: np.ndarray) -> MassProperties:
+def _body(mass: float, place: np.ndarray, turn: Any, six: Any) -> MassProperties:
+    xx, yy, zz, xy, xz, yz = six
     turn = np.asarray(turn, float)
-    tensor = turn @ tensor @ turn.T
+    tensor = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
     if not mass > 0:
         raise ValueError(f"wanted a positive mass, got {mass:g}")
     second = 0.5 * np.trace(tensor) * np.eye(3) - tensor
@@ -162,9 +161,8 @@ def _to_urdf(inertial: Tree.Element, body: MassProperties) -> None:
     tensor = np.asarray(body.inertia.tensor)
     Tree.SubElement(inertial, "origin", xyz=_text(body.com), rpy="0 0 0")
     Tree.SubElement(inertial, "mass", value=_text(body.mass))
-    names = "ixx", "ixy", "ixz", "iyy", "iyz", "izz"
-    entries = zip(names, tensor[np.triu_indices(3)], strict=True)
-    Tree.SubElement(inertial, "inertia", {key: _text(entry) for key, entry in entries})
+    entries = {key: _text(tensor[at]) for key, at in zip(_KEYS, PAIRS, strict=True)}
+    Tree.SubElement(inertial, "inertia", entries)
 
 
 def _to_mujoco(inertial: Tree.Element, body: MassProperties) -> None:

@@ -2,10 +2,8 @@
 
 The second moment is the square of a symmetric matrix, 𝔖 ∝ (1 + V)² with V trace-free. Every vector
 is then a real body, and an optimiser needs no constraint. Plates and rods are ordinary points:
-their root has a zero eigenvalue. (In the log-Cholesky chart of Rucker and Wensing 2022,
-doi:10.1109/LRA.2022.3144517, they lie at infinity; in Cholesky's factor itself a small turn of a
-plate is a large step.) If 1 + V has a negative eigenvalue, another vector without one has the same
-body; `pack` returns that vector.
+their root has a zero eigenvalue. If 1 + V has a negative eigenvalue, another vector without one has
+the same body; `pack` returns that vector.
 """
 
 from collections.abc import Callable
@@ -133,7 +131,9 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
     Array([2., 2., 2.], dtype=float64)
     """
     v = _checks.floating(vector, (3,), "vector")
-    a, b, c = _squares(jnp.stack([1.0 + v[1], 1.0 + v[2], 1.0 - v[1] - v[2]]))
+    root = jnp.stack([1.0 + v[1], 1.0 + v[2], 1.0 - v[1] - v[2]])
+    root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
+    a, b, c = root * root / jnp.sum(root * root)
     s = 3.0 * jnp.exp(2.0 * _hold(v[0]))
     return s * jnp.stack([b + c, c + a, a + b])
 
@@ -177,12 +177,6 @@ def flat_bend(
     nil = jnp.zeros((), n.dtype)
     rows = [x, nil, y, nil, z], [nil, y, x, z, nil], [-z, -z, nil, y, x]
     return size * jnp.stack([jnp.stack(row) for row in rows])
-
-
-def _squares(root: Vec3) -> Vec3:
-    """The squares of three numbers, not all zero, over their sum."""
-    root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
-    return root * root / jnp.sum(root * root)
 
 
 def _shape(v: Float[Array, "5"]) -> Mat3:

@@ -6,7 +6,6 @@ symmetric top, and in JAX also for distinct moments above 1e16 kg m² (jax#669).
 
 import itertools
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -163,21 +162,14 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
 
     values, axes = eigensystem(jax.lax.stop_gradient(a))
     change = product(axes.T, product(a - jax.lax.stop_gradient(a), axes))
-    first, second = _divided_differences(scaled, values)
+    close = _CLOSE * jnp.max(jnp.abs(values))
+    x, y = values[np.array(_PAIRS)].T
+    first = jax.vmap(lambda x, y: _first(scaled, x, y, close))(x, y)[_PAIR]
+    x, y, z = values[np.array(_TRIPLES)].T
+    second = jax.vmap(lambda x, y, z: _second(scaled, x, y, z, close))(x, y, z)[_TRIPLE]
     bent = second * change[:, :, None] * change[None, :, :]
     inner = jnp.diag(jax.vmap(scaled)(values)) + first * change + bent.sum(axis=1)
     return product(axes, product(inner, axes.T))
-
-
-def _divided_differences(f, values):
-    """f[λi, λj] as (3, 3) and f[λi, λk, λj] as (3, 3, 3), of ascending eigenvalues."""
-    close = _CLOSE * jnp.max(jnp.abs(values))
-    pairs, triples = np.array(_PAIRS), np.array(_TRIPLES)
-
-    first, second = partial(_first, f, close=close), partial(_second, f, close=close)
-    of_pairs = jax.vmap(first)(*(values[pairs[:, k]] for k in range(2)))
-    of_triples = jax.vmap(second)(*(values[triples[:, k]] for k in range(3)))
-    return of_pairs[_PAIR], of_triples[_TRIPLE]
 
 
 def _first(f, x, y, close):

@@ -29,11 +29,6 @@ def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     return _checks.sign(mass, "mass", "a positive mass (kg)")
 
 
-def mass_of_a_body(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """A positive mass; another one is refused if it is known, and becomes NaN if it is traced."""
-    return real_mass(mass) if _checks.known(mass) else jnp.where(mass > 0, mass, jnp.nan)
-
-
 def real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Refuse an inertia tensor that is not symmetric, or has moments of no real body."""
     tensor = _symmetric(_checks.finite(tensor, "inertia tensor"), "inertia tensor")

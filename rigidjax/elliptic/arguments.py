@@ -5,7 +5,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
@@ -35,7 +34,7 @@ def complementary(name: str, value: Any, complement: Any) -> dict[str, Any]:
     if complement is None:
         return {name: value, name + "1": 1 - value}
     other = _checks.floating(complement, (), name + "1", batched=True)
-    if not isinstance(value, Tracer) and not isinstance(other, Tracer):
+    if _checks.known((value, other)):
         a, b = np.asarray(value), np.asarray(other)
         eps = max(np.finfo(a.dtype).eps, np.finfo(b.dtype).eps)
         excess = np.abs(a + b - 1)

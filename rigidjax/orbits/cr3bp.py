@@ -131,9 +131,9 @@ class ThreeBody(AbstractReversible):
         middle = 0.5 * (4 - u[0, 0] - u[1, 1])
         product = u[0, 0] * u[1, 1] - u[0, 1] * u[0, 1]
         kind = jnp.complex128 if u.dtype == jnp.float64 else jnp.complex64
-        half = jnp.sqrt((middle * middle - product).astype(kind))
-        squares = jnp.stack([half - middle, -half - middle, u[2, 2].astype(half.dtype)])
-        roots = jnp.sqrt(squares)
+        middle, product, across = (number.astype(kind) for number in (middle, product, u[2, 2]))
+        half = jnp.sqrt(middle * middle - product)
+        roots = jnp.sqrt(jnp.stack([half - middle, -half - middle, across]))
         return jnp.concatenate([roots, -roots])
 
     def lyapunov_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:

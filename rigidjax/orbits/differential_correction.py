@@ -224,18 +224,12 @@ def _corrected_jvp(primals: Any, tangents: Any) -> Any:
         return miss(whole, together(unknown, held, index))
 
     matrix = jax.jacfwd(missed)(flat)
-    dots = [
-        jnp.zeros_like(leaf) if dot is None else dot
-        for leaf, dot in zip(leaves, _tangents(numbers, scene_dot), strict=True)
-    ]
+    paths = {path: dot for path, dot in jax.tree.leaves_with_path(scene_dot) if dot is not None}
+    # A leaf without a tangent does not change.
+    named = jax.tree.leaves_with_path(numbers)
+    dots = [paths.get(path, jnp.zeros_like(leaf)) for path, leaf in named]
     held_dot = jnp.zeros_like(held) if held_dot is None else held_dot
     pushed, _ = ravel_pytree((dots, held_dot))
     moved = jnp.sum(matrix[:, :-3] * pushed[None], axis=1)
     total = -jnp.linalg.solve(matrix[:, -3:], moved)
     return (found, left), (total, jnp.zeros_like(left))
-
-
-def _tangents(numbers: Any, dots: Any) -> list[Any]:
-    """The tangents of the leaves of `numbers`; `None` for a leaf without one."""
-    paths = {path: leaf for path, leaf in jax.tree.leaves_with_path(dots) if leaf is not None}
-    return [paths.get(path) for path, _ in jax.tree.leaves_with_path(numbers)]

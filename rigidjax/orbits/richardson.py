@@ -15,9 +15,9 @@ from rigidjax.orbits.differential_correction import PeriodicOrbit
 def points(mu: Scalar) -> Float[Array, "5 3"]:
     """L1 … L5 (5, 3) of 0 < μ ≤ ½ by Euler's quintics (Szebehely 1967, sec. 4.4), rotating axes."""
     between, beyond, opposite = distances(mu)
-    half = 0.5 - mu
+    half, zero, height = 0.5 - mu, jnp.zeros_like(mu), jnp.full_like(mu, 0.75**0.5)
     x = jnp.stack([1 - mu - between, 1 - mu + beyond, -mu - opposite, half, half])
-    y = jnp.asarray([0.0, 0.0, 0.0, 0.75**0.5, -(0.75**0.5)], x.dtype)
+    y = jnp.stack([zero, zero, zero, height, -height])
     return jnp.stack([x, y, jnp.zeros_like(x)], axis=1)
 
 

@@ -226,12 +226,9 @@ def _aliases(problem: Problem, ends: list[Tried]) -> list[Alias]:
     return out
 
 
-def _numbers(alias: Alias) -> np.ndarray:
-    return np.log([alias.rotation, alias.precession, *alias.ratios])
-
-
 def _same(a: Alias, b: Alias, near: np.ndarray) -> bool:
-    return a.mode == b.mode and bool((np.abs(_numbers(a) - _numbers(b)) < near).all())
+    one, other = (np.log([m.rotation, m.precession, *m.ratios]) for m in (a, b))
+    return a.mode == b.mode and bool((np.abs(one - other) < near).all())
 
 
 @eqx.filter_jit

@@ -58,11 +58,24 @@ def light_curve(
     count = 1 + len(folds)
     ax = several_axes(ax, (count,), nrows=count, figsize=(7.2, 2.5 * count))
     label = "magnitude" if quantity == "mag" else "flux"
-    _against(ax[0], t / seconds, read, predicted)
+    ax[0].plot(t / seconds, read, ".", color=COLOURS[6], ms=3, label="read")
+    if predicted is not None:
+        # No line over a gap: the motion's brightness there is unknown.
+        wide = np.append(np.diff(t) > 10 * np.median(np.diff(t)), False)
+        line = np.where(wide, np.nan, predicted)
+        ax[0].plot(t / seconds, line, color=COLOURS[1], lw=1.0, label="motion")
+        # Beside the picture: a legend inside would cover data.
+        ax[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     ax[0].set(xlabel=f"time, {time_unit}", ylabel=label)
     for one, period in zip(ax[1:], folds, strict=True):
         turns = (t - t[0]) / period
-        _folded(one, turns, read, predicted)
+        # The start is drawn again after the end, to show that they join.
+        both, cycle = np.concatenate([turns % 1.0, turns % 1.0 + 1.0]), np.tile(turns // 1.0, 2)
+        if predicted is not None:
+            one.plot(both, np.tile(predicted, 2), ".", color=COLOURS[1], ms=1.5, alpha=0.6)
+        dots = one.scatter(both, np.tile(read, 2), c=cycle, s=8, cmap=_MAP, lw=0)
+        one.set_xlim(0.0, 2.0)
+        one.figure.colorbar(dots, ax=one, label="cycle", pad=0.01)
         one.set(xlabel=f"phase, in periods of {period / seconds:.6g} {time_unit}", ylabel=label)
     for one in ax:
         one.grid(alpha=0.3)
@@ -71,27 +84,6 @@ def light_curve(
     if title:
         ax[0].set_title(plain(title))
     return ax
-
-
-def _against(ax: Any, t: np.ndarray, read: np.ndarray, predicted: np.ndarray | None) -> None:
-    ax.plot(t, read, ".", color=COLOURS[6], ms=3, label="read")
-    if predicted is not None:
-        # No line over a gap: the motion's brightness there is unknown.
-        wide = np.append(np.diff(t) > 10 * np.median(np.diff(t)), False)
-        ax.plot(t, np.where(wide, np.nan, predicted), color=COLOURS[1], lw=1.0, label="motion")
-        # Beside the picture: a legend inside would cover data.
-        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-
-
-def _folded(ax: Any, turns: np.ndarray, read: np.ndarray, predicted: np.ndarray | None) -> None:
-    phase = turns % 1.0
-    # The start is drawn again after the end, to show that they join.
-    both, twice = np.concatenate([phase, phase + 1.0]), np.concatenate([turns, turns])
-    if predicted is not None:
-        ax.plot(both, np.tile(predicted, 2), ".", color=COLOURS[1], ms=1.5, alpha=0.6)
-    dots = ax.scatter(both, np.tile(read, 2), c=np.floor(twice), s=8, cmap=_MAP, lw=0)
-    ax.set_xlim(0.0, 2.0)
-    ax.figure.colorbar(dots, ax=ax, label="cycle", pad=0.01)
 
 
 show(__name__)

@@ -148,15 +148,12 @@ def summary(records: Iterable[Record]) -> str:
             lines.append(f"\n{scene}, {kind}: µs to an error of{wanted}   best error  compile, s")
             for label in dict.fromkeys(r.label for r in of):
                 mine = [r for r in of if r.label == label]
-                spent = "".join(_cell(pareto.time_to(mine, e)) for e in pareto.WANTED)
+                times = [1e6 * pareto.time_to(mine, e) for e in pareto.WANTED]
+                spent = "".join(f"{'-' if math.isnan(t) else f'{t:.4g}':>10s}" for t in times)
                 least = min(r.error for r in mine)
                 mark = "*" if label in best else "+" if label in near else " "
                 lines.append(f"{mark} {label:38s}{spent}   {least:10.1e}  {mine[0].compile:10.1f}")
     return "\n".join(lines)
-
-
-def _cell(seconds: float) -> str:
-    return f"{'-' if math.isnan(seconds) else f'{1e6 * seconds:.4g}':>10s}"
 
 
 def _drifts(scene: str, records: list[Record]) -> list[str]:

@@ -11,11 +11,6 @@ Number = Any
 Torque = Callable[[Number, Any, Any], tuple[Number, Number, Number]]
 
 
-def free(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> None:
-    """No torque: the body's equations leave the term away."""
-    return None
-
-
 def heavy(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Torque:
     """`τ = c m × Rᵀg`; constants m c (3) and g (3)."""
     cx, cy, cz, gx, gy, gz = constants

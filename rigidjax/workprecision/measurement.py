@@ -89,7 +89,12 @@ def measure(
             for setting in _settings(scene, method, thin * (2 if adjoint else 1)):
                 jobs += _looked_at(scene, method, adjoint, setting, ready, right)
     _timed(jobs, rounds)
-    return [_finished(job) for job in jobs]
+    found = []
+    for job in jobs:
+        low, middle, high = (float(p) for p in np.percentile(job.times[1:], [25, 50, 75]))
+        times = dict(time=middle, time_low=low, time_high=high)
+        found.append(dataclasses.replace(job.record, **times))
+    return found
 
 
 def worked_out(scene: Scene, gradients: bool = True) -> Reference:
@@ -213,11 +218,6 @@ def _timed(jobs: list[_Job], rounds: int) -> None:
             for _ in range(many):
                 job.ready.run(job.record.setting)
             job.times.append((time.perf_counter() - begin) / many)
-
-
-def _finished(job: _Job) -> Record:
-    low, middle, high = (float(p) for p in np.percentile(job.times[1:], [25, 50, 75]))
-    return dataclasses.replace(job.record, time=middle, time_low=low, time_high=high)
 
 
 def long_drift(

@@ -77,8 +77,9 @@ def write_csv(records: Iterable[Record], path: str | Path) -> None:
     with Path(path).open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(field.name for field in dataclasses.fields(Record))
-        for record in records:
-            rows.writerow(_written(value) for value in dataclasses.astuple(record))
+        for values in map(dataclasses.astuple, records):
+            shown = (f"{v:.6g}" if isinstance(v, float) and v == v else v for v in values)
+            rows.writerow("" if v != v else v for v in shown)
 
 
 def read_csv(path: str | Path) -> list[Record]:
@@ -93,12 +94,6 @@ def read_csv(path: str | Path) -> list[Record]:
             Record(**{n: row[n] if n in _WORDS else float(row[n] or "nan") for n in names})  # pyright: ignore
             for row in rows
         ]
-
-
-def _written(value: object) -> str:
-    if not isinstance(value, float):
-        return str(value)
-    return "" if value != value else f"{value:.6g}"
 
 
 def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str], list[str]]:

@@ -27,12 +27,9 @@ RADIUS = 7.0
 
 # Bodies: title, principal moments, Ω0, end, equations, and their constants.
 BODIES: dict[str, tuple[str, Any, Any, float, Any, Any]] = {
-    "free-top": (
-        "free asymmetric top", (1.0, 2.0, 3.0), (1.0, 0.7, 0.4), 100.0, equations.free, (),
-    ),
+    "free-top": ("free asymmetric top", (1.0, 2.0, 3.0), (1.0, 0.7, 0.4), 100.0, None, ()),
     "middle-axis": (
-        "free top about its middle axis", (1.0, 2.0, 3.0), (0.0, 1.0, 1e-3), 50.0,
-        equations.free, (),
+        "free top about its middle axis", (1.0, 2.0, 3.0), (0.0, 1.0, 1e-3), 50.0, None, (),
     ),
     "heavy-top": (
         "heavy symmetric top", (1.0, 1.0, 0.7), (0.3, 0.2, 5.0), 50.0,
@@ -96,12 +93,14 @@ def _body(
         numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = _same, number: Any = _same
     ) -> Any:
         exact = tuple(number(c) for c in constants)
-        torque = kind(numbers[:6], exact, sin, cos, wrap(equations.into_body))
-        return wrap(equations.body_rates(numbers[:6], None if torque is None else wrap(torque)))
+        torque = None
+        if kind is not None:
+            torque = wrap(kind(numbers[:6], exact, sin, cos, wrap(equations.into_body)))
+        return wrap(equations.body_rates(numbers[:6], torque))
 
     # What MuJoCo can do: weight alone, or nothing.
     com, gravity = (constants[:3], constants[3:]) if kind is equations.heavy else ((0.0,) * 3,) * 2
-    weighs = kind in (equations.free, equations.heavy)
+    weighs = kind in (None, equations.heavy)
     return Scene(
         name, title, Inertia.from_principal(*moments), Attitude(TILTED, omega),
         _torque(kind, constants), end, plain, stored(name), slow=omega[2] > 1e3,
