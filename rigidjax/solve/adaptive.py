@@ -180,14 +180,7 @@ def _again(
     """A recorded run, the constants that move, one a body; and tangents or cotangents."""
     many, whole = len(Run._fields), len(Run._fields) + len(Record._fields)
     run, record = Run(*each[:many]), Record(*each[many:whole])
-    if layout.bodies:
-        own = [s and m for s, m in zip(layout.shared, moving[0], strict=True)]
-        constants = [
-            jnp.broadcast_to(c[..., None], (*c.shape, *run.t0.shape)) if o else c
-            for c, o in zip(constants, own, strict=True)
-        ]
-        shared = tuple(s and not o for s, o in zip(layout.shared, own, strict=True))
-        layout = layout._replace(shared=shared)
+    layout, constants = layout.owned(constants, moving[0], run.t0)
     method = _over_bodies(method, layout, constants)
 
     def of_moving(chosen: Arrays, t: Array, y: Array) -> Array:
