@@ -28,15 +28,14 @@ from rigidjax.solve.splitting import AbstractSplitting
 # A torque must accept the given state: gravity on a `Spin` is an error that type checkers see.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 
-# Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
+# Made once: building a Module costs as much as ten steps.
 SOLVER = Projected(dfx.Dopri8())
 ADJOINT = dfx.RecursiveCheckpointAdjoint()
 NO_METER = dfx.NoProgressMeter()
-# Our loop has both modes of differentiation: these adjoints of diffrax ask no more than that.
+# Our loop has both modes of differentiation, all that these adjoints of diffrax ask.
 _EITHER_MODE = (type(None), dfx.ForwardMode, dfx.RecursiveCheckpointAdjoint)
-# A step that reverse mode runs again rounds differently. Where the tolerance is so near round-off
-# that its length then differs, too, the gradient belongs to other steps (2e-4 off at 1e-13 under
-# the gravity gradient): keep the start of every step of all but the longest runs.
+# A step that reverse mode runs again rounds differently. So near to round-off its length then
+# differs, too (2e-4 of a gradient at 1e-13): keep the start of every step of all but long runs.
 _TIGHT, _EVERY_STEP = 1e-10, dfx.RecursiveCheckpointAdjoint(checkpoints=4096)
 
 

@@ -103,7 +103,7 @@ def rate_of_jvp(primals, tangents):
 
 
 class AbstractSplitting(dfx.AbstractSolver):
-    """Kicks and exact free flows in the order that `composition` says; subclasses name it."""
+    """Kicks and exact free flows in the order of `composition`, which subclasses name."""
 
     term_structure: ClassVar = dfx.ODETerm
     interpolation_cls: ClassVar = NestedInterpolation
