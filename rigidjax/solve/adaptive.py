@@ -102,11 +102,9 @@ def taken_out(
     closed = [eqx.filter_closure_convert(function, *like) for function in functions]
     arrays, rest = eqx.partition(closed, eqx.is_array)
     constants, tree = jax.tree.flatten(arrays)
-
-    def outer(i: int) -> Callable[..., Any]:
-        return lambda constants, *args: eqx.combine(tree.unflatten(constants), rest)[i](*args)
-
-    return [outer(i) for i in range(len(closed))], constants, len(jax.tree.leaves(arrays[0]))
+    call = lambda i, constants, *args: eqx.combine(tree.unflatten(constants), rest)[i](*args)  # noqa: E731
+    calls = [partial(call, i) for i in range(len(closed))]
+    return calls, constants, len(jax.tree.leaves(arrays[0]))
 
 
 def _solved(

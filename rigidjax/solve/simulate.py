@@ -18,7 +18,7 @@ from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import validation
 from rigidjax.solve.crossings import Event, ready, solve_until
-from rigidjax.solve.error import foreseen_error, solve_to
+from rigidjax.solve.error import error_of_run, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected, Watched
 from rigidjax.solve.run import Free, Loop, Setup, direction, refuse, refuse_ended, solve
@@ -189,7 +189,7 @@ def _accurate(loop: Loop, event: Any, state0: Any, times: Array, accuracy: Any) 
     found, run, tried = solve_to(loop, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=loop.throw)
     sol = _solution(found, event, state0, times, None if event is not None else run)
-    error = foreseen_error(found, times, sol._states, sol.stats["num_steps"], tried)
+    error = error_of_run(found, times, sol._states, sol.stats["num_steps"], tried)
     return told(sol, error, accuracy)
 
 
