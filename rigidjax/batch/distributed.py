@@ -111,7 +111,8 @@ def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
     **Returns** the path of the file.
 
     >>> import tempfile
-    >>> save(jnp.arange(2), tempfile.mkdtemp()).name
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save(jnp.arange(2), folder).name
     'share-0.npz'
     """
     folder = _checks.path(folder, "folder")
