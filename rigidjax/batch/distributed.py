@@ -1,7 +1,6 @@
 """Several hosts: each works on its own share of the bodies; only results are sent.
 
-A run itself sends nothing, and the results of a share are the same bits as on one process alone.
-Gathering fails if another process has ended: a share is therefore written to disk first.
+The results of a share are the same bits as on one process alone.
 """
 
 import os
@@ -44,10 +43,9 @@ def connect(address: str, processes: int, process: int, *, patience: int = 20) -
 
 
 def share(tree: Any) -> Any:
-    """This process's rows of arrays that have a leading axis of bodies.
+    """This process's rows of arrays that have a leading axis of bodies, ⌈N / processes⌉ or fewer.
 
-    **Returns** the tree with ⌈N / processes⌉ rows, the last processes fewer. Leave out arrays that
-    all bodies share.
+    Leave out arrays that all bodies share.
 
     **Raises:** `ValueError` for fewer bodies than processes.
 
@@ -94,10 +92,9 @@ def gather(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
 
 
 def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
-    """The sum over all processes, on every process: of losses, gradients, normal equations.
+    """The sum over all processes, on every process, with the same bits.
 
-    **Arguments:** `tree` arrays, the same shapes everywhere; `checkpoint` as for `gather`. The sum
-    follows the order of the processes, so that every process has the same bits.
+    **Arguments:** `tree` arrays, the same shapes everywhere; `checkpoint` as for `gather`.
 
     **Raises:** as `gather`.
 
@@ -109,15 +106,14 @@ def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
 
 
 def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
-    """Write this process's rows, a `tree` of arrays, to `folder/share-<process>.npz`.
+    """Write this process's rows, a `tree` of arrays, to `folder/share-<process>.npz`, or nothing.
 
-    It writes all or nothing. **Returns** the path of the file.
+    **Returns** the path of the file.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = save(jnp.arange(2), folder)
-    ...     recover(jnp.zeros(2), folder)[0].tolist()
-    [0, 1]
+    ...     save(jnp.arange(2), folder).name
+    'share-0.npz'
     """
     folder = _checks.path(folder, "folder")
     leaves: dict[str, Any] = {

@@ -116,22 +116,18 @@ def rollout(
     - `inputs`: the inputs of the torque, by the names of its `rigidjax.torques.Input`s: arrays (N,
       num_steps, *k) whose row i is held exactly through step i of that body; rows of a
       `rigidjax.torques.Delayed` input come later.
-    - `chunk`: the number of bodies computed at a time. `None` fills the first cache, 128 in
-      float64. Bodies are independent: chunks change results in the last digits at most.
+    - `chunk`: the number of bodies computed at a time; `None` fills the first cache, 128 in
+      float64. It changes results in the last digits at most, as do:
     - `devices`: `None` for one, `"all"` of this process, or a sequence of them; N is cut into
-      equal shares. Free bodies get the same bits; XLA may change the order of products of a shared
-      torque, which is one rounding.
+      equal shares.
 
     **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
     (N, num_steps // save_every); with `reduce` the pair (last states, carried). Under a torque with
     states of its own they have `.motion` and `.own`.
 
-    Memory: the inputs, the results, and a chunk. Derivatives are exact for the steps taken, in
-    forward and reverse mode. Reverse mode goes back in pieces of √`num_steps` steps and stores one
-    chunk at a time; it takes five to ten times the time of the value. A body that becomes NaN
-    stays NaN and changes no other.
-
-    For use inside your own `jax.jit` see `rigidjax.batch.compiler_options`.
+    Memory: the inputs, the results, and a chunk, also in reverse mode, which takes five to ten
+    times the time of the value. Derivatives are exact for the steps taken, in both modes. A body
+    that becomes NaN changes no other. Inside your own `jax.jit` see `compiler_options`.
 
     **Raises:** `TypeError` if bodies, states, torque and solver do not fit together; `ValueError`
     for shapes that do not agree, an input that is missing or that no torque reads, a step that is

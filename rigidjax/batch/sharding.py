@@ -28,10 +28,9 @@ _WIDE = {"xla_cpu_prefer_vector_width": 512}
 def compiler_options() -> dict[str, Any]:
     """Options for `jax.jit(f, compiler_options=…)` around code that calls `rigidjax.batch`.
 
-    They enable 512-bit vectors on CPU, which XLA does not use by default: 1.5 to 2 times the speed
-    on cores with AVX-512. `rollout` and `simulate` use them outside of any transformation. JAX
-    takes options only at the outermost `jit`: give them there if it is your own. They are empty
-    unless the backend is CPU.
+    They enable 512-bit vectors on CPU: 1.5 to 2 times the speed on cores with AVX-512. `rollout`
+    and `simulate` use them outside of any transformation. JAX takes options only at the outermost
+    `jit`: give them there if it is your own. They are empty unless the backend is CPU.
 
     >>> bool(jax.jit(lambda x: x + 1, compiler_options=compiler_options())(1.0) == 2)
     True
@@ -65,10 +64,9 @@ def cpu_flags() -> CpuFlags:
     """The flag to export before Python starts, for loops over one or few bodies on CPU.
 
     XLA compiles a small loop as one kernel; this undocumented option sets the limit of small. It
-    helps if the loop's state is larger than a kilobyte and the arrays are short: on jaxlib 0.12.0.1
-    a `rollout` of one free body took 0.45 of the time; of many bodies it is as fast without. It
-    acts on the whole process, and only if it is there before JAX first looks for devices. This
-    function sets nothing. **Returns** a `CpuFlags`.
+    helps if the loop's state is larger than a kilobyte and the arrays are short. It acts on the
+    whole process, if it is there before JAX first looks for devices. This function sets nothing.
+    **Returns** a `CpuFlags`.
 
     >>> print(cpu_flags().xla_flags.split()[-1])
     --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000
@@ -82,11 +80,7 @@ def cpu_flags() -> CpuFlags:
 
 
 class Compiled:
-    """A function compiled once with `compiler_options`, or, inside a transformation, without.
-
-    A tracer among the `numbers`, its last argument, means that another `jit` may be outermost, and
-    only that one takes options.
-    """
+    """A function compiled with `compiler_options`; without, if its last argument is traced."""
 
     def __init__(self, function: Callable[..., Any]):
         self.function = function

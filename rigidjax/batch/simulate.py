@@ -95,12 +95,10 @@ def simulate(
       loop.
     - `rtol`, `atol`, `max_steps`, `adjoint`: as for `rigidjax.simulate`.
 
-    Bodies of one chunk take steps until the last of them has arrived; they are therefore computed
-    in the order of their initial rates. A body that becomes NaN ends within two steps. The other
-    bodies get the same bits whatever happens to one.
+    Bodies are computed in the order of their initial rates: those of one chunk wait for the last.
+    The other bodies get the same bits whatever happens to one.
 
-    **Returns** `ts`, `ys`, `result`, `num_steps` and `own` of each body (`Batch`). Nothing is
-    raised for what happens during a run: look at `result`.
+    **Returns** a `Batch`. Nothing is raised for what happens during a run: look at `result`.
 
     **Raises:** as `rollout`; `ValueError` for times that neither increase nor decrease.
 
@@ -181,10 +179,7 @@ def _statuses(batch: BodyBatch, ys: Any) -> dfx.RESULTS:
 
 
 def dealt(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:
-    """An order by `key` (N,), NaN last, and the way back from it.
-
-    Several devices get chunks in turn, so that each has quick and slow ones.
-    """
+    """An order by `key` (N,), NaN last, in which devices get chunks in turn, and the way back."""
     order, count = jnp.argsort(key), key.shape[0]
     chunk = min(chunk, -(-count // parts))
     size = -(-count // (chunk * parts)) * chunk

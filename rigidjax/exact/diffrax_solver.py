@@ -65,9 +65,8 @@ class FreeSolver(dfx.AbstractSolver):
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: None, made_jump: Any
     ) -> tuple[Any, Any, dict[str, Any], None, dfx.RESULTS]:
-        inertia, zero = _field(terms).inertia, jnp.zeros_like(t0)
-        # −1 where diffrax integrates backwards, its times running as −t: the control of [0, 1].
-        direction = terms.contr(zero, jnp.ones_like(zero))
+        # −1 where diffrax integrates backwards, its times running as −t.
+        inertia, direction = _field(terms).inertia, jnp.asarray(field_of(terms)[1], t0.dtype)
         y1 = FreeBody(inertia, y0)(direction * (t1 - t0))
         error = jax.tree.map(jnp.zeros_like, y0)
         dense = dict(y0=y0, inertia=inertia, direction=direction)
@@ -77,12 +76,18 @@ class FreeSolver(dfx.AbstractSolver):
         return terms.vf(t0, y0, args)
 
 
-def _field(terms: Any) -> EulerEquations:
-    """Euler's equations inside a term, which diffrax may have wrapped."""
+def field_of(terms: Any) -> tuple[Any, Any]:
+    """The vector field inside a term, and the direction of time that diffrax wraps around it."""
     # `vf` and `contr`, all that diffrax promises of a wrapped term, give numbers, not the inertia.
     term = getattr(terms, "term", terms)
-    field = getattr(term, "vector_field", None)
+    return getattr(term, "vector_field", None), getattr(terms, "direction", 1)
+
+
+def _field(terms: Any) -> EulerEquations:
+    """Euler's equations inside a term."""
+    field, _ = field_of(terms)
     euler = field.euler if isinstance(field, AttitudeEquations) else field
+    term = getattr(terms, "term", terms)
     if not isinstance(term, dfx.ODETerm) or not isinstance(euler, EulerEquations):
         raise ValueError(
             "FreeSolver: wanted ODETerm(equations_of_motion(inertia, y0)) of a Spin or an "

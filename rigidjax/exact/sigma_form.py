@@ -19,8 +19,8 @@ which doubles as `Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u)`,
     G = ∫₀ᵗ Π Πᵀ dt = 2σ/(W det T) (adj(T)k)(adj(T)k)ᵀ − 2 adj(E₂ 1 − h² K) Y.
 
 Proof of the first: in principal axes of K it is Jacobi's solution with T = diag(D, 1, C), σ = S, by
-`E₃₃ − E₂₂ = (a₂ − a₃)(a₁h² − E₂) = p`, `E₁₁ − E₂₂ = q`; both sides turn with the axes. All terms
-but `|…|` are polynomial in K: a sphere or a symmetric top is an ordinary point. (The second:
+`E₃₃ − E₂₂ = (a₂ − a₃)(a₁h² − E₂) = p`, `E₁₁ − E₂₂ = q`, and both sides turn with the axes. All
+terms but `|…|` are polynomial in K: a sphere or a symmetric top is an ordinary point. (The second:
 differentiate in principal axes: with g = σ/τᵢ, g' = τⱼτₖ/τᵢ²; the mid point removes even terms.)
 
 The axes are principal at the point of evaluation: off-diagonal entries are zeros that carry

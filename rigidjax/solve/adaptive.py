@@ -102,11 +102,9 @@ def taken_out(
     closed = [eqx.filter_closure_convert(function, *like) for function in functions]
     arrays, rest = eqx.partition(closed, eqx.is_array)
     constants, tree = jax.tree.flatten(arrays)
-
-    def outer(i: int) -> Callable[..., Any]:
-        return lambda constants, *args: eqx.combine(tree.unflatten(constants), rest)[i](*args)
-
-    return [outer(i) for i in range(len(closed))], constants, len(jax.tree.leaves(arrays[0]))
+    call = lambda i, constants, *args: eqx.combine(tree.unflatten(constants), rest)[i](*args)  # noqa: E731
+    calls = [partial(call, i) for i in range(len(closed))]
+    return calls, constants, len(jax.tree.leaves(arrays[0]))
 
 
 def _solved(
@@ -180,14 +178,7 @@ def _again(
     """A recorded run, the constants that move, one a body; and tangents or cotangents."""
     many, whole = len(Run._fields), len(Run._fields) + len(Record._fields)
     run, record = Run(*each[:many]), Record(*each[many:whole])
-    if layout.bodies:
-        own = [s and m for s, m in zip(layout.shared, moving[0], strict=True)]
-        constants = [
-            jnp.broadcast_to(c[..., None], (*c.shape, *run.t0.shape)) if o else c
-            for c, o in zip(constants, own, strict=True)
-        ]
-        shared = tuple(s and not o for s, o in zip(layout.shared, own, strict=True))
-        layout = layout._replace(shared=shared)
+    layout, constants = layout.owned(constants, moving[0], run.t0)
     method = _over_bodies(method, layout, constants)
 
     def of_moving(chosen: Arrays, t: Array, y: Array) -> Array:

@@ -8,9 +8,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jaxtyping import Array
 
 Arrays = list[Any]
@@ -29,6 +31,18 @@ class Layout(NamedTuple):
         """`function(constants, t, y)` of one body on the arrays of all."""
         axes = [None if s else -1 for s in self.shared]
         return jax.vmap(function, (axes, -1, -1), -1) if self.bodies else function
+
+    def owned(self, constants: Arrays, which: list[bool], like: Any) -> tuple["Layout", Arrays]:
+        """The constants, `which` of them one of each body, of which `like` has as many."""
+        if not self.bodies:
+            return self, constants
+        own = [s and w for s, w in zip(self.shared, which, strict=True)]
+        constants = [
+            jnp.broadcast_to(c[..., None], (*c.shape, like.shape[-1])) if o else c
+            for c, o in zip(constants, own, strict=True)
+        ]
+        shared = tuple(s and not o for s, o in zip(self.shared, own, strict=True))
+        return self._replace(shared=shared), constants
 
 
 # `program(layout, constants, each)` returns a list of arrays of each body.
@@ -87,7 +101,37 @@ def in_lanes(
 
         return [first(a) for a in out], [True] * len(out)
 
-    return call(*constants, *each)
+    answer: Any = jax.custom_jvp(lambda *args: call(*args))
+    # The rule of `custom_vmap` itself gives wrong shapes in a batch of tangents.
+    answer.defjvp(partial(_jvp, program, was, number, linear), symbolic_zeros=True)
+    return answer(*constants, *each)
+
+
+def _jvp(
+    program: Program, was: Layout, number: int, linear: int, primals: Any, tangents: Any
+) -> tuple[Arrays, Arrays]:
+    """The result of a program of `number` constants, and its tangent, as one program in lanes."""
+    constants, each = list(primals[:number]), list(primals[number:])
+    moving = [not isinstance(t, SymbolicZero) for t in tangents]
+    # Tangents of constants have a last axis of bodies, and so have then these.
+    _, along = was.owned(list(tangents[:number]), moving[:number], each[0])
+    along = [t for t, m in zip([*along, *tangents[number:]], moving, strict=True) if m]
+
+    def with_tangents(layout: Layout, constants: Arrays, rest: Arrays) -> Arrays:
+        layout, constants = layout.owned(constants, moving[:number], rest[0])
+        args, given = [*constants, *rest[: len(each)]], iter(rest[len(each) :])
+        both = zip(args, moving, strict=True)
+        moved = [next(given) if m else zero_from_primal(a) for a, m in both]
+        one = lambda *args: program(layout, list(args[:number]), list(args[number:]))  # noqa: E731
+        pairs = zip(*jax.jvp(one, args, moved), strict=True)
+        return [a for o, m in pairs for a in ([o, m] if eqx.is_inexact_array(o) else [o])]
+
+    out, moved = [], []
+    found = iter(in_lanes(with_tangents, constants, [*each, *along], linear + len(along), was))
+    for a in found:
+        out.append(a)
+        moved.append(next(found) if eqx.is_inexact_array(a) else zero_from_primal(a))
+    return out, moved
 
 
 def _in_blocks(program: Program, layout: Layout, number: int, *args: Any) -> Arrays:

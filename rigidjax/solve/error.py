@@ -24,7 +24,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.motion.manifold import minus, names, parts
 from rigidjax.solve import validation
 from rigidjax.solve.linear_map import as_known
-from rigidjax.solve.run import Free, Loop, Setup, solve
+from rigidjax.solve.run import Free, Loop, solve
 
 # Order 8 makes that 1.6 times the steps.
 _CLOSER = 2e-2
@@ -106,30 +106,22 @@ class Error(eqx.Module):
 
 
 @eqx.filter_jit
-def error_of_run(setup: Free | Loop | Setup, ts: Array, ys: Any, count: Array) -> Error:
-    """The error of the states `ys` that `setup` gave at `ts` in `count` steps."""
-    setup, ts, ys, count = _still((setup, ts, ys, count))
-    if isinstance(setup, Free):
-        steps, rtol = _apart(ys, ys), jnp.zeros((), ts.dtype)
-    else:
+def error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None) -> Error:
+    """The error of the states `ys` that `setup` gave at `ts` in `count` steps.
+
+    By another run `tried`, its tolerance and states, it is too large by up to ten.
+    """
+    setup, ts, ys, count, tried = _still((setup, ts, ys, count, tried))
+    rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
+    if tried is not None:
+        rtol, (before, others) = setup.rtol, tried
+        far = _largest(_apart(others, ys), _sizes(ys)) > _FORESEEN
+        factor = jnp.where(far, jnp.inf, _ALLOWED * rtol / before)
+    elif not isinstance(setup, Free):
         second, rtol, factor = _closer(setup, ts)
-        start = jax.tree.map(lambda leaf: leaf[0], ys)
-        steps = _apart(solve(second, start, ts)[0], ys)
-        steps = jax.tree.map(lambda part: factor * part, steps)
+        others, *_ = solve(second, jax.tree.map(lambda leaf: leaf[0], ys), ts)
+    steps = jax.tree.map(lambda part: factor * part, _apart(others, ys))
     return _with_round_off(setup, ts, ys, count, steps, rtol)
-
-
-@eqx.filter_jit
-def foreseen_error(loop: Loop, ts: Array, ys: Any, count: Array, tried: Any) -> Error:
-    """The same, too large by up to ten, from another run: its tolerance and its states."""
-    loop, ts, ys, count, tried = _still((loop, ts, ys, count, tried))
-    before, others = tried
-    steps = _apart(others, ys)
-    far = _largest(steps, _sizes(ys)) > _FORESEEN
-    factor = jnp.where(far, jnp.inf, _ALLOWED * loop.rtol / before)
-    return _with_round_off(
-        loop, ts, ys, count, jax.tree.map(lambda part: factor * part, steps), loop.rtol
-    )
 
 
 def _still(tree: Any) -> Any:
@@ -151,18 +143,17 @@ def _with_round_off(
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
     setup, ys, more = _cheaper(setup, start, times, ys, count)
 
+    free = isinstance(setup, Free)
+
     def neighbour(numbers: Any, later: Array) -> Array:
         body, torque, y0 = eqx.combine(numbers, rest)
-        if isinstance(setup, Free):
-            near = dataclasses.replace(setup, body=body, throw=False)
-            return jax.vmap(minus)(solve(near, y0, times * later)[0], ys)
-        near = dataclasses.replace(setup, body=body, torque=torque, throw=False)
-        return jax.vmap(minus)(solve(near, y0, times)[0], ys)
+        new = dict(body=body, throw=False) | ({} if free else dict(torque=torque))
+        return jax.vmap(minus)(solve(dataclasses.replace(setup, **new), y0, times * later)[0], ys)
 
     rng = np.random.default_rng(0)
     near = jax.tree.map(lambda leaf: _nudged(leaf, rng), numbers)
     # The closed form rounds its angle once, and numbers that differ may round to the same one.
-    later = jnp.asarray(1.0 + eps * np.array([1.0, -1.0, 1.0]), ts.dtype)
+    later = jnp.asarray(1.0 + eps * free * np.array([1.0, -1.0, 1.0]), ts.dtype)
     changes = more * jax.vmap(neighbour)(near, later)
     off = _lengths(start, _DEVIATIONS * jnp.sqrt(_spread(changes)))
     off = {name: jnp.where(clear, plain[name], off[name]) for name in off}
@@ -197,11 +188,16 @@ def _lengths(state: Any, changes: Array) -> dict[str, Array]:
     return {name.removeprefix("motion."): jnp.linalg.norm(part, axis=-1) for name, part in named}
 
 
+def largest_in_run(leaf: Array) -> Array:
+    """The largest length of an array of the states in the part of a run that it reached."""
+    return jnp.nanmax(jnp.linalg.norm(leaf.reshape(leaf.shape[0], -1), axis=-1))
+
+
 def _sizes(ys: Any) -> dict[str, Array]:
     sizes = {}
     for name, leaf in zip(names(ys), jax.tree.leaves(ys), strict=True):
         name = name.removeprefix("motion.")
-        most = jnp.nanmax(jnp.linalg.norm(leaf.reshape(leaf.shape[0], -1), axis=-1))
+        most = largest_in_run(leaf)
         sizes[name] = jnp.ones_like(most) if name == "q" else jnp.maximum(most, _SMALL)
     return sizes
 

@@ -18,10 +18,7 @@ from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
 
 
 class NestedInterpolation(dfx.AbstractLocalInterpolation):
-    """Dense output of a Runge–Kutta step, its quaternion scaled to length 1.
-
-    The rows of `coefficients` are those of `rigidjax.solve.runge_kutta.nested`.
-    """
+    """Dense output of a step by rows of `runge_kutta.nested`, its quaternion scaled to length 1."""
 
     t0: Any
     t1: Any
@@ -85,8 +82,8 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
 class RungeKutta4(AbstractExplicit):
     """The classical Runge–Kutta method: order 4, four stages, an estimate of order 3.
 
-    For coarse tolerances (1e-3) and torques known to few digits. A quaternion is scaled to |q| = 1
-    once per step, and in dense output (cubic, as accurate as the steps themselves).
+    For coarse tolerances (1e-3). A quaternion is scaled to |q| = 1 once per step, and in dense
+    output (cubic, as accurate as the steps).
 
     Source: Kutta 1901; Hairer, Nørsett and Wanner (1993), II.1, doi:10.1007/978-3-540-78862-1.
 

@@ -60,9 +60,8 @@ def lyapunov_exponents(
 ) -> Exponents:
     """The spectrum of Lyapunov exponents along a motion, the largest first.
 
-    An orthonormal frame of tangents is solved along with the motion (continuous QR), to the same
-    tolerances, with the logarithms of its growth: the exponents are their means.
-    Tangents of an attitude are small turns in body axes, three numbers: |q| is no direction.
+    An orthonormal frame of tangents is solved along with the motion (continuous QR); the exponents
+    are the mean rates of its growth. Tangents of an attitude are small turns in body axes.
 
     **Arguments:**
 
@@ -71,15 +70,13 @@ def lyapunov_exponents(
     - `state0`: the state at `t0`; `time`: the length of the run, s.
     - `number`: k, the number of exponents; `None` for all, 6 for an `Attitude`.
     - `intervals`: N; the frame is made orthonormal to round-off after each.
-    - `transient`: intervals at the beginning that are not counted: the state approaches its
-      attractor, and the tangents to their directions.
+    - `transient`: intervals at the beginning that are not counted.
     - `solver`, `rtol`, `atol`, `max_steps` (in an interval): as for `simulate`.
 
     Each conserved quantity, and the direction of the motion itself, gives a zero; it decreases as
-    (log t)/t, and `errors` does not include such a trend: look at `running`.
+    (log t)/t, a trend that `errors` does not include: look at `running`.
 
-    **Returns** `values` and `errors`, `times` and `running`, `state`, `result` (`Exponents`). Where
-    a run fails they are NaN, and `result` says why.
+    **Returns** an `Exponents`; NaN where a run fails: `result` says why.
 
     Source: Dieci, Russell and Van Vleck 1997, doi:10.1137/S0036142993247311; for orthonormal
     frames: Christiansen and Rugh 1997, doi:10.1088/0951-7715/10/5/004.

@@ -135,16 +135,9 @@ def _transposed(cotangents: Any, *args: Any, **params: Any) -> Any:
         jnp.zeros(*result) if isinstance(c, ad.Zero) else c
         for c, result in zip(cotangents, params["results"], strict=True)
     ]
-    found = _linear_map.bind(
-        *given,
-        *whole,
-        function=params["transposed"],
-        transposed=params["function"],
-        number=number,
-        inputs=params["results"],
-        results=params["inputs"],
-    )
-    return [None] * number + found
+    turned = dict(function=params["transposed"], transposed=params["function"])
+    turned |= dict(inputs=params["results"], results=params["inputs"])
+    return [None] * number + _linear_map.bind(*given, *whole, number=number, **turned)
 
 
 def _batched(args: Any, dims: Any, **params: Any) -> Any:
@@ -163,16 +156,9 @@ def _batched(args: Any, dims: Any, **params: Any) -> Any:
         return tuple(((size, *shape), dtype) for shape, dtype in shapes)
 
     inputs, results = params["inputs"], params["results"]
-    out = _linear_map.bind(
-        *given,
-        *along,
-        function=over(params["function"], len(inputs)),
-        transposed=over(params["transposed"], len(results)),
-        number=number,
-        inputs=longer(inputs),
-        results=longer(results),
-    )
-    return out, [0] * len(out)
+    both = dict(function=over(params["function"], len(inputs)), inputs=longer(inputs))
+    both |= dict(transposed=over(params["transposed"], len(results)), results=longer(results))
+    return _linear_map.bind(*given, *along, number=number, **both), [0] * len(results)
 
 
 ad.primitive_jvps[_linear_map] = _differentiated

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from rigidjax.exact.components3 import Four, Triple, cross, plus
+from rigidjax.exact.diffrax_solver import field_of
 from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations, on_the_group
 from rigidjax.motion.torques.base import sees_attitude
@@ -106,13 +107,6 @@ class Magnus4(dfx.AbstractSolver):
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
-
-
-def field_of(terms: Any) -> tuple[Any, Any]:
-    """The vector field inside the term, and the direction of time that diffrax wraps around it."""
-    if isinstance(terms, dfx.ODETerm):
-        return terms.vector_field, 1
-    return terms.term.vector_field, terms.direction
 
 
 def require_attitude(name: str, field: Any, y0: Any, instead: str) -> AttitudeEquations:

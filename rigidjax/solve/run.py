@@ -130,9 +130,8 @@ def ahead(
     def directed(s: Array, y: Any, args: Any = None) -> Any:
         t = time(s)
         if jumps.size:
-            # A law has its new value from the jump on. A step back that begins there wants the old
-            # one, and one that ends there, at the last moment before it in s, the new one.
-            # The oldest JAX has no derivative of `nextafter`, not even one to be stopped.
+            # A law has its new value from the jump on; a step back that begins there wants the old
+            # one. The oldest JAX has no derivative of `nextafter`, not even one to be stopped.
             still = lax.stop_gradient(t)
             before = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
             t = t + jnp.where(sign < 0, before - still, jnp.zeros_like(still))

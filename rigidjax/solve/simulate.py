@@ -18,7 +18,7 @@ from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import validation
 from rigidjax.solve.crossings import Event, ready, solve_until
-from rigidjax.solve.error import foreseen_error, solve_to
+from rigidjax.solve.error import error_of_run, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected, Watched
 from rigidjax.solve.run import Free, Loop, Setup, direction, refuse, refuse_ended, solve
@@ -28,15 +28,14 @@ from rigidjax.solve.splitting import AbstractSplitting
 # A torque must accept the given state: gravity on a `Spin` is an error that type checkers see.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 
-# Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
+# Made once: building a Module costs as much as ten steps.
 SOLVER = Projected(dfx.Dopri8())
 ADJOINT = dfx.RecursiveCheckpointAdjoint()
 NO_METER = dfx.NoProgressMeter()
-# Our loop has both modes of differentiation: these adjoints of diffrax ask no more than that.
+# Our loop has both modes of differentiation, all that these adjoints of diffrax ask.
 _EITHER_MODE = (type(None), dfx.ForwardMode, dfx.RecursiveCheckpointAdjoint)
-# A step that reverse mode runs again rounds differently. Where the tolerance is so near round-off
-# that its length then differs, too, the gradient belongs to other steps (2e-4 off at 1e-13 under
-# the gravity gradient): keep the start of every step of all but the longest runs.
+# A step that reverse mode runs again rounds differently. So near to round-off its length then
+# differs, too (2e-4 of a gradient at 1e-13): keep the start of every step of all but long runs.
 _TIGHT, _EVERY_STEP = 1e-10, dfx.RecursiveCheckpointAdjoint(checkpoints=4096)
 
 
@@ -190,7 +189,7 @@ def _accurate(loop: Loop, event: Any, state0: Any, times: Array, accuracy: Any) 
     found, run, tried = solve_to(loop, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=loop.throw)
     sol = _solution(found, event, state0, times, None if event is not None else run)
-    error = foreseen_error(found, times, sol._states, sol.stats["num_steps"], tried)
+    error = error_of_run(found, times, sol._states, sol.stats["num_steps"], tried)
     return told(sol, error, accuracy)
 
 

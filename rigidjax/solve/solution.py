@@ -19,7 +19,7 @@ from rigidjax.motion.conserved import drift
 from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.manifold import dimension, minus_small, parts, plus, turns
 from rigidjax.motion.torques.states import require_stateless
-from rigidjax.solve.error import Error, error_of_run
+from rigidjax.solve.error import Error, error_of_run, largest_in_run
 from rigidjax.solve.run import Free, Loop, Setup, solve
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
@@ -221,17 +221,11 @@ def _growth(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, " ti
     """The largest singular value of dy(t)/dy(t0), each part relative to its largest size."""
     start = jax.tree.map(lambda leaf: leaf[0], ys)
     each = parts(start, jnp.ones(dimension(start), ts.dtype)).values()
-    sizes = jnp.concatenate(
-        [a.reshape(-1) * _size(b) for a, b in zip(each, jax.tree.leaves(ys), strict=True)]
-    )
+    both = zip(each, jax.tree.leaves(ys), strict=True)
+    sizes = jnp.concatenate([a.reshape(-1) * largest_in_run(b) for a, b in both])
+    sizes = jnp.where(sizes > 0, sizes, 1)
     # A turn by δθ changes q by half of it.
     for turned in turns(start):
         sizes = sizes.at[turned].multiply(2)
     change = _transition(setup, ts, ys) * (sizes[None] / sizes[:, None])[None]
     return jnp.linalg.norm(change, ord=2, axis=(1, 2))
-
-
-def _size(leaf: Array) -> Array:
-    # A run that ended early has NaN in the rows that it did not reach.
-    size = jnp.sqrt(jnp.nanmax(jnp.sum((leaf * leaf).reshape(leaf.shape[0], -1), axis=1)))
-    return jnp.where(size > 0, size, jnp.ones_like(size))

@@ -13,23 +13,16 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.exact.components3 import (
-    Six,
-    Triple,
-    adjugate,
-    determinant,
-    plus,
-    times,
-    turned_back,
-)
+from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, plus, times, turned_back
 from rigidjax.exact.derivatives import flow
+from rigidjax.exact.diffrax_solver import field_of
 from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import evaluate, sees_rate
 from rigidjax.rotation import quaternion
 from rigidjax.solve.explicit import NestedInterpolation, cubic_rows
-from rigidjax.solve.magnus import field_of, require_attitude
+from rigidjax.solve.magnus import require_attitude
 from rigidjax.solve.tableaus import numbers
 
 
@@ -103,7 +96,7 @@ def rate_of_jvp(primals, tangents):
 
 
 class AbstractSplitting(dfx.AbstractSolver):
-    """Kicks and exact free flows in the order that `composition` says; subclasses name it."""
+    """Kicks and exact free flows in the order of `composition`, which subclasses name."""
 
     term_structure: ClassVar = dfx.ODETerm
     interpolation_cls: ClassVar = NestedInterpolation

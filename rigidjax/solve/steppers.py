@@ -110,7 +110,10 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
             "Magnus4 or a Splitting of rigidjax.solvers; for others use simulate with "
             "stepsize_controller=diffrax.ConstantStepSize() under jax.vmap"
         )
-    return _general(solver, field, y0) if turning is None else _explicit(solver, turning, y0)
+    if turning is not None:
+        return _explicit(solver, turning, y0)
+    slope = lambda inputs: lambda t, y: split(bind(field, inputs)(t, join(y, y0), None))  # noqa: E731
+    return _of_slope(solver, slope, split(y0), lambda y: join(y, y0), y0)
 
 
 class _Turning(NamedTuple):
@@ -219,14 +222,6 @@ def _explicit(solver: AbstractExplicit | Rolled, turning: _Turning, state0: Any)
 
     momentum = times(_entries(body.tensor), start[many:])
     return _of_slope(solver, slope_under, (*start[:many], *momentum), state, state0)
-
-
-def _general(solver: AbstractExplicit | Rolled, field: Callable[..., Any], state0: Any) -> Stepper:
-    def slope_under(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
-        here = bind(field, inputs)
-        return lambda t, y: split(here(t, join(y, state0), None))
-
-    return _of_slope(solver, slope_under, split(state0), lambda y: join(y, state0), state0)
 
 
 def _of_slope(solver: Any, slope_under: Any, start: Atoms, state: Any, like: Any) -> Stepper:

@@ -271,6 +271,24 @@ def test_second_derivatives_of_blocks_of_bodies_are_those_of_each_alone(monkeypa
     np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.long
+def test_a_batch_of_products_of_second_derivatives_with_directions():
+    law = rj.torques.Damping([0.3, 0.1, 0.2])
+
+    def energy(omega):
+        sol = rj.simulate(BODY, rj.Spin(omega), [0.0, 1.0], law, throw=False)
+        return jnp.sum(sol.ys.omega[-1] ** 2)
+
+    def bend(omega, turn):
+        return jax.jvp(jax.grad(energy), (omega,), (turn,))[1]
+
+    omega = jnp.array([[0.1, 0.2, 1.0], [0.3, 1.2, 1.0]])
+    found = once(jax.vmap(bend))(omega, omega[::-1])
+    slope, step = once(jax.vmap(jax.grad(energy))), 1e-4 * omega[::-1]
+    rise = slope(omega + step) - slope(omega - step)
+    np.testing.assert_allclose(found, rise / 2e-4, rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_bodies_in_lanes_are_bodies_alone(monkeypatch):
     # Steps of different number, jumps, saved times, a law of each body's own and one for all.
