@@ -77,9 +77,6 @@ def channel(text: str) -> Channel:
     KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y, z) or `euler-ZXZ` (any sequence; body →
     world); NOISE one number or three, one for each axis, as in `0.1,0.1,0.2`. **Raises**
     `LogError` in words.
-
-    >>> channel("gyro=p,q,r:deg/s").unit
-    'deg/s'
     """
     kind, _, rest = text.partition("=")
     names, *more = rest.split(":")
@@ -118,9 +115,6 @@ def wheel(text: str) -> WheelColumn:
     """A wheel written `COLUMN:INERTIA[:AXIS[:UNIT]]`, such as `flywheel:5.2e-7:z:rad/s`.
 
     INERTIA in kg m² about its axis, AXIS `x`, `y` or `z` of the body. **Raises** `LogError`.
-
-    >>> wheel("speed:1e-6").axis
-    (0.0, 0.0, 1.0)
     """
     name, *more = text.split(":")
     axis = more[1] if len(more) > 1 else "z"
@@ -151,10 +145,6 @@ def read_log(
     or `None` for all; `wheels`; `free` some of `bias`, `drag`, `delay`: sensors and torque get
     these numbers, so that a fit can move them. An empty cell is a gap. **Raises** `LogError` as
     `read_table`.
-
-    >>> read_log("missing.csv", [channel("gyro=wx,wy,wz")])
-    Traceback (most recent call last):
-    rigidjax.identify.csv_io.LogError: missing.csv: no such file
     """
     # Two wheels may share a column of their speed.
     turning = dict.fromkeys(w.column for w in wheels)

@@ -85,11 +85,7 @@ UNITS = {
 
 
 class LogError(ValueError):
-    """A log that cannot be read; the message names the file and, where known, line and column.
-
-    >>> issubclass(LogError, ValueError)
-    True
-    """
+    """A log that cannot be read; the message names the file and, where known, line and column."""
 
     def __str__(self) -> str:
         # Names out of a file must not move the cursor of the terminal that shows them.

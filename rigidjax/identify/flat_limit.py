@@ -53,9 +53,6 @@ def ends(
     They follow from the likelihood ratio of two Gaussian numbers, one of them not negative:
     `m²(y) = min over z ≥ 0`. **Arguments:** `reach` the quantile; `correlation` of the number y
     with the flatness z; `away` the free flatness over its standard deviation.
-
-    >>> ends(2.0, np.array([0.0, 1.0]), 0.0)
-    (array([-2.,  0.]), array([2., 2.]))
     """
     rho = np.clip(np.asarray(correlation), -1.0, 1.0)
     past = min(away, 0.0)

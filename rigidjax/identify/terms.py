@@ -179,11 +179,7 @@ def with_blocks(parameters: Parameters, problem: "Problem") -> tuple[Any, Any]:
 
 
 def with_jacobian(function: Callable[[Array], Any], at: Float[Array, " n"]) -> tuple[Any, Any]:
-    """The derivative (…, n) of a function, in forward mode, and its value (…).
-
-    >>> with_jacobian(lambda x: x * x, jnp.array([1.0, 3.0]))[0].tolist()
-    [[2.0, 0.0], [0.0, 6.0]]
-    """
+    """The derivative (…, n) of a function, in forward mode, and its value (…)."""
 
     def twice(at: Array) -> tuple[Any, Any]:
         found = function(at)

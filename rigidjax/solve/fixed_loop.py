@@ -164,11 +164,7 @@ def march(
 
 
 def piece_length(count: int) -> int:
-    """About √count steps; a divisor of count where there is one near, for less to compile.
-
-    >>> piece_length(1000), piece_length(997)
-    (40, 32)
-    """
+    """About √count steps; a divisor of count where there is one near, for less to compile."""
     root = math.isqrt(count - 1) + 1
     near = [d for d in range(root, min(2 * root, count) + 1) if count % d == 0]
     return near[0] if near else root

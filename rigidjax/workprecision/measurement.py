@@ -232,9 +232,6 @@ def long_drift(
     drift is bounded if they agree; it grows with time if the second is a hundred times the first.
     `setting` is the length of a step, s; `error` is the energy's (the motion forgets its start long
     before the end).
-
-    >>> [record.steps for record in long_drift(10_000, ["RungeKutta4"])]
-    [100.0, 10000.0]
     """
     body = Inertia.from_principal(*BODY)
     start = Attitude([0.955336489125606, 0.29552020666133955, 0.0, 0.0], [0.4, 0.3, 1.2])

@@ -34,12 +34,7 @@ def front(records: Iterable[Record]) -> list[Record]:
 
 
 def first_answers(records: Iterable[Record]) -> list[Record]:
-    """The same records with the time that a first answer takes: compiling and one run.
-
-    >>> cold = Record("scene", "method", "ours", "value", "", 1e-6, time=1e-3, compile=2.0)
-    >>> first_answers([cold])[0].time
-    2.001
-    """
+    """The same records with the time that a first answer takes: compiling and one run."""
     return [
         dataclasses.replace(r, time=r.time + c, time_low=r.time_low + c, time_high=r.time_high + c)
         for r in listed(records)
