@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar
@@ -108,7 +108,7 @@ class LogDensity(eqx.Module):
         self.problem, self.process, self.noises = problem, process, fit.noises
         known = process is None or deviation is None
         self.deviation = None if known else jnp.asarray(_checks.positive(deviation, "deviation"))
-        groups = np.asarray(groups_of(problem))
+        groups = np.asarray(problem.noise_groups)
         factors = tuple(
             jnp.zeros(groups.max() + 1) if reading.sensor.noise is None else None
             for reading in problem.records.readings
@@ -233,12 +233,6 @@ def prior_residuals(density: LogDensity, x: Float[Array, " n"]) -> Float[Array, 
     return jnp.concatenate(parts) if parts else jnp.zeros(0, x.dtype)
 
 
-def groups_of(problem: Problem) -> Int[Array, " records"]:
-    """The index of each recording's noise in the fit: all the same unless `noise_each`."""
-    groups = problem.noise_groups
-    return jnp.zeros(problem.count, jnp.int32) if groups is None else groups
-
-
 def grown_noises(noises: tuple, steps: tuple) -> tuple[Float[Array, "*records k"], ...]:
     """The noises of the sensors by the logarithms of their factors, `None` for none."""
     pairs = zip(noises, steps, strict=True)
@@ -249,8 +243,7 @@ def own_numbers(density: LogDensity, x: Array) -> Any:
     """The problem's numbers, factors of noises and the process's numbers of each recording."""
     problem = density.problem
     parameters, factors, logs = ravel_pytree(density.like)[1](x)
-    groups = groups_of(problem)
-    steps = tuple(None if factor is None else factor[groups] for factor in factors)
+    steps = tuple(None if f is None else f[problem.noise_groups] for f in factors)
     laws = None if logs is None else jnp.broadcast_to(logs, (problem.count, logs.size))
     return local(problem, parameters), steps, laws
 

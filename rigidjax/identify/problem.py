@@ -95,7 +95,7 @@ class Problem(eqx.Module):
     body: AbstractBodyChart | Bodies
     of: tuple[str, ...] = eqx.field(static=True)
     which: Int[Array, " records"] | None
-    noise_groups: Int[Array, " records"] | None
+    noise_groups: Int[Array, " records"]
     slots: tuple[Slot, ...]
     loss: AbstractLoss | None
     prior: Entropic | None
@@ -140,16 +140,15 @@ class Problem(eqx.Module):
         recordings = with_limits(recordings)
         self.records, self.counts = padding.stack(recordings)
         self.body, self.loss, self.prior = chart, loss, prior
-        self.of, self.which, self.noise_groups = of, None, None
+        self.of, self.which = of, None
         if isinstance(chart, Bodies):
             self.which = jnp.asarray([chart.names.index(name) for name in of], jnp.int32)
             if prior is not None:
                 raise ValueError("Problem: a prior is about one body, got several; give None")
         apart = shares(noise_each, "noise_each")
-        if apart is True:
-            self.noise_groups = jnp.arange(len(of), dtype=jnp.int32)
-        elif not isinstance(apart, bool):
-            self.noise_groups, _ = grouped(apart, of, "noise_each")
+        if isinstance(apart, bool):
+            apart = tuple(range(len(of))) if apart else ("",) * len(of)
+        self.noise_groups, _ = grouped(apart, of, "noise_each")
         self.slots = find(free, recordings[0], of)
         taken = {name for one in charts_of(chart) for name in (*one.log_names, *one.plain_names)}
         for slot in self.slots:

@@ -348,10 +348,7 @@ def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Pa
     free = ravel_pytree(parameters)[0].size
     weights = weights_of(problem, errors, noise)
     share = max(1.0 - free / problem.records.size, 0.1)
-    count = problem.count
-    groups = np.zeros(count, int) if problem.noise_groups is None else problem.noise_groups
-    groups = np.asarray(groups)
-    out = []
+    groups, out = np.asarray(problem.noise_groups), []
     cut = at_limit(problem.records.readings)
     for reading, error, sigma, weight, full in zip(
         problem.records.readings, errors, noise, weights, cut, strict=True
