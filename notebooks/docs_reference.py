@@ -163,8 +163,9 @@ def index(modules: list[types.ModuleType], short: dict[str, str], names: dict[in
     assert not strange, f"docs_topics.FIRST names {strange}"
     parts = [
         "# Reference",
-        "Every public name, by topic; `rj` is `import rigidjax as rj`. Docstrings state the shapes, "
-        "units and frames of arguments; functions and classes have a link to their source.",
+        "Every public name, by topic; `rj` is `import rigidjax as rj`, `jnp` is `jax.numpy`. "
+        "Docstrings state the shapes, units and frames of arguments; functions and classes have a "
+        "link to their source.",
         table("wanted | names", ((title, links(row)) for title, row in first.items())),
     ]
     for title, inside in docs_topics.GROUPS.items():

@@ -134,7 +134,6 @@ def rollout(
     not positive, a `save_every` that does not divide `num_steps`, and, for known numbers, moments
     that are not positive or quaternions that are not unit.
 
-    >>> import rigidjax as rj
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))
     >>> rj.batch.rollout(bodies, states, 0.01, 100).q[4, 3]

@@ -52,7 +52,6 @@ class Batch(eqx.Module, Generic[State]):
     numbers), `max_steps_reached`, `dt_min_reached`. `num_steps` (N,) accepted and rejected, 0 for
     the closed form. `own` a tuple of the torques' own states, as `ys`, or `None`.
 
-    >>> import rigidjax as rj
     >>> bodies, omega = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0]))), jnp.ones((5, 3))
     >>> rj.batch.simulate(bodies, rj.Spin(omega), [0.0, 1.0]).ys.omega.shape
     (5, 2, 3)
@@ -102,7 +101,6 @@ def simulate(
 
     **Raises:** as `rollout`; `ValueError` for times that neither increase nor decrease.
 
-    >>> import rigidjax as rj
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))
     >>> rj.batch.simulate(bodies, states, [0.0, 1.0]).ys.q.shape

@@ -39,7 +39,7 @@ class FreeSolver(dfx.AbstractSolver):
 
     **Raises:** `ValueError` for another term, or one with a torque.
 
-    >>> import diffrax, rigidjax as rj
+    >>> import diffrax
     >>> y0 = rj.Spin([0.0, 1.0, 1e-4])
     >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), y0)
     >>> solver = FreeSolver()

@@ -28,7 +28,6 @@ class FreeBody(eqx.Module):
 
     Its constants are computed once. **Arguments:** as for `free_body`.
 
-    >>> import rigidjax as rj
     >>> motion = FreeBody(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([0.0, 0.0, 1.0]))
     >>> motion(10.0).omega
     Array([0., 0., 1.], dtype=float64)
@@ -55,7 +54,6 @@ class FreeBody(eqx.Module):
     def at(self, ts: Float[Array, "*n"]) -> HasSpin:
         """The states at `ts` (n,), s since `state0`: as by `jax.vmap`, quicker to compile.
 
-        >>> import jax.numpy as jnp, rigidjax as rj
         >>> motion = FreeBody(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([0.0, 0.0, 1.0]))
         >>> motion.at(jnp.array([0.0, 10.0])).omega
         Array([[0., 0., 1.],
@@ -128,7 +126,6 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     for known values also for NaN, a moment that is not positive, a quaternion that is not unit, and
     a time in which the body turns by more than 1/eps rad.
 
-    >>> import rigidjax as rj
     >>> state0 = rj.Attitude([1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1e-4])
     >>> free_body(rj.Inertia.from_principal(1.0, 2.0, 3.0), state0, 20.0).omega
     Array([-0.42522037, -0.90508985,  0.24550111], dtype=float64)

@@ -32,7 +32,6 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
-    >>> import rigidjax as rj, jax.numpy as jnp
     >>> top = rj.Inertia.from_principal(1.0, 2.0, 2.0)
     >>> bool(abs(body_period(top, jnp.array([1.0, 0.5, 0.0])) - 4 * jnp.pi) < 1e-14)
     True
@@ -54,7 +53,6 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
-    >>> import rigidjax as rj, jax.numpy as jnp
     >>> top = rj.Inertia.from_principal(1.0, 2.0, 2.0)
     >>> precession_period(top, jnp.array([1.0, 0.5, 0.0]))  # 2π I₂/|L|
     Array(8.88576588, dtype=float64)

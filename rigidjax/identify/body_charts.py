@@ -222,7 +222,6 @@ class Mass(AbstractBodyChart):
     moved. **Raises:** `TypeError` for a guess of another type; `ValueError` for another word, or
     none.
 
-    >>> import rigidjax as rj
     >>> box = rj.shapes.box(2.0, [1.0, 1.0, 1.0])
     >>> float(Mass(box).body(jnp.zeros(10)).mass), Mass(box, ["inertia"]).log_names
     (2.0, ('I1', 'I2', 'I3'))
@@ -298,7 +297,6 @@ class Known(AbstractBodyChart):
 
     **Arguments:** `known` an `Inertia` or `MassProperties`.
 
-    >>> import rigidjax as rj
     >>> Known(rj.Inertia.from_principal(1.0, 2.0, 3.0)).size
     0
     """

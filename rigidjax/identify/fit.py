@@ -94,7 +94,6 @@ def fit(
     **Raises:** `TypeError` unless `problem` is a `Problem`, `ValueError` for fewer than one start,
     a checkpoint that is damaged or of another problem, or one in a folder that does not exist.
 
-    >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))

@@ -47,7 +47,6 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
     end of each piece is held to the start of the next by a residual of deviation `width`, in
     typical rates and rad. Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_8.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording(range(20), (rj.identify.Gyro(), [[1.0, 0, 0]] * 20))
     >>> pieces(rj.identify.Problem(record, rj.identify.Ratios()), 4).count
     4

@@ -84,7 +84,6 @@ class Problem(eqx.Module):
     and torque need: `Spin`, `Attitude`, `Rigid`. **Raises:** `TypeError` for arguments of another
     type; `ValueError` if they do not fit together.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> rj.identify.Problem(record, rj.identify.Ratios()).typical_rate
     Array(1., dtype=float64)

@@ -20,7 +20,6 @@ class Reading(eqx.Module):
 
     Inside a `Problem` all arrays have a leading axis over recordings.
 
-    >>> import rigidjax as rj
     >>> record = Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]]))
     >>> record.readings[0].values.shape, record.readings[0].mask.tolist()
     ((2, 3), [True, True])
@@ -53,7 +52,6 @@ class Recording(eqx.Module):
     float32 (where this changes a step by a tenth, it warns), a wrong shape, an unmasked NaN (with
     its index), or a quaternion that is not unit.
 
-    >>> import rigidjax as rj
     >>> Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]])).t.shape
     (2,)
     """

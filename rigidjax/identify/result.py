@@ -29,7 +29,6 @@ class Start(eqx.Module):
     **Fields:** `parameters` at its end; `cost` half of the sum of squares there; `converged`
     whether the search did; `fits` whether it explains the data as well as the best point does.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
     >>> Start(problem.start(), 0.0, True, True).fits
@@ -58,13 +57,9 @@ class Fit(eqx.Module):
     the sensors whose errors it does not explain; `limits` the distance of each body from a flat
     one; `near` the point of the derivatives beside a flat body, else `None`.
 
-    >>> import jax.numpy as jnp, rigidjax as rj
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
     >>> [quantity.name for quantity in found.quantities[:2]], found.covariance.shape
-    (['Ix/Iz', 'Iy/Iz'], (5, 5))
+    (['Ix/Iz', 'Iy/Iz'], (8, 8))
     """
 
     problem: Problem

@@ -32,7 +32,7 @@ class Descent(eqx.Module):
     anything but an optimiser, `ValueError` for counts below one. Source: Robbins and Monro 1951,
     doi:10.1214/aoms/1177729586.
 
-    >>> import optax, rigidjax as rj
+    >>> import optax
     >>> rj.identify.Descent(optax.adam(1e-2), steps=200, batch=4).batch
     4
     """

@@ -151,7 +151,6 @@ class WindowFit(eqx.Module, Generic[Value]):
     of `noise`; `noise` by kind; `steps` taken over the whole windows; `converged`; `message`
     remarks; `scene` as given.
 
-    >>> import rigidjax as rj
     >>> t = np.linspace(0.0, 1.0, 11)
     >>> spin = rj.Spin(np.stack([0 * t, 0 * t, np.exp(-0.5 * t)], 1))
     >>> body = rj.Inertia.from_principal(1.0, 1.0, 1.0)
@@ -220,7 +219,6 @@ def fit_windows(
     `ValueError` for missing inputs, unknown kinds, and a guess with runs that are not finite;
     `TypeError` if body, states and torque do not fit together.
 
-    >>> import rigidjax as rj
     >>> t = np.linspace(0.0, 1.0, 11)
     >>> spin = rj.Spin(np.stack([0 * t, 0 * t, np.exp(-0.5 * t)], 1))
     >>> body = rj.Inertia.from_principal(1.0, 1.0, 1.0)

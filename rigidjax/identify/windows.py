@@ -24,7 +24,6 @@ class Horizons(NamedTuple):
     **Fields:** `steps` (L,) how many steps ahead; by kind, each (L,): `mean_absolute` of a
     component, `mean_norm` the mean length of the vector, `rms` the root of its mean square.
 
-    >>> import rigidjax as rj
     >>> t = np.arange(6.0)
     >>> spin = rj.Spin(np.stack([t, 0 * t, 0 * t], 1))
     >>> rj.identify.windows(t, spin, length=2).held().rms["omega"].tolist()  # it grows by 1 a step

@@ -24,10 +24,7 @@ def residuals(
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`,
     `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
 
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
     >>> residuals(found)[0, 2].get_xlabel()
     'lag, samples'
     """

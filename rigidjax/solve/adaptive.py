@@ -62,7 +62,6 @@ def adaptive(
 
     **Raises:** `TypeError` for a state of several dtypes, or of another than `ts`.
 
-    >>> import rigidjax as rj
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), start)
     >>> solver, ts = rj.solvers.Tsitouras5(), jnp.array([0.0, 1.0])

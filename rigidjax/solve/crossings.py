@@ -72,7 +72,6 @@ class Event(eqx.Module):
     **Raises:** `TypeError`, `ValueError` for anything but a function, another direction, a step
     that is not positive.
 
-    >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
     >>> flip = Event(lambda t, state, body: state.omega[1])
     >>> float(rj.simulate(body, start, [0.0, 20.0], event=flip).event_time)  # doctest: +ELLIPSIS
@@ -106,7 +105,6 @@ class Crossings(eqx.Module, Generic[State]):
     `successful` if the run reached `t1`, `event_occurred` if it ended with `max_crossings` of them,
     or why it ended early; `num_steps` of the method, partial ones included.
 
-    >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
     >>> flips = rj.crossings(body, start, 0.0, 40.0, lambda t, state, body: state.omega[1])
     >>> int(flips.count), bool(flips.full)
@@ -171,7 +169,6 @@ def crossings(
     **Raises:** `TypeError`, `ValueError` as `simulate`, for equal times, and for a condition that
     is no number, is NaN at the start, or reads a part that the state does not have.
 
-    >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
     >>> flips = crossings(body, start, 0.0, 40.0, lambda t, state, body: state.omega[1])
     >>> int(flips.count), bool(flips.full)

@@ -60,7 +60,6 @@ class Error(eqx.Module):
     Both are NaN at times that the run did not reach, inf if a run for comparison did not. `sizes`
     has the scale of each name: 1 rad, or the largest value in the run.
 
-    >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
     >>> error = rj.simulate(body, start, [0.0, 1.0, 20.0]).error
     >>> bool(error.total["omega"][-1] < 1e-13), float(error.known_until)
@@ -300,7 +299,6 @@ class FunctionError(eqx.Module):
     **Fields:** `value`, and `derivative` by x, as `jax.grad` or `jax.jacfwd` have it;
     `value_error` and `derivative_error` of their shapes, absolute.
 
-    >>> import rigidjax as rj
     >>> rj.error_of(lambda x, **tolerances: x * x, 3.0).known
     Array(True, dtype=bool)
     """
@@ -346,7 +344,6 @@ def error_of(
 
     **Returns** a `FunctionError`.
 
-    >>> import rigidjax as rj
     >>> body, law = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.torques.Damping([0.1, 0.1, 0.1])
     >>> def last(omega, **tolerances):
     ...     return rj.simulate(body, rj.Spin(omega), [0.0, 5.0], law, **tolerances).ys.omega[-1, 0]

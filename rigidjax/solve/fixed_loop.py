@@ -41,7 +41,6 @@ def fixed(
 
     **Raises:** `TypeError` for another solver, or as the solver does.
 
-    >>> import rigidjax as rj
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), start)
     >>> ys = fixed(rj.solvers.DormandPrince8(), field, jnp.array([0.0, 1.0]), start, 8)

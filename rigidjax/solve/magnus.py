@@ -64,7 +64,7 @@ class Magnus4(dfx.AbstractSolver):
 
     **Raises:** `TypeError` for a torque that depends on the attitude, or another state.
 
-    >>> import diffrax, rigidjax as rj
+    >>> import diffrax
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), start)
     >>> term = diffrax.ODETerm(field)

@@ -92,7 +92,6 @@ def equations_of_motion(
     own `state0` is a `rigidjax.motion.coupled.Coupled`. **Raises** `TypeError` where they do not
     fit.
 
-    >>> import rigidjax as rj
     >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))
     <class 'rigidjax.motion.equations.EulerEquations'>
     """

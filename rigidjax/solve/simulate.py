@@ -113,7 +113,6 @@ def simulate(
     that neither increase nor decrease, NaN, or a quaternion that is not unit (`EquinoxRuntimeError`
     under `jit`).
 
-    >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
     >>> bool(abs(rj.simulate(body, start, jnp.linspace(0.0, 9.43, 3)).ys.omega[-1, 1]) < 0.01)
     True

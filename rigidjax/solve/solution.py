@@ -38,7 +38,6 @@ class Solution(eqx.Module, Generic[State]):
     a tuple of the states of the laws that have some, in the order of the laws, what is inside
     another first, with a leading time axis, or `None`.
 
-    >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
     >>> sol = rj.simulate(body, start, [0.0, 1.0, 2.0])
     >>> sol.ys.omega.shape, sol.event_time
@@ -120,7 +119,6 @@ class Solution(eqx.Module, Generic[State]):
         digits of body, torque and start (in closed form, of the times). A `UserWarning` names the
         time after which nothing is known, as in chaos.
 
-        >>> import rigidjax as rj
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.5, 1.0])
         >>> law = rj.torques.Damping([0.1, 0.1, 0.1])
         >>> rj.simulate(body, start, [0.0, 5.0], law).error.total["omega"] < 1e-9
@@ -140,7 +138,6 @@ class Solution(eqx.Module, Generic[State]):
         q ⊗ exp(½δθ): three numbers. The columns are forward-mode derivatives, NaN at times that the
         run did not reach. An event does not end this run.
 
-        >>> import rigidjax as rj
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
         >>> rj.simulate(body, start, [0.0, 2.0]).transition_matrix()[1, 2].tolist()
         [0.0, 0.0, 1.0]

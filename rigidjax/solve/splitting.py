@@ -133,7 +133,7 @@ class Splitting2(AbstractSplitting):
 
     Source: Strang 1968, doi:10.1137/0705041, with the free flow of `rigidjax.exact.free_body`.
 
-    >>> import diffrax, rigidjax as rj
+    >>> import diffrax
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), start)
     >>> term = diffrax.ODETerm(field)

@@ -166,7 +166,6 @@ class Tide(eqx.Module):
     Boggs, Park, Kuchynka 2014, The planetary and lunar ephemerides DE430 and DE431, IPN Progress
     Report 42-196, section III.
 
-    >>> import rigidjax as rj
     >>> tide, body = Tide(3.0, 0.0, 1.0, [1.0, 0.0, 0.0]), rj.Inertia(4.0 * jnp.eye(3))
     >>> tide(0.0, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]), body).diagonal()
     Array([2., 5., 5.], dtype=float64)
