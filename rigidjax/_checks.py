@@ -267,7 +267,7 @@ def single(
     in the middle of the arithmetic.
     """
     instance(value, kinds, name, wanted=wanted, hint=hint)
-    for field in _ONE.keys() & vars(value).keys():
+    for field in (field for field in _ONE if field in vars(value)):
         part, shape = getattr(value, field), _ONE[field]
         if getattr(part, "shape", None) != shape or part.dtype not in (jnp.float32, jnp.float64):
             floating(part, shape, f"{name}.{field}")
