@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -82,38 +83,28 @@ class Checkpoint:
         if self.path is None:
             return
         stage, strides, current = position
-        items = [bare(item) for item in (*done, current)]
-        leaves = [np.asarray(x) for item in items for x in jax.tree.leaves(item)]
+        head = dict(print_of=self.print_of, done=len(done), stage=stage, strides=strides)
         beside = self.path.with_name(self.path.name + ".new")
         with beside.open("wb") as file:
-            held: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(leaves)}
-            held |= dict(print_of=self.print_of, stage=stage, strides=strides, done=len(done))
-            np.savez(file, **held)
+            file.write(json.dumps(head).encode() + b"\n")
+            eqx.tree_serialise_leaves(file, [bare(item) for item in (*done, current)])
         beside.replace(self.path)
 
     def _read(self, path: Path) -> None:
-        # An empty file raises EOFError; a cut one BadZipFile, or zlib.error.
         try:
-            # NumPy leaves the handle open of a file that it opened itself and cannot read.
-            with path.open("rb") as raw, np.load(raw) as file:
-                held = {name: file[name] for name in file.files}
-            print_of, done = str(held["print_of"]), int(held["done"])
-            stage, strides = int(held["stage"]), int(held["strides"])
+            with path.open("rb") as file:
+                head = json.loads(file.readline())
+                same = head["print_of"] == self.print_of
+                if same:
+                    like = [self.like] * (int(head["done"]) + 1)
+                    *self.done, tried = eqx.tree_deserialise_leaves(file, like)
+                    self.position = SearchState(head["stage"], head["strides"], tried)
         except Exception as error:
             raise ValueError(
                 f"{path}: no checkpoint of a fit, or a damaged one ({type(error).__name__}); "
                 "delete it, or name another file"
             ) from None
-        leaves, structure = jax.tree.flatten(self.like)
-        count = len(leaves)
-        found = [held.get(f"leaf{i}", np.zeros(0)) for i in range((done + 1) * count)]
-        shapes = [leaf.shape for leaf in leaves] * (done + 1)
-        if print_of != self.print_of or [leaf.shape for leaf in found] != shapes:
+        if not same:
             raise ValueError(
                 f"{path}: the checkpoint of another problem, or of other options; name another file"
             )
-        items = [
-            jax.tree.unflatten(structure, map(jnp.asarray, found[i * count : (i + 1) * count]))
-            for i in range(done + 1)
-        ]
-        self.done, self.position = items[:-1], SearchState(stage, strides, items[-1])

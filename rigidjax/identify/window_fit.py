@@ -21,7 +21,7 @@ from rigidjax.identify.terms import with_jacobian
 from rigidjax.identify.uncertainty import inverted
 from rigidjax.identify.windows import Horizons, Windows, by_horizon, held_errors
 from rigidjax.motion.coupled import Coupled, motion_of, started
-from rigidjax.motion.manifold import minus_small, names, parts, plus
+from rigidjax.motion.manifold import minus_small, names, plus
 from rigidjax.motion.torques.inputs import bind, delays_of, require_inputs
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.components import split
@@ -230,18 +230,9 @@ def fit_windows(
     max_steps = _checks.whole(max_steps, "max_steps", 1)
     stretches = _checks.whole(stretches, "stretches", 2)
     _require_windows(windows)
-    _checks.function(scene, "scene", "of the free numbers to (body, torque)")
     x, back = _numbers(guess, windows.starts.omega.dtype)
-    guess = back(x)
-    start = jax.tree.map(lambda a: a[0], windows.starts)
-    made = scene(guess)
-    if not isinstance(made, tuple) or len(made) != 2:
-        raise TypeError(f"scene: wanted (body, torque), got {type(made).__name__}")
-    require_fit(made[0], start, made[1])
-    require_inputs(made[1], windows.inputs)
-    if wrong := _too_late(windows, made[1]):
-        raise ValueError(wrong)
-    whole = windows.length
+    guess, whole = back(x), windows.length
+    _require_scene(scene, guess, windows)
     scales = _scales(windows, whole, noise)
     firm = precisions(starts, names(windows.starts), noise)
     padded, count = _padded(windows), np.asarray(windows.count, np.int32)
@@ -277,7 +268,7 @@ def fit_windows(
         back(jnp.asarray(deviation)),
         own,
         float(end.cost) / (windows.count * windows.length),
-        {kind: float(part[0]) for kind, part in parts(start, scales).items()},
+        {kind: float(s) for kind, s in zip(names(windows.starts), scales[::3], strict=True)},
         taken,
         converged,
         "; ".join(message),
@@ -346,6 +337,17 @@ def _require_windows(windows: Any) -> None:
                     f"windows: wanted a row for each of N windows in {name}, got {leaf.shape}"
                 )
             _checks.finite(leaf, f"windows: {name}")
+
+
+def _require_scene(scene: Any, guess: Any, windows: Windows) -> None:
+    _checks.function(scene, "scene", "of the free numbers to (body, torque)")
+    made = scene(guess)
+    if not isinstance(made, tuple) or len(made) != 2:
+        raise TypeError(f"scene: wanted (body, torque), got {type(made).__name__}")
+    require_fit(made[0], jax.tree.map(lambda a: a[0], windows.starts), made[1])
+    require_inputs(made[1], windows.inputs)
+    if wrong := _too_late(windows, made[1]):
+        raise ValueError(wrong)
 
 
 def _numbers(guess: Any, kind: Any) -> tuple[Float[Array, " n"], Callable[[Array], Any]]:

@@ -348,12 +348,9 @@ def test_a_damaged_checkpoint_is_told_in_words(short_record, tmp_path, kind):
     elif kind == "table":
         np.savez(path, t=np.arange(3))
     else:
-        held = dict(np.load(path))
-        del held["leaf3"]
-        np.savez(path, **held)
-    words = "another problem" if kind == "fewer" else "no checkpoint of a fit, or a damaged one"
+        path.write_bytes(whole[:-8])
     before = path.read_bytes()
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match="no checkpoint of a fit, or a damaged one"):
         checkpoint.Checkpoint(path, like, "2")
     assert path.read_bytes() == before
 
