@@ -14,7 +14,7 @@ its states (`distributed.save`), or `gather`s all. Shuffle bodies with adaptive 
 from rigidjax._names import show
 from rigidjax.batch import distributed as distributed
 from rigidjax.batch.rollout import rollout as rollout
-from rigidjax.batch.sharding import compiler_options as compiler_options, cpu_flags as cpu_flags
+from rigidjax.batch.sharding import compiler_options as compiler_options
 from rigidjax.batch.simulate import Steps as Steps, simulate as simulate
 
 show(__name__)

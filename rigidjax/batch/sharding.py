@@ -1,9 +1,8 @@
 """Many bodies in chunks that fit the cache, and in shares for devices, whatever is computed."""
 
 import functools
-import os
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -14,10 +13,6 @@ from jax.sharding import AxisType, Mesh, PartitionSpec as P
 
 from rigidjax import _checks
 
-_OPTION = "xla_cpu_small_while_loop_byte_threshold"
-_FLAG = f"--xla_backend_extra_options={_OPTION}=10000000"
-# The versions of the measurement: `python tests/batch/bench_batch.py --flag`.
-CHECKED = ("0.12.0.1",)
 AXIS = "bodies"
 # Bytes of one number of every body in a chunk: the arrays of a step then stay in the first cache.
 _ROW = 1024
@@ -36,47 +31,6 @@ def compiler_options() -> dict[str, Any]:
     True
     """
     return dict(_WIDE) if jax.default_backend() == "cpu" else {}
-
-
-class CpuFlags(NamedTuple):
-    """The result of `cpu_flags`.
-
-    **Fields:** `xla_flags` the value for the environment variable `XLA_FLAGS`, with its present
-    contents; `set` whether the flag is there; `checked` versions of jaxlib it was measured on;
-    `jaxlib` the one in use.
-
-    >>> str(CpuFlags("--some_flag", False, ("1.0",), "1.0"))
-    "export XLA_FLAGS='--some_flag'    # not set"
-    """
-
-    xla_flags: str
-    set: bool
-    checked: tuple[str, ...]
-    jaxlib: str
-
-    def __str__(self) -> str:
-        state = "set" if self.set else "not set"
-        known = "" if self.jaxlib in self.checked else f"; not checked on jaxlib {self.jaxlib}"
-        return f"export XLA_FLAGS='{self.xla_flags}'    # {state}{known}"
-
-
-def cpu_flags() -> CpuFlags:
-    """The flag to export before Python starts, for loops over one or few bodies on CPU.
-
-    XLA compiles a small loop as one kernel; this undocumented option sets the limit of small. It
-    helps if the loop's state is larger than a kilobyte and the arrays are short. It acts on the
-    whole process, if it is there before JAX first looks for devices. This function sets nothing.
-    **Returns** a `CpuFlags`.
-
-    >>> print(cpu_flags().xla_flags.split()[-1])
-    --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000
-    """
-    import jaxlib
-
-    given = os.environ.get("XLA_FLAGS", "")
-    there = _OPTION in given
-    wanted = given if there else f"{given} {_FLAG}".strip()
-    return CpuFlags(wanted, there, CHECKED, getattr(jaxlib, "__version__", jax.__version__))
 
 
 class Compiled:

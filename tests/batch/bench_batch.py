@@ -4,7 +4,7 @@ Run `python tests/batch/bench_batch.py [--quick] [--float32] [--flag] [--devices
 [--numba-python /venv/bin/python]`.
 Everything is timed in turn, round after round, on one pinned core, as processor time (on a GPU as
 wall time); medians are printed, and ratios to the first row of each table. Compilation is apart.
-What is not installed is left out and says so. `--flag` starts again with what `rj.batch.cpu_flags` says;
+What is not installed is left out and says so. `--flag` starts again with XLA's flag for small loops;
 `--devices 2` compares one device with two, in wall time, on as many cores.
 """
 
@@ -425,7 +425,7 @@ def two_devices(count):
 def main():
     device = jax.devices()[0]
     print(f"jax {jax.__version__}, {device.platform} {device.device_kind}, {np.dtype(DTYPE)}")
-    print(rj.batch.cpu_flags() if ON_CPU else "")
+    print(os.environ.get("XLA_FLAGS", "no XLA_FLAGS") if ON_CPU else "")
     if DTYPE == jnp.float32:
         print("float32: the error of a long run is at least about 5e-6, whatever the step")
     counts = OPTIONS.bodies or ([1000] if OPTIONS.quick else [10_000, 100_000])

@@ -135,13 +135,3 @@ def test_words(unhooked):
         rj.batch.simulate(bodies, states.omega, TS)
     with pytest.raises(TypeError, match="wanted Inertia"):
         rj.batch.simulate(bodies.tensor, states, TS)
-
-
-def test_cpu_flags_tell_and_do_not_set(monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", "--xla_dump_to=/nowhere")
-    found = rj.batch.cpu_flags()
-    assert not found.set
-    assert found.xla_flags.startswith("--xla_dump_to=/nowhere --xla_backend_extra_options=")
-    assert "export XLA_FLAGS=" in str(found)
-    monkeypatch.setenv("XLA_FLAGS", found.xla_flags)
-    assert rj.batch.cpu_flags().set and rj.batch.cpu_flags().xla_flags == found.xla_flags

@@ -375,7 +375,6 @@ row(
     transforms=(),
 )
 row("batch.compiler_options", transforms=())
-row("batch.cpu_flags", transforms=())
 for name in ("share", "gather", "total"):
     row(
         f"batch.distributed.{name}",
@@ -387,4 +386,4 @@ leave_out(
     "joins other processes, or writes: tests/batch/test_devices.py",
     *(f"batch.distributed.{n}" for n in ("connect", "save", "recover")),
 )
-leave_out("batch.simulate, batch.cpu_flags return them", "batch.Batch", "batch.CpuFlags")
+leave_out("batch.simulate returns it", "batch.Batch")

@@ -485,8 +485,6 @@ way(
 leave_out(
     "options of a compiler: no numbers",
     "batch.compiler_options",
-    "batch.cpu_flags",
-    "batch.CpuFlags",
 )
 leave_out("shares of a run's own statistics: `drift` and `lyapunov_exponents` are rows",
           "solve.Solution.drift", "solve.Solution.growth")  # fmt: skip
