@@ -17,6 +17,8 @@ from rigidjax.body.symmetric3 import swap_trace
 
 # The parts of a `MassProperties` that may be free, and their places in `pack`.
 _PARTS = {"mass": (0,), "com": (7, 8, 9), "inertia": (1, 2, 3, 4, 5, 6)}
+Numbers = Float[Array, " chart"]
+Rows = Float[Array, "rows chart"]
 # Components of a tensor in the order of their names.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
@@ -47,16 +49,14 @@ class AbstractBodyChart(eqx.Module):
     scale: ClassVar[str | None] = None
 
     @abc.abstractmethod
-    def body(self, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
+    def body(self, vector: Numbers) -> Inertia | MassProperties:
         """The body of these numbers."""
 
     @abc.abstractmethod
-    def vector(self, body: Any) -> Float[Array, " chart"]:
+    def vector(self, body: Any) -> Numbers:
         """The numbers of a body with this `Inertia`, the initial guess of a fit."""
 
-    def bend(
-        self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
-    ) -> Float[Array, "rows chart"]:
+    def bend(self, vector: Numbers, slope: Numbers) -> Rows:
         """Rows whose squares are the second derivative of a misfit from the chart's curvature.
 
         They matter if a body may be flat (`rigidjax.body.parameters.flat_bend`); else there are
@@ -87,15 +87,13 @@ class Ratios(AbstractBodyChart):
     log_names: ClassVar[tuple[str, ...]] = ("I1/I3", "I2/I3")
     scale: ClassVar[str | None] = "arbitrary"
 
-    def body(self, vector: Float[Array, " chart"]) -> Inertia:
+    def body(self, vector: Numbers) -> Inertia:
         return Inertia(swap_trace(charts.unpack_shape(vector)))
 
-    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+    def vector(self, body: Inertia) -> Numbers:
         return charts.pack_shape(body.second_moment)
 
-    def bend(
-        self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
-    ) -> Float[Array, "rows chart"]:
+    def bend(self, vector: Numbers, slope: Numbers) -> Rows:
         return charts.flat_bend(vector, slope)
 
     def logs(self, body: Inertia) -> Float[Array, "2"]:
@@ -117,15 +115,13 @@ class PrincipalRatios(AbstractBodyChart):
     log_names: ClassVar[tuple[str, ...]] = ("Ix/Iz", "Iy/Iz")
     scale: ClassVar[str | None] = "arbitrary"
 
-    def body(self, vector: Float[Array, " chart"]) -> Inertia:
+    def body(self, vector: Numbers) -> Inertia:
         return Inertia(jnp.diag(charts.unpack_moments(_padded(vector, 1, 0)) / 3.0))
 
-    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+    def vector(self, body: Inertia) -> Numbers:
         return charts.pack_moments(jnp.diagonal(body.tensor))[1:]
 
-    def bend(
-        self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
-    ) -> Float[Array, "rows chart"]:
+    def bend(self, vector: Numbers, slope: Numbers) -> Rows:
         return charts.flat_bend(_padded(vector, 0, 3), _padded(slope, 0, 3))[:, :2]
 
     def logs(self, body: Inertia) -> Float[Array, "2"]:
@@ -162,15 +158,13 @@ class Tensor(AbstractBodyChart):
     plain_names: ClassVar[tuple[str, ...]] = ("Ixx", "Iyy", "Izz", "Iyz", "Ixz", "Ixy")
     unit: ClassVar[str] = "kg m²"
 
-    def body(self, vector: Float[Array, " chart"]) -> Inertia:
+    def body(self, vector: Numbers) -> Inertia:
         return Inertia(swap_trace(charts.unpack_second_moment(vector) * (0.5 * self.typical)))
 
-    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+    def vector(self, body: Inertia) -> Numbers:
         return charts.pack_second_moment(body.second_moment / (0.5 * self.typical))
 
-    def bend(
-        self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
-    ) -> Float[Array, "rows chart"]:
+    def bend(self, vector: Numbers, slope: Numbers) -> Rows:
         return _padded(Ratios().bend(vector[1:], slope[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
@@ -196,15 +190,13 @@ class Principal(AbstractBodyChart):
     log_names: ClassVar[tuple[str, ...]] = ("Ix", "Iy", "Iz")
     unit: ClassVar[str] = "kg m²"
 
-    def body(self, vector: Float[Array, " chart"]) -> Inertia:
+    def body(self, vector: Numbers) -> Inertia:
         return Inertia(jnp.diag(charts.unpack_moments(vector) * (0.5 * self.typical)))
 
-    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+    def vector(self, body: Inertia) -> Numbers:
         return charts.pack_moments(jnp.diagonal(body.tensor) / (0.5 * self.typical))
 
-    def bend(
-        self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
-    ) -> Float[Array, "rows chart"]:
+    def bend(self, vector: Numbers, slope: Numbers) -> Rows:
         return _padded(PrincipalRatios().bend(vector[1:], slope[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
@@ -258,22 +250,20 @@ class Mass(AbstractBodyChart):
         # The centre in units of the body's own size: every number is of order one.
         return jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
 
-    def body(self, vector: Float[Array, " chart"]) -> MassProperties:
+    def body(self, vector: Numbers) -> MassProperties:
         if self.size < 10:
             vector = jnp.zeros(10, vector.dtype).at[np.array(self._places)].set(vector)
         step = jnp.concatenate([vector[:7], self._length * vector[7:]])
         return charts.unpack(charts.pack(self.guess) + step)
 
-    def vector(self, body: Inertia | MassProperties) -> Float[Array, " chart"]:
+    def vector(self, body: Inertia | MassProperties) -> Numbers:
         if isinstance(body, Inertia):
             return jnp.zeros(self.size, self.guess.mass.dtype)
         step = charts.pack(body) - charts.pack(self.guess)
         step = jnp.concatenate([step[:7], step[7:] / self._length])
         return step[np.array(self._places)]
 
-    def bend(
-        self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
-    ) -> Float[Array, "rows chart"]:
+    def bend(self, vector: Numbers, slope: Numbers) -> Rows:
         if "inertia" not in self.free:
             return jnp.zeros((0, self.size), vector.dtype)
         first = self._places.index(2)
@@ -308,10 +298,10 @@ class Known(AbstractBodyChart):
     def __check_init__(self) -> None:
         _checks.single(self.known, (Inertia, MassProperties), "known")
 
-    def body(self, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
+    def body(self, vector: Numbers) -> Inertia | MassProperties:
         return self.known
 
-    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+    def vector(self, body: Inertia) -> Numbers:
         return jnp.zeros(0, body.tensor.dtype)
 
     def logs(self, body: Any) -> Float[Array, "0"]:
@@ -378,7 +368,7 @@ class Bodies(eqx.Module):
         parts = self.parts(vector)
         return {n: scaled(c, parts[n]) for n, c in zip(self.names, self.charts, strict=True)}
 
-    def body(self, vector: Float[Array, " chart"], which: Int[Array, ""]) -> Any:
+    def body(self, vector: Numbers, which: Int[Array, ""]) -> Any:
         """The body at the index `which`, from its numbers, padded with zeros."""
         kind, row = jnp.asarray(self.kind_of)[which], jnp.asarray(self.row_of)[which]
         found: Any = None
@@ -395,7 +385,7 @@ class Bodies(eqx.Module):
         return found
 
 
-def scaled(chart: AbstractBodyChart, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
+def scaled(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
     """The body of a chart as a user gets it: it says if its scale is arbitrary."""
     body = chart.body(vector)
     if chart.scale is None or isinstance(body, MassProperties):
@@ -422,7 +412,7 @@ def spread(
 
 
 def matter(
-    body: AbstractBodyChart | Bodies, vector: Float[Array, " chart"], which: Int[Array, ""] | None
+    body: AbstractBodyChart | Bodies, vector: Numbers, which: Int[Array, ""] | None
 ) -> Inertia | MassProperties:
     """The body of one recording."""
     if not isinstance(body, Bodies):
