@@ -218,7 +218,9 @@ def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     out = {}
     for name in columns:
         if name not in held:
-            raise LogError(f"{path}: no array {name!r}; the arrays are {_listed(names)}")
+            more = f", and {len(names) - 40} more" if len(names) > 40 else ""
+            listed = ", ".join(names[:40]) + more
+            raise LogError(f"{path}: no array {name!r}; the arrays are {listed}")
         if np.asarray(held[name]).dtype.kind not in "biuf":
             raise LogError(f"{path}: array {name!r} does not hold real numbers")
         out[name] = np.asarray(held[name], float).reshape(-1)
@@ -232,11 +234,6 @@ def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     if len(set(sizes.values())) > 1:
         raise LogError(f"{path}: arrays of different lengths: {sizes}")
     return out
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f", and {len(names) - 40} more" if len(names) > 40 else ""
-    return ", ".join(names[:40]) + more
 
 
 def _npz(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:

@@ -76,12 +76,10 @@ class Combination(eqx.Module):
             return (
                 f"{names[0]} rises as {names[1]} falls: only {names[0]}·{names[1]} is determined."
             )
-        parts = [
-            f"{name} by {_signed(100 * size if ratio else size)} {'%' if ratio else unit}".rstrip()
-            for name, size, unit, ratio in zip(
-                names, self.changes, self.units, self.relative, strict=True
-            )
-        ]
+        parts = []
+        for name, size, unit, ratio in zip(names, sizes, self.units, self.relative, strict=True):
+            size = f"{100 * size if ratio else size:+.2g}".replace("-", "−")
+            parts.append(f"{name} by {size} {'%' if ratio else unit}".rstrip())
         more = "" if len(parts) <= MOST else f", and {len(parts) - MOST} more"
         return f"No reading changes where these change together: {', '.join(parts[:MOST])}{more}."
 
@@ -231,10 +229,6 @@ def _reduced(rows: np.ndarray) -> np.ndarray:
         done += 1
     rows = rows[:done]
     return np.where(np.abs(rows) > PART * np.abs(rows).max(axis=1, keepdims=True), rows, 0.0)
-
-
-def _signed(number: float) -> str:
-    return f"{number:+.2g}".replace("-", "−")
 
 
 def identifiability(fit: "Fit") -> tuple[str, ...]:

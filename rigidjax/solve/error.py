@@ -262,10 +262,6 @@ def _at(loop: Loop, rtol: Any) -> Loop:
     return dataclasses.replace(loop, rtol=rtol, atol=_SMALL * rtol, throw=False)
 
 
-def _cuts(ts: Array) -> Array:
-    return ts[0] + (ts[-1] - ts[0]) * jnp.arange(1, _CUTS).astype(ts.dtype) / _CUTS
-
-
 def _closer(setup: Any, ts: Array) -> tuple[Any, Any, float]:
     """The set-up of a closer run, the tolerance of the given one, the factor of their distance."""
     eps = float(jnp.finfo(ts.dtype).eps)
@@ -274,7 +270,8 @@ def _closer(setup: Any, ts: Array) -> tuple[Any, Any, float]:
         rtol = jnp.asarray(setup.rtol, ts.dtype)
         less = jnp.maximum(_CLOSER * rtol, _DEEPEST * eps)
         atol = setup.atol * (less / rtol)
-        new = dict(rtol=less, atol=atol, cuts=_cuts(ts), max_steps=most, throw=False)
+        cuts = ts[0] + (ts[-1] - ts[0]) * jnp.arange(1, _CUTS).astype(ts.dtype) / _CUTS
+        new = dict(rtol=less, atol=atol, cuts=cuts, max_steps=most, throw=False)
         return dataclasses.replace(setup, **new), rtol, 1.0
     setup = dataclasses.replace(setup, max_steps=most, throw=False)
     pid = lambda node: isinstance(node, dfx.PIDController)  # noqa: E731
