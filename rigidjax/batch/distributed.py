@@ -43,9 +43,9 @@ def connect(address: str, processes: int, process: int, *, patience: int = 20) -
 
 
 def share(tree: Any) -> Any:
-    """This process's rows of arrays that have a leading axis of bodies, ⌈N / processes⌉ or fewer.
+    """This process's rows of a tree of arrays, ⌈N / processes⌉ or fewer.
 
-    Leave out arrays that all bodies share.
+    **Arguments:** `tree` of arrays with a leading axis of bodies; leave out what all bodies share.
 
     **Raises:** `ValueError` for fewer bodies than processes.
 

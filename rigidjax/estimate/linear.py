@@ -184,9 +184,7 @@ def _moving(parts: Parts) -> Parts:
 def solved(
     parts: Parts, readings: Array, mean: Array, root: Array, seen: Array, *, back: bool
 ) -> LinearEstimate:
-    """The filter forward through all times, and with `back` the smoother's pass after it; `parts`
-    are a `LinearModel`'s by name.
-    """
+    """The filter forward, and with `back` the smoother's pass; `parts` are a `LinearModel`'s."""
     steps = {name: part for name, part in _moving(parts).items() if name in _STEPS}
     times = {name: part for name, part in _moving(parts).items() if name not in _STEPS}
 

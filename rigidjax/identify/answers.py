@@ -56,9 +56,7 @@ def status(search: Answer, model: Answer) -> str:
 def advice(
     search: Answer, model: Answer, causes: tuple[Cause, ...], kind: str, above: float
 ) -> str:
-    """Whether the intervals can be trusted, and what to try; `above` the errors over the given
-    noise.
-    """
+    """Whether the intervals can be trusted, what to try; `above`: errors over the given noise."""
     remedies = list(dict.fromkeys(cause.remedy for cause in causes))
     tries = f" Try: {'; '.join(remedies)}." if remedies else ""
     if model.word == FAILS:

@@ -250,9 +250,7 @@ def _table(
 def _response(
     problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, index: int
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """The effect of torques (R, T, 3, c) on rates: `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt` with Φ = dΩ/dΩ₀ of the
-    fit.
-    """
+    """The effect of torques (R, T, 3, c) on rates: `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt`, Φ = dΩ/dΩ₀ of the fit."""
     if not isinstance(problem.records.readings[index].sensor, Gyro):
         return np.zeros_like
     first = np.asarray(numbered(parameters).own.spin)[0]

@@ -18,9 +18,7 @@ from rigidjax.identify.parameters import Parameters
 
 
 class Tried(eqx.Module):
-    """The end of one start; `cost` is ½ Σ of squares; `found` that of `with_blocks` there, if
-    known.
-    """
+    """The end of one start; `cost` is ½ Σ of squares; `found` of `with_blocks` there, if known."""
 
     parameters: Parameters
     cost: Float[Array, "*starts"] = eqx.field(converter=jnp.asarray, default=np.inf)

@@ -219,9 +219,7 @@ def problem_of(
     free: Sequence[str] = (),
     loss: str = "soft-l1",
 ) -> Problem:
-    """The problem of recordings of `read_log`: a drag for all, a bias and a delay for each
-    recording.
-    """
+    """The problem of recordings of `read_log`: a drag for all, bias and delay for each."""
     if model not in MODELS:
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {model!r}")
     if loss not in LOSSES:

@@ -37,9 +37,7 @@ def stack(
 
 
 def of_few_lengths(problem: Any) -> Any:
-    """The problem with masked readings up to one of four lengths an octave, to compile few
-    programs.
-    """
+    """The problem with masked readings up to one of four lengths an octave: few programs."""
     records, _ = stack(problem.recordings, _length)
     return eqx.tree_at(lambda p: p.records, problem, records)
 

@@ -136,9 +136,7 @@ def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> An
 
 
 def made_of(parameters: Parameters) -> Float[Array, " n"]:
-    """One for numbers scaled to order one, zero for those of a `Free`, whose unit is a user's
-    guess.
-    """
+    """One for numbers scaled to order one, zero for those of a `Free`: their unit is a user's."""
     ones, zeros = (jax.tree.map(of, parameters) for of in (jnp.ones_like, jnp.zeros_like))
     marked = eqx.tree_at(lambda p: (p.shared, p.own.each), ones, (zeros.shared, zeros.own.each))
     return ravel_pytree(marked)[0]
@@ -306,9 +304,7 @@ def climb(
 
 
 def enough(problem: Problem) -> float:
-    """A misfit that only the true motion reaches: twice the mean of χ², or a hundredth of the
-    signal.
-    """
+    """A misfit that only the true motion reaches: twice the mean of χ², or 1 % of the signal."""
     return sum(
         (0.01 if reading.sensor.noise is None else 1.0) * count_of(reading)
         for reading in problem.records.readings

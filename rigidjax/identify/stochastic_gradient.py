@@ -58,9 +58,7 @@ def descend(
     key: PRNGKeyArray,
     progress: Callable[[str], Any] | None = None,
 ) -> tuple[Parameters, bool]:
-    """The end of the steps, or the last point before a misfit of NaN; and whether it was not
-    interrupted.
-    """
+    """The end of the steps, or the last point before a NaN; and whether it was not interrupted."""
     if how.batch > problem.count:
         raise ValueError(
             f"Descent: wanted a batch of at most {problem.count} recordings, got {how.batch}"

@@ -112,9 +112,7 @@ def over_records(function: Any, problem: "Problem", mine: Any) -> Any:
 
 @eqx.filter_custom_jvp
 def all_errors(parameters: Parameters, problem: "Problem") -> tuple[tuple[Array, ...], Any]:
-    """The errors (R, T, k) of each sensor, and the last states; differentiated recording by
-    recording.
-    """
+    """The errors (R, T, k) of each sensor, and the last states; derivatives by recordings."""
 
     def of_one(*trees: Any) -> Any:
         return errors_of_one(problem, *trees)
@@ -159,9 +157,7 @@ def normal_matrix(blocks: Sequence[Array], where: Array, size: int) -> Array:
 
 
 def with_blocks(parameters: Parameters, problem: "Problem") -> tuple[Any, Any]:
-    """The errors and last states, and their derivatives (…, n) in the recording's numbers; `places`
-    gives each column's place.
-    """
+    """Errors and last states, and derivatives (…, n) in the numbers of a recording (`places`)."""
     mine = local(problem, parameters)
     single = padding.one(mine, 0)
     twice = columns(problem, single)

@@ -703,7 +703,7 @@ leave_out(
     "estimate.Nuts", "estimate.refit", "estimate.Refit", "estimate.Refit.effective",
     "estimate.Refit.interval_of", "estimate.Refit.point", "estimate.LogDensity",
     "estimate.LogDensity.grown", "estimate.LogDensity.unpack", "identify.Unpacked",
-    "estimate.Filtered.nis", "estimate.Read", "estimate.Read.log_density",
+    "estimate.Filtered.nis", "estimate.Read",
 )  # fmt: skip
 leave_out(
     "searches of many fits, tens of seconds each: tests/identify hold them against motions known",
