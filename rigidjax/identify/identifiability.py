@@ -161,7 +161,7 @@ def _names(problem: Problem) -> list[list[tuple[str, str, bool]]]:
 
 @eqx.filter_jit
 def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
-    """Derivatives (2, M, n) of the named numbers, attitudes in world's or body's axes; values (M,)."""
+    """Derivatives (2, M, n) of named numbers, attitudes in world's or body's axes; values (M,)."""
     flat, restore = ravel_pytree(parameters)
     reference = problem.reference
     start = jax.vmap(ReferenceStates.moved)(reference, parameters.own)

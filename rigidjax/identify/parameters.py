@@ -314,7 +314,7 @@ def by_slot(problem: "Problem", parameters: Parameters) -> list[tuple["Slot", An
 
 
 def columns(problem: "Problem", one: Parameters) -> np.ndarray:
-    """The recording's number of each column of its block: all, then shared ones with a deviation."""
+    """The number of each column of a recording's block: all, then shared ones with a deviation."""
     steps = zip(problem.slots, numbered(one).shared, strict=True)
     twice = [np.ravel(step) for slot, step in steps if slot.spread is not None]
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(one))
