@@ -30,8 +30,9 @@ def shown(value: Any) -> str:
 
 def time(t: Any, span: Any, digits: int = 6) -> str:
     """A time, with so many digits of the `span` of its record: seconds since 1970 need more."""
-    more = np.log10(max(abs(float(t)), 1e-300) / float(span)) if span > 0 else 0.0
-    return f"{float(t):.{digits + max(0, int(np.ceil(more)))}g}"
+    t, span = float(t), float(span)
+    more = np.log10(abs(t) / span) if span > 0 and 0 < abs(t) < np.inf else 0.0
+    return f"{t:.{digits + max(0, int(np.ceil(more)))}g}"
 
 
 def _nested(value: Any) -> str:

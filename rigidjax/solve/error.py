@@ -75,8 +75,9 @@ class Error(eqx.Module):
         if not _checks.known(self) or np.ndim(self.ts) != 1:
             return eqx.tree_pformat(self)
         last = ", ".join(f"{name} {float(part[-1]):.1e}" for name, part in self.total.items())
-        known = f"known until {float(self.known_until):g} s"
-        return f"Error(at {float(self.ts[-1]):g} s: {last}; {known})"
+        times, t = (self.ts[-1], self.known_until), np.asarray(self.ts)
+        end, until = (_show.time(one, abs(t[-1] - t[0])) for one in times)
+        return f"Error(at {end} s: {last}; known until {until} s)"
 
     @property
     def total(self) -> dict[str, Float[Array, " times"]]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -58,7 +58,8 @@ class Solution(eqx.Module, Generic[State]):
     def __repr__(self) -> str:
         if not _checks.known((self.ts, self.stats, self.result)) or np.ndim(self.ts) != 1:
             return eqx.tree_pformat(self)
-        count, ends = self.ts.shape[0], f"{float(self.ts[0]):g} … {float(self.ts[-1]):g} s"
+        count, t = self.ts.shape[0], np.asarray(self.ts)
+        ends = " … ".join(_show.time(end, abs(t[-1] - t[0])) for end in (t[0], t[-1])) + " s"
         steps = "".join(
             f", {int(self.stats[name])} {words}"
             for name, words in (("num_steps", "steps"), ("num_rejected_steps", "rejected"))

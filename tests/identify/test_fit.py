@@ -119,6 +119,8 @@ def test_a_recording_prints_what_it_holds():
         "Recording(5 times 0 … 1 s; Gyro: 5 readings from [1.23457, 1.23457, 1.23457]; "
         "AttitudeSensor: 4 readings from [1, 0, 0, 0]; torque: Damping)"
     )
+    lately = rj.identify.Recording(1.7e9 + np.linspace(0.0, 10.0, 5), gyro)
+    assert repr(lately).startswith("Recording(5 times 1700000000 … 1700000010 s; ")
     problem = rj.identify.Problem([record, record], rj.identify.PrincipalRatios())
     # With a leading axis it has no words of its own.
     assert "values=f64[2,5,3]" in repr(problem)

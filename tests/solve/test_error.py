@@ -296,6 +296,8 @@ def test_errors_print_their_numbers():
     ts, off = jnp.array([0.0, 2.0]), {"omega": jnp.array([0.0, 3e-9])}
     error = Error(ts, off, {"omega": jnp.zeros(2)}, {"omega": jnp.asarray(1.0)})
     assert repr(error) == "Error(at 2 s: omega 3.0e-09; known until 2 s)"
+    late = Error(ts + 1.7e9, off, {"omega": jnp.zeros(2)}, {"omega": jnp.asarray(1.0)})
+    assert repr(late).startswith("Error(at 1700000002 s: ")
     one = jnp.asarray(1.5)
     assert repr(FunctionError(one, one, one, one)) == (
         "FunctionError(value=1.5, value_error=1.5, derivative=1.5, derivative_error=1.5)"
