@@ -93,7 +93,7 @@ class Recording(eqx.Module):
         # A long recording must not be copied more than needed.
         kept = used if self.dropped else slice(None)
         self.t = jnp.asarray(t[kept])
-        _require_digits(t[kept], np.asarray(self.t, float), self.t.dtype)
+        _require_digits(t[kept], self.t.dtype)
         self.readings = tuple(
             Reading(sensor, jnp.asarray(values[kept]), jnp.asarray(mask[kept]))
             for sensor, values, mask in rows
@@ -139,14 +139,15 @@ def count_of(reading: Reading) -> int:
     return reading.sensor.components * int(reading.seen.sum())
 
 
-def _require_digits(given: np.ndarray, held: np.ndarray, dtype: Any) -> None:
+def _require_digits(given: np.ndarray, dtype: Any) -> None:
     """Raise `ValueError` for times that are no longer apart in this dtype, warn of uneven ones."""
-    steps = np.diff(given)
-    off = np.abs(np.diff(held) / steps - 1)
+    # By NumPy: within a trace an array of JAX is not known.
+    steps, held = np.diff(given), np.diff(given.astype(dtype).astype(float))
+    off = np.abs(held / steps - 1)
     index = int(np.argmax(off))
     words = (
         f"t: {dtype} changes the step of {steps[index]:.3g} s after {given[index]} s to "
-        f"{np.diff(held)[index]:.3g} s; count time from a later origin, or use float64"
+        f"{held[index]:.3g} s; count time from a later origin, or use float64"
     )
     if off[index] >= 1:
         raise ValueError(words)

@@ -255,6 +255,13 @@ def test_a_series_and_a_wheel_can_be_made_under_a_trace():
 @pytest.mark.usefixtures("unhooked")
 def test_a_recording_under_a_trace_is_refused_in_words():
     gyro, ts, values = rj.identify.Gyro(0.1), jnp.arange(4.0), jnp.ones((4, 3))
+    # Known numbers make one within a trace, too.
+    assert (
+        jax.jit(lambda x: x * rj.identify.Recording(np.arange(4.0), (gyro, np.ones((4, 3)))).t)(
+            2.0
+        )[3]
+        == 6
+    )
     for traced in (
         lambda x: rj.identify.Recording(ts + x, (gyro, values)).t,
         lambda x: rj.identify.Recording(ts, (gyro, values + x)).t,
