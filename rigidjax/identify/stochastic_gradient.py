@@ -112,8 +112,10 @@ def _misfit_of(point: Parameters, problem: Problem, noise: Noise, rows: Array) -
 def only(problem: Problem, rows: Array) -> Problem:
     """The problem of some recordings (traced indices), for misfits: they keep their padding."""
 
-    def of_each(p: Problem) -> Any:
-        return p.records, p.reference, p.which, [slot.groups for slot in p.slots]
+    def pick(at: Any, whole: Any) -> Any:
+        return whole if at(whole) is None else eqx.tree_at(at, whole, padding.one(at(whole), rows))
 
-    some = padding.one(of_each(problem), rows)
-    return eqx.tree_at(of_each, problem, some, is_leaf=lambda node: node is None)
+    for at in (lambda p: p.records, lambda p: p.reference, lambda p: p.which):
+        problem = pick(at, problem)
+    slots = tuple(pick(lambda slot: slot.groups, slot) for slot in problem.slots)
+    return eqx.tree_at(lambda p: p.slots, problem, slots) if slots else problem
