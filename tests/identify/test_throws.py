@@ -62,7 +62,7 @@ def test_a_right_throw_has_no_cause_of_its_errors_and_one_read_wrong_has_its_own
     right = throws.record(throws.FOLDER / "object_empty_log00179.csv")
 
     def changed(where, change):
-        record = eqx.tree_at(where, right, replace_fn=lambda x: jnp.asarray(change(x)))
+        record = eqx.tree_at(where, right, replace_fn=lambda x: jnp.asarray(change(np.asarray(x))))
         (cause,) = identify.fit(throws.problem([record], model), starts=1).causes
         return cause.words
 
