@@ -21,15 +21,19 @@ PULL = 0.3
 
 
 class Pull(Rows):
-    """A reported quantity, the one at `index`, pulled to a `target` by a residual of a `width`."""
+    """A quantity (at `index`) pulled to a `target` to a `width`, after the problem's `own` rows."""
 
+    own: Rows | None
     index: Int[Array, ""]
     target: Scalar
     width: Scalar
 
     def __call__(self, problem: Problem, parameters: Parameters, ends: Any) -> Array:
         value = quantities.vector(problem, parameters)[self.index]
-        return ((value - self.target) / self.width)[None]
+        pull = ((value - self.target) / self.width)[None]
+        if self.own is None:
+            return pull
+        return jnp.append(self.own(problem, parameters, ends).reshape(-1), pull)
 
 
 def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
@@ -74,9 +78,9 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
             # A weak pull: its best point has the least misfit of its own value, wherever that is.
             nonlocal point
             pull = middle + side * steps * deviation, PULL * deviation
-            rows = Pull(jnp.asarray(index, jnp.int32), *(jnp.asarray(x, kind) for x in pull))
-            own = eqx.tree_at(lambda p: p.rows, problem, rows, is_leaf=lambda node: node is None)
-            point = again(Tried(point), Task(own, fit.noises, 1e-4, 100)).parameters
+            at = jnp.asarray(index, jnp.int32), *(jnp.asarray(x, kind) for x in pull)
+            task = Task(_with(problem, Pull(problem.rows, *at)), fit.noises, 1e-4, 100)
+            point = again(Tried(point), task).parameters
             grown = (2.0 * cost_of(point, problem, fit.noises) - bottom) / shares - reach**2
             return grown, float(_value(problem, point)[index])
 
@@ -86,6 +90,10 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
 
 
 _value = eqx.filter_jit(quantities.vector)
+
+
+def _with(problem: Problem, rows: Rows) -> Problem:
+    return eqx.tree_at(lambda p: p.rows, problem, rows, is_leaf=lambda node: node is None)
 
 
 def _end(pulled: Any, reach: float, most: float, side: float) -> float:

@@ -302,7 +302,7 @@ def _deviations(there: Search, point: np.ndarray, count: int) -> tuple[np.ndarra
         return np.full(point.size, np.nan), message
     steps = np.zeros_like(slopes)
     for k in range(many):
-        half, null = inverted(gram - grams[k])
+        half, null = inverted(np.delete(grams, k, 0).sum(0))
         steps[k] = half @ (half.T @ slopes[k])
         nulls.append(null)
     square = (many - 1) / many * steps.T @ steps

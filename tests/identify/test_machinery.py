@@ -193,6 +193,11 @@ def test_pieces_meet_and_give_the_start(free_record):
         np.exp(problem.body.logs(whole.body)), [1 / 2.1, 1.6 / 2.1], rtol=0.02
     )
     cut = identify.fit(pieces(problem, 6), starts=1)
+    # The joints hold while a quantity is pulled.
+    widths = [
+        np.subtract(*ends) for ends in (identify.profile(cut, "Ix/Iz"), cut.interval()["Ix/Iz"])
+    ]
+    np.testing.assert_allclose(*widths, rtol=0.03)
     np.testing.assert_allclose(
         problem.body.logs(cut.body), problem.body.logs(whole.body), atol=5e-3
     )
