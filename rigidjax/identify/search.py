@@ -36,7 +36,7 @@ from rigidjax.identify.terms import (
 # by whole turns), a short one has not.
 HORIZONS = (0.25, 0.5, 1.0)
 # From so many recordings on, numbers of one recording alone go out of the normal equations.
-MANY = 8
+MANY = 16
 # Steps between two checks of the clock, the keyboard and the checkpoint.
 STRIDE = 25
 # A stride that lowers the misfit by less than this share is at the minimum.
