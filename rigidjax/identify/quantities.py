@@ -199,7 +199,8 @@ def cuts_of(
 def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
     """Standard deviations of functions with this derivative (…, n); all intervals use them.
 
-    Infinite along a direction of `null` (k, n); NaN along one of negative variance or round-off.
+    Infinite along a direction of `null` (k, n); NaN along one of negative variance or round-off, or
+    of a number with a correlation beyond one.
     """
     if not np.isfinite(covariance).all():
         return np.full(slope.shape[:-1], np.nan)
@@ -208,26 +209,16 @@ def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.n
     unit = np.sqrt(np.abs(np.diag(covariance)))
     unit = np.where(unit > 0, unit, 1.0)
     rows, scaled = (slope * unit).reshape(-1, unit.size), covariance / np.outer(unit, unit)
-    found, definite = np.zeros(len(rows)), _definite(scaled)
+    beyond, found = np.abs(scaled).max(axis=0, initial=0.0) > 1.0 + 1e-6, np.zeros(len(rows))
     # Functions of the same few numbers, such as the state of one recording, at once.
     alike: dict[bytes, list[int]] = {}
     for index, row in enumerate(rows):
-        some = row != 0 if definite else np.ones(row.size, bool)
-        alike.setdefault(some.tobytes(), []).append(index)
+        alike.setdefault((row != 0).tobytes(), []).append(index)
     for key, mine in alike.items():
         some = np.frombuffer(key, bool)
-        found[mine] = _deviations(rows[mine][:, some], scaled[np.ix_(some, some)])
+        own = _deviations(rows[mine][:, some], scaled[np.ix_(some, some)])
+        found[mine] = np.nan if beyond[some].any() else own
     return np.where(touched, np.inf, found.reshape(slope.shape[:-1]))
-
-
-def _definite(matrix: np.ndarray) -> bool:
-    """Whether no eigenvalue is negative, but for round-off: a tenth of the time of finding them."""
-    least = 10 * len(matrix) * np.finfo(float).eps * len(matrix)
-    try:
-        np.linalg.cholesky(matrix + least * np.eye(len(matrix)))
-    except np.linalg.LinAlgError:
-        return False
-    return True
 
 
 def _deviations(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ repeats in one process, other readings each time; compile apart.
 
 What is not installed is left out. `--joint` adds all throws of the data beside the checkout as one
 problem (see `bench_throws.py`), then 55: throws of the groups that have fewest are in it twice.
+`--many` adds a thousand starts at once, and up to a thousand recordings, six numbers each.
 `--steps` adds what one evaluation costs in equal and in adaptive steps. `--real` has only the first
 comparison, with the throws of an object beside the checkout in the place of simulated readings:
 their errors are not white, and the fit estimates its noise.
@@ -279,6 +280,25 @@ def many(readings):
         print(f"{name}: {time.process_time() - begun:.1f} CPU s")
 
 
+def recordings(counts=(100, 500, 1000)):
+    """Recordings of a free body by one gyro, each with a rate and a bias of its own."""
+    body, ts, rng = rj.Inertia.from_principal(1.0, 2.0, 2.5), T[:600:10], np.random.default_rng(0)
+    move = jax.jit(jax.vmap(lambda w: rj.simulate(body, rj.Spin(w), 5.0 * ts).ys.omega))
+    bias = lambda r: r.readings[0].sensor.bias
+    free = [identify.Free(bias, "bias", scale=0.02, spread=0.02)]
+    for count in counts:
+        rates = np.asarray(move(jnp.asarray(3.0 * rng.normal(size=(count, 3)))))
+        read = rates + 0.02 * rng.normal(size=(count, 1, 3)) + 0.01 * rng.normal(size=rates.shape)
+        gyro = identify.Gyro(0.01, bias=np.zeros(3))
+        records = [identify.Recording(5.0 * ts, (gyro, row)) for row in read]
+        for name in ("first call", "warm"):
+            begun = time.perf_counter()
+            made = identify.Problem(records, identify.PrincipalRatios(), free=free)
+            found = identify.fit(made, starts=1)
+            size = found.covariance.shape[0]
+            print(f"{count} recordings, {size} numbers, {name}: {time.perf_counter() - begun:.1f} s")
+
+
 def joint(more):
     """All throws of the data beside the checkout as one problem, and so many again; three times."""
     places = Path(__file__).parent
@@ -403,6 +423,7 @@ def main():
     cold()
     if options.many:
         many(draws[0])
+        recordings()
     if options.joint:
         joint(0)
         joint(24)

@@ -174,7 +174,9 @@ def test_the_notebook_gives_the_figures(monkeypatch):
     for cell in cells:
         if cell["cell_type"] == "code":
             exec("".join(cell["source"]), space)
-    for name, mean in (("calibration_proof_body", 0.8), ("object_empty", 1.25), ("object_a", 1.1)):
+    # With the wheel calibrated by least squares of the proof body's moments it was 1.09, and joint
+    # intervals were wider by a quarter; by the trace it is 1.105.
+    for name, mean in (("calibration_proof_body", 0.8), ("object_empty", 1.25), ("object_a", 1.11)):
         error = 100 * (space["singles"][name][0] - np.log(space["MOMENTS"][name]))
         assert np.abs(error).mean() < mean
         middle, reach = space["together"][name]
