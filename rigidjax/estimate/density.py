@@ -15,10 +15,9 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar
 from rigidjax.estimate import roots
-from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.filter import TURN_A_STEP, grid_of, scan_filter
+from rigidjax.estimate.filter import Belief, grid_of, scan_filter
 from rigidjax.estimate.roots import Terms
-from rigidjax.estimate.scene import Extended, Model, sensors_of, with_torque
+from rigidjax.estimate.scene import TURN_A_STEP, Extended, Model, sensors_of, with_torque
 from rigidjax.identify import padding, uncertainty
 from rigidjax.identify.body_charts import matter
 from rigidjax.identify.parameters import Unpacked, local

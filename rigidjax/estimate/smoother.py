@@ -11,8 +11,15 @@ from jaxtyping import Array, Float, Int
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.estimate import roots
-from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.filter import WORDS, Given, looked_at, scan_filter, status_of, told
+from rigidjax.estimate.filter import (
+    WORDS,
+    Belief,
+    Given,
+    looked_at,
+    scan_filter,
+    status_of,
+    told,
+)
 from rigidjax.estimate.linear import LinearEstimate, solved
 from rigidjax.estimate.scene import (
     Dynamics,

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax.body import parameters as charts
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Inertia, MassProperties, tensor_of as tensor_of
 from rigidjax.body.symmetric3 import swap_trace
 
 # The parts of a `MassProperties` that may be free, and their places in `pack`.
@@ -429,11 +429,6 @@ def charts_of(body: Any) -> tuple[Any, ...]:
 def in_a_row(bodies: Any) -> list[Any]:
     """The bodies of `Problem.bodies`, of one or of several."""
     return list(bodies.values()) if isinstance(bodies, dict) else [bodies]
-
-
-def tensor_of(body: Inertia | MassProperties) -> Float[Array, "3 3"]:
-    """The inertia tensor of a body, about its centre of mass if it has one, kg m²."""
-    return (body.inertia if isinstance(body, MassProperties) else body).tensor
 
 
 def has_mass(chart: AbstractBodyChart) -> bool:

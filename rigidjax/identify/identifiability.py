@@ -10,8 +10,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.answers import FAILS, NOT_ENDED
-from rigidjax.identify.body_charts import COMPONENTS, Bodies, Tensor, in_a_row, tensor_of
+from rigidjax.identify.body_charts import COMPONENTS, Bodies, Tensor, in_a_row
 from rigidjax.identify.full_scale import in_words
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
@@ -315,19 +316,14 @@ def _unseen(fit: "Fit") -> list[str]:
 
 def scale_is_unseen(fit: "Fit") -> bool:
     """Whether an undetermined direction scales the whole body and changes nothing else."""
-    flat, restore = ravel_pytree(fit.beside)
     null = np.asarray(fit.null_directions)
     if not len(null) or isinstance(fit.problem.body, Bodies):
         return False
-
-    def tensor(x: jax.Array) -> jax.Array:
-        return tensor_of(fit.problem.bodies(restore(x))).reshape(-1)
-
-    here = np.asarray(tensor(flat))
-    slopes = np.stack([np.asarray(jax.jvp(tensor, (flat,), (jnp.asarray(v),))[1]) for v in null])
-    wanted, *_ = np.linalg.lstsq(slopes.T, here, rcond=None)
-    left = np.linalg.norm(slopes.T @ wanted - here) / np.linalg.norm(here)
-    return bool(left < 1e-3)
+    first = len(labels(fit.problem))
+    slopes, values = (np.asarray(a) for a in _slopes(fit.problem, fit.beside))
+    here, moved = values[first : first + 6], slopes[0, first : first + 6] @ null.T
+    wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)
+    return bool(np.linalg.norm(moved @ wanted - here) < 1e-3 * np.linalg.norm(here))
 
 
 def correlations(fit: "Fit") -> list[str]:

@@ -14,9 +14,8 @@ from rigidjax.identify import padding
 from rigidjax.identify.body_charts import COMPONENTS, Bodies
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.recording import Recording, readings_of
+from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import rates
-from rigidjax.identify.sensors import Gyro
 from rigidjax.motion import Spin
 from rigidjax.motion.torques.base import Torque, evaluate
 from rigidjax.motion.torques.states import has_states
@@ -41,7 +40,7 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> l
     else:
         regressed = regress_inertia(recordings)
     start = problem.start(regressed)
-    rates = np.asarray(start.own.spin)
+    spins = np.asarray(start.own.spin)
     centre = np.asarray(start.body)
     # NumPy's generator: that of JAX takes seconds to compile.
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)
@@ -50,7 +49,7 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> l
         wide = 0.0 if index == 0 else (0.5 if regressed is not None and index % 2 else 1.5)
         middle = centre if (index == 0 or wide < 1) else 0 * centre
         body = middle + wide * rng.normal(size=centre.shape)
-        spin = rates + (0.0 if index == 0 else 0.1) * rng.normal(size=rates.shape)
+        spin = spins + (0.0 if index == 0 else 0.1) * rng.normal(size=spins.shape)
         kind = start.own.spin.dtype
         moved = jnp.asarray(body, kind), jnp.asarray(spin, kind)
         out.append(eqx.tree_at(lambda p: (p.body, p.own.spin), start, moved))
@@ -67,7 +66,7 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
     """
     found = []
     for recording in recordings:
-        t, w = _rates(recording)
+        t, w = rates(recording)
         if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
             return None
         if not of_rates(recording.torque):
@@ -105,19 +104,11 @@ def of_rates(torque: Any) -> bool:
     return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
 
 
-def _rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Times and rates of the gyro, or else of attitudes."""
-    gyro = readings_of(recording, Gyro)
-    if not gyro:
-        return rates(recording)
-    return np.asarray(recording.t)[gyro[0].seen], np.asarray(gyro[0].values)[gyro[0].seen]
-
-
 def balance(recording: Recording, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Euler's equations integrated over a recording, of rates turned by `turn`: rows (n, 6), right
     sides (n,), rows of the momentum itself.
     """
-    t, w = _rates(recording)
+    t, w = rates(recording)
     w, pushed = w @ turn.T, np.zeros((t.size, 3))
     if recording.torque is not None:
         pushed = np.asarray(_torques(recording.torque, t, w))

@@ -1,6 +1,7 @@
 """A problem: the known and the free numbers, and the errors of a guess."""
 
 import abc
+import dataclasses
 import operator
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -41,8 +42,8 @@ from rigidjax.identify.reference_states import ReferenceStates, first_rates, ref
 from rigidjax.identify.terms import all_errors, filled, over_records, states_of_one
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
-from rigidjax.motion.torques import Sum
 from rigidjax.motion.torques.base import AbstractForce, Torque, require_law
+from rigidjax.motion.torques.composite import parts_of
 
 
 class Rows(eqx.Module):
@@ -210,18 +211,13 @@ class Problem(eqx.Module):
             )
         else:
             vector = _numbers(self.body, body)
-        zeros = ([_zeros(*shape) for shape in shapes] for shapes in _shapes(self).values())
-        _, shared, *state, each = zeros
-        firsts: Any = [part[0] if part else None for part in state]
-        spin: Any = firsts[-1]
+        blank, kind = _blank(self), jnp.result_type(float)
         if omega is None:
             rates = first_rates(self.records, self.counts)
         else:
-            rates = _checks.floating(omega, (3,), "omega").astype(spin.dtype)
-            rates = jnp.broadcast_to(rates, spin.shape)
-        firsts[-1] = (rates / self.reference.rate[:, None]).astype(spin.dtype)
-        own = Own(*firsts, each=tuple(each))
-        return Parameters(vector, tuple(shared), own)
+            rates = _checks.floating(omega, (3,), "omega").astype(kind)[None]
+        spin = (rates / self.reference.rate[:, None]).astype(kind)
+        return eqx.tree_at(lambda p: (p.body, p.own.spin), blank, (vector, spin))
 
     def unpack(self, parameters: Parameters) -> tuple[Any, Any]:
         """The body and the initial state that the parameters represent.
@@ -308,13 +304,15 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
     one_problem(problem)
     hint = "problem.start(body) makes them"
     _checks.instance(parameters, Parameters, "parameters", hint=hint)
-    for name, shapes in _shapes(problem).items():
-        part = operator.attrgetter(name)(parameters)
-        numbers = [_checks.numbers(leaf, f"parameters.{name}") for leaf in jax.tree.leaves(part)]
-        if [leaf.shape for leaf in numbers] != shapes:
+    blank = _blank(problem)
+    for name in ("body", "shared", *(f"own.{field.name}" for field in dataclasses.fields(Own))):
+        wanted, part = (jax.tree.leaves(operator.attrgetter(name)(p)) for p in (blank, parameters))
+        numbers = [_checks.numbers(leaf, f"parameters.{name}") for leaf in part]
+        found, shapes = ([leaf.shape for leaf in leaves] for leaves in (numbers, wanted))
+        if found != shapes:
             raise ValueError(
                 f"parameters.{name}: wanted arrays of shapes {shapes}, as this problem has, got "
-                f"{[leaf.shape for leaf in numbers]}; {hint}"
+                f"{found}; {hint}"
             )
         for leaf in numbers:
             if leaf.dtype != problem.records.t.dtype:
@@ -327,24 +325,19 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
     return parameters
 
 
-def _shapes(problem: Problem) -> dict[str, list[tuple[int, ...]]]:
-    """The shapes of the arrays of each part of the problem's `Parameters`."""
+def _blank(problem: Problem) -> Parameters:
+    """Zeros in the shapes of the problem's free numbers."""
     shared, alone, each = [], [], (problem.count, 3)
     for slot in problem.slots:
         size = jnp.shape(slot.read(problem.records))[1:]
         if not slot.each:
-            shared.append(size if slot.groups is None else (len(slot.labels), *size))
+            shared.append(_zeros(*(() if slot.groups is None else (len(slot.labels),)), *size))
         if slot.each or slot.spread is not None:
-            alone.append((problem.count, *size))
-    return {
-        "body": [(problem.body.size,)],
-        "shared": shared,
-        "own.place": [each] if problem.rung is Rigid else [],
-        "own.speed": [each] if problem.rung is Rigid else [],
-        "own.turn": [] if problem.rung is Spin else [each],
-        "own.spin": [each],
-        "own.each": alone,
-    }
+            alone.append(_zeros(problem.count, *size))
+    moves = [_zeros(*each) if problem.rung is Rigid else None for _ in range(2)]
+    turn = None if problem.rung is Spin else _zeros(*each)
+    own = Own(*moves, turn, _zeros(*each), tuple(alone))
+    return Parameters(_zeros(problem.body.size), tuple(shared), own)
 
 
 def _sorted(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
@@ -434,8 +427,7 @@ def _rung(recording: Recording, body: AbstractBodyChart | Bodies) -> type:
     law: Any = recording.torque
     if law is not None:
         felt.append(getattr(law, "feels", HasAttitude))
-    parts = law.parts if isinstance(law, Sum) else (law,)
-    forced = any(isinstance(part, AbstractForce) for part in parts)
+    forced = any(isinstance(part, AbstractForce) for part in parts_of(law))
     if HasPose in felt or forced:
         for chart in charts_of(body):
             if not has_mass(chart):

@@ -179,6 +179,20 @@ def quantities(
     return tuple(out)
 
 
+def around(
+    middle: np.ndarray,
+    slope: np.ndarray,
+    covariance: np.ndarray,
+    null: np.ndarray,
+    reach: float,
+    limits: tuple[flat_limit.Limit, ...] = (),
+) -> tuple[np.ndarray, np.ndarray]:
+    """The interval of functions of value `middle` and derivative `slope`; else as `quantities`."""
+    wide = carried(slope, covariance, null)
+    low, high = cut_ends(reach, cuts_of(slope, covariance, wide, limits))
+    return np.asarray(middle + low * wide), np.asarray(middle + high * wide)
+
+
 def cuts_of(
     slope: np.ndarray,
     covariance: np.ndarray,

@@ -77,12 +77,14 @@ def _nearest(body: ArrayLike, world: ArrayLike) -> Array:
 
 
 def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,), s, and body rates (n, 3), rad/s, between attitudes; n may be 0."""
+    """Times (n,), s, and body rates (n, 3), rad/s: of a gyro, or between attitudes; n may be 0."""
+    for reading in readings_of(recording, Gyro):
+        return np.asarray(recording.t)[reading.seen], np.asarray(reading.values)[reading.seen]
     return rates_of(*attitudes(recording))
 
 
 def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
-    """The same of attitudes (n, 4) at times (n,)."""
+    """Times (n,) and body rates (n, 3) between attitudes (n, 4) at times (n,)."""
     if t.size < 2:
         return np.zeros(0), np.zeros((0, 3))
     turned = np.concatenate([[0.0], np.cumsum(np.linalg.norm(_turns(q[:-1], q[1:]), axis=1))])
@@ -142,11 +144,10 @@ def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates
 
 
 def _typical_rate(recording: Recording) -> float:
-    gyros = readings_of(recording, Gyro)
-    if gyros:
-        values = np.asarray(gyros[0].values)[gyros[0].seen]
-        return float(np.sqrt(np.mean(np.sum(values**2, axis=1)))) or 1.0
-    rate = float(np.linalg.norm(first_rate(recording)))
+    _, w = rates(recording)
+    if readings_of(recording, Gyro):
+        return float(np.sqrt(np.mean(np.sum(w**2, axis=1)))) or 1.0
+    rate = float(np.linalg.norm(w[0])) if len(w) else 0.0
     # Else by the first sensor whose readings show one.
     for reading in recording.readings if rate == 0 else ():
         sensor: Any = reading.sensor
@@ -243,8 +244,6 @@ def first_rates(records: Recording, counts: Any) -> Float[Array, "records 3"]:
 
 
 def first_rate(recording: Recording) -> np.ndarray:
-    """The initial body rate (3,), rad/s: from a gyro, or between attitudes; zero without either."""
-    for reading in readings_of(recording, Gyro):
-        return np.asarray(reading.values)[int(np.argmax(reading.seen))]
+    """The initial body rate (3,), rad/s, of `rates`; zero without any."""
     _, w = rates(recording)
     return w[0] if len(w) else np.zeros(3)
