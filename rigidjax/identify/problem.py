@@ -327,16 +327,19 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
 
 def _blank(problem: Problem) -> Parameters:
     """Zeros in the shapes of the problem's free numbers."""
-    shared, alone, each = [], [], (problem.count, 3)
+    shared, alone = [], []
     for slot in problem.slots:
         size = jnp.shape(slot.read(problem.records))[1:]
         if not slot.each:
             shared.append(_zeros(*(() if slot.groups is None else (len(slot.labels),)), *size))
         if slot.each or slot.spread is not None:
             alone.append(_zeros(problem.count, *size))
-    moves = [_zeros(*each) if problem.rung is Rigid else None for _ in range(2)]
-    turn = None if problem.rung is Spin else _zeros(*each)
-    own = Own(*moves, turn, _zeros(*each), tuple(alone))
+
+    def each(there: bool = True) -> Any:
+        return _zeros(problem.count, 3) if there else None
+
+    moves, turns = problem.rung is Rigid, problem.rung is not Spin
+    own = Own(each(moves), each(moves), each(turns), each(), tuple(alone))
     return Parameters(_zeros(problem.body.size), tuple(shared), own)
 
 

@@ -79,8 +79,9 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
             nonlocal point
             pull = middle + side * steps * deviation, PULL * deviation
             at = jnp.asarray(index, jnp.int32), *(jnp.asarray(x, kind) for x in pull)
-            task = Task(_with(problem, Pull(problem.rows, *at)), fit.noises, 1e-4, 100)
-            point = again(Tried(point), task).parameters
+            pull = Pull(problem.rows, *at)
+            pulled = eqx.tree_at(lambda p: p.rows, problem, pull, is_leaf=lambda node: node is None)
+            point = again(Tried(point), Task(pulled, fit.noises, 1e-4, 100)).parameters
             grown = (2.0 * cost_of(point, problem, fit.noises) - bottom) / shares - reach**2
             return grown, float(_value(problem, point)[index])
 
@@ -90,10 +91,6 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
 
 
 _value = eqx.filter_jit(quantities.vector)
-
-
-def _with(problem: Problem, rows: Rows) -> Problem:
-    return eqx.tree_at(lambda p: p.rows, problem, rows, is_leaf=lambda node: node is None)
 
 
 def _end(pulled: Any, reach: float, most: float, side: float) -> float:

@@ -80,14 +80,10 @@ def labels(problem: Problem) -> list[tuple[str, str, bool]]:
     for slot in problem.slots:
         shape = np.shape(slot.read(problem.records))[1:]
         parts = [""] if not shape else [f" {_place(i)}" for i in np.ndindex(shape)]
-        groups = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
-        for where in groups:
-            out += [(f"{slot.name}{part}{where}", slot.unit, slot.positive) for part in parts]
-        if slot.spread is not None:
-            for where in names:
-                out += [
-                    (f"{slot.name}{part}, own{where}", slot.unit, slot.positive) for part in parts
-                ]
+        ends = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
+        ends = ends if slot.spread is None else [*ends, *(f", own{where}" for where in names)]
+        called = [f"{slot.name}{part}{end}" for end in ends for part in parts]
+        out += [(name, slot.unit, slot.positive) for name in called]
     return out
 
 

@@ -162,12 +162,30 @@ def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     """First position and velocity, m and m/s, and a typical length, m: of the centre of mass, or of
     the body's frame if only markers were read.
     """
-    direct = _read_place(recording)
-    if direct is not None:
-        return direct
-    markers = readings_of(recording, Marker)
-    if not markers:
-        return np.zeros(3), np.zeros(3), 1.0
+    t, when, x = np.asarray(recording.t), np.zeros(0), np.zeros((0, 3))
+    positions, markers = readings_of(recording, Position), readings_of(recording, Marker)
+    ranges = readings_of(recording, Range)
+    speeds = [r for r in readings_of(recording, Velocity) if r.sensor.mounting is None]
+    if positions:
+        when, x = t[positions[0].seen], np.asarray(positions[0].values)[positions[0].seen]
+    elif markers:
+        when, x = _from_markers(recording, markers)
+    elif ranges:
+        seen = np.all([r.seen for r in ranges], axis=0)
+        stations = np.stack([np.asarray(r.sensor.station) for r in ranges])
+        lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[seen]
+        when, x = t[seen], _from_ranges(stations, lengths)
+    if speeds and (positions or not markers):
+        v = np.asarray(speeds[0].values)[speeds[0].seen][0]
+    else:
+        v = _first_speed(when, x)
+    x = x if when.size else np.zeros((1, 3))
+    # The largest distance from the mean; 1 if the places are all the same.
+    return x[0], v, float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
+
+
+def _from_markers(recording: Recording, markers: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) and places (n, 3), of the first marker alone if all are never seen at once."""
     seen = np.all([r.seen for r in markers], axis=0)
     if not seen.any():
         markers, seen = markers[:1], markers[0].seen
@@ -175,47 +193,16 @@ def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     x = np.mean([np.asarray(r.values)[seen] for r in markers], axis=0)
     place = np.mean([np.asarray(r.sensor.place) for r in markers], axis=0)
     known, q = attitudes(recording)
-    there = np.isin(t, known)
-    if there.all():
+    if np.isin(t, known).all():
         arms = jax.vmap(lambda turn: quaternion.rotate(turn, place))(q[np.isin(known, t)])
         x = x - np.asarray(arms)
-    return x[0], _first_speed(t, x), _length(x)
+    return t, x
 
 
 def _first_speed(t: np.ndarray, x: np.ndarray) -> np.ndarray:
     """The slope of a line through the first places (n, 3); zero of one place."""
     few = slice(0, max(2, min(5, t.size)))
     return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
-
-
-def _length(x: np.ndarray) -> float:
-    """The largest distance of places (n, 3) from their mean; 1 if they are all the same."""
-    return float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
-
-
-def _read_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """As `_first_place`, from sensors of positions, ranges and velocities; `None` without them."""
-    t = np.asarray(recording.t)
-    positions, ranges = readings_of(recording, Position), readings_of(recording, Range)
-    speeds = [r for r in readings_of(recording, Velocity) if r.sensor.mounting is None]
-    if readings_of(recording, Marker) and not positions:
-        return None
-    when, x = np.zeros(0), np.zeros((0, 3))
-    if positions:
-        when, x = t[positions[0].seen], np.asarray(positions[0].values)[positions[0].seen]
-    elif ranges:
-        seen = np.all([r.seen for r in ranges], axis=0)
-        stations = np.stack([np.asarray(r.sensor.station) for r in ranges])
-        lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[seen]
-        when, x = t[seen], _from_ranges(stations, lengths)
-    if not when.size and not speeds:
-        return None
-    if speeds:
-        v = np.asarray(speeds[0].values)[speeds[0].seen][0]
-    else:
-        v = _first_speed(when, x)
-    x = x if when.size else np.zeros((1, 3))
-    return x[0], v, _length(x)
 
 
 def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:

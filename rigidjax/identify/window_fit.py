@@ -70,34 +70,22 @@ def all_errors(windows: Windows, scene: Any, value: Any) -> Float[Array, "window
 _STEPS = 3
 
 
-def precisions(
-    starts: Any, kinds: tuple[str, ...], noise: Mapping[str, float] | None
-) -> Float[Array, " m"] | None:
-    """The precision of each number of the starts, (noise/deviation)²; `None` for exact starts."""
-    if starts is None:
-        return None
-    require_kinds(starts, kinds, "starts")
-    if noise is None:
-        raise ValueError(
-            "starts: deviations of the starts need the noise of the readings: give noise={…}, too"
-        )
-    found = []
-    for kind in kinds:
-        deviation = _checks.number(starts[kind], f"starts[{kind!r}]")
-        if not deviation > 0:
-            raise ValueError(
-                f"starts[{kind!r}]: wanted a positive deviation, or infinity for a start that is "
-                f"free, got {deviation}"
-            )
-        found += 3 * [(np.float64(noise[kind]) / deviation) ** 2]
-    return jnp.asarray(np.array(found))
-
-
-def require_kinds(given: Any, kinds: tuple[str, ...], name: str) -> None:
-    """Raise `TypeError`, `ValueError` for anything but a mapping with these keys."""
+def _by_kind(given: Any, kinds: tuple[str, ...], name: str, check: Any) -> np.ndarray:
+    """The checked numbers of a mapping with these keys, one for each component (m,)."""
     _checks.instance(given, Mapping, name, wanted="numbers by kind")
     if set(given) != set(kinds):
         raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(given)}")
+    return np.repeat([check(given[kind], f"{name}[{kind!r}]") for kind in kinds], 3)
+
+
+def _deviation(value: Any, name: str) -> float:
+    found = _checks.number(value, name)
+    if not found > 0:
+        raise ValueError(
+            f"{name}: wanted a positive deviation, or infinity for a start that is free, got "
+            f"{found}"
+        )
+    return found
 
 
 def eliminated(
@@ -233,8 +221,16 @@ def fit_windows(
     x, back = _numbers(guess, windows.starts.omega.dtype)
     guess, whole = back(x), windows.length
     _require_scene(scene, guess, windows)
-    scales = _scales(windows, whole, noise)
-    firm = precisions(starts, names(windows.starts), noise)
+    scales, firm = _scales(windows, whole, noise), None
+    if starts is not None:
+        wide = _by_kind(starts, names(windows.starts), "starts", _deviation)
+        if noise is None:
+            raise ValueError(
+                "starts: deviations of the starts need the noise of the readings: give noise={…}, "
+                "too"
+            )
+        # The precision of each number of the starts.
+        firm = jnp.asarray((np.asarray(scales) / wide) ** 2)
     padded, count = _padded(windows), np.asarray(windows.count, np.int32)
     own = min(stretches, windows.count)
 
@@ -379,14 +375,11 @@ def _scales(windows: Windows, steps: int, noise: Mapping[str, float] | None) -> 
     """The unit of each number of an error, for windows of so many steps."""
     kinds = names(windows.starts)
     if noise is not None:
-        require_kinds(noise, kinds, "noise")
-        each = np.array([_checks.positive(noise[k], f"noise[{k!r}]") for k in kinds])
-    else:
-        wanted = jax.tree.map(lambda a: a[:, :steps], windows.wanted)
-        squares = np.mean(np.asarray(held_errors(windows.starts, wanted)) ** 2, (0, 1))
-        each = np.sqrt(np.mean(squares.reshape(len(kinds), 3), 1))
-        each[each == 0] = 1.0
-    return jnp.asarray(np.repeat(each, 3))
+        return jnp.asarray(_by_kind(noise, kinds, "noise", _checks.positive))
+    wanted = jax.tree.map(lambda a: a[:, :steps], windows.wanted)
+    squares = np.mean(np.asarray(held_errors(windows.starts, wanted)) ** 2, (0, 1))
+    each = np.sqrt(np.mean(squares.reshape(len(kinds), 3), 1))
+    return jnp.asarray(np.repeat(np.where(each == 0, 1.0, each), 3))
 
 
 def _padded(windows: Windows) -> tuple[Any, Any, Any]:
