@@ -11,15 +11,7 @@ from jaxtyping import Array, Float, Int
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.estimate import roots
-from rigidjax.estimate.filter import (
-    WORDS,
-    Belief,
-    Given,
-    looked_at,
-    scan_filter,
-    status_of,
-    told,
-)
+from rigidjax.estimate.filter import WORDS, Belief, Given, looked_at, scan_filter, status_of, told
 from rigidjax.estimate.linear import LinearEstimate, solved
 from rigidjax.estimate.scene import (
     Dynamics,

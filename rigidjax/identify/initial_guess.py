@@ -32,10 +32,11 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> l
     """
     recordings = padding.on_host(problem.records, problem.counts)
     if isinstance(problem.body, Bodies):
-        found = {}
-        for name in problem.body.names:
-            mine = [r for r, of in zip(recordings, problem.of, strict=True) if of == name]
-            found[name] = regress_inertia(tuple(mine))
+        rows = list(zip(recordings, problem.of, strict=True))
+        found = {
+            name: regress_inertia(tuple(record for record, of in rows if of == name))
+            for name in problem.body.names
+        }
         regressed = {name: body for name, body in found.items() if body is not None} or None
     else:
         regressed = regress_inertia(recordings)

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
-from rigidjax.identify import padding
 from rigidjax.identify.body_charts import Bodies
 from rigidjax.identify.parameters import Own, Parameters
 from rigidjax.identify.problem import Problem, Rows, one_problem
@@ -87,22 +86,18 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
 
 def joined(problem: Problem, cut: Problem, found: Parameters) -> Parameters:
     """The parameters of the uncut problem, taken from the first piece."""
-    first = padding.one(found.own, 0)
+    first = jax.tree.map(lambda leaf: leaf[:1], found.own)
     spin = first.spin * cut.reference.rate[0] / problem.reference.rate[0]
-    whole = problem.start()
-    values = iter(found.shared)
     shared, each = [], []
-    for slot in problem.slots:
-        value = next(values)
+    for slot, value in zip(problem.slots, found.shared, strict=True):
         if slot.each:
             each.append(value[None])
             continue
         shared.append(value if slot.groups is None else value[None])
         if slot.spread is not None:
             each.append(jnp.zeros((1, *value.shape)))
-    own = Own(first.place, first.speed, first.turn, spin, ())
-    own = eqx.tree_at(lambda o: o.each, jax.tree.map(lambda leaf: leaf[None], own), tuple(each))
-    return eqx.tree_at(lambda p: (p.body, p.shared, p.own), whole, (found.body, tuple(shared), own))
+    own = Own(first.place, first.speed, first.turn, spin, tuple(each))
+    return Parameters(found.body, tuple(shared), own)
 
 
 def _piece(record: Recording, first: int, last: int, ends: bool) -> Recording:

@@ -16,13 +16,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import padding
-from rigidjax.identify.body_charts import (
-    AbstractBodyChart,
-    Bodies,
-    charts_of,
-    has_mass,
-    scaled,
-)
+from rigidjax.identify.body_charts import AbstractBodyChart, Bodies, charts_of, has_mass, scaled
 from rigidjax.identify.full_scale import with_limits
 from rigidjax.identify.loss import AbstractLoss, Entropic
 from rigidjax.identify.parameters import (

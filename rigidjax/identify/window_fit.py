@@ -236,9 +236,7 @@ def fit_windows(
 
     def searched(value: Any, settings: Settings, steps: int) -> Search:
         units = scales if steps == whole else _scales(windows, steps, noise)
-        return _searched(
-            scene, windows.step, value, padded, count, units, firm, settings, np.int32(steps), own
-        )
+        return _searched(scene, value, padded, count, units, firm, settings, np.int32(steps), own)
 
     evaluated = Settings(_SETTLED, BOLD, 0)
     last = Settings(_SETTLED, BOLD, max_steps, level=_LEVEL)
@@ -382,20 +380,18 @@ def _scales(windows: Windows, steps: int, noise: Mapping[str, float] | None) -> 
     return jnp.asarray(np.repeat(np.where(each == 0, 1.0, each), 3))
 
 
-def _padded(windows: Windows) -> tuple[Any, Any, Any]:
-    """Starts, states and inputs, the last repeated to full batches: a rest needs a program more."""
+def _padded(windows: Windows) -> Windows:
+    """The windows, the last repeated to full batches: a rest needs a program more."""
     batches = -(-windows.count // _SIDE_BY_SIDE)
     order = np.minimum(np.arange(batches * _SIDE_BY_SIDE), windows.count - 1)
-    parts = (windows.starts, windows.wanted, windows.inputs)
-    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[order]), parts)
+    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[order]), windows)
 
 
 @eqx.filter_jit
 def _searched(
     scene: Any,
-    h: float,
     guess: Any,
-    windows: tuple[Any, Any, Any],
+    windows: Windows,
     count: Any,
     scales: Any,
     firm: Any,
@@ -408,17 +404,17 @@ def _searched(
     """
     x, back = ravel_pytree(guess)
 
-    def of_one(x: Array, window: Any) -> tuple[Array, Array, Array]:
-        start, wanted, inputs = window
+    def of_one(x: Array, window: Windows) -> tuple[Array, Array, Array]:
+        measured, wanted, inputs = window.starts, window.wanted, window.inputs
 
         def errors(x: Array, start: Any) -> Array:
-            found = open_loop_errors(scene, h, back(x), start, wanted, inputs, steps)
+            found = open_loop_errors(scene, window.step, back(x), start, wanted, inputs, steps)
             return (found / scales[None]).reshape(-1)
 
         if firm is None:
-            jacobian, flat = with_jacobian(lambda x: errors(x, start), x)
+            jacobian, flat = with_jacobian(lambda x: errors(x, measured), x)
             return 0.5 * flat @ flat, jacobian.T @ jacobian, jacobian.T @ flat
-        return eliminated(lambda x, step: errors(x, plus(start, scales * step)), x, firm)
+        return eliminated(lambda x, step: errors(x, plus(measured, scales * step)), x, firm)
 
     def evaluated(x: Array) -> Any:
         def side_by_side(i: Array, total: Any) -> Any:
