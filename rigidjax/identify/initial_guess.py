@@ -114,8 +114,10 @@ def balance(recording: Recording, turn: np.ndarray) -> tuple[np.ndarray, np.ndar
     if recording.torque is not None:
         pushed = np.asarray(_torques(recording.torque, t, w))
     momenta = np.einsum("kij,tj->tki", BASIS, w)
-    total = momenta + _integral(np.cross(w[:, None, :], momenta), t)
-    impulse = _integral(pushed[:, None, :], t)
+    turned = np.concatenate([np.cross(w[:, None, :], momenta), pushed[:, None, :]], axis=1)
+    steps = 0.5 * (turned[1:] + turned[:-1]) * np.diff(t)[:, None, None]
+    integral = np.concatenate([np.zeros_like(turned[:1]), np.cumsum(steps, axis=0)])
+    total, impulse = momenta + integral[:, :-1], integral[:, -1:]
 
     def about_the_mean(x: np.ndarray) -> np.ndarray:
         # A conserved momentum is constant: compare it with its mean over the record.
@@ -129,8 +131,3 @@ def balance(recording: Recording, turn: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _torques(torque: Torque, t: Any, w: Any) -> Any:
     body = Inertia(jnp.eye(3))
     return jax.vmap(lambda time, omega: evaluate(torque, time, Spin(omega), body))(t, w)
-
-
-def _integral(values: np.ndarray, t: np.ndarray) -> np.ndarray:
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t)[:, None, None]
-    return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(steps, axis=0)])

@@ -73,12 +73,11 @@ def one(records: Any, index: Any) -> Any:
 def on_host(records: Recording, counts: Any) -> tuple[Recording, ...]:
     """The recordings one by one, in NumPy's arrays, so that no JAX operation is needed."""
     known = jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, records)
-    arrays, rest = eqx.partition(known, eqx.is_array)
-    rows = (jax.tree.map(lambda leaf, i=i: leaf[i], arrays) for i in range(len(counts)))
-    return tuple(
-        cut(eqx.combine(row, rest), n)
-        for row, n in zip(rows, np.asarray(counts).tolist(), strict=True)
-    )
+
+    def row(index: int) -> Any:
+        return jax.tree.map(lambda x: x[index] if isinstance(x, np.ndarray) else x, known)
+
+    return tuple(cut(row(index), n) for index, n in enumerate(np.asarray(counts).tolist()))
 
 
 def cut(recording: Recording, count: int) -> Recording:

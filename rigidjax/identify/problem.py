@@ -231,9 +231,7 @@ class Problem(eqx.Module):
 
     def scenes(self, parameters: Parameters) -> Recording:
         """The recordings with the parameters' values in the slots, with a leading axis."""
-        fits(self, parameters)
-        mine = local(self, parameters)
-        return jax.vmap(lambda one, record: filled(self, one, record))(mine, self.records)
+        return _scenes(self, fits(self, parameters))
 
     def values(self, parameters: Parameters) -> dict[str, Array]:
         """The value of each `Free`, by name, in its unit.
@@ -242,21 +240,7 @@ class Problem(eqx.Module):
         A `Free` with a `spread` gives the shared value, and each recording's value under "its name,
         own".
         """
-        scenes = self.scenes(parameters)
-        out = {}
-        for slot, step, _ in by_slot(self, parameters):
-            value = slot.read(scenes)
-            if step is None:
-                out[slot.name] = value
-                continue
-            first: Any = 0
-            if slot.groups is not None:
-                groups = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
-                first = jnp.argmax(slot.groups[None, :] == groups[:, None], axis=1)
-            out[slot.name] = slot.move(slot.read(self.records)[first], step)
-            if slot.spread is not None:
-                out[f"{slot.name}, own"] = value
-        return out
+        return values_of(self, fits(self, parameters))
 
     def motion(self, parameters: Parameters) -> Any:
         """The states at the recording's times, with a leading time axis.
@@ -276,6 +260,30 @@ class Problem(eqx.Module):
         fits(self, parameters)
         out = all_errors(parameters, self)[0]
         return tuple(e[0] for e in out) if self.count == 1 else out
+
+
+def _scenes(problem: Problem, parameters: Parameters) -> Recording:
+    mine = local(problem, parameters)
+    return jax.vmap(lambda one, record: filled(problem, one, record))(mine, problem.records)
+
+
+def values_of(problem: Problem, parameters: Parameters) -> dict[str, Array]:
+    """`Problem.values` without a check of the parameters."""
+    scenes = _scenes(problem, parameters)
+    out = {}
+    for slot, step, _ in by_slot(problem, parameters):
+        value = slot.read(scenes)
+        if step is None:
+            out[slot.name] = value
+            continue
+        first: Any = 0
+        if slot.groups is not None:
+            groups = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
+            first = jnp.argmax(slot.groups[None, :] == groups[:, None], axis=1)
+        out[slot.name] = slot.move(slot.read(problem.records)[first], step)
+        if slot.spread is not None:
+            out[f"{slot.name}, own"] = value
+    return out
 
 
 def one_problem(problem: Any) -> Problem:
@@ -390,7 +398,7 @@ def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
     if body is None:
         return _zeros(chart.size)
     _checks.single(body, (Inertia, MassProperties), "body")
-    vector = _vector(chart, body)
+    vector = eqx.filter_jit(chart.vector)(body)
     if _checks.known(vector):
         _checks.refuse(
             vector,
@@ -399,11 +407,6 @@ def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
             "moments above zero, the largest below the sum of the others",
         )
     return vector
-
-
-@eqx.filter_jit
-def _vector(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
-    return chart.vector(body)
 
 
 def _zeros(*shape: int) -> Array:

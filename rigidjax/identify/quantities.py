@@ -14,7 +14,7 @@ from rigidjax import _checks
 from rigidjax.identify import flat_limit
 from rigidjax.identify.body_charts import AbstractBodyChart, Bodies, Ratios, in_a_row
 from rigidjax.identify.parameters import Parameters
-from rigidjax.identify.problem import Problem
+from rigidjax.identify.problem import Problem, values_of
 
 if TYPE_CHECKING:
     from rigidjax.identify.result import Fit
@@ -116,7 +116,7 @@ def vector(problem: Problem, parameters: Parameters) -> Array:
     for (_, chart), body in zip(charts(problem), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
     parts.append(rates.reshape(-1))
-    values = problem.values(parameters)
+    values = values_of(problem, parameters)
     for slot in problem.slots:
         for name in (slot.name, f"{slot.name}, own")[: 1 + (slot.spread is not None)]:
             value = values[name].reshape(-1)
