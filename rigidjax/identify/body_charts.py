@@ -21,6 +21,10 @@ Numbers = Float[Array, " chart"]
 Rows = Float[Array, "rows chart"]
 # Components of a tensor in the order of their names.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+# The basis of symmetric tensors, in this order.
+BASIS = np.zeros((6, 3, 3))
+for _k, (_i, _j) in enumerate(COMPONENTS):
+    BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
 
 
 class AbstractBodyChart(eqx.Module):

@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.answers import FAILS, NOT_ENDED
-from rigidjax.identify.body_charts import COMPONENTS, Bodies, Tensor, in_a_row
+from rigidjax.identify.body_charts import BASIS, COMPONENTS, Bodies, Tensor, in_a_row
 from rigidjax.identify.full_scale import in_words
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
@@ -203,9 +203,7 @@ def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
 
 def _turns(tensor: np.ndarray, changes: np.ndarray) -> bool:
     """Whether some change (k, 6) of a tensor (3, 3) turns its principal axes."""
-    steps = np.zeros((len(changes), 3, 3))
-    for column, (i, j) in zip(changes.T, TENSOR.values(), strict=True):
-        steps[:, i, j] = steps[:, j, i] = column
+    steps = np.einsum("mk,kij->mij", changes, BASIS)
     _, axes = np.linalg.eigh(tensor)
     along = np.einsum("ia,kij,jb->kab", axes, steps, axes)
     across = along - along * np.eye(3)

@@ -11,7 +11,7 @@ from jaxtyping import PRNGKeyArray
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify import padding
-from rigidjax.identify.body_charts import COMPONENTS, Bodies
+from rigidjax.identify.body_charts import BASIS, Bodies
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
@@ -19,11 +19,6 @@ from rigidjax.identify.reference_states import rates
 from rigidjax.motion import Spin
 from rigidjax.motion.torques.base import Torque, evaluate
 from rigidjax.motion.torques.states import has_states
-
-# The basis of symmetric tensors.
-BASIS = np.zeros((6, 3, 3))
-for _k, (_i, _j) in enumerate(COMPONENTS):
-    BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
 
 
 def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> list[Parameters]:
