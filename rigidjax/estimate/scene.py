@@ -257,29 +257,23 @@ class Dynamics(eqx.Module):
         return after, block_diag(grown, same), block_diag(noise, strewn)
 
 
-def reset(x: Extended, e: Float[Array, " n"], root: Float[Array, "n m"]) -> Float[Array, "n m"]:
+def reset(
+    x: Extended, e: Float[Array, " n"], root: Float[Array, "n m"], *, back: bool = False
+) -> Float[Array, "n m"]:
     """The root of the errors about `x ⊕ e`, from the `root` of the errors about x.
 
     `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, to second order in the turn e: Mueller, Hehn and D'Andrea
-    2017, doi:10.2514/1.G000848.
+    2017, doi:10.2514/1.G000848. With `back` by `J_r(e)⁻¹`, to third order: how `log(exp(e) exp(δ))`
+    moves with δ.
     """
-    return _turned(x, e, root, -0.5, 1 / 6)
-
-
-def reset_inverse(x: Extended, e: Float[Array, " n"], a: Float[Array, "n m"]) -> Array:
-    """`J_r(e)⁻¹ a`: how `log(exp(e) exp(δ))` moves where δ moves by a; to third order in e."""
-    return _turned(x, e, a, 0.5, 1 / 12)
-
-
-def _turned(x: Extended, e: Array, a: Array, first: float, second: float) -> Array:
-    """The rows of each attitude times `1 + first hat(e) + second hat(e)²`."""
+    first, second = (0.5, 1 / 12) if back else (-0.5, 1 / 6)
     across = jax.vmap(cross, (None, 1), 1)
     for rows in turns(x):
-        turn, mine = e[rows], a[rows]
+        turn, mine = e[rows], root[rows]
         once = across(turn, mine)
         mine = mine + first * once + second * across(turn, once)
-        a = jnp.concatenate([a[: rows.start], mine, a[rows.stop :]])
-    return a
+        root = jnp.concatenate([root[: rows.start], mine, root[rows.stop :]])
+    return root
 
 
 def not_negative(value: Any, name: str) -> Array:
