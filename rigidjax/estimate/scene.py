@@ -98,8 +98,7 @@ def with_torque(model: Model, torque: Torque | None) -> Model:
     """The model with a recording's own torque beside its torques."""
     if torque is None:
         return model
-    known = () if model.torque is None else (model.torque,)
-    laws = Sum(*known, torque, *model.white, *model.coloured)
+    laws = Sum(*parts_of(model.torque), torque, *model.white, *model.coloured)
     return Model(model.body, laws, walks=model.walks)
 
 

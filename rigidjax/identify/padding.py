@@ -80,15 +80,15 @@ def on_host(records: Recording, counts: Any) -> tuple[Recording, ...]:
     return tuple(cut(row(index), n) for index, n in enumerate(np.asarray(counts).tolist()))
 
 
-def cut(recording: Recording, count: int) -> Recording:
-    """A recording without the rows that `stack` appended."""
-    if recording.t.shape[0] == count:
+def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
+    """The rows from `begin` to before `end` of a recording: without those that `stack` appended."""
+    if recording.t.shape[0] == end - begin:
         return recording
 
     def long(r: Recording) -> list[Any]:
         return [r.t, *(part for reading in r.readings for part in (reading.values, reading.mask))]
 
-    return eqx.tree_at(long, recording, [leaf[:count] for leaf in long(recording)])
+    return eqx.tree_at(long, recording, [leaf[begin:end] for leaf in long(recording)])
 
 
 def _is_table(node: Any) -> bool:
