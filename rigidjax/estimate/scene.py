@@ -1,7 +1,4 @@
-"""The state equations of a filter: the motion, correlated torques, drifting sensor errors.
-
-And a random draw of a motion by them.
-"""
+"""The state equations of a filter (motion, torques, sensor errors), and random motions by them."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -262,8 +259,8 @@ def reset(
     """The root of the errors about `x ⊕ e`, from the `root` of the errors about x.
 
     `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, to second order in the turn e: Mueller, Hehn and D'Andrea
-    2017, doi:10.2514/1.G000848. With `back` by `J_r(e)⁻¹`, to third order: how `log(exp(e) exp(δ))`
-    moves with δ.
+    2017, doi:10.2514/1.G000848. With `back` it multiplies by `J_r(e)⁻¹`, to third order: this is
+    how `log(exp(e) exp(δ))` moves with δ.
     """
     first, second = (0.5, 1 / 12) if back else (-0.5, 1 / 6)
     across = jax.vmap(cross, (None, 1), 1)

@@ -1,7 +1,4 @@
-"""From a body and an initial state to the states at a recording's times, and to sensors' input.
-
-And the readings of sensors along a known motion: simulated data.
-"""
+"""From a body and an initial state to the states at a recording's times, and to readings."""
 
 import abc
 import math

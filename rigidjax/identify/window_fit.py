@@ -32,13 +32,14 @@ from rigidjax.solve.validation import require_fit
 
 
 def open_loop_errors(
-    scene: Any, h: float, value: Any, start: Any, wanted: Any, inputs: Any, steps: Any = None
+    scene: Any, value: Any, window: Windows, steps: Any = None
 ) -> Float[Array, "steps n"]:
     """The errors of one window, as changes from the measured states; zero beyond `steps`."""
     body, law = scene(value)
-    size, length = jnp.asarray(h, wanted.omega.dtype), wanted.omega.shape[0]
-    before = next(iter(inputs.values())).shape[0] - length if inputs else 0
-    start = started(body, start, bind(law, first_row(law, size, inputs)), 0.0)
+    wanted, inputs = window.wanted, window.inputs
+    size, length = jnp.asarray(window.step, wanted.omega.dtype), wanted.omega.shape[0]
+    before = window.before if inputs else 0
+    start = started(body, window.starts, bind(law, first_row(law, size, inputs)), 0.0)
     field = equations_of_motion(body, start, law)
     stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
 
@@ -48,7 +49,7 @@ def open_loop_errors(
 
     def ahead(y: Any, i: Array) -> tuple[Any, None]:
         # The torque's own states follow the inputs; the body keeps its measured state.
-        y = step(stepper, size, jnp.zeros_like(size), i, y, inputs, before)
+        y, _ = one(y, i)
         return split(Coupled(start.motion, stepper.state(y).own)), None
 
     y0 = stepper.start
@@ -61,9 +62,8 @@ def open_loop_errors(
 @eqx.filter_jit
 def all_errors(windows: Windows, scene: Any, value: Any) -> Float[Array, "windows steps n"]:
     """The errors of a model with these numbers."""
-    of = partial(open_loop_errors, scene, windows.step, value)
-    parts = (windows.starts, windows.wanted, windows.inputs)
-    return lax.map(lambda window: of(*window), parts, batch_size=min(128, windows.count))
+    of = partial(open_loop_errors, scene, value)
+    return lax.map(of, windows, batch_size=min(128, windows.count))
 
 
 # Steps of Gauss and Newton's for each start; residuals of a short run are nearly linear in it.
@@ -405,16 +405,15 @@ def _searched(
     x, back = ravel_pytree(guess)
 
     def of_one(x: Array, window: Windows) -> tuple[Array, Array, Array]:
-        measured, wanted, inputs = window.starts, window.wanted, window.inputs
-
         def errors(x: Array, start: Any) -> Array:
-            found = open_loop_errors(scene, window.step, back(x), start, wanted, inputs, steps)
+            begun = eqx.tree_at(lambda w: w.starts, window, start)
+            found = open_loop_errors(scene, back(x), begun, steps)
             return (found / scales[None]).reshape(-1)
 
         if firm is None:
-            jacobian, flat = with_jacobian(lambda x: errors(x, measured), x)
+            jacobian, flat = with_jacobian(lambda x: errors(x, window.starts), x)
             return 0.5 * flat @ flat, jacobian.T @ jacobian, jacobian.T @ flat
-        return eliminated(lambda x, step: errors(x, plus(measured, scales * step)), x, firm)
+        return eliminated(lambda x, step: errors(x, plus(window.starts, scales * step)), x, firm)
 
     def evaluated(x: Array) -> Any:
         def side_by_side(i: Array, total: Any) -> Any:
