@@ -73,11 +73,10 @@ def one(records: Any, index: Any) -> Any:
 def on_host(records: Recording, counts: Any) -> tuple[Recording, ...]:
     """The recordings one by one, in NumPy's arrays, so that no JAX operation is needed."""
     known = jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, records)
-
-    def row(index: int) -> Any:
-        return jax.tree.map(lambda x: x[index] if isinstance(x, np.ndarray) else x, known)
-
-    return tuple(cut(row(index), n) for index, n in enumerate(np.asarray(counts).tolist()))
+    return tuple(
+        cut(jax.tree.map(lambda x, i=i: x[i] if isinstance(x, np.ndarray) else x, known), n)
+        for i, n in enumerate(np.asarray(counts).tolist())
+    )
 
 
 def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
