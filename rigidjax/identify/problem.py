@@ -333,7 +333,8 @@ def _blank(problem: Problem) -> Parameters:
     for slot in problem.slots:
         size = jnp.shape(slot.read(problem.records))[1:]
         if not slot.each:
-            shared.append(_zeros(*(() if slot.groups is None else (len(slot.labels),)), *size))
+            groups = () if slot.groups is None else (len(slot.labels),)
+            shared.append(_zeros(*groups, *size))
         if slot.each or slot.spread is not None:
             alone.append(_zeros(problem.count, *size))
 
