@@ -223,7 +223,8 @@ def curvature(density: LogDensity, x: Float[Array, " n"]) -> Curvature:
 def prior_residuals(density: LogDensity, x: Float[Array, " n"]) -> Float[Array, " m"]:
     """The terms of the priors, as numbers whose halved squares are subtracted from the density."""
     parameters, _, logs = ravel_pytree(density.like)[1](x)
-    parts = [leaf.reshape(-1) for leaf in beside(parameters, density.problem, None)]
+    rest = jax.tree.leaves(beside(parameters, density.problem, None))
+    parts = [leaf.reshape(-1) for leaf in rest]
     if logs is not None and density.deviation is not None:
         parts.append(logs / density.deviation)
     return jnp.concatenate(parts) if parts else jnp.zeros(0, x.dtype)

@@ -21,6 +21,7 @@ from rigidjax._types import Scalar
 from rigidjax.body.inertia import tensor_of
 from rigidjax.estimate.density import LogDensity, curvature, of_draws
 from rigidjax.identify.levenberg_marquardt import Settings, search
+from rigidjax.identify.normal import Normal
 from rigidjax.identify.parameters import Unpacked
 from rigidjax.identify.quantities import around
 from rigidjax.identify.search import made_of
@@ -325,13 +326,14 @@ def refit(
 @eqx.filter_jit
 def _refit(density: LogDensity, settings: Settings, key: Any, count: int) -> Refit:
     def evaluated(x: Array) -> Any:
-        return None, *curvature(density, x)
+        cost, gram, slope = curvature(density, x)
+        return None, cost, Normal(gram), slope
 
     parameters, factors, logs = density.like
     ones = jax.tree.map(jnp.ones_like, (factors, logs))
     made = ravel_pytree((made_of(parameters), *ones))[0]
     end = search(evaluated, density.x0, made, settings, None)
-    covariance = jnp.linalg.inv(end.gram)
+    covariance = jnp.linalg.inv(end.normal.core)
     draws, weights = _weighted(density, end.point, covariance, key, count)
     converged = end.converged & jnp.isfinite(weights).all()
     return Refit(density, end.point, -end.cost, covariance, converged, draws, weights)

@@ -242,7 +242,7 @@ def assess(
         if cost <= level and found and cost > best_cost + 0.01 * margin:
             away = ravel_pytree(item.parameters)[0] - ravel_pytree(value)[0]
             # In a flat valley readings do not tell two points apart.
-            if float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin:
+            if linear.along(np.asarray(away)) > 2 * margin:
                 rivals.append(item)
     rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere" if rivals else ""
     if believable and not any(start.fits for start in starts):

@@ -12,10 +12,11 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
 from rigidjax.identify import flat_limit
+from rigidjax.identify.normal import normal_of
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem, fits, one_problem
 from rigidjax.identify.quantities import Quantity, quantities, values_and_slopes
-from rigidjax.identify.terms import normal_matrix, with_blocks
+from rigidjax.identify.terms import with_blocks
 from rigidjax.identify.uncertainty import inverted
 
 
@@ -66,7 +67,7 @@ def _fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
     noises: list[Any] = [sensor.noise for sensor in problem.records.sensors]
     blocks = with_blocks(parameters, problem)[1][0]
     rows = [rows / noise[:, None, :, None] for rows, noise in zip(blocks, noises, strict=True)]
-    return normal_matrix(rows, places(problem, parameters), ravel_pytree(parameters)[0].size)
+    return normal_of(rows, places(problem, parameters), ravel_pytree(parameters)[0].size).core
 
 
 def _look(problem: Problem, parameters: Parameters) -> None:

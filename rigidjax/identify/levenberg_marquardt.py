@@ -10,6 +10,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rigidjax.identify.normal import Normal
+
 # Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
 # long as Gauss and Newton's.
 CAREFUL, BOLD = 1.0, 1e-3
@@ -55,7 +57,7 @@ class Settings(eqx.Module):
 
 
 class Search(eqx.Module):
-    """The state of a search: the best `point` so far, with `gram` (n, n) and `slope` there; the
+    """The state of a search: the best `point` so far, with `normal` and `slope` there; the
     `trial` next, and its `hoped` gain; `pace` of the logarithm of the cost; evaluations `taken`;
     `found` of the last one, whether `here` at the best point; `rise` of the last trial over its
     predicted gain, zero if it was better.
@@ -64,7 +66,7 @@ class Search(eqx.Module):
     first: Float[Array, ""]
     point: Float[Array, " n"]
     cost: Float[Array, ""]
-    gram: Float[Array, "n n"]
+    normal: Normal
     slope: Float[Array, " n"]
     trial: Float[Array, " n"]
     hoped: Float[Array, ""]
@@ -79,19 +81,21 @@ class Search(eqx.Module):
 
 
 def search(
-    evaluated: Callable[[Array], tuple[Any, Array, Array, Array]],
+    evaluated: Callable[[Array], tuple[Any, Array, Normal, Array]],
     start: Float[Array, " n"],
     made: Float[Array, " n"],
     settings: Settings,
     nothing: Any,
-    by_noise: Callable[[Any, Array], Array] | None = None,
+    empty: Normal | None = None,
+    by_noise: Callable[[Any, Normal], Array] | None = None,
 ) -> Search:
     """At most `settings.steps` steps down from `start`; with none, `start` is evaluated.
 
     **Arguments:** `evaluated` point → values to keep, cost, normal matrix, gradient: of half a sum
     of squares, or minus a log-density with Fisher's information (scoring); `made` (n,) one for
-    numbers of order one, which no step moves far, else zero; `nothing` zeros like the kept values;
-    `by_noise` of them and the normal matrix: the expected excess of the cost at the true numbers.
+    numbers of order one, which no step moves far, else zero; `nothing` zeros like the kept values,
+    `empty` like the normal matrix, if that has more than a core; `by_noise` of them and the normal
+    matrix: the expected excess of the cost at the true numbers.
     Source: Marquardt 1963, doi:10.1137/0111030; damping by the ratio of actual to predicted gain:
     Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares problems, section 3.2.
     """
@@ -101,7 +105,7 @@ def search(
         jnp.asarray(jnp.inf, kind),
         start,
         jnp.asarray(jnp.inf, kind),
-        jnp.zeros((number, number), kind),
+        Normal(jnp.zeros((number, number), kind)) if empty is None else empty,
         jnp.zeros(number, kind),
         start,
         jnp.zeros((), kind),
@@ -123,14 +127,16 @@ def search(
 
 def _after(
     now: Search,
-    trial: tuple[Any, Array, Array, Array],
+    trial: tuple[Any, Array, Normal, Array],
     made: Array,
     settings: Settings,
-    by_noise: Callable[[Any, Array], Array] | None,
+    by_noise: Callable[[Any, Normal], Array] | None,
 ) -> Search:
     """The state of the search after an evaluation of the trial point, with the next trial."""
-    found, cost, gram, slope = trial
-    finite = jnp.isfinite(cost) & jnp.isfinite(slope).all() & jnp.isfinite(gram).all()
+    found, cost, normal, slope = trial
+    finite = jnp.isfinite(cost)
+    for leaf in jax.tree.leaves((normal, slope)):
+        finite = finite & jnp.isfinite(leaf).all()
     first = now.taken == 0
     better = finite & ((cost < now.cost) | first)
     ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
@@ -144,18 +150,18 @@ def _after(
     pace = jnp.where(first, now.pace, 0.5 * (now.pace + fell))
     level = better & ~first & (ratio > FAIR) & (now.damping <= FREE)
     if by_noise is not None:
-        level = level & (now.cost - cost < settings.level * by_noise(found, gram))
+        level = level & (now.cost - cost < settings.level * by_noise(found, normal))
     rise = jnp.where(better | ~finite, 0.0, -ratio)
     noisy = (now.rise > 0) & (rise > jnp.maximum(now.rise, NOISY)) & (now.hoped < LITTLE * now.cost)
-    point, cost, gram, slope = jax.tree.map(
+    point, cost, normal, slope = jax.tree.map(
         lambda new, old: jnp.where(better, new, old),
-        (now.trial, cost, gram, slope),
-        (now.point, now.cost, now.gram, now.slope),
+        (now.trial, cost, normal, slope),
+        (now.point, now.cost, now.normal, now.slope),
     )
-    move, root = _damped(gram, slope, made, damping)
+    move, root = _damped(normal, slope, made, damping)
     sound = jnp.isfinite(move).all()
     move = jnp.where(sound, move, 0.0)
-    hoped = -(slope @ move) - 0.5 * move @ (gram @ move)
+    hoped = -(slope @ move) - 0.5 * move @ (normal @ move)
     small = (jnp.max(jnp.abs(move) * root) < settings.tolerance) & (damping <= FREE)
     # Round-off refuses every step at the minimum itself.
     bottom = hoped <= 1e-14 * jnp.abs(cost)
@@ -170,7 +176,7 @@ def _after(
         jnp.where(first & finite, cost, now.first),
         point,
         cost,
-        gram,
+        normal,
         slope,
         point + move,
         hoped,
@@ -185,15 +191,13 @@ def _after(
     )
 
 
-def _damped(gram: Array, slope: Array, made: Array, damping: Array) -> tuple[Array, Array]:
+def _damped(normal: Normal, slope: Array, made: Array, damping: Array) -> tuple[Array, Array]:
     """The step (n,), and the root of the diagonal of the normal matrix (n,)."""
-    felt = jnp.diagonal(gram)
+    felt = normal.diagonal
     felt = jnp.maximum(felt, jnp.maximum(1e-12 * jnp.max(felt), 1e-300))
     # Columns of length one: the factor of Cholesky loses no digits to units.
     root = jnp.sqrt(felt)
     damped = damping * jnp.maximum(felt, made) / root**2
-    matrix = gram / (root[:, None] * root[None, :]) + jnp.diag(damped)
-    factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
-    move = -jax.scipy.linalg.cho_solve(factor, slope / root) / root
+    move = -normal.scaled(1.0 / root).plus(damped).solve(slope / root) / root
     far = jnp.max(jnp.abs(move) * made)
     return move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300)), root

@@ -321,6 +321,16 @@ def columns(problem: "Problem", one: Parameters) -> np.ndarray:
     return np.concatenate([np.arange(size), *twice]).astype(int)
 
 
+def columns_alone(problem: "Problem", one: Parameters) -> np.ndarray:
+    """The columns of a recording's block whose numbers no other recording has."""
+    counted, total = numbered(one), columns(problem, one).size
+    steps = zip(problem.slots, counted.shared, strict=True)
+    each = [np.ravel(step) for slot, step in steps if slot.each]
+    state = [np.ravel(leaf) for leaf in jax.tree.leaves(counted.own)]
+    size = sum(np.size(leaf) for leaf in jax.tree.leaves(one))
+    return np.concatenate([*each, *state, np.arange(size, total)]).astype(int)
+
+
 def places(problem: "Problem", parameters: Parameters) -> Int[Array, "records columns"]:
     """Each column's place in the flattened parameters; n for a column of no number."""
     counted = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.int32), numbered(parameters))

@@ -11,10 +11,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from rigidjax.identify import padding
 from rigidjax.identify.body_charts import charts_of
 from rigidjax.identify.checkpoint import SearchState, Tried
 from rigidjax.identify.levenberg_marquardt import BOLD, CAREFUL, Search, Settings, search
-from rigidjax.identify.parameters import Parameters, places
+from rigidjax.identify.normal import Normal, normal_of
+from rigidjax.identify.parameters import Parameters, columns_alone, local, places
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.propagation import FixedSteps
 from rigidjax.identify.recording import count_of
@@ -22,8 +24,8 @@ from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.identify.terms import (
     Noise,
     along,
-    beside,
-    normal_matrix,
+    firm,
+    linked,
     seen,
     with_blocks,
     with_jacobian,
@@ -33,6 +35,8 @@ from rigidjax.identify.terms import (
 # The beginning of the record is fitted first: a long record has many wrong minima (the phase slips
 # by whole turns), a short one has not.
 HORIZONS = (0.25, 0.5, 1.0)
+# From so many recordings on, numbers of one recording alone go out of the normal equations.
+MANY = 16
 # Steps between two checks of the clock, the keyboard and the checkpoint.
 STRIDE = 25
 # A stride that lowers the misfit by less than this share is at the minimum.
@@ -70,8 +74,12 @@ def descend(
     where, made = places(problem, start), made_of(start)
     number, kind = flat.size, flat.dtype
     problem = _as_far_as(problem, weights)
+    held = ravel_pytree(firm(start, problem))[0]
+    alone = None
+    if problem.count >= MANY and problem.rows is None:
+        alone = columns_alone(problem, padding.one(local(problem, start), 0))
 
-    def evaluated(point: Array) -> tuple[Any, Array, Array, Array]:
+    def evaluated(point: Array) -> tuple[Any, Array, Normal, Array]:
         here = restore(point)
         found = with_blocks(here, problem)
         (errors, ends), (slopes, end_slopes) = found
@@ -80,16 +88,19 @@ def descend(
         for e, rows in zip(read, blocks, strict=True):
             total = total + jnp.sum(e**2)
             slope = slope.at[where].add(jnp.einsum("rtki,rtk->ri", rows, e))
-        gram, slope = normal_matrix(blocks, where, number), slope[:-1]
-        e, rows = beside_rows(problem, point, restore, ends, end_slopes)
+        normal = normal_of(blocks, where, number, alone).plus(held**2)
+        total, slope = total + jnp.sum((held * point) ** 2), slope[:-1] + held**2 * point
+        e, rows = linked_rows(problem, point, restore, ends, end_slopes)
         if e.size:
-            total = total + jnp.sum(e**2)
-            gram, slope = gram + rows.T @ rows, slope + e @ rows
-        rows = _bends(problem, here.body, slope)
-        return found, 0.5 * total, gram + rows.T @ rows, slope
+            total, slope = total + jnp.sum(e**2), slope + e @ rows
+            normal = normal.wider(rows)
+        return found, 0.5 * total, normal.wider(_bends(problem, here.body, slope)), slope
 
     nothing = _nothing(problem, start, where.shape[1], kind)
-    end = search(evaluated, flat, made, settings, nothing)
+    empty = normal_of(
+        (jnp.zeros((*where.shape[:1], 0, 0, where.shape[1]), kind),), where, number, alone
+    )
+    end = search(evaluated, flat, made, settings, nothing, empty)
     # A wild step can end in NaN: the start is then the better point.
     lost = ~jnp.isfinite(end.cost)
     value = restore(jnp.where(lost, flat, end.point))
@@ -142,10 +153,10 @@ def made_of(parameters: Parameters) -> Float[Array, " n"]:
     return ravel_pytree(marked)[0]
 
 
-def beside_rows(
+def linked_rows(
     problem: Problem, point: Array, restore: Any, ends: Any, end_slopes: Any
 ) -> tuple[Array, Array]:
-    """Priors and joints between pieces as one vector, and its Jacobian (m, n)."""
+    """The residuals `linked` as one vector, and its Jacobian (m, n)."""
 
     @jax.custom_jvp
     def last(vector: Array) -> Any:
@@ -156,7 +167,7 @@ def beside_rows(
         return ends, along(problem, end_slopes, restore(tangents[0]))
 
     def value(vector: Array) -> Array:
-        parts = [leaf.reshape(-1) for leaf in beside(restore(vector), problem, last(vector))]
+        parts = [leaf.reshape(-1) for leaf in linked(restore(vector), problem, last(vector))]
         return jnp.concatenate(parts) if parts else jnp.zeros(0, vector.dtype)
 
     rows, e = with_jacobian(value, point)

@@ -1,6 +1,6 @@
 """The errors of all readings, and their derivatives recording by recording."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -147,15 +147,6 @@ def along(problem: "Problem", blocks: Any, step: Parameters) -> Any:
     return jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, moved), blocks)
 
 
-def normal_matrix(blocks: Sequence[Array], where: Array, size: int) -> Array:
-    """Σ JᵀJ (n, n) of blocks (R, T, k, m), their columns at the places `where` (R, m) of n."""
-    total = jnp.zeros((size + 1, size + 1), blocks[0].dtype)
-    for rows in blocks:
-        squares = jnp.einsum("rtki,rtkj->rij", rows, rows)
-        total = total.at[where[:, :, None], where[:, None, :]].add(squares)
-    return total[:-1, :-1]
-
-
 def with_blocks(parameters: Parameters, problem: "Problem") -> tuple[Any, Any]:
     """Errors and last states, and derivatives (…, n) in the numbers of a recording (`places`)."""
     mine = local(problem, parameters)
@@ -245,13 +236,30 @@ def with_rows(of: Callable[[tuple], tuple], errors: tuple, blocks: tuple) -> tup
 
 
 def beside(parameters: Parameters, problem: "Problem", ends: Any) -> tuple[Array, ...]:
-    """Residuals that are no readings: priors, and the problem's own rows."""
+    """Residuals that are no readings: of `firm`, and those of `linked`."""
+    pulled = jax.tree.map(jnp.multiply, firm(parameters, problem), parameters)
+    return (*jax.tree.leaves(pulled), *linked(parameters, problem, ends))
+
+
+def firm(parameters: Parameters, problem: "Problem") -> Parameters:
+    """One over the deviation of each number about zero, by its prior or spread; zero without."""
+    shared, each = [], []
+    for slot, of_all, of_each in by_slot(problem, parameters):
+        if of_all is not None:
+            shared.append(_pull(of_all, slot.prior))
+        if of_each is not None:
+            each.append(_pull(of_each, slot.prior if of_all is None else slot.spread))
+    none = jax.tree.map(jnp.zeros_like, parameters)
+    return eqx.tree_at(lambda p: (p.shared, p.own.each), none, (tuple(shared), tuple(each)))
+
+
+def _pull(number: Array, width: Array | None) -> Array:
+    return jnp.zeros_like(number) if width is None else jnp.ones_like(number) / width
+
+
+def linked(parameters: Parameters, problem: "Problem", ends: Any) -> tuple[Array, ...]:
+    """Residuals of several numbers at once: the prior of the body, and the problem's own rows."""
     out = []
-    for slot, shared, each in by_slot(problem, parameters):
-        if slot.prior is not None:
-            out.append((each if shared is None else shared) / slot.prior)
-        if slot.spread is not None:
-            out.append(each / slot.spread)
     if problem.prior is not None:
         assert not isinstance(problem.body, Bodies)
         body = problem.body.body(parameters.body)

@@ -13,8 +13,8 @@ from jax.flatten_util import ravel_pytree
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.search import beside_rows, evaluate
-from rigidjax.identify.terms import Noise, weights_of, whitened, with_rows
+from rigidjax.identify.search import evaluate, linked_rows
+from rigidjax.identify.terms import Noise, firm, weights_of, whitened, with_rows
 
 # A direction is undetermined if its singular value is below this share of the largest.
 BLIND = 1e-8
@@ -25,7 +25,8 @@ WEAKEST = 1e-6
 class Linearised(eqx.Module):
     """A problem about its best point. For each sensor `raw` errors (R, T, k) in its unit, whitened
     `errors`, `slopes` (R, T, k, m) in a recording's numbers, `weights` (R, T); their `places` (R,
-    m) among the n free numbers; `extra` (j,), `extra_slopes` (j, n) of priors and joints.
+    m) among the n free numbers; `pulls` (n,) of these to zero by priors, `firm` (n,) one over their
+    deviations; `extra` (j,), `extra_slopes` (j, n) of the prior of a body and of joints.
     """
 
     raw: tuple[np.ndarray, ...]
@@ -33,6 +34,8 @@ class Linearised(eqx.Module):
     slopes: tuple[np.ndarray, ...]
     weights: tuple[np.ndarray, ...]
     places: np.ndarray
+    pulls: np.ndarray
+    firm: np.ndarray
     extra: np.ndarray
     extra_slopes: np.ndarray
 
@@ -44,7 +47,8 @@ class Linearised(eqx.Module):
     @property
     def slope(self) -> np.ndarray:
         """The gradient (n,) of the misfit."""
-        return self.scores.sum(axis=0) + self.extra @ self.extra_slopes
+        readings = self.spread(self.scores).sum(axis=0)
+        return readings + self.firm * self.pulls + self.extra @ self.extra_slopes
 
     @property
     def dense(self) -> np.ndarray:
@@ -55,22 +59,18 @@ class Linearised(eqx.Module):
         ]
         return np.concatenate(parts, axis=1)
 
-    @property
-    def rows(self) -> np.ndarray:
-        """Rows (N, n) with the Gram matrix of the weighted Jacobian, reduced to triangles."""
-        if not np.isfinite(self.dense).all():
-            return np.full((1, self.size), np.nan)
-        return np.concatenate([*self.apart(np.linalg.qr(self.dense, mode="r")), self.extra_slopes])
+    def along(self, step: np.ndarray) -> float:
+        """The square of the change of all residuals with a step (n,) of the numbers."""
+        moved = np.append(step, 0.0)[self.places]
+        readings = np.einsum("rim,rm->ri", self.dense, moved)
+        rest = self.firm * step, self.extra_slopes @ step
+        return float(sum(np.sum(part**2) for part in (readings, *rest)))
 
-    def apart(self, blocks: np.ndarray) -> list[np.ndarray]:
-        """Columns (R, …, m) of the recordings as columns of all numbers (…, n)."""
-        return [self.spread(block, where) for block, where in zip(blocks, self.places, strict=True)]
-
-    def spread(self, block: np.ndarray, where: np.ndarray) -> np.ndarray:
-        """A recording's columns (…, m) as columns of all numbers (…, n)."""
-        wide = np.zeros((*block.shape[:-1], self.size + 1))
-        np.add.at(wide.T, where, block.T)
-        return wide[..., :-1]
+    def spread(self, blocks: np.ndarray) -> np.ndarray:
+        """Columns (R, m) of the recordings as columns of all numbers (R, n)."""
+        wide = np.zeros((len(blocks), self.size + 1))
+        np.add.at(wide, (np.arange(len(blocks))[:, None], self.places), blocks)
+        return wide[:, :-1]
 
     def blocks(self, covariance: np.ndarray) -> np.ndarray:
         """The covariance (R, m, m) of each recording's numbers; zero if it is not finite."""
@@ -80,12 +80,12 @@ class Linearised(eqx.Module):
 
     @property
     def scores(self) -> np.ndarray:
-        """The part of each recording in the gradient of the misfit, (R, n)."""
+        """The part of each recording in the gradient of the misfit, (R, m)."""
         total: Any = sum(
             np.einsum("rtk,rtkm,rt->rm", error, slope, weight)
             for error, slope, weight in zip(self.errors, self.slopes, self.weights, strict=True)
         )
-        return np.stack(self.apart(total))
+        return total
 
 
 @eqx.filter_jit
@@ -93,9 +93,9 @@ def _linearised(problem: Problem, parameters: Parameters, noise: Noise, found: A
     (errors, ends), (blocks, end_blocks) = found
     out, slopes = with_rows(lambda e: whitened(problem, e, noise), errors, blocks)
     flat, restore = ravel_pytree(parameters)
-    extra, extra_slopes = beside_rows(problem, flat, restore, ends, end_blocks)
-    weights = weights_of(problem, errors, noise)
-    return (out, slopes, weights), places(problem, parameters), extra, extra_slopes
+    beside = linked_rows(problem, flat, restore, ends, end_blocks)
+    weights, held = weights_of(problem, errors, noise), ravel_pytree(firm(parameters, problem))[0]
+    return (out, slopes, weights), places(problem, parameters), (held * flat, held, *beside)
 
 
 def linearise(
@@ -109,20 +109,80 @@ def linearise(
     the point of the derivatives beside a flat body.
     """
     found = evaluate(parameters, problem) if found is None else found
-    (errors, slopes, weights), where, extra, extra_slopes = jax.tree.map(
+    (errors, slopes, weights), where, beside = jax.tree.map(
         np.asarray, _linearised(problem, parameters, noise, found)
     )
     raw = tuple(np.asarray(error) for error in found[0][0])
     if near is not None:
         aside = linearise(problem, near, noise)
-        slopes, extra_slopes = aside.slopes, aside.extra_slopes
-    return Linearised(raw, errors, slopes, weights, where, extra, extra_slopes)
+        slopes, beside = aside.slopes, (*beside[:-1], aside.extra_slopes)
+    return Linearised(raw, errors, slopes, weights, where, *beside)
+
+
+class Root(eqx.Module):
+    """A root of the covariance of n numbers for white errors, in units of `size` (n,).
+
+    `lift` (n, s): how all numbers follow those that recordings share, of root `core` (s, r); `own`
+    the places and roots of the numbers of one recording alone; `null` (k, n) orthonormal rows.
+    """
+
+    size: np.ndarray
+    lift: np.ndarray
+    core: np.ndarray
+    own: tuple[tuple[np.ndarray, np.ndarray], ...]
+    null: np.ndarray
+
+    def carried(self, rows: Any, where: np.ndarray, middle: np.ndarray) -> np.ndarray:
+        """`H⁻¹ M H⁻¹` (n, n), M the sum over recordings of `rowsᵀ middle rows` at `where` (R, m).
+
+        `rows` (R, q, m), `middle` (R, q, q).
+        """
+        n, wide = self.size.size, np.append(1.0 / self.size, 0.0)
+        lift = np.concatenate([self.lift, np.zeros((1, self.lift.shape[1]))])
+        a = rows * wide[where][:, None, :]
+        shared = self.core @ (self.core.T @ (a @ lift[where]).swapaxes(1, 2))
+        total = np.sum(shared @ middle @ shared.swapaxes(1, 2), axis=0)
+        cross, out = np.zeros((n, self.lift.shape[1])), self.lift @ total @ self.lift.T
+        blocks = []
+        for (mine, root), columns, one, y, m in zip(
+            self.own, where, a, shared, middle, strict=True
+        ):
+            z = root @ (root.T @ one[:, _found(mine, columns)].T)
+            cross[mine] = z @ m @ y.T
+            blocks.append((np.ix_(mine, mine), z @ m @ z.T))
+        both = cross @ self.lift.T
+        out = out + both + both.T
+        for at, block in blocks:
+            out[at] += block
+        return self._whole(out)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """`H⁻¹` (n, n) within the directions that are determined."""
+        half = self.lift @ self.core
+        out = half @ half.T
+        for mine, root in self.own:
+            out[np.ix_(mine, mine)] += root @ root.T
+        return self._whole(out)
+
+    def _whole(self, inner: np.ndarray) -> np.ndarray:
+        """Without the directions that are not determined, in the numbers' own units."""
+        if len(self.null):
+            inner = inner - self.null.T @ (self.null @ inner)
+            inner = inner - (inner @ self.null.T) @ self.null
+        return inner / np.outer(self.size, self.size)
+
+
+def _found(wanted: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """The index of each wanted number in a row of columns."""
+    order = np.argsort(columns)
+    return order[np.searchsorted(columns[order], wanted)]
 
 
 class Spread(eqx.Module):
     """Covariance of the parameters, infinite along undetermined directions, `seen` within the
     determined ones, and its method; `singular_values` of the weighted Jacobian with columns of
-    length one; `null_directions` (k, n); `root` (n, m) of the covariance of white errors.
+    length one; `null_directions` (k, n); `root` of the covariance of white errors.
     """
 
     covariance: np.ndarray
@@ -130,29 +190,81 @@ class Spread(eqx.Module):
     kind: str
     singular_values: np.ndarray
     null_directions: np.ndarray
-    root: np.ndarray
+    root: Root | None
 
 
 def of_white(linear: Linearised) -> Spread:
-    """`(JᵀWJ)⁻¹`; infinite for singular values below 1e-8 of the largest."""
-    rows = linear.rows
-    n = rows.shape[1]
-    if not np.isfinite(rows).all():
+    """`(JᵀWJ)⁻¹`; infinite for singular values below 1e-8 of the largest.
+
+    Numbers of one recording alone are eliminated first, each recording's by itself (Schur
+    complement); the singular values are those of their blocks and of what is left.
+    """
+    n, dense = linear.size, linear.dense
+    if not (np.isfinite(dense).all() and np.isfinite(linear.extra_slopes).all()):
         lost, kind = np.full((n, n), np.nan), "none: the motion is not finite"
-        return Spread(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)), lost)
+        return Spread(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)), None)
+    triangles, owner = np.linalg.qr(dense, mode="r"), _owners(linear)
+    shared = np.flatnonzero(owner < 0)
     # Columns of order one: a bias in rad/s must not look undetermined beside a moment. But a column
     # of round-off must not be scaled up.
-    size = np.sqrt(np.sum(rows**2, axis=0))
+    squares = np.bincount(linear.places.ravel(), np.sum(triangles**2, axis=1).ravel(), n + 1)[:n]
+    size = np.sqrt(squares + linear.firm**2 + np.sum(linear.extra_slopes**2, axis=0))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
-    _, singular, directions = np.linalg.svd(rows / size, full_matrices=False)
-    seen = singular > BLIND * max(singular.max(), 1e-300)
-    inverse = np.where(seen, 1.0 / np.where(seen, singular, 1.0), 0.0)
-    half = directions.T * inverse
-    covariance = (half @ half.T) / np.outer(size, size)
-    null = directions[~seen] / size
-    null = null / np.linalg.norm(null, axis=1, keepdims=True)
-    shown = _blinded(covariance, null)
-    return Spread(shown, covariance, "Gauss–Newton", singular, null, half / size[:, None])
+    firm, extra = linear.firm / size, linear.extra_slopes / size
+    of = np.where(extra != 0, owner, -1).max(axis=1, initial=-1)
+    lift = np.zeros((n, shared.size))
+    lift[shared, np.arange(shared.size)] = 1.0
+    rest, own, values, null = [np.diag(firm[shared]), extra[of < 0][:, shared]], [], [], []
+    for record, (triangle, columns) in enumerate(zip(triangles, linear.places, strict=True)):
+        mine = np.flatnonzero(owner == record)
+        wide, held = np.zeros((len(triangle), n + 1)), np.zeros((mine.size, n))
+        wide[:, columns], held[np.arange(mine.size), mine] = triangle, firm[mine]
+        rows = np.concatenate([wide[:, :-1] / size, extra[of == record], held])
+        range_, root, blind, singular = _parts(rows[:, mine])
+        taken = range_.T @ rows[:, shared]
+        lift[mine] = -root @ taken
+        rest.append(np.linalg.qr(rows[:, shared] - range_ @ taken, mode="r"))
+        own.append((mine, root))
+        values.append(singular)
+        null.append(np.zeros((len(blind), n)))
+        null[-1][:, mine] = blind
+    _, core, blind, singular = _parts(np.concatenate(rest))
+    null.append(blind @ lift.T)
+    root = Root(size, lift, core, tuple(own), np.linalg.qr(np.concatenate(null).T)[0].T)
+    directions = root.null / size
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    covariance = root.covariance
+    return Spread(
+        _blinded(covariance, directions),
+        covariance,
+        "Gauss–Newton",
+        np.concatenate([singular, *values]),
+        directions,
+        root,
+    )
+
+
+def _owners(linear: Linearised) -> np.ndarray:
+    """The recording (n,) that alone changes with a number, −1 if several do or a row ties them."""
+    records, n = len(linear.places), linear.size
+    owner, seen = np.full(n + 1, -1), np.zeros((records, n + 1), bool)
+    seen[np.arange(records)[:, None], linear.places] = True
+    alone = seen.sum(axis=0) == 1
+    owner[alone] = seen.argmax(axis=0)[alone]
+    for row in linear.extra_slopes != 0:
+        tied = np.flatnonzero(row)
+        if np.unique(owner[tied][owner[tied] >= 0]).size > 1:
+            owner[tied] = -1
+    return owner[:-1]
+
+
+def _parts(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of rows (q, k) in columns of order one: their range, a root (k, r) of the inverse of their
+    Gram matrix, the directions (j, k) that they do not show, their singular values.
+    """
+    u, singular, directions = np.linalg.svd(rows, full_matrices=False)
+    seen = singular > BLIND * singular.max(initial=1.0)
+    return u[:, seen], directions[seen].T / singular[seen], directions[~seen], singular
 
 
 def spread(linear: Linearised, times: "Times", white: Spread | None = None) -> Spread:
@@ -168,7 +280,7 @@ def spread(linear: Linearised, times: "Times", white: Spread | None = None) -> S
     white = of_white(linear) if white is None else white
     if times.longest <= 1.5 or not np.isfinite(white.seen).all():
         return white
-    covariance = _sandwich(linear, white.root, times)
+    covariance = _sandwich(linear, white, times)
     kind = f"sandwich: the errors are autocorrelated over {times.longest:.0f} samples"
     shown = _blinded(covariance, white.null_directions)
     return dataclasses.replace(white, covariance=shown, seen=covariance, kind=kind)
@@ -204,28 +316,27 @@ def distance(linear: Linearised, white: Spread, held: Sequence[np.ndarray] = ())
     return float(np.sqrt(max(linear.slope @ covariance @ linear.slope, 0.0)))
 
 
-def _sandwich(linear: Linearised, half: np.ndarray, times: "Times") -> np.ndarray:
-    """White's covariance, with `half halfᵀ` as the covariance of independent errors.
+def _sandwich(linear: Linearised, white: Spread, times: "Times") -> np.ndarray:
+    """White's covariance of errors that are not independent.
 
     Products of derivatives are taken in orthonormal columns: otherwise round-off could make
     variances negative.
     """
     columns, triangles = np.linalg.qr(linear.dense)
-    seen = np.concatenate(linear.apart(triangles)) @ half
     longest = max(int(np.median((linear.weights[0] > 0).sum(axis=1))) // 2, 2)
     spans = 2.0 ** np.arange(1, np.log2(longest) + 1)
-    n = half.shape[0]
+    n, records = linear.size, len(linear.places)
     grown = times.independent / max(times.independent - n, 0.1 * times.independent)
-    channels = list(_channels(linear, columns))
-    meats = ((_meat(channels, span) @ seen.reshape(len(columns), -1, n)) for span in spans)
-    found = [grown * half @ (seen.T @ meat.reshape(-1, n)) @ half.T for meat in meats]
-    scores = linear.scores @ half
-    records = scores.shape[0]
+    channels, root = list(_channels(linear, columns)), white.root
+    assert root is not None
+    meats = [grown * _meat(channels, span) for span in spans]
+    found = [root.carried(triangles, linear.places, meat) for meat in meats]
     if records > n // 2 and records > 5:
         # Many recordings: the variance between them needs no model of their errors.
-        found.append(half @ (scores.T @ scores) @ half.T * records / (records - 1))
+        between = np.full((records, 1, 1), records / (records - 1))
+        found.append(root.carried(linear.scores[:, None], linear.places, between))
     # Never narrower than for white errors.
-    all_ = np.stack([np.sum(half**2, axis=1), *(np.diag(c) for c in found)])
+    all_ = np.stack([np.diag(white.seen), *(np.diag(c) for c in found)])
     least = np.maximum(all_[0], 1e-300)
     out = found[int(np.argmax((all_[1:] / least).mean(axis=1)))]
     own = np.maximum(np.diag(out), 1e-300)

@@ -16,6 +16,7 @@ from rigidjax import _checks
 from rigidjax.identify import flat_limit
 from rigidjax.identify.flat_limit import unreal
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
+from rigidjax.identify.normal import Normal
 from rigidjax.identify.quantities import carried
 from rigidjax.identify.terms import with_jacobian
 from rigidjax.identify.uncertainty import inverted
@@ -434,22 +435,21 @@ def _searched(
         rounds = (count + _SIDE_BY_SIDE - 1) // _SIDE_BY_SIDE
         start = (line[:, 0], square, line)
         cost, grams, slopes = lax.fori_loop(0, rounds, side_by_side, start)
-        return (grams, slopes), jnp.sum(cost), jnp.sum(grams, 0), jnp.sum(slopes, 0)
+        return (grams, slopes), jnp.sum(cost), Normal(jnp.sum(grams, 0)), jnp.sum(slopes, 0)
 
     nothing = (
         jnp.zeros((stretches, x.size, x.size), x.dtype),
         jnp.zeros((stretches, x.size), x.dtype),
     )
-    return search(evaluated, x, jnp.zeros_like(x), settings, nothing, _by_noise)
+    return search(evaluated, x, jnp.zeros_like(x), settings, nothing, by_noise=_by_noise)
 
 
-def _by_noise(parts: tuple[Array, Array], gram: Array) -> Array:
+def _by_noise(parts: tuple[Array, Array], normal: Normal) -> Array:
     """½ tr(K G⁻¹), the mean excess of the cost at the true numbers, K of the gradients of the
     stretches: Takeuchi 1976; Burnham and Anderson 2002, doi:10.1007/b97636, section 7.2.
     """
     spread = parts[1].T @ parts[1]
-    felt = jnp.diagonal(gram)
+    felt = normal.diagonal
     root = jnp.sqrt(jnp.maximum(felt, 1e-12 * jnp.max(felt)))
-    units = root[:, None] * root[None, :]
-    factor = jax.scipy.linalg.cho_factor(gram / units + 1e-12 * jnp.eye(root.size), lower=True)
-    return 0.5 * jnp.trace(jax.scipy.linalg.cho_solve(factor, spread / units))
+    firm = normal.scaled(1.0 / root).plus(jnp.full_like(root, 1e-12))
+    return 0.5 * jnp.trace(firm.solve(spread / (root[:, None] * root[None, :])))

@@ -253,7 +253,7 @@ def _with_shape(best: Fit) -> Fit:
     size = np.full(weight.shape, 1.0 / MAGNITUDE) if reading.sensor.unit == "mag" else flux
     n = np.asarray(_half_way(best.parameters, best.problem))
     change = SHAPE / float(best.noises[0][0, 0]) * size[:, None, None] * n[:, :, None] * n[:, None]
-    slopes = linear.spread(linear.slopes[0][0, :, 0] * weight[:, None], linear.places[0])
+    slopes = linear.slopes[0][0, :, 0] * weight[:, None]
     kept = weight > 0
     shift = uncertainty.of_white(linear).covariance @ slopes[kept].T @ change[kept].reshape(-1, 9)
     covariance, seen = (np.asarray(c) + shift @ shift.T for c in (best.covariance, best.seen))

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.levenberg_marquardt import CAREFUL, Settings, search
+from rigidjax.identify.normal import Normal
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.rotation import quaternion
@@ -147,12 +148,12 @@ def _many(
         def errors(point: Array) -> Array:
             return problem.errors(restore(point))[0][:, 0] / noise[0][0, 0]
 
-        def evaluated(point: Array) -> tuple[Any, Array, Array, Array]:
+        def evaluated(point: Array) -> tuple[Any, Array, Normal, Array]:
             steps = jnp.concatenate([jnp.zeros((1, flat.size)), jnp.eye(flat.size)])
             moved = point[None] + DIFFERENCE * steps
             e = jax.lax.map(errors, moved)
             rows = (e[1:] - e[:1]) / DIFFERENCE
-            return (), 0.5 * jnp.sum(e[0] ** 2), rows @ rows.T, rows @ e[0]
+            return (), 0.5 * jnp.sum(e[0] ** 2), Normal(rows @ rows.T), rows @ e[0]
 
         steps = jnp.where(number < count, settings.steps, 0)
         mine = eqx.tree_at(lambda s: s.steps, settings, steps)

@@ -15,6 +15,7 @@ from rigidjax import identify
 from rigidjax.identify import levenberg_marquardt, search
 from rigidjax.identify.checkpoint import SearchState, Tried
 from rigidjax.identify.levenberg_marquardt import Search, Settings
+from rigidjax.identify.normal import Normal
 from rigidjax.identify.search import Task, climb, descend, horizon, settle, whole
 from rigidjax.identify.terms import half_sum, residuals
 
@@ -36,7 +37,7 @@ def an_end(first):
     """A search that began at a cost of `first`, and keeps nothing of where it ended."""
     one, line, no = jnp.asarray(first), jnp.zeros(5), jnp.asarray(False)
     return Search(
-        one, line, one, jnp.zeros((5, 5)), line, line, one, one, one, jnp.asarray(1), no, no, (), no, one
+        one, line, one, Normal(jnp.zeros((5, 5))), line, line, one, one, one, jnp.asarray(1), no, no, (), no, one
     )  # fmt: skip
 
 
@@ -164,7 +165,7 @@ def test_a_search_ends_in_the_noise_of_its_cost():
     def evaluated(x):
         error = scale * (x - 0.5)
         cost = 1e3 + 0.5 * jnp.sum(error**2) + 0.1 * jnp.sin(7e11 * x.sum())
-        return (), cost, jnp.diag(scale**2), scale * error
+        return (), cost, Normal(jnp.diag(scale**2)), scale * error
 
     settings = Settings(1e-15, 1.0, 100)
     end = jax.jit(lambda x: levenberg_marquardt.search(evaluated, x, jnp.ones(3), settings, ()))(

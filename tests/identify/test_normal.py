@@ -1,0 +1,242 @@
+"""Normal equations without the numbers of one recording alone, beside the whole matrix."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import rigidjax as rj
+from rigidjax import identify
+from rigidjax.identify import padding, uncertainty
+from rigidjax.identify.multiple_shooting import pieces
+from rigidjax.identify.normal import Alone, Normal, normal_of
+from rigidjax.identify.parameters import columns_alone, local, places
+
+RNG = np.random.default_rng(0)
+TS = np.linspace(0.0, 2.0, 20)
+BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
+BIAS = lambda r: r.readings[0].sensor.bias
+SCALE = lambda r: r.readings[0].sensor.scale
+SKEW = lambda r: r.readings[0].sensor.skew
+
+
+def records(count, noise=0.01):
+    rng = np.random.default_rng(1)
+    out = []
+    for _ in range(count):
+        omega = 3.0 * rng.normal(size=3)
+        rates = np.asarray(rj.simulate(BODY, rj.Spin(omega), TS).ys.omega)
+        gyro = identify.Gyro(noise, bias=np.zeros(3), scale=np.ones(3), skew=np.zeros(3))
+        out.append(identify.Recording(TS, (gyro, rates + 0.01 * rng.normal(size=rates.shape))))
+    return out
+
+
+def several(count=9):
+    """A problem with numbers of every kind: of all, of a group, of each, with deviations."""
+    labels = ["a", "b", "c"] * (count // 3)
+    free = [
+        identify.Free(SCALE, "scale", scale=0.01, each=True, prior=0.1),
+        identify.Free(BIAS, "bias", scale=0.02, each=labels, spread=0.01),
+        identify.Free(SKEW, "skew", scale=0.01, prior=0.05),
+    ]
+    return identify.Problem(records(count), identify.Ratios(), free=free)
+
+
+def start_of(problem):
+    flat, back = ravel_pytree(problem.start(BODY))
+    return back(flat + 0.01 * RNG.normal(size=flat.size))
+
+
+def blocks_of(problem, start, dtype=float):
+    where = np.asarray(places(problem, start))
+    rows = RNG.normal(size=(problem.count, 30, 3, where.shape[1])).astype(dtype)
+    alone = columns_alone(problem, padding.one(local(problem, start), 0))
+    return rows, where, ravel_pytree(start)[0].size, alone
+
+
+def dense(rows, where, size):
+    """JᵀJ by the definition: every row in the columns of all numbers."""
+    out = np.zeros((size, size))
+    for block, columns in zip(rows, where, strict=True):
+        wide = np.zeros((block.shape[0] * block.shape[1], size + 1))
+        for k, column in enumerate(columns):
+            wide[:, column] += block.reshape(-1, columns.size)[:, k]
+        out += wide[:, :size].T @ wide[:, :size]
+    return out
+
+
+def test_columns_of_one_recording_alone():
+    problem = several()
+    start = start_of(problem)
+    where, size = np.asarray(places(problem, start)), ravel_pytree(start)[0].size
+    counts = np.bincount(where.ravel(), minlength=size + 1)
+    alone = columns_alone(problem, padding.one(local(problem, start), 0))
+    # Scale, rate and the deviation of the bias, each three numbers.
+    assert alone.size == 9 and (counts[where[:, alone]] == 1).all()
+    others = np.setdiff1d(np.arange(where.shape[1]), alone)
+    assert (counts[where[:, others]] > 1).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_it_is_the_whole_matrix(dtype):
+    problem = several()
+    start = start_of(problem)
+    rows, where, size, alone = blocks_of(problem, start, dtype)
+    wanted = dense(rows, where, size)
+    exact = 2e-4 if dtype == np.float32 else 1e-11
+    unit, more = (RNG.uniform(0.5, 2.0, size).astype(dtype) for _ in range(2))
+    x, sides = RNG.normal(size=size).astype(dtype), RNG.normal(size=(size, 2)).astype(dtype)
+    for own in (None, alone):
+        found = normal_of((jnp.asarray(rows),), jnp.asarray(where), size, own)
+        assert found.core.shape[0] == (size if own is None else size - own.size * problem.count)
+        np.testing.assert_allclose(found.diagonal, np.diag(wanted), rtol=exact)
+        np.testing.assert_allclose(found @ jnp.asarray(x), wanted @ x, rtol=exact, atol=100 * exact)
+        whole = wanted * np.outer(unit, unit) + np.diag(more)
+        made = found.scaled(jnp.asarray(unit)).plus(jnp.asarray(more))
+        for side in (x, sides):
+            solved = np.linalg.solve(whole, side)
+            near = exact * np.abs(solved).max()
+            np.testing.assert_allclose(made.solve(jnp.asarray(side)), solved, atol=near)
+    body = np.zeros((2, size), dtype)
+    body[:, :4] = RNG.normal(size=(2, 4))
+    wider = found.wider(jnp.asarray(body))
+    np.testing.assert_allclose(
+        wider @ jnp.asarray(x), wanted @ x + body.T @ (body @ x), atol=100 * exact
+    )
+
+
+def test_a_matrix_that_is_not_positive_has_no_solution():
+    core = jnp.asarray([[1.0, 2.0], [2.0, 1.0]])
+    assert not jnp.isfinite(Normal(core).solve(jnp.ones(2))).all()
+    own, sides = jnp.ones((1, 1, 1)), jnp.asarray([[[2.0]]])
+    arrow = Normal(jnp.ones((1, 1)), Alone(own, sides, jnp.asarray([[1]])))
+    assert not jnp.isfinite(arrow.solve(jnp.ones(2))).all()
+
+
+def jacobian(linear):
+    """The weighted Jacobian, row by row, in the columns of all numbers."""
+    rows = [np.diag(linear.firm), linear.extra_slopes]
+    for block, where in zip(linear.dense, linear.places, strict=True):
+        wide = np.zeros((len(block), linear.size + 1))
+        np.add.at(wide.T, where, block.T)
+        rows.append(wide[:, :-1])
+    return np.concatenate(rows)
+
+
+def linear_at(problem, sigma=0.01):
+    start = start_of(problem)
+    return uncertainty.linearise(problem, start, (jnp.full((problem.count, 3), sigma),))
+
+
+@pytest.mark.parametrize("count", [1, 3, 9])
+def test_the_covariance_is_the_inverse_of_the_information(count):
+    problem = several(count) if count > 1 else identify.Problem(records(1), identify.Ratios())
+    linear = linear_at(problem)
+    rows = jacobian(linear)
+    wanted = np.linalg.pinv(rows) @ np.linalg.pinv(rows).T
+    found = uncertainty.of_white(linear)
+    size = np.sqrt(np.diag(wanted))
+    np.testing.assert_allclose(
+        found.seen / np.outer(size, size), wanted / np.outer(size, size), atol=1e-9
+    )
+    assert len(found.null_directions) == 0
+
+
+def test_the_sandwich_is_the_product_of_its_definition():
+    linear = linear_at(several())
+    white = uncertainty.of_white(linear)
+    _, triangles = np.linalg.qr(linear.dense)
+    meat = RNG.normal(size=(9, triangles.shape[2], triangles.shape[1]))
+    meat = meat @ meat.swapaxes(1, 2)
+    middle = np.zeros((linear.size, linear.size))
+    for triangle, where, m in zip(triangles, linear.places, meat, strict=True):
+        wide = np.zeros((len(triangle), linear.size + 1))
+        wide[:, where] = triangle
+        middle += wide[:, :-1].T @ m @ wide[:, :-1]
+    wanted = white.seen @ middle @ white.seen
+    found = white.root.carried(triangles, linear.places, meat)
+    size = np.sqrt(np.diag(wanted))
+    np.testing.assert_allclose(
+        found / np.outer(size, size), wanted / np.outer(size, size), atol=1e-7
+    )
+
+
+def test_what_is_not_determined_is_found_in_the_shared_numbers_and_in_those_of_one_recording():
+    # Free motion shows no scale, and a gyro without bias, scale and noise of its own none either:
+    # of nine recordings the third has no weight at all.
+    problem = identify.Problem(records(9), identify.Tensor(1.0))
+    linear = linear_at(problem)
+    slopes = linear.slopes[0].copy()
+    slopes[2] = 0.0
+    linear = dataclasses.replace(linear, slopes=(slopes,))
+    found = uncertainty.of_white(linear)
+    rows = jacobian(linear)
+    size = np.sqrt(np.sum(rows**2, axis=0))
+    # A column of round-off is none.
+    size = np.maximum(size, 1e-6 * size.max())
+    assert len(found.null_directions) == linear.size - np.linalg.matrix_rank(rows / size, 1e-8) == 4
+    reach = np.abs(rows @ found.null_directions.T).max(axis=0)
+    assert (reach < 1e-7 * np.abs(rows).max()).all()
+    # Within the others it is the inverse: H C H = H.
+    half = rows / size
+    information, covariance = half.T @ half, found.seen * np.outer(size, size)
+    np.testing.assert_allclose(information @ covariance @ information, information, atol=1e-8)
+    blind = np.isinf(np.diag(found.covariance))
+    third = np.asarray(linear.places[2])[-3:]
+    assert (
+        blind[third].all()
+        and blind[:6].any()
+        and not blind[np.asarray(linear.places[3])[-3:]].any()
+    )
+
+
+def test_numbers_that_rows_tie_together_stay_in_the_core():
+    # Joints of pieces tie the state of a piece to that of the next one.
+    ts = np.linspace(0.0, 8.0, 90)
+    rates = np.asarray(rj.simulate(BODY, rj.Spin([1.0, 2.0, 0.5]), ts).ys.omega)
+    whole = identify.Problem(
+        identify.Recording(ts, (identify.Gyro(0.01), rates)), identify.Ratios()
+    )
+    linear = linear_at(pieces(whole, 9, width=0.1))
+    rows = jacobian(linear)
+    wanted = np.linalg.pinv(rows) @ np.linalg.pinv(rows).T
+    size = np.sqrt(np.diag(wanted))
+    found = uncertainty.of_white(linear).seen
+    np.testing.assert_allclose(
+        found / np.outer(size, size), wanted / np.outer(size, size), atol=1e-7
+    )
+
+
+def test_fewer_readings_than_numbers_are_told():
+    few = [
+        identify.Recording(TS[:2], (r.readings[0].sensor, r.readings[0].values[:2]))
+        for r in records(9)
+    ]
+    free = [
+        identify.Free(where, name, scale=0.01, each=True)
+        for where, name in ((SKEW, "skew"), (SCALE, "scale"))
+    ]
+    linear = linear_at(identify.Problem(few, identify.Ratios(), free=free))
+    found = uncertainty.of_white(linear)
+    # Six numbers read and nine of its own in each recording, and five of all.
+    assert len(found.null_directions) == linear.size - 54 == 32
+
+
+def test_many_recordings_are_fitted_as_few_are():
+    problem = several(18)
+    found = identify.fit(problem, starts=1)
+    assert found.search.word == "found"
+    linear = uncertainty.linearise(problem, found.parameters, found.noises)
+    step = found.seen @ linear.slope
+    # At the least misfit the gradient vanishes, in standard deviations.
+    assert np.abs(step / np.sqrt(np.diag(np.asarray(found.seen)))).max() < 1e-3
+
+
+def test_many_starts_at_once_reach_the_same_misfit():
+    problem = several(18)
+    together = identify.fit(problem, starts=2, together=2)
+    alone = identify.fit(problem, starts=1)
+    assert abs(together.chi2 / alone.chi2 - 1) < 1e-6
+    np.testing.assert_allclose(together.body.moments, alone.body.moments, rtol=1e-5)
