@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 import rigidjax as rj
 from rigidjax import identify, torques
 from rigidjax.identify import window_fit
+from rigidjax.identify.normal import Normal
 from rigidjax.identify.window_fit import open_loop_errors
 
 H, T = 0.02, 81
@@ -208,7 +209,7 @@ def test_the_true_numbers_cost_as_much_more_as_is_expected_of_noise():
         gained.append(np.sum(linear(true, cut)[2]) - cost)
         expected.append(0.5 * np.trace(np.linalg.solve(gram, spread)))
         root = jnp.linalg.cholesky(jnp.asarray(spread)).T
-        level = window_fit._by_noise((jnp.asarray(gram), root), jnp.asarray(gram))
+        level = window_fit._by_noise((jnp.asarray(gram), root), Normal(jnp.asarray(gram)))
         np.testing.assert_allclose(level, expected[-1], rtol=1e-9)
     ratio = np.mean(gained) / np.mean(expected)
     assert 0.5 < ratio < 2.0, ratio
