@@ -6,11 +6,11 @@ motion under random torques.
 """
 
 from rigidjax._names import show
-from rigidjax.estimate.belief import start as start
 from rigidjax.estimate.density import LogDensity as LogDensity
 from rigidjax.estimate.filter import (
     filter as filter,
     log_likelihood as log_likelihood,
+    start as start,
     step as step,
 )
 from rigidjax.estimate.linear import (
@@ -18,10 +18,14 @@ from rigidjax.estimate.linear import (
     linear_filter as linear_filter,
     linear_smooth as linear_smooth,
 )
-from rigidjax.estimate.posterior import Nuts as Nuts, Posterior as Posterior, posterior as posterior
-from rigidjax.estimate.refit import Refit as Refit, refit as refit
-from rigidjax.estimate.sample import sample as sample
-from rigidjax.estimate.scene import Model as Model, Walk as Walk
+from rigidjax.estimate.posterior import (
+    Nuts as Nuts,
+    Posterior as Posterior,
+    Refit as Refit,
+    posterior as posterior,
+    refit as refit,
+)
+from rigidjax.estimate.scene import Model as Model, Walk as Walk, sample as sample
 from rigidjax.estimate.smoother import smooth as smooth
 
 show(__name__)

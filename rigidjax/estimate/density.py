@@ -15,10 +15,9 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar
 from rigidjax.estimate import roots
-from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.filter import TURN_A_STEP, grid_of, scan_filter
+from rigidjax.estimate.filter import Belief, grid_of, scan_filter
 from rigidjax.estimate.roots import Terms
-from rigidjax.estimate.scene import Extended, Model, sensors_of, with_torque
+from rigidjax.estimate.scene import TURN_A_STEP, Extended, Model, sensors_of, with_torque
 from rigidjax.identify import padding, uncertainty
 from rigidjax.identify.body_charts import matter
 from rigidjax.identify.parameters import Unpacked, local
@@ -108,13 +107,17 @@ class LogDensity(eqx.Module):
         self.problem, self.process, self.noises = problem, process, fit.noises
         known = process is None or deviation is None
         self.deviation = None if known else jnp.asarray(_checks.positive(deviation, "deviation"))
-        groups = np.asarray(problem.noise_groups)
-        factors = tuple(
-            jnp.zeros(groups.max() + 1) if reading.sensor.noise is None else None
-            for reading in problem.records.readings
-        )
+        groups, factors, rest, total = np.asarray(problem.noise_groups), [], [], 0
+        for reading in problem.records.readings:
+            rows = np.bincount(groups, np.asarray(reading.seen.sum(axis=1)))
+            total += int(rows.sum())
+            guessed = reading.sensor.noise is None
+            factors.append(jnp.zeros(rows.size) if guessed else None)
+            if guessed:
+                # The logarithm of a standard deviation is known to 1/√(2n).
+                rest.append(0.5 / np.maximum(rows * reading.sensor.components, 1))
         logs = None if known else jnp.zeros(len(jax.tree.leaves(process)))
-        self.like = (fit.parameters, factors, logs)
+        self.like = (fit.parameters, tuple(factors), logs)
         self.x0 = ravel_pytree(self.like)[0]
         seen = np.asarray(fit.covariance)
         if fit.covariance_kind.startswith("sandwich"):
@@ -125,13 +128,6 @@ class LogDensity(eqx.Module):
             if process is None or not definite:
                 linear = uncertainty.linearise(problem, fit.parameters, fit.noises, near=fit.near)
                 seen = uncertainty.of_white(linear).covariance
-        rest, total = [], 0
-        for factor, reading in zip(factors, problem.records.readings, strict=True):
-            rows = np.bincount(groups, np.asarray(reading.seen.sum(axis=1)))
-            total += int(rows.sum())
-            if factor is not None:
-                # The logarithm of a standard deviation is known to 1/√(2n).
-                rest.append(0.5 / np.maximum(rows * reading.sensor.components, 1))
         if logs is not None:
             rest.append(np.full(logs.shape, 1 / math.sqrt(total)))
         self.covariance = jax.scipy.linalg.block_diag(seen, *(np.diag(part) for part in rest))

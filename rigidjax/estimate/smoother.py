@@ -11,8 +11,7 @@ from jaxtyping import Array, Float, Int
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.estimate import roots
-from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.filter import WORDS, Given, looked_at, scan_filter, status_of, told
+from rigidjax.estimate.filter import WORDS, Belief, Given, looked_at, scan_filter, status_of, told
 from rigidjax.estimate.linear import LinearEstimate, solved
 from rigidjax.estimate.scene import (
     Dynamics,
@@ -23,7 +22,6 @@ from rigidjax.estimate.scene import (
     by_sensor,
     linearised,
     reset,
-    reset_inverse,
 )
 from rigidjax.identify.recording import Recording
 from rigidjax.motion.manifold import minus, plus
@@ -172,7 +170,7 @@ def _iterate(
             t0.astype(dtype), (stop.t - t0).astype(dtype), x, kick
         )
         off = minus(after, y)
-        grown, noise = reset_inverse(y, off, grown), reset_inverse(y, off, noise)
+        grown, noise = (reset(y, off, part, back=True) for part in (grown, noise))
         push = off - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
         return (grown, noise, push), linearised(dynamics, stop, y)
 

@@ -32,7 +32,11 @@ from rigidjax.identify.parameters import (
 )
 from rigidjax.identify.problem import Problem as Problem
 from rigidjax.identify.profile import profile as profile
-from rigidjax.identify.propagation import Adaptive as Adaptive, FixedSteps as FixedSteps
+from rigidjax.identify.propagation import (
+    Adaptive as Adaptive,
+    FixedSteps as FixedSteps,
+    simulate_readings as simulate_readings,
+)
 from rigidjax.identify.recording import Recording as Recording
 from rigidjax.identify.result import Fit as Fit
 from rigidjax.identify.sensors import (
@@ -49,7 +53,6 @@ from rigidjax.identify.sensors import (
     SensorInput as SensorInput,
     Velocity as Velocity,
 )
-from rigidjax.identify.simulated_readings import simulate_readings as simulate_readings
 from rigidjax.identify.stochastic_gradient import Descent as Descent
 from rigidjax.identify.window_fit import WindowFit as WindowFit, fit_windows as fit_windows
 from rigidjax.identify.windows import Windows as Windows, windows as windows

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax.body import parameters as charts
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Inertia, MassProperties, tensor_of as tensor_of
 from rigidjax.body.symmetric3 import swap_trace
 
 # The parts of a `MassProperties` that may be free, and their places in `pack`.
@@ -21,6 +21,10 @@ Numbers = Float[Array, " chart"]
 Rows = Float[Array, "rows chart"]
 # Components of a tensor in the order of their names.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+# The basis of symmetric tensors, in this order.
+BASIS = np.zeros((6, 3, 3))
+for _k, (_i, _j) in enumerate(COMPONENTS):
+    BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
 
 
 class AbstractBodyChart(eqx.Module):
@@ -350,23 +354,10 @@ class Bodies(eqx.Module):
         """The number of free numbers of all bodies."""
         return sum(chart.size for chart in self.charts)
 
-    @property
-    def widest(self) -> int:
-        """The number of free numbers of the largest chart."""
-        return max(chart.size for chart in self.charts)
-
-    def parts(self, vector: Array) -> dict[str, Array]:
-        """The numbers of each body."""
-        out, first = {}, 0
-        for name, chart in zip(self.names, self.charts, strict=True):
-            out[name] = vector[first : first + chart.size]
-            first += chart.size
-        return out
-
     def all(self, vector: Float[Array, " numbers"]) -> dict[str, Any]:
         """Every body by its name."""
-        parts = self.parts(vector)
-        return {n: scaled(c, parts[n]) for n, c in zip(self.names, self.charts, strict=True)}
+        rows = zip(self.names, self.charts, numbers_of(self, vector), strict=True)
+        return {name: scaled(chart, numbers) for name, chart, numbers in rows}
 
     def body(self, vector: Numbers, which: Int[Array, ""]) -> Any:
         """The body at the index `which`, from its numbers, padded with zeros."""
@@ -403,10 +394,10 @@ def spread(
     """The numbers of each recording's body, (R, K), padded with `fill`."""
     if not isinstance(body, Bodies):
         return jnp.broadcast_to(vector, (count, body.size))
-    widest = body.widest
+    widest = max(chart.size for chart in body.charts)
     rows = [
         jnp.concatenate([part, jnp.full(widest - part.shape[0], fill, part.dtype)])
-        for part in body.parts(vector).values()
+        for part in numbers_of(body, vector)
     ]
     return jnp.stack(rows)[which]
 
@@ -426,14 +417,15 @@ def charts_of(body: Any) -> tuple[Any, ...]:
     return body.charts if isinstance(body, Bodies) else (body,)
 
 
+def numbers_of(body: Any, vector: Array) -> list[Array]:
+    """The numbers of each chart of a problem's body or bodies."""
+    sizes = [chart.size for chart in charts_of(body)]
+    return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
+
+
 def in_a_row(bodies: Any) -> list[Any]:
     """The bodies of `Problem.bodies`, of one or of several."""
     return list(bodies.values()) if isinstance(bodies, dict) else [bodies]
-
-
-def tensor_of(body: Inertia | MassProperties) -> Float[Array, "3 3"]:
-    """The inertia tensor of a body, about its centre of mass if it has one, kg m²."""
-    return (body.inertia if isinstance(body, MassProperties) else body).tensor
 
 
 def has_mass(chart: AbstractBodyChart) -> bool:

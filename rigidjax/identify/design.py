@@ -37,7 +37,7 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
     _on_host(problem, parameters)
     _look(problem, parameters)
     near = flat_limit.beside(problem, parameters)
-    information = np.asarray(fisher(problem, parameters if near is None else near))
+    information = np.asarray(_fisher(problem, parameters if near is None else near))
     if not np.isfinite(information).all():
         raise ValueError(
             "expected: Fisher's information has NaN or infinity in it: problem holds NaN in its "

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import swap_trace
-from rigidjax.identify.body_charts import AbstractBodyChart, charts_of, in_a_row
+from rigidjax.identify.body_charts import AbstractBodyChart, charts_of, in_a_row, numbers_of
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 
@@ -85,16 +85,11 @@ def beside(problem: Problem, parameters: Parameters) -> Parameters | None:
     The chart has a derivative of zero at a flat body; the information about the tensor itself is
     regular there and hardly changes over such a small thickness.
     """
-    vectors, first, changed = [], 0, False
-    bodies = bodies_of(problem, parameters)
-    for chart, body in zip(charts_of(problem.body), bodies, strict=True):
-        vector = parameters.body[first : first + chart.size]
-        first += chart.size
-        thick = _thicker(chart, body)
-        changed |= thick is not None
-        vectors.append(vector if thick is None else thick)
-    if not changed:
+    thick = list(map(_thicker, charts_of(problem.body), bodies_of(problem, parameters)))
+    if all(one is None for one in thick):
         return None
+    pairs = zip(numbers_of(problem.body, parameters.body), thick, strict=True)
+    vectors = [old if new is None else new for old, new in pairs]
     return eqx.tree_at(lambda p: p.body, parameters, jnp.concatenate(vectors))
 
 

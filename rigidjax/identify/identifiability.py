@@ -10,8 +10,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.answers import FAILS, NOT_ENDED
-from rigidjax.identify.body_charts import COMPONENTS, Bodies, Tensor, in_a_row, tensor_of
+from rigidjax.identify.body_charts import BASIS, COMPONENTS, Bodies, Tensor, in_a_row
 from rigidjax.identify.full_scale import in_words
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
@@ -98,24 +99,28 @@ def undetermined(fit: "Fit") -> tuple[Combination, ...]:
         return ()
     best = None
     slopes, values = map(np.asarray, _slopes(fit.problem, fit.beside))
-    for slope, names in zip(slopes, _names(fit.problem), strict=True):
+    names, many = _names(fit.problem), len(charts(fit.problem))
+    first, turns = len(labels(fit.problem)), 3 * fit.problem.count
+    for other in (1, 0):
+        # Attitudes about the world's axes, or about the body's.
+        begin = first + 6 * many + other * turns
+        rows = np.delete(np.arange(len(names)), slice(begin, begin + turns))
+        here, slope = [names[row] for row in rows], slopes[rows]
         # The free numbers are of order one: a number's largest derivative is its own size.
         size = np.abs(slope).max(axis=1)
-        first, many = len(labels(fit.problem)), len(charts(fit.problem))
         tensors = size[first : first + 6 * many].reshape(many, 6)
         tensors[:] = tensors.max(axis=1, keepdims=True)
-        relative = np.array([one[2] for one in names])
+        relative = np.array([one[2] for one in here])
         size = np.where(relative | (size == 0), 1.0, size)
         changes = null @ slope.T / size
-        kept = _kept(fit, [one[0] for one in names], changes)
-        rows = _reduced(np.where(kept, changes, 0.0))
-        if best is None or np.count_nonzero(rows) < np.count_nonzero(best[0]):
-            best = rows, names, size
+        kept = _kept(fit, [one[0] for one in here], changes)
+        found = _reduced(np.where(kept, changes, 0.0))
+        if best is None or np.count_nonzero(found) < np.count_nonzero(best[0]):
+            best = found, here, size, values[rows]
     assert best is not None
-    rows, names, size = best
     # In the order of their first numbers: the order of the directions depends on round-off.
-    rows = sorted((row for row in rows if row.any()), key=lambda row: np.flatnonzero(row)[0])
-    return tuple(_combination(row, names, size, values) for row in rows)
+    found = sorted((row for row in best[0] if row.any()), key=lambda row: np.flatnonzero(row)[0])
+    return tuple(_combination(row, *best[1:]) for row in found)
 
 
 def _combination(
@@ -138,30 +143,27 @@ def _combination(
     )
 
 
-def _names(problem: Problem) -> list[list[tuple[str, str, bool]]]:
-    """Name, unit, and whether relative, for `_numbers` in the world's axes, then the body's."""
-    of_all = labels(problem)
+def _names(problem: Problem) -> list[tuple[str, str, bool]]:
+    """Name, unit, and whether relative, of the numbers of `_slopes`."""
+    out = labels(problem)
     for name, chart in charts(problem):
         unit = chart.unit.replace("SI", "kg m²")
-        of_all += [(f"{part}{name}", unit, False) for part in TENSOR]
-    own, out = problem.start().own, []
-    for axes in ("the world's", "the body's"):
-        turn = (own.turn, f"attitude about {axes}", "rad")
-        parts = (turn, (own.place, "position", "m"), (own.speed, "velocity", "m/s"))
-        rows = [
-            (f"the initial {name} {k}{where}", unit, False)
-            for part, name, unit in parts
-            if part is not None
-            for where in recording_names(problem)
-            for k in "xyz"
-        ]
-        out.append([*of_all, *rows])
+        out += [(f"{part}{name}", unit, False) for part in TENSOR]
+    for part, name, unit in (
+        ("q", "attitude about the world's", "rad"),
+        ("q", "attitude about the body's", "rad"),
+        ("x", "position", "m"),
+        ("v", "velocity", "m/s"),
+    ):
+        if hasattr(problem.reference.state, part):
+            for where in recording_names(problem):
+                out += [(f"the initial {name} {k}{where}", unit, False) for k in "xyz"]
     return out
 
 
 @eqx.filter_jit
 def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
-    """Derivatives (2, M, n) of named numbers, attitudes in world's or body's axes; values (M,)."""
+    """Derivatives (M, n) of the reported numbers, tensors and initial states; their values (M,)."""
     flat, restore = ravel_pytree(parameters)
     reference = problem.reference
     start = jax.vmap(ReferenceStates.moved)(reference, parameters.own)
@@ -176,14 +178,12 @@ def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
         one = jax.tree.map(lambda leaf: leaf[0], now)
         change = parts(one, jax.vmap(minus)(now, start))
         offset = parts(one, jax.vmap(minus)(now, reference.state))
-        beyond = [offset[name].reshape(-1) for name in ("x", "v") if name in offset]
-        both = [], []
         if "q" in change:
-            world = jax.vmap(quaternion.rotate)(start.q, change["q"])
-            both = [world.reshape(-1)], [change["q"].reshape(-1)]
-        return jnp.stack([jnp.concatenate([*shown, *turn, *beyond]) for turn in both])
+            shown += [jax.vmap(quaternion.rotate)(start.q, change["q"]), change["q"]]
+        shown += [offset[name] for name in ("x", "v") if name in offset]
+        return jnp.concatenate([part.reshape(-1) for part in shown])
 
-    return jax.jacfwd(value)(flat), value(flat)[1]
+    return jax.jacfwd(value)(flat), value(flat)
 
 
 def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
@@ -203,9 +203,7 @@ def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
 
 def _turns(tensor: np.ndarray, changes: np.ndarray) -> bool:
     """Whether some change (k, 6) of a tensor (3, 3) turns its principal axes."""
-    steps = np.zeros((len(changes), 3, 3))
-    for column, (i, j) in zip(changes.T, TENSOR.values(), strict=True):
-        steps[:, i, j] = steps[:, j, i] = column
+    steps = np.einsum("mk,kij->mij", changes, BASIS)
     _, axes = np.linalg.eigh(tensor)
     along = np.einsum("ia,kij,jb->kab", axes, steps, axes)
     across = along - along * np.eye(3)
@@ -315,19 +313,14 @@ def _unseen(fit: "Fit") -> list[str]:
 
 def scale_is_unseen(fit: "Fit") -> bool:
     """Whether an undetermined direction scales the whole body and changes nothing else."""
-    flat, restore = ravel_pytree(fit.beside)
     null = np.asarray(fit.null_directions)
     if not len(null) or isinstance(fit.problem.body, Bodies):
         return False
-
-    def tensor(x: jax.Array) -> jax.Array:
-        return tensor_of(fit.problem.bodies(restore(x))).reshape(-1)
-
-    here = np.asarray(tensor(flat))
-    slopes = np.stack([np.asarray(jax.jvp(tensor, (flat,), (jnp.asarray(v),))[1]) for v in null])
-    wanted, *_ = np.linalg.lstsq(slopes.T, here, rcond=None)
-    left = np.linalg.norm(slopes.T @ wanted - here) / np.linalg.norm(here)
-    return bool(left < 1e-3)
+    first = len(labels(fit.problem))
+    slopes, values = (np.asarray(a) for a in _slopes(fit.problem, fit.beside))
+    here, moved = values[first : first + 6], slopes[first : first + 6] @ null.T
+    wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)
+    return bool(np.linalg.norm(moved @ wanted - here) < 1e-3 * np.linalg.norm(here))
 
 
 def correlations(fit: "Fit") -> list[str]:

@@ -11,20 +11,14 @@ from jaxtyping import PRNGKeyArray
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify import padding
-from rigidjax.identify.body_charts import COMPONENTS, Bodies
+from rigidjax.identify.body_charts import BASIS, Bodies
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.recording import Recording, readings_of
+from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import rates
-from rigidjax.identify.sensors import Gyro
 from rigidjax.motion import Spin
 from rigidjax.motion.torques.base import Torque, evaluate
 from rigidjax.motion.torques.states import has_states
-
-# The basis of symmetric tensors.
-BASIS = np.zeros((6, 3, 3))
-for _k, (_i, _j) in enumerate(COMPONENTS):
-    BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
 
 
 def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> list[Parameters]:
@@ -33,15 +27,16 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> l
     """
     recordings = padding.on_host(problem.records, problem.counts)
     if isinstance(problem.body, Bodies):
-        found = {}
-        for name in problem.body.names:
-            mine = [r for r, of in zip(recordings, problem.of, strict=True) if of == name]
-            found[name] = regress_inertia(tuple(mine))
+        rows = list(zip(recordings, problem.of, strict=True))
+        found = {
+            name: regress_inertia(tuple(record for record, of in rows if of == name))
+            for name in problem.body.names
+        }
         regressed = {name: body for name, body in found.items() if body is not None} or None
     else:
         regressed = regress_inertia(recordings)
     start = problem.start(regressed)
-    rates = np.asarray(start.own.spin)
+    spins = np.asarray(start.own.spin)
     centre = np.asarray(start.body)
     # NumPy's generator: that of JAX takes seconds to compile.
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)
@@ -50,7 +45,7 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> l
         wide = 0.0 if index == 0 else (0.5 if regressed is not None and index % 2 else 1.5)
         middle = centre if (index == 0 or wide < 1) else 0 * centre
         body = middle + wide * rng.normal(size=centre.shape)
-        spin = rates + (0.0 if index == 0 else 0.1) * rng.normal(size=rates.shape)
+        spin = spins + (0.0 if index == 0 else 0.1) * rng.normal(size=spins.shape)
         kind = start.own.spin.dtype
         moved = jnp.asarray(body, kind), jnp.asarray(spin, kind)
         out.append(eqx.tree_at(lambda p: (p.body, p.own.spin), start, moved))
@@ -67,7 +62,7 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
     """
     found = []
     for recording in recordings:
-        t, w = _rates(recording)
+        t, w = rates(recording)
         if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
             return None
         if not of_rates(recording.torque):
@@ -105,25 +100,19 @@ def of_rates(torque: Any) -> bool:
     return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
 
 
-def _rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Times and rates of the gyro, or else of attitudes."""
-    gyro = readings_of(recording, Gyro)
-    if not gyro:
-        return rates(recording)
-    return np.asarray(recording.t)[gyro[0].seen], np.asarray(gyro[0].values)[gyro[0].seen]
-
-
 def balance(recording: Recording, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Euler's equations integrated over a recording, of rates turned by `turn`: rows (n, 6), right
     sides (n,), rows of the momentum itself.
     """
-    t, w = _rates(recording)
+    t, w = rates(recording)
     w, pushed = w @ turn.T, np.zeros((t.size, 3))
     if recording.torque is not None:
         pushed = np.asarray(_torques(recording.torque, t, w))
     momenta = np.einsum("kij,tj->tki", BASIS, w)
-    total = momenta + _integral(np.cross(w[:, None, :], momenta), t)
-    impulse = _integral(pushed[:, None, :], t)
+    turned = np.concatenate([np.cross(w[:, None, :], momenta), pushed[:, None, :]], axis=1)
+    steps = 0.5 * (turned[1:] + turned[:-1]) * np.diff(t)[:, None, None]
+    integral = np.concatenate([np.zeros_like(turned[:1]), np.cumsum(steps, axis=0)])
+    total, impulse = momenta + integral[:, :-1], integral[:, -1:]
 
     def about_the_mean(x: np.ndarray) -> np.ndarray:
         # A conserved momentum is constant: compare it with its mean over the record.
@@ -137,8 +126,3 @@ def balance(recording: Recording, turn: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _torques(torque: Torque, t: Any, w: Any) -> Any:
     body = Inertia(jnp.eye(3))
     return jax.vmap(lambda time, omega: evaluate(torque, time, Spin(omega), body))(t, w)
-
-
-def _integral(values: np.ndarray, t: np.ndarray) -> np.ndarray:
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t)[:, None, None]
-    return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(steps, axis=0)])

@@ -1,7 +1,7 @@
 """Losses: the weight of an outlier."""
 
 import abc
-from typing import Any
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -35,8 +35,7 @@ class AbstractLoss(eqx.Module):
         """dρ/ds, the weight of the reading in the normal equations: 1 for a small error."""
 
 
-def _scale(value: Any) -> float:
-    return _checks.positive(value, "scale")
+_scale = partial(_checks.positive, name="scale")
 
 
 class SoftL1(AbstractLoss):

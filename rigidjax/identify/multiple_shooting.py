@@ -12,10 +12,10 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.identify import padding
-from rigidjax.identify.body_charts import Bodies
+from rigidjax.identify.body_charts import charts_of
 from rigidjax.identify.parameters import Own, Parameters
 from rigidjax.identify.problem import Problem, Rows, one_problem
-from rigidjax.identify.recording import Reading, Recording
+from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.motion.manifold import minus
 from rigidjax.motion.torques.states import has_states
@@ -71,8 +71,7 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
         _piece(record, int(first), int(last), index == count - 1)
         for index, (first, last) in enumerate(itertools.pairwise(edges))
     ]
-    chart = problem.body.charts[0] if isinstance(problem.body, Bodies) else problem.body
-    cut = Problem(parts, chart, loss=problem.loss, prior=problem.prior)
+    cut = Problem(parts, charts_of(problem.body)[0], loss=problem.loss, prior=problem.prior)
     # One typical rate for all pieces, so that a gap has the same unit at every joint.
     rate = jnp.broadcast_to(problem.reference.rate[0], (count,))
     slots = tuple(slot.alone() for slot in problem.slots)
@@ -87,31 +86,24 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
 
 def joined(problem: Problem, cut: Problem, found: Parameters) -> Parameters:
     """The parameters of the uncut problem, taken from the first piece."""
-    first = padding.one(found.own, 0)
+    first = jax.tree.map(lambda leaf: leaf[:1], found.own)
     spin = first.spin * cut.reference.rate[0] / problem.reference.rate[0]
-    whole = problem.start()
-    values = iter(found.shared)
     shared, each = [], []
-    for slot in problem.slots:
-        value = next(values)
+    for slot, value in zip(problem.slots, found.shared, strict=True):
         if slot.each:
             each.append(value[None])
             continue
         shared.append(value if slot.groups is None else value[None])
         if slot.spread is not None:
             each.append(jnp.zeros((1, *value.shape)))
-    own = Own(first.place, first.speed, first.turn, spin, ())
-    own = eqx.tree_at(lambda o: o.each, jax.tree.map(lambda leaf: leaf[None], own), tuple(each))
-    return eqx.tree_at(lambda p: (p.body, p.shared, p.own), whole, (found.body, tuple(shared), own))
+    own = Own(first.place, first.speed, first.turn, spin, tuple(each))
+    return Parameters(found.body, tuple(shared), own)
 
 
 def _piece(record: Recording, first: int, last: int, ends: bool) -> Recording:
     """Samples `first` to `last`; the last is only a time: the next piece has its readings."""
-    rows = slice(first, last + 1)
-    readings = []
-    for reading in record.readings:
-        mask = jnp.asarray(reading.mask[rows])
-        if not ends:
-            mask = mask.at[-1].set(False)
-        readings.append(Reading(reading.sensor, reading.values[rows], mask))
-    return eqx.tree_at(lambda r: (r.t, r.readings), record, (record.t[rows], tuple(readings)))
+    part = padding.cut(record, last + 1, first)
+    if ends:
+        return part
+    masks = [reading.mask.at[-1].set(False) for reading in part.readings]
+    return eqx.tree_at(lambda r: [reading.mask for reading in r.readings], part, masks)

@@ -22,7 +22,9 @@ def stack(
     """
     counts = np.array([r.t.shape[0] for r in recordings], np.int32)
     longest = length(int(counts.max()))
-    rows = max((_rows(_tabled(r)) for r in recordings), default=0)
+    parts = [(r.torque, r.sensors) for r in recordings]
+    tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))
+    rows = max((int(table.values.shape[0]) for table in tables), default=0)
     rows = length(rows) if rows else 0
     alike = [lengthened(r, longest, rows) for r in recordings]
     forms = [(jax.tree.structure(r), [np.shape(x) for x in jax.tree.leaves(r)]) for r in alike]
@@ -71,45 +73,34 @@ def one(records: Any, index: Any) -> Any:
 def on_host(records: Recording, counts: Any) -> tuple[Recording, ...]:
     """The recordings one by one, in NumPy's arrays, so that no JAX operation is needed."""
     known = jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, records)
-    arrays, rest = eqx.partition(known, eqx.is_array)
-    rows = (jax.tree.map(lambda leaf, i=i: leaf[i], arrays) for i in range(len(counts)))
     return tuple(
-        cut(eqx.combine(row, rest), n)
-        for row, n in zip(rows, np.asarray(counts).tolist(), strict=True)
+        cut(jax.tree.map(lambda x, i=i: x[i] if isinstance(x, np.ndarray) else x, known), n)
+        for i, n in enumerate(np.asarray(counts).tolist())
     )
 
 
-def cut(recording: Recording, count: int) -> Recording:
-    """A recording without the rows that `stack` appended."""
-    if recording.t.shape[0] == count:
+def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
+    """The rows from `begin` to before `end` of a recording: without those that `stack` appended."""
+    if recording.t.shape[0] == end - begin:
         return recording
 
     def long(r: Recording) -> list[Any]:
         return [r.t, *(part for reading in r.readings for part in (reading.values, reading.mask))]
 
-    return eqx.tree_at(long, recording, [leaf[:count] for leaf in long(recording)])
+    return eqx.tree_at(long, recording, [leaf[begin:end] for leaf in long(recording)])
 
 
 def _is_table(node: Any) -> bool:
     return isinstance(node, Linear | Series)
 
 
-def _tabled(recording: Recording) -> Any:
-    """The parts that may hold tables of time: the torque, and sensors that read a moving object."""
-    return recording.torque, recording.sensors
-
-
-def _rows(tree: Any) -> int:
-    tables = [n for n in jax.tree.leaves(tree, is_leaf=_is_table) if _is_table(n)]
-    return max((int(n.values.shape[0]) for n in tables), default=0)
-
-
 def lengthened(recording: Recording, count: int, rows: int = 0) -> Recording:
     """The recording with masked readings at its last time, up to `count` times."""
     missing = count - recording.t.shape[0]
+    # Sensors that read a moving object may hold tables of time, too.
     torque, sensors = jax.tree.map(
         lambda node: _table(node, rows) if _is_table(node) else node,
-        _tabled(recording),
+        (recording.torque, recording.sensors),
         is_leaf=_is_table,
     )
     t, readings = recording.t, recording.readings

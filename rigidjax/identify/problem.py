@@ -1,6 +1,7 @@
 """A problem: the known and the free numbers, and the errors of a guess."""
 
 import abc
+import dataclasses
 import operator
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,13 +16,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import padding
-from rigidjax.identify.body_charts import (
-    AbstractBodyChart,
-    Bodies,
-    charts_of,
-    has_mass,
-    scaled,
-)
+from rigidjax.identify.body_charts import AbstractBodyChart, Bodies, charts_of, has_mass, scaled
 from rigidjax.identify.full_scale import with_limits
 from rigidjax.identify.loss import AbstractLoss, Entropic
 from rigidjax.identify.parameters import (
@@ -41,8 +36,8 @@ from rigidjax.identify.reference_states import ReferenceStates, first_rates, ref
 from rigidjax.identify.terms import all_errors, filled, over_records, states_of_one
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
-from rigidjax.motion.torques import Sum
 from rigidjax.motion.torques.base import AbstractForce, Torque, require_law
+from rigidjax.motion.torques.composite import parts_of
 
 
 class Rows(eqx.Module):
@@ -210,18 +205,13 @@ class Problem(eqx.Module):
             )
         else:
             vector = _numbers(self.body, body)
-        zeros = ([_zeros(*shape) for shape in shapes] for shapes in _shapes(self).values())
-        _, shared, *state, each = zeros
-        firsts: Any = [part[0] if part else None for part in state]
-        spin: Any = firsts[-1]
+        blank, kind = _blank(self), jnp.result_type(float)
         if omega is None:
             rates = first_rates(self.records, self.counts)
         else:
-            rates = _checks.floating(omega, (3,), "omega").astype(spin.dtype)
-            rates = jnp.broadcast_to(rates, spin.shape)
-        firsts[-1] = (rates / self.reference.rate[:, None]).astype(spin.dtype)
-        own = Own(*firsts, each=tuple(each))
-        return Parameters(vector, tuple(shared), own)
+            rates = _checks.floating(omega, (3,), "omega").astype(kind)[None]
+        spin = (rates / self.reference.rate[:, None]).astype(kind)
+        return eqx.tree_at(lambda p: (p.body, p.own.spin), blank, (vector, spin))
 
     def unpack(self, parameters: Parameters) -> tuple[Any, Any]:
         """The body and the initial state that the parameters represent.
@@ -241,9 +231,7 @@ class Problem(eqx.Module):
 
     def scenes(self, parameters: Parameters) -> Recording:
         """The recordings with the parameters' values in the slots, with a leading axis."""
-        fits(self, parameters)
-        mine = local(self, parameters)
-        return jax.vmap(lambda one, record: filled(self, one, record))(mine, self.records)
+        return _scenes(self, fits(self, parameters))
 
     def values(self, parameters: Parameters) -> dict[str, Array]:
         """The value of each `Free`, by name, in its unit.
@@ -252,21 +240,7 @@ class Problem(eqx.Module):
         A `Free` with a `spread` gives the shared value, and each recording's value under "its name,
         own".
         """
-        scenes = self.scenes(parameters)
-        out = {}
-        for slot, step, _ in by_slot(self, parameters):
-            value = slot.read(scenes)
-            if step is None:
-                out[slot.name] = value
-                continue
-            first: Any = 0
-            if slot.groups is not None:
-                groups = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
-                first = jnp.argmax(slot.groups[None, :] == groups[:, None], axis=1)
-            out[slot.name] = slot.move(slot.read(self.records)[first], step)
-            if slot.spread is not None:
-                out[f"{slot.name}, own"] = value
-        return out
+        return values_of(self, fits(self, parameters))
 
     def motion(self, parameters: Parameters) -> Any:
         """The states at the recording's times, with a leading time axis.
@@ -286,6 +260,30 @@ class Problem(eqx.Module):
         fits(self, parameters)
         out = all_errors(parameters, self)[0]
         return tuple(e[0] for e in out) if self.count == 1 else out
+
+
+def _scenes(problem: Problem, parameters: Parameters) -> Recording:
+    mine = local(problem, parameters)
+    return jax.vmap(lambda one, record: filled(problem, one, record))(mine, problem.records)
+
+
+def values_of(problem: Problem, parameters: Parameters) -> dict[str, Array]:
+    """`Problem.values` without a check of the parameters."""
+    scenes = _scenes(problem, parameters)
+    out = {}
+    for slot, step, _ in by_slot(problem, parameters):
+        value = slot.read(scenes)
+        if step is None:
+            out[slot.name] = value
+            continue
+        first: Any = 0
+        if slot.groups is not None:
+            groups = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
+            first = jnp.argmax(slot.groups[None, :] == groups[:, None], axis=1)
+        out[slot.name] = slot.move(slot.read(problem.records)[first], step)
+        if slot.spread is not None:
+            out[f"{slot.name}, own"] = value
+    return out
 
 
 def one_problem(problem: Any) -> Problem:
@@ -308,13 +306,15 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
     one_problem(problem)
     hint = "problem.start(body) makes them"
     _checks.instance(parameters, Parameters, "parameters", hint=hint)
-    for name, shapes in _shapes(problem).items():
-        part = operator.attrgetter(name)(parameters)
-        numbers = [_checks.numbers(leaf, f"parameters.{name}") for leaf in jax.tree.leaves(part)]
-        if [leaf.shape for leaf in numbers] != shapes:
+    blank = _blank(problem)
+    for name in ("body", "shared", *(f"own.{field.name}" for field in dataclasses.fields(Own))):
+        wanted, part = (jax.tree.leaves(operator.attrgetter(name)(p)) for p in (blank, parameters))
+        numbers = [_checks.numbers(leaf, f"parameters.{name}") for leaf in part]
+        found, shapes = ([leaf.shape for leaf in leaves] for leaves in (numbers, wanted))
+        if found != shapes:
             raise ValueError(
                 f"parameters.{name}: wanted arrays of shapes {shapes}, as this problem has, got "
-                f"{[leaf.shape for leaf in numbers]}; {hint}"
+                f"{found}; {hint}"
             )
         for leaf in numbers:
             if leaf.dtype != problem.records.t.dtype:
@@ -327,24 +327,23 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
     return parameters
 
 
-def _shapes(problem: Problem) -> dict[str, list[tuple[int, ...]]]:
-    """The shapes of the arrays of each part of the problem's `Parameters`."""
-    shared, alone, each = [], [], (problem.count, 3)
+def _blank(problem: Problem) -> Parameters:
+    """Zeros in the shapes of the problem's free numbers."""
+    shared, alone = [], []
     for slot in problem.slots:
         size = jnp.shape(slot.read(problem.records))[1:]
         if not slot.each:
-            shared.append(size if slot.groups is None else (len(slot.labels), *size))
+            groups = () if slot.groups is None else (len(slot.labels),)
+            shared.append(_zeros(*groups, *size))
         if slot.each or slot.spread is not None:
-            alone.append((problem.count, *size))
-    return {
-        "body": [(problem.body.size,)],
-        "shared": shared,
-        "own.place": [each] if problem.rung is Rigid else [],
-        "own.speed": [each] if problem.rung is Rigid else [],
-        "own.turn": [] if problem.rung is Spin else [each],
-        "own.spin": [each],
-        "own.each": alone,
-    }
+            alone.append(_zeros(problem.count, *size))
+
+    def each(there: bool = True) -> Any:
+        return _zeros(problem.count, 3) if there else None
+
+    moves, turns = problem.rung is Rigid, problem.rung is not Spin
+    own = Own(each(moves), each(moves), each(turns), each(), tuple(alone))
+    return Parameters(_zeros(problem.body.size), tuple(shared), own)
 
 
 def _sorted(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
@@ -400,7 +399,7 @@ def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
     if body is None:
         return _zeros(chart.size)
     _checks.single(body, (Inertia, MassProperties), "body")
-    vector = _vector(chart, body)
+    vector = eqx.filter_jit(chart.vector)(body)
     if _checks.known(vector):
         _checks.refuse(
             vector,
@@ -409,11 +408,6 @@ def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
             "moments above zero, the largest below the sum of the others",
         )
     return vector
-
-
-@eqx.filter_jit
-def _vector(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
-    return chart.vector(body)
 
 
 def _zeros(*shape: int) -> Array:
@@ -434,8 +428,7 @@ def _rung(recording: Recording, body: AbstractBodyChart | Bodies) -> type:
     law: Any = recording.torque
     if law is not None:
         felt.append(getattr(law, "feels", HasAttitude))
-    parts = law.parts if isinstance(law, Sum) else (law,)
-    forced = any(isinstance(part, AbstractForce) for part in parts)
+    forced = any(isinstance(part, AbstractForce) for part in parts_of(law))
     if HasPose in felt or forced:
         for chart in charts_of(body):
             if not has_mass(chart):

@@ -77,10 +77,11 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
         def pulled(steps: float, side: float = side) -> tuple[float, float]:
             # A weak pull: its best point has the least misfit of its own value, wherever that is.
             nonlocal point
-            pull = middle + side * steps * deviation, PULL * deviation
-            at = jnp.asarray(index, jnp.int32), *(jnp.asarray(x, kind) for x in pull)
-            task = Task(_with(problem, Pull(problem.rows, *at)), fit.noises, 1e-4, 100)
-            point = again(Tried(point), task).parameters
+            size = middle + side * steps * deviation, PULL * deviation
+            target, width = (jnp.asarray(x, kind) for x in size)
+            pull = Pull(problem.rows, jnp.asarray(index, jnp.int32), target, width)
+            held = eqx.tree_at(lambda p: p.rows, problem, pull, is_leaf=lambda node: node is None)
+            point = again(Tried(point), Task(held, fit.noises, 1e-4, 100)).parameters
             grown = (2.0 * cost_of(point, problem, fit.noises) - bottom) / shares - reach**2
             return grown, float(_value(problem, point)[index])
 
@@ -90,10 +91,6 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
 
 
 _value = eqx.filter_jit(quantities.vector)
-
-
-def _with(problem: Problem, rows: Rows) -> Problem:
-    return eqx.tree_at(lambda p: p.rows, problem, rows, is_leaf=lambda node: node is None)
 
 
 def _end(pulled: Any, reach: float, most: float, side: float) -> float:

@@ -14,7 +14,7 @@ from rigidjax import _checks
 from rigidjax.identify import flat_limit
 from rigidjax.identify.body_charts import AbstractBodyChart, Bodies, Ratios, in_a_row
 from rigidjax.identify.parameters import Parameters
-from rigidjax.identify.problem import Problem
+from rigidjax.identify.problem import Problem, values_of
 
 if TYPE_CHECKING:
     from rigidjax.identify.result import Fit
@@ -80,14 +80,10 @@ def labels(problem: Problem) -> list[tuple[str, str, bool]]:
     for slot in problem.slots:
         shape = np.shape(slot.read(problem.records))[1:]
         parts = [""] if not shape else [f" {_place(i)}" for i in np.ndindex(shape)]
-        groups = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
-        for where in groups:
-            out += [(f"{slot.name}{part}{where}", slot.unit, slot.positive) for part in parts]
-        if slot.spread is not None:
-            for where in names:
-                out += [
-                    (f"{slot.name}{part}, own{where}", slot.unit, slot.positive) for part in parts
-                ]
+        ends = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
+        ends = ends if slot.spread is None else [*ends, *(f", own{where}" for where in names)]
+        called = [f"{slot.name}{part}{end}" for end in ends for part in parts]
+        out += [(name, slot.unit, slot.positive) for name in called]
     return out
 
 
@@ -120,7 +116,7 @@ def vector(problem: Problem, parameters: Parameters) -> Array:
     for (_, chart), body in zip(charts(problem), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
     parts.append(rates.reshape(-1))
-    values = problem.values(parameters)
+    values = values_of(problem, parameters)
     for slot in problem.slots:
         for name in (slot.name, f"{slot.name}, own")[: 1 + (slot.spread is not None)]:
             value = values[name].reshape(-1)
@@ -177,6 +173,20 @@ def quantities(
         deviation = float(np.maximum(deviation, least))
         out.append(Quantity(name, shown, deviation, unit, positive, mine, most))
     return tuple(out)
+
+
+def around(
+    middle: np.ndarray,
+    slope: np.ndarray,
+    covariance: np.ndarray,
+    null: np.ndarray,
+    reach: float,
+    limits: tuple[flat_limit.Limit, ...] = (),
+) -> tuple[np.ndarray, np.ndarray]:
+    """The interval of functions of value `middle` and derivative `slope`; else as `quantities`."""
+    wide = carried(slope, covariance, null)
+    low, high = cut_ends(reach, cuts_of(slope, covariance, wide, limits))
+    return np.asarray(middle + low * wide), np.asarray(middle + high * wide)
 
 
 def cuts_of(

@@ -77,12 +77,14 @@ def _nearest(body: ArrayLike, world: ArrayLike) -> Array:
 
 
 def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,), s, and body rates (n, 3), rad/s, between attitudes; n may be 0."""
+    """Times (n,), s, and body rates (n, 3), rad/s: of a gyro, or between attitudes; n may be 0."""
+    for reading in readings_of(recording, Gyro):
+        return np.asarray(recording.t)[reading.seen], np.asarray(reading.values)[reading.seen]
     return rates_of(*attitudes(recording))
 
 
 def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
-    """The same of attitudes (n, 4) at times (n,)."""
+    """Times (n,) and body rates (n, 3) between attitudes (n, 4) at times (n,)."""
     if t.size < 2:
         return np.zeros(0), np.zeros((0, 3))
     turned = np.concatenate([[0.0], np.cumsum(np.linalg.norm(_turns(q[:-1], q[1:]), axis=1))])
@@ -142,11 +144,10 @@ def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates
 
 
 def _typical_rate(recording: Recording) -> float:
-    gyros = readings_of(recording, Gyro)
-    if gyros:
-        values = np.asarray(gyros[0].values)[gyros[0].seen]
-        return float(np.sqrt(np.mean(np.sum(values**2, axis=1)))) or 1.0
-    rate = float(np.linalg.norm(first_rate(recording)))
+    _, w = rates(recording)
+    if readings_of(recording, Gyro):
+        return float(np.sqrt(np.mean(np.sum(w**2, axis=1)))) or 1.0
+    rate = float(np.linalg.norm(w[0])) if len(w) else 0.0
     # Else by the first sensor whose readings show one.
     for reading in recording.readings if rate == 0 else ():
         sensor: Any = reading.sensor
@@ -161,12 +162,30 @@ def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     """First position and velocity, m and m/s, and a typical length, m: of the centre of mass, or of
     the body's frame if only markers were read.
     """
-    direct = _read_place(recording)
-    if direct is not None:
-        return direct
-    markers = readings_of(recording, Marker)
-    if not markers:
-        return np.zeros(3), np.zeros(3), 1.0
+    t, when, x = np.asarray(recording.t), np.zeros(0), np.zeros((0, 3))
+    positions, markers = readings_of(recording, Position), readings_of(recording, Marker)
+    ranges = readings_of(recording, Range)
+    speeds = [r for r in readings_of(recording, Velocity) if r.sensor.mounting is None]
+    if positions:
+        when, x = t[positions[0].seen], np.asarray(positions[0].values)[positions[0].seen]
+    elif markers:
+        when, x = _from_markers(recording, markers)
+    elif ranges:
+        seen = np.all([r.seen for r in ranges], axis=0)
+        stations = np.stack([np.asarray(r.sensor.station) for r in ranges])
+        lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[seen]
+        when, x = t[seen], _from_ranges(stations, lengths)
+    if speeds and (positions or not markers):
+        v = np.asarray(speeds[0].values)[speeds[0].seen][0]
+    else:
+        v = _first_speed(when, x)
+    x = x if when.size else np.zeros((1, 3))
+    # The largest distance from the mean; 1 if the places are all the same.
+    return x[0], v, float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
+
+
+def _from_markers(recording: Recording, markers: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) and places (n, 3), of the first marker alone if all are never seen at once."""
     seen = np.all([r.seen for r in markers], axis=0)
     if not seen.any():
         markers, seen = markers[:1], markers[0].seen
@@ -174,47 +193,16 @@ def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     x = np.mean([np.asarray(r.values)[seen] for r in markers], axis=0)
     place = np.mean([np.asarray(r.sensor.place) for r in markers], axis=0)
     known, q = attitudes(recording)
-    there = np.isin(t, known)
-    if there.all():
+    if np.isin(t, known).all():
         arms = jax.vmap(lambda turn: quaternion.rotate(turn, place))(q[np.isin(known, t)])
         x = x - np.asarray(arms)
-    return x[0], _first_speed(t, x), _length(x)
+    return t, x
 
 
 def _first_speed(t: np.ndarray, x: np.ndarray) -> np.ndarray:
     """The slope of a line through the first places (n, 3); zero of one place."""
     few = slice(0, max(2, min(5, t.size)))
     return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
-
-
-def _length(x: np.ndarray) -> float:
-    """The largest distance of places (n, 3) from their mean; 1 if they are all the same."""
-    return float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
-
-
-def _read_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """As `_first_place`, from sensors of positions, ranges and velocities; `None` without them."""
-    t = np.asarray(recording.t)
-    positions, ranges = readings_of(recording, Position), readings_of(recording, Range)
-    speeds = [r for r in readings_of(recording, Velocity) if r.sensor.mounting is None]
-    if readings_of(recording, Marker) and not positions:
-        return None
-    when, x = np.zeros(0), np.zeros((0, 3))
-    if positions:
-        when, x = t[positions[0].seen], np.asarray(positions[0].values)[positions[0].seen]
-    elif ranges:
-        seen = np.all([r.seen for r in ranges], axis=0)
-        stations = np.stack([np.asarray(r.sensor.station) for r in ranges])
-        lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[seen]
-        when, x = t[seen], _from_ranges(stations, lengths)
-    if not when.size and not speeds:
-        return None
-    if speeds:
-        v = np.asarray(speeds[0].values)[speeds[0].seen][0]
-    else:
-        v = _first_speed(when, x)
-    x = x if when.size else np.zeros((1, 3))
-    return x[0], v, _length(x)
 
 
 def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -243,8 +231,6 @@ def first_rates(records: Recording, counts: Any) -> Float[Array, "records 3"]:
 
 
 def first_rate(recording: Recording) -> np.ndarray:
-    """The initial body rate (3,), rad/s: from a gyro, or between attitudes; zero without either."""
-    for reading in readings_of(recording, Gyro):
-        return np.asarray(reading.values)[int(np.argmax(reading.seen))]
+    """The initial body rate (3,), rad/s, of `rates`; zero without any."""
     _, w = rates(recording)
     return w[0] if len(w) else np.zeros(3)

@@ -18,7 +18,7 @@ from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.identifiability import Combination, undetermined
 from rigidjax.identify.parameters import Parameters, Unpacked
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.quantities import Quantity, carried, cut_ends, cuts_of, quantile
+from rigidjax.identify.quantities import Quantity, around, quantile
 from rigidjax.identify.search import evaluate
 from rigidjax.identify.terms import Noise
 
@@ -204,10 +204,8 @@ class Fit(eqx.Module):
 
         middle = np.asarray(_checks.finite(value(flat), "of(point)"))
         slope = np.asarray(jax.jacfwd(value)(ravel_pytree(self.beside)[0]))
-        seen = np.asarray(self.seen)
-        found = carried(slope, seen, np.asarray(self.null_directions))
-        low, high = cut_ends(quantile(self, level), cuts_of(slope, seen, found, self.limits))
-        return np.asarray(middle + low * found), np.asarray(middle + high * found)
+        seen, null = np.asarray(self.seen), np.asarray(self.null_directions)
+        return around(middle, slope, seen, null, quantile(self, level), self.limits)
 
     @property
     def undetermined(self) -> tuple[Combination, ...]:

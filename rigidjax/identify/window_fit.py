@@ -33,13 +33,14 @@ from rigidjax.solve.validation import require_fit
 
 
 def open_loop_errors(
-    scene: Any, h: float, value: Any, start: Any, wanted: Any, inputs: Any, steps: Any = None
+    scene: Any, value: Any, window: Windows, steps: Any = None
 ) -> Float[Array, "steps n"]:
     """The errors of one window, as changes from the measured states; zero beyond `steps`."""
     body, law = scene(value)
-    size, length = jnp.asarray(h, wanted.omega.dtype), wanted.omega.shape[0]
-    before = next(iter(inputs.values())).shape[0] - length if inputs else 0
-    start = started(body, start, bind(law, first_row(law, size, inputs)), 0.0)
+    wanted, inputs = window.wanted, window.inputs
+    size, length = jnp.asarray(window.step, wanted.omega.dtype), wanted.omega.shape[0]
+    before = window.before if inputs else 0
+    start = started(body, window.starts, bind(law, first_row(law, size, inputs)), 0.0)
     field = equations_of_motion(body, start, law)
     stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
 
@@ -49,7 +50,7 @@ def open_loop_errors(
 
     def ahead(y: Any, i: Array) -> tuple[Any, None]:
         # The torque's own states follow the inputs; the body keeps its measured state.
-        y = step(stepper, size, jnp.zeros_like(size), i, y, inputs, before)
+        y, _ = one(y, i)
         return split(Coupled(start.motion, stepper.state(y).own)), None
 
     y0 = stepper.start
@@ -62,43 +63,30 @@ def open_loop_errors(
 @eqx.filter_jit
 def all_errors(windows: Windows, scene: Any, value: Any) -> Float[Array, "windows steps n"]:
     """The errors of a model with these numbers."""
-    of = partial(open_loop_errors, scene, windows.step, value)
-    parts = (windows.starts, windows.wanted, windows.inputs)
-    return lax.map(lambda window: of(*window), parts, batch_size=min(128, windows.count))
+    of = partial(open_loop_errors, scene, value)
+    return lax.map(of, windows, batch_size=min(128, windows.count))
 
 
 # Steps of Gauss and Newton's for each start; residuals of a short run are nearly linear in it.
 _STEPS = 3
 
 
-def precisions(
-    starts: Any, kinds: tuple[str, ...], noise: Mapping[str, float] | None
-) -> Float[Array, " m"] | None:
-    """The precision of each number of the starts, (noise/deviation)²; `None` for exact starts."""
-    if starts is None:
-        return None
-    require_kinds(starts, kinds, "starts")
-    if noise is None:
-        raise ValueError(
-            "starts: deviations of the starts need the noise of the readings: give noise={…}, too"
-        )
-    found = []
-    for kind in kinds:
-        deviation = _checks.number(starts[kind], f"starts[{kind!r}]")
-        if not deviation > 0:
-            raise ValueError(
-                f"starts[{kind!r}]: wanted a positive deviation, or infinity for a start that is "
-                f"free, got {deviation}"
-            )
-        found += 3 * [(np.float64(noise[kind]) / deviation) ** 2]
-    return jnp.asarray(np.array(found))
-
-
-def require_kinds(given: Any, kinds: tuple[str, ...], name: str) -> None:
-    """Raise `TypeError`, `ValueError` for anything but a mapping with these keys."""
+def _by_kind(given: Any, kinds: tuple[str, ...], name: str, check: Any) -> np.ndarray:
+    """The checked numbers of a mapping with these keys, one for each component (m,)."""
     _checks.instance(given, Mapping, name, wanted="numbers by kind")
     if set(given) != set(kinds):
         raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(given)}")
+    return np.repeat([check(given[kind], f"{name}[{kind!r}]") for kind in kinds], 3)
+
+
+def _deviation(value: Any, name: str) -> float:
+    found = _checks.number(value, name)
+    if not found > 0:
+        raise ValueError(
+            f"{name}: wanted a positive deviation, or infinity for a start that is free, got "
+            f"{found}"
+        )
+    return found
 
 
 def eliminated(
@@ -234,16 +222,22 @@ def fit_windows(
     x, back = _numbers(guess, windows.starts.omega.dtype)
     guess, whole = back(x), windows.length
     _require_scene(scene, guess, windows)
-    scales = _scales(windows, whole, noise)
-    firm = precisions(starts, names(windows.starts), noise)
+    scales, firm = _scales(windows, whole, noise), None
+    if starts is not None:
+        wide = _by_kind(starts, names(windows.starts), "starts", _deviation)
+        if noise is None:
+            raise ValueError(
+                "starts: deviations of the starts need the noise of the readings: give noise={…}, "
+                "too"
+            )
+        # The precision of each number of the starts.
+        firm = jnp.asarray((np.asarray(scales) / wide) ** 2)
     padded, count = _padded(windows), np.asarray(windows.count, np.int32)
     own = min(stretches, windows.count)
 
     def searched(value: Any, settings: Settings, steps: int) -> Search:
         units = scales if steps == whole else _scales(windows, steps, noise)
-        return _searched(
-            scene, windows.step, value, padded, count, units, firm, settings, np.int32(steps), own
-        )
+        return _searched(scene, value, padded, count, units, firm, settings, np.int32(steps), own)
 
     evaluated = Settings(_SETTLED, BOLD, 0)
     last = Settings(_SETTLED, BOLD, max_steps, level=_LEVEL)
@@ -380,30 +374,25 @@ def _scales(windows: Windows, steps: int, noise: Mapping[str, float] | None) -> 
     """The unit of each number of an error, for windows of so many steps."""
     kinds = names(windows.starts)
     if noise is not None:
-        require_kinds(noise, kinds, "noise")
-        each = np.array([_checks.positive(noise[k], f"noise[{k!r}]") for k in kinds])
-    else:
-        wanted = jax.tree.map(lambda a: a[:, :steps], windows.wanted)
-        squares = np.mean(np.asarray(held_errors(windows.starts, wanted)) ** 2, (0, 1))
-        each = np.sqrt(np.mean(squares.reshape(len(kinds), 3), 1))
-        each[each == 0] = 1.0
-    return jnp.asarray(np.repeat(each, 3))
+        return jnp.asarray(_by_kind(noise, kinds, "noise", _checks.positive))
+    wanted = jax.tree.map(lambda a: a[:, :steps], windows.wanted)
+    squares = np.mean(np.asarray(held_errors(windows.starts, wanted)) ** 2, (0, 1))
+    each = np.sqrt(np.mean(squares.reshape(len(kinds), 3), 1))
+    return jnp.asarray(np.repeat(np.where(each == 0, 1.0, each), 3))
 
 
-def _padded(windows: Windows) -> tuple[Any, Any, Any]:
-    """Starts, states and inputs, the last repeated to full batches: a rest needs a program more."""
+def _padded(windows: Windows) -> Windows:
+    """The windows, the last repeated to full batches: a rest needs a program more."""
     batches = -(-windows.count // _SIDE_BY_SIDE)
     order = np.minimum(np.arange(batches * _SIDE_BY_SIDE), windows.count - 1)
-    parts = (windows.starts, windows.wanted, windows.inputs)
-    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[order]), parts)
+    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[order]), windows)
 
 
 @eqx.filter_jit
 def _searched(
     scene: Any,
-    h: float,
     guess: Any,
-    windows: tuple[Any, Any, Any],
+    windows: Windows,
     count: Any,
     scales: Any,
     firm: Any,
@@ -416,17 +405,16 @@ def _searched(
     """
     x, back = ravel_pytree(guess)
 
-    def of_one(x: Array, window: Any) -> tuple[Array, Array, Array]:
-        start, wanted, inputs = window
-
+    def of_one(x: Array, window: Windows) -> tuple[Array, Array, Array]:
         def errors(x: Array, start: Any) -> Array:
-            found = open_loop_errors(scene, h, back(x), start, wanted, inputs, steps)
+            begun = eqx.tree_at(lambda w: w.starts, window, start)
+            found = open_loop_errors(scene, back(x), begun, steps)
             return (found / scales[None]).reshape(-1)
 
         if firm is None:
-            jacobian, flat = with_jacobian(lambda x: errors(x, start), x)
+            jacobian, flat = with_jacobian(lambda x: errors(x, window.starts), x)
             return 0.5 * flat @ flat, jacobian.T @ jacobian, jacobian.T @ flat
-        return eliminated(lambda x, step: errors(x, plus(start, scales * step)), x, firm)
+        return eliminated(lambda x, step: errors(x, plus(window.starts, scales * step)), x, firm)
 
     def evaluated(x: Array) -> Any:
         def side_by_side(i: Array, total: Any) -> Any:

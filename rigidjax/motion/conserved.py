@@ -11,8 +11,9 @@ from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, V
 from rigidjax.body.energy import angular_momentum, kinetic_energy
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.coupled import Coupled, motion_of
-from rigidjax.motion.torques import AbstractTorque, CentralGravity, Sum
+from rigidjax.motion.torques import AbstractTorque, CentralGravity
 from rigidjax.motion.torques.base import Torque, in_precision, length_or_zero, require_scene
+from rigidjax.motion.torques.composite import parts_of
 from rigidjax.motion.torques.states import Frozen, freeze
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
@@ -149,19 +150,10 @@ def _scene(body: Any, state: Any, torque: Any, t: Any) -> tuple[Any, tuple[Any, 
     """The body's state, its torques with their own states put in, and the time."""
     if isinstance(state, Coupled):
         state, torque = state.motion, freeze(torque, state.own)
-    parts = _parts(torque)
+    parts = parts_of(torque)
     for part in parts or (None,):
         require_scene(part, state, body)
     return state, parts, _checks.floating(t, (), "t")
-
-
-def _parts(torque: Torque | None) -> tuple[Any, ...]:
-    """The torques in a sum, and in sums within it."""
-    if torque is None:
-        return ()
-    if isinstance(torque, Sum):
-        return tuple(inner for part in torque.parts for inner in _parts(part))
-    return (torque,)
 
 
 def _energy(body: Any, state: HasSpin, parts: tuple[Any, ...], t: Scalar) -> Scalar:

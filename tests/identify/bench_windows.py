@@ -243,7 +243,7 @@ def main():
         # A search of no steps, the inside of the fit.
         jax.block_until_ready(
             window_fit._searched(
-                scene, windows.step, jnp.asarray(GUESS), padded, count, scales, None,
+                scene, jnp.asarray(GUESS), padded, count, scales, None,
                 Settings(0.0, 1.0, 0), np.int32(LENGTH), 12,
             )
         )  # fmt: skip

@@ -194,7 +194,7 @@ def test_the_true_numbers_cost_as_much_more_as_is_expected_of_noise():
         flat, back = ravel_pytree(x)
 
         def errors(flat):
-            return open_loop_errors(scene, H, back(flat), *one).reshape(-1)
+            return open_loop_errors(scene, back(flat), one).reshape(-1)
 
         rows, e = jax.jacfwd(errors)(flat), errors(flat)
         return rows.T @ rows, jnp.outer(e @ rows, e @ rows), 0.5 * e @ e
@@ -205,9 +205,8 @@ def test_the_true_numbers_cost_as_much_more_as_is_expected_of_noise():
         noisy = rj.Attitude(q, np.asarray(states.omega) + 2e-3 * rng.normal(size=(T, 3)))
         cut = identify.windows(t, noisy, {"u": u}, length=8, stride=8)
         found = identify.fit_windows(cut, scene, true, noise=noise)
-        one = (cut.starts, cut.wanted, cut.inputs)
-        gram, spread, cost = (np.asarray(a).sum(0) for a in linear(found.value, one))
-        gained.append(np.sum(linear(true, one)[2]) - cost)
+        gram, spread, cost = (np.asarray(a).sum(0) for a in linear(found.value, cut))
+        gained.append(np.sum(linear(true, cut)[2]) - cost)
         expected.append(0.5 * np.trace(np.linalg.solve(gram, spread)))
         root = jnp.linalg.cholesky(jnp.asarray(spread)).T
         level = window_fit._by_noise((jnp.asarray(gram), root), Normal(jnp.asarray(gram)))

@@ -70,6 +70,13 @@ class Sum(eqx.Module):
         return base.Wrench(sum(forces[1:], forces[0]), torque)
 
 
+def parts_of(torque: base.Torque | None) -> tuple[Any, ...]:
+    """The torques in a sum, and in sums within it; none of `None`."""
+    if isinstance(torque, Sum):
+        return tuple(inner for part in torque.parts for inner in parts_of(part))
+    return () if torque is None else (torque,)
+
+
 class ChangingInertia(eqx.Module):
     """The effect of a changing inertia: `d(IΩ)/dt = IΩ × Ω + τ`, that is `I dΩ/dt = … − İΩ + τ`.
 
