@@ -296,7 +296,9 @@ def recordings(counts=(100, 500, 1000)):
             made = identify.Problem(records, identify.PrincipalRatios(), free=free)
             found = identify.fit(made, starts=1)
             size = found.covariance.shape[0]
-            print(f"{count} recordings, {size} numbers, {name}: {time.perf_counter() - begun:.1f} s")
+            print(
+                f"{count} recordings, {size} numbers, {name}: {time.perf_counter() - begun:.1f} s"
+            )
 
 
 def joint(more):
