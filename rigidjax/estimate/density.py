@@ -305,11 +305,13 @@ def _of_motion(
     scaled, log_variance = [], []
     for reading, error, noise in zip(record.readings, errors, noises, strict=True):
         limit = getattr(reading.sensor, "limit", None)
-        one, full = standardised(reading.values, reading.mask, error, noise, limit)
+        given = reading.values, reading.mask, error, noise, limit, reading.late
+        one, full, wider = standardised(*given)
         scaled.append(one)
         # What a channel at its limit counts is a probability, not a density.
         seen = reading.mask[:, None] & ~full
-        log_variance.append(jnp.where(seen, jnp.log(2 * math.pi * noise**2)[None], 0))
+        logs = jnp.log(2 * math.pi * noise**2)[None]
+        log_variance.append(jnp.where(seen, logs if wider is None else logs + wider, 0))
     return Terms(
         *(jnp.concatenate([a.reshape(-1) for a in part]) for part in (scaled, log_variance))
     )

@@ -42,8 +42,8 @@ from rigidjax.identify.search import (
     whole,
 )
 from rigidjax.identify.stochastic_gradient import Descent, descend
-from rigidjax.identify.terms import Noise, all_errors
-from rigidjax.identify.uncertainty import estimate_noise, linearise, of_white
+from rigidjax.identify.terms import Noise, all_errors, with_jitter
+from rigidjax.identify.uncertainty import estimate_jitter, estimate_noise, linearise, of_white
 
 # Steps are fine enough if finer ones change no prediction by more of its noise.
 _MATTERS = 0.05
@@ -147,7 +147,13 @@ def fit(
         best = _evaluated(best, task.problem)
     found = assess(task.problem, best, task.noise, tried, lowest, cut, rough)
     # Of the readings as they were given.
-    own = eqx.tree_at(lambda p: p.records, task.problem, given.records)
+    count, readings = given.records.t.shape[1], task.problem.records.readings
+    jitter = [
+        None if r.change is None else (r.change[:, :count], r.sensor.jitter.deviation)
+        for r in readings
+    ]
+    records = with_jitter(given.records, jitter)
+    own = eqx.tree_at(lambda p: p.records, task.problem, records)
     return eqx.tree_at(lambda one: one.problem, found, own)
 
 
@@ -158,13 +164,14 @@ def _cost(tried: Tried) -> float:
 
 def _with_noise(best: Tried, task: Task) -> tuple[Tried, Task]:
     """The best point together with its noise, if some noise is to be estimated."""
-    if all(sensor.noise is not None for sensor in task.problem.records.sensors):
+    if all(reading.known_noise for reading in task.problem.records.readings):
         return best, task
 
     def estimated(best: Tried, task: Task) -> Task:
         (errors, _), _ = _evaluated(best, task.problem).found
         noise = estimate_noise(task.problem, errors, task.noise, best.parameters)
-        return task._replace(noise=noise)
+        problem, noise = estimate_jitter(task.problem, errors, noise, best.parameters)
+        return task._replace(problem=problem, noise=noise)
 
     # Twice: the weights of the channels and the robust loss both depend on the noise.
     for _ in range(2):
@@ -329,7 +336,7 @@ def _first_noise(problem: Problem) -> Noise:
     out = []
     for reading in problem.records.readings:
         sensor = reading.sensor
-        if sensor.noise is not None:
+        if reading.known_noise:
             out.append(sensor.noise)
         else:
             # A tenth of the signal: what counts is that no channel drowns another.

@@ -3,6 +3,7 @@
 import abc
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import diffrax as dfx
@@ -173,21 +174,25 @@ def what_turns(body: Any, rung: type) -> Any:
 
 
 def sensor_inputs(
-    sensor: Any, body: Any, torque: Any, ts: Array, state0: Any, states: Any
+    sensor: Any, body: Any, torque: Any, ts: Array, state0: Any, states: Any, late: Any = None
 ) -> tuple[Array, Any, Callable[[Array, Any], SensorInput]]:
-    """The times that a sensor shows at `ts` (T,), by its clock; the states then; its input at one
-    time. `states` are `Coupled` if a torque has states of its own.
+    """The times that a sensor shows at `ts` (T,), by its clock, and `late` s later, one number or
+    (T,); the states then; its input at one time. `states` are `Coupled` if a torque has states of
+    its own.
     """
     turned = what_turns(body, type(state0))
     field = equations_of_motion(turned, state0, torque)
     offset, times = getattr(sensor, "offset", None), ts
+    if late is not None:
+        offset = late if offset is None else offset + late
     if offset is not None:
         times = ts + offset
         if torque is None:
             states = FreeMotion(turned, state0)(times - ts[0])
         else:
             whole = CoupledEquations(field, turned) if isinstance(states, Coupled) else field
-            states = jax.vmap(lambda t, y: shifted(whole, t, y, offset))(ts, states)
+            axes = (0, 0, 0 if jnp.ndim(offset) else None)
+            states = jax.vmap(partial(shifted, whole), axes)(ts, states, offset)
 
     def now(t: Array, state: Any) -> SensorInput:
         if not isinstance(state, Coupled):

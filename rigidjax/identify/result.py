@@ -152,6 +152,16 @@ class Fit(eqx.Module):
         return tuple(n[0] for n in self.noises) if self.problem.count == 1 else self.noises
 
     @property
+    def jitter(self) -> tuple[Float[Array, "*records"] | None, ...]:
+        """The standard deviation of each sensor's time stamps, s, given or estimated; (R,) of R
+        recordings; `None` of a sensor without `jitter`.
+        """
+        every = [getattr(sensor, "jitter", None) for sensor in self.problem.records.sensors]
+        found = (None if one is None else one.deviation for one in every)
+        single = self.problem.count == 1
+        return tuple(tau[0] if single and tau is not None else tau for tau in found)
+
+    @property
     def residuals(self) -> tuple[Float[Array, "*records times _"], ...]:
         """Reading minus prediction for each sensor, in its unit; zero where masked.
 

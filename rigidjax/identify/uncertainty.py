@@ -14,12 +14,21 @@ from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.search import beside_rows, evaluate
-from rigidjax.identify.terms import Noise, weights_of, whitened, with_rows
+from rigidjax.identify.terms import (
+    Noise,
+    changes,
+    weights_of,
+    whitened,
+    with_jitter,
+    with_rows,
+)
 
 # A direction is undetermined if its singular value is below this share of the largest.
 BLIND = 1e-8
 # Columns of the Jacobian are scaled to length one, unless shorter than this share of the longest.
 WEAKEST = 1e-6
+# The rounds of scoring of two variances.
+ROUNDS = 200
 
 
 class Linearised(eqx.Module):
@@ -354,7 +363,7 @@ def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Pa
         problem.records.readings, errors, noise, weights, cut, strict=True
     ):
         if reading.sensor.noise is not None:
-            out.append(sigma)
+            out.append(reading.sensor.noise)
             continue
         # The error of a reading at full scale is no noise.
         kept = reading.seen[..., None] & ~full
@@ -367,3 +376,69 @@ def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Pa
         found = np.maximum(np.sqrt(variance), floor)[groups]
         out.append(jnp.broadcast_to(jnp.asarray(found, sigma.dtype)[:, None], sigma.shape))
     return tuple(out)
+
+
+def estimate_jitter(
+    problem: Problem, errors: tuple, noise: Noise, parameters: Parameters
+) -> tuple[Problem, Noise]:
+    """The problem and the noise with the changes along this motion, and the most likely deviation
+    of time stamps, and noise of their sensors, unless given: one figure each for the recordings of
+    a group. Errors have the covariance `σ² + τ² u uᵀ` with u the change.
+    """
+    readings = problem.records.readings
+    if all(reading.change is None for reading in readings):
+        return problem, noise
+    free = ravel_pytree(parameters)[0].size
+    share = max(1.0 - free / problem.records.size, 0.1)
+    moved, weights = changes(parameters, problem), weights_of(problem, errors, noise)
+    groups, cut = np.asarray(problem.noise_groups), at_limit(readings)
+    noises, found = list(noise), []
+    for index, reading in enumerate(readings):
+        if reading.change is None:
+            found.append(None)
+            continue
+        sensor: Any = reading.sensor
+        known, jitter = sensor.noise is not None, sensor.jitter
+        unit = np.asarray(noise[index] if known else np.ones_like(noise[index]), float)[:, None]
+        weight = np.asarray(weights[index], float)[..., None] / share
+        e, u = np.asarray(errors[index]) / unit * np.sqrt(weight), np.asarray(moved[index]) / unit
+        kept = (weight[..., 0] > 0) & ~cut[index].any(axis=-1)
+        squares = np.ones((groups.max() + 1, 2))
+        for group in range(len(squares)):
+            rows = kept & (groups == group)[:, None]
+            given = np.asarray(jitter.deviation, float)[groups == group][0] ** 2
+            squares[group] = _variances(
+                e[rows], u[rows], 1.0 if known else None, None if jitter.estimated else given
+            )
+        roots = jnp.asarray(np.sqrt(squares)[groups], noise[index].dtype)
+        found.append((moved[index], roots[:, 1]))
+        if not known:
+            noises[index] = jnp.broadcast_to(roots[:, :1], noise[index].shape)
+    records = with_jitter(problem.records, found)
+    return eqx.tree_at(lambda p: p.records, problem, records), tuple(noises)
+
+
+def _variances(
+    e: np.ndarray, u: np.ndarray, white: float | None, late: float | None
+) -> tuple[float, float]:
+    """σ² and τ² of errors e (N, k) of covariances `σ² + τ² u uᵀ`, unless given: most likely ones,
+    by Fisher's scoring in turn. The mean square along u is `σ² + τ² |u|²`, across it σ².
+    """
+    size, total = np.sum(u**2, axis=1), np.sum(e**2, axis=1)
+    count, ways = e.shape
+    along = np.where(size > 0, np.sum(e * u, axis=1) ** 2 / np.maximum(size, 1e-300), total / ways)
+    across = np.sum(total - along)
+    p = max(total.mean() / ways, 1e-300) if white is None else white
+    q = 0.0 if late is None else late
+    for _ in range(ROUNDS):
+        before = p, q
+        weight = (p + q * size) ** -2
+        if white is None:
+            mean = np.sum(weight * (along - q * size)) + across / p**2
+            p = max(mean / (np.sum(weight) + (ways - 1) * count / p**2), 1e-3 * p)
+        if late is None:
+            information = max(np.sum(weight * size**2), 1e-300)
+            q = max(np.sum(weight * size * (along - p)) / information, 0.0)
+        if abs(p - before[0]) <= 1e-9 * p and abs(q - before[1]) <= 1e-9 * q:
+            break
+    return p, q

@@ -114,10 +114,32 @@ def positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
     return _checks.refuse(numbers, ~(numbers > 0), f"{name}: wanted {wanted}")
 
 
+class Jitter(eqx.Module):
+    """The standard deviation of a sensor's time stamps, s, given or to be `estimated` by a fit."""
+
+    deviation: Scalar
+    estimated: bool = eqx.field(static=True)
+
+
+def jitter_of(given: Any) -> Jitter | None:
+    """The jitter of a positive number, s, or `"estimated"`; `None` stays."""
+    if given is None or isinstance(given, Jitter):
+        return given
+    if isinstance(given, str):
+        _checks.word(given, ("estimated",), "jitter: a word")
+        return Jitter(jnp.zeros(()), True)
+    wanted = 'a positive standard deviation, s, "estimated" or None'
+    number = _checks.floating(given, (), "jitter").astype(jnp.result_type(float))
+    return Jitter(_checks.sign(number, "jitter", wanted), False)
+
+
 class ClockedSensor(AbstractSensor):
-    """A sensor whose clock may be behind; it reads a vector (3,) unless it says otherwise."""
+    """A sensor whose clock may be behind, and whose time stamps may scatter (`jitter`); it reads a
+    vector (3,) unless it says otherwise.
+    """
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 3
     _: dataclasses.KW_ONLY
     offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
+    jitter: Jitter | None = eqx.field(converter=jitter_of, default=None)
