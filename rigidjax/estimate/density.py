@@ -55,8 +55,8 @@ class LogDensity(eqx.Module):
 
     With a `process` the filter integrates the unknown torque out. Without it the readings are
     independent and normal about the motion: this is too narrow if errors are autocorrelated; keep
-    fewer readings then, or give a process. Priors are the problem's: `Free`s with a prior, an
-    `Entropic` one; the prior of all other numbers is flat in x.
+    fewer readings then, or give a process. A sensor's jitter is that of the fit. Priors are the
+    problem's: `Free`s with a prior, an `Entropic` one; the prior of all other numbers is flat in x.
 
     **Arguments:** `fit` of `identify.fit`; with a process a first guess is enough, `fit(problem,
     starts=1, max_steps=1)`; `process` a `RandomTorque` or `CorrelatedTorque` or `None`; `deviation`

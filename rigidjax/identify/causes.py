@@ -9,7 +9,6 @@ nothing.
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,7 +23,7 @@ from rigidjax.identify.recording import Recording, readings_of
 from rigidjax.identify.reference_states import attitudes, rates_of
 from rigidjax.identify.search import evaluate
 from rigidjax.identify.sensors import Gyro
-from rigidjax.identify.terms import Noise, independent
+from rigidjax.identify.terms import Noise, in_deviations
 from rigidjax.identify.uncertainty import Linearised
 
 # Corrected rates must leave less than this share of the error as read, and of the whole signal.
@@ -145,8 +144,8 @@ def causes(
         cause = clock(problem, noise, linear, index)
         if cause is None and _of_three(sensor):
             rows = _table(problem, parameters, noise, linear, index)
-            ways = [_apart(problem, noise, index, row[1]) for row in rows]
-            shares = [_explained(linear, index, which, free, way) for way in ways]
+            given = problem, noise, linear, index, which, free
+            shares = [_explained(*given, row[1]) for row in rows]
             cause = _largest(sensor, rows, shares)
         if cause is None and hasattr(sensor, "suspect"):
             cause = Cause(sensor.suspect[0], type(sensor).__name__, None, *sensor.suspect[1:])
@@ -163,7 +162,9 @@ def clock(problem: Problem, noise: Noise, linear: Linearised, index: int) -> Cau
     if not (_of_three(sensor) and error[kept].any()):
         return None
     slope = _slope(problem, np.asarray(problem.records.readings[index].values) - error)
-    error, slope = (_apart(problem, noise, index, x[..., None])[..., 0] for x in (error, slope))
+    late = problem.records.readings[index].late
+    both = np.asarray(in_deviations(np.stack([error, slope], -1), noise[index], late))
+    error, slope = both[..., 0], both[..., 1]
     moved = np.sum(slope**2, axis=-1) * kept
     moving = moved > 1e-2 * moved.max()
     if not moving.any():
@@ -180,16 +181,6 @@ def clock(problem: Problem, noise: Noise, linear: Linearised, index: int) -> Cau
         "clock", sensor, share, f"time stamps that scatter by {scatter:.2g} ms",
         "take times from the sensor's own count of samples, or give it jitter=\"estimated\"",
     )  # fmt: skip
-
-
-def _apart(problem: Problem, noise: Noise, index: int, x: np.ndarray) -> np.ndarray:
-    """Changes of errors (R, T, k, c) in standard deviations, with jitter in independent numbers."""
-    sigma, late = np.asarray(noise[index])[:, None], problem.records.readings[index].late
-    x = x / sigma[..., None]
-    if late is None:
-        return x
-    late = late / sigma
-    return np.asarray(jax.vmap(lambda e: independent(e, late)[0], -1, -1)(x))
 
 
 def _cause(name: str, sensor: Any, share: float, words: str, remedy: str) -> Cause:
@@ -287,18 +278,21 @@ def _response(
 
 
 def _explained(
+    problem: Problem,
+    noise: Noise,
     linear: Linearised,
     index: int,
     which: Sequence[int],
     free: np.ndarray,
     direction: np.ndarray,
 ) -> tuple[float, np.ndarray]:
-    """The share of squared errors that a direction (R, T, k, c), in standard deviations, explains beside the orthonormal
+    """The share of squared errors that a direction (R, T, k, c) explains beside the orthonormal
     columns `free` (R, N, m) of the free numbers, and its coefficient.
     """
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]
-    scaled = direction * roots[index][..., None]
+    late = problem.records.readings[index].late
+    scaled = np.asarray(in_deviations(direction, noise[index], late)) * roots[index][..., None]
     size = np.sqrt(np.sum(scaled**2, axis=(0, 1, 2)))
     size[size == 0] = 1.0
     columns = [np.zeros((*error.shape, size.size)) for error in errors]

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from types import NoneType
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -42,8 +42,8 @@ from rigidjax.identify.search import (
     whole,
 )
 from rigidjax.identify.stochastic_gradient import Descent, descend
-from rigidjax.identify.terms import Noise, all_errors, with_jitter
-from rigidjax.identify.uncertainty import estimate_jitter, estimate_noise, linearise, of_white
+from rigidjax.identify.terms import Noise, all_errors
+from rigidjax.identify.uncertainty import estimate_noise, linearise, of_white
 
 # Steps are fine enough if finer ones change no prediction by more of its noise.
 _MATTERS = 0.05
@@ -147,13 +147,15 @@ def fit(
         best = _evaluated(best, task.problem)
     found = assess(task.problem, best, task.noise, tried, lowest, cut, rough)
     # Of the readings as they were given.
-    count, readings = given.records.t.shape[1], task.problem.records.readings
-    jitter = [
-        None if r.change is None else (r.change[:, :count], r.sensor.jitter.deviation)
-        for r in readings
-    ]
-    records = with_jitter(given.records, jitter)
-    own = eqx.tree_at(lambda p: p.records, task.problem, records)
+    own = eqx.tree_at(lambda p: p.records, task.problem, given.records)
+    pairs = zip(given.records.readings, task.problem.records.readings, strict=True)
+    readings = tuple(
+        one
+        if r.late is None
+        else one.scattered(r.late[:, : one.mask.shape[1]], cast(Any, r.sensor).jitter.deviation)
+        for one, r in pairs
+    )
+    own = eqx.tree_at(lambda p: p.records.readings, own, readings)
     return eqx.tree_at(lambda one: one.problem, found, own)
 
 
@@ -169,8 +171,7 @@ def _with_noise(best: Tried, task: Task) -> tuple[Tried, Task]:
 
     def estimated(best: Tried, task: Task) -> Task:
         (errors, _), _ = _evaluated(best, task.problem).found
-        noise = estimate_noise(task.problem, errors, task.noise, best.parameters)
-        problem, noise = estimate_jitter(task.problem, errors, noise, best.parameters)
+        problem, noise = estimate_noise(task.problem, errors, task.noise, best.parameters)
         return task._replace(problem=problem, noise=noise)
 
     # Twice: the weights of the channels and the robust loss both depend on the noise.

@@ -85,7 +85,7 @@ def cut(recording: Recording, count: int) -> Recording:
         return recording
 
     def long(r: Recording) -> list[Any]:
-        parts = [(reading.values, reading.mask, reading.change) for reading in r.readings]
+        parts = [(reading.values, reading.mask, reading.late) for reading in r.readings]
         return jax.tree.leaves((r.t, parts))
 
     return eqx.tree_at(long, recording, [leaf[:count] for leaf in long(recording)])

@@ -153,13 +153,14 @@ class Fit(eqx.Module):
 
     @property
     def jitter(self) -> tuple[Float[Array, "*records"] | None, ...]:
-        """The standard deviation of each sensor's time stamps, s, given or estimated; (R,) of R
-        recordings; `None` of a sensor without `jitter`.
+        """The deviation of each sensor's time stamps, s, given or estimated; `None` without jitter.
+
+        With several recordings (R,).
         """
-        every = [getattr(sensor, "jitter", None) for sensor in self.problem.records.sensors]
-        found = (None if one is None else one.deviation for one in every)
-        single = self.problem.count == 1
-        return tuple(tau[0] if single and tau is not None else tau for tau in found)
+        first: Any = 0 if self.problem.count == 1 else slice(None)
+        sensors = self.problem.records.sensors
+        found = (getattr(sensor, "jitter", None) for sensor in sensors)
+        return tuple(None if one is None else one.deviation[first] for one in found)
 
     @property
     def residuals(self) -> tuple[Float[Array, "*records times _"], ...]:

@@ -38,7 +38,8 @@ def simulate_readings(
     **Arguments:** `sensor` an `AbstractSensor`, or a sequence of them along one motion; `body`,
     `state0`, `ts` (T,) s, `torque` as for `rigidjax.simulate`; `MassProperties` are allowed for all
     states (a sensor's `place` is then in their frame). `key` of `jax.random`: normal noise of the
-    sensor's standard deviation `noise` is added; `None` for readings without noise. **Returns**
+    sensor's standard deviation `noise` is added, and times scatter by its `jitter`; `None` for
+    readings without either. **Returns**
     readings (T, …) by the sensor's `reading_shape`, in its unit, for `Recording(ts, (sensor,
     readings), torque=torque)`; for a sequence a tuple of them.
 
@@ -82,7 +83,11 @@ def _readings(
     *,
     key: Any,
 ) -> Float[Array, "times ..."]:
-    times, states, now = sensor_inputs(sensor, body, torque, ts, state0, states)
+    jitter, late = getattr(sensor, "jitter", None), None
+    if key is not None and jitter is not None:
+        key, own = jax.random.split(key)
+        late = jitter.deviation * jax.random.normal(own, ts.shape, ts.dtype)
+    times, states, now = sensor_inputs(sensor, body, torque, ts, state0, states, late)
     error = jnp.zeros((ts.shape[0], sensor.components), ts.dtype)
     if key is not None:
         assert sensor.noise is not None
@@ -118,6 +123,11 @@ def _fits(sensor: Any, state0: Any, key: Any) -> None:
     if key is not None and sensor.noise is None:
         raise ValueError(
             f"{name}: noise=None gives no size of the noise to draw; give noise, or key=None"
+        )
+    jitter, lowpass = getattr(sensor, "jitter", None), getattr(sensor, "lowpass", None)
+    if key is not None and jitter is not None and (jitter.estimated or lowpass is not None):
+        raise ValueError(
+            f"{name}: wanted a jitter in s, and no lowpass beside it, to draw times; or key=None"
         )
     if not hasattr(sensor, "reading_of") and math.prod(sensor.reading_shape) != sensor.components:
         raise ValueError(

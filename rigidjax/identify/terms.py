@@ -60,11 +60,10 @@ def errors_of_one(
     last state.
     """
     record, body, state0, states = states_of_one(problem, mine, record, ref, which)
-    out = []
+    out, motion = [], (body, record.torque, record.t, state0, states)
     for reading in record.readings:
         sensor = reading.sensor
-        given = body, record.torque, record.t, state0, states
-        times, seen, now = sensor_inputs(sensor, *given, late)
+        times, seen, now = sensor_inputs(sensor, *motion, late)
 
         def error(t: Array, state: Any, value: Array, of: Any = (sensor, now)) -> Array:
             sensor, now = of
@@ -149,29 +148,13 @@ def _all_errors_jvp(primals: Any, tangents: Any) -> Any:
 
 @eqx.filter_jit
 def changes(parameters: Parameters, problem: "Problem") -> tuple[Float[Array, "..."], ...]:
-    """The time derivative (R, T, k) of each sensor's errors: that in the offset of its clock."""
+    """The time derivative (R, T, k) of the errors of each sensor."""
 
     def of_one(*trees: Any) -> Any:
-        late = jnp.zeros((), problem.records.t.dtype)
-        by_clock = lambda late: errors_of_one(problem, *trees, late)[0]  # noqa: E731
-        return jax.jvp(by_clock, (late,), (jnp.ones_like(late),))[1]
+        now = jnp.zeros((), problem.records.t.dtype)
+        return jax.jvp(lambda s: errors_of_one(problem, *trees, late=s)[0], (now,), (now + 1,))[1]
 
     return over_records(of_one, problem, local(problem, parameters))
-
-
-def with_jitter(records: Recording, found: Sequence[Any]) -> Recording:
-    """The recordings, with the change (R, T, k) and the deviation (R,) of each sensor with jitter.
-
-    A search keeps the changes fixed: if errors counted less where a motion changes quickly, it
-    would prefer such a motion.
-    """
-    which = [i for i, reading in enumerate(records.readings) if reading.change is not None]
-
-    def parts(r: Any) -> list[Array]:
-        mine = [r.readings[i] for i in which]
-        return [part for one in mine for part in (one.change, one.sensor.jitter.deviation)]
-
-    return eqx.tree_at(parts, records, [part for i in which for part in found[i]])
 
 
 def along(problem: "Problem", blocks: Any, step: Parameters) -> Any:
@@ -246,6 +229,14 @@ def independent(
     return (e - v * told / before) * jnp.sqrt(before / total), jnp.log(total / before)
 
 
+def in_deviations(x: Any, sigma: Array, late: Array | None) -> Float[Array, "..."]:
+    """Changes (R, T, k, n) of a sensor's errors in standard deviations, as `standardised`."""
+    x = x / sigma[:, None, :, None]
+    if late is None:
+        return x
+    return jax.vmap(lambda e: independent(e, late / sigma[:, None])[0], -1, -1)(x)
+
+
 def standardised(
     values: Float[Array, "times *components"],
     mask: Bool[Array, " times"],
@@ -256,8 +247,8 @@ def standardised(
 ) -> tuple[Float[Array, "times k"], Bool[Array, "times k"], Float[Array, "times k"] | None]:
     """Errors in standard deviations, and the mask of saturated channels: these say "at least that
     much", and count as `√(−2 log Φ(z))`, z the prediction's excess over the limit (Tobin 1958,
-    doi:10.2307/1907382). `late` is the effect of the time stamps' deviation; the last part is the
-    logarithm of the variances with it in units of those without.
+    doi:10.2307/1907382). `late` is the error by a time stamp one standard deviation off; the last
+    part is the logarithm of what it multiplies the variances by.
     """
     scaled, wider = error / sigma[None], None
     full = jnp.zeros(scaled.shape, bool)
@@ -266,8 +257,8 @@ def standardised(
     if late is not None:
         v = late / sigma[None]
         # A channel at full scale hardly shows the time.
-        apart, wider = independent(scaled, jnp.where(full, 0.0, v))
-        scaled = jnp.where(full, scaled / jnp.sqrt(1.0 + v * v), apart)
+        white, wider = independent(scaled, jnp.where(full, 0.0, v))
+        scaled = jnp.where(full, scaled / jnp.sqrt(1.0 + v * v), white)
     if limit is None:
         return scaled, full, wider
     side = jnp.sign(values)

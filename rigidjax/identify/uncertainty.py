@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -14,21 +14,14 @@ from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.search import beside_rows, evaluate
-from rigidjax.identify.terms import (
-    Noise,
-    changes,
-    weights_of,
-    whitened,
-    with_jitter,
-    with_rows,
-)
+from rigidjax.identify.terms import Noise, changes, weights_of, whitened, with_rows
 
 # A direction is undetermined if its singular value is below this share of the largest.
 BLIND = 1e-8
 # Columns of the Jacobian are scaled to length one, unless shorter than this share of the longest.
 WEAKEST = 1e-6
-# The rounds of scoring of two variances.
-ROUNDS = 200
+# Rounds of the search for two variances.
+ROUNDS = 500
 
 
 class Linearised(eqx.Module):
@@ -350,95 +343,74 @@ def _channel_time(e: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
     return float(total), float(first)
 
 
-def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Parameters) -> Noise:
+def estimate_noise(
+    problem: Problem, errors: tuple, noise: Noise, parameters: Parameters
+) -> tuple[Problem, Noise]:
     """Noise (R, k) of each sensor: as given, or the weighted scatter of its errors, one figure for
-    all channels and the recordings of a group.
+    all channels and the recordings of a group. The problem with the jitter of its sensors likewise.
     """
     free = ravel_pytree(parameters)[0].size
     weights = weights_of(problem, errors, noise)
     share = max(1.0 - free / problem.records.size, 0.1)
     groups, out = np.asarray(problem.noise_groups), []
-    cut = at_limit(problem.records.readings)
-    for reading, error, sigma, weight, full in zip(
-        problem.records.readings, errors, noise, weights, cut, strict=True
+    readings = list(problem.records.readings)
+    cut = at_limit(readings)
+    for index, (reading, error, sigma, weight, full) in enumerate(
+        zip(readings, errors, noise, weights, cut, strict=True)
     ):
-        if reading.sensor.noise is not None:
-            out.append(reading.sensor.noise)
-            continue
         # The error of a reading at full scale is no noise.
-        kept = reading.seen[..., None] & ~full
-        squares = np.asarray(weight)[..., None] * np.asarray(error) ** 2
-        squares = np.sum(np.where(kept, squares, 0.0), axis=(1, 2))
-        seen = kept.sum(axis=(1, 2))
-        variance = np.bincount(groups, squares) / np.maximum(np.bincount(groups, seen), 1) / share
-        # Data without noise must not divide by zero: the least noise is round-off.
-        floor = 1e-15 * float(jnp.abs(reading.values).max() + 1e-300)
-        found = np.maximum(np.sqrt(variance), floor)[groups]
-        out.append(jnp.broadcast_to(jnp.asarray(found, sigma.dtype)[:, None], sigma.shape))
-    return tuple(out)
+        sensor, kept = cast(Any, reading.sensor), reading.seen[..., None] & ~full
+        known = sensor.noise is not None
+        if known:
+            sigma = sensor.noise
+        else:
+            squares = np.asarray(weight)[..., None] * np.asarray(error) ** 2
+            squares = np.sum(np.where(kept, squares, 0.0), axis=(1, 2))
+            seen = kept.sum(axis=(1, 2))
+            variance = np.bincount(groups, squares) / np.maximum(np.bincount(groups, seen), 1)
+            # Data without noise must not divide by zero: the least noise is round-off.
+            floor = 1e-15 * float(jnp.abs(reading.values).max() + 1e-300)
+            found = np.maximum(np.sqrt(variance / share), floor)[groups]
+            sigma = jnp.broadcast_to(jnp.asarray(found, sigma.dtype)[:, None], sigma.shape)
+        if reading.late is not None:
+            change = changes(parameters, problem)[index]
+            root = np.sqrt(np.asarray(weight, float) / share) * kept.all(axis=-1)
+            e, u = (np.asarray(x) / np.asarray(sigma, float)[:, None] for x in (error, change))
+            tau = None if sensor.jitter.estimated else np.asarray(sensor.jitter.deviation)
+            both = _jitter(e * root[..., None], u, groups, known, tau)
+            grown, tau = (jnp.asarray(each, sigma.dtype) for each in both)
+            sigma = sigma * grown[:, None]
+            readings[index] = reading.scattered(tau[:, None, None] * change, tau)
+        out.append(sigma)
+    return eqx.tree_at(lambda p: p.records.readings, problem, tuple(readings)), tuple(out)
 
 
-def estimate_jitter(
-    problem: Problem, errors: tuple, noise: Noise, parameters: Parameters
-) -> tuple[Problem, Noise]:
-    """The problem and the noise with the changes along this motion, and the most likely deviation
-    of time stamps, and noise of their sensors, unless given: one figure each for the recordings of
-    a group. Errors have the covariance `σ² + τ² u uᵀ` with u the change.
+def _jitter(
+    e: np.ndarray, u: np.ndarray, groups: np.ndarray, known: bool, tau: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The most likely σ and τ (R,) of errors e (R, T, k) of covariances `σ² + τ² u uᵀ`, alike in a
+    group; a `known` σ is 1, a known τ is given. In turn τ² by Fisher's scoring of the squares along
+    u, whose mean is `σ² + τ² |u|²`, and σ² by expectation and maximisation.
     """
-    readings = problem.records.readings
-    if all(reading.change is None for reading in readings):
-        return problem, noise
-    free = ravel_pytree(parameters)[0].size
-    share = max(1.0 - free / problem.records.size, 0.1)
-    moved, weights = changes(parameters, problem), weights_of(problem, errors, noise)
-    groups, cut = np.asarray(problem.noise_groups), at_limit(readings)
-    noises, found = list(noise), []
-    for index, reading in enumerate(readings):
-        if reading.change is None:
-            found.append(None)
-            continue
-        sensor: Any = reading.sensor
-        known, jitter = sensor.noise is not None, sensor.jitter
-        unit = np.asarray(noise[index] if known else np.ones_like(noise[index]), float)[:, None]
-        weight = np.asarray(weights[index], float)[..., None] / share
-        e, u = np.asarray(errors[index]) / unit * np.sqrt(weight), np.asarray(moved[index]) / unit
-        kept = (weight[..., 0] > 0) & ~cut[index].any(axis=-1)
-        squares = np.ones((groups.max() + 1, 2))
-        for group in range(len(squares)):
-            rows = kept & (groups == group)[:, None]
-            given = np.asarray(jitter.deviation, float)[groups == group][0] ** 2
-            squares[group] = _variances(
-                e[rows], u[rows], 1.0 if known else None, None if jitter.estimated else given
-            )
-        roots = jnp.asarray(np.sqrt(squares)[groups], noise[index].dtype)
-        found.append((moved[index], roots[:, 1]))
-        if not known:
-            noises[index] = jnp.broadcast_to(roots[:, :1], noise[index].shape)
-    records = with_jitter(problem.records, found)
-    return eqx.tree_at(lambda p: p.records, problem, records), tuple(noises)
+    size, total = np.sum(u**2, axis=-1), np.sum(e**2, axis=-1)
+    seen = total > 0
+    dot = np.sum(e * u, axis=-1)
+    along = dot**2 / np.maximum(size, 1e-300)
 
+    def ratio(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        x, y = (np.bincount(groups, np.sum(each * seen, axis=1)) for each in (x, y))
+        return (x / np.maximum(y, 1e-300))[groups][:, None]
 
-def _variances(
-    e: np.ndarray, u: np.ndarray, white: float | None, late: float | None
-) -> tuple[float, float]:
-    """σ² and τ² of errors e (N, k) of covariances `σ² + τ² u uᵀ`, unless given: most likely ones,
-    by Fisher's scoring in turn. The mean square along u is `σ² + τ² |u|²`, across it σ².
-    """
-    size, total = np.sum(u**2, axis=1), np.sum(e**2, axis=1)
-    count, ways = e.shape
-    along = np.where(size > 0, np.sum(e * u, axis=1) ** 2 / np.maximum(size, 1e-300), total / ways)
-    across = np.sum(total - along)
-    p = max(total.mean() / ways, 1e-300) if white is None else white
-    q = 0.0 if late is None else late
+    p, q = np.ones((len(e), 1)), np.zeros((len(e), 1)) if tau is None else tau[:, None] ** 2
     for _ in range(ROUNDS):
-        before = p, q
-        weight = (p + q * size) ** -2
-        if white is None:
-            mean = np.sum(weight * (along - q * size)) + across / p**2
-            p = max(mean / (np.sum(weight) + (ways - 1) * count / p**2), 1e-3 * p)
-        if late is None:
-            information = max(np.sum(weight * size**2), 1e-300)
-            q = max(np.sum(weight * size * (along - p)) / information, 0.0)
-        if abs(p - before[0]) <= 1e-9 * p and abs(q - before[1]) <= 1e-9 * q:
+        before, weight = (p, q), (p + q * size) ** -2.0
+        if tau is None:
+            q = np.maximum(ratio(weight * size * (along - p), weight * size**2), 0.0)
+        if not known:
+            wide = p + q * size
+            delay, unsure = q * dot / wide, p * q / wide
+            left = total - 2 * delay * dot + size * (delay**2 + unsure)
+            p = np.maximum(ratio(left, np.full(left.shape, e.shape[-1])), 1e-12)
+        if np.allclose((p, q), before, rtol=1e-9, atol=0.0):
             break
-    return p, q
+    return np.sqrt(p[:, 0]), np.sqrt(q[:, 0])

@@ -115,22 +115,20 @@ def positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
 
 
 class Jitter(eqx.Module):
-    """The standard deviation of a sensor's time stamps, s, given or to be `estimated` by a fit."""
+    """The standard deviation of time stamps, s: as given, or to be `estimated`."""
 
     deviation: Scalar
     estimated: bool = eqx.field(static=True)
 
 
 def jitter_of(given: Any) -> Jitter | None:
-    """The jitter of a positive number, s, or `"estimated"`; `None` stays."""
+    """The jitter of a positive number, s, or of `"estimated"`; `None` stays."""
     if given is None or isinstance(given, Jitter):
         return given
-    if isinstance(given, str):
-        _checks.word(given, ("estimated",), "jitter: a word")
+    if isinstance(given, str) and given == "estimated":
         return Jitter(jnp.zeros(()), True)
-    wanted = 'a positive standard deviation, s, "estimated" or None'
-    number = _checks.floating(given, (), "jitter").astype(jnp.result_type(float))
-    return Jitter(_checks.sign(number, "jitter", wanted), False)
+    wanted = 'a positive number of seconds or "estimated"'
+    return Jitter(jnp.asarray(_checks.positive(given, "jitter", wanted)), False)
 
 
 class ClockedSensor(AbstractSensor):
