@@ -45,8 +45,11 @@ class Reading(eqx.Module):
         """The same with another jitter. A search keeps `late`: if errors counted less where a
         motion changes quickly, it would prefer such a motion.
         """
-        sensor: Any = eqx.tree_at(lambda s: s.jitter.deviation, self.sensor, deviation)
-        return Reading(sensor, self.values, self.mask, late)
+
+        def parts(reading: Any) -> Any:
+            return reading.late, reading.sensor.jitter.deviation
+
+        return eqx.tree_at(parts, self, (late, deviation))
 
     @property
     def known_noise(self) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax import identify
+from rigidjax import estimate, identify
 from rigidjax.estimate.scene import sensors_of
 from rigidjax.identify.terms import independent
 
@@ -111,8 +111,9 @@ def test_a_wrong_jitter_is_refused_in_words(wrong):
 
 
 def test_where_jitter_has_no_meaning_it_is_refused_in_words():
+    model = estimate.Model(BODY, rj.torques.RandomTorque(1e-3))
     with pytest.raises(ValueError, match="jitter"):
-        sensors_of([identify.Gyro(SIGMA, jitter=TAU)], None)
+        sensors_of([identify.Gyro(SIGMA, jitter=TAU)], model)
     gyro = identify.Gyro(SIGMA, jitter="estimated")
     with pytest.raises(ValueError, match="jitter in s"):
         identify.simulate_readings(gyro, BODY, rj.Spin([0, 0, 1.0]), TS, key=jax.random.key(0))
