@@ -117,3 +117,15 @@ def test_where_jitter_has_no_meaning_it_is_refused_in_words():
     gyro = identify.Gyro(SIGMA, jitter="estimated")
     with pytest.raises(ValueError, match="jitter in s"):
         identify.simulate_readings(gyro, BODY, rj.Spin([0, 0, 1.0]), TS, key=jax.random.key(0))
+
+
+def test_the_log_density_is_that_of_the_full_covariance():
+    found = fitted(identify.Gyro(SIGMA, jitter="estimated"), throw(3))
+    wanted = 0.0
+    late = np.asarray(found.problem.records.readings[0].late[0])
+    for e, v in zip(np.asarray(found.residuals[0]), late, strict=True):
+        covariance = SIGMA**2 * np.eye(3) + np.outer(v, v)
+        wanted -= 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]
+        wanted -= 0.5 * e @ np.linalg.solve(covariance, e)
+    density = estimate.LogDensity(found)
+    np.testing.assert_allclose(density(density.x0), wanted, rtol=1e-10)
