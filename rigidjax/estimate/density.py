@@ -54,8 +54,8 @@ class LogDensity(eqx.Module):
 
     With a `process` the filter integrates the unknown torque out. Without it the readings are
     independent and normal about the motion: this is too narrow if errors are autocorrelated; keep
-    fewer readings then, or give a process. Priors are the problem's: `Free`s with a prior, an
-    `Entropic` one; the prior of all other numbers is flat in x.
+    fewer readings then, or give a process. A sensor's jitter is that of the fit. Priors are the
+    problem's: `Free`s with a prior, an `Entropic` one; the prior of all other numbers is flat in x.
 
     **Arguments:** `fit` of `identify.fit`; with a process a first guess is enough, `fit(problem,
     starts=1, max_steps=1)`; `process` a `RandomTorque` or `CorrelatedTorque` or `None`; `deviation`
@@ -302,11 +302,13 @@ def _of_motion(
     scaled, log_variance = [], []
     for reading, error, noise in zip(record.readings, errors, noises, strict=True):
         limit = getattr(reading.sensor, "limit", None)
-        one, full = standardised(reading.values, reading.mask, error, noise, limit)
+        given = reading.values, reading.mask, error, noise, limit, reading.late
+        one, full, wider = standardised(*given)
         scaled.append(one)
         # What a channel at its limit counts is a probability, not a density.
         seen = reading.mask[:, None] & ~full
-        log_variance.append(jnp.where(seen, jnp.log(2 * math.pi * noise**2)[None], 0))
+        logs = jnp.log(2 * math.pi * noise**2)[None]
+        log_variance.append(jnp.where(seen, logs if wider is None else logs + wider, 0))
     return Terms(
         *(jnp.concatenate([a.reshape(-1) for a in part]) for part in (scaled, log_variance))
     )

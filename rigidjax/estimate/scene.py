@@ -153,6 +153,11 @@ def sensors_of(sensors: Sequence[AbstractSensor], model: Model) -> Sensors:
                 f"{name}: a lowpass has states of its own, which the filter does not estimate; "
                 "leave it out, and give its lag as offset"
             )
+        if getattr(sensor, "jitter", None) is not None:
+            raise ValueError(
+                f"{name}: jitter makes errors that depend on each other, which the filter takes as "
+                "independent; leave it out, and give more noise"
+            )
     readings = tuple(Mounted(sensor) for sensor in sensors)
     tree = Sensors(readings, (), ())
     leaves = tuple(leaf_at(walk.where, tree, "Walk", "the sensor")[0] for walk in model.walks)

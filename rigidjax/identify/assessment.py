@@ -29,7 +29,7 @@ HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
 def goodness(
-    problem: Problem, linear: Linearised, times: Times, covariance: np.ndarray
+    problem: Problem, noise: Noise, linear: Linearised, times: Times, covariance: np.ndarray
 ) -> tuple[float, int, Answer, tuple[int, ...]]:
     """χ² and its degrees of freedom (sensors of given noise), the answer, the sensors left over.
 
@@ -59,7 +59,7 @@ def goodness(
         root = np.sqrt(weight)[..., None]
         slope = linear.slopes[index] * root[..., None]
         white = left <= tiny or _white(e * root, kept, slope, own, given)
-        late = left > tiny and clock(problem, linear, index) is not None
+        late = left > tiny and clock(problem, noise, linear, index) is not None
         # Errors below a given noise cannot hide a missing part of the model.
         small = given or left <= QUARTER * varies + tiny
         if factor == 1.0 and white and small and not late:
@@ -227,10 +227,10 @@ def assess(
     # Steps stay short in a long curved valley, although hardly anything is left to gain.
     held = [limit.slope for limit in limits if limit.free < 0]
     done = bool(best.converged) or uncertainty.distance(linear, white, held) < AT_THE_END
-    chi2, dof, model, left = goodness(problem, linear, times, white.seen)
+    chi2, dof, model, left = goodness(problem, noise, linear, times, white.seen)
     believable = model.word != FAILS
     # Ten units of log-likelihood, of the noise as estimated; autocorrelated errors count as fewer.
-    guessed = any(sensor.noise is None for sensor in problem.records.sensors)
+    guessed = not all(reading.known_noise for reading in problem.records.readings)
     unit = 2 * best_cost / problem.records.size if guessed else 1.0
     margin = 10.0 * unit * max(times.longest, 1.0)
 

@@ -21,8 +21,9 @@ from rigidjax.identify.parameters import Parameters, numbered
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording, readings_of
 from rigidjax.identify.reference_states import attitudes, rates_of
+from rigidjax.identify.search import evaluate
 from rigidjax.identify.sensors import Gyro
-from rigidjax.identify.terms import Noise
+from rigidjax.identify.terms import Noise, in_deviations
 from rigidjax.identify.uncertainty import Linearised
 
 # Corrected rates must leave less than this share of the error as read, and of the whole signal.
@@ -140,10 +141,11 @@ def causes(
     found = []
     for index in which:
         sensor: Any = problem.records.readings[index].sensor
-        cause = clock(problem, linear, index)
+        cause = clock(problem, noise, linear, index)
         if cause is None and _of_three(sensor):
             rows = _table(problem, parameters, noise, linear, index)
-            shares = [_explained(noise, linear, index, which, free, row[1]) for row in rows]
+            given = problem, noise, linear, index, which, free
+            shares = [_explained(*given, row[1]) for row in rows]
             cause = _largest(sensor, rows, shares)
         if cause is None and hasattr(sensor, "suspect"):
             cause = Cause(sensor.suspect[0], type(sensor).__name__, None, *sensor.suspect[1:])
@@ -151,13 +153,18 @@ def causes(
     return tuple(found)
 
 
-def clock(problem: Problem, linear: Linearised, index: int) -> Cause | None:
-    """Time stamps that scatter: each error is along the change of the readings."""
+def clock(problem: Problem, noise: Noise, linear: Linearised, index: int) -> Cause | None:
+    """Time stamps that scatter, by more than the sensor's jitter: each error is along the change of
+    the readings.
+    """
     sensor, error = problem.records.readings[index].sensor, linear.raw[index]
     kept = (linear.weights[index] > 0) & ~at_limit(problem.records.readings)[index].any(axis=-1)
     if not (_of_three(sensor) and error[kept].any()):
         return None
     slope = _slope(problem, np.asarray(problem.records.readings[index].values) - error)
+    late = problem.records.readings[index].late
+    both = np.asarray(in_deviations(np.stack([error, slope], -1), noise[index], late))
+    error, slope = both[..., 0], both[..., 1]
     moved = np.sum(slope**2, axis=-1) * kept
     moving = moved > 1e-2 * moved.max()
     if not moving.any():
@@ -172,7 +179,7 @@ def clock(problem: Problem, linear: Linearised, index: int) -> Cause | None:
     scatter = 1e3 * np.sqrt(along / moved[moving].sum())
     return _cause(
         "clock", sensor, share, f"time stamps that scatter by {scatter:.2g} ms",
-        "take times from the sensor's own count of samples, or a gyro that expects it (the guide)",
+        "take times from the sensor's own count of samples, or give it jitter=\"estimated\"",
     )  # fmt: skip
 
 
@@ -255,7 +262,8 @@ def _response(
         return np.zeros_like
     first = np.asarray(numbered(parameters).own.spin)[0]
     columns = (linear.places[0][:, None] == first).argmax(axis=0)
-    flow = linear.slopes[index][..., columns] * np.asarray(noise[index])[:, None, :, None]
+    slopes = evaluate(parameters, problem)[1][0][index]
+    flow = np.asarray(slopes)[..., columns]
     tensors = np.stack([np.asarray(tensor_of(b)) for b in in_a_row(problem.bodies(parameters))])
     of = np.zeros(problem.count, int) if problem.which is None else np.asarray(problem.which)
     back = np.linalg.pinv(flow) @ np.linalg.inv(tensors)[of][:, None]
@@ -270,6 +278,7 @@ def _response(
 
 
 def _explained(
+    problem: Problem,
     noise: Noise,
     linear: Linearised,
     index: int,
@@ -282,7 +291,8 @@ def _explained(
     """
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]
-    scaled = direction / np.asarray(noise[index])[:, None, :, None] * roots[index][..., None]
+    late = problem.records.readings[index].late
+    scaled = np.asarray(in_deviations(direction, noise[index], late)) * roots[index][..., None]
     size = np.sqrt(np.sum(scaled**2, axis=(0, 1, 2)))
     size[size == 0] = 1.0
     columns = [np.zeros((*error.shape, size.size)) for error in errors]

@@ -13,6 +13,8 @@ from rigidjax.identify.fit import fit
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording, count_of
 from rigidjax.identify.result import Fit
+from rigidjax.identify.search import evaluate
+from rigidjax.identify.terms import independent, whitened
 
 
 class Comparison(eqx.Module):
@@ -58,9 +60,12 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     shortest = max(min(found.correlation for found in fits.values()), 1.0)
     rows = []
     for name, found in fits.items():
+        jitters = [getattr(s, "jitter", None) for s in found.problem.records.sensors]
+        several = int(np.max(found.problem.noise_groups)) + 1
         size = int(found.covariance.shape[0])
+        size += several * sum(jitter is not None and jitter.estimated for jitter in jitters)
         independent = np.array(counts[name]) / shortest
-        misfit = independent @ (2.0 * np.log(np.maximum(found.rms, 1e-300)))
+        misfit = independent @ _log_squares(found)
         rows.append((misfit + size * np.log(max(independent.sum(), 2.0)), name, size, found))
     rows.sort(key=lambda row: row[0])
     best = rows[0][0]
@@ -68,6 +73,20 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
         Comparison(name, size, found.rms, found.correlation, float(total - best))
         for total, name, size, found in rows
     )
+
+
+def _log_squares(found: Fit) -> np.ndarray:
+    """The logarithm of each sensor's mean square error; with jitter of white errors as likely."""
+    out, problem = 2.0 * np.log(np.maximum(found.rms, 1e-300)), found.problem
+    white = whitened(problem, evaluate(found.parameters, problem)[0][0], found.noises)
+    for index, (reading, e, sigma) in enumerate(
+        zip(problem.records.readings, white, found.noises, strict=True)
+    ):
+        if reading.late is not None:
+            wider = np.asarray(independent(e, reading.late / sigma[:, None])[1])[reading.seen]
+            squares = np.sum(np.asarray(e * sigma[:, None])[reading.seen] ** 2, axis=-1)
+            out[index] = np.log(squares.mean()) + wider.mean()
+    return out
 
 
 def cross_validate(

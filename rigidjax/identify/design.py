@@ -16,7 +16,7 @@ from rigidjax.identify.normal import normal_of
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem, fits, one_problem
 from rigidjax.identify.quantities import Quantity, quantities, values_and_slopes
-from rigidjax.identify.terms import with_blocks
+from rigidjax.identify.terms import changes, in_deviations, with_blocks
 from rigidjax.identify.uncertainty import inverted
 
 
@@ -64,9 +64,15 @@ def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
 
 @eqx.filter_jit
 def _fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
-    noises: list[Any] = [sensor.noise for sensor in problem.records.sensors]
+    sensors = problem.records.sensors
+    noises: list[Any] = [sensor.noise for sensor in sensors]
     blocks = with_blocks(parameters, problem)[1][0]
-    rows = [rows / noise[:, None, :, None] for rows, noise in zip(blocks, noises, strict=True)]
+    rows = []
+    for index, (sensor, noise, block) in enumerate(zip(sensors, noises, blocks, strict=True)):
+        jitter, late = getattr(sensor, "jitter", None), None
+        if jitter is not None:
+            late = jitter.deviation[:, None, None] * changes(parameters, problem)[index]
+        rows.append(in_deviations(block, noise, late))
     return normal_of(rows, places(problem, parameters), ravel_pytree(parameters)[0].size).core
 
 
@@ -77,6 +83,8 @@ def _look(problem: Problem, parameters: Parameters) -> None:
             raise ValueError(
                 f"design: wanted a {type(sensor).__name__} with known noise, got noise=None"
             )
+        if (jitter := getattr(sensor, "jitter", None)) is not None and jitter.estimated:
+            raise ValueError(f"design: wanted a {type(sensor).__name__} with known jitter, in s")
 
 
 def _on_host(problem: Problem, motion: Any) -> None:

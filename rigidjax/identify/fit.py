@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from types import NoneType
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -148,6 +148,14 @@ def fit(
     found = assess(task.problem, best, task.noise, tried, lowest, cut, rough)
     # Of the readings as they were given.
     own = eqx.tree_at(lambda p: p.records, task.problem, given.records)
+    pairs = zip(given.records.readings, task.problem.records.readings, strict=True)
+    readings = tuple(
+        one
+        if r.late is None
+        else one.scattered(r.late[:, : one.mask.shape[1]], cast(Any, r.sensor).jitter.deviation)
+        for one, r in pairs
+    )
+    own = eqx.tree_at(lambda p: p.records.readings, own, readings)
     return eqx.tree_at(lambda one: one.problem, found, own)
 
 
@@ -158,13 +166,13 @@ def _cost(tried: Tried) -> float:
 
 def _with_noise(best: Tried, task: Task) -> tuple[Tried, Task]:
     """The best point together with its noise, if some noise is to be estimated."""
-    if all(sensor.noise is not None for sensor in task.problem.records.sensors):
+    if all(reading.known_noise for reading in task.problem.records.readings):
         return best, task
 
     def estimated(best: Tried, task: Task) -> Task:
         (errors, _), _ = _evaluated(best, task.problem).found
-        noise = estimate_noise(task.problem, errors, task.noise, best.parameters)
-        return task._replace(noise=noise)
+        problem, noise = estimate_noise(task.problem, errors, task.noise, best.parameters)
+        return task._replace(problem=problem, noise=noise)
 
     # Twice: the weights of the channels and the robust loss both depend on the noise.
     for _ in range(2):
@@ -329,7 +337,7 @@ def _first_noise(problem: Problem) -> Noise:
     out = []
     for reading in problem.records.readings:
         sensor = reading.sensor
-        if sensor.noise is not None:
+        if reading.known_noise:
             out.append(sensor.noise)
         else:
             # A tenth of the signal: what counts is that no channel drowns another.

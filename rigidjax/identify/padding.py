@@ -85,7 +85,8 @@ def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
         return recording
 
     def long(r: Recording) -> list[Any]:
-        return [r.t, *(part for reading in r.readings for part in (reading.values, reading.mask))]
+        parts = [(reading.values, reading.mask, reading.late) for reading in r.readings]
+        return jax.tree.leaves((r.t, parts))
 
     return eqx.tree_at(long, recording, [leaf[begin:end] for leaf in long(recording)])
 

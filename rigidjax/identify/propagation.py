@@ -3,6 +3,7 @@
 import abc
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import diffrax as dfx
@@ -173,21 +174,25 @@ def what_turns(body: Any, rung: type) -> Any:
 
 
 def sensor_inputs(
-    sensor: Any, body: Any, torque: Any, ts: Array, state0: Any, states: Any
+    sensor: Any, body: Any, torque: Any, ts: Array, state0: Any, states: Any, late: Any = None
 ) -> tuple[Array, Any, Callable[[Array, Any], SensorInput]]:
-    """The times that a sensor shows at `ts` (T,), by its clock; the states then; its input at one
-    time. `states` are `Coupled` if a torque has states of its own.
+    """The times that a sensor shows at `ts` (T,), by its clock, and `late` s later, one number or
+    (T,); the states then; its input at one time. `states` are `Coupled` if a torque has states of
+    its own.
     """
     turned = what_turns(body, type(state0))
     field = equations_of_motion(turned, state0, torque)
     offset, times = getattr(sensor, "offset", None), ts
+    if late is not None:
+        offset = late if offset is None else offset + late
     if offset is not None:
         times = ts + offset
         if torque is None:
             states = FreeMotion(turned, state0)(times - ts[0])
         else:
             whole = CoupledEquations(field, turned) if isinstance(states, Coupled) else field
-            states = jax.vmap(lambda t, y: shifted(whole, t, y, offset))(ts, states)
+            axes = (0, 0, 0 if jnp.ndim(offset) else None)
+            states = jax.vmap(partial(shifted, whole), axes)(ts, states, offset)
 
     def now(t: Array, state: Any) -> SensorInput:
         if not isinstance(state, Coupled):
@@ -214,9 +219,9 @@ def simulate_readings(
     **Arguments:** `sensor` an `AbstractSensor`, or a sequence of them along one motion; `body`,
     `state0`, `ts` (T,) s, `torque` as for `rigidjax.simulate`; `MassProperties` are allowed for all
     states (a sensor's `place` is then in their frame). `key` of `jax.random`: normal noise of the
-    sensor's standard deviation `noise` is added; `None` for readings without noise. **Returns**
-    readings (T, …) by the sensor's `reading_shape`, in its unit, for `Recording(ts, (sensor,
-    readings), torque=torque)`; for a sequence a tuple of them.
+    sensor's standard deviation `noise` is added, and times scatter by its `jitter`; `None` for
+    readings without either. **Returns** readings (T, …) by the sensor's `reading_shape`, in its
+    unit, for `Recording(ts, (sensor, readings), torque=torque)`; for a sequence a tuple of them.
 
     **Raises:** `TypeError` for anything but a sensor, and for a state without the parts that the
     sensor reads; `ValueError` for a key if the sensor's noise is `None`, and for a sensor of your
@@ -258,7 +263,11 @@ def _readings(
     *,
     key: Any,
 ) -> Float[Array, "times ..."]:
-    times, states, now = sensor_inputs(sensor, body, torque, ts, state0, states)
+    jitter, late = getattr(sensor, "jitter", None), None
+    if key is not None and jitter is not None:
+        key, own = jax.random.split(key)
+        late = jitter.deviation * jax.random.normal(own, ts.shape, ts.dtype)
+    times, states, now = sensor_inputs(sensor, body, torque, ts, state0, states, late)
     error = jnp.zeros((ts.shape[0], sensor.components), ts.dtype)
     if key is not None:
         assert sensor.noise is not None
@@ -294,6 +303,11 @@ def _fits(sensor: Any, state0: Any, key: Any) -> None:
     if key is not None and sensor.noise is None:
         raise ValueError(
             f"{name}: noise=None gives no size of the noise to draw; give noise, or key=None"
+        )
+    jitter, lowpass = getattr(sensor, "jitter", None), getattr(sensor, "lowpass", None)
+    if key is not None and jitter is not None and (jitter.estimated or lowpass is not None):
+        raise ValueError(
+            f"{name}: wanted a jitter in s, and no lowpass beside it, to draw times; or key=None"
         )
     if not hasattr(sensor, "reading_of") and math.prod(sensor.reading_shape) != sensor.components:
         raise ValueError(

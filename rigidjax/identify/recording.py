@@ -18,7 +18,8 @@ from rigidjax.motion.torques.base import Torque, require_law
 class Reading(eqx.Module):
     """The readings of one sensor: `values` (T, …) and `mask` (T,), true where there is a reading.
 
-    Inside a `Problem` all arrays have a leading axis over recordings.
+    Inside a `Problem` all arrays have a leading axis over recordings. `late` (T, k), of a sensor
+    with jitter, is the error by a time stamp one standard deviation off, as a fit found it.
 
     >>> record = Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]]))
     >>> record.readings[0].values.shape, record.readings[0].mask.tolist()
@@ -28,11 +29,32 @@ class Reading(eqx.Module):
     sensor: AbstractSensor
     values: Float[Array, "times ..."]
     mask: Bool[Array, "*records times"]
+    late: Float[Array, "*records times k"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.late is None and getattr(self.sensor, "jitter", None) is not None:
+            shape = (*np.shape(self.mask), self.sensor.components)
+            self.late = jnp.asarray(np.zeros(shape, self.values.dtype))
 
     @property
     def seen(self) -> np.ndarray:
         """The mask as a NumPy array, for work outside `jit`."""
         return np.asarray(self.mask)
+
+    def scattered(self, late: Array, deviation: Array) -> "Reading":
+        """The same with another jitter. A search keeps `late`: if errors counted less where a
+        motion changes quickly, it would prefer such a motion.
+        """
+
+        def parts(reading: Any) -> Any:
+            return reading.late, reading.sensor.jitter.deviation
+
+        return eqx.tree_at(parts, self, (late, deviation))
+
+    @property
+    def known_noise(self) -> bool:
+        """Whether the size of the errors is known before the fit."""
+        return self.sensor.noise is not None and self.late is None
 
 
 class Recording(eqx.Module):

@@ -152,6 +152,17 @@ class Fit(eqx.Module):
         return tuple(n[0] for n in self.noises) if self.problem.count == 1 else self.noises
 
     @property
+    def jitter(self) -> tuple[Float[Array, "*records"] | None, ...]:
+        """The deviation of each sensor's time stamps, s, given or estimated; `None` without jitter.
+
+        With several recordings (R,).
+        """
+        first: Any = 0 if self.problem.count == 1 else slice(None)
+        sensors = self.problem.records.sensors
+        found = (getattr(sensor, "jitter", None) for sensor in sensors)
+        return tuple(None if one is None else one.deviation[first] for one in found)
+
+    @property
     def residuals(self) -> tuple[Float[Array, "*records times _"], ...]:
         """Reading minus prediction for each sensor, in its unit; zero where masked.
 

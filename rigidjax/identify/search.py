@@ -317,7 +317,7 @@ def climb(
 def enough(problem: Problem) -> float:
     """A misfit that only the true motion reaches: twice the mean of χ², or 1 % of the signal."""
     return sum(
-        (0.01 if reading.sensor.noise is None else 1.0) * count_of(reading)
+        (1.0 if reading.known_noise else 0.01) * count_of(reading)
         for reading in problem.records.readings
     )
 

@@ -49,14 +49,21 @@ def states_of_one(
 
 
 def errors_of_one(
-    problem: "Problem", mine: Parameters, record: Recording, ref: ReferenceStates, which: Which
+    problem: "Problem",
+    mine: Parameters,
+    record: Recording,
+    ref: ReferenceStates,
+    which: Which,
+    late: Array | None = None,
 ) -> tuple[tuple[Array, ...], Any]:
-    """The errors (T, k) of each sensor in one recording, and the last state."""
+    """The errors (T, k) of each sensor in one recording, all clocks `late` s more behind, and the
+    last state.
+    """
     record, body, state0, states = states_of_one(problem, mine, record, ref, which)
-    out = []
+    out, motion = [], (body, record.torque, record.t, state0, states)
     for reading in record.readings:
         sensor = reading.sensor
-        times, seen, now = sensor_inputs(sensor, body, record.torque, record.t, state0, states)
+        times, seen, now = sensor_inputs(sensor, *motion, late)
 
         def error(t: Array, state: Any, value: Array, of: Any = (sensor, now)) -> Array:
             sensor, now = of
@@ -139,6 +146,17 @@ def _all_errors_jvp(primals: Any, tangents: Any) -> Any:
     return out, along(problem, blocks, zeros)
 
 
+@eqx.filter_jit
+def changes(parameters: Parameters, problem: "Problem") -> tuple[Float[Array, "..."], ...]:
+    """The time derivative (R, T, k) of the errors of each sensor."""
+
+    def of_one(*trees: Any) -> Any:
+        now = jnp.zeros((), problem.records.t.dtype)
+        return jax.jvp(lambda s: errors_of_one(problem, *trees, late=s)[0], (now,), (now + 1,))[1]
+
+    return over_records(of_one, problem, local(problem, parameters))
+
+
 def along(problem: "Problem", blocks: Any, step: Parameters) -> Any:
     """The derivatives of `with_blocks` along a step of all parameters."""
     flat = ravel_pytree(step)[0]
@@ -184,9 +202,30 @@ def whitened(problem: "Problem", errors: tuple, noise: Noise) -> tuple[Float[Arr
     out = []
     for reading, error, sigma in zip(problem.records.readings, errors, noise, strict=True):
         limit = getattr(reading.sensor, "limit", None)
-        scaled, _ = jax.vmap(standardised)(reading.values, reading.mask, error, sigma, limit)
-        out.append(scaled)
+        given = reading.values, reading.mask, error, sigma, limit, reading.late
+        out.append(jax.vmap(standardised)(*given)[0])
     return tuple(out)
+
+
+def independent(
+    e: Float[Array, "*rows k"], v: Float[Array, "*rows k"]
+) -> tuple[Float[Array, "*rows k"], Float[Array, "*rows k"]]:
+    """Errors of covariance `1 + v vᵀ` made independent, of variance one: `L⁻¹ e`, L the factor of
+    Cholesky; and the logarithms of its squared diagonal, the variance of each given those before.
+    """
+    told, total = jnp.cumsum(v * e, axis=-1), 1.0 + jnp.cumsum(v * v, axis=-1)
+    none = jnp.zeros_like(total[..., :1])
+    told = jnp.concatenate([none, told[..., :-1]], axis=-1)
+    before = jnp.concatenate([none + 1.0, total[..., :-1]], axis=-1)
+    return (e - v * told / before) * jnp.sqrt(before / total), jnp.log(total / before)
+
+
+def in_deviations(x: Any, sigma: Array, late: Array | None) -> Float[Array, "..."]:
+    """Changes (R, T, k, n) of a sensor's errors in standard deviations, as `standardised`."""
+    x = x / sigma[:, None, :, None]
+    if late is None:
+        return x
+    return jax.vmap(lambda e: independent(e, late / sigma[:, None])[0], -1, -1)(x)
 
 
 def standardised(
@@ -195,20 +234,29 @@ def standardised(
     error: Float[Array, "times k"],
     sigma: Float[Array, " k"],
     limit: Float[Array, " k"] | None,
-) -> tuple[Float[Array, "times k"], Bool[Array, "times k"]]:
+    late: Float[Array, "times k"] | None,
+) -> tuple[Float[Array, "times k"], Bool[Array, "times k"], Float[Array, "times k"] | None]:
     """Errors in standard deviations, and the mask of saturated channels: these say "at least that
     much", and count as `√(−2 log Φ(z))`, z the prediction's excess over the limit (Tobin 1958,
-    doi:10.2307/1907382).
+    doi:10.2307/1907382). `late` is the error by a time stamp one standard deviation off; the last
+    part is the logarithm of what it multiplies the variances by.
     """
-    scaled = error / sigma[None]
+    scaled, wider = error / sigma[None], None
+    full = jnp.zeros(scaled.shape, bool)
+    if limit is not None:
+        full = (jnp.abs(values) >= limit[None] * (1 - 1e-6)) & mask[:, None]
+    if late is not None:
+        v = late / sigma[None]
+        # A channel at full scale hardly shows the time.
+        white, wider = independent(scaled, jnp.where(full, 0.0, v))
+        scaled = jnp.where(full, scaled / jnp.sqrt(1.0 + v * v), white)
     if limit is None:
-        return scaled, jnp.zeros(scaled.shape, bool)
-    full = (jnp.abs(values) >= limit[None] * (1 - 1e-6)) & mask[:, None]
+        return scaled, full, wider
     side = jnp.sign(values)
     z = jnp.where(full, -side * scaled, 0.0)
     # The term vanishes beyond five standard deviations, and the root has no derivative there.
     root = jnp.sqrt(-2.0 * jax.scipy.special.log_ndtr(jnp.minimum(z, 5.0)))
-    return jnp.where(full, -side * jnp.where(z < 5.0, root, 0.0), scaled), full
+    return jnp.where(full, -side * jnp.where(z < 5.0, root, 0.0), scaled), full, wider
 
 
 def residuals(parameters: Parameters, args: Any) -> Any:
@@ -230,7 +278,7 @@ def seen(problem: "Problem", errors: tuple, noise: Noise, weights: Array) -> tup
 
 def with_rows(of: Callable[[tuple], tuple], errors: tuple, blocks: tuple) -> tuple[tuple, tuple]:
     """`of(errors)`, and its derivatives (R, T, k, n) of those of the errors, `blocks`."""
-    # Each residual depends on its own error alone: a product of small matrices.
+    # Each residual depends on the errors of its reading alone: a product of small matrices.
     read, push = jax.linearize(of, errors)
     return read, jax.vmap(push, in_axes=-1, out_axes=-1)(blocks)
 

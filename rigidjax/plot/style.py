@@ -33,7 +33,7 @@ def unit(name: str, known: dict[str, float], what: str) -> float:
 
 
 def of_fit(found: Any, index: Any) -> tuple[Any, list[np.ndarray], list[np.ndarray]]:
-    """A recording of a fit, residuals and noise of its sensors; raises in words if it has none."""
+    """A recording of a fit, residuals and their deviations; raises in words if it has none."""
     if np.shape(getattr(found, "chi2", 0.0)) != ():
         raise ValueError("found: wanted one Fit, got one with leading axes; draw them one by one")
     wanted = ("problem", "parameters", "residuals")
@@ -44,7 +44,9 @@ def of_fit(found: Any, index: Any) -> tuple[Any, list[np.ndarray], list[np.ndarr
         raise ValueError(f"index: wanted one of {count} recordings, from 0, got {index}")
     record, which = found.problem.recordings[index], ... if count == 1 else index
     errors = [np.asarray(e[which])[: record.t.shape[0]] for e in found.residuals]
-    return record, errors, [np.asarray(noise[which]) for noise in found.noise]
+    lates = [0.0 if reading.late is None else reading.late for reading in record.readings]
+    noises = zip(found.noise, lates, strict=True)
+    return record, errors, [np.hypot(noise[which], late) for noise, late in noises]
 
 
 def flat_axes(ax: Any, **how: Any) -> Any:

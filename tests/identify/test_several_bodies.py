@@ -128,7 +128,7 @@ def test_noise_is_estimated_by_group(records, each, wanted):
     rng = np.random.default_rng(3)
     errors = (np.array([0.02, 0.05, 0.1, 0.1])[:, None, None] * rng.normal(size=(4, 60, 3)),)
     first = (jnp.ones((4, 3)),)
-    (noise,) = estimate_noise(problem, errors, first, problem.start())
+    _, (noise,) = estimate_noise(problem, errors, first, problem.start())
     np.testing.assert_allclose(noise[:, 0], wanted, rtol=0.15)
 
 

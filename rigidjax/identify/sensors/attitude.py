@@ -31,8 +31,8 @@ class AttitudeSensor(ClockedSensor):
     `jax.vmap(lambda a: rj.euler.to_quaternion(a, "ZYX"))(jnp.deg2rad(angles))` makes them.
 
     **Arguments:** `noise` standard deviation of each component of that vector, rad, one number or
-    (3,); `None` estimates it; `mounting` (3,) rotation vector from the body's axes to the
-    sensor's, rad, or `None`; `offset` s as for `Gyro`. **Raises** `ValueError` for a noise that is
+    (3,); `None` estimates it; `mounting` (3,) rotation vector from the body's axes to the sensor's,
+    rad, or `None`; `offset` s, `jitter` as for `Gyro`. **Raises** `ValueError` for a noise that is
     not positive, a wrong shape, NaN; the recording for a matrix that is no rotation.
 
     >>> AttitudeSensor(noise=0.01).reading_shape
@@ -98,7 +98,7 @@ class Direction(ClockedSensor):
     reading, taken in the plane across the reading (two numbers, rad for small errors, 2 at most).
 
     **Arguments:** `world` (3,) the direction in the world frame, any length; `noise` rad across the
-    line of sight, one number or (2,), `None` to estimate it; `mounting`, `offset` as for
+    line of sight, one number or (2,), `None` to estimate it; `mounting`, `offset`, `jitter` as for
     `AttitudeSensor`. Readings (T, 3) are unit vectors. **Raises** `ValueError` for a direction of
     length zero, a noise that is not positive, NaN.
 
@@ -188,7 +188,7 @@ class Position(ClockedSensor):
     """Reads the centre of mass, in the world: `x + bias`, m. Use `Marker` for another point.
 
     **Arguments:** `noise` m, one number or (3,), `None` to estimate it; `bias` (3,) m, world frame,
-    or `None`; `offset` s as for `Gyro`. For a `Rigid`. **Raises** `ValueError` as `Gyro`.
+    or `None`; `offset` s, `jitter` as for `Gyro`. For a `Rigid`. **Raises** `ValueError` as `Gyro`.
 
     >>> Position(noise=0.01).unit
     'm'
@@ -212,9 +212,9 @@ class Velocity(ClockedSensor):
     m, in the frame of the `MassProperties` (r is the vector to it from the centre of mass); `None`
     for the centre of mass itself; `mounting` (3,) rotation vector that turns the body's axes onto
     the sensor's, rad, for a sensor on the body, such as a Doppler log (zeros for the body's axes);
-    `None` for the world's axes, as in satellite navigation; `bias` (3,) m/s or `None`; `offset` s
-    as for `Gyro`. For a `Rigid`. **Raises** `ValueError` as `Gyro`. Source: Landau and Lifshitz,
-    Mechanics, eq 31.2.
+    `None` for the world's axes, as in satellite navigation; `bias` (3,) m/s or `None`; `offset` s,
+    `jitter` as for `Gyro`. For a `Rigid`. **Raises** `ValueError` as `Gyro`. Source: Landau and
+    Lifshitz, Mechanics, eq 31.2.
 
     >>> Velocity(noise=0.1, mounting=[0.0, 0.0, 0.0]).unit
     'm/s'
@@ -244,8 +244,8 @@ class Range(ClockedSensor):
 
     **Arguments:** `station` s (3,) m, world frame; `noise` m, `None` to estimate it; `place` (3,)
     the point, m, in the frame of the `MassProperties`; `None` for the centre of mass; `bias` m, or
-    `None`; `offset` s as for `Gyro`. Readings (T,). For a `Rigid`. **Raises** `ValueError` as
-    `Gyro`, and for a reading below zero.
+    `None`; `offset` s, `jitter` as for `Gyro`. Readings (T,). For a `Rigid`. **Raises**
+    `ValueError` as `Gyro`, and for a reading below zero.
 
     >>> Range([0.0, 0.0, 100.0], noise=0.05).reading_shape
     ()

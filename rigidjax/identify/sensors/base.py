@@ -114,10 +114,30 @@ def positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
     return _checks.refuse(numbers, ~(numbers > 0), f"{name}: wanted {wanted}")
 
 
+class Jitter(eqx.Module):
+    """The standard deviation of time stamps, s: as given, or to be `estimated`."""
+
+    deviation: Scalar
+    estimated: bool = eqx.field(static=True)
+
+
+def jitter_of(given: Any) -> Jitter | None:
+    """The jitter of a positive number, s, or of `"estimated"`; `None` stays."""
+    if given is None or isinstance(given, Jitter):
+        return given
+    if isinstance(given, str) and given == "estimated":
+        return Jitter(jnp.zeros(()), True)
+    wanted = 'a positive number of seconds or "estimated"'
+    return Jitter(jnp.asarray(_checks.positive(given, "jitter", wanted)), False)
+
+
 class ClockedSensor(AbstractSensor):
-    """A sensor whose clock may be behind; it reads a vector (3,) unless it says otherwise."""
+    """A sensor whose clock may be behind, and whose time stamps may scatter (`jitter`); it reads a
+    vector (3,) unless it says otherwise.
+    """
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 3
     _: dataclasses.KW_ONLY
     offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
+    jitter: Jitter | None = eqx.field(converter=jitter_of, default=None)

@@ -60,12 +60,16 @@ class Gyro(_Vector):
     z in x, and of z in y, for axes that are not orthogonal:
     `S = [[1, a, b], [0, 1, c], [0, 0, 1]]`; `limit` full scale, rad/s, one number or (3,): a
     reading at it counts as "at least that much", `None` finds it from the readings; `offset` s: the
-    reading at t belongs to t + offset; `lowpass` the `LowPass` of the readings; `g_sensitivity` G
+    reading at t belongs to t + offset; `jitter` s the standard deviation of the time stamps, each a
+    number of its own, or `"estimated"`; `lowpass` the `LowPass` of the readings; `g_sensitivity` G
     (3, 3), rad/s per m/s²: the effect on each channel of the specific force f, in the body's axes,
     at the gyro's place: `place` (3,) m and `gravity` (3,) m/s² as for `Accelerometer`, the centre
     of mass and `None` unless given.
 
-    **Raises** `ValueError` for a noise or limit that is not positive, a wrong shape, NaN.
+    With jitter a reading is also wrong along the change of the prediction, by the change in the
+    stamp's error: to first order, for motions that turn little in that time.
+
+    **Raises** `ValueError` for a noise, limit or jitter that is not positive, a wrong shape, NaN.
 
     >>> Gyro(noise=0.01).noise.shape
     (3,)
@@ -120,7 +124,7 @@ class Accelerometer(_Vector):
     sensor's place, m, body frame: from the reference point of the `Inertia`, or in the frame of the
     `MassProperties`; `gravity` (3,) m/s², world frame: `None` for a body in free fall (`Spin`,
     `Attitude`), needed by a body on a pivot and by a `Rigid`; `bias`, `scale`, `mounting`, `skew`,
-    `limit`, `offset`, `lowpass` as for `Gyro`. **Raises** `ValueError` as `Gyro`.
+    `limit`, `offset`, `jitter`, `lowpass` as for `Gyro`. **Raises** `ValueError` as `Gyro`.
 
     >>> Accelerometer(noise=0.1, place=[0.01, 0.0, 0.0]).unit
     'm/s²'
@@ -142,8 +146,8 @@ class Magnetometer(_Vector):
 
     **Arguments:** `noise` in the field's unit, one number or (3,), `None` to estimate it; `field`
     (3,) b, world frame, any unit; `bias` (the body's own magnetism), `scale`, `mounting`, `skew`,
-    `limit`, `offset`, `lowpass` as for `Gyro`. For a direction without a strength use `Direction`.
-    **Raises** `ValueError` as `Gyro`.
+    `limit`, `offset`, `jitter`, `lowpass` as for `Gyro`. For a direction without a strength use
+    `Direction`. **Raises** `ValueError` as `Gyro`.
 
     >>> Magnetometer(noise=1e-7, field=[2e-5, 0.0, 4e-5]).reading_shape
     (3,)

@@ -1,0 +1,131 @@
+"""Time stamps that scatter: whitened errors against NumPy, and simulated throws."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rigidjax as rj
+from rigidjax import estimate, identify
+from rigidjax.estimate.scene import sensors_of
+from rigidjax.identify.terms import independent
+
+BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
+TRUTH = np.array([1.0 / 2.1, 1.6 / 2.1])
+TS = np.linspace(0.0, 1.0, 101)
+TAU, SIGMA, THROWS = 5e-3, 0.02, 40
+
+
+def throw(seed, tau=TAU):
+    """Rates of a throw at 8 rad/s, each read at a time of its own."""
+    way = np.random.default_rng(seed).normal(size=3)
+    start = rj.Spin(8.0 * way / np.linalg.norm(way))
+    gyro = identify.Gyro(SIGMA, jitter=tau)
+    return identify.simulate_readings(gyro, BODY, start, TS, key=jax.random.key(seed))
+
+
+def fitted(gyro, rates):
+    record = identify.Recording(TS, (gyro, rates))
+    return identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=1)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("size", [0.0, 1e-3, 1.0, 1e3])
+def test_independent_errors_are_those_of_choleskys_factor(dtype, size):
+    rng = np.random.default_rng(0)
+    for k in (1, 2, 3):
+        e, v = rng.normal(size=(2, k)).astype(dtype)
+        v = (size * v).astype(dtype)
+        covariance = np.eye(k) + np.outer(v.astype(float), v.astype(float))
+        lower = np.linalg.cholesky(covariance)
+        found, logs = independent(jnp.asarray(e), jnp.asarray(v))
+        slope = jax.jacfwd(lambda e, v=v: independent(e, jnp.asarray(v))[0])(jnp.asarray(e))
+        digits = 1e-9 if dtype is np.float64 else 2e-4
+        wanted, scale = np.linalg.inv(lower), max(1.0, size)
+        np.testing.assert_allclose(found, wanted @ e, rtol=digits, atol=digits)
+        np.testing.assert_allclose(slope, wanted, rtol=digits, atol=digits)
+        np.testing.assert_allclose(np.exp(logs.sum()), np.linalg.det(covariance), rtol=digits)
+        # The length is that of Σ^(-1/2) e.
+        values, ways = np.linalg.eigh(covariance)
+        length = np.sum((ways.T @ e) ** 2 / values)
+        np.testing.assert_allclose(np.sum(np.asarray(found) ** 2), length, rtol=digits * scale)
+
+
+def test_throws_with_scattered_stamps_have_right_intervals():
+    plain, errors, held, taus, good = [], [], [], [], 0
+    for seed in range(THROWS):
+        rates = throw(seed)
+        for gyro, out in (
+            (identify.Gyro(SIGMA), plain),
+            (identify.Gyro(SIGMA, jitter="estimated"), errors),
+        ):
+            found = fitted(gyro, rates)
+            out.append(np.log([q.value for q in found.quantities[:2]] / TRUTH))
+        good += found.ok
+        ends = np.array([found.interval()[q.name] for q in found.quantities[:2]])
+        held.append((ends[:, 0] <= TRUTH) & (ends[:, 1] >= TRUTH))
+        taus.append(float(found.jitter[0]))
+        assert not found.causes
+    before, after = (np.sqrt(np.mean(np.square(x))) for x in (plain, errors))
+    print(good, before, after, np.mean(held), np.mean(taus), np.std(taus))
+    assert good >= 0.9 * THROWS and after < 0.8 * before
+    assert 0.9 <= np.mean(held) <= 0.99
+    assert abs(np.mean(taus) - TAU) < 4 * np.std(taus) / np.sqrt(THROWS)
+
+
+def test_a_regular_clock_has_next_to_no_jitter():
+    rates = throw(1, tau=1e-9)
+    plain, found = (fitted(identify.Gyro(SIGMA, jitter=j), rates) for j in (None, "estimated"))
+    assert plain.jitter == (None,) and found.jitter[0] < 1e-3 and found.ok
+    for name, ends in plain.interval().items():
+        np.testing.assert_allclose(found.interval()[name], ends, rtol=5e-3, atol=5e-3)
+
+
+def test_noise_and_jitter_at_once_and_the_report():
+    found = fitted(identify.Gyro(jitter="estimated"), throw(2))
+    assert found.ok and abs(found.noise[0][0] / SIGMA - 1) < 0.2
+    assert "time stamps of the Gyro scatter by" in str(found)
+    assert identify.report.as_dict(found)["jitter"] == [float(found.jitter[0])]
+    plain = fitted(identify.Gyro(), throw(2))
+    assert identify.compare({"plain": plain, "jitter": found})[0].name == "jitter"
+    # Errors stay those of the readings.
+    np.testing.assert_allclose(found.rms, plain.rms, rtol=0.1)
+
+
+def test_a_known_jitter_widens_what_is_expected():
+    def deviation(jitter):
+        record = identify.Recording(TS, (identify.Gyro(SIGMA, jitter=jitter), np.ones((101, 3))))
+        problem = identify.Problem(record, identify.PrincipalRatios())
+        plan = problem.start(BODY, [5.0, 4.0, 4.0])
+        return identify.expected(problem, plan)[0].deviation
+
+    assert 1.05 * deviation(None) < deviation(TAU)
+    with pytest.raises(ValueError, match="known jitter"):
+        deviation("estimated")
+
+
+@pytest.mark.parametrize("wrong", [-1e-3, 0.0, np.nan, "estimate"])
+def test_a_wrong_jitter_is_refused_in_words(wrong):
+    with pytest.raises((TypeError, ValueError), match="jitter"):
+        identify.Gyro(SIGMA, jitter=wrong)
+
+
+def test_where_jitter_has_no_meaning_it_is_refused_in_words():
+    model = estimate.Model(BODY, rj.torques.RandomTorque(1e-3))
+    with pytest.raises(ValueError, match="jitter"):
+        sensors_of([identify.Gyro(SIGMA, jitter=TAU)], model)
+    gyro = identify.Gyro(SIGMA, jitter="estimated")
+    with pytest.raises(ValueError, match="jitter in s"):
+        identify.simulate_readings(gyro, BODY, rj.Spin([0, 0, 1.0]), TS, key=jax.random.key(0))
+
+
+def test_the_log_density_is_that_of_the_full_covariance():
+    found = fitted(identify.Gyro(SIGMA, jitter="estimated"), throw(3))
+    wanted = 0.0
+    late = np.asarray(found.problem.records.readings[0].late[0])
+    for e, v in zip(np.asarray(found.residuals[0]), late, strict=True):
+        covariance = SIGMA**2 * np.eye(3) + np.outer(v, v)
+        wanted -= 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]
+        wanted -= 0.5 * e @ np.linalg.solve(covariance, e)
+    density = estimate.LogDensity(found)
+    np.testing.assert_allclose(density(density.x0), wanted, rtol=1e-10)
