@@ -675,7 +675,7 @@ leave_out(
     "identify.Problem.recording", "identify.Problem.recordings", "identify.Problem.torque",
     "identify.Problem.bodies", "identify.Problem.scenes",
     "identify.Recording.sensors", "identify.Fit.values",
-    "identify.Fit.spreads", "identify.Fit.noise", "identify.Fit.rms", "tumblers.Alias",
+    "identify.Fit.spreads", "identify.Fit.noise", "identify.Fit.jitter", "identify.Fit.rms", "tumblers.Alias",
     "tumblers.LightCurve", "tumblers.LightCurve.rivals", "identify.Comparison",
 )  # fmt: skip
 leave_out(
