@@ -331,12 +331,19 @@ def _sandwich(linear: Linearised, white: Spread, times: "Times") -> np.ndarray:
     grown = times.independent / max(times.independent - n, 0.1 * times.independent)
     channels, root = list(_channels(linear, columns)), white.root
     assert root is not None
-    meats = [grown * _meat(channels, span) for span in spans]
-    found = [root.carried(triangles, linear.places, meat) for meat in meats]
+    as_white = np.eye(triangles.shape[1])
+    # M has the information of priors, too: `H⁻¹ M H⁻¹` is `H⁻¹` and what readings change in it.
+    found = [
+        white.seen
+        + root.carried(triangles, linear.places, grown * _meat(channels, span) - as_white)
+        for span in spans
+    ]
     if records > n // 2 and records > 5:
         # Many recordings: the variance between them needs no model of their errors.
-        between = np.full((records, 1, 1), records / (records - 1))
-        found.append(root.carried(linear.scores[:, None], linear.places, between))
+        rows = np.concatenate([linear.scores[:, None], triangles], axis=1)
+        between = np.diag([records / (records - 1), *-np.ones(len(as_white))])
+        middle = np.broadcast_to(between, (records, *between.shape))
+        found.append(white.seen + root.carried(rows, linear.places, middle))
     # Never narrower than for white errors.
     all_ = np.stack([np.diag(white.seen), *(np.diag(c) for c in found)])
     least = np.maximum(all_[0], 1e-300)

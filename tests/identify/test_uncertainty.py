@@ -3,9 +3,11 @@
 import csv
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import report
 from rigidjax.identify.uncertainty import correlation_times, inverted, linearise, spread
@@ -76,3 +78,31 @@ def test_what_an_information_does_not_show_is_not_made_up():
     wanted = np.linalg.inv(good) / np.outer(units, units)
     np.testing.assert_allclose(root @ root.T, wanted, rtol=1e-12)
     assert null.shape == (0, 3)
+
+
+def test_what_a_prior_tells_is_as_sure_beside_errors_that_are_autocorrelated():
+    # Rates show moments and a wheel only up to one factor, which the wheel's prior knows to 5 %.
+    ts = np.linspace(0.0, 2.0, 120)
+    speed = rj.torques.Series(ts, 500.0 + 100.0 * np.sin(ts))
+    law = rj.torques.Flywheel(rj.torques.Wheel(2e-6, [0.0, 0.6, 0.8], speed))
+    body = rj.Inertia.from_principal(2e-4, 3e-4, 4e-4)
+    rates = np.asarray(rj.simulate(body, rj.Spin([2.0, 5.0, 1.0]), ts, law).ys.omega)
+    rng = np.random.default_rng(0)
+    errors = rng.normal(size=rates.shape)
+    for k in range(1, len(errors)):
+        errors[k] = 0.8 * errors[k - 1] + 0.6 * errors[k]
+    record = identify.Recording(ts, (identify.Gyro(0.01), rates + 0.01 * errors), torque=law)
+    wheel = identify.Free(lambda r: r.torque.momentum.inertia, "wheel", positive=True, prior=0.05)
+    found = identify.fit(identify.Problem(record, identify.Principal(3e-4), free=[wheel]), starts=1)
+    assert found.covariance_kind.startswith("sandwich")
+
+    def half(power):
+        low, high = found.interval_of(
+            lambda p: jnp.mean(jnp.log(p.body.moments)) + power * jnp.log(p.values["wheel"])
+        )
+        return float(high - low) / 2
+
+    alone, product, ratio = half(0.0), half(1.0), half(-1.0)
+    print(alone, product, ratio)
+    assert alone == pytest.approx(1.96 * 0.05, rel=0.1)
+    assert product == pytest.approx(2 * alone, rel=0.05) and ratio < 0.2 * alone
