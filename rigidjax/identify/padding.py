@@ -105,10 +105,17 @@ def lengthened(recording: Recording, count: int, rows: int = 0) -> Recording:
         is_leaf=_is_table,
     )
     t, readings = recording.t, recording.readings
-    parts = [(r.values, r.mask) for r in readings]
+    parts = [(r.values, r.mask, r.late) for r in readings]
     if missing:
         t = _repeat_last(t, missing)
-        parts = [(_repeat_last(v, missing), _repeat_last(m, missing, False)) for v, m in parts]
+        parts = [
+            (
+                _repeat_last(values, missing),
+                _repeat_last(mask, missing, False),
+                None if late is None else _repeat_last(late, missing),
+            )
+            for values, mask, late in parts
+        ]
     return eqx.tree_at(
         lambda r: (r.t, r.torque, r.readings),
         recording,

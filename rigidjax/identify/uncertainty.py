@@ -492,10 +492,10 @@ def estimate_noise(
             sigma = jnp.broadcast_to(jnp.asarray(found, sigma.dtype)[:, None], sigma.shape)
         if reading.late is not None:
             change = changes(parameters, problem)[index]
-            root = np.sqrt(np.asarray(weight, float) / share) * kept.all(axis=-1)
-            e, u = (np.asarray(x) / np.asarray(sigma, float)[:, None] for x in (error, change))
+            root, size = np.sqrt(np.asarray(weight, float) / share), np.asarray(sigma, float)
+            e, u = (np.where(kept, np.asarray(x) / size[:, None], 0.0) for x in (error, change))
             tau = None if sensor.jitter.estimated else np.asarray(sensor.jitter.deviation)
-            both = _jitter(e * root[..., None], u, groups, known, tau)
+            both = _jitter(e * root[..., None], u, kept.sum(axis=-1), groups, known, tau)
             grown, tau = (jnp.asarray(each, sigma.dtype) for each in both)
             sigma = sigma * grown[:, None]
             readings[index] = reading.scattered(tau[:, None, None] * change, tau)
@@ -504,11 +504,17 @@ def estimate_noise(
 
 
 def _jitter(
-    e: np.ndarray, u: np.ndarray, groups: np.ndarray, known: bool, tau: np.ndarray | None
+    e: np.ndarray,
+    u: np.ndarray,
+    count: np.ndarray,
+    groups: np.ndarray,
+    known: bool,
+    tau: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The most likely σ and τ (R,) of errors e (R, T, k) of covariances `σ² + τ² u uᵀ`, alike in a
-    group; a `known` σ is 1, a known τ is given. In turn τ² by Fisher's scoring of the squares along
-    u, whose mean is `σ² + τ² |u|²`, and σ² by expectation and maximisation.
+    group, `count` (R, T) channels seen; a `known` σ is 1, a known τ is given. In turn τ² by
+    Fisher's scoring of the squares along u, whose mean is `σ² + τ² |u|²`, and σ² by expectation and
+    maximisation.
     """
     size, total = np.sum(u**2, axis=-1), np.sum(e**2, axis=-1)
     seen = total > 0
@@ -528,7 +534,7 @@ def _jitter(
             wide = p + q * size
             delay, unsure = q * dot / wide, p * q / wide
             left = total - 2 * delay * dot + size * (delay**2 + unsure)
-            p = np.maximum(ratio(left, np.full(left.shape, e.shape[-1])), 1e-12)
+            p = np.maximum(ratio(left, count), 1e-12)
         if np.allclose((p, q), before, rtol=1e-9, atol=0.0):
             break
     return np.sqrt(p[:, 0]), np.sqrt(q[:, 0])

@@ -104,9 +104,24 @@ def test_a_known_jitter_widens_what_is_expected():
         deviation("estimated")
 
 
+def test_a_profile_has_the_jitter_of_the_fit():
+    found = fitted(identify.Gyro(SIGMA, jitter="estimated"), throw(0))
+    for name in ("Ix/Iz", "Iy/Iz"):
+        low, high = found.interval()[name]
+        ends = identify.profile(found, name)
+        np.testing.assert_allclose(ends, (low, high), atol=0.05 * (high - low))
+
+
+def test_channels_at_full_scale_do_not_hide_the_jitter_of_the_others():
+    rates = np.clip(throw(0), -6.0, 6.0)
+    assert (np.abs(rates).max(axis=1) == 6.0).mean() > 0.9
+    found = fitted(identify.Gyro(SIGMA, jitter="estimated", limit=6.0), rates)
+    assert found.ok and abs(found.jitter[0] / TAU - 1) < 0.2
+
+
 @pytest.mark.parametrize("wrong", [-1e-3, 0.0, np.nan, "estimate"])
 def test_a_wrong_jitter_is_refused_in_words(wrong):
-    with pytest.raises((TypeError, ValueError), match="jitter"):
+    with pytest.raises(ValueError, match='jitter: wanted a positive number of seconds or "estim'):
         identify.Gyro(SIGMA, jitter=wrong)
 
 

@@ -125,9 +125,11 @@ def jitter_of(given: Any) -> Jitter | None:
     """The jitter of a positive number, s, or of `"estimated"`; `None` stays."""
     if given is None or isinstance(given, Jitter):
         return given
-    if isinstance(given, str) and given == "estimated":
-        return Jitter(jnp.zeros(()), True)
     wanted = 'a positive number of seconds or "estimated"'
+    if isinstance(given, str):
+        if given != "estimated":
+            raise ValueError(f"jitter: wanted {wanted}, got {given!r}")
+        return Jitter(jnp.zeros(()), True)
     return Jitter(jnp.asarray(_checks.positive(given, "jitter", wanted)), False)
 
 
