@@ -125,37 +125,38 @@ class Root(eqx.Module):
     """A root of the covariance of n numbers for white errors, in units of `size` (n,).
 
     `lift` (n, s): how all numbers follow those that recordings share, of root `core` (s, r); `own`
-    the places and roots of the numbers of one recording alone; `null` (k, n) orthonormal rows.
+    the places (k,) and roots (k, j) of the numbers of one recording alone, and the rows (p, k + s)
+    of priors of these and of shared ones; `ties` (q, s) those of shared ones; `null` (i, n)
+    orthonormal directions that are not determined.
     """
 
     size: np.ndarray
     lift: np.ndarray
     core: np.ndarray
-    own: tuple[tuple[np.ndarray, np.ndarray], ...]
+    own: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]
+    ties: np.ndarray
     null: np.ndarray
 
-    def carried(self, rows: Any, where: np.ndarray, middle: np.ndarray) -> np.ndarray:
-        """`H⁻¹ M H⁻¹` (n, n), M the sum over recordings of `rowsᵀ middle rows` at `where` (R, m).
-
-        `rows` (R, q, m), `middle` (R, q, q).
+    def carried(self, rows: np.ndarray, where: np.ndarray, middle: np.ndarray) -> np.ndarray:
+        """`H⁻¹ M H⁻¹` (n, n), M the sum over recordings of `rowsᵀ middle rows` at `where` (R, m),
+        and of the information of priors. `rows` (R, q, m), `middle` (R, q, q).
         """
-        n, wide = self.size.size, np.append(1.0 / self.size, 0.0)
-        lift = np.concatenate([self.lift, np.zeros((1, self.lift.shape[1]))])
-        a = rows * wide[where][:, None, :]
-        shared = self.core @ (self.core.T @ (a @ lift[where]).swapaxes(1, 2))
-        total = np.sum(shared @ middle @ shared.swapaxes(1, 2), axis=0)
-        cross, out = np.zeros((n, self.lift.shape[1])), self.lift @ total @ self.lift.T
-        blocks = []
-        for (mine, root), columns, one, y, m in zip(
-            self.own, where, a, shared, middle, strict=True
-        ):
-            z = root @ (root.T @ one[:, _found(mine, columns)].T)
-            cross[mine] = z @ m @ y.T
-            blocks.append((np.ix_(mine, mine), z @ m @ z.T))
+        wide, lift = (np.concatenate([x, 0 * x[:1]]) for x in (1.0 / self.size, self.lift))
+        rows, inverse = rows * wide[where][:, None, :], self.core @ self.core.T
+        total = inverse @ self.ties.T @ self.ties @ inverse
+        cross, blocks = np.zeros_like(self.lift), []
+        for (mine, root, ties), columns, one, m in zip(self.own, where, rows, middle, strict=True):
+            count, alone = mine.size, root @ root.T
+            read = alone @ one[:, _found(mine, columns)].T, inverse @ (one @ lift[columns]).T
+            tied = ties[:, count:] + ties[:, :count] @ lift[mine]
+            held = alone @ ties[:, :count].T, inverse @ tied.T
+            total = total + read[1] @ m @ read[1].T + held[1] @ held[1].T
+            cross[mine] = read[0] @ m @ read[1].T + held[0] @ held[1].T
+            blocks.append(read[0] @ m @ read[0].T + held[0] @ held[0].T)
         both = cross @ self.lift.T
-        out = out + both + both.T
-        for at, block in blocks:
-            out[at] += block
+        out = self.lift @ total @ self.lift.T + both + both.T
+        for (mine, *_), block in zip(self.own, blocks, strict=True):
+            out[np.ix_(mine, mine)] += block
         return self._whole(out)
 
     @property
@@ -163,7 +164,7 @@ class Root(eqx.Module):
         """`H⁻¹` (n, n) within the directions that are determined."""
         half = self.lift @ self.core
         out = half @ half.T
-        for mine, root in self.own:
+        for mine, root, _ in self.own:
             out[np.ix_(mine, mine)] += root @ root.T
         return self._whole(out)
 
@@ -216,23 +217,25 @@ def of_white(linear: Linearised) -> Spread:
     of = np.where(extra != 0, owner, -1).max(axis=1, initial=-1)
     lift = np.zeros((n, shared.size))
     lift[shared, np.arange(shared.size)] = 1.0
-    rest, own, values, null = [np.diag(firm[shared]), extra[of < 0][:, shared]], [], [], []
+    ties = np.concatenate([np.diag(firm[shared]), extra[of < 0][:, shared]])
+    rest, own, values, null = [ties], [], [], []
     for record, (triangle, columns) in enumerate(zip(triangles, linear.places, strict=True)):
         mine = np.flatnonzero(owner == record)
         wide, held = np.zeros((len(triangle), n + 1)), np.zeros((mine.size, n))
         wide[:, columns], held[np.arange(mine.size), mine] = triangle, firm[mine]
-        rows = np.concatenate([wide[:, :-1] / size, extra[of == record], held])
+        priors = np.concatenate([extra[of == record], held])
+        rows = np.concatenate([wide[:, :-1] / size, priors])
         range_, root, blind, singular = _parts(rows[:, mine])
         taken = range_.T @ rows[:, shared]
         lift[mine] = -root @ taken
         rest.append(np.linalg.qr(rows[:, shared] - range_ @ taken, mode="r"))
-        own.append((mine, root))
+        own.append((mine, root, np.concatenate([priors[:, mine], priors[:, shared]], axis=1)))
         values.append(singular)
         null.append(np.zeros((len(blind), n)))
         null[-1][:, mine] = blind
     _, core, blind, singular = _parts(np.concatenate(rest))
     null.append(blind @ lift.T)
-    root = Root(size, lift, core, tuple(own), np.linalg.qr(np.concatenate(null).T)[0].T)
+    root = Root(size, lift, core, tuple(own), ties, np.linalg.qr(np.concatenate(null).T)[0].T)
     directions = root.null / size
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     covariance = root.covariance
@@ -331,19 +334,12 @@ def _sandwich(linear: Linearised, white: Spread, times: "Times") -> np.ndarray:
     grown = times.independent / max(times.independent - n, 0.1 * times.independent)
     channels, root = list(_channels(linear, columns)), white.root
     assert root is not None
-    as_white = np.eye(triangles.shape[1])
-    # M has the information of priors, too: `H⁻¹ M H⁻¹` is `H⁻¹` and what readings change in it.
-    found = [
-        white.seen
-        + root.carried(triangles, linear.places, grown * _meat(channels, span) - as_white)
-        for span in spans
-    ]
+    meats = [grown * _meat(channels, span) for span in spans]
+    found = [root.carried(triangles, linear.places, meat) for meat in meats]
     if records > n // 2 and records > 5:
         # Many recordings: the variance between them needs no model of their errors.
-        rows = np.concatenate([linear.scores[:, None], triangles], axis=1)
-        between = np.diag([records / (records - 1), *-np.ones(len(as_white))])
-        middle = np.broadcast_to(between, (records, *between.shape))
-        found.append(white.seen + root.carried(rows, linear.places, middle))
+        between = np.full((records, 1, 1), records / (records - 1))
+        found.append(root.carried(linear.scores[:, None], linear.places, between))
     # Never narrower than for white errors.
     all_ = np.stack([np.diag(white.seen), *(np.diag(c) for c in found)])
     least = np.maximum(all_[0], 1e-300)

@@ -130,9 +130,14 @@ def linear_at(problem, sigma=0.01):
     return uncertainty.linearise(problem, start, (jnp.full((problem.count, 3), sigma),))
 
 
+def near_a_guess():
+    """A problem of one recording, with a prior of the body."""
+    return identify.Problem(records(1), identify.Ratios(), prior=identify.Entropic(BODY, 50.0))
+
+
 @pytest.mark.parametrize("count", [1, 3, 9])
 def test_the_covariance_is_the_inverse_of_the_information(count):
-    problem = several(count) if count > 1 else identify.Problem(records(1), identify.Ratios())
+    problem = several(count) if count > 1 else near_a_guess()
     linear = linear_at(problem)
     rows = jacobian(linear)
     wanted = np.linalg.pinv(rows) @ np.linalg.pinv(rows).T
@@ -144,13 +149,15 @@ def test_the_covariance_is_the_inverse_of_the_information(count):
     assert len(found.null_directions) == 0
 
 
-def test_the_sandwich_is_the_product_of_its_definition():
-    linear = linear_at(several())
+@pytest.mark.parametrize("count", [1, 9])
+def test_the_sandwich_is_the_product_of_its_definition(count):
+    linear = linear_at(several(9) if count > 1 else near_a_guess())
     white = uncertainty.of_white(linear)
     _, triangles = np.linalg.qr(linear.dense)
-    meat = RNG.normal(size=(9, triangles.shape[2], triangles.shape[1]))
+    meat = RNG.normal(size=(count, triangles.shape[2], triangles.shape[1]))
     meat = meat @ meat.swapaxes(1, 2)
-    middle = np.zeros((linear.size, linear.size))
+    # Priors have their own information in the middle.
+    middle = np.diag(linear.firm**2) + linear.extra_slopes.T @ linear.extra_slopes
     for triangle, where, m in zip(triangles, linear.places, meat, strict=True):
         wide = np.zeros((len(triangle), linear.size + 1))
         wide[:, where] = triangle

@@ -166,7 +166,9 @@ def stand_in():
     """What the pictures ask of a fit, without a fit: one reading is wild, λ known to 10 %."""
     errors = 0.01 * np.random.default_rng(2).standard_normal((101, 3))
     errors[7] = 1.0
-    reading = SimpleNamespace(sensor=rj.identify.Gyro(0.01), seen=np.ones(101, dtype=bool))
+    reading = SimpleNamespace(
+        sensor=rj.identify.Gyro(0.01), seen=np.ones(101, dtype=bool), late=None
+    )
     shaped = lambda p: rj.Inertia.from_second_moment(jnp.diag(jnp.exp(p)))
     return SimpleNamespace(
         problem=SimpleNamespace(
