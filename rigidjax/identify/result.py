@@ -46,16 +46,16 @@ class Fit(eqx.Module):
 
     **Fields:** `problem` that was fitted; `parameters` the free numbers at the best point;
     `covariance` (n, n) of them, flattened in order, infinite for undetermined numbers, `seen` the
-    same within the determined directions, `covariance_kind` its method; `noises` (R, k)
-    for each sensor; `starts` a `Start` each; `chi2` and `dof` of the whitened errors of the sensors
-    whose noise was given; `correlation` the number of samples over which the errors are
-    autocorrelated, 1 for white ones, and `independent` the number of independent errors;
-    `singular_values` (n,) of the whitened Jacobian, its columns of length one; `null_directions`
-    (k, n) that the data do not determine; `quantities` all reported quantities, by name; `search`
-    the first answer, whose `word` is `found`, `not alone` or `not ended`; `model` the second one:
-    `explains the readings`, `leaves a part`, `does not explain the readings`; `left` the indices of
-    the sensors whose errors it does not explain; `limits` the distance of each body from a flat
-    one; `near` the point of the derivatives beside a flat body, else `None`.
+    same within the determined directions, `covariance_kind` its method; `noises` (R, k) for each
+    sensor; `starts` a `Start` each; `chi2` and `dof` of the whitened errors of the sensors whose
+    noise was given; `correlation` the number of samples over which the errors are autocorrelated, 1
+    for white ones, and `independent` the number of independent errors; `singular_values` (n,) of
+    the whitened Jacobian, its columns of length one, with the numbers of one recording alone apart;
+    `null_directions` (k, n) that the data do not determine; `quantities` all reported quantities,
+    by name; `search` the first answer, whose `word` is `found`, `not alone` or `not ended`; `model`
+    the second one: `explains the readings`, `leaves a part`, `does not explain the readings`;
+    `left` the indices of the sensors whose errors it does not explain; `limits` the distance of
+    each body from a flat one; `near` the point of the derivatives beside a flat body, else `None`.
 
     >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
     >>> [quantity.name for quantity in found.quantities[:2]], found.covariance.shape
