@@ -146,17 +146,19 @@ def fit(
         best, task = _with_noise(again(best, task), task)
         best = _evaluated(best, task.problem)
     found = assess(task.problem, best, task.noise, tried, lowest, cut, rough)
-    # Of the readings as they were given.
-    own = eqx.tree_at(lambda p: p.records, task.problem, given.records)
-    pairs = zip(given.records.readings, task.problem.records.readings, strict=True)
+    return eqx.tree_at(lambda one: one.problem, found, _as_given(given, task.problem))
+
+
+def _as_given(given: Problem, fitted: Problem) -> Problem:
+    """The problem that was fitted, of the readings as they were given, with their jitter."""
     readings = tuple(
         one
         if r.late is None
         else one.scattered(r.late[:, : one.mask.shape[1]], cast(Any, r.sensor).jitter.deviation)
-        for one, r in pairs
+        for one, r in zip(given.records.readings, fitted.records.readings, strict=True)
     )
-    own = eqx.tree_at(lambda p: p.records.readings, own, readings)
-    return eqx.tree_at(lambda one: one.problem, found, own)
+    own = eqx.tree_at(lambda p: p.records, fitted, given.records)
+    return eqx.tree_at(lambda p: p.records.readings, own, readings)
 
 
 def _cost(tried: Tried) -> float:

@@ -134,9 +134,8 @@ def _after(
 ) -> Search:
     """The state of the search after an evaluation of the trial point, with the next trial."""
     found, cost, normal, slope = trial
-    finite = jnp.isfinite(cost)
-    for leaf in jax.tree.leaves((normal, slope)):
-        finite = finite & jnp.isfinite(leaf).all()
+    parts = jax.tree.leaves((cost, normal, slope))
+    finite = jnp.stack([jnp.isfinite(part).all() for part in parts]).all()
     first = now.taken == 0
     better = finite & ((cost < now.cost) | first)
     ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
