@@ -7,7 +7,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.quantities import quantities
+from rigidjax.identify.quantities import quantities, values_and_slopes
 
 RECORDS = 200
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -91,7 +91,8 @@ def test_intervals_hold_the_truth_as_often_as_they_say(scene):
         plan = problem.start(BODY, omega)
         if truth is None:
             n = sum(x.size for x in jax.tree.leaves(plan))
-            named = quantities(problem, plan, np.eye(n), np.zeros((0, n)))
+            found = values_and_slopes(problem, plan, None)
+            named = quantities(problem, found, np.eye(n), np.zeros((0, n)))
             truth = {q.name: q.value for q in named if not q.name.startswith(("drag", "bias"))}
         found = identify.fit(problem, starts=1, initial=plan)
         bounds = found.interval(0.95)
