@@ -151,14 +151,13 @@ def fit(
 
 def _as_given(given: Problem, fitted: Problem) -> Problem:
     """The problem that was fitted, of the readings as they were given, with their jitter."""
-    readings = tuple(
-        one
-        if r.late is None
-        else one.scattered(r.late[:, : one.mask.shape[1]], cast(Any, r.sensor).jitter.deviation)
-        for one, r in zip(given.records.readings, fitted.records.readings, strict=True)
-    )
-    own = eqx.tree_at(lambda p: p.records, fitted, given.records)
-    return eqx.tree_at(lambda p: p.records.readings, own, readings)
+    records = given.records
+    for index, r in enumerate(fitted.records.readings):
+        if r.late is not None:
+            one, jitter = records.readings[index], cast(Any, r.sensor).jitter
+            one = one.scattered(r.late[:, : one.mask.shape[1]], jitter.deviation)
+            records = eqx.tree_at(lambda a, i=index: a.readings[i], records, one)
+    return eqx.tree_at(lambda p: p.records, fitted, records)
 
 
 def _cost(tried: Tried) -> float:

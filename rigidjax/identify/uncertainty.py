@@ -392,11 +392,12 @@ def _fading(x: np.ndarray, rho: float) -> np.ndarray:
     """The sums y_t = x_t + ρ y_{t−1} along the second axis of (R, T, n)."""
     # Imported where it is used; not `scipy.signal.lfilter`, nor `scipy.stats` below: to load each
     # takes a second, which is as long as the rest of a first fit's imports.
-    from scipy.linalg import solve_banded
+    from scipy.linalg import get_lapack_funcs
 
     x = np.moveaxis(x, 1, 0)
     bands = np.array([[1.0], [-rho]]) * np.ones(x.shape[0])
-    y = solve_banded((1, 0), bands, x.reshape(x.shape[0], -1))
+    (solve,) = get_lapack_funcs(("tbtrs",), (x,))
+    y, _ = solve(bands, x.reshape(x.shape[0], -1), uplo="L")
     return np.moveaxis(y.reshape(x.shape), 0, 1)
 
 
@@ -496,7 +497,9 @@ def estimate_noise(
             sigma = sigma * grown[:, None]
             readings[index] = reading.scattered(tau[:, None, None] * change, tau)
         out.append(sigma)
-    return eqx.tree_at(lambda p: p.records.readings, problem, tuple(readings)), tuple(out)
+    if any(reading.late is not None for reading in readings):
+        problem = eqx.tree_at(lambda p: p.records.readings, problem, tuple(readings))
+    return problem, tuple(out)
 
 
 def _jitter(
