@@ -396,7 +396,7 @@ def _fading(x: np.ndarray, rho: float) -> np.ndarray:
 
     x = np.moveaxis(x, 1, 0)
     bands = np.array([[1.0], [-rho]]) * np.ones(x.shape[0])
-    (solve,) = get_lapack_funcs(("tbtrs",), (x,))
+    (solve,) = get_lapack_funcs(("tbtrs",), dtype=np.float64)
     y, _ = solve(bands, x.reshape(x.shape[0], -1), uplo="L")
     return np.moveaxis(y.reshape(x.shape), 0, 1)
 
