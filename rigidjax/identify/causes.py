@@ -144,7 +144,7 @@ def causes(
         cause = clock(problem, noise, linear, index)
         if cause is None and _of_three(sensor):
             rows = _table(problem, parameters, noise, linear, index)
-            given = problem, noise, linear, index, which, free
+            given = problem, noise, linear, index, free
             shares = [_explained(*given, row[1]) for row in rows]
             cause = _largest(sensor, rows, shares)
         if cause is None and hasattr(sensor, "suspect"):
@@ -282,12 +282,11 @@ def _explained(
     noise: Noise,
     linear: Linearised,
     index: int,
-    which: Sequence[int],
     free: np.ndarray,
     direction: np.ndarray,
 ) -> tuple[float, np.ndarray]:
-    """The share of squared errors that a direction (R, T, k, c) explains beside the orthonormal
-    columns `free` (R, N, m) of the free numbers, and its coefficient.
+    """The share of a sensor's squared errors that a direction (R, T, k, c) explains beside the
+    orthonormal columns `free` (R, N, m) of the free numbers, and its coefficient.
     """
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]
@@ -304,5 +303,5 @@ def _explained(
 
     u, s, v = np.linalg.svd(besides(columns, size.size), full_matrices=False)
     told = np.where(s > APART, u.T @ besides(errors, 1)[:, 0], 0.0)
-    total = sum(float(np.sum(errors[i] ** 2)) for i in which)
+    total = float(np.sum(errors[index] ** 2))
     return min(float(told @ told) / total, 1.0), v.T @ (told / np.maximum(s, APART)) / size
