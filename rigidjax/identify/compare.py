@@ -64,9 +64,9 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
         several = int(np.max(found.problem.noise_groups)) + 1
         size = int(found.covariance.shape[0])
         size += several * sum(jitter is not None and jitter.estimated for jitter in jitters)
-        independent = np.array(counts[name]) / shortest
-        misfit = independent @ _log_squares(found)
-        rows.append((misfit + size * np.log(max(independent.sum(), 2.0)), name, size, found))
+        many = np.array(counts[name]) / shortest
+        misfit = many @ _log_squares(found)
+        rows.append((misfit + size * np.log(max(many.sum(), 2.0)), name, size, found))
     rows.sort(key=lambda row: row[0])
     best = rows[0][0]
     return tuple(
@@ -76,7 +76,9 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 
 
 def _log_squares(found: Fit) -> np.ndarray:
-    """The logarithm of each sensor's mean square error; with jitter of white errors as likely."""
+    """The logarithm of each sensor's mean square error; with jitter, of white errors that are as
+    likely as these.
+    """
     out, problem = 2.0 * np.log(np.maximum(found.rms, 1e-300)), found.problem
     white = whitened(problem, evaluate(found.parameters, problem)[0][0], found.noises)
     for index, (reading, e, sigma) in enumerate(

@@ -25,6 +25,7 @@ from rigidjax.identify.checkpoint import (
 )
 from rigidjax.identify.initial_guess import starting_points
 from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces
+from rigidjax.identify.noise import estimate_noise
 from rigidjax.identify.parameters import Parameters, by_slot, numbered
 from rigidjax.identify.problem import Problem, fits
 from rigidjax.identify.propagation import AbstractIntegrator, Adaptive
@@ -43,7 +44,7 @@ from rigidjax.identify.search import (
 )
 from rigidjax.identify.stochastic_gradient import Descent, descend
 from rigidjax.identify.terms import Noise, all_errors
-from rigidjax.identify.uncertainty import estimate_noise, linearise, of_white
+from rigidjax.identify.uncertainty import linearise, of_white
 
 # Steps are fine enough if finer ones change no prediction by more of its noise.
 _MATTERS = 0.05

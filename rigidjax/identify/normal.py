@@ -66,7 +66,7 @@ class Normal(eqx.Module):
         return self._joined(first, jnp.einsum("rkl,rl->rk", alone.own, own) + beside)
 
     def solve(self, side: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
-        """What the matrix must be multiplied with to give `side`; NaN unless it is positive."""
+        """The x with `matrix @ x = side`; NaN unless the matrix is positive definite."""
         alone, count = self.alone, self.core.shape[0]
         if alone is None:
             return _solve(self.core, side)

@@ -2,26 +2,22 @@
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any, cast
+from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.search import evaluate, linked_rows
-from rigidjax.identify.terms import Noise, changes, firm, weights_of, whitened, with_rows
+from rigidjax.identify.terms import Noise, firm, weights_of, whitened, with_rows
 
 # A direction is undetermined if its singular value is below this share of the largest.
 BLIND = 1e-8
 # Columns of the Jacobian are scaled to length one, unless shorter than this share of the longest.
 WEAKEST = 1e-6
-# Rounds of the search for two variances.
-ROUNDS = 500
 
 
 class Linearised(eqx.Module):
@@ -137,7 +133,7 @@ class Root(eqx.Module):
     ties: np.ndarray
     null: np.ndarray
 
-    def carried(self, rows: np.ndarray, where: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    def sandwich(self, rows: np.ndarray, where: np.ndarray, middle: np.ndarray) -> np.ndarray:
         """`H⁻¹ M H⁻¹` (n, n), M the sum over recordings of `rowsᵀ middle rows` at `where` (R, m),
         and of the information of priors. `rows` (R, q, m), `middle` (R, q, q).
         """
@@ -335,11 +331,11 @@ def _sandwich(linear: Linearised, white: Spread, times: "Times") -> np.ndarray:
     channels, root = list(_channels(linear, columns)), white.root
     assert root is not None
     meats = [grown * _meat(channels, span) for span in spans]
-    found = [root.carried(triangles, linear.places, meat) for meat in meats]
+    found = [root.sandwich(triangles, linear.places, meat) for meat in meats]
     if records > n // 2 and records > 5:
         # Many recordings: the variance between them needs no model of their errors.
         between = np.full((records, 1, 1), records / (records - 1))
-        found.append(root.carried(linear.scores[:, None], linear.places, between))
+        found.append(root.sandwich(linear.scores[:, None], linear.places, between))
     # Never narrower than for white errors.
     all_ = np.stack([np.diag(white.seen), *(np.diag(c) for c in found)])
     least = np.maximum(all_[0], 1e-300)
@@ -456,84 +452,3 @@ def _channel_time(e: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
             break
         total += 2.0 * rho
     return float(total), float(first)
-
-
-def estimate_noise(
-    problem: Problem, errors: tuple, noise: Noise, parameters: Parameters
-) -> tuple[Problem, Noise]:
-    """Noise (R, k) of each sensor: as given, or the weighted scatter of its errors, one figure for
-    all channels and the recordings of a group. The problem with the jitter of its sensors likewise.
-    """
-    free = ravel_pytree(parameters)[0].size
-    weights = weights_of(problem, errors, noise)
-    share = max(1.0 - free / problem.records.size, 0.1)
-    groups, out = np.asarray(problem.noise_groups), []
-    readings = list(problem.records.readings)
-    cut = at_limit(readings)
-    for index, (reading, error, sigma, weight, full) in enumerate(
-        zip(readings, errors, noise, weights, cut, strict=True)
-    ):
-        # The error of a reading at full scale is no noise.
-        sensor, kept = cast(Any, reading.sensor), reading.seen[..., None] & ~full
-        known = sensor.noise is not None
-        if known:
-            sigma = sensor.noise
-        else:
-            squares = np.asarray(weight)[..., None] * np.asarray(error) ** 2
-            squares = np.sum(np.where(kept, squares, 0.0), axis=(1, 2))
-            seen = kept.sum(axis=(1, 2))
-            variance = np.bincount(groups, squares) / np.maximum(np.bincount(groups, seen), 1)
-            # Data without noise must not divide by zero: the least noise is round-off.
-            floor = 1e-15 * float(jnp.abs(reading.values).max() + 1e-300)
-            found = np.maximum(np.sqrt(variance / share), floor)[groups]
-            sigma = jnp.broadcast_to(jnp.asarray(found, sigma.dtype)[:, None], sigma.shape)
-        if reading.late is not None:
-            change = changes(parameters, problem)[index]
-            root, size = np.sqrt(np.asarray(weight, float) / share), np.asarray(sigma, float)
-            e, u = (np.where(kept, np.asarray(x) / size[:, None], 0.0) for x in (error, change))
-            tau = None if sensor.jitter.estimated else np.asarray(sensor.jitter.deviation)
-            both = _jitter(e * root[..., None], u, kept.sum(axis=-1), groups, known, tau)
-            grown, tau = (jnp.asarray(each, sigma.dtype) for each in both)
-            sigma = sigma * grown[:, None]
-            readings[index] = reading.scattered(tau[:, None, None] * change, tau)
-        out.append(sigma)
-    if any(reading.late is not None for reading in readings):
-        problem = eqx.tree_at(lambda p: p.records.readings, problem, tuple(readings))
-    return problem, tuple(out)
-
-
-def _jitter(
-    e: np.ndarray,
-    u: np.ndarray,
-    count: np.ndarray,
-    groups: np.ndarray,
-    known: bool,
-    tau: np.ndarray | None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The most likely σ and τ (R,) of errors e (R, T, k) of covariances `σ² + τ² u uᵀ`, alike in a
-    group, `count` (R, T) channels seen; a `known` σ is 1, a known τ is given. In turn τ² by
-    Fisher's scoring of the squares along u, whose mean is `σ² + τ² |u|²`, and σ² by expectation and
-    maximisation.
-    """
-    size, total = np.sum(u**2, axis=-1), np.sum(e**2, axis=-1)
-    seen = total > 0
-    dot = np.sum(e * u, axis=-1)
-    along = dot**2 / np.maximum(size, 1e-300)
-
-    def ratio(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        x, y = (np.bincount(groups, np.sum(each * seen, axis=1)) for each in (x, y))
-        return (x / np.maximum(y, 1e-300))[groups][:, None]
-
-    p, q = np.ones((len(e), 1)), np.zeros((len(e), 1)) if tau is None else tau[:, None] ** 2
-    for _ in range(ROUNDS):
-        before, weight = (p, q), (p + q * size) ** -2.0
-        if tau is None:
-            q = np.maximum(ratio(weight * size * (along - p), weight * size**2), 0.0)
-        if not known:
-            wide = p + q * size
-            delay, unsure = q * dot / wide, p * q / wide
-            left = total - 2 * delay * dot + size * (delay**2 + unsure)
-            p = np.maximum(ratio(left, count), 1e-12)
-        if np.allclose((p, q), before, rtol=1e-9, atol=0.0):
-            break
-    return np.sqrt(p[:, 0]), np.sqrt(q[:, 0])

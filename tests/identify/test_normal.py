@@ -163,7 +163,7 @@ def test_the_sandwich_is_the_product_of_its_definition(count):
         wide[:, where] = triangle
         middle += wide[:, :-1].T @ m @ wide[:, :-1]
     wanted = white.seen @ middle @ white.seen
-    found = white.root.carried(triangles, linear.places, meat)
+    found = white.root.sandwich(triangles, linear.places, meat)
     size = np.sqrt(np.diag(wanted))
     np.testing.assert_allclose(
         found / np.outer(size, size), wanted / np.outer(size, size), atol=1e-7
