@@ -216,7 +216,8 @@ def _root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
     # derivative.
     root, one = _root(*primals), jnp.eye(3, dtype=primals[0].dtype)
     sums = jnp.kron(root, one) + jnp.kron(one, root)
-    return root, jnp.linalg.solve(sums, tangents[0].reshape(9)).reshape(3, 3)
+    change = 0.5 * (tangents[0] + tangents[0].T)
+    return root, jnp.linalg.solve(sums, change.reshape(9)).reshape(3, 3)
 
 
 def _not_a_point(total: Scalar) -> Scalar:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
+from rigidjax.rotation.barrier import batched_as
 
 # Arguments and results of all functions: real numbers of shapes that broadcast.
 Real = Float[ArrayLike, "..."]
@@ -49,7 +50,7 @@ def complementary(name: str, value: Any, complement: Any) -> dict[str, Any]:
 @jax.custom_jvp
 def exact_complement(value: Result, complement: Result) -> Any:
     """`value`, whose derivative by its `complement` is −1 and by itself 0."""
-    return value
+    return batched_as(value, complement)
 
 
 @exact_complement.defjvp

@@ -35,6 +35,7 @@ from rigidjax.identify.terms import (
 )
 from rigidjax.motion.manifold import dimension
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
+from rigidjax.rotation.barrier import batched_as
 
 # The advice if a fit without the torque ended far from the body.
 _GUESS = (
@@ -186,12 +187,13 @@ def terms(density: LogDensity, x: Float[Array, " n"]) -> Terms:
     @jax.custom_jvp
     def of(rows: Array) -> Terms:
         of_one = partial(_of_one, density)
-        return over_records(of_one, density.problem, (rows, density.noises))
+        return batched_as(over_records(of_one, density.problem, (rows, density.noises)), rows)
 
     @of.defjvp
     def _(rows: tuple, step: tuple) -> tuple[Terms, Terms]:
         out, blocks = _with_blocks(density, rows[0])
-        return out, jax.tree.map(lambda b: jnp.einsum("rni,ri->rn", b, step[0]), blocks)
+        moved = jax.tree.map(lambda b: jnp.einsum("rni,ri->rn", b, step[0]), blocks)
+        return batched_as(out, rows[0]), moved
 
     return of(_rows(density, x))
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from rigidjax._types import Mat3, Scalar, Vec3
 from rigidjax.exact.components3 import Six, Triple
-from rigidjax.rotation.barrier import one_kernel
+from rigidjax.rotation.barrier import batched_as, one_kernel
 
 # Cyclic Jacobi converges quadratically; 3×3 needs four or five sweeps from anywhere.
 _SWEEPS = 6
@@ -28,7 +28,7 @@ def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
 def in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
     """`AᵀIA`: diagonal in value."""
     zero = jnp.zeros_like(tensor[0, 0])
-    return *moments, zero, zero, zero
+    return batched_as((*moments, zero, zero, zero), (tensor, axes, moments))
 
 
 @in_axes.defjvp

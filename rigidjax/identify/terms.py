@@ -18,6 +18,7 @@ from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.identify.sensors import SensorInput
 from rigidjax.motion.coupled import motion_of
+from rigidjax.rotation.barrier import batched_as
 
 if TYPE_CHECKING:
     from rigidjax.identify.problem import Problem
@@ -124,7 +125,7 @@ def all_errors(parameters: Parameters, problem: "Problem") -> tuple[tuple[Array,
     def of_one(*trees: Any) -> Any:
         return errors_of_one(problem, *trees)
 
-    return over_records(of_one, problem, local(problem, parameters))
+    return batched_as(over_records(of_one, problem, local(problem, parameters)), parameters)
 
 
 @all_errors.def_jvp
@@ -143,7 +144,7 @@ def _all_errors_jvp(primals: Any, tangents: Any) -> Any:
         step,
         is_leaf=lambda node: node is None,
     )
-    return out, along(problem, blocks, zeros)
+    return batched_as(out, parameters), along(problem, blocks, zeros)
 
 
 @eqx.filter_jit

@@ -71,6 +71,33 @@ def one_kernel(function: Function) -> Function:
 
     @call.defjvp
     def _jvp(primals: Any, tangents: Any) -> Any:
-        return jax.jvp(plain, primals, tangents)
+        out, change = jax.jvp(plain, primals, tangents)
+        return batched_as(out, primals), change
 
     return call  # pyright: ignore[reportReturnType]
+
+
+@jax.custom_jvp
+def batched_as(out: Any, args: Any) -> Any:
+    """`out`, all of it batched if any of `args` is, as `_batched` of `one_kernel` returns it.
+
+    Under `jit` JAX takes the axes of a batch from the function, and the values from the rule for
+    its derivative: where the two differ, arrays have wrong shapes, and nothing says so.
+    """
+    return _grown(out, args)
+
+
+batched_as.defjvp(lambda primals, tangents: (batched_as(*primals), tangents[0]))
+
+
+@jax.custom_batching.custom_vmap
+def _grown(out: Any, args: Any) -> Any:
+    del args
+    return out
+
+
+@_grown.def_vmap
+def _(size: int, batched: Any, out: Any, args: Any) -> Any:
+    del args
+    grow = lambda a, b: a if b else jnp.broadcast_to(a, (size, *a.shape))  # noqa: E731
+    return jax.tree.map(grow, out, batched[0]), jax.tree.map(lambda _: True, out)

@@ -18,6 +18,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
+from rigidjax.rotation.barrier import batched_as
+
 Arrays = list[Any]
 Map = Callable[..., Arrays]
 _ZERO: Any = ad.Zero
@@ -56,12 +58,12 @@ def nan_derivatives(tree: Any, inputs: Any) -> Any:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _with_nan(count: int, *numbers: Array) -> Arrays:
-    return list(numbers[:count])
+    return batched_as(list(numbers[:count]), numbers)
 
 
 @_with_nan.defjvp
 def _(count: int, primals: Any, tangents: Any) -> Any:
-    outs = list(primals[:count])
+    outs = _with_nan(count, *primals)
 
     def along(*args: Array) -> Arrays:
         moved = args[count : 2 * count]

@@ -102,6 +102,20 @@ def test_its_gradient_is_right(fitted):
     np.testing.assert_allclose(slope, far, rtol=1e-5, atol=1e-5 * np.abs(far).max())
 
 
+def test_its_gradient_over_a_batch_of_draws_is_that_of_each(fitted):
+    """The noises do not move with x: in the batch they are shared, in the derivative they are not."""
+    density = estimate.LogDensity(fitted)
+    x = density.x0[None] + 0.01 * jnp.arange(3.0)[:, None]
+    each = jax.jit(lambda x: density(x))
+    found, wanted = jax.jit(
+        lambda x: (
+            jax.grad(lambda x: jnp.sum(jax.vmap(each)(x)))(x),
+            jax.vmap(jax.grad(density))(x),
+        )
+    )(x)
+    np.testing.assert_allclose(found, wanted, rtol=1e-10, atol=1e-10 * jnp.abs(wanted).max())
+
+
 @pytest.mark.slow
 def test_a_process_of_no_density_changes_nothing(fitted):
     plain = estimate.LogDensity(fitted)

@@ -25,6 +25,8 @@ from surface import accepted, judge, replace
 from surface.calls import TABLE, Call
 
 RTOL = {"same": 1e-12, "single": 1e-3, "whole": 1e-12}
+# A derivative of a batch, as of a cost of many bodies: of all floats, of the last array alone.
+OUTSIDE = ("jvp of vmap", "jvp of vmap of one")
 
 
 def failures_of(
@@ -136,6 +138,8 @@ def transformed(call: Call, counts: collections.Counter) -> Iterator[tuple[str, 
 
     programs = _programs(run, floats)
     wanted = [name for name in programs if name in call.transforms]
+    if "grad" in call.transforms:
+        wanted += ["jvp", *OUTSIDE]
     counts["calls"] += len(wanted)
     counts["transforms"] += len(wanted)
     for name in list(wanted):
@@ -172,7 +176,23 @@ def _programs(run: Any, floats: Any) -> dict[str, Any]:
     def raveled(x: Any) -> Any:
         return jax.flatten_util.ravel_pytree(x)[0]
 
+    def jvp(function: Any, x: Any) -> Any:
+        return jax.jvp(function, (x,), (jax.tree.map(jnp.cos, x),))
+
+    def outside(x: Any, all_of_it: bool) -> Any:
+        leaves, tree = jax.tree.flatten(x)
+        axes = [0 if all_of_it else None] * (len(leaves) - 1) + [0]
+        many = [
+            leaf if axis is None else twice(leaf) for axis, leaf in zip(axes, leaves, strict=True)
+        ]
+        # Within `jit` a batch is made before its derivative.
+        one = jax.jit(lambda leaves: run(jax.tree.unflatten(tree, leaves)))
+        return jvp(jax.vmap(one, (axes,)), many)
+
     return {
+        "jvp": lambda x: jvp(run, x),
+        OUTSIDE[0]: lambda x: outside(x, True),
+        OUTSIDE[1]: lambda x: outside(x, False),
         "jit": run,
         "vmap": lambda x: jax.vmap(run)(twice(x)),
         "grad": lambda x: jax.grad(of_flat)(raveled(x)),
@@ -197,6 +217,11 @@ def _compared(values: dict[str, Any], eager: Any) -> Iterator[tuple[str, str]]:
             for i in range(2):
                 one = jax.tree.map(lambda leaf, i=i: leaf[i], values[name])
                 yield from check(name, one, eager, 1e-9)
+    for name in OUTSIDE:
+        if name in values and "jvp" in values:
+            for i in range(2):
+                one = jax.tree.map(lambda leaf, i=i: leaf[i], values[name])
+                yield from check(name, one, values["jvp"], 1e-7)
     if "grad" in values:
         slope = np.asarray(values["grad"])
         if not np.isfinite(slope).all():

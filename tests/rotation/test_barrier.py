@@ -1,0 +1,38 @@
+"""A function compiled as one kernel is the same function, in batches and in derivatives, too."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rigidjax.rotation.barrier import batched_as, one_kernel
+
+
+def partly_shared(a, b):
+    return 2.0 * a, jnp.zeros_like(a) + 3.0, a * jnp.sin(b)
+
+
+@pytest.mark.parametrize("axes", [(None, 0), (0, None), (0, 0)])
+def test_a_derivative_of_its_batch_under_jit(axes):
+    """Results that a batch shares: JAX gave the derivatives of all bodies to each."""
+    a, b = (jnp.arange(1.0, 4.0) if axis == 0 else jnp.array(0.7) for axis in axes)
+    one, plain = jax.jit(one_kernel(partly_shared)), partly_shared
+    found, wanted = (
+        jax.jit(lambda a, b, f=f: jax.jvp(jax.vmap(f, axes), (a, b), (2 * a, -b)))(a, b)
+        for f in (one, plain)
+    )
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_a_constant_with_a_derivative():
+    """As entries that are zero by choice of the axes; all is linear: the slope is 4 exactly."""
+
+    @jax.custom_jvp
+    def zero(x):
+        return batched_as(jnp.zeros_like(x), x)
+
+    zero.defjvp(lambda primals, tangents: (zero(*primals), tangents[0]))
+    batch = jax.vmap(jax.jit(lambda x: 2.0 * zero(x) + 1.0))
+    slope = jax.grad(lambda x: jnp.sum(batch(x) ** 2))(jnp.arange(3.0))
+    np.testing.assert_array_equal(slope, [4.0, 4.0, 4.0])
