@@ -66,8 +66,10 @@ def one_kernel(function: Function) -> Function:
     def _batched(size: int, batched: Any, *args: Any) -> Any:
         del size
         axes = jax.tree.map(lambda b: 0 if b else None, tuple(batched))
-        out = jax.vmap(plain, axes)(*args)
-        return out, jax.tree.map(lambda _: True, out)
+        # JAX before 0.12 asks for this where only tangents are batched, too, and then nothing is.
+        some = any(jax.tree.leaves(batched))
+        out = jax.vmap(plain, axes)(*args) if some else plain(*args)
+        return out, jax.tree.map(lambda _: some, out)
 
     @call.defjvp
     def _jvp(primals: Any, tangents: Any) -> Any:
@@ -99,5 +101,7 @@ def _grown(out: Any, args: Any) -> Any:
 @_grown.def_vmap
 def _(size: int, batched: Any, out: Any, args: Any) -> Any:
     del args
+    if not any(jax.tree.leaves(batched)):
+        return out, batched[0]
     grow = lambda a, b: a if b else jnp.broadcast_to(a, (size, *a.shape))  # noqa: E731
     return jax.tree.map(grow, out, batched[0]), jax.tree.map(lambda _: True, out)
