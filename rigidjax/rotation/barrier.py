@@ -18,7 +18,12 @@ _DROPPED = jax.__version_info__ < (0, 11)
 
 
 def barrier(tree: Tree) -> Tree:
-    """The same numbers, computed once: `lax.optimization_barrier`, or `once` if XLA drops it."""
+    """The same numbers, computed once: `lax.optimization_barrier`, or `once` if XLA drops it.
+
+    On a GPU each barrier ends a kernel, which costs more than what is computed twice.
+    """
+    if jax.default_backend() != "cpu":
+        return tree
     if not _DROPPED:
         return lax.optimization_barrier(tree)
     real = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731

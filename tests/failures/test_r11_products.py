@@ -1,8 +1,7 @@
 """Row R11: products of rotations have no matrix product in them, so TF32 cannot enter.
 
-On a GPU since Ampere a float32 `@` is rounded to ten bits unless one asks otherwise. No GPU here:
-what is tested is the compiled program's operations, and the drift on the CPU under default
-settings. Bar: R·Rᵀ − 1 after 1e4 products to 1e-5.
+On a GPU since Ampere a float32 `@` is rounded to ten bits unless one asks otherwise. What is tested
+is the compiled program's operations, and the drift under default settings. Bar: R·Rᵀ − 1 after 1e4 products to 1e-5.
 """
 
 import jax
