@@ -211,10 +211,11 @@ def assess(
     noise: Noise,
     tried: list[Tried],
     best_cost: float,
-    interrupted: Sequence[str] = (),
-    remarks: Sequence[str] = (),
+    shown: Problem,
+    interrupted: Sequence[str],
+    remarks: Sequence[str],
 ) -> Fit:
-    """The `Fit` of the best point of all starts, converged or not."""
+    """The `Fit` of the best point of all starts, converged or not, with the problem `shown`."""
     value = best.parameters
     near = flat_limit.beside(problem, value)
     linear = uncertainty.linearise(problem, value, noise, best.found, near)
@@ -250,7 +251,7 @@ def assess(
     unreal = of_charts(of, flat_limit.bodies_of(problem, value))
     model = Answer(model.word, (*unreal, *model.reasons)) if best_cost < np.inf else Answer(FAILS)
     return Fit(
-        problem,
+        shown,
         value,
         jnp.asarray(spread.covariance),
         jnp.asarray(spread.seen),

@@ -146,8 +146,8 @@ def fit(
         task = task._replace(problem=_with(task.problem, finer))
         best, task = _with_noise(again(best, task), task)
         best = _evaluated(best, task.problem)
-    found = assess(task.problem, best, task.noise, tried, lowest, cut, rough)
-    return eqx.tree_at(lambda one: one.problem, found, _as_given(given, task.problem))
+    shown = given if task.problem is problem else _as_given(given, task.problem)
+    return assess(task.problem, best, task.noise, tried, lowest, shown, cut, rough)
 
 
 def _as_given(given: Problem, fitted: Problem) -> Problem:

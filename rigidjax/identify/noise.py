@@ -3,9 +3,9 @@
 from typing import Any, cast
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.parameters import Parameters
@@ -22,7 +22,7 @@ def estimate_noise(
     """Noise (R, k) of each sensor: as given, or the weighted scatter of its errors, one figure for
     all channels and the recordings of a group. The problem with the jitter of its sensors likewise.
     """
-    free = ravel_pytree(parameters)[0].size
+    free = sum(leaf.size for leaf in jax.tree.leaves(parameters))
     weights = weights_of(problem, errors, noise)
     share = max(1.0 - free / problem.records.size, 0.1)
     groups, out = np.asarray(problem.noise_groups), []
@@ -42,9 +42,10 @@ def estimate_noise(
             seen = kept.sum(axis=(1, 2))
             variance = np.bincount(groups, squares) / np.maximum(np.bincount(groups, seen), 1)
             # Data without noise must not divide by zero: the least noise is round-off.
-            floor = 1e-15 * float(jnp.abs(reading.values).max() + 1e-300)
+            floor = 1e-15 * float(np.abs(np.asarray(reading.values)).max() + 1e-300)
             found = np.maximum(np.sqrt(variance / share), floor)[groups]
-            sigma = jnp.broadcast_to(jnp.asarray(found, sigma.dtype)[:, None], sigma.shape)
+            found = np.broadcast_to(found[:, None], sigma.shape)
+            sigma = jnp.asarray(found.astype(sigma.dtype))
         if reading.late is not None:
             change = changes(parameters, problem)[index]
             root, size = np.sqrt(np.asarray(weight, float) / share), np.asarray(sigma, float)

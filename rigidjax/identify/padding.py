@@ -1,6 +1,6 @@
 """Several recordings of one body as one tree with a leading axis, so that one program fits them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,20 +13,13 @@ from rigidjax.identify.recording import Reading, Recording
 from rigidjax.motion.torques import Linear, Series
 
 
-def stack(
-    recordings: Sequence[Recording], length: Callable[[int], int] = lambda count: count
-) -> tuple[Recording, np.ndarray]:
+def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
     """One recording with a leading axis, and the number of times of each: shorter ones are
-    continued with masked readings at their last time, tables of time with their last value, up to
-    the `length` for the longest.
+    continued with masked readings at their last time, tables of time with their last value.
     """
     counts = np.array([r.t.shape[0] for r in recordings], np.int32)
-    longest = length(int(counts.max()))
-    parts = [(r.torque, r.sensors) for r in recordings]
-    tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))
-    rows = max((int(table.values.shape[0]) for table in tables), default=0)
-    rows = length(rows) if rows else 0
-    alike = [lengthened(r, longest, rows) for r in recordings]
+    rows = max(_rows(recording, 0) for recording in recordings)
+    alike = [lengthened(r, int(counts.max()), rows) for r in recordings]
     forms = [(jax.tree.structure(r), [np.shape(x) for x in jax.tree.leaves(r)]) for r in alike]
     for index, form in enumerate(forms):
         if form != forms[0]:
@@ -40,12 +33,22 @@ def stack(
 
 def of_few_lengths(problem: Any) -> Any:
     """The problem with masked readings up to one of four lengths an octave: few programs."""
-    records, _ = stack(problem.recordings, _length)
-    return eqx.tree_at(lambda p: p.records, problem, records)
+    records = problem.records
+    longer = lengthened(records, _length(records.t.shape[1]), _length(_rows(records, 1)), 1)
+    return eqx.tree_at(lambda p: p.records, problem, longer)
+
+
+def _rows(recording: Recording, axis: int) -> int:
+    """The rows of the longest table of time in the torque and the sensors, 0 without one."""
+    parts = recording.torque, recording.sensors
+    tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))
+    return max((int(table.values.shape[axis]) for table in tables), default=0)
 
 
 def _length(count: int) -> int:
     """The least of these lengths that is not below `count`."""
+    if not count:
+        return 0
     octaves = np.array([-1, 0]) + np.ceil(4.0 * np.log2(count))
     lengths = 16 * np.ceil(2.0 ** (octaves / 4.0) / 16)
     return int(lengths[0] if lengths[0] >= count else lengths[1])
@@ -95,24 +98,26 @@ def _is_table(node: Any) -> bool:
     return isinstance(node, Linear | Series)
 
 
-def lengthened(recording: Recording, count: int, rows: int = 0) -> Recording:
-    """The recording with masked readings at its last time, up to `count` times."""
-    missing = count - recording.t.shape[0]
+def lengthened(recording: Recording, count: int, rows: int = 0, axis: int = 0) -> Recording:
+    """The recording with masked readings at its last time, up to `count` times, and with tables of
+    `rows`; of several, stacked, with times along `axis` 1.
+    """
+    missing = count - recording.t.shape[axis]
     # Sensors that read a moving object may hold tables of time, too.
     torque, sensors = jax.tree.map(
-        lambda node: _table(node, rows) if _is_table(node) else node,
+        lambda node: _table(node, rows, axis) if _is_table(node) else node,
         (recording.torque, recording.sensors),
         is_leaf=_is_table,
     )
-    t, readings = recording.t, recording.readings
-    parts = [(r.values, r.mask, r.late) for r in readings]
+    t = recording.t
+    parts = [(r.values, r.mask, r.late) for r in recording.readings]
     if missing:
-        t = _repeat_last(t, missing)
+        t = _repeat_last(t, missing, axis)
         parts = [
             (
-                _repeat_last(values, missing),
-                _repeat_last(mask, missing, False),
-                None if late is None else _repeat_last(late, missing),
+                _repeat_last(values, missing, axis),
+                _repeat_last(mask, missing, axis, False),
+                None if late is None else _repeat_last(late, missing, axis),
             )
             for values, mask, late in parts
         ]
@@ -124,26 +129,24 @@ def lengthened(recording: Recording, count: int, rows: int = 0) -> Recording:
     )
 
 
-def _table(table: Any, rows: int) -> Any:
-    missing = rows - table.values.shape[0]
+def _table(table: Any, rows: int, axis: int) -> Any:
+    missing = rows - table.values.shape[axis]
     if missing <= 0:
         return table
-    values = _repeat_last(table.values, missing)
+    values = _repeat_last(table.values, missing, axis)
     if isinstance(table, Series):
-        slopes = jnp.concatenate(
-            [table.slopes, jnp.zeros((missing, *table.slopes.shape[1:]), table.slopes.dtype)]
-        )
+        slopes = _repeat_last(table.slopes, missing, axis, 0.0)
         return eqx.tree_at(lambda s: (s.values, s.slopes), table, (values, slopes))
-    gap = table.times[-1] - table.times[-2]
-    more = table.times[-1] + gap * jnp.arange(1, missing + 1, dtype=gap.dtype)
-    times = jnp.concatenate([table.times, more])
+    last = table.times[..., -1:]
+    more = last + (last - table.times[..., -2:-1]) * np.arange(1, missing + 1, dtype=last.dtype)
+    times = jnp.concatenate([table.times, more], axis=-1)
     return eqx.tree_at(lambda s: (s.times, s.values), table, (times, values))
 
 
-def _repeat_last(values: Any, count: int, last: Any = None) -> Any:
+def _repeat_last(values: Any, count: int, axis: int, last: Any = None) -> Any:
     # By NumPy where the numbers are known: JAX compiles a program for each shape.
     xp: Any = np if _checks.known(values) else jnp
     values = xp.asarray(values)
-    last = values[-1] if last is None else last
-    more = xp.broadcast_to(last, (count, *values.shape[1:]))
-    return jnp.asarray(xp.concatenate([values, more]))
+    edge = values[(slice(None),) * axis + (slice(-1, None),)]
+    more = xp.repeat(edge if last is None else xp.full_like(edge, last), count, axis)
+    return jnp.asarray(xp.concatenate([values, more], axis))

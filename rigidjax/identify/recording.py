@@ -27,7 +27,7 @@ class Reading(eqx.Module):
     """
 
     sensor: AbstractSensor
-    values: Float[Array, "times ..."]
+    values: Float[Array, "..."]
     mask: Bool[Array, "*records times"]
     late: Float[Array, "*records times k"] | None = None
 

@@ -1,7 +1,7 @@
 """The uncertainty of a fit: covariance, for white and other errors, undetermined directions."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -328,9 +328,9 @@ def _sandwich(linear: Linearised, white: Spread, times: "Times") -> np.ndarray:
     spans = 2.0 ** np.arange(1, np.log2(longest) + 1)
     n, records = linear.size, len(linear.places)
     grown = times.independent / max(times.independent - n, 0.1 * times.independent)
-    channels, root = list(_channels(linear, columns)), white.root
+    channels, root = _spectra(linear, columns), white.root
     assert root is not None
-    meats = [grown * _meat(channels, span) for span in spans]
+    meats = [grown * _meat(*channels, span) for span in spans]
     found = [root.sandwich(triangles, linear.places, meat) for meat in meats]
     if records > n // 2 and records > 5:
         # Many recordings: the variance between them needs no model of their errors.
@@ -345,9 +345,11 @@ def _sandwich(linear: Linearised, white: Spread, times: "Times") -> np.ndarray:
     return out * np.outer(factor, factor)
 
 
-def _channels(linear: Linearised, columns: np.ndarray) -> Iterator[tuple[np.ndarray, float, float]]:
-    """For each channel its `columns` (R, T, m), the variance of its errors, their smooth share."""
-    first = 0
+def _spectra(linear: Linearised, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the `columns` of the k channels of all sensors, times the deviation of their errors, real
+    and imaginary parts (R, k, 2, T + 1, m) by frequency; the smooth share (k, 1, 1) of the errors.
+    """
+    first, slopes, shares = 0, [], []
     for error, weight in zip(linear.errors, linear.weights, strict=True):
         root, last = np.sqrt(weight), first + error[0].size
         slope = columns[:, first:last].reshape(*error.shape, -1)
@@ -355,19 +357,26 @@ def _channels(linear: Linearised, columns: np.ndarray) -> Iterator[tuple[np.ndar
         for channel in range(error.shape[-1]):
             e = error[..., channel] * root
             variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
-            yield slope[..., channel, :], variance, smooth_share(e, weight > 0)
+            slopes.append(np.sqrt(variance) * slope[..., channel, :])
+            shares.append(smooth_share(e, weight > 0))
+    # Twice as long: then products in frequency are those of covariances in time.
+    size = 2 * slopes[0].shape[1]
+    found = np.fft.rfft(np.stack(slopes, axis=1), size, axis=2)
+    each = np.full(size // 2 + 1, 2.0 / size)
+    each[[0, -1]] = 1.0 / size
+    parts = np.stack([found.real, found.imag], axis=2) * np.sqrt(each)[:, None]
+    return parts, np.array(shares)[:, None, None]
 
 
-def _meat(channels: list[tuple[np.ndarray, float, float]], time: float) -> np.ndarray:
+def _meat(spectra: np.ndarray, share: np.ndarray, time: float) -> np.ndarray:
     """`Jᵀ C J` with C the scatter of each channel and a part that decays over `time` samples."""
-    meat: Any = 0.0
-    fade = float(np.exp(-1.0 / time))
-    for j, variance, share in channels:
-        # The sum over earlier errors is the transpose of the sum over later ones.
-        at_once, ahead = (j.transpose(0, 2, 1) @ x for x in (j, _fading(j, fade)))
-        spread = share * (ahead + ahead.transpose(0, 2, 1)) + (1.0 - 2.0 * share) * at_once
-        meat = meat + variance * spread
-    return meat
+    size = 2 * spectra.shape[3] - 2
+    lags = np.arange(size)
+    decay = np.exp(-np.minimum(lags, size - lags) / time)
+    power = share * np.fft.rfft(decay).real[:, None] + (1.0 - share)
+    weighed = spectra * power[:, None]
+    flat = (*spectra.shape[:2], -1, spectra.shape[-1])
+    return np.sum(weighed.reshape(flat).swapaxes(2, 3) @ spectra.reshape(flat), axis=1)
 
 
 def smooth_share(e: np.ndarray, seen: np.ndarray) -> float:
@@ -382,19 +391,6 @@ def scatter(rows: list[np.ndarray]) -> float:
     bends = np.concatenate([row[2:] - 2.0 * row[1:-1] + row[:-2] for row in rows])
     # The second difference of white noise has six times the variance of the noise.
     return float(np.mean(bends**2)) / 6.0 if bends.size else 0.0
-
-
-def _fading(x: np.ndarray, rho: float) -> np.ndarray:
-    """The sums y_t = x_t + ρ y_{t−1} along the second axis of (R, T, n)."""
-    # Imported where it is used; not `scipy.signal.lfilter`, nor `scipy.stats` below: to load each
-    # takes a second, which is as long as the rest of a first fit's imports.
-    from scipy.linalg import get_lapack_funcs
-
-    x = np.moveaxis(x, 1, 0)
-    bands = np.array([[1.0], [-rho]]) * np.ones(x.shape[0])
-    (solve,) = get_lapack_funcs(("tbtrs",), dtype=np.float64)
-    y, _ = solve(bands, x.reshape(x.shape[0], -1), uplo="L")
-    return np.moveaxis(y.reshape(x.shape), 0, 1)
 
 
 class Times(eqx.Module):
@@ -438,17 +434,17 @@ def _channel_time(e: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
     variance = np.sum(centred**2)
     if not variance > 0:
         return 1.0, 0.0
-    total, first = 1.0, 0.0
-    noise = 2.0 / np.sqrt(max(seen.sum(), 1))
-    for lag in range(1, max(2, int(np.max(np.nonzero(seen)[1], initial=0) + 1) // 3)):
-        # Each lag has fewer pairs than lag zero.
-        pairs = np.sum(seen[:, lag:] & seen[:, :-lag])
-        if pairs < 10:
-            break
-        rho = np.sum(centred[:, lag:] * centred[:, :-lag]) / variance * seen.sum() / pairs
-        if lag == 1:
-            first = rho
-        if rho < noise:
-            break
-        total += 2.0 * rho
-    return float(total), float(first)
+    lags = np.arange(1, max(2, int(np.max(np.nonzero(seen)[1], initial=0) + 1) // 3))
+    # Each lag has fewer pairs than lag zero.
+    pairs, products = np.round(_lagged(seen)[lags]), _lagged(centred)[lags]
+    rho = products / variance * (counts.sum() / np.maximum(pairs, 1))
+    ends = (pairs < 10) | (rho < 2.0 / np.sqrt(max(counts.sum(), 1)))
+    last = int(np.argmax(ends)) if ends.any() else lags.size
+    first = rho[0] if lags.size and pairs[0] >= 10 else 0.0
+    return 1.0 + 2.0 * float(rho[:last].sum()), float(first)
+
+
+def _lagged(x: np.ndarray) -> np.ndarray:
+    """The sums of products of rows (R, T) with themselves `lag` samples later, by FFT."""
+    size = x.shape[1]
+    return np.fft.irfft(np.sum(np.abs(np.fft.rfft(x, 2 * size)) ** 2, axis=0), 2 * size)[:size]
