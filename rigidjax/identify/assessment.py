@@ -219,8 +219,7 @@ def assess(
     value = best.parameters
     near = flat_limit.beside(problem, value)
     linear = uncertainty.linearise(problem, value, noise, best.found, near)
-    cut = at_limit(problem.records.readings)
-    times = uncertainty.correlation_times(linear, cut)
+    times = uncertainty.correlation_times(linear, at_limit(problem.records.readings))
     white = uncertainty.of_white(linear)
     spread = uncertainty.spread(linear, times, white)
     numbers, of = values_and_slopes(problem, value, near), charts(problem)
