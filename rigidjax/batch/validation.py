@@ -54,6 +54,7 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
                 f"{leaf.shape}"
             )
     dtype = validation.one_dtype(states0, "states0")
+    _checks.numbers(states0.omega, "states0")
     if not isinstance(bodies, Inertia | MassProperties):
         raise TypeError(
             f"bodies: wanted Inertia, or MassProperties for Rigid, got {type(bodies).__name__}"

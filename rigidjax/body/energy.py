@@ -65,7 +65,7 @@ def kinetic_energy_about(
     """
     _checks.single(body, MassProperties, "body")
     velocity = _checks.floating(velocity, (3,), "velocity")
-    omega = _omega(omega)
+    omega = _checks.floating(omega, (3,), "omega")
     about_origin = body.inertia_about(jnp.zeros_like(body.com)).tensor
     swing = quaternion.rotate(unit_quaternion(q), cross(omega, body.com))
     return (

@@ -119,7 +119,7 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
     i = real_moments(_checks.floating(moments, (3,), "moments"))
     s = 0.5 * jnp.stack([(i[1] - i[0]) + i[2], (i[2] - i[1]) + i[0], (i[0] - i[2]) + i[1]])
     total = _not_a_point(s[0] + s[1] + s[2])
-    root = jnp.sqrt(jnp.maximum(s / total, 0.0))
+    root = jnp.sqrt(jnp.maximum(_share(s, total), 0.0))
     size = _hold(0.5 * jnp.log(total / 3.0), jnp.expm1)
     return jnp.stack([size, *(3.0 * root[:2] / (root[0] + root[1] + root[2]) - 1.0)])
 
@@ -170,7 +170,8 @@ def flat_bend(
     pull = from_components(d1 + d3, d2 + d3, d3, 0.5 * s12, 0.5 * s13, 0.5 * s23)
     square = jnp.sum(root * root)
     gained = a * (n @ apply(pull, n)) / 2.0
-    flat = (a * a < FLAT * square) & (gained > 0)
+    # NaN passes.
+    flat = (a * a < FLAT * square) & ~(gained <= 0)
     size = jnp.where(flat, jnp.sqrt(2.0 * jnp.where(flat, gained, 1.0)), 0.0)
     size = size / jnp.where(flat, jnp.abs(a), 1.0)
     x, y, z = n
@@ -197,7 +198,7 @@ def _root_of(shape: Float[Array, "5"]) -> Mat3:
 def _factors(s: Mat3) -> Float[Array, "6"]:
     """(ρ, d1, d2, s12, s23, s13) of 𝔖 = 3 e^{2ρ} (1 + V)² / Tr (1 + V)²."""
     total = _not_a_point(s[0, 0] + s[1, 1] + s[2, 2])
-    root = _root(real_second_moment(s) / total)
+    root = _root(_share(real_second_moment(s), total))
     v = 3.0 * root / (root[0, 0] + root[1, 1] + root[2, 2]) - jnp.eye(3, dtype=s.dtype)
     size = _hold(0.5 * jnp.log(total / 3.0), jnp.expm1)
     return jnp.stack([size, v[0, 0], v[1, 1], v[0, 1], v[1, 2], v[0, 2]])
@@ -221,8 +222,13 @@ def _root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
 
 
 def _not_a_point(total: Scalar) -> Scalar:
-    words = "pack: the second moment is zero: a point has no shape"
-    return _checks.refuse(total, ~(total > 0), words)
+    words = "pack: the second moment is zero (a point has no shape) or beyond the dtype"
+    return _checks.refuse(total, ~((total > 0) & (total < jnp.inf)), words)
+
+
+def _share(part: Array, total: Scalar) -> Array:
+    """The quotient. XLA multiplies by the reciprocal, which for the Earth in float32 is zero."""
+    return (0.25 * part) / (0.25 * total)
 
 
 def _hold(exponent: Array, bend: Callable[[Array], Array] = jnp.log1p) -> Array:

@@ -183,19 +183,25 @@ class Curvature(NamedTuple):
 
 def terms(density: LogDensity, x: Float[Array, " n"]) -> Terms:
     """The terms of all readings; derivatives recording by recording, in the numbers of each."""
+    return _terms_of(_rows(density, x), density)
 
-    @jax.custom_jvp
-    def of(rows: Array) -> Terms:
-        of_one = partial(_of_one, density)
-        return batched_as(over_records(of_one, density.problem, (rows, density.noises)), rows)
 
-    @of.defjvp
-    def _(rows: tuple, step: tuple) -> tuple[Terms, Terms]:
-        out, blocks = _with_blocks(density, rows[0])
-        moved = jax.tree.map(lambda b: jnp.einsum("rni,ri->rn", b, step[0]), blocks)
-        return batched_as(out, rows[0]), moved
+@eqx.filter_custom_jvp
+def _terms_of(rows: Array, density: LogDensity) -> Terms:
+    out = over_records(partial(_of_one, density), density.problem, (rows, density.noises))
+    return batched_as(out, (rows, eqx.filter(density, eqx.is_inexact_array)))
 
-    return of(_rows(density, x))
+
+@_terms_of.def_jvp
+def _(primals: Any, tangents: Any) -> tuple[Terms, Terms]:
+    (rows, density), (step, beside) = primals, tangents
+    if jax.tree.leaves(beside):
+        raise TypeError(
+            "LogDensity: wanted derivatives in x alone, not in the density's own numbers"
+        )
+    out, blocks = _with_blocks(density, rows)
+    moved = jax.tree.map(lambda b: jnp.einsum("rni,ri->rn", b, step), blocks)
+    return batched_as(out, (rows, eqx.filter(density, eqx.is_inexact_array))), moved
 
 
 def curvature(density: LogDensity, x: Float[Array, " n"]) -> Curvature:

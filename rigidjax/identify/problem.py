@@ -296,6 +296,7 @@ def one_problem(problem: Any) -> Problem:
             "problem: wanted one, as Problem(recording, …) makes it, got times and masks of shapes "
             f"{sorted(shapes)}; take many one by one"
         )
+    _checks.numbers(records.t, "problem")
     if _checks.known(rate):
         _checks.finite(rate, "problem: its typical rate")
     return problem
@@ -392,6 +393,7 @@ def _are_recordings(recordings: Sequence[Any]) -> None:
                 "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
                 f"shapes {sorted(lengths)}; for many give a sequence"
             )
+        _checks.numbers(item.t, "recording")
 
 
 def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
@@ -399,6 +401,8 @@ def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
     if body is None:
         return _zeros(chart.size)
     _checks.single(body, (Inertia, MassProperties), "body")
+    if _checks.known(body):
+        jax.tree.map(lambda leaf: _checks.finite(leaf, "body"), body)
     vector = eqx.filter_jit(chart.vector)(body)
     if _checks.known(vector):
         _checks.refuse(

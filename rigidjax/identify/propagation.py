@@ -94,8 +94,8 @@ class FixedSteps(AbstractIntegrator):
         return FixedSteps(2 * self.substeps, self.solver, self.last)
 
 
-def _tolerance(value: ScalarLike) -> Array:
-    return jnp.asarray(_checks.number(value, "a tolerance"), jnp.result_type(float))
+def _tolerance(name: str) -> Callable[[ScalarLike], Array]:
+    return lambda value: jnp.asarray(_checks.number(value, name), jnp.result_type(float))
 
 
 class Adaptive(AbstractIntegrator):
@@ -108,8 +108,8 @@ class Adaptive(AbstractIntegrator):
     1e-09
     """
 
-    rtol: Float[Array, ""] = eqx.field(converter=_tolerance, default=1e-9)
-    atol: Float[Array, ""] = eqx.field(converter=_tolerance, default=1e-12)
+    rtol: Float[Array, ""] = eqx.field(converter=_tolerance("rtol"), default=1e-9)
+    atol: Float[Array, ""] = eqx.field(converter=_tolerance("atol"), default=1e-12)
 
     def __check_init__(self):
         _checks.positive(self.rtol, "rtol")

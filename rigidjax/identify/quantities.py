@@ -247,7 +247,7 @@ def quantile(fit: "Fit", level: float) -> float:
     """Half-width of an interval in standard deviations: Student's where the noise is estimated, by
     the number of independent errors.
     """
-    level = _checks.fraction(level, "interval", "a level between 0 and 1")
+    level = _checks.fraction(level, "level", "a level between 0 and 1")
     from scipy.special import ndtri, stdtrit
 
     tail = 0.5 * (1 + level)

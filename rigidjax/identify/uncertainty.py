@@ -208,7 +208,7 @@ def of_white(linear: Linearised) -> Spread:
     # of round-off must not be scaled up.
     squares = np.bincount(linear.places.ravel(), np.sum(triangles**2, axis=1).ravel(), n + 1)[:n]
     size = np.sqrt(squares + linear.firm**2 + np.sum(linear.extra_slopes**2, axis=0))
-    size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
+    size = np.maximum(size, max(WEAKEST * size.max(), 1e-150))
     firm, extra = linear.firm / size, linear.extra_slopes / size
     of = np.where(extra != 0, owner, -1).max(axis=1, initial=-1)
     lift = np.zeros((n, shared.size))
@@ -298,7 +298,7 @@ def _blinded(covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
 def inverted(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A root (n, m) of the covariance in determined directions; the others are `null` (k, n)."""
     size = np.sqrt(np.diag(information))
-    size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
+    size = np.maximum(size, max(WEAKEST * size.max(), 1e-150))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
     seen = values > 1e-14 * values.max()
     half = vectors[:, seen] / np.sqrt(values[seen]) / size[:, None]

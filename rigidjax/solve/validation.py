@@ -107,10 +107,10 @@ def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
 def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     """`rtol` and `atol`, by default suited to `dtype`; a warning if it cannot reach known ones."""
     double = dtype == jnp.float64
-    usual, given = (1e-9, 1e-12) if double else (2e-5, 1e-7), (rtol, atol)
-    rtol, atol = (u if g is None else g for u, g in zip(usual, given, strict=True))
-    if given == (None, None):
-        return rtol, atol
+    usual = (1e-9, 1e-12) if double else (2e-5, 1e-7)
+    if rtol is None and atol is None:
+        return usual
+    rtol, atol = (u if g is None else g for u, g in zip(usual, (rtol, atol), strict=True))
     if not _checks.known((rtol, atol)):
         return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
     # Floats of Python: those of NumPy would lift a float32 run to float64.

@@ -270,6 +270,9 @@ def test_words(unhooked):
     one = jax.tree.map(lambda a: a[0], states)
     with pytest.raises(ValueError, match=r"for one body use rigidjax.simulate"):
         run(bodies, one, 0.1, 4)
+    half = jax.tree.map(lambda a: a.astype(jnp.float16), states)
+    with pytest.raises(TypeError, match="states0: wanted float32 or float64, got float16"):
+        run(bodies, half, 0.1, 4)
     with pytest.raises(ValueError, match="wanted one body, or 3 as the states"):
         run(batch(2)[0], states, 0.1, 4)
     with pytest.raises(ValueError, match="positive step"):

@@ -128,6 +128,13 @@ def test_a_matrix_is_no_body(unhooked):
         kinetic_energy(np.eye(3), [1.0, 0, 0])
 
 
+def test_a_state_is_no_rate(unhooked):
+    """Its own attitude and velocity would not count beside those that are given."""
+    body = rj.shapes.box(2.0, [0.1, 0.2, 0.3])
+    with pytest.raises(TypeError, match="omega: wanted an array of numbers, got Spin"):
+        kinetic_energy_about(body, [1.0, 0, 0, 0], [0.0, 0, 0], rj.Spin([1.0, 0, 0]))
+
+
 def test_states_of_the_floor_above_are_understood():
     inertia = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     body = rj.MassProperties(2.0, [0.0, 0, 0], inertia.second_moment)

@@ -205,6 +205,35 @@ def test_what_cannot_be_packed_is_refused_in_words(unhooked):
         parameters.pack(Inertia.from_principal(1.0, 1.0, 1.0))
     with pytest.raises(RuntimeError, match="a point has no shape"):
         eqx.filter_jit(parameters.pack)(point)
+    with pytest.raises(ValueError, match="beyond the dtype"):
+        parameters.pack_second_moment(1e308 * np.eye(3))
+
+
+def test_the_earth_in_single_precision():
+    """A total whose reciprocal is no normal number was lost: all numbers were NaN."""
+    moments = jnp.array([8.008e37, 8.01e37, 8.034e37], jnp.float32)
+    second = jnp.diag(jnp.array([4.018e37, 4.016e37, 3.992e37], jnp.float32))
+    back = parameters.unpack_second_moment(parameters.pack_second_moment(second))
+    np.testing.assert_allclose(back / 1e37, second / 1e37, rtol=1e-5, atol=1e-5)
+    back = parameters.unpack_moments(parameters.pack_moments(moments))
+    np.testing.assert_allclose(back / 1e37, moments / 1e37, rtol=1e-5)
+
+
+def test_second_derivatives_of_packing_are_symmetric():
+    """By all nine entries, off the symmetric matrices, too."""
+    second = jnp.diag(jnp.array([1.0, 1.3, 0.8])) + 0.1
+    weights = jnp.cos(jnp.arange(6.0))
+    of_flat = lambda x: weights @ parameters.pack_second_moment(x.reshape(3, 3))
+    found = jax.jit(jax.hessian(of_flat))(second.ravel())
+    np.testing.assert_allclose(found, found.T, rtol=0, atol=1e-13)
+
+
+def test_nan_of_a_misfit_is_not_lost():
+    plate = parameters.pack_shape(jnp.diag(jnp.array([4.0, 4.0, 1e-12])))
+    assert jnp.isnan(parameters.flat_bend(plate, jnp.full(5, jnp.nan))).any()
+
+
+...
 
 
 def test_scale_and_units_are_free_in_the_shape_chart():

@@ -114,6 +114,10 @@ def test_its_gradient_over_a_batch_of_draws_is_that_of_each(fitted):
         )
     )(x)
     np.testing.assert_allclose(found, wanted, rtol=1e-10, atol=1e-10 * jnp.abs(wanted).max())
+    # A compiled function of the density itself.
+    whole = eqx.filter_jit(lambda density, x: density(x))
+    found = jax.grad(lambda x: whole(density, x))(x[0])
+    np.testing.assert_allclose(found, wanted[0], rtol=1e-10, atol=1e-10 * jnp.abs(wanted).max())
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ and in other files, are one set of programs.
 import re
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -243,6 +244,14 @@ def test_other_mistakes_are_named(tumble):
     problem = rj.identify.Problem(record, rj.identify.Ratios())
     with pytest.raises(TypeError, match="wanted a Problem, got Recording"):
         rj.identify.fit(record)
+    half = eqx.tree_at(lambda r: r.t, record, record.t.astype(jnp.float16))
+    with pytest.raises(TypeError, match="recording: wanted float32 or float64, got float16"):
+        rj.identify.Problem(half, rj.identify.Ratios())
+    broken = rj.Inertia(np.diag([1.0, 2.0, np.nan]))
+    with pytest.raises(ValueError, match="body: contains NaN"):
+        rj.identify.Problem(record, rj.identify.PrincipalRatios()).start(broken)
+    with pytest.raises(ValueError, match=r"rtol: wanted one number, got shape \(2,\)"):
+        rj.identify.Adaptive(rtol=np.ones(2))
     with pytest.raises(TypeError, match=r"such as Ratios\(\) or .*got Inertia"):
         rj.identify.Problem(record, rj.Inertia.from_principal(1.0, 2.0, 3.0))
     with pytest.raises(TypeError, match="wanted a Recording, got Problem"):

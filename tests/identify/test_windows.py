@@ -99,6 +99,13 @@ def test_what_windows_do_not_show_has_no_deviation():
     assert "from the differences between windows, and there is one" in found.message
 
 
+def test_a_body_at_rest_shows_nothing_of_its_damping():
+    still = identify.windows(H * np.arange(9), rj.Spin(np.zeros((9, 3))), length=2, stride=2)
+    one = lambda k: (BODY, torques.Damping(k * jnp.ones(3)))
+    found = identify.fit_windows(still, one, jnp.asarray(0.1), noise={"omega": 0.1})
+    assert np.isinf(found.deviation) and "changes nothing" in found.message
+
+
 @pytest.mark.parametrize("apart", [1e-3, 1e-5, 3e-6])
 def test_numbers_that_are_hardly_told_apart_have_wide_deviations_not_nan(apart):
     t = H * np.arange(T)

@@ -143,6 +143,7 @@ def test_linear_of_any_number_of_channels_under_jit_and_vmap():
     np.testing.assert_allclose(spline, [1.23**3, 1 - 1.23**3, 0.0], rtol=0, atol=1e-14)
     # Round-off of the times makes no uneven ones: seconds since 1970, and float32 under `jit`.
     unix = np.linspace(0.0, 10.0, 80) + 1.7e9
+    torques.Series(jnp.arange(5.0, dtype=jnp.bfloat16), np.arange(5.0))
     lately = torques.Series(unix, np.sin(unix - 1.7e9))(1.7e9 + 3.3)
     np.testing.assert_allclose(lately, np.sin(3.3), rtol=0, atol=1e-5)
     short = jnp.linspace(0.0, 10.0, 1000, dtype=jnp.float32)

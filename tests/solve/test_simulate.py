@@ -269,6 +269,7 @@ BAD = [
     (dict(body=WIDE, state0=rj.Rigid(OMEGA, OMEGA, Q, OMEGA)), ValueError, r"body\.mass: wanted shape \(\), got \(3,\).* one body; batch with jax.vmap"),
     (dict(state0=TALL), ValueError, r"q: wanted shape \(4,\), got \(2, 4\).* one body; batch"),
     (dict(rtol=0.0), ValueError, "wanted rtol > 0"),
+    (dict(rtol=np.array([1e-6, 1e-6])), ValueError, r"rtol: wanted one number, got shape \(2,\)"),
     (dict(rtol=1e-9, stepsize_controller=dfx.ConstantStepSize()), ValueError, "not both"),
     (dict(torque=lambda t, state, body: jnp.zeros(2)), ValueError, r"wanted shape \(3,\), got \(2,\); body-frame"),
 ]  # fmt: skip

@@ -209,6 +209,7 @@ row(
     "body.shapes.mesh",
     dict(vertices=CORNERS, faces=FACES, density=6.0),
     traced=("vertices", "density"),
+    says=("mass",),
 )
 leave_out("reads a file: tests/body/test_meshes.py", "body.shapes.mesh_file")
 leave_out(

@@ -47,7 +47,8 @@ class Series(eqx.Module):
             raise ValueError(f"Series: wanted at least four times and as many rows, {words}")
         t, rows = _checks.finite(t, "Series: times"), _checks.finite(rows, "Series: values")
         step = (t[-1] - t[0]) / (t.size - 1)
-        kind = np.promote_types(getattr(times, "dtype", float), np.float16)
+        kind = np.dtype(getattr(times, "dtype", float))
+        kind = kind if kind == jnp.bfloat16 else np.promote_types(kind, np.float16)
         slack = 1e-6 * step + 4 * float(jnp.finfo(kind).eps) * abs(t).max()
         uneven = ~((step > 0) & (abs(t[1:] - t[:-1] - step).max() <= slack))
         words = "Series: wanted evenly spaced, increasing times; resample, or use Linear"
