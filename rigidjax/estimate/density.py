@@ -199,9 +199,8 @@ def terms(density: LogDensity, x: Float[Array, " n"]) -> Terms:
 
 
 def curvature(density: LogDensity, x: Float[Array, " n"]) -> Curvature:
-    """Cost, gradient and Fisher's information: normal errors with variances that x moves, too.
-
-    `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta and Mehra 1974,
+    """Cost, gradient and Fisher's information: normal errors with variances that x moves, too. `Σ
+    ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta and Mehra 1974,
     doi:10.1109/TAC.1974.1100714, for the filter), and priors.
     """
     rows, push = jax.linearize(lambda x: _rows(density, x), x)
@@ -267,9 +266,7 @@ def _with_blocks(density: LogDensity, rows: Array) -> tuple[Terms, Terms]:
 def _of_one(
     density: LogDensity, own: tuple[Array, Any], record: Recording, ref: Any, which: Any
 ) -> Terms:
-    """The terms of one recording, of its row `own` and the noises at the fit; the filter integrates
-    the unknown torque out.
-    """
+    """The terms of a recording, of its row and noises `own`; a filter integrates the torque out."""
     problem = density.problem
     restore = ravel_pytree(padding.one(own_numbers(density, density.x0), 0))[1]
     mine, steps, logs = restore(own[0])

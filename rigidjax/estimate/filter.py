@@ -199,10 +199,9 @@ WORDS = (
 class Filtered(eqx.Module):
     """The result of `filter`.
 
-    **Fields:** `belief` a `Belief` at each time of the recording, after its readings; `readings`,
-    for each sensor, a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all
-    readings; `status` 0 followed, 1 lost, 2 stopped (`words` says it); `lost_at` s, NaN unless
-    lost.
+    **Fields:** `belief` a `Belief` at each time of the recording, after its readings; `readings` of
+    each sensor a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all;
+    `status` 0 followed, 1 lost, 2 stopped (`words` says it); `lost_at` s, NaN unless lost.
     """
 
     belief: Belief
@@ -228,10 +227,8 @@ class Filtered(eqx.Module):
 
     @property
     def nis(self) -> tuple[Float[Array, " times"], ...]:
-        """Normalised innovations squared of each sensor, and how many numbers each holds.
-
-        They follow χ² with as many degrees of freedom if the model is right (Bar-Shalom, Li and
-        Kirubarajan, Estimation (2001), §5.4).
+        """Normalised innovations squared of each sensor: χ² of as many degrees of freedom as
+        numbers read if the model is right (Bar-Shalom, Li and Kirubarajan 2001, §5.4).
         """
         return tuple(
             jnp.sum(jnp.where(r.seen, r.innovation**2 / r.variance, 0), -1) for r in self.readings

@@ -13,7 +13,6 @@ from rigidjax.identify.answers import EXPLAINS, FAILS, FOUND, LEAVES, NOT_ALONE,
 from rigidjax.identify.causes import clock
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.flat_limit import of_charts
-from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import charts, quantities as quantities_of, values_and_slopes
 from rigidjax.identify.result import Fit, Start
@@ -32,20 +31,18 @@ def goodness(
     problem: Problem, noise: Noise, linear: Linearised, times: Times, covariance: np.ndarray
 ) -> tuple[float, int, Answer, tuple[int, ...]]:
     """χ² and its degrees of freedom (sensors of given noise), the answer, the sensors left over.
-
-    The size of the errors is compared with a given noise (five standard deviations of χ², or of the
-    median of the squares under a robust loss) and with the variance of the readings; Ljung and
-    Box's test (1978, doi:10.1093/biomet/65.2.297) says whether they are white. Readings at full
-    scale take no part. `covariance` (n, n) is that of white errors.
+    The size of errors is compared with a given noise (five standard deviations of χ², or of the
+    median of squares under a robust loss) and with the variance of the readings; Ljung and Box's
+    test (1978, doi:10.1093/biomet/65.2.297) says if they are white. Readings at full scale take no
+    part. `covariance` (n, n) is that of white errors.
     """
     chi2, count, word, free = 0.0, 0, EXPLAINS, linear.size
     words: list[str] = []
     sensors: list[int] = []
-    cut, own = at_limit(problem.records.readings), linear.blocks(covariance)
-    for index, (reading, error, e, weight, full) in enumerate(
-        zip(problem.records.readings, linear.raw, linear.errors, linear.weights, cut, strict=True)
-    ):
-        kept, given = (weight > 0)[..., None] & ~full, reading.sensor.noise is not None
+    own, readings = linear.blocks(covariance), problem.records.readings
+    parts = zip(readings, linear.raw, linear.errors, linear.weights, linear.kept, strict=True)
+    for index, (reading, error, e, weight, kept) in enumerate(parts):
+        given = reading.sensor.noise is not None
         left, varies, tiny = _sizes(reading, error, kept)
         factor = 1.0
         if given:
@@ -54,8 +51,8 @@ def goodness(
             dof = max(many - free, 1)
             factor = float(np.sqrt(total / dof)) if total > dof + 5 * np.sqrt(2 * dof) else 1.0
             if problem.loss is not None and many:
-                rows = kept.all(axis=-1) & (weight > 0)
-                factor = _median_above(np.sum(e[rows] ** 2, axis=-1), e.shape[-1])
+                squares = np.sum(e[kept.all(axis=-1)] ** 2, axis=-1)
+                factor = _median_above(squares, e.shape[-1])
         root = np.sqrt(weight)[..., None]
         slope = linear.slopes[index] * root[..., None]
         white = left <= tiny or _white(e * root, kept, slope, own, given)
@@ -156,10 +153,8 @@ def _white(
     e: np.ndarray, kept: np.ndarray, slope: np.ndarray, covariance: np.ndarray, given: bool
 ) -> bool:
     """Whether whitened errors (R, T, k) are white; errors far below a `given` noise are no
-    evidence.
-
-    Fitted numbers take `slope covariance slopeᵀ` of white errors away, and leave them correlated,
-    which shows in many short recordings (Box and Pierce 1970, doi:10.1080/01621459.1970.10481180).
+    evidence. Fitted numbers take `slope covariance slopeᵀ` away and leave them correlated, which
+    shows in many short recordings (Box and Pierce 1970, doi:10.1080/01621459.1970.10481180).
     """
     from scipy.special import chdtrc
 
@@ -219,7 +214,7 @@ def assess(
     value = best.parameters
     near = flat_limit.beside(problem, value)
     linear = uncertainty.linearise(problem, value, noise, best.found, near)
-    times = uncertainty.correlation_times(linear, at_limit(problem.records.readings))
+    times = uncertainty.correlation_times(linear)
     white = uncertainty.of_white(linear)
     spread = uncertainty.spread(linear, times, white)
     numbers, of = values_and_slopes(problem, value, near), charts(problem)

@@ -22,8 +22,7 @@ class Comparison(eqx.Module):
 
     **Fields:** `name`; `free` the number of free numbers; `rms` of each sensor; `correlation` the
     samples over which its errors are autocorrelated; `information` its Bayesian information
-    criterion minus that of the best: 0 for the best, 10 and more is strong evidence against the
-    model.
+    criterion minus that of the best: 0 for the best, 10 and more is strong evidence against.
     """
 
     name: str
@@ -76,9 +75,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 
 
 def _log_squares(found: Fit) -> np.ndarray:
-    """The logarithm of each sensor's mean square error; with jitter, of white errors that are as
-    likely as these.
-    """
+    """Each sensor's log mean square error; with jitter, of white errors that are as likely."""
     out, problem = 2.0 * np.log(np.maximum(found.rms, 1e-300)), found.problem
     white = whitened(problem, evaluate(found.parameters, problem)[0][0], found.noises)
     for index, (reading, e, sigma) in enumerate(

@@ -287,8 +287,7 @@ def local(
     problem: "Problem", parameters: Parameters, fill: int = 0, join: Any = jnp.add
 ) -> Parameters:
     """What each recording depends on, with a leading axis: numbers of its body (padded by `fill` to
-    the largest chart), as `shared` one step for each `Free` (shared and own ones joined), its
-    initial state.
+    the largest chart), as `shared` a step for each `Free` (shared and own ones joined), its state.
     """
     steps = []
     for slot, shared, each in by_slot(problem, parameters):

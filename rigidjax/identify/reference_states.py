@@ -25,11 +25,9 @@ from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import names, plus
 from rigidjax.rotation import quaternion, so3
 
-# The turn, rad, between two attitudes that give a rate: large against noise, small enough that the
-# axis hardly moves.
+# The turn, rad, between attitudes that give a rate: above noise, and the axis hardly moves.
 _TURN = 0.3
-# A turn is undetermined if two singular values of Σ world bodyᵀ are below this share of the
-# largest.
+# A turn is undetermined if two singular values of Σ world bodyᵀ are below this share of the top.
 _FIRM = 1e-3
 
 
@@ -206,10 +204,8 @@ def _first_speed(t: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Places (n, 3) with these distances (n, k) to stations.
-
-    Differences of the equations `|x|² − 2 s·x + |s|² = d²` are linear in x. A component of x that
-    they do not determine is that of the stations' centre.
+    """Places (n, 3) with these distances (n, k) to stations: differences of `|x|² − 2 s·x + |s|² =
+    d²` are linear in x; a component that they do not determine is that of the stations' centre.
     """
     centre = stations.mean(axis=0)
     s = stations - centre

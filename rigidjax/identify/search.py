@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from rigidjax.identify import padding
-from rigidjax.identify.body_charts import charts_of
+from rigidjax.identify.body_charts import charts_of, numbers_of
 from rigidjax.identify.checkpoint import SearchState, Tried
 from rigidjax.identify.levenberg_marquardt import BOLD, CAREFUL, Search, Settings, search
 from rigidjax.identify.normal import Normal, normal_of
@@ -109,13 +110,9 @@ def descend(
 
 def _bends(problem: Problem, numbers: Array, slope: Float[Array, " n"]) -> Array:
     """The rows (m, n) of the Jacobian from the curvature of the charts of bodies."""
-    out, first = [jnp.zeros((0, slope.size), slope.dtype)], 0
-    for chart in charts_of(problem.body):
-        mine = slice(first, first + chart.size)
-        rows = chart.bend(numbers[mine], slope[mine])
-        out.append(jnp.zeros((rows.shape[0], slope.size), slope.dtype).at[:, mine].set(rows))
-        first += chart.size
-    return jnp.concatenate(out)
+    parts = (charts_of(problem.body), *(numbers_of(problem.body, x) for x in (numbers, slope)))
+    rows = block_diag(*(chart.bend(*mine) for chart, *mine in zip(*parts, strict=True)))
+    return jnp.pad(rows, ((0, 0), (0, slope.size - rows.shape[1])))
 
 
 def _as_far_as(problem: Problem, weights: Float[Array, "records times"]) -> Problem:

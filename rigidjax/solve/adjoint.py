@@ -105,7 +105,6 @@ def cotangents(
     method: Method, constants: Arrays, run: Run, record: Record, bars: Arrays, timed: bool
 ) -> tuple[Arrays, Run]:
     """The transpose of the tangents of `replayed`: cotangents of the constants and of the run.
-
     `bars` are those of the states between and at the end. Times have some only where `timed`.
     """
     number, size = jnp.max(record.number), run.between.shape[0]

@@ -144,8 +144,7 @@ class Pulses(AbstractTorque):
 
 def _row(times: Float[Array, " n"], t: Scalar) -> Any:
     """The last row whose time is not after t. At a jump this is the piece that begins."""
-    # A comparison with all rows keeps a short table inside the solver's one kernel; a search is a
-    # loop.
+    # A comparison with all rows keeps a short table in the solver's one kernel; a search loops.
     method = "compare_all" if times.shape[0] <= 128 else "scan"
     return jnp.searchsorted(times, t, side="right", method=method) - 1
 
