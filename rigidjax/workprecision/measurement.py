@@ -66,9 +66,8 @@ def measure(
 
     **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more of them;
     `gradients` whether gradients are measured, too; `thin` takes every `thin`-th setting; `rounds`
-    the least number of timings of each run; `progress` is called with a line of text.
-
-    **Raises:** `TypeError` for something that is no `Scene` or `Method`.
+    the least number of timings of each run; `progress` is called with a line of text. **Raises:**
+    `TypeError` for something that is no `Scene` or `Method`.
     """
     made = 'standard ones are made by rj.workprecision.scenes()["heavy-top"]()'
     _checks.instance(scene, Scene, "scene", wanted="a Scene", hint=made)
