@@ -90,8 +90,7 @@ def simulate(
       `Steps(size, number)` for fixed steps.
     - `solver`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
       under a torque, and the choice of `rollout` for `Steps`. With times any
-      `diffrax.AbstractSolver` may be given; the explicit ones of `rigidjax.solvers` run in our own
-      loop.
+      `diffrax.AbstractSolver` may be given; our explicit ones run in our own loop.
     - `rtol`, `atol`, `max_steps`, `adjoint`: as for `rigidjax.simulate`.
 
     Bodies are computed in the order of their initial rates: those of one chunk wait for the last.

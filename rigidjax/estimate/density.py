@@ -50,8 +50,7 @@ class LogDensity(eqx.Module):
     Call it with x (n,), real numbers without bounds: the problem's `Parameters` (body chart,
     `Free`s, initial states), then logarithms of factors of the noises that the fit estimates and of
     the process's numbers. `unpack(x)` gives body, states and values, `x0` is the fit. `covariance`
-    is Laplace's, for a sampler's start and mass matrix; it is smaller than the fit's if errors are
-    autocorrelated.
+    is Laplace's, for a sampler; it is smaller than the fit's if errors are autocorrelated.
 
     With a `process` the filter integrates the unknown torque out. Without it the readings are
     independent and normal about the motion: this is too narrow if errors are autocorrelated; keep

@@ -91,8 +91,7 @@ def start(
     initial attitude and rate from the recording (`Spin` if no sensor shows an attitude). Then
     standard deviations, one number or three, zero for known values: `rate` of Ω, rad/s; `attitude`
     rad; `position` m and `velocity` m/s of a `Rigid`. Torques start from their model's stationary
-    distribution. **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing
-    or below zero.
+    distribution. **Returns** a `Belief`. **Raises:** `ValueError` for a missing or negative one.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))

@@ -14,8 +14,7 @@ def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """The lower triangular root L of `a aᵀ`, its diagonal ≥ 0, by the modified Gram–Schmidt process
     on the rows, whose factor is as good as Householder's (Björck 1967, doi:10.1007/BF01934122). A
     row that depends on earlier ones, to a few units of round-off, leaves a zero on the diagonal,
-    with zero derivatives, where those of `jnp.linalg.qr` are NaN: a state known without error has
-    such rows.
+    with zero derivatives, where those of `jnp.linalg.qr` are NaN (a state without error).
     """
     n = a.shape[0]
     below = jnp.arange(n)

@@ -2,8 +2,7 @@
 
 Each cause has a direction: the change of the readings with it along the fitted motion. Errors are
 regressed on it together with all free numbers (a score test: Rao 1948,
-doi:10.1017/S0305004100023987). A cause that the free numbers could absorb therefore explains
-nothing.
+doi:10.1017/S0305004100023987). A cause that these could absorb explains nothing.
 """
 
 from collections.abc import Callable, Sequence

@@ -47,8 +47,7 @@ MOST, SEVERAL = 6, 5
 class Combination(eqx.Module):
     """Numbers that may change together without changing a reading.
 
-    **Fields:** `names`; small `changes` of each: relative if `relative` is true, else in its
-    `units`.
+    **Fields:** `names`; small `changes` of each: relative if `relative`, else in its `units`.
 
     >>> Combination(("I1", "I2"), (0.01, 0.01), ("", ""), (True, True)).in_words
     'I1 and I2 rise together: only I1/I2 is determined.'

@@ -231,9 +231,8 @@ def canonical(q: QuatLike) -> Quat:
 def angle(q: QuatLike) -> Scalar:
     """The angle of a rotation, rad, in [0, π]; the same bits for q and −q.
 
-    **Arguments:** `q` (4,) of any length. The angle is 2 atan2(|q_v|, |q_w|). At the identity it
-    has no derivative: 0 is returned, the shortest subgradient. **Raises:** `ValueError` for zero or
-    NaN.
+    **Arguments:** `q` (4,) of any length. The angle is 2 atan2(|q_v|, |q_w|). At the identity its
+    derivative is 0, the shortest subgradient. **Raises:** `ValueError` for zero or NaN.
 
     >>> round(float(angle(exp(jnp.array([0.0, 1e-9, 0.0]))) * 1e9), 9)
     1.0

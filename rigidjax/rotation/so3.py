@@ -1,8 +1,7 @@
 """Rotation matrices M, active, body → world, and their tangent vectors.
 
 `exp` and `log` take and return one rotation; batch with `jax.vmap`. Every kernel is a smooth
-function of θ²: values and derivatives of any order are correct at θ = 0. Range: as in
-`rigidjax.quaternion`.
+function of θ²: derivatives of any order are correct at θ = 0. Range: as in `rigidjax.quaternion`.
 """
 
 from typing import Any
@@ -220,8 +219,7 @@ def world_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
 def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     """The point at s of the shortest turn from a (s = 0) to b (s = 1): a exp(s log(aᵀb)).
 
-    **Arguments:** `a`, `b` (3, 3) rotations; `s` dimensionless, also beyond [0, 1]. **Raises:** as
-    `distance`.
+    **Arguments:** `a`, `b` (3, 3) rotations; `s`, also beyond [0, 1]. **Raises:** as `distance`.
 
     >>> interpolate(jnp.eye(3), exp(jnp.array([0.0, 0.0, 2.0])), 0.5).round(6)[0].tolist()
     [0.540302, -0.841471, 0.0]

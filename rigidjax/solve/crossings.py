@@ -154,8 +154,7 @@ def crossings(
 
     A start on the section does not count, and a tangential contact may be missed. A zero counts if
     the condition goes through it 16 times as fast as round-off could make it (under a solver, times
-    the root of the number of steps): an energy minus its value has none. For many bodies use
-    `jax.vmap`.
+    the root of the number of steps): an energy minus its value has none. Batch it by `jax.vmap`.
 
     **Returns** a `Crossings`. Times and states have first and second derivatives with respect to
     all numbers of the scene, of `condition` and of `state0`, forward and reverse; near a tangential

@@ -333,8 +333,7 @@ def error_of(
 
     The second run has a fiftieth of them; where its distance is not far above round-off, three more
     have the last digits of `x` changed (in a `vmap` always). See `Solution.error`. Each call
-    compiles anew: put it into a `jax.jit` of your own to call it often. **Returns** a
-    `FunctionError`.
+    compiles anew: put it into a `jax.jit` of your own. **Returns** a `FunctionError`.
 
     >>> body, law = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.torques.Damping([0.1, 0.1, 0.1])
     >>> def last(omega, **tolerances):

@@ -89,8 +89,7 @@ def equations_of_motion(
     """The vector field of this body for states like `state0`, for plain `diffrax.ODETerm`.
 
     **Arguments** `body`, `state0`, `torque` as for `simulate`; under a torque with states of its
-    own `state0` is a `rigidjax.motion.coupled.Coupled`. **Raises** `TypeError` where they do not
-    fit.
+    own `state0` is a `motion.coupled.Coupled`. **Raises** `TypeError` where they do not fit.
 
     >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))
     <class 'rigidjax.motion.equations.EulerEquations'>

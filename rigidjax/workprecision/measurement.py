@@ -60,9 +60,8 @@ def measure(
 ) -> list[Record]:
     """Error and cost of each method at each of its settings, of the value and of its gradient.
 
-    All runs are in this process, in turn, round after round; compilation is timed separately. The
-    records omit methods that cannot do the scene, and runs with an error of more than half a radian
-    (or 100 %).
+    All runs are in this process, in turn, round after round; compilation is timed separately.
+    Methods that cannot do the scene, and errors above half a radian (or 100 %), are omitted.
 
     **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more of them;
     `gradients` whether gradients are measured, too; `thin` takes every `thin`-th setting; `rounds`

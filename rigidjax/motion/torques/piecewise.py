@@ -39,8 +39,7 @@ class Linear(_Table):
     `ChangingInertia`. Both may be traced. The derivative at a row is the slope of the line after
     it. `Series` is a cubic spline through evenly spaced rows, which has no kinks.
 
-    **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
-    increase, NaN.
+    **Raises:** `ValueError` for fewer than two rows, other counts, times that do not increase, NaN.
 
     >>> Linear([0.0, 2.0], [[0.0, 0, 0], [0.0, 0, 4]])(1.0)
     Array([0., 0., 2.], dtype=float64)
