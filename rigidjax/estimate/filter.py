@@ -11,23 +11,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar, ScalarLike
-from rigidjax.estimate import roots
-from rigidjax.estimate.scene import (
-    Dynamics,
-    Extended,
-    Model,
-    Read,
-    Sensors,
-    Stops,
-    bare,
-    by_sensor,
-    linearised,
-    not_negative,
-    reset,
-    sensors_of,
-    steps_of,
-    with_torque,
-)
+from rigidjax.estimate import roots, scene
+from rigidjax.estimate.scene import Dynamics, Extended, Model, Read, Sensors, Stops
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import attitudes, first_rate
 from rigidjax.motion import Attitude, Spin
@@ -100,8 +85,8 @@ def start(
     """
     _checks.instance(model, Model, "model")
     _checks.instance(recording, Recording, "recording")
-    model = with_torque(model, recording.torque)
-    sensors = sensors_of(recording.sensors, model)
+    model = scene.with_torque(model, recording.torque)
+    sensors = scene.sensors_of(recording.sensors, model)
     if state is None:
         state = _shown(recording)
     _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
@@ -130,7 +115,7 @@ def start(
 
 
 def _spread(value: Any, shape: tuple[int, ...], name: str, dtype: Any) -> Array:
-    deviation = not_negative(value, name)
+    deviation = scene.not_negative(value, name)
     if deviation.shape not in ((), shape):
         raise ValueError(f"{name}: wanted one number or shape {shape}, got {deviation.shape}")
     return jnp.broadcast_to(deviation, shape).astype(dtype)
@@ -177,7 +162,7 @@ def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | N
         )
         _checks.refuse(t, t[0] < t0, words)
     ends = xp.concatenate([t0[None], t])
-    counts = steps_of(model, ends, first.x.motion, substeps, recording)
+    counts = scene.steps_of(model, ends, first.x.motion, substeps, recording)
     index = np.repeat(np.arange(counts.size), counts)
     rows = np.cumsum(counts) - 1
     part = (np.arange(index.size) - np.repeat(rows - counts, counts)) / counts[index]
@@ -325,7 +310,7 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     if _checks.known((when, belief.t)):
         words = f"t: readings are out of order: {float(when):g} s is before {float(belief.t):g} s"
         _checks.refuse(when, when < belief.t, words)
-    sensors = sensors_of([reading[0] for reading in readings], model)
+    sensors = scene.sensors_of([reading[0] for reading in readings], model)
     values, masks = [], []
     for sensor, value, *seen in readings:
         name = type(sensor).__name__
@@ -336,7 +321,7 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
             _checks.refuse(value, not np.isfinite(np.asarray(value)).all(), words)
         values.append(value)
         masks.append(mask)
-    return _step(bare(model), sensors, belief, when, tuple(values), tuple(masks))
+    return _step(scene.bare(model), sensors, belief, when, tuple(values), tuple(masks))
 
 
 @eqx.filter_jit
@@ -356,10 +341,10 @@ def _one(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, Read]
     since = (stop.t - belief.t).astype(dtype)
     x, grown, noise = dynamics.predict(belief.t.astype(dtype), since, belief.x)
     root = roots.predicted(grown, belief.root, noise)
-    matrix, error, deviation, seen = linearised(dynamics, stop, x)
+    matrix, error, deviation, seen = scene.linearised(dynamics, stop, x)
     e = jnp.zeros_like(root[0])
     e, root, innovation, variance = roots.absorb_all(e, root, matrix, error, deviation**2, seen)
-    return Belief(stop.t, plus(x, e), reset(x, e, root)), Read(innovation, variance, seen)
+    return Belief(stop.t, plus(x, e), scene.reset(x, e, root)), Read(innovation, variance, seen)
 
 
 # The checked arguments of a filter: see `looked_at`.
@@ -388,7 +373,7 @@ def scan_filter(given: Given, keep: Any) -> tuple[Dynamics, Stops, Any]:
 def _filter(given: Given) -> Filtered:
     _, sensors, _, first, grid = given
     beliefs, read = grid.of_rows(scan_filter(given, lambda belief, read: (belief, read))[2])
-    reads, total = by_sensor(sensors, read), roots.terms(*read).log_density
+    reads, total = scene.by_sensor(sensors, read), roots.terms(*read).log_density
     return Filtered(beliefs, reads, total, *status_of(beliefs, reads, first.t))
 
 
@@ -424,6 +409,6 @@ def looked_at(model: Model, recording: Recording, first: Belief, substeps: int |
         if not isinstance(first.x.motion, sensor.feels):
             kind, got = sensor.feels.__name__, type(first.x.motion).__name__
             raise TypeError(f"first: a sensor needs a state with {kind}, got a {got}")
-    model = with_torque(model, recording.torque)
-    sensors = sensors_of(recording.sensors, model)
-    return bare(model), sensors, recording, first, grid_of(model, recording, first, substeps)
+    model = scene.with_torque(model, recording.torque)
+    sensors = scene.sensors_of(recording.sensors, model)
+    return scene.bare(model), sensors, recording, first, grid_of(model, recording, first, substeps)

@@ -11,13 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax.identify.body_charts import (
-    AbstractBodyChart,
-    Principal,
-    PrincipalRatios,
-    Ratios,
-    Tensor,
-)
+from rigidjax.identify import body_charts
 from rigidjax.identify.csv_io import (
     UNITS,
     USUAL as USUAL,
@@ -36,11 +30,11 @@ from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation import euler
 
 # Of the typical size of a moment, kg m².
-MODELS: dict[str, Callable[[float], AbstractBodyChart]] = {
-    "ratios": lambda _: Ratios(),
-    "principal-ratios": lambda _: PrincipalRatios(),
-    "tensor": Tensor,
-    "principal": Principal,
+MODELS: dict[str, Callable[[float], body_charts.AbstractBodyChart]] = {
+    "ratios": lambda _: body_charts.Ratios(),
+    "principal-ratios": lambda _: body_charts.PrincipalRatios(),
+    "tensor": body_charts.Tensor,
+    "principal": body_charts.Principal,
 }
 LOSSES = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}
 # The units of each kind of sensor, the usual one first; angles have those of "euler".
