@@ -37,9 +37,8 @@ def rf(x: Real, y: Real, z: Real) -> Result:
 def rd(x: Real, y: Real, z: Real) -> Result:
     """R_D(x, y, z) = (3/2) ∫₀^∞ dt / ((t+z) √((t+x)(t+y)(t+z))), of the second kind.
 
-    **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, in one unit. The result is
-    infinite for z = 0 or x = y = 0, and NaN for negative arguments. **Returns:** R_D (DLMF
-    19.16.5), symmetric in x and y.
+    **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, in one unit. It is infinite for
+    z = 0 or x = y = 0, NaN for negative arguments. **Returns:** R_D (DLMF 19.16.5).
 
     >>> float(rd(4.0, 4.0, 4.0))
     0.125

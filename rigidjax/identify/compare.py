@@ -33,8 +33,7 @@ class Comparison(eqx.Module):
 
 
 def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
-    """Models of the same data, best first, by Schwarz's criterion (1978,
-    doi:10.1214/aos/1176344136).
+    """Models of the same data, best first (Schwarz 1978, doi:10.1214/aos/1176344136).
 
     `N log s² + p log N` with s² the mean square of each sensor's errors and N the number of
     independent readings, those read divided by the samples over which the errors of the best model

@@ -34,8 +34,7 @@ class Free(eqx.Module):
     this standard deviation (in its unit; relative for `positive`), or `"estimated"` from the
     deviations of three recordings or more, with one `scale` as first guess; or `None`.
 
-    **Raises** `ValueError` for a scale, prior or spread that is not positive, and for a spread if
-    each recording has its own value already.
+    **Raises** `ValueError` for a scale, prior or spread ≤ 0, and for a spread with `each=True`.
 
     >>> Free(lambda r: r.readings[0].sensor.bias, "gyro bias", scale=0.01, spread=0.02).name
     'gyro bias'
