@@ -11,11 +11,11 @@ from rigidjax import _show
 from rigidjax.identify import flat_limit, uncertainty
 from rigidjax.identify.answers import EXPLAINS, FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
 from rigidjax.identify.causes import clock
-from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.flat_limit import of_charts
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import charts, quantities as quantities_of, values_and_slopes
 from rigidjax.identify.result import Fit, Start
+from rigidjax.identify.search import Tried
 from rigidjax.identify.terms import Noise
 from rigidjax.identify.uncertainty import Linearised, Times, scatter
 

@@ -15,14 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax.identify import padding, search
 from rigidjax.identify.assessment import assess
-from rigidjax.identify.checkpoint import (
-    Checkpoint,
-    SearchState,
-    Tried,
-    bare,
-    fingerprint,
-    require_folder,
-)
+from rigidjax.identify.checkpoint import Checkpoint, bare, fingerprint, require_folder
 from rigidjax.identify.initial_guess import starting_points
 from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces
 from rigidjax.identify.noise import estimate_noise
@@ -30,7 +23,7 @@ from rigidjax.identify.parameters import Parameters, by_slot, numbered
 from rigidjax.identify.problem import Problem, fits
 from rigidjax.identify.propagation import AbstractIntegrator, Adaptive
 from rigidjax.identify.result import Fit
-from rigidjax.identify.search import Task
+from rigidjax.identify.search import SearchState, Task, Tried
 from rigidjax.identify.stochastic_gradient import Descent, descend
 from rigidjax.identify.terms import Noise, all_errors
 from rigidjax.identify.uncertainty import linearise, of_white

@@ -10,11 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import block_diag
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify import padding, terms
 from rigidjax.identify.body_charts import charts_of, numbers_of
-from rigidjax.identify.checkpoint import SearchState, Tried
 from rigidjax.identify.levenberg_marquardt import BOLD, CAREFUL, Search, Settings, search
 from rigidjax.identify.normal import Normal, normal_of
 from rigidjax.identify.parameters import Parameters, columns_alone, local, places
@@ -37,6 +36,23 @@ SETTLED = 1e-7
 WILD = 100.0
 # Samples after the last one with weight: a low-pass filter looks ahead.
 _BEYOND = 2
+
+
+class Tried(eqx.Module):
+    """The end of one start; `cost` is ½ Σ of squares; `found` of `with_blocks` there, if known."""
+
+    parameters: Parameters
+    cost: Float[Array, "*starts"] = eqx.field(converter=jnp.asarray, default=np.inf)
+    converged: Bool[Array, "*starts"] = eqx.field(converter=jnp.asarray, default=False)
+    found: Any = None
+
+
+class SearchState(NamedTuple):
+    """The search from one start: the next horizon (their number at the end), strides, result."""
+
+    stage: int
+    strides: int
+    tried: Tried
 
 
 class Task(NamedTuple):

@@ -16,12 +16,12 @@ from rigidjax.body.inertia import Inertia, tensor_of
 from rigidjax.identify import answers, padding, uncertainty
 from rigidjax.identify.answers import FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
 from rigidjax.identify.body_charts import Bodies
-from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.fit import fit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, one_problem
 from rigidjax.identify.quantities import carried, quantities, values_and_slopes
 from rigidjax.identify.result import Fit
+from rigidjax.identify.search import Tried
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot
 from rigidjax.tumblers.search import MAGNITUDE, descended, noise_of, relative_flux, starts_of
