@@ -5,13 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax._types import Mat3
-from rigidjax.rotation.linalg3 import (
-    apply as apply,
-    cofactors,
-    determinant,
-    entries,
-    product as product,
-)
+from rigidjax.rotation import linalg3
+from rigidjax.rotation.linalg3 import apply as apply, product as product
 
 
 @jax.custom_jvp
@@ -21,10 +16,10 @@ def inverse(a: Mat3) -> Mat3:
     infinities; `Inertia.invertible` refuses it in words.
     """
     # One split: indexed, each entry is a kernel.
-    xx, _, _, _, yy, _, _, _, zz = entries(a)
+    xx, _, _, _, yy, _, _, _, zz = linalg3.entries(a)
     scale = xx + yy + zz
     unit = a / scale
-    return cofactors(unit) / determinant(unit) / scale
+    return linalg3.cofactors(unit) / linalg3.determinant(unit) / scale
 
 
 @inverse.defjvp

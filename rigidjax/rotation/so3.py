@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Scalar, ScalarLike, Vec3, Vec3Like
-from rigidjax.rotation import kernels, quaternion
+from rigidjax.rotation import kernels, linalg3, quaternion
 from rigidjax.rotation.fitting import (
     align as align,
     mean as mean,
@@ -24,14 +24,12 @@ from rigidjax.rotation.kernels import hat_polynomial, matrix_to_quaternion, vect
 from rigidjax.rotation.linalg3 import (
     apply as apply,
     basis as basis,
-    components,
     cross as cross,
     determinant as determinant,
     dot as dot,
     hat as hat,
     product as product,
     solve as solve,
-    square,
     vee as vee,
 )
 from rigidjax.rotation.stumpff import stumpff
@@ -72,8 +70,8 @@ def left_jacobian(v: Vec3Like) -> Mat3:
     >>> left_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    parts = components(turn(_checks.floating(v, (3,), "v"), "v"))
-    t = square(parts)
+    parts = linalg3.components(turn(_checks.floating(v, (3,), "v"), "v"))
+    t = linalg3.square(parts)
     return hat_polynomial(parts, stumpff(2, t), stumpff(3, t))
 
 

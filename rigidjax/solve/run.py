@@ -17,14 +17,9 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
-from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin, equations
 from rigidjax.motion.coupled import Coupled, CoupledEquations, started
-from rigidjax.motion.equations import (
-    AttitudeEquations,
-    EulerEquations,
-    NewtonEuler,
-    on_the_group,
-)  # fmt: skip
+from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
 from rigidjax.motion.torques.base import Torque, jumps_of
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
@@ -144,7 +139,7 @@ def solve(
     setup: Free | Loop | Setup, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
-    state0 = given = on_the_group(state0)
+    state0 = given = equations.on_the_group(state0)
     if isinstance(setup, Free):
         ys, stats, result = _free(setup, state0, ts)
     else:
