@@ -47,7 +47,6 @@ def from_components(
 
 
 def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
-    """The matrix `a bᵀ`."""
     return a[:, None] * b[None, :]
 
 

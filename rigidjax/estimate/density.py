@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -172,14 +172,6 @@ def of_draws(
     return jax.vmap(lambda one: function(density.unpack(one)))(x)
 
 
-class Curvature(NamedTuple):
-    """The cost, minus a log-density; Fisher's information `gram`; the gradient `slope`."""
-
-    cost: Scalar
-    gram: Float[Array, "n n"]
-    slope: Float[Array, " n"]
-
-
 def terms(density: LogDensity, x: Float[Array, " n"]) -> Terms:
     """The terms of all readings; derivatives recording by recording, in the numbers of each."""
 
@@ -197,9 +189,9 @@ def terms(density: LogDensity, x: Float[Array, " n"]) -> Terms:
     return of(_rows(density, x))
 
 
-def curvature(density: LogDensity, x: Float[Array, " n"]) -> Curvature:
-    """Cost, gradient and Fisher's information: normal errors with variances that x moves, too. `Σ
-    ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta and Mehra 1974,
+def curvature(density: LogDensity, x: Float[Array, " n"]) -> tuple[Scalar, Array, Array]:
+    """Cost, Fisher's information (n, n) and gradient (n,) of normal errors whose variances x moves,
+    too: `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta and Mehra 1974,
     doi:10.1109/TAC.1974.1100714, for the filter), and priors.
     """
     rows, push = jax.linearize(lambda x: _rows(density, x), x)
@@ -217,7 +209,7 @@ def curvature(density: LogDensity, x: Float[Array, " n"]) -> Curvature:
 
     extra, rest = with_jacobian(lambda x: prior_residuals(density, x), x)
     cost = 0.5 * jnp.sum(rest**2) - found.log_density
-    return Curvature(cost, gram + extra.T @ extra, slope + rest @ extra)
+    return cost, gram + extra.T @ extra, slope + rest @ extra
 
 
 def prior_residuals(density: LogDensity, x: Float[Array, " n"]) -> Float[Array, " m"]:

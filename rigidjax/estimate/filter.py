@@ -152,7 +152,6 @@ class Grid(NamedTuple):
 
 
 def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Grid:
-    """The times of the steps."""
     xp = _checks.namespace((recording.t, first.t))
     t, t0 = xp.asarray(recording.t), xp.asarray(first.t)
     if xp is np:

@@ -274,7 +274,6 @@ def reset(
 
 
 def not_negative(value: Any, name: str) -> Array:
-    """Finite numbers, none below zero."""
     array, wanted = _checks.numbers(value, name), "a finite number that is not below zero"
     if not array.size:
         raise ValueError(f"{name}: wanted {wanted}, got none")

@@ -428,6 +428,5 @@ def in_a_row(bodies: Any) -> list[Any]:
 
 
 def has_mass(chart: AbstractBodyChart) -> bool:
-    """Whether the chart's bodies have a mass."""
     sample: Any = eqx.filter_eval_shape(chart.body, jnp.zeros(chart.size))
     return isinstance(sample, MassProperties)

@@ -291,5 +291,4 @@ def weights_of(problem: "Problem", errors: tuple, noise: Noise) -> tuple[Float[A
 
 
 def half_sum(tree: Any) -> Float[Array, ""]:
-    """Half the sum of the squares of all leaves."""
     return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

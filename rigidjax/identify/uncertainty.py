@@ -41,7 +41,6 @@ class Linearised(eqx.Module):
 
     @property
     def size(self) -> int:
-        """The number of free numbers."""
         return int(self.extra_slopes.shape[-1])
 
     @property
@@ -400,7 +399,6 @@ class Times(eqx.Module):
 
     @property
     def longest(self) -> float:
-        """The longest of all channels."""
         return max(span for sensor in self.spans for span in sensor)
 
 
