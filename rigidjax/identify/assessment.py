@@ -67,15 +67,12 @@ def goodness(
             word = FAILS
         word = LEAVES if word == EXPLAINS else word
         sensors.append(index)
-        share = left / varies if varies > tiny and _differences(reading) else None
+        # An error with as many numbers as a reading has its unit.
+        alike = int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
+        share = left / varies if varies > tiny and alike else None
         span = None if white else times.longest
         words.append(_in_words(problem, reading, error, kept, factor, share, span))
     return chi2, max(count - free, 1), Answer(word, tuple(words)), tuple(sensors)
-
-
-def _differences(reading: Any) -> bool:
-    """Whether an error has as many numbers as a reading, and so its unit."""
-    return int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
 
 
 def _in_words(

@@ -167,10 +167,8 @@ def _with_noise(best: Tried, task: Task) -> tuple[Tried, Task]:
 
 def _from_pieces(problem: Problem, count: int, tolerance: float, max_steps: int) -> Parameters:
     cut = in_pieces(problem, count)
-    task, point = (
-        Task(cut, _first_noise(cut), tolerance, max_steps),
-        starting_points(cut, 1, None)[0],
-    )
+    task = Task(cut, _first_noise(cut), tolerance, max_steps)
+    point = starting_points(cut, 1, None)[0]
     for width in WIDTHS:
         narrowed = eqx.tree_at(lambda t: t.problem.rows.width, task, jnp.asarray(width))
         point = search.least_squares(

@@ -97,7 +97,6 @@ def search(
     Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares problems, section 3.2.
     """
     number, kind = start.size, start.dtype
-
     begun = Search(
         jnp.asarray(jnp.inf, kind),
         start,

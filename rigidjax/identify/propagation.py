@@ -29,8 +29,6 @@ from rigidjax.solve.tableaus import KUTTA4
 # The turn in a step, rad: the error of a fifth-order method is then 1e-9 a radian. A method of
 # order 4 has it in steps shorter by the second factor, at two thirds of the cost.
 TURN_A_STEP, TURN_OF_ORDER_4 = 0.1, 0.02
-
-
 # More fixed steps than this between two samples cost more than adaptive steps.
 FINEST = 32
 # The least relative tolerance at which steps are compared, and the part of one to the next.
