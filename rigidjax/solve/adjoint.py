@@ -31,7 +31,6 @@ def of_saved(
     between: Array | None,
 ) -> tuple[Array | None, Step, Array]:  # fmt: skip
     """The transpose of the states at the times in a step, from number `first` to before `last`.
-
     `bars` (K, n, *bodies) are the cotangents of all states. **Returns** `between`, if it is not
     `None`, with the cotangents of the times added, and those of the step and its slopes.
     """

@@ -206,10 +206,9 @@ def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
 
 @eqx.filter_jit
 def solve_to(loop: Loop, state0: Any, ts: Array, accuracy: Array) -> tuple[Loop, Any, Any]:
-    """A run with a global error of `accuracy`, if there is one.
-
-    The error of each run is its distance to the next, and decreases as the tolerance does.
-    **Returns** the loop at its tolerance, its result, tolerance and states of the run before.
+    """A run with a global error of `accuracy`, if there is one. The error of each run is its
+    distance to the next, and decreases as the tolerance does. **Returns** the loop at its
+    tolerance, its result, tolerance and states of the run before.
     """
     still = _still((loop, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
