@@ -26,14 +26,11 @@ _OUT = ("checkpoint", "figure", "report", "json", "csv", "keep")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code.
+    """Run the command line; returns the exit code: 0 success; 1 an untrustworthy fit; 2 bad input,
+    or a file that could not be written; 130 interrupted.
 
-    0 success; 1 an untrustworthy fit; 2 bad input, or a file that could not be written; 130
-    interrupted.
-
-    **Arguments:** `arguments` those of the command line; `None` for the ones of this process. Only
-    then does the process belong to this command, and its compiled programs are kept for the next
-    run (`--no-cache`).
+    **Arguments:** `arguments` of the command line; `None` for those of this process, which then
+    belongs to this command: its compiled programs are kept for the next run (`--no-cache`).
     """
     parser = _parser()
     options = parser.parse_args(arguments)
@@ -111,10 +108,7 @@ def _check_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -
 
 
 def _keep_compiled() -> None:
-    """Keep compiled programs in the user's cache folder: the next start takes seconds.
-
-    Not those of `workprecision`, which measures how long compiling takes.
-    """
+    """Keep compiled programs in the user's cache folder, unless it is compiling that is timed."""
     if jax.__version_info__ < (0, 12):
         # XLA reports two flags of its own for each program that it loads, 2.6 kB a line, as errors.
         jax.config.update("jax_logging_level", "CRITICAL")

@@ -37,8 +37,7 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
 
     **Arguments:** `tensor` (3, 3) symmetric: I (kg m²) or 𝔖 (kg m²), body frame. **Returns**
     `(moments, q)`: (3,), ascending, in the units of `tensor`, and (4,) a unit quaternion (w, x, y,
-    z) with `A = R(q) diag(moments) R(q)ᵀ`. Of the four right-handed choices it is the smallest
-    turn, hence `w ≥ ½`.
+    z) with `A = R(q) diag(moments) R(q)ᵀ`. Of four choices it is the smallest turn: `w ≥ ½`.
 
     The derivative is exact if the moments differ. Moments that are equal to round-off have one
     eigenspace: their derivatives are their own diagonal entries, and the axes do not turn inside
@@ -58,10 +57,9 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
 @jax.custom_jvp
 @jax.jit
 def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
-    """Ascending eigenvalues and a right-handed matrix of eigenvectors, as columns.
-
-    By cyclic Jacobi rotations (Golub and Van Loan 2013, section 8.5): in a batch eight times as
-    fast as LAPACK's `eigh`, and accurate for the small moment of a slender body along the axes.
+    """Ascending eigenvalues and a right-handed matrix of eigenvectors, as columns. By cyclic Jacobi
+    rotations (Golub and Van Loan 2013, section 8.5): in a batch eight times as fast as LAPACK's
+    `eigh`, and accurate for the small moment of a slender body along the axes.
     """
     # A power of two, so that scaling costs no digit.
     exponent = exponent_of(a)
@@ -144,8 +142,7 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     1965; Higham 2008, "Functions of Matrices", section 3.2).
 
     **Arguments:** `function` f, scalar → scalar, written in `jax.numpy`, smooth on the spectrum; it
-    may depend on differentiated values; `tensor` (3, 3) symmetric, I or 𝔖, any units. **Returns**
-    (3, 3), same frame.
+    may depend on differentiated values; `tensor` (3, 3) symmetric, any units. **Returns** (3, 3).
 
     >>> matrix_function(jnp.sqrt, 4.0 * jnp.eye(3))[0]
     Array([2., 0., 0.], dtype=float64)

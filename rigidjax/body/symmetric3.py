@@ -5,27 +5,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax._types import Mat3
-from rigidjax.rotation.linalg3 import (
-    apply as apply,
-    cofactors,
-    determinant,
-    entries,
-    product as product,
-)
+from rigidjax.rotation import linalg3
+from rigidjax.rotation.linalg3 import apply as apply, product as product
 
 
 @jax.custom_jvp
 def inverse(a: Mat3) -> Mat3:
-    """The inverse of a symmetric 3×3 matrix with trace > 0, by cofactors.
-
-    The matrix is divided by its trace first: 1e-20 or 1e37 kg m² neither underflow nor overflow. A
-    zero moment gives infinities; `Inertia.invertible` refuses it in words.
+    """The inverse of a symmetric 3×3 matrix with trace > 0, by cofactors. The matrix is divided by
+    its trace first: 1e-20 or 1e37 kg m² neither underflow nor overflow. A zero moment gives
+    infinities; `Inertia.invertible` refuses it in words.
     """
     # One split: indexed, each entry is a kernel.
-    xx, _, _, _, yy, _, _, _, zz = entries(a)
+    xx, _, _, _, yy, _, _, _, zz = linalg3.entries(a)
     scale = xx + yy + zz
     unit = a / scale
-    return cofactors(unit) / determinant(unit) / scale
+    return linalg3.cofactors(unit) / linalg3.determinant(unit) / scale
 
 
 @inverse.defjvp
@@ -53,7 +47,6 @@ def from_components(
 
 
 def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
-    """The matrix `a bᵀ`."""
     return a[:, None] * b[None, :]
 
 

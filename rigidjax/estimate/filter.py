@@ -11,23 +11,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar, ScalarLike
-from rigidjax.estimate import roots
-from rigidjax.estimate.scene import (
-    Dynamics,
-    Extended,
-    Model,
-    Read,
-    Sensors,
-    Stops,
-    bare,
-    by_sensor,
-    linearised,
-    not_negative,
-    reset,
-    sensors_of,
-    steps_of,
-    with_torque,
-)
+from rigidjax.estimate import roots, scene
+from rigidjax.estimate.scene import Dynamics, Extended, Model, Read, Sensors, Stops
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import attitudes, first_rate
 from rigidjax.motion import Attitude, Spin
@@ -91,8 +76,7 @@ def start(
     initial attitude and rate from the recording (`Spin` if no sensor shows an attitude). Then
     standard deviations, one number or three, zero for known values: `rate` of Ω, rad/s; `attitude`
     rad; `position` m and `velocity` m/s of a `Rigid`. Torques start from their model's stationary
-    distribution. **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing
-    or below zero.
+    distribution. **Returns** a `Belief`. **Raises:** `ValueError` for a missing or negative one.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
@@ -101,8 +85,8 @@ def start(
     """
     _checks.instance(model, Model, "model")
     _checks.instance(recording, Recording, "recording")
-    model = with_torque(model, recording.torque)
-    sensors = sensors_of(recording.sensors, model)
+    model = scene.with_torque(model, recording.torque)
+    sensors = scene.sensors_of(recording.sensors, model)
     if state is None:
         state = _shown(recording)
     _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
@@ -131,7 +115,7 @@ def start(
 
 
 def _spread(value: Any, shape: tuple[int, ...], name: str, dtype: Any) -> Array:
-    deviation = not_negative(value, name)
+    deviation = scene.not_negative(value, name)
     if deviation.shape not in ((), shape):
         raise ValueError(f"{name}: wanted one number or shape {shape}, got {deviation.shape}")
     return jnp.broadcast_to(deviation, shape).astype(dtype)
@@ -168,7 +152,6 @@ class Grid(NamedTuple):
 
 
 def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Grid:
-    """The times of the steps."""
     xp = _checks.namespace((recording.t, first.t))
     t, t0 = xp.asarray(recording.t), xp.asarray(first.t)
     if xp is np:
@@ -178,7 +161,7 @@ def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | N
         )
         _checks.refuse(t, t[0] < t0, words)
     ends = xp.concatenate([t0[None], t])
-    counts = steps_of(model, ends, first.x.motion, substeps, recording)
+    counts = scene.steps_of(model, ends, first.x.motion, substeps, recording)
     index = np.repeat(np.arange(counts.size), counts)
     rows = np.cumsum(counts) - 1
     part = (np.arange(index.size) - np.repeat(rows - counts, counts)) / counts[index]
@@ -199,10 +182,9 @@ WORDS = (
 class Filtered(eqx.Module):
     """The result of `filter`.
 
-    **Fields:** `belief` a `Belief` at each time of the recording, after its readings; `readings`,
-    for each sensor, a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all
-    readings; `status` 0 followed, 1 lost, 2 stopped (`words` says it); `lost_at` s, NaN unless
-    lost.
+    **Fields:** `belief` a `Belief` at each time of the recording, after its readings; `readings` of
+    each sensor a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all;
+    `status` 0 followed, 1 lost, 2 stopped (`words` says it); `lost_at` s, NaN unless lost.
     """
 
     belief: Belief
@@ -228,10 +210,8 @@ class Filtered(eqx.Module):
 
     @property
     def nis(self) -> tuple[Float[Array, " times"], ...]:
-        """Normalised innovations squared of each sensor, and how many numbers each holds.
-
-        They follow χ² with as many degrees of freedom if the model is right (Bar-Shalom, Li and
-        Kirubarajan, Estimation (2001), §5.4).
+        """Normalised innovations squared of each sensor: χ² of as many degrees of freedom as
+        numbers read if the model is right (Bar-Shalom, Li and Kirubarajan 2001, §5.4).
         """
         return tuple(
             jnp.sum(jnp.where(r.seen, r.innovation**2 / r.variance, 0), -1) for r in self.readings
@@ -329,7 +309,7 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     if _checks.known((when, belief.t)):
         words = f"t: readings are out of order: {float(when):g} s is before {float(belief.t):g} s"
         _checks.refuse(when, when < belief.t, words)
-    sensors = sensors_of([reading[0] for reading in readings], model)
+    sensors = scene.sensors_of([reading[0] for reading in readings], model)
     values, masks = [], []
     for sensor, value, *seen in readings:
         name = type(sensor).__name__
@@ -340,7 +320,7 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
             _checks.refuse(value, not np.isfinite(np.asarray(value)).all(), words)
         values.append(value)
         masks.append(mask)
-    return _step(bare(model), sensors, belief, when, tuple(values), tuple(masks))
+    return _step(scene.bare(model), sensors, belief, when, tuple(values), tuple(masks))
 
 
 @eqx.filter_jit
@@ -360,10 +340,10 @@ def _one(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, Read]
     since = (stop.t - belief.t).astype(dtype)
     x, grown, noise = dynamics.predict(belief.t.astype(dtype), since, belief.x)
     root = roots.predicted(grown, belief.root, noise)
-    matrix, error, deviation, seen = linearised(dynamics, stop, x)
+    matrix, error, deviation, seen = scene.linearised(dynamics, stop, x)
     e = jnp.zeros_like(root[0])
     e, root, innovation, variance = roots.absorb_all(e, root, matrix, error, deviation**2, seen)
-    return Belief(stop.t, plus(x, e), reset(x, e, root)), Read(innovation, variance, seen)
+    return Belief(stop.t, plus(x, e), scene.reset(x, e, root)), Read(innovation, variance, seen)
 
 
 # The checked arguments of a filter: see `looked_at`.
@@ -392,7 +372,7 @@ def scan_filter(given: Given, keep: Any) -> tuple[Dynamics, Stops, Any]:
 def _filter(given: Given) -> Filtered:
     _, sensors, _, first, grid = given
     beliefs, read = grid.of_rows(scan_filter(given, lambda belief, read: (belief, read))[2])
-    reads, total = by_sensor(sensors, read), roots.terms(*read).log_density
+    reads, total = scene.by_sensor(sensors, read), roots.terms(*read).log_density
     return Filtered(beliefs, reads, total, *status_of(beliefs, reads, first.t))
 
 
@@ -428,6 +408,6 @@ def looked_at(model: Model, recording: Recording, first: Belief, substeps: int |
         if not isinstance(first.x.motion, sensor.feels):
             kind, got = sensor.feels.__name__, type(first.x.motion).__name__
             raise TypeError(f"first: a sensor needs a state with {kind}, got a {got}")
-    model = with_torque(model, recording.torque)
-    sensors = sensors_of(recording.sensors, model)
-    return bare(model), sensors, recording, first, grid_of(model, recording, first, substeps)
+    model = scene.with_torque(model, recording.torque)
+    sensors = scene.sensors_of(recording.sensors, model)
+    return scene.bare(model), sensors, recording, first, grid_of(model, recording, first, substeps)

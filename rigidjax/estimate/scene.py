@@ -235,9 +235,7 @@ class Dynamics(eqx.Module):
     def predict(
         self, t: Scalar, h: Scalar, x: Extended, kicks: Array | None = None
     ) -> tuple[Extended, Float[Array, "n n"], Float[Array, "n m"]]:
-        """`x` a time `h` later, F (n, n) of its errors, and the root G (n, m) of the noise, about
-        `kicks`; drifts of walks come last in G.
-        """
+        """`x` after `h`; F (n, n) of its errors; G (n, m), root of noise at `kicks`, walks last."""
         kicks = jnp.zeros(self.kicks, x.motion.omega.dtype) if kicks is None else kicks
         after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
         moving = Extended(x.motion, x.torques, ())
@@ -261,11 +259,9 @@ class Dynamics(eqx.Module):
 def reset(
     x: Extended, e: Float[Array, " n"], root: Float[Array, "n m"], *, back: bool = False
 ) -> Float[Array, "n m"]:
-    """The root of the errors about `x ⊕ e`, from the `root` of the errors about x.
-
-    `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, to second order in the turn e: Mueller, Hehn and D'Andrea
-    2017, doi:10.2514/1.G000848. With `back` it multiplies by `J_r(e)⁻¹`, to third order: this is
-    how `log(exp(e) exp(δ))` moves with δ.
+    """The root of the errors about `x ⊕ e` from that about x: `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`,
+    to second order in the turn e (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848). With
+    `back` it multiplies by `J_r(e)⁻¹`, to third order: so `log(exp(e) exp(δ))` moves with δ.
     """
     first, second = (0.5, 1 / 12) if back else (-0.5, 1 / 6)
     across = jax.vmap(cross, (None, 1), 1)
@@ -278,7 +274,6 @@ def reset(
 
 
 def not_negative(value: Any, name: str) -> Array:
-    """Finite numbers, none below zero."""
     array, wanted = _checks.numbers(value, name), "a finite number that is not below zero"
     if not array.size:
         raise ValueError(f"{name}: wanted {wanted}, got none")
@@ -296,9 +291,7 @@ class Stops(NamedTuple):
 def linearised(
     dynamics: Dynamics, stop: Stops, x: Extended
 ) -> tuple[Float[Array, "k n"], Float[Array, " k"], Float[Array, " k"], Bool[Array, " k"]]:
-    """All numbers read at one time about the state x: the matrix of their predictions, their
-    errors, the deviations of these, and which are seen.
-    """
+    """All numbers read at one time about x: matrix, errors, deviations of these, which are seen."""
     dtype = x.motion.omega.dtype
     t = stop.t.astype(dtype)
     basis = jax.vmap(lambda e: tangent(x, e))(jnp.eye(dimension(x), dtype=dtype))
@@ -355,9 +348,7 @@ MEMORY_A_STEP = 0.25
 def steps_of(
     model: Model, ts: Any, state: Any, substeps: int | None, recording: Recording | None = None
 ) -> np.ndarray:
-    """The number of fixed steps from each of the times `ts` to the next: `substeps`, or by the rate
-    of the `state` and of gyros, or one if numbers are not known.
-    """
+    """Fixed steps from each of `ts` to the next: `substeps`, or by the rate if known, else one."""
     if substeps is not None:
         return np.full(ts.shape[0] - 1, _checks.whole(substeps, "substeps", 1))
     if not _checks.known((ts, state.omega, model.coloured)):
@@ -373,10 +364,8 @@ def steps_of(
 
 
 class Sampled(eqx.Module):
-    """The result of `sample`.
-
-    **Fields:** `t` (T,) s; `states` with a leading time axis; `torques` the value (T, 3) of each
-    `CorrelatedTorque`, N m, body frame.
+    """The result of `sample`: `t` (T,) s; `states` with a leading time axis; `torques` the value
+    (T, 3) of each `CorrelatedTorque`, N m, body frame.
     """
 
     t: Float[Array, " times"]

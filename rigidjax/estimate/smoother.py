@@ -10,28 +10,17 @@ from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
-from rigidjax.estimate import roots
+from rigidjax.estimate import roots, scene
 from rigidjax.estimate.filter import WORDS, Belief, Given, looked_at, scan_filter, status_of, told
 from rigidjax.estimate.linear import LinearEstimate, solved
-from rigidjax.estimate.scene import (
-    Dynamics,
-    Extended,
-    Model,
-    Read,
-    Stops,
-    by_sensor,
-    linearised,
-    reset,
-)
+from rigidjax.estimate.scene import Dynamics, Extended, Model, Read, Stops
 from rigidjax.identify.recording import Recording
 from rigidjax.motion.manifold import minus, plus
 
 
 class Push(NamedTuple):
-    """The estimate of a white torque, averaged over the step that ends at each time.
-
-    **Fields:** `mean`, `deviation` (N, 3) N m, body frame; the deviation is large for short steps,
-    since white noise has no value at a time.
+    """The estimate of a white torque, averaged over the step that ends at each time: `mean`,
+    `deviation` (N, 3) N m, body frame. The deviation is large for short steps.
     """
 
     mean: Float[Array, "stops 3"]
@@ -89,15 +78,13 @@ def smooth(
 
     The motion of largest posterior density, by Gauss and Newton's method: each iteration linearises
     dynamics and sensors about the last motion, at first that of `filter`, and solves the linear
-    problem exactly by a Kalman filter and the pass of Rauch, Tung and Striebel (Bell 1994,
-    doi:10.1137/0804035).
+    problem by a Kalman filter and Rauch, Tung and Striebel's pass (Bell 1994, doi:10.1137/0804035).
 
     **Arguments:** as for `filter`; `iterations` at most; it ends when no number moved by more than
     `tolerance` of its standard deviation (the error that remains is about the square of that).
     **Returns** `belief`, `rows`, `pushes`, `readings`, `log_likelihood`, `change`, `iterations`,
     `status` and `lost_at` (`Smoothed`). It may be jitted, differentiated in forward mode, and
-    batched. **Raises:** as `filter`; with `throw` also for a motion that still moves by a standard
-    deviation.
+    batched. **Raises:** as `filter`; with `throw` also if it moves by a deviation still.
 
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
@@ -124,7 +111,7 @@ def _smooth(given: Given, iterations: int, tolerance: float) -> Smoothed:
     _, sensors, _, first, grid = given
     dynamics, stops, kept = scan_filter(given, lambda belief, read: (belief, read))
     beliefs, read = grid.of_rows(kept)
-    status, lost_at = status_of(beliefs, by_sensor(sensors, read), first.t)
+    status, lost_at = status_of(beliefs, scene.by_sensor(sensors, read), first.t)
     path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, kept[0].x)
 
     def more(state: tuple) -> Array:
@@ -151,7 +138,7 @@ def _smooth(given: Given, iterations: int, tolerance: float) -> Smoothed:
         variance = jnp.diagonal(found.kick_covariance, axis1=1, axis2=2)[:, mine]
         pushes.append(Push(size * found.kicks[:, mine], size * jnp.sqrt(variance)))
     belief = Belief(stops.t, jax.tree.map(lambda leaf: leaf[1:], path), found.root[1:])
-    reads = by_sensor(sensors, Read(found.innovation[1:], found.variance[1:], kept[1].seen))
+    reads = scene.by_sensor(sensors, Read(found.innovation[1:], found.variance[1:], kept[1].seen))
     status = jnp.where(jnp.isfinite(change), status, 2)
     total = found.log_likelihood
     return Smoothed(belief, grid.rows, tuple(pushes), reads, total, change, count, status, lost_at)
@@ -170,9 +157,9 @@ def _iterate(
             t0.astype(dtype), (stop.t - t0).astype(dtype), x, kick
         )
         off = minus(after, y)
-        grown, noise = (reset(y, off, part, back=True) for part in (grown, noise))
+        grown, noise = (scene.reset(y, off, part, back=True) for part in (grown, noise))
         push = off - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
-        return (grown, noise, push), linearised(dynamics, stop, y)
+        return (grown, noise, push), scene.linearised(dynamics, stop, y)
 
     before = jnp.concatenate([first.t[None], stops.t[:-1]])
     x0, earlier, later = (
@@ -184,6 +171,6 @@ def _iterate(
     parts = dict(zip(("transition", "noise", "push"), steps, strict=True))
     parts |= {"matrix": matrix, "deviation": deviation, "offset": None}
     off = minus(x0, first.x)
-    found = solved(parts, error, -off, reset(x0, off, first.root), seen, back=True)
+    found = solved(parts, error, -off, scene.reset(x0, off, first.root), seen, back=True)
     change = jnp.max(jnp.abs(found.mean) * roots.inverse_root(jnp.sum(found.root**2, -1)))
     return jax.vmap(plus)(path, found.mean), found, change

@@ -47,16 +47,14 @@ from rigidjax.rotation.linalg3 import components
 _STILL = {jnp.dtype("float32"): 5e-3, jnp.dtype("float64"): 5e-6}
 
 
-# Up to so many times a loop over them compiles sooner than one batch, and is as fast but for the
-# values of one body.
+# Up to so many times a loop compiles sooner than a batch, as fast but for values of one body.
 _LOOPED = 1000
 
 
 @jax.custom_jvp
 def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
-    """Π(t) and the quaternion of the turn since 0.
-
-    `moments`: I11 ≤ I22 ≤ I33, I12, I13, I23, the last three zero in value; `momentum` Π(0).
+    """Π(t) and the quaternion of the turn since 0. `moments`: I11 ≤ I22 ≤ I33, I12, I13, I23, the
+    last three zero in value; `momentum` Π(0).
     """
     return momentum_and_turn(orbit(moments[:3], momentum), t)
 

@@ -11,12 +11,11 @@ from rigidjax import _show
 from rigidjax.identify import flat_limit, uncertainty
 from rigidjax.identify.answers import EXPLAINS, FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
 from rigidjax.identify.causes import clock
-from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.flat_limit import of_charts
-from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import charts, quantities as quantities_of, values_and_slopes
 from rigidjax.identify.result import Fit, Start
+from rigidjax.identify.search import Tried
 from rigidjax.identify.terms import Noise
 from rigidjax.identify.uncertainty import Linearised, Times, scatter
 
@@ -32,20 +31,18 @@ def goodness(
     problem: Problem, noise: Noise, linear: Linearised, times: Times, covariance: np.ndarray
 ) -> tuple[float, int, Answer, tuple[int, ...]]:
     """χ² and its degrees of freedom (sensors of given noise), the answer, the sensors left over.
-
-    The size of the errors is compared with a given noise (five standard deviations of χ², or of the
-    median of the squares under a robust loss) and with the variance of the readings; Ljung and
-    Box's test (1978, doi:10.1093/biomet/65.2.297) says whether they are white. Readings at full
-    scale take no part. `covariance` (n, n) is that of white errors.
+    The size of errors is compared with a given noise (five standard deviations of χ², or of the
+    median of squares under a robust loss) and with the variance of the readings; Ljung and Box's
+    test (1978, doi:10.1093/biomet/65.2.297) says if they are white. Readings at full scale take no
+    part. `covariance` (n, n) is that of white errors.
     """
     chi2, count, word, free = 0.0, 0, EXPLAINS, linear.size
     words: list[str] = []
     sensors: list[int] = []
-    cut, own = at_limit(problem.records.readings), linear.blocks(covariance)
-    for index, (reading, error, e, weight, full) in enumerate(
-        zip(problem.records.readings, linear.raw, linear.errors, linear.weights, cut, strict=True)
-    ):
-        kept, given = (weight > 0)[..., None] & ~full, reading.sensor.noise is not None
+    own, readings = linear.blocks(covariance), problem.records.readings
+    parts = zip(readings, linear.raw, linear.errors, linear.weights, linear.kept, strict=True)
+    for index, (reading, error, e, weight, kept) in enumerate(parts):
+        given = reading.sensor.noise is not None
         left, varies, tiny = _sizes(reading, error, kept)
         factor = 1.0
         if given:
@@ -54,8 +51,8 @@ def goodness(
             dof = max(many - free, 1)
             factor = float(np.sqrt(total / dof)) if total > dof + 5 * np.sqrt(2 * dof) else 1.0
             if problem.loss is not None and many:
-                rows = kept.all(axis=-1) & (weight > 0)
-                factor = _median_above(np.sum(e[rows] ** 2, axis=-1), e.shape[-1])
+                squares = np.sum(e[kept.all(axis=-1)] ** 2, axis=-1)
+                factor = _median_above(squares, e.shape[-1])
         root = np.sqrt(weight)[..., None]
         slope = linear.slopes[index] * root[..., None]
         white = left <= tiny or _white(e * root, kept, slope, own, given)
@@ -70,15 +67,12 @@ def goodness(
             word = FAILS
         word = LEAVES if word == EXPLAINS else word
         sensors.append(index)
-        share = left / varies if varies > tiny and _differences(reading) else None
+        # An error with as many numbers as a reading has its unit.
+        alike = int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
+        share = left / varies if varies > tiny and alike else None
         span = None if white else times.longest
         words.append(_in_words(problem, reading, error, kept, factor, share, span))
     return chi2, max(count - free, 1), Answer(word, tuple(words)), tuple(sensors)
-
-
-def _differences(reading: Any) -> bool:
-    """Whether an error has as many numbers as a reading, and so its unit."""
-    return int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
 
 
 def _in_words(
@@ -156,10 +150,8 @@ def _white(
     e: np.ndarray, kept: np.ndarray, slope: np.ndarray, covariance: np.ndarray, given: bool
 ) -> bool:
     """Whether whitened errors (R, T, k) are white; errors far below a `given` noise are no
-    evidence.
-
-    Fitted numbers take `slope covariance slopeᵀ` of white errors away, and leave them correlated,
-    which shows in many short recordings (Box and Pierce 1970, doi:10.1080/01621459.1970.10481180).
+    evidence. Fitted numbers take `slope covariance slopeᵀ` away and leave them correlated, which
+    shows in many short recordings (Box and Pierce 1970, doi:10.1080/01621459.1970.10481180).
     """
     from scipy.special import chdtrc
 
@@ -219,7 +211,7 @@ def assess(
     value = best.parameters
     near = flat_limit.beside(problem, value)
     linear = uncertainty.linearise(problem, value, noise, best.found, near)
-    times = uncertainty.correlation_times(linear, at_limit(problem.records.readings))
+    times = uncertainty.correlation_times(linear)
     white = uncertainty.of_white(linear)
     spread = uncertainty.spread(linear, times, white)
     numbers, of = values_and_slopes(problem, value, near), charts(problem)

@@ -2,8 +2,7 @@
 
 Each cause has a direction: the change of the readings with it along the fitted motion. Errors are
 regressed on it together with all free numbers (a score test: Rao 1948,
-doi:10.1017/S0305004100023987). A cause that the free numbers could absorb therefore explains
-nothing.
+doi:10.1017/S0305004100023987). A cause that these could absorb explains nothing.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +14,6 @@ import numpy as np
 from rigidjax.identify import padding
 from rigidjax.identify.answers import Cause
 from rigidjax.identify.body_charts import in_a_row, tensor_of
-from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.initial_guess import balance, of_rates, tensor_and_margin
 from rigidjax.identify.parameters import Parameters, numbered
 from rigidjax.identify.problem import Problem
@@ -53,10 +51,9 @@ ATTITUDES = {
 
 
 def misread(recordings: Sequence[Recording]) -> Cause | None:
-    """The mistake in reading the rates of one body, if there is one.
-
-    Rates are compared with those between attitudes, or else with Euler's equations for the best
-    body: a correction counts only if that is real. A mirrored axis shows only under a torque.
+    """The mistake in reading the rates of one body, if there is one. Rates are compared with those
+    between attitudes, or else with Euler's equations for the best body: a correction counts only if
+    that is real. A mirrored axis shows only under a torque.
     """
     gyros = readings_of(recordings[0], Gyro)
     if not gyros:
@@ -154,11 +151,9 @@ def causes(
 
 
 def clock(problem: Problem, noise: Noise, linear: Linearised, index: int) -> Cause | None:
-    """Time stamps that scatter, by more than the sensor's jitter: each error is along the change of
-    the readings.
-    """
+    """Time stamps that scatter by more than the jitter: errors are along the readings' change."""
     sensor, error = problem.records.readings[index].sensor, linear.raw[index]
-    kept = (linear.weights[index] > 0) & ~at_limit(problem.records.readings)[index].any(axis=-1)
+    kept = linear.kept[index].all(axis=-1)
     if not (_of_three(sensor) and error[kept].any()):
         return None
     slope = _slope(problem, np.asarray(problem.records.readings[index].values) - error)

@@ -6,37 +6,18 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
 
-from rigidjax.identify.parameters import Parameters
-
-
-class Tried(eqx.Module):
-    """The end of one start; `cost` is ½ Σ of squares; `found` of `with_blocks` there, if known."""
-
-    parameters: Parameters
-    cost: Float[Array, "*starts"] = eqx.field(converter=jnp.asarray, default=np.inf)
-    converged: Bool[Array, "*starts"] = eqx.field(converter=jnp.asarray, default=False)
-    found: Any = None
+from rigidjax.identify.search import SearchState, Tried
 
 
 def bare(tried: Tried) -> Tried:
     """The same without its large arrays."""
     return tried if tried.found is None else dataclasses.replace(tried, found=None)
-
-
-class SearchState(NamedTuple):
-    """The search from one start: the next horizon (their number at the end), strides, result."""
-
-    stage: int
-    strides: int
-    tried: Tried
 
 
 def require_folder(path: str | Path) -> None:
@@ -62,10 +43,9 @@ def fingerprint(*trees: Any) -> str:
 
 
 class Checkpoint:
-    """The results of a long search so far, on disk after every stride of steps.
-
-    `like` is a `Tried` of the right shapes, `print_of` the `fingerprint` of all that the search
-    depends on. A file of another problem raises `ValueError`, and is not overwritten.
+    """The results of a long search so far, on disk after every stride of steps. `like` is a `Tried`
+    of the right shapes, `print_of` the `fingerprint` of all that the search depends on. A file of
+    another problem raises `ValueError`, and is not overwritten.
     """
 
     def __init__(self, path: str | Path | None, like: Tried, print_of: str):

@@ -11,21 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax.identify.body_charts import (
-    AbstractBodyChart,
-    Principal,
-    PrincipalRatios,
-    Ratios,
-    Tensor,
-)
-from rigidjax.identify.csv_io import (
-    UNITS,
-    USUAL as USUAL,
-    LogError,
-    increasing,
-    layout_of as layout_of,
-    read_table,
-)
+from rigidjax.identify import body_charts, csv_io
+from rigidjax.identify.csv_io import UNITS, USUAL as USUAL, LogError, layout_of as layout_of
 from rigidjax.identify.loss import Huber, SoftL1
 from rigidjax.identify.parameters import Free
 from rigidjax.identify.problem import Problem
@@ -36,11 +23,11 @@ from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation import euler
 
 # Of the typical size of a moment, kg m².
-MODELS: dict[str, Callable[[float], AbstractBodyChart]] = {
-    "ratios": lambda _: Ratios(),
-    "principal-ratios": lambda _: PrincipalRatios(),
-    "tensor": Tensor,
-    "principal": Principal,
+MODELS: dict[str, Callable[[float], body_charts.AbstractBodyChart]] = {
+    "ratios": lambda _: body_charts.Ratios(),
+    "principal-ratios": lambda _: body_charts.PrincipalRatios(),
+    "tensor": body_charts.Tensor,
+    "principal": body_charts.Principal,
 }
 LOSSES = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}
 # The units of each kind of sensor, the usual one first; angles have those of "euler".
@@ -72,11 +59,9 @@ class WheelColumn(eqx.Module):
 
 
 def channel(text: str) -> Channel:
-    """A sensor written `KIND=COLUMNS[:UNIT[:NOISE]]`, such as `gyro=wx,wy,wz:deg/s:0.1`.
-
-    KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y, z) or `euler-ZXZ` (any sequence; body →
-    world); NOISE one number or three, one for each axis, as in `0.1,0.1,0.2`. **Raises**
-    `LogError` in words.
+    """A sensor written `KIND=COLUMNS[:UNIT[:NOISE]]`, such as `gyro=wx,wy,wz:deg/s:0.1`: KIND is
+    `gyro`, `accelerometer`, `quaternion` (w, x, y, z) or `euler-ZXZ` (any sequence; body → world);
+    NOISE one number or one for each axis, as in `0.1,0.1,0.2`. **Raises** `LogError` in words.
     """
     kind, _, rest = text.partition("=")
     names, *more = rest.split(":")
@@ -112,9 +97,8 @@ def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
 
 
 def wheel(text: str) -> WheelColumn:
-    """A wheel written `COLUMN:INERTIA[:AXIS[:UNIT]]`, such as `flywheel:5.2e-7:z:rad/s`.
-
-    INERTIA in kg m² about its axis, AXIS `x`, `y` or `z` of the body. **Raises** `LogError`.
+    """A wheel written `COLUMN:INERTIA[:AXIS[:UNIT]]`, such as `flywheel:5.2e-7:z:rad/s`: INERTIA in
+    kg m² about its AXIS, `x`, `y` or `z` of the body. **Raises** `LogError`.
     """
     name, *more = text.split(":")
     axis = more[1] if len(more) > 1 else "z"
@@ -141,17 +125,16 @@ def read_log(
 ) -> Recording:
     """One recording from a file, with the described sensors and wheels.
 
-    **Arguments:** `path`; `channels`; `time`, `time_unit` the time column; `window` (from, to), s,
-    or `None` for all; `wheels`; `free` some of `bias`, `drag`, `delay`: sensors and torque get
-    these numbers, so that a fit can move them. An empty cell is a gap. **Raises** `LogError` as
-    `read_table`.
+    **Arguments:** `path`; `channels`; `time`, `time_unit` of the time column; `window` (from, to),
+    s, or `None` for all; `wheels`; `free` some of `bias`, `drag`, `delay`, which are put in for a
+    fit to move. An empty cell is a gap. **Raises** `LogError` as `read_table`.
     """
     # Two wheels may share a column of their speed.
     turning = dict.fromkeys(w.column for w in wheels)
     names = [time, *(c for one in channels for c in one.columns), *turning]
-    table = read_table(path, names)
+    table = csv_io.read_table(path, names)
     t = table[time] * UNITS[time_unit]
-    increasing(path, t, time)
+    csv_io.increasing(path, t, time)
     inside = np.ones(t.shape, bool)
     if window is not None:
         inside = (t >= window[0] - 1e-12) & (t <= window[1] + 1e-12)

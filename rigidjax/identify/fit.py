@@ -13,16 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax.identify import padding
+from rigidjax.identify import padding, search
 from rigidjax.identify.assessment import assess
-from rigidjax.identify.checkpoint import (
-    Checkpoint,
-    SearchState,
-    Tried,
-    bare,
-    fingerprint,
-    require_folder,
-)
+from rigidjax.identify.checkpoint import Checkpoint, bare, fingerprint, require_folder
 from rigidjax.identify.initial_guess import starting_points
 from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces
 from rigidjax.identify.noise import estimate_noise
@@ -30,18 +23,7 @@ from rigidjax.identify.parameters import Parameters, by_slot, numbered
 from rigidjax.identify.problem import Problem, fits
 from rigidjax.identify.propagation import AbstractIntegrator, Adaptive
 from rigidjax.identify.result import Fit
-from rigidjax.identify.search import (
-    CAREFUL,
-    Task,
-    again,
-    climb,
-    climb_together,
-    cost_of,
-    enough,
-    evaluate,
-    least_squares,
-    whole,
-)
+from rigidjax.identify.search import SearchState, Task, Tried
 from rigidjax.identify.stochastic_gradient import Descent, descend
 from rigidjax.identify.terms import Noise, all_errors
 from rigidjax.identify.uncertainty import linearise, of_white
@@ -128,7 +110,7 @@ def fit(
     points, cut, rough = points[:starts], [], []
     if isinstance(problem.integrator, Adaptive):
         # Another tolerance is no other program: the noise of long steps would slow down the search.
-        finer = _finer(Tried(points[0], found=evaluate(points[0], problem)), task, rough)
+        finer = _finer(Tried(points[0], found=search.evaluate(points[0], problem)), task, rough)
         task = task if rough else task._replace(problem=_with(problem, finer))
     if descent is not None:
         points = _descended(points, task, descent, key, progress, cut)
@@ -144,7 +126,7 @@ def fit(
     rough.clear()
     while (finer := _finer(best, task, rough)) is not None:
         task = task._replace(problem=_with(task.problem, finer))
-        best, task = _with_noise(again(best, task), task)
+        best, task = _with_noise(search.again(best, task), task)
         best = _evaluated(best, task.problem)
     shown = given if task.problem is problem else _as_given(given, task.problem)
     return assess(task.problem, best, task.noise, tried, lowest, shown, cut, rough)
@@ -179,19 +161,19 @@ def _with_noise(best: Tried, task: Task) -> tuple[Tried, Task]:
     # Twice: the weights of the channels and the robust loss both depend on the noise.
     for _ in range(2):
         task = estimated(best, task)
-        best = again(best, task)
+        best = search.again(best, task)
     return best, estimated(best, task)
 
 
 def _from_pieces(problem: Problem, count: int, tolerance: float, max_steps: int) -> Parameters:
     cut = in_pieces(problem, count)
-    task, point = (
-        Task(cut, _first_noise(cut), tolerance, max_steps),
-        starting_points(cut, 1, None)[0],
-    )
+    task = Task(cut, _first_noise(cut), tolerance, max_steps)
+    point = starting_points(cut, 1, None)[0]
     for width in WIDTHS:
         narrowed = eqx.tree_at(lambda t: t.problem.rows.width, task, jnp.asarray(width))
-        point = least_squares(point, narrowed, whole(cut), max_steps, CAREFUL).parameters
+        point = search.least_squares(
+            point, narrowed, search.whole(cut), max_steps, search.CAREFUL
+        ).parameters
     return joined(problem, cut, point)
 
 
@@ -206,9 +188,9 @@ def _descended(
     keys = jax.random.split(jax.random.key(1) if key is None else key, len(points))
     out: list[Parameters] = []
     for point, own in zip(points, keys, strict=True):
-        near, whole = descend(point, task.problem, task.noise, descent, own, progress)
+        near, ended = descend(point, task.problem, task.noise, descent, own, progress)
         out.append(near)
-        if not whole:
+        if not ended:
             cut.append(f"interrupted in the descent of start {len(out)} of {len(points)}")
             break
     return out
@@ -224,7 +206,7 @@ def _one_by_one(
     like, print_of = Tried(points[0]), ""
     if checkpoint is not None:
         # The misfits as well: the fingerprint contains only the name of a torque function.
-        costs = [cost_of(point, task.problem, task.noise) for point in points]
+        costs = [search.cost_of(point, task.problem, task.noise) for point in points]
         print_of = fingerprint(points, task, costs)
     keep = Checkpoint(checkpoint, like, print_of)
     tried, latest = list(keep.done), keep.position.tried
@@ -243,8 +225,8 @@ def _one_by_one(
             start = keep.position if resumed else SearchState(0, 0, Tried(point))
             # After a start that explains the record, other starts only show whether it is unique.
             aim = min((float(item.cost) for item in tried if bool(item.converged)), default=np.inf)
-            aim = aim if aim <= enough(task.problem) else 0.0
-            out, latest = climb(start, task, look=look, aim=aim), like
+            aim = aim if aim <= search.enough(task.problem) else 0.0
+            out, latest = search.climb(start, task, look=look, aim=aim), like
             tried.append(out)
             # Only the best start keeps its derivatives, which need memory.
             best = min(tried, key=_cost)
@@ -272,7 +254,7 @@ def _together(
         for first in range(0, len(points), together):
             batch = points[first : first + together]
             stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *batch)
-            tried += climb_together(stacked, task)
+            tried += search.climb_together(stacked, task)
             _say(progress, len(tried), len(points), tried)
     except KeyboardInterrupt:
         cut.append(f"interrupted after {len(tried)} of {len(points)} starts")
@@ -291,7 +273,7 @@ def _evaluated(best: Tried, problem: Problem) -> Tried:
     """The same with errors and derivatives, unless the search ended with them."""
     if best.found is not None:
         return best
-    return dataclasses.replace(best, found=evaluate(best.parameters, problem))
+    return dataclasses.replace(best, found=search.evaluate(best.parameters, problem))
 
 
 @eqx.filter_jit
@@ -308,7 +290,6 @@ def _with(problem: Problem, integrator: AbstractIntegrator | None) -> Problem:
 
 def _finer(best: Tried, task: Task, rough: list[str]) -> AbstractIntegrator | None:
     """The integrator whose predictions finer steps do not change, `None` if it is the one in use.
-
     If there is none, `rough` says so.
     """
     problem, (errors, _) = task.problem, best.found[0]
@@ -316,7 +297,7 @@ def _finer(best: Tried, task: Task, rough: list[str]) -> AbstractIntegrator | No
     while steps is not None and (finer := steps.finer()) is not None:
         closer = _with(problem, finer)
         if jax.tree.structure(finer) == jax.tree.structure(problem.integrator):
-            (exact, _), _ = evaluate(best.parameters, closer)
+            (exact, _), _ = search.evaluate(best.parameters, closer)
         else:
             exact = _errors_alone(best.parameters, closer)
         apart = max(
@@ -367,7 +348,7 @@ def _with_widths(best: Tried, task: Task) -> tuple[Tried, Task]:
         new = [jnp.asarray(width) for width in found]
         problem = eqx.tree_at(lambda p: [p.slots[i].spread for i in wanted], task.problem, new)
         task = task._replace(problem=problem)
-        best = again(best, task)
+        best = search.again(best, task)
         if (np.abs(found - before) < _SETTLED * before).all() or (found <= least).all():
             break
         before = found

@@ -29,10 +29,9 @@ class Layout(NamedTuple):
 
 
 def blackbox(path: Path, columns: Sequence[str]) -> Columns:
-    """The names of all fields, and the wanted ones, of the first flight in a Blackbox log.
-
-    Rates come in deg/s and accelerations in g by the scales in the header, as in the flight
-    controllers' own viewer; other fields as logged. A log without its last mark is read to its end.
+    """The names of all fields, and the wanted ones, of the first flight in a Blackbox log. Rates
+    come in deg/s and accelerations in g by the scales in the header, as in the flight controllers'
+    own viewer; other fields as logged. A log without its last mark is read to its end.
     """
     parser = _checks.library("orangebox", "blackbox", str(path)).Parser.load(str(path))
     names = parser.field_names
@@ -81,9 +80,8 @@ def ulog(path: Path, columns: Sequence[str]) -> Columns:
 
 
 def mcap(path: Path, columns: Sequence[str]) -> Columns:
-    """`topic.field.part` of the JSON and ROS 2 messages in an MCAP file, as
-    `/imu.angular_velocity.x`; `topic.log_time` and `topic.stamp` (of its header), s from the first
-    message of the file.
+    """`topic.field.part` of JSON and ROS 2 messages in an MCAP file, as `/imu.angular_velocity.x`;
+    `topic.log_time` and `topic.stamp` (of its header), s from the first message.
     """
     make_reader = _checks.library("mcap.reader", "mcap", str(path)).make_reader
     ros = _checks.library("mcap_ros2.decoder", "mcap", str(path)).DecoderFactory
@@ -138,10 +136,9 @@ _CRAZYFLIE = 0xBC
 
 
 def crazyflie(path: Path, columns: Sequence[str]) -> Columns:
-    """The variables of a Crazyflie's µSD log by name, as `gyro.x`, and their `timestamp`, µs.
-
-    They are those of the event with most of the wanted names. Source: the format's description in
-    the firmware's documentation, "µSD card deck", versions 1 and 2.
+    """The variables of a Crazyflie's µSD log by name, as `gyro.x`, and their `timestamp`, µs. They
+    are those of the event with most of the wanted names. Source: the format's description in the
+    firmware's documentation, "µSD card deck", versions 1 and 2.
     """
     data = path.read_bytes()
     version, count = struct.unpack_from("<HH", data, 1)

@@ -60,24 +60,11 @@ def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
     return out
 
 
-def at_limit(readings: Sequence[Any]) -> tuple[np.ndarray, ...]:
-    """The mask of each sensor's readings at full scale, (R, T, k); of a problem's stacked ones."""
-    out = []
-    for reading in readings:
-        limit = getattr(reading.sensor, "limit", None)
-        if limit is None:
-            out.append(np.zeros((*reading.mask.shape, reading.sensor.components), bool))
-            continue
-        full = np.abs(np.asarray(reading.values)) >= np.asarray(limit)[:, None] * (1 - 1e-6)
-        out.append(full & reading.seen[..., None])
-    return tuple(out)
-
-
 def in_words(readings: Sequence[Any]) -> list[str]:
     """The readings at full scale, for a report."""
     out = []
-    for reading, full in zip(readings, at_limit(readings), strict=True):
-        count = full.sum(axis=(0, 1))
+    for reading in readings:
+        count = (reading.seen[..., None] & ~reading.kept).sum(axis=(0, 1))
         if not count.any():
             continue
         sensor = reading.sensor

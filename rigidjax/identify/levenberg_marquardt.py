@@ -12,8 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rigidjax.identify.normal import Normal
 
-# Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
-# long as Gauss and Newton's.
+# Damping over the diagonal of the normal equations (Marquardt's): one halves Gauss–Newton's step.
 CAREFUL, BOLD = 1.0, 1e-3
 # Numbers scaled to order one go no further than this in a step.
 LONGEST = 2.0
@@ -40,12 +39,11 @@ def _float(value: Any) -> np.ndarray:
 
 
 class Settings(eqx.Module):
-    """The settings of a search, as arrays: another value does not compile again.
-
-    Steps of `tolerance` standard deviations (of each number alone) end it, and more than `steps`;
-    if it would need more than `PATIENCE` steps at its pace to an `aim` of another search; if a step
-    of about the predicted gain gains less than `level` of what a fit gains from noise; at a cost of
-    `near`. Zero for none.
+    """The settings of a search, as arrays: another value does not compile again. It ends at steps
+    of `tolerance` standard deviations (of each number alone); after `steps`; if it would need more
+    than `PATIENCE` steps at its pace to an `aim` of another search; if a step of about the
+    predicted gain gains less than `level` of what a fit gains from noise; at a cost of `near`. Zero
+    for none.
     """
 
     tolerance: Any = eqx.field(converter=_float)
@@ -57,10 +55,9 @@ class Settings(eqx.Module):
 
 
 class Search(eqx.Module):
-    """The state of a search: the best `point` so far, with `normal` and `slope` there; the
-    `trial` next, and its `hoped` gain; `pace` of the logarithm of the cost; evaluations `taken`;
-    `found` of the last one, whether `here` at the best point; `rise` of the last trial over its
-    predicted gain, zero if it was better.
+    """The state of a search: the best `point` so far, `normal` and `slope` there; the `trial` next,
+    its `hoped` gain; `pace` of the logarithm of the cost; evaluations `taken`; `found` of the last
+    one, if `here` at the best point; `rise` of the last trial over its hoped gain, zero if better.
     """
 
     first: Float[Array, ""]
@@ -100,7 +97,6 @@ def search(
     Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares problems, section 3.2.
     """
     number, kind = start.size, start.dtype
-
     begun = Search(
         jnp.asarray(jnp.inf, kind),
         start,

@@ -25,9 +25,7 @@ WIDTHS = (1.0, 1e-1, 1e-2, 1e-3)
 
 
 class Links(Rows):
-    """Pieces of a long recording: `on` (R,) one if it continues in the next, else zero; `width` the
-    standard deviation of the gap, in order-one numbers.
-    """
+    """Pieces of a recording: `on` (R,) one if another follows; `width` the deviation of a gap."""
 
     on: Float[Array, " records"]
     width: Scalar

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.terms import Noise, changes, weights_of
@@ -27,12 +26,11 @@ def estimate_noise(
     share = max(1.0 - free / problem.records.size, 0.1)
     groups, out = np.asarray(problem.noise_groups), []
     readings = list(problem.records.readings)
-    cut = at_limit(readings)
-    for index, (reading, error, sigma, weight, full) in enumerate(
-        zip(readings, errors, noise, weights, cut, strict=True)
+    for index, (reading, error, sigma, weight) in enumerate(
+        zip(readings, errors, noise, weights, strict=True)
     ):
         # The error of a reading at full scale is no noise.
-        sensor, kept = cast(Any, reading.sensor), reading.seen[..., None] & ~full
+        sensor, kept = cast(Any, reading.sensor), reading.kept
         known = sensor.noise is not None
         if known:
             sigma = sensor.noise
@@ -70,9 +68,8 @@ def _jitter(
     tau: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The most likely σ and τ (R,) of errors e (R, T, k) of covariances `σ² + τ² u uᵀ`, alike in a
-    group, `count` (R, T) channels seen; a `known` σ is 1, a known τ is given. In turn τ² by
-    Fisher's scoring of the squares along u, whose mean is `σ² + τ² |u|²`, and σ² by expectation and
-    maximisation.
+    group, `count` (R, T) channels; a `known` σ is 1, a known τ is given. In turn τ² by Fisher's
+    scoring of squares along u, of mean `σ² + τ² |u|²`, and σ² by expectation–maximisation.
     """
     size, total = np.sum(u**2, axis=-1), np.sum(e**2, axis=-1)
     seen = total > 0

@@ -29,7 +29,6 @@ class Normal(eqx.Module):
 
     @property
     def diagonal(self) -> Float[Array, " n"]:
-        """Its diagonal."""
         own = self.alone and jnp.diagonal(self.alone.own, axis1=1, axis2=2)
         return self._joined(jnp.diagonal(self.core), own)
 
@@ -96,7 +95,6 @@ def normal_of(
     blocks: Sequence[Array], where: Array, size: int, own: np.ndarray | None = None
 ) -> Normal:
     """Σ JᵀJ of blocks (R, T, j, m), their columns at the places `where` (R, m) of `size` numbers.
-
     The columns `own` are of one recording alone, and go out of the core; for `None` all are in it.
     """
     count, columns = where.shape

@@ -10,11 +10,10 @@ from jaxtyping import Array, Int
 
 from rigidjax._types import Scalar
 from rigidjax.identify import padding, quantities
-from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, Rows
 from rigidjax.identify.result import Fit, one_fit
-from rigidjax.identify.search import Task, again, cost_of
+from rigidjax.identify.search import Task, Tried, again, cost_of
 
 # The width of a pull, in standard deviations: a stiff one makes the search slow.
 PULL = 0.3

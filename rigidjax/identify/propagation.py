@@ -29,8 +29,6 @@ from rigidjax.solve.tableaus import KUTTA4
 # The turn in a step, rad: the error of a fifth-order method is then 1e-9 a radian. A method of
 # order 4 has it in steps shorter by the second factor, at two thirds of the cost.
 TURN_A_STEP, TURN_OF_ORDER_4 = 0.1, 0.02
-
-
 # More fixed steps than this between two samples cost more than adaptive steps.
 FINEST = 32
 # The least relative tolerance at which steps are compared, and the part of one to the next.
@@ -52,9 +50,8 @@ class AbstractIntegrator(eqx.Module):
 
     @abc.abstractmethod
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        """The states at `ts`, with a leading time axis.
-
-        They are a `motion.Coupled` if a torque has states of its own and a sensor needs them.
+        """The states at `ts`, with a leading time axis. They are a `motion.Coupled` if a torque has
+        states of its own and a sensor needs them.
         """
 
     def finer(self) -> "AbstractIntegrator | None":
@@ -176,9 +173,8 @@ def what_turns(body: Any, rung: type) -> Any:
 def sensor_inputs(
     sensor: Any, body: Any, torque: Any, ts: Array, state0: Any, states: Any, late: Any = None
 ) -> tuple[Array, Any, Callable[[Array, Any], SensorInput]]:
-    """The times that a sensor shows at `ts` (T,), by its clock, and `late` s later, one number or
-    (T,); the states then; its input at one time. `states` are `Coupled` if a torque has states of
-    its own.
+    """The times that a sensor shows at `ts` (T,), by its clock and `late` s later, a number or
+    (T,); the states then; its input at one time. `states` are `Coupled` if a torque has its own.
     """
     turned = what_turns(body, type(state0))
     field = equations_of_motion(turned, state0, torque)
@@ -200,6 +196,42 @@ def sensor_inputs(
         return SensorInput(t, state.motion, body, freeze(field, state.own), state.own)
 
     return times, states, now
+
+
+def errors_along(
+    sensor: Any, values: Array, times: Array, states: Any, now: Callable[[Array, Any], SensorInput]
+) -> Float[Array, "times k"]:
+    """The errors of readings `values` (T, …) along a motion, as `sensor_inputs` gives it."""
+
+    def error(t: Array, state: Any, value: Array) -> Array:
+        return _error_of(sensor, now(t, state), value)
+
+    lowpass = getattr(sensor, "lowpass", None)
+    if lowpass is None:
+        return jax.vmap(error)(times, states, values)
+    # The error of a zero reading is the prediction with the opposite sign.
+    return values + lowpass(times, jax.vmap(error)(times, states, jnp.zeros_like(values)))
+
+
+def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:
+    """The checked result of a sensor's `error`, which a user may have written."""
+    name = type(sensor).__name__
+    try:
+        found = sensor.error(now, value)
+    except AttributeError as wrong:
+        if type(now.state).__name__ not in str(wrong):
+            raise
+        raise TypeError(
+            f"{name}.error: {wrong}; it has feels = {sensor.feels.__name__}, but it reads more "
+            "than that: set feels = rj.motion.HasAttitude, or rj.motion.HasPose"
+        ) from wrong
+    wanted = (sensor.components,)
+    if jnp.shape(found) != wanted:
+        raise ValueError(
+            f"{name}.error: wanted reading minus prediction of shape {wanted}, as components = "
+            f"{sensor.components} says, got {jnp.shape(found)}"
+        )
+    return found
 
 
 def simulate_readings(
@@ -272,15 +304,12 @@ def _readings(
     if key is not None:
         assert sensor.noise is not None
         error = sensor.noise[None] * jax.random.normal(key, error.shape, ts.dtype)
-    lowpass = getattr(sensor, "lowpass", None)
     reading = getattr(sensor, "reading_of", None)
     if reading is not None:
         values = jax.vmap(lambda t, y, e: reading(now(t, y), e))(times, states, error)
     else:
-        # The error of a zero reading is the prediction with the opposite sign.
-        nothing = jnp.zeros(sensor.reading_shape, ts.dtype)
-        missed = jax.vmap(lambda t, y: sensor.error(now(t, y), nothing))(times, states)
-        missed = missed if lowpass is None else -lowpass(times, -missed)
+        nothing = jnp.zeros((ts.shape[0], *sensor.reading_shape), ts.dtype)
+        missed = errors_along(sensor, nothing, times, states, now)
         values = (error - missed).reshape(ts.shape[0], *sensor.reading_shape)
     limit = getattr(sensor, "limit", None)
     return values if limit is None else jnp.clip(values, -limit[None], limit[None])

@@ -41,6 +41,15 @@ class Reading(eqx.Module):
         """The mask as a NumPy array, for work outside `jit`."""
         return np.asarray(self.mask)
 
+    @property
+    def kept(self) -> np.ndarray:
+        """The mask (…, T, k) of the channels read and not at full scale, as a NumPy array."""
+        seen = np.broadcast_to(self.seen[..., None], (*self.mask.shape, self.sensor.components))
+        limit = getattr(self.sensor, "limit", None)
+        if limit is None:
+            return seen
+        return seen & (np.abs(self.values) < np.asarray(limit)[..., None, :] * (1 - 1e-6))
+
     def scattered(self, late: Array, deviation: Array) -> "Reading":
         """The same with another jitter. A search keeps `late`: if errors counted less where a
         motion changes quickly, it would prefer such a motion.
@@ -152,7 +161,6 @@ class Recording(eqx.Module):
 
 
 def readings_of(recording: Recording, kind: type) -> list[Any]:
-    """The readings of the sensors of one kind."""
     return [reading for reading in recording.readings if isinstance(reading.sensor, kind)]
 
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax._names import show
-from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.result import Fit, one_fit
 
 _UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
@@ -194,10 +193,9 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
 
 def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
     """Name, rms of each component without readings at full scale, and unit of sensors."""
-    readings = fit.problem.records.readings
     out = []
-    for error, reading, full in zip(fit.residuals, readings, at_limit(readings), strict=True):
-        kept = reading.seen[..., None] & ~full
+    for error, reading in zip(fit.residuals, fit.problem.records.readings, strict=True):
+        kept = reading.kept
         squares = np.where(kept, np.asarray(error).reshape(kept.shape) ** 2, 0.0)
         mean = squares.sum(axis=(0, 1)) / np.maximum(kept.sum(axis=(0, 1)), 1)
         sensor = reading.sensor
@@ -309,7 +307,6 @@ def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str
 
 
 def _cells(lines: Iterable[tuple[str, ...]]) -> str:
-    """Lines of a table."""
     cells = ("".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in lines)
     return "".join(f"<tr>{line}</tr>" for line in cells)
 

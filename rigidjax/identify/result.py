@@ -14,7 +14,6 @@ from rigidjax.identify import answers, identifiability, uncertainty
 from rigidjax.identify.answers import Answer, Cause
 from rigidjax.identify.causes import causes
 from rigidjax.identify.flat_limit import Limit
-from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.identifiability import Combination, undetermined
 from rigidjax.identify.parameters import Parameters, Unpacked
 from rigidjax.identify.problem import Problem
@@ -175,10 +174,9 @@ class Fit(eqx.Module):
     def rms(self) -> tuple[float, ...]:
         """Root mean square length of each sensor's error, in its unit; without full scale."""
         out = []
-        readings = self.problem.records.readings
         errors = evaluate(self.parameters, self.problem)[0][0]
-        for error, reading, full in zip(errors, readings, at_limit(readings), strict=True):
-            kept = reading.seen & ~full.any(axis=-1)
+        for error, reading in zip(errors, self.problem.records.readings, strict=True):
+            kept = reading.kept.all(axis=-1)
             lengths = np.sum(np.asarray(error) ** 2, axis=-1)[kept if kept.any() else reading.seen]
             out.append(float(np.sqrt(lengths.mean())))
         return tuple(out)
@@ -222,8 +220,7 @@ class Fit(eqx.Module):
     def undetermined(self) -> tuple[Combination, ...]:
         """The combinations of numbers that the data do not determine at all, by name.
 
-        The list is empty if they determine all. Each combination has `names`, `changes` and
-        `in_words`.
+        None if they determine all. Each has `names`, `changes` and `in_words`.
         """
         return undetermined(self)
 

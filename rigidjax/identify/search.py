@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jax.scipy.linalg import block_diag
+from jaxtyping import Array, Bool, Float
 
-from rigidjax.identify import padding
-from rigidjax.identify.body_charts import charts_of
-from rigidjax.identify.checkpoint import SearchState, Tried
+from rigidjax.identify import padding, terms
+from rigidjax.identify.body_charts import charts_of, numbers_of
 from rigidjax.identify.levenberg_marquardt import BOLD, CAREFUL, Search, Settings, search
 from rigidjax.identify.normal import Normal, normal_of
 from rigidjax.identify.parameters import Parameters, columns_alone, local, places
@@ -21,16 +21,7 @@ from rigidjax.identify.problem import Problem
 from rigidjax.identify.propagation import FixedSteps
 from rigidjax.identify.recording import count_of
 from rigidjax.identify.reference_states import ReferenceStates
-from rigidjax.identify.terms import (
-    Noise,
-    along,
-    firm,
-    linked,
-    seen,
-    with_blocks,
-    with_jacobian,
-    with_rows,
-)
+from rigidjax.identify.terms import Noise
 
 # The beginning of the record is fitted first: a long record has many wrong minima (the phase slips
 # by whole turns), a short one has not.
@@ -45,6 +36,23 @@ SETTLED = 1e-7
 WILD = 100.0
 # Samples after the last one with weight: a low-pass filter looks ahead.
 _BEYOND = 2
+
+
+class Tried(eqx.Module):
+    """The end of one start; `cost` is ½ Σ of squares; `found` of `with_blocks` there, if known."""
+
+    parameters: Parameters
+    cost: Float[Array, "*starts"] = eqx.field(converter=jnp.asarray, default=np.inf)
+    converged: Bool[Array, "*starts"] = eqx.field(converter=jnp.asarray, default=False)
+    found: Any = None
+
+
+class SearchState(NamedTuple):
+    """The search from one start: the next horizon (their number at the end), strides, result."""
+
+    stage: int
+    strides: int
+    tried: Tried
 
 
 class Task(NamedTuple):
@@ -74,17 +82,19 @@ def descend(
     where, made = places(problem, start), made_of(start)
     number, kind = flat.size, flat.dtype
     problem = _as_far_as(problem, weights)
-    held = ravel_pytree(firm(start, problem))[0]
+    held = ravel_pytree(terms.firm(start, problem))[0]
     alone = None
     if problem.count >= MANY and problem.rows is None:
         alone = columns_alone(problem, padding.one(local(problem, start), 0))
 
     def evaluated(point: Array) -> tuple[Any, Array, Normal, Array]:
         here = restore(point)
-        found = with_blocks(here, problem)
+        found = terms.with_blocks(here, problem)
         (errors, ends), (slopes, end_slopes) = found
         total, slope = jnp.zeros((), kind), jnp.zeros(number + 1, kind)
-        read, blocks = with_rows(lambda e: seen(problem, e, noise, weights), errors, slopes)
+        read, blocks = terms.with_rows(
+            lambda e: terms.seen(problem, e, noise, weights), errors, slopes
+        )
         for e, rows in zip(read, blocks, strict=True):
             total = total + jnp.sum(e**2)
             slope = slope.at[where].add(jnp.einsum("rtki,rtk->ri", rows, e))
@@ -109,13 +119,9 @@ def descend(
 
 def _bends(problem: Problem, numbers: Array, slope: Float[Array, " n"]) -> Array:
     """The rows (m, n) of the Jacobian from the curvature of the charts of bodies."""
-    out, first = [jnp.zeros((0, slope.size), slope.dtype)], 0
-    for chart in charts_of(problem.body):
-        mine = slice(first, first + chart.size)
-        rows = chart.bend(numbers[mine], slope[mine])
-        out.append(jnp.zeros((rows.shape[0], slope.size), slope.dtype).at[:, mine].set(rows))
-        first += chart.size
-    return jnp.concatenate(out)
+    parts = (charts_of(problem.body), *(numbers_of(problem.body, x) for x in (numbers, slope)))
+    rows = block_diag(*(chart.bend(*mine) for chart, *mine in zip(*parts, strict=True)))
+    return jnp.pad(rows, ((0, 0), (0, slope.size - rows.shape[1])))
 
 
 def _as_far_as(problem: Problem, weights: Float[Array, "records times"]) -> Problem:
@@ -164,13 +170,13 @@ def linked_rows(
 
     @last.defjvp
     def _(primals: Any, tangents: Any) -> Any:
-        return ends, along(problem, end_slopes, restore(tangents[0]))
+        return ends, terms.along(problem, end_slopes, restore(tangents[0]))
 
     def value(vector: Array) -> Array:
-        parts = [leaf.reshape(-1) for leaf in linked(restore(vector), problem, last(vector))]
+        parts = [leaf.reshape(-1) for leaf in terms.linked(restore(vector), problem, last(vector))]
         return jnp.concatenate(parts) if parts else jnp.zeros(0, vector.dtype)
 
-    rows, e = with_jacobian(value, point)
+    rows, e = terms.with_jacobian(value, point)
     return e, rows
 
 
@@ -204,7 +210,6 @@ def evaluate(parameters: Parameters, problem: Problem) -> Any:
 
 
 def cost_of(parameters: Parameters, problem: Problem, noise: Noise) -> float:
-    """The misfit over the whole of the records."""
     return float(_at(parameters, problem, noise).cost)
 
 
@@ -287,11 +292,11 @@ def climb(
         else:
             level = float(end.first)
     for stage in range(start.stage, len(HORIZONS)):
-        seen = horizon(problem, HORIZONS[stage])
+        shown = horizon(problem, HORIZONS[stage])
         if stage < len(HORIZONS) - 1:
             # A part of the record need not be fitted to convergence.
             before, part = tried.parameters, aim * HORIZONS[stage]
-            found = least_squares(before, task, seen, task.stride, CAREFUL, aim=part, near=part)
+            found = least_squares(before, task, shown, task.stride, CAREFUL, aim=part, near=part)
             after = found.parameters
             # A point that explains a part alone may be wrong beyond it, such as a negative drag.
             first = cost_of(before, problem, noise) if level is None else level
@@ -310,7 +315,7 @@ def climb(
             look(SearchState(stage + over, strides, now))
 
         done = start.strides if stage == start.stage else 0
-        tried = settle(tried, task, seen, at_last, strides=done, aim=aim)
+        tried = settle(tried, task, shown, at_last, strides=done, aim=aim)
     return tried
 
 

@@ -13,10 +13,9 @@ from jaxtyping import Array, Bool, Float
 from rigidjax.identify import padding
 from rigidjax.identify.body_charts import Bodies, matter
 from rigidjax.identify.parameters import Parameters, by_slot, columns, local, places, put
-from rigidjax.identify.propagation import sensor_inputs, states_at, what_turns
+from rigidjax.identify.propagation import errors_along, sensor_inputs, states_at, what_turns
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import ReferenceStates
-from rigidjax.identify.sensors import SensorInput
 from rigidjax.motion.coupled import motion_of
 from rigidjax.rotation.barrier import batched_as
 
@@ -57,56 +56,19 @@ def errors_of_one(
     which: Which,
     late: Array | None = None,
 ) -> tuple[tuple[Array, ...], Any]:
-    """The errors (T, k) of each sensor in one recording, all clocks `late` s more behind, and the
-    last state.
-    """
+    """Errors (T, k) of each sensor in a recording, clocks `late` s more behind; the last state."""
     record, body, state0, states = states_of_one(problem, mine, record, ref, which)
     out, motion = [], (body, record.torque, record.t, state0, states)
     for reading in record.readings:
         sensor = reading.sensor
-        times, seen, now = sensor_inputs(sensor, *motion, late)
-
-        def error(t: Array, state: Any, value: Array, of: Any = (sensor, now)) -> Array:
-            sensor, now = of
-            return _error_of(sensor, now(t, state), value)
-
-        lowpass = getattr(sensor, "lowpass", None)
-        if lowpass is None:
-            errors = jax.vmap(error)(times, seen, reading.values)
-        else:
-            # The error of a zero reading is the prediction with the opposite sign.
-            shown = jax.vmap(error)(times, seen, jnp.zeros_like(reading.values))
-            errors = reading.values + lowpass(times, shown)
+        errors = errors_along(sensor, reading.values, *sensor_inputs(sensor, *motion, late))
         out.append(jnp.where(reading.mask[:, None], errors, 0.0))
     return tuple(out), jax.tree.map(lambda leaf: leaf[-1], motion_of(states))
 
 
-def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:
-    """The checked result of a sensor's `error`, which a user may have written."""
-    name = type(sensor).__name__
-    try:
-        found = sensor.error(now, value)
-    except AttributeError as wrong:
-        if type(now.state).__name__ not in str(wrong):
-            raise
-        raise TypeError(
-            f"{name}.error: {wrong}; it has feels = {sensor.feels.__name__}, but it reads more "
-            "than that: set feels = rj.motion.HasAttitude, or rj.motion.HasPose"
-        ) from wrong
-    wanted = (sensor.components,)
-    if jnp.shape(found) != wanted:
-        raise ValueError(
-            f"{name}.error: wanted reading minus prediction of shape {wanted}, as components = "
-            f"{sensor.components} says, got {jnp.shape(found)}"
-        )
-    return found
-
-
 def over_records(function: Any, problem: "Problem", mine: Any) -> Any:
-    """`function(mine, record, reference, which)` of every recording.
-
-    On a CPU one after another: XLA makes one kernel of a loop over a few dozen numbers, and scalars
-    within an inner loop run at half the speed.
+    """`function(mine, record, reference, which)` of every recording: on a CPU in turn, where XLA
+    makes one kernel of a loop over some dozen numbers, and inner loops run at half the speed.
     """
     trees = mine, problem.records, problem.reference, problem.which
     if problem.count == 1:
@@ -329,5 +291,4 @@ def weights_of(problem: "Problem", errors: tuple, noise: Noise) -> tuple[Float[A
 
 
 def half_sum(tree: Any) -> Float[Array, ""]:
-    """Half the sum of the squares of all leaves."""
     return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

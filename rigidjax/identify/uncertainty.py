@@ -22,15 +22,17 @@ WEAKEST = 1e-6
 
 class Linearised(eqx.Module):
     """A problem about its best point. For each sensor `raw` errors (R, T, k) in its unit, whitened
-    `errors`, `slopes` (R, T, k, m) in a recording's numbers, `weights` (R, T); their `places` (R,
-    m) among the n free numbers; `pulls` (n,) of these to zero by priors, `firm` (n,) one over their
-    deviations; `extra` (j,), `extra_slopes` (j, n) of the prior of a body and of joints.
+    `errors`, `slopes` (R, T, k, m) in a recording's numbers, `weights` (R, T), `kept` (R, T, k) if
+    they have weight and are below full scale; the `places` (R, m) of a recording's numbers among
+    all n; `pulls` (n,) of these to zero by priors, `firm` (n,) one over their deviations; `extra`
+    (j,), `extra_slopes` (j, n) of the prior of a body and of joints.
     """
 
     raw: tuple[np.ndarray, ...]
     errors: tuple[np.ndarray, ...]
     slopes: tuple[np.ndarray, ...]
     weights: tuple[np.ndarray, ...]
+    kept: tuple[np.ndarray, ...]
     places: np.ndarray
     pulls: np.ndarray
     firm: np.ndarray
@@ -39,7 +41,6 @@ class Linearised(eqx.Module):
 
     @property
     def size(self) -> int:
-        """The number of free numbers."""
         return int(self.extra_slopes.shape[-1])
 
     @property
@@ -103,9 +104,7 @@ def linearise(
     found: Any = None,
     near: Parameters | None = None,
 ) -> Linearised:
-    """Errors, derivatives and weights as NumPy arrays; `found` that of `evaluate`, if known; `near`
-    the point of the derivatives beside a flat body.
-    """
+    """Errors, derivatives and weights; `found` of `evaluate`; derivatives `near` a flat body."""
     found = evaluate(parameters, problem) if found is None else found
     (errors, slopes, weights), where, beside = jax.tree.map(
         np.asarray, _linearised(problem, parameters, noise, found)
@@ -114,7 +113,9 @@ def linearise(
     if near is not None:
         aside = linearise(problem, near, noise)
         slopes, beside = aside.slopes, (*beside[:-1], aside.extra_slopes)
-    return Linearised(raw, errors, slopes, weights, where, *beside)
+    pairs = zip(problem.records.readings, weights, strict=True)
+    kept = tuple(reading.kept & (weight > 0)[..., None] for reading, weight in pairs)
+    return Linearised(raw, errors, slopes, weights, kept, where, *beside)
 
 
 class Root(eqx.Module):
@@ -193,10 +194,9 @@ class Spread(eqx.Module):
 
 
 def of_white(linear: Linearised) -> Spread:
-    """`(JᵀWJ)⁻¹`; infinite for singular values below 1e-8 of the largest.
-
-    Numbers of one recording alone are eliminated first, each recording's by itself (Schur
-    complement); the singular values are those of their blocks and of what is left.
+    """`(JᵀWJ)⁻¹`; infinite for singular values below 1e-8 of the largest. Numbers of one recording
+    alone are eliminated first, each recording's by itself (Schur complement); the singular values
+    are those of their blocks and of what is left.
     """
     n, dense = linear.size, linear.dense
     if not (np.isfinite(dense).all() and np.isfinite(linear.extra_slopes).all()):
@@ -204,8 +204,8 @@ def of_white(linear: Linearised) -> Spread:
         return Spread(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)), None)
     triangles, owner = np.linalg.qr(dense, mode="r"), _owners(linear)
     shared = np.flatnonzero(owner < 0)
-    # Columns of order one: a bias in rad/s must not look undetermined beside a moment. But a column
-    # of round-off must not be scaled up.
+    # Columns of order one: a bias in rad/s must not look undetermined beside a moment, nor
+    # round-off be scaled up.
     squares = np.bincount(linear.places.ravel(), np.sum(triangles**2, axis=1).ravel(), n + 1)[:n]
     size = np.sqrt(squares + linear.firm**2 + np.sum(linear.extra_slopes**2, axis=0))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-150))
@@ -269,14 +269,13 @@ def _parts(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def spread(linear: Linearised, times: "Times", white: Spread | None = None) -> Spread:
-    """`(JᵀWJ)⁻¹` for white errors, else the sandwich `H⁻¹ M H⁻¹`.
-
-    `M = Jᵀ C J` and the information of priors, C the errors' covariance in time: of each channel
-    what second differences show is white, the rest decays. Fitted errors do not show the decay time
-    well, so that each number gets the largest variance over all times from two samples to half a
-    record; they are too small, so that `Jᵀ C J` is multiplied by n/(n − p) for n independent
-    errors. The variance between many recordings counts if it is larger. Source: White 1980,
-    doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
+    """`(JᵀWJ)⁻¹` for white errors, else the sandwich `H⁻¹ M H⁻¹` with `M = Jᵀ C J` and the
+    information of priors, C the errors' covariance in time: of each channel what second differences
+    show is white, the rest decays. Fitted errors do not show the decay time well: each number gets
+    the largest variance over times from two samples to half a record. They are too small: `Jᵀ C J`
+    is multiplied by n/(n − p) for n independent errors. The variance between many recordings counts
+    if larger. Source: White 1980, doi:10.2307/1912934; Liang and Zeger 1986,
+    doi:10.1093/biomet/73.1.13.
     """
     white = of_white(linear) if white is None else white
     if times.longest <= 1.5 or not np.isfinite(white.seen).all():
@@ -318,11 +317,7 @@ def distance(linear: Linearised, white: Spread, held: Sequence[np.ndarray] = ())
 
 
 def _sandwich(linear: Linearised, white: Spread, times: "Times") -> np.ndarray:
-    """White's covariance of errors that are not independent.
-
-    Products of derivatives are taken in orthonormal columns: otherwise round-off could make
-    variances negative.
-    """
+    """White's covariance of dependent errors, in orthonormal columns: no variance below zero."""
     columns, triangles = np.linalg.qr(linear.dense)
     longest = max(int(np.median((linear.weights[0] > 0).sum(axis=1))) // 2, 2)
     spans = 2.0 ** np.arange(1, np.log2(longest) + 1)
@@ -404,21 +399,17 @@ class Times(eqx.Module):
 
     @property
     def longest(self) -> float:
-        """The longest of all channels."""
         return max(span for sensor in self.spans for span in sensor)
 
 
-def correlation_times(linear: Linearised, cut: tuple[np.ndarray, ...] | None = None) -> Times:
-    """The autocorrelation time `1 + 2 Σ ρ_l` of each channel, up to the first ρ below twice its
-    scatter; readings at full scale (`cut`) take no part.
-    """
-    cut = tuple(np.zeros(e.shape, bool) for e in linear.errors) if cut is None else cut
+def correlation_times(linear: Linearised) -> Times:
+    """The times `1 + 2 Σ ρ_l` of channels, up to the first ρ below twice its scatter."""
     spans, longest, closest, independent = [], 1.0, 0.0, 0.0
-    for error, weight, full in zip(linear.errors, linear.weights, cut, strict=True):
-        kept, found = error * np.sqrt(weight)[..., None], []
+    for error, weight, kept in zip(linear.errors, linear.weights, linear.kept, strict=True):
+        weighted, found = error * np.sqrt(weight)[..., None], []
         for channel in range(error.shape[-1]):
-            seen = (weight > 0) & ~full[..., channel]
-            span, first = _channel_time(kept[..., channel], seen)
+            seen = kept[..., channel]
+            span, first = _channel_time(weighted[..., channel], seen)
             if span > longest:
                 longest, closest = span, first
             found.append(span)

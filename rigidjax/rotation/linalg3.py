@@ -56,10 +56,8 @@ def square(v: Sequence[Scalar]) -> Scalar:
 
 
 def near_one(*parts: Scalar) -> Scalar:
-    """A power of two that brings the largest of some scalars near 1, with derivative zero.
-
-    For formulas that do not depend on the length of their argument: times this number, it keeps all
-    its digits, and its squares do not overflow.
+    """A power of two, with derivative zero, that brings the largest of some scalars near 1: all
+    digits stay, and no square overflows, in formulas that do not depend on the argument's length.
     """
     sizes = [jnp.abs(lax.stop_gradient(part)) for part in parts]
     info = jnp.finfo(sizes[0].dtype)
@@ -92,8 +90,7 @@ def vee(matrix: Mat3Like) -> Vec3:
 def basis(dtype: Any = float) -> Float[Array, "3 3 3"]:
     """The matrices J_1, J_2, J_3: J_i y = e_i × y, ½ Tr(J_iᵀ J_j) = δ_ij (notes, eqs 41–43, 53).
 
-    **Arguments:** `dtype` of the (3, 3, 3) array. Eq 16 of the notes prints −J_3, the transpose of
-    J_3; eq 42 is right.
+    **Arguments:** `dtype` of the (3, 3, 3) array. Eq 16 of the notes prints −J_3; eq 42 is right.
 
     >>> vee(basis()[2]).tolist()
     [0.0, 0.0, 1.0]

@@ -22,10 +22,9 @@ from rigidjax.solve.linear_map import linear_map, refuse
 
 
 class Found(NamedTuple):
-    """The result of `adaptive`.
-
-    **Fields:** `ys` the states at `ts`; `num_steps` accepted and rejected, `num_rejected` of these;
-    `result` a `diffrax.RESULTS`; `last` the state at the end, `last_time`.
+    """The result of `adaptive`. **Fields:** `ys` the states at `ts`; `num_steps` accepted and
+    rejected, `num_rejected` of these; `result` a `diffrax.RESULTS`; `last` the state at the end,
+    `last_time`.
     """
 
     ys: Any
@@ -59,7 +58,6 @@ def adaptive(
 
     **Returns** a `Found`. A run that needs more than `max_steps`, is halted, or meets a NaN that no
     shorter step avoids, ends early: its `result` says so, and the states not reached are NaN.
-
     **Raises:** `TypeError` for a state of several dtypes, or of another than `ts`.
 
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])

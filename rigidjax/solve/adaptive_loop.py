@@ -93,7 +93,6 @@ def packed(loop: LoopState) -> Array:
 
 
 def unpacked(row: Array) -> LoopState:
-    """The inverse of `packed`."""
     head = len(LoopState._fields) - 1
     stop, steps, rejected = row[2:head].astype(jnp.int32)
     return LoopState(row[head:], row[0], row[1], stop, steps, rejected)
@@ -144,7 +143,6 @@ def at(a: Array, index: Array) -> Array:
 
 
 def finite(tree: Any) -> Bool[Array, ""]:
-    """Whether every number in `tree` is finite."""
     good = jnp.asarray(True)
     for leaf in jax.tree.leaves(tree):
         good = good & jnp.all(jnp.isfinite(leaf))
@@ -175,7 +173,6 @@ def controlled(
     norm: Array, order: int, t: Array, h: Array, kept: Array, last: Array, length: Array
 ) -> tuple[Array, Array]:
     """Whether a step is accepted, and the next one: 0 where none is left to try, NaN after a NaN.
-
     `norm` as of `tried`; `kept` the step wanted before it was cut short as the `last` before a
     stop; `length` of the run, whose round-off counts where that of `t` vanishes.
     """

@@ -107,9 +107,8 @@ class Error(eqx.Module):
 
 @eqx.filter_jit
 def error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None) -> Error:
-    """The error of the states `ys` that `setup` gave at `ts` in `count` steps.
-
-    By another run `tried`, its tolerance and states, it is too large by up to ten.
+    """The error of the states `ys` that `setup` gave at `ts` in `count` steps. By another run
+    `tried`, its tolerance and states, it is too large by up to ten.
     """
     setup, ts, ys, count, tried = _still((setup, ts, ys, count, tried))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
@@ -166,9 +165,8 @@ def _with_round_off(
 
 
 def _cheaper(setup: Any, start: Any, ts: Array, ys: Any, count: Array) -> tuple[Any, Any, Any]:
-    """A set-up of fewer steps, its run, and what to multiply its round-off by.
-
-    Roundings grow alike at any tolerance; n of them add up to √n. float32 takes few steps anyway.
+    """A set-up of fewer steps, its run, and what to multiply its round-off by. Roundings grow alike
+    at any tolerance; n of them add up to √n. float32 takes few steps anyway.
     """
     if not isinstance(setup, Loop) or ts.dtype == jnp.float32:
         return setup, ys, 1.0
@@ -208,10 +206,9 @@ def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
 
 @eqx.filter_jit
 def solve_to(loop: Loop, state0: Any, ts: Array, accuracy: Array) -> tuple[Loop, Any, Any]:
-    """A run with a global error of `accuracy`, if there is one.
-
-    The error of each run is its distance to the next, and decreases as the tolerance does.
-    **Returns** the loop at its tolerance, its result, tolerance and states of the run before.
+    """A run with a global error of `accuracy`, if there is one. The error of each run is its
+    distance to the next, and decreases as the tolerance does. **Returns** the loop at its
+    tolerance, its result, tolerance and states of the run before.
     """
     still = _still((loop, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
@@ -311,10 +308,7 @@ class FunctionError(eqx.Module):
 
     @property
     def known(self) -> Bool[Array, ""]:
-        """Whether the error of the derivative is below half of its length.
-
-        Where it is not, as in chaos, the derivative means nothing, finite or not.
-        """
+        """Whether a derivative's error is below half its length; else (chaos) it is worthless."""
         size = jnp.linalg.norm(ravel_pytree(self.derivative)[0])
         return jnp.linalg.norm(ravel_pytree(self.derivative_error)[0]) < _LOST * size
 
@@ -336,11 +330,9 @@ def error_of(
       where the value is a scalar, else in forward mode.
     - `rtol`, `atol`: those of the answer, by default those of `simulate`.
 
-    The second run has a fiftieth of them; where its distance is not far above round-off, three
-    more have the last digits of `x` changed (in a `vmap` always). See `Solution.error`. Each call
-    compiles anew: put it into a `jax.jit` of your own to call it often.
-
-    **Returns** a `FunctionError`.
+    The second run has a fiftieth of them; where its distance is not far above round-off, three more
+    have the last digits of `x` changed (in a `vmap` always). See `Solution.error`. Each call
+    compiles anew: put it into a `jax.jit` of your own. **Returns** a `FunctionError`.
 
     >>> body, law = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.torques.Damping([0.1, 0.1, 0.1])
     >>> def last(omega, **tolerances):

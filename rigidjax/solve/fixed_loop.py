@@ -38,7 +38,6 @@ def fixed(
     stop, traced as well (no reverse mode): later times get `y0`; `None` goes to the end.
 
     **Returns** the states at `ts`, with a leading time axis. Differentiable in both modes.
-
     **Raises:** `TypeError` for another solver, or as the solver does.
 
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
@@ -139,9 +138,8 @@ def _row(a: Array, i: Any) -> Array:
 def march(
     stepper: AnyStepper, h: Array, t0: Array, first: Array, count: int, y: Any, inputs: Any = None
 ) -> Any:
-    """`count` steps from number `first` on; `inputs` as for `step`.
-
-    In reverse mode the states at the starts of √count pieces are kept, and those in one piece.
+    """`count` steps from number `first` on; `inputs` as for `step`. In reverse mode the states at
+    the starts of √count pieces are kept, and those in one piece.
     """
 
     @functools.partial(jax.checkpoint, prevent_cse=False)

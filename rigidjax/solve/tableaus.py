@@ -39,7 +39,6 @@ def _rows(text: str) -> tuple[Row, ...]:
 
 
 def numbers(text: str) -> tuple[float, ...]:
-    """The numbers of a table."""
     return tuple(map(float, text.split()))
 
 

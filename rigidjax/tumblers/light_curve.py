@@ -16,12 +16,12 @@ from rigidjax.body.inertia import Inertia, tensor_of
 from rigidjax.identify import answers, padding, uncertainty
 from rigidjax.identify.answers import FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
 from rigidjax.identify.body_charts import Bodies
-from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.fit import fit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, one_problem
 from rigidjax.identify.quantities import carried, quantities, values_and_slopes
 from rigidjax.identify.result import Fit
+from rigidjax.identify.search import Tried
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot
 from rigidjax.tumblers.search import MAGNITUDE, descended, noise_of, relative_flux, starts_of
@@ -124,8 +124,7 @@ def fit_light_curve(
 
     Intervals allow for a real shape by consider parameters (Tapley, Schutz and Born 2004,
     Statistical Orbit Determination, ch. 6): the brightness has a factor 1 + n·S n, where n is half
-    way between sun and observer, body frame, and the entries of S are independent with deviation 4
-    %.
+    way between sun and observer, body frame, the entries of S independent, of deviation 4 %.
 
     **Arguments:** `problem` of one recording with one `Brightness` sensor and no torque; let a
     `Free` move the sensor's `level` unless it is known. `shortest` period of a line in the

@@ -10,11 +10,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import Inertia
-from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.levenberg_marquardt import CAREFUL, Settings, search
 from rigidjax.identify.normal import Normal
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
+from rigidjax.identify.search import Tried
 from rigidjax.rotation import quaternion
 from rigidjax.tumblers import starts
 from rigidjax.tumblers.sensor import half_way
@@ -136,9 +136,8 @@ def descended(
 def _many(
     starts: Parameters, problem: Problem, noise: Any, settings: Settings, count: Any
 ) -> Tried:
-    """The search from the first `count` starts, one after another, with slopes by differences.
-
-    The closed form without derivatives takes a hundredth of the time.
+    """The search from the first `count` starts, one after another, with slopes by differences. The
+    closed form without derivatives takes a hundredth of the time.
     """
 
     def one(given: tuple[Parameters, Array]) -> Tried:

@@ -60,15 +60,13 @@ def measure(
 ) -> list[Record]:
     """Error and cost of each method at each of its settings, of the value and of its gradient.
 
-    All runs are in this process, in turn, round after round; compilation is timed separately. The
-    records omit methods that cannot do the scene, and runs with an error of more than half a radian
-    (or 100 %).
+    All runs are in this process, in turn, round after round; compilation is timed separately.
+    Methods that cannot do the scene, and errors above half a radian (or 100 %), are omitted.
 
     **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more of them;
     `gradients` whether gradients are measured, too; `thin` takes every `thin`-th setting; `rounds`
-    the least number of timings of each run; `progress` is called with a line of text.
-
-    **Raises:** `TypeError` for something that is no `Scene` or `Method`.
+    the least number of timings of each run; `progress` is called with a line of text. **Raises:**
+    `TypeError` for something that is no `Scene` or `Method`.
     """
     made = 'standard ones are made by rj.workprecision.scenes()["heavy-top"]()'
     _checks.instance(scene, Scene, "scene", wanted="a Scene", hint=made)
@@ -98,9 +96,8 @@ def measure(
 
 
 def worked_out(scene: Scene, gradients: bool = True) -> Reference:
-    """A reference for a scene without one: order 8 with fixed steps, and with half as many.
-
-    Its error is their difference, no less than a hundred units of round-off.
+    """A reference for a scene without one: order 8 with fixed steps, and with half as many. Its
+    error is their difference, no less than a hundred units of round-off.
     """
     counts = (4000, 2000)
     numbers, scale = scene.numbers, max(1.0, _turn(scene) / 50)
@@ -226,12 +223,10 @@ def long_drift(
     *,
     progress: Callable[[str], None] | None = None,
 ) -> list[Record]:
-    """Largest drift of energy and momentum over `steps` equal steps of an asymmetric heavy top.
-
-    There are two records for each method, of the first hundredth of the run and of all of it. The
-    drift is bounded if they agree; it grows with time if the second is a hundred times the first.
-    `setting` is the length of a step, s; `error` is the energy's (the motion forgets its start long
-    before the end).
+    """Largest drift of energy and momentum over `steps` equal steps of an asymmetric heavy top, a
+    record of the first hundredth of the run and one of all of it: bounded if both agree, growing
+    with time if the second is a hundred times the first. `setting` is the length of a step, s;
+    `error` the energy's (the motion forgets its start long before the end).
     """
     body = Inertia.from_principal(*BODY)
     start = Attitude([0.955336489125606, 0.29552020666133955, 0.0, 0.0], [0.4, 0.3, 1.2])

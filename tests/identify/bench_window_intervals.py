@@ -16,28 +16,13 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
+from test_windows import BODY, TRUE, H, Push, scene
+
 import rigidjax as rj
 from rigidjax import identify, torques
 
-H, NOISE, SIZE = 0.02, 2e-3, 0.1
-BODY = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+NOISE, SIZE = 2e-3, 0.1
 START = np.array([0.5, 1.0, -0.4])
-TRUE = {"damping": jnp.array(0.2), "gain": jnp.array([0.5, -0.3, 0.8])}
-
-
-class Push(torques.AbstractTorque):
-    """A driven torque."""
-
-    feels = rj.motion.HasSpin
-    gain: jax.Array
-    source: torques.Input = torques.Input("u")
-
-    def __call__(self, t, state, body):
-        return self.gain * self.source(t)
-
-
-def scene(free):
-    return BODY, torques.Sum(Push(free["gain"]), torques.Damping(free["damping"] * jnp.ones(3)))
 
 
 @jax.jit

@@ -18,11 +18,11 @@ import rigidjax as rj
 from rigidjax import identify
 from rigidjax.__main__ import main
 from rigidjax.identify import checkpoint, cli_spec, quantities, search
-from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.csv_io import LogError
 from rigidjax.identify.multiple_shooting import pieces
 from rigidjax.identify.padding import one
 from rigidjax.identify.parameters import local, places
+from rigidjax.identify.search import Tried
 from rigidjax.identify.terms import errors_of_one, with_blocks
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)

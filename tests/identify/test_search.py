@@ -13,10 +13,18 @@ from jaxtyping import Array
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import levenberg_marquardt, search
-from rigidjax.identify.checkpoint import SearchState, Tried
 from rigidjax.identify.levenberg_marquardt import Search, Settings
 from rigidjax.identify.normal import Normal
-from rigidjax.identify.search import Task, climb, descend, horizon, settle, whole
+from rigidjax.identify.search import (
+    SearchState,
+    Task,
+    Tried,
+    climb,
+    descend,
+    horizon,
+    settle,
+    whole,
+)
 from rigidjax.identify.terms import half_sum, residuals
 
 TS = np.linspace(0.0, 1.0, 8)

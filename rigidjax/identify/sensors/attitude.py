@@ -11,13 +11,8 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar, Vec3
-from rigidjax.identify.sensors.base import (
-    ClockedSensor,
-    SensorInput,
-    deviations,
-    optional,
-    required,
-)
+from rigidjax.identify.sensors import base
+from rigidjax.identify.sensors.base import ClockedSensor, SensorInput
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
 
@@ -42,9 +37,9 @@ class AttitudeSensor(ClockedSensor):
     reading_shape: ClassVar[tuple[int, ...]] = (4,)
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "rad"
-    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    noise: Vec3 | None = eqx.field(converter=base.deviations(), default=None)
     _: dataclasses.KW_ONLY
-    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=base.optional("mounting"), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         q = _mounted(now.state.q, self.mounting)
@@ -85,7 +80,7 @@ def _mounted(q: Array, mounting: Vec3 | None) -> Array:
 
 
 def _unit(world: Any) -> Vec3:
-    vector = required("world")(world)
+    vector = base.required("world")(world)
     length = jnp.sqrt(dot(vector, vector))
     words = "world: wanted a direction, got a vector of length zero"
     return vector / _checks.refuse(length, ~(length > 0), words)
@@ -110,9 +105,9 @@ class Direction(ClockedSensor):
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "rad"
     world: Vec3 = eqx.field(converter=_unit)
-    noise: Float[Array, "2"] | None = eqx.field(converter=deviations(2), default=None)
+    noise: Float[Array, "2"] | None = eqx.field(converter=base.deviations(2), default=None)
     _: dataclasses.KW_ONLY
-    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=base.optional("mounting"), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "2"]:
         seen = self._seen(now)
@@ -123,11 +118,9 @@ class Direction(ClockedSensor):
         return -jnp.stack([dot(first, seen), dot(second, seen)]) / half
 
     def reading_of(self, now: SensorInput, error: Float[Array, "2"]) -> Vec3:
-        """A reading (3,) with an error of the same length as this one (2,), and equal for small
-        errors.
+        """A reading (3,) with an error as long as this one (2,), and equal if small.
 
-        The two axes across the prediction are the axes across the reading, turned by the angle
-        between.
+        The axes across the prediction are those across the reading, turned by the angle between.
         """
         seen = self._seen(now)
         first, second = _across(seen)
@@ -173,10 +166,10 @@ class Marker(ClockedSensor):
     # A body on a pivot need not move.
     feels: ClassVar[Any] = property(lambda self: HasPose if self.origin is None else HasAttitude)
     unit: ClassVar[str] = "m"
-    place: Vec3 = eqx.field(converter=required("place"), default=None)
-    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    place: Vec3 = eqx.field(converter=base.required("place"), default=None)
+    noise: Vec3 | None = eqx.field(converter=base.deviations(), default=None)
     _: dataclasses.KW_ONLY
-    origin: Vec3 | None = eqx.field(converter=optional("origin"), default=None)
+    origin: Vec3 | None = eqx.field(converter=base.optional("origin"), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         state = now.state
@@ -196,9 +189,9 @@ class Position(ClockedSensor):
 
     feels: ClassVar[type] = HasPose
     unit: ClassVar[str] = "m"
-    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    noise: Vec3 | None = eqx.field(converter=base.deviations(), default=None)
     _: dataclasses.KW_ONLY
-    bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
+    bias: Vec3 | None = eqx.field(converter=base.optional("bias"), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         place = now.state.x
@@ -222,11 +215,11 @@ class Velocity(ClockedSensor):
 
     feels: ClassVar[type] = HasPose
     unit: ClassVar[str] = "m/s"
-    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    noise: Vec3 | None = eqx.field(converter=base.deviations(), default=None)
     _: dataclasses.KW_ONLY
-    place: Vec3 | None = eqx.field(converter=optional("place"), default=None)
-    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
-    bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
+    place: Vec3 | None = eqx.field(converter=base.optional("place"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=base.optional("mounting"), default=None)
+    bias: Vec3 | None = eqx.field(converter=base.optional("bias"), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         state = now.state
@@ -255,11 +248,11 @@ class Range(ClockedSensor):
     components: ClassVar[int] = 1
     feels: ClassVar[type] = HasPose
     unit: ClassVar[str] = "m"
-    station: Vec3 = eqx.field(converter=required("station"), default=None)
-    noise: Float[Array, "1"] | None = eqx.field(converter=deviations(1), default=None)
+    station: Vec3 = eqx.field(converter=base.required("station"), default=None)
+    noise: Float[Array, "1"] | None = eqx.field(converter=base.deviations(1), default=None)
     _: dataclasses.KW_ONLY
-    place: Vec3 | None = eqx.field(converter=optional("place"), default=None)
-    bias: Scalar | None = eqx.field(converter=optional("bias", ()), default=None)
+    place: Vec3 | None = eqx.field(converter=base.optional("place"), default=None)
+    bias: Scalar | None = eqx.field(converter=base.optional("bias", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
         state = now.state

@@ -32,8 +32,7 @@ class LowPass(eqx.Module):
     first four, before a sample after a gap of more than three intervals a straight line.
 
     **Arguments:** `cutoff` Hz, the frequency of gain 1/√2 (a `Free` may move it); `order` 1 or 2.
-    **Raises** `ValueError` for a cutoff that is not positive, another order. Source: Butterworth
-    1930, Experimental Wireless 7:536.
+    **Raises** `ValueError` for other values. Source: Butterworth 1930, Experimental Wireless 7:536.
 
     >>> slow = LowPass(0.5)(jnp.arange(4.0), jnp.ones((4, 1)))
     >>> bool(jnp.allclose(slow, 1.0))
@@ -54,11 +53,9 @@ class LowPass(eqx.Module):
     def __call__(
         self, t: Float[Array, " times"], values: Float[Array, "times k"]
     ) -> Float[Array, "times k"]:
-        """The filtered samples.
-
-        **Arguments:** `t` (T,) increasing times, s; `values` (T, k), of any unit. **Raises**
-        `ValueError` for times that do not increase, NaN, and numbers whose cubes overflow, if they
-        are known.
+        """The filtered samples of `values` (T, k), of any unit, at increasing times `t` (T,), s.
+        **Raises** `ValueError` for times that do not increase, NaN, and numbers whose cubes
+        overflow, if known.
         """
         values = _checks.numbers(values, "values")
         if values.ndim != 2:

@@ -8,14 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Vec3
-from rigidjax.identify.sensors.base import (
-    ClockedSensor,
-    SensorInput,
-    deviations,
-    optional,
-    positive,
-    required,
-)
+from rigidjax.identify.sensors import base
+from rigidjax.identify.sensors.base import ClockedSensor, SensorInput
 from rigidjax.identify.sensors.lowpass import LowPass, lowpass_of
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross
@@ -24,14 +18,15 @@ from rigidjax.rotation.linalg3 import apply, cross
 class _Vector(ClockedSensor):
     """A sensor that reads a vector in its own axes: `scale · S exp(−mounting) v + bias`."""
 
-    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    noise: Vec3 | None = eqx.field(converter=base.deviations(), default=None)
     _: dataclasses.KW_ONLY
-    bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
-    scale: Vec3 | None = eqx.field(converter=optional("scale"), default=None)
-    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
-    skew: Vec3 | None = eqx.field(converter=optional("skew"), default=None)
+    bias: Vec3 | None = eqx.field(converter=base.optional("bias"), default=None)
+    scale: Vec3 | None = eqx.field(converter=base.optional("scale"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=base.optional("mounting"), default=None)
+    skew: Vec3 | None = eqx.field(converter=base.optional("skew"), default=None)
     limit: Vec3 | None = eqx.field(
-        converter=lambda limit: positive(limit, "limit", "a positive full scale", 3), default=None
+        converter=lambda limit: base.positive(limit, "limit", "a positive full scale", 3),
+        default=None,
     )
     lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
 
@@ -67,9 +62,8 @@ class Gyro(_Vector):
     of mass and `None` unless given.
 
     With jitter a reading is also wrong along the change of the prediction, by the change in the
-    stamp's error: to first order, for motions that turn little in that time.
-
-    **Raises** `ValueError` for a noise, limit or jitter that is not positive, a wrong shape, NaN.
+    stamp's error: to first order, for motions that turn little in that time. **Raises**
+    `ValueError` for a noise, limit or jitter that is not positive, a wrong shape, NaN.
 
     >>> Gyro(noise=0.01).noise.shape
     (3,)
@@ -78,10 +72,10 @@ class Gyro(_Vector):
     unit: ClassVar[str] = "rad/s"
     _: dataclasses.KW_ONLY
     g_sensitivity: Float[Array, "3 3"] | None = eqx.field(
-        converter=optional("g_sensitivity", (3, 3)), default=None
+        converter=base.optional("g_sensitivity", (3, 3)), default=None
     )
-    place: Vec3 | None = eqx.field(converter=optional("place"), default=None)
-    gravity: Vec3 | None = eqx.field(converter=optional("gravity"), default=None)
+    place: Vec3 | None = eqx.field(converter=base.optional("place"), default=None)
+    gravity: Vec3 | None = eqx.field(converter=base.optional("gravity"), default=None)
     # Only gravity needs the attitude.
     feels: type = eqx.field(static=True, init=False, default=HasSpin)
 
@@ -134,8 +128,8 @@ class Accelerometer(_Vector):
     feels: ClassVar[Any] = property(lambda self: HasSpin if self.gravity is None else HasAttitude)
     unit: ClassVar[str] = "m/s²"
     _: dataclasses.KW_ONLY
-    place: Vec3 = eqx.field(converter=required("place"), default=None)
-    gravity: Vec3 | None = eqx.field(converter=optional("gravity"), default=None)
+    place: Vec3 = eqx.field(converter=base.required("place"), default=None)
+    gravity: Vec3 | None = eqx.field(converter=base.optional("gravity"), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         return reading - self._shown(specific_force(now, self.place, self.gravity))
@@ -156,7 +150,7 @@ class Magnetometer(_Vector):
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "of the field"
     _: dataclasses.KW_ONLY
-    field: Vec3 = eqx.field(converter=required("field"), default=None)
+    field: Vec3 = eqx.field(converter=base.required("field"), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         seen = quaternion.rotate(quaternion.conjugate(now.state.q), self.field)
