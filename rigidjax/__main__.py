@@ -26,11 +26,14 @@ _OUT = ("checkpoint", "figure", "report", "json", "csv", "keep")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code: 0 success; 1 an untrustworthy fit; 2 bad input,
-    or a file that could not be written; 130 interrupted.
+    """Run the command line; returns the exit code.
 
-    **Arguments:** `arguments` of the command line; `None` for those of this process, which then
-    belongs to this command: its compiled programs are kept for the next run (`--no-cache`).
+    0 success; 1 an untrustworthy fit; 2 bad input, or a file that could not be written; 130
+    interrupted.
+
+    **Arguments:** `arguments` those of the command line; `None` for the ones of this process. Only
+    then does the process belong to this command, and its compiled programs are kept for the next
+    run (`--no-cache`).
     """
     parser = _parser()
     options = parser.parse_args(arguments)

@@ -135,8 +135,12 @@ def _dimension(value: Any, unit: Any) -> dict[str, Any] | None:
 
 
 def same_batch(**arrays: tuple[Array, int]) -> None:
-    """Refuse arrays, `name=(array, n)`, whose leading axes, before the last `n` of each, differ: a
-    container of many bodies has the same everywhere, one body has none. **Raises:** `ValueError`.
+    """Refuse arrays whose leading axes, before the last `n` of each, differ.
+
+    **Arguments:** `name=(array, n)`, for each part of one container. A container of many bodies has
+    the same leading axes everywhere; one body has none.
+
+    **Raises:** `ValueError`.
     """
     leading = {name: a.shape[: a.ndim - n] for name, (a, n) in arrays.items()}
     if len(set(leading.values())) > 1:
@@ -164,16 +168,19 @@ def known(value: Any) -> bool:
 
 
 def namespace(value: Any) -> Any:
-    """NumPy where `value` is known, else `jax.numpy`: a JAX operation outside `jit` costs some 30
-    µs, ten of them more than a whole short simulation.
+    """NumPy where `value` is known, else `jax.numpy`.
+
+    A check of known numbers is done by NumPy on the host: a JAX operation outside `jit` costs some
+    30 µs, ten of them more than a whole short simulation.
     """
     return np if known(value) else jnp
 
 
 def refuse(value: Any, bad: Bool[ArrayLike, "..."], message: str) -> Any:
     """Return `value` unless `bad`; then raise with `message`, the same under `jit` and `vmap`.
-    Outside a trace this is a `ValueError` with the bare text. Inside one it is `equinox.error_if`;
-    the result must be used, or the check is dropped.
+
+    Outside a trace this is a `ValueError` with the bare text. Inside one it is
+    `equinox.error_if`; the result must be used, or the check is dropped.
     """
     if known(bad):
         if bool(np.any(np.asarray(bad))):
@@ -254,8 +261,10 @@ _ONE = {
 def single(
     value: Any, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
 ) -> Any:
-    """Return `value` if it is one of `kinds` without leading axes: a container of many bodies has
-    the same type, and its shape would raise an error in the middle of the arithmetic.
+    """Return `value` if it is one of `kinds`, and one body or state: no leading axes.
+
+    A container of many bodies has the same type; without this check its shape would raise an error
+    in the middle of the arithmetic.
     """
     instance(value, kinds, name, wanted=wanted, hint=hint)
     for field in (field for field in _ONE if field in vars(value)):
@@ -267,6 +276,7 @@ def single(
 
 def function(value: Any, name: str, of: str, *, hint: str = "") -> Any:
     """Return `value` if it is a function and no class; `of` gives arguments and result: "t → (3,)".
+
     The number of arguments is checked if `of` begins with a list: "(t, state, body) → scalar".
     """
     found = kind(value)

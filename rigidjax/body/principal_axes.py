@@ -57,9 +57,10 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
 @jax.custom_jvp
 @jax.jit
 def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
-    """Ascending eigenvalues and a right-handed matrix of eigenvectors, as columns. By cyclic Jacobi
-    rotations (Golub and Van Loan 2013, section 8.5): in a batch eight times as fast as LAPACK's
-    `eigh`, and accurate for the small moment of a slender body along the axes.
+    """Ascending eigenvalues and a right-handed matrix of eigenvectors, as columns.
+
+    By cyclic Jacobi rotations (Golub and Van Loan 2013, section 8.5): in a batch eight times as
+    fast as LAPACK's `eigh`, and accurate for the small moment of a slender body along the axes.
     """
     # A power of two, so that scaling costs no digit.
     exponent = exponent_of(a)

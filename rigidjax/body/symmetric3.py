@@ -11,9 +11,10 @@ from rigidjax.rotation.linalg3 import apply as apply, product as product
 
 @jax.custom_jvp
 def inverse(a: Mat3) -> Mat3:
-    """The inverse of a symmetric 3×3 matrix with trace > 0, by cofactors. The matrix is divided by
-    its trace first: 1e-20 or 1e37 kg m² neither underflow nor overflow. A zero moment gives
-    infinities; `Inertia.invertible` refuses it in words.
+    """The inverse of a symmetric 3×3 matrix with trace > 0, by cofactors.
+
+    The matrix is divided by its trace first: 1e-20 or 1e37 kg m² neither underflow nor overflow. A
+    zero moment gives infinities; `Inertia.invertible` refuses it in words.
     """
     # One split: indexed, each entry is a kernel.
     xx, _, _, _, yy, _, _, _, zz = linalg3.entries(a)

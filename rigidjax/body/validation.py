@@ -61,6 +61,7 @@ def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 
 
 def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bool) -> Any:
     """Return `body` if some mass has these numbers and no moment is zero; `mass` may be `None`.
+
     Other numbers are refused if they are known, or if `throw`; else the traced body becomes NaN.
     """
     tensor = _checks.numbers(tensor, "inertia tensor")

@@ -97,8 +97,9 @@ class Moon(eqx.Module):
     def body(
         self, beta: ScalarLike | None = None, gamma: ScalarLike | None = None, *, core: bool = False
     ) -> Inertia:
-        """The inertia, kg m², of DE421's J2, β = (C − A)/B and γ = (B − A)/C, or other ones. With
-        `core` that of the mantle alone, which then turns under `torque(core=True)`.
+        """The inertia, kg m², of DE421's J2, β = (C − A)/B and γ = (B − A)/C, or other ones.
+
+        With `core` that of the mantle alone, which then turns under `torque(core=True)`.
         """
         c = self.constants
         b = jnp.asarray(c["LBET"] if beta is None else beta)
@@ -203,9 +204,11 @@ class _Shape(AbstractBodyChart):
 
 
 class _Core(eqx.Module):
-    """A liquid core in the mantle: friction at the boundary, and its flattening; its own state is
-    its rate (3,), rad/s, mantle frame. Source: Folkner and others 2014 (DE430), section III;
-    Williams and others 2001, JGR 106:27933.
+    """A liquid core in the mantle: friction at the boundary, and its flattening.
+
+    Its own state is its angular velocity (3,), rad/s, mantle frame. Source: Folkner and others 2014
+    (DE430), section III; Williams and others 2001, Lunar rotational dissipation in solid body and
+    molten core, JGR 106:27933.
     """
 
     feels: ClassVar[type] = HasAttitude

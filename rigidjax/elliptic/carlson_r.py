@@ -29,9 +29,10 @@ _UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def r_integral(powers: tuple[float, ...], arguments: tuple[Result, ...]) -> Result:
-    """∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt for aᵢ ≥ 0 and multiples bᵢ of ½ (`powers`) with Σ bᵢ > 1. It is
-    infinite if the integral diverges at 0, NaN for a negative argument, and accurate to round-off
-    for ratios of the aᵢ up to 1e35 (to 1e-13 at 1e60).
+    """∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt for aᵢ ≥ 0 and multiples bᵢ of ½ (`powers`) with Σ bᵢ > 1.
+
+    It is infinite if the integral diverges at 0, NaN for a negative argument, and accurate to
+    round-off for ratios of the aᵢ up to 1e35 (to 1e-13 at 1e60).
     """
     scale = scale_of(arguments)
     dtype = np.dtype(arguments[0].dtype)

@@ -196,8 +196,9 @@ def _(primals: Any, tangents: Any) -> tuple[Terms, Terms]:
 
 
 def curvature(density: LogDensity, x: Float[Array, " n"]) -> tuple[Scalar, Array, Array]:
-    """Cost, Fisher's information (n, n) and gradient (n,) of normal errors whose variances x moves,
-    too: `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta and Mehra 1974,
+    """Cost, Fisher's information (n, n), gradient (n,): normal errors, variances that x moves, too.
+
+    `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta and Mehra 1974,
     doi:10.1109/TAC.1974.1100714, for the filter), and priors.
     """
     rows, push = jax.linearize(lambda x: _rows(density, x), x)

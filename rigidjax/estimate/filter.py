@@ -210,8 +210,10 @@ class Filtered(eqx.Module):
 
     @property
     def nis(self) -> tuple[Float[Array, " times"], ...]:
-        """Normalised innovations squared of each sensor: χ² of as many degrees of freedom as
-        numbers read if the model is right (Bar-Shalom, Li and Kirubarajan 2001, §5.4).
+        """Normalised innovations squared of each sensor, and how many numbers each holds.
+
+        They follow χ² with as many degrees of freedom if the model is right (Bar-Shalom, Li and
+        Kirubarajan, Estimation (2001), §5.4).
         """
         return tuple(
             jnp.sum(jnp.where(r.seen, r.innovation**2 / r.variance, 0), -1) for r in self.readings

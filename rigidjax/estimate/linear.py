@@ -241,8 +241,9 @@ def joint(grown: Array, noise: Array, root: Array) -> Joint:
 def smoothed(
     kept: Joint, mean: Array, predicted: Array, noise: Array, end: tuple[Array, Array]
 ) -> tuple[Array, Array, Array, Array]:
-    """Means and roots at all times, and means and covariances of the unit noise of all steps. The
-    pass back (Rauch, Tung, Striebel 1965), and of the noise (m, m) with `Z = L⁻¹ G`, L the
+    """Means and roots at all times, and means and covariances of the unit noise of all steps.
+
+    The pass back (Rauch, Tung, Striebel 1965), and of the noise (m, m) with `Z = L⁻¹ G`, L the
     predicted root: `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ`, S the smoothed root after the step.
     """
 

@@ -11,10 +11,12 @@ from rigidjax._types import Scalar
 
 
 def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
-    """The lower triangular root L of `a aᵀ`, its diagonal ≥ 0, by the modified Gram–Schmidt process
-    on the rows, whose factor is as good as Householder's (Björck 1967, doi:10.1007/BF01934122). A
-    row that depends on earlier ones, to a few units of round-off, leaves a zero on the diagonal,
-    with zero derivatives, where those of `jnp.linalg.qr` are NaN (a state without error).
+    """The lower triangular root L of `a aᵀ`, its diagonal ≥ 0.
+
+    By the modified Gram–Schmidt process on the rows, whose triangular factor is as good as
+    Householder's (Björck 1967, doi:10.1007/BF01934122). A row that depends on earlier rows, to a
+    few units of round-off, leaves a zero on the diagonal. Its derivatives are zero, whereas those
+    of `jnp.linalg.qr` are NaN: a state known without error has such rows.
     """
     n = a.shape[0]
     below = jnp.arange(n)
@@ -48,9 +50,11 @@ def product(a: Float[Array, "n m"], b: Float[Array, "m k"]) -> Float[Array, "n k
 
 
 class Absorbed(NamedTuple):
-    """The update by the numbers read: `step` (n,) of the mean; the new `root` (n, n); `innovation`
-    ν, the reading minus its prediction from all readings before; `variance` s of ν. A masked number
-    has 0 and 1, so that it counts for nothing.
+    """The update by the numbers read: the mean's step, the new root, and each innovation.
+
+    **Fields:** `step` (n,); `root` (n, n); `innovation` ν, the reading minus its prediction from
+    all readings before; `variance` s of ν; a masked number has 0 and 1, so that it counts for
+    nothing.
     """
 
     step: Float[Array, " n"]
@@ -68,6 +72,7 @@ def absorb_all(
     seen: Bool[Array, " k"],
 ) -> Absorbed:
     """Potter's update by k numbers `error = row · e + noise`, one by one, of an e of mean `step`.
+
     `s = |Sᵀh|² + r`, `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh`: Potter, in Battin, Astronautical
     Guidance (1964), §9.6; Bierman, Factorization Methods (1977), §II.4.
     """

@@ -259,9 +259,11 @@ class Dynamics(eqx.Module):
 def reset(
     x: Extended, e: Float[Array, " n"], root: Float[Array, "n m"], *, back: bool = False
 ) -> Float[Array, "n m"]:
-    """The root of the errors about `x ⊕ e` from that about x: `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`,
-    to second order in the turn e (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848). With
-    `back` it multiplies by `J_r(e)⁻¹`, to third order: so `log(exp(e) exp(δ))` moves with δ.
+    """The root of the errors about `x ⊕ e`, from the `root` of the errors about x.
+
+    `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, to second order in the turn e: Mueller, Hehn and D'Andrea
+    2017, doi:10.2514/1.G000848. With `back` it multiplies by `J_r(e)⁻¹`, to third order: this is
+    how `log(exp(e) exp(δ))` moves with δ.
     """
     first, second = (0.5, 1 / 12) if back else (-0.5, 1 / 6)
     across = jax.vmap(cross, (None, 1), 1)
@@ -364,8 +366,10 @@ def steps_of(
 
 
 class Sampled(eqx.Module):
-    """The result of `sample`: `t` (T,) s; `states` with a leading time axis; `torques` the value
-    (T, 3) of each `CorrelatedTorque`, N m, body frame.
+    """The result of `sample`.
+
+    **Fields:** `t` (T,) s; `states` with a leading time axis; `torques` the value (T, 3) of each
+    `CorrelatedTorque`, N m, body frame.
     """
 
     t: Float[Array, " times"]

@@ -19,8 +19,10 @@ from rigidjax.motion.manifold import minus, plus
 
 
 class Push(NamedTuple):
-    """The estimate of a white torque, averaged over the step that ends at each time: `mean`,
-    `deviation` (N, 3) N m, body frame. The deviation is large for short steps.
+    """The estimate of a white torque, averaged over the step that ends at each time.
+
+    **Fields:** `mean`, `deviation` (N, 3) N m, body frame; the deviation is large for short steps,
+    since white noise has no value at a time.
     """
 
     mean: Float[Array, "stops 3"]

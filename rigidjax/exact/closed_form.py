@@ -87,8 +87,9 @@ def restored(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar]:
 
 
 def in_step(f: Elliptic, m: Modulus) -> Elliptic:
-    """The larger of C² and D², computed again from the smaller: D² − C² = (p − q)S². C and SD
-    cancel near the middle axis, and of the doublings' errors only a common one does, too.
+    """The larger of C² and D², computed again from the smaller: D² − C² = (p − q)S².
+
+    C and SD cancel near the middle axis, and of the doublings' errors only a common one does, too.
     """
     gs = m.gap * f.S * f.S
     other = jnp.sqrt(jnp.where(gs > 0, f.C * f.C + gs, f.D * f.D - gs))

@@ -53,8 +53,9 @@ _LOOPED = 1000
 
 @jax.custom_jvp
 def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
-    """Π(t) and the quaternion of the turn since 0. `moments`: I11 ≤ I22 ≤ I33, I12, I13, I23, the
-    last three zero in value; `momentum` Π(0).
+    """Π(t) and the quaternion of the turn since 0.
+
+    `moments`: I11 ≤ I22 ≤ I33, I12, I13, I23, the last three zero in value; `momentum` Π(0).
     """
     return momentum_and_turn(orbit(moments[:3], momentum), t)
 

@@ -74,8 +74,9 @@ class FreeBody(eqx.Module):
 
 
 class FreeMotion(eqx.Module):
-    """The motion of a free body of any kind: `FreeBody`, and x + v t of a `Rigid`. Call it with a
-    time, or with times (n,), s since `state0`. Times that are too long give NaN.
+    """The motion of a free body of any kind: `FreeBody`, and x + v t of a `Rigid`.
+
+    Call it with a time, or with times (n,), s since `state0`. Times that are too long give NaN.
     """
 
     state0: Any

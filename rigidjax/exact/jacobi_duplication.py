@@ -112,8 +112,10 @@ def series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
 
 
 def growth(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
-    """∫ S²/(1 + μS²) du = ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)) for a small S. Its power series
-    in S, by the recurrence of Legendre's polynomials for the roots and one more for 1 + μS².
+    """∫ S²/(1 + μS²) du = ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)) for a small S.
+
+    Its power series in S, by the recurrence of Legendre's polynomials for the roots and one more
+    for 1 + μS².
     """
     s = S * S
     e, f, w = (m.p + m.q) * s, (m.p * m.q) * (s * s), mu * s

@@ -15,8 +15,9 @@ _SWEEPS = 6
 
 
 def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
-    """The inertia in its own principal axes, ascending, and those axes as columns (a rotation). By
-    Jacobi's method, in which small moments keep their digits; A is held fixed in derivatives.
+    """The inertia in its own principal axes, ascending, and those axes as columns (a rotation).
+
+    By Jacobi's method, in which small moments keep their digits; A is held fixed in derivatives.
     """
     columns, moments = _jacobi(jax.lax.stop_gradient(tensor))
     axes = jnp.stack([jnp.stack(row) for row in columns])

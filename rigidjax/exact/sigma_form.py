@@ -224,9 +224,10 @@ def sigma_at(u: Scalar, v: Invariants) -> Sigma:
 
 
 def period(v: Invariants) -> Scalar:
-    """The period of Π: `2π/agm(√(z − x), √(z − y))`, z the largest eigenvalue of E. One step of
-    Newton's from the diagonal entry has the derivatives of z to third order; the other two enter
-    through symmetric functions, the first step of the mean.
+    """The period of Π: `2π/agm(√(z − x), √(z − y))`, z the largest eigenvalue of E.
+
+    One step of Newton's from the diagonal entry has the derivatives of z to third order; the other
+    two enter through symmetric functions, the first step of the mean.
     """
     three = v.gap > 0
     top = jnp.where(three, v.p, v.q)

@@ -31,10 +31,11 @@ def goodness(
     problem: Problem, noise: Noise, linear: Linearised, times: Times, covariance: np.ndarray
 ) -> tuple[float, int, Answer, tuple[int, ...]]:
     """χ² and its degrees of freedom (sensors of given noise), the answer, the sensors left over.
-    The size of errors is compared with a given noise (five standard deviations of χ², or of the
-    median of squares under a robust loss) and with the variance of the readings; Ljung and Box's
-    test (1978, doi:10.1093/biomet/65.2.297) says if they are white. Readings at full scale take no
-    part. `covariance` (n, n) is that of white errors.
+
+    The size of the errors is compared with a given noise (five standard deviations of χ², or of the
+    median of the squares under a robust loss) and with the variance of the readings; Ljung and
+    Box's test (1978, doi:10.1093/biomet/65.2.297) says whether they are white. Readings at full
+    scale take no part. `covariance` (n, n) is that of white errors.
     """
     chi2, count, word, free = 0.0, 0, EXPLAINS, linear.size
     words: list[str] = []

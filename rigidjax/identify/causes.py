@@ -51,9 +51,10 @@ ATTITUDES = {
 
 
 def misread(recordings: Sequence[Recording]) -> Cause | None:
-    """The mistake in reading the rates of one body, if there is one. Rates are compared with those
-    between attitudes, or else with Euler's equations for the best body: a correction counts only if
-    that is real. A mirrored axis shows only under a torque.
+    """The mistake in reading the rates of one body, if there is one.
+
+    Rates are compared with those between attitudes, or else with Euler's equations for the best
+    body: a correction counts only if that is real. A mirrored axis shows only under a torque.
     """
     gyros = readings_of(recordings[0], Gyro)
     if not gyros:

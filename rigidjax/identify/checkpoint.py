@@ -43,9 +43,10 @@ def fingerprint(*trees: Any) -> str:
 
 
 class Checkpoint:
-    """The results of a long search so far, on disk after every stride of steps. `like` is a `Tried`
-    of the right shapes, `print_of` the `fingerprint` of all that the search depends on. A file of
-    another problem raises `ValueError`, and is not overwritten.
+    """The results of a long search so far, on disk after every stride of steps.
+
+    `like` is a `Tried` of the right shapes, `print_of` the `fingerprint` of all that the search
+    depends on. A file of another problem raises `ValueError`, and is not overwritten.
     """
 
     def __init__(self, path: str | Path | None, like: Tried, print_of: str):

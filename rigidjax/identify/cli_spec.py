@@ -59,9 +59,11 @@ class WheelColumn(eqx.Module):
 
 
 def channel(text: str) -> Channel:
-    """A sensor written `KIND=COLUMNS[:UNIT[:NOISE]]`, such as `gyro=wx,wy,wz:deg/s:0.1`: KIND is
-    `gyro`, `accelerometer`, `quaternion` (w, x, y, z) or `euler-ZXZ` (any sequence; body → world);
-    NOISE one number or one for each axis, as in `0.1,0.1,0.2`. **Raises** `LogError` in words.
+    """A sensor written `KIND=COLUMNS[:UNIT[:NOISE]]`, such as `gyro=wx,wy,wz:deg/s:0.1`.
+
+    KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y, z) or `euler-ZXZ` (any sequence; body →
+    world); NOISE one number or three, one for each axis, as in `0.1,0.1,0.2`. **Raises**
+    `LogError` in words.
     """
     kind, _, rest = text.partition("=")
     names, *more = rest.split(":")
@@ -97,8 +99,9 @@ def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
 
 
 def wheel(text: str) -> WheelColumn:
-    """A wheel written `COLUMN:INERTIA[:AXIS[:UNIT]]`, such as `flywheel:5.2e-7:z:rad/s`: INERTIA in
-    kg m² about its AXIS, `x`, `y` or `z` of the body. **Raises** `LogError`.
+    """A wheel written `COLUMN:INERTIA[:AXIS[:UNIT]]`, such as `flywheel:5.2e-7:z:rad/s`.
+
+    INERTIA in kg m² about its axis, AXIS `x`, `y` or `z` of the body. **Raises** `LogError`.
     """
     name, *more = text.split(":")
     axis = more[1] if len(more) > 1 else "z"

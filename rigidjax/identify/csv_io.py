@@ -52,8 +52,9 @@ class Header(NamedTuple):
 
 
 def read_header(file: TextIO) -> Header:
-    """The header of a text, read from its beginning: the first line, below comments (`#`). It may
-    be the last comment, as `numpy.savetxt` writes it: then numbers follow.
+    """The header of a text, read from its beginning: the first line, below comments (`#`).
+
+    It may be the last comment, as `numpy.savetxt` writes it: then numbers follow.
     """
     comments, first, line = "", file.readline(_LONGEST), 1
     while first.startswith("#") or (first and not first.strip()):

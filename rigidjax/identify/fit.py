@@ -290,6 +290,7 @@ def _with(problem: Problem, integrator: AbstractIntegrator | None) -> Problem:
 
 def _finer(best: Tried, task: Task, rough: list[str]) -> AbstractIntegrator | None:
     """The integrator whose predictions finer steps do not change, `None` if it is the one in use.
+
     If there is none, `rough` says so.
     """
     problem, (errors, _) = task.problem, best.found[0]

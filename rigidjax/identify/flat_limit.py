@@ -48,10 +48,11 @@ class Limit(eqx.Module):
 def ends(
     reach: float, correlation: np.ndarray | float, away: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The ends of an interval from its middle, in standard deviations, cut at a flat body, by the
-    likelihood ratio of two Gaussian numbers, one not negative: `m²(y) = min over z ≥ 0`.
-    **Arguments:** `reach` the quantile; `correlation` of y with the flatness z; `away` the free
-    flatness over its standard deviation.
+    """The ends of an interval from its middle, in standard deviations, cut at a flat body.
+
+    They follow from the likelihood ratio of two Gaussian numbers, one of them not negative:
+    `m²(y) = min over z ≥ 0`. **Arguments:** `reach` the quantile; `correlation` of the number y
+    with the flatness z; `away` the free flatness over its standard deviation.
     """
     rho = np.clip(np.asarray(correlation), -1.0, 1.0)
     past = min(away, 0.0)
@@ -79,9 +80,10 @@ def in_words(body: Inertia | MassProperties) -> str | None:
 
 
 def beside(problem: Problem, parameters: Parameters) -> Parameters | None:
-    """The same numbers, but flat bodies a little thicker; `None` if no body is flat. The chart has
-    a derivative of zero at a flat body; the information about the tensor itself is regular there
-    and hardly changes over such a small thickness.
+    """The same numbers, but flat bodies a little thicker; `None` if no body is flat.
+
+    The chart has a derivative of zero at a flat body; the information about the tensor itself is
+    regular there and hardly changes over such a small thickness.
     """
     thick = list(map(_thicker, charts_of(problem.body), bodies_of(problem, parameters)))
     if all(one is None for one in thick):
@@ -144,9 +146,10 @@ def flatness(problem: Problem, parameters: Parameters) -> Float[Array, " bodies"
 def limits(
     problem: Problem, found: tuple[np.ndarray, np.ndarray], step: np.ndarray, names: list[str]
 ) -> tuple[Limit, ...]:
-    """The limit of each body whose moments are free. `found` are numbers and derivatives, the
-    flatness of each body last; `step` (n,) leads to the least misfit of the linear problem; `names`
-    are the suffixes of the bodies' quantities.
+    """The limit of each body whose moments are free.
+
+    `found` are numbers and derivatives, the flatness of each body last; `step` (n,) leads to the
+    least misfit of the linear problem; `names` are the suffixes of the bodies' quantities.
     """
     rows = zip(names, *(part[-len(names) :] for part in found), strict=True)
     kept = [_has_limit(chart) for chart in charts_of(problem.body)]

@@ -29,9 +29,10 @@ class Layout(NamedTuple):
 
 
 def blackbox(path: Path, columns: Sequence[str]) -> Columns:
-    """The names of all fields, and the wanted ones, of the first flight in a Blackbox log. Rates
-    come in deg/s and accelerations in g by the scales in the header, as in the flight controllers'
-    own viewer; other fields as logged. A log without its last mark is read to its end.
+    """The names of all fields, and the wanted ones, of the first flight in a Blackbox log.
+
+    Rates come in deg/s and accelerations in g by the scales in the header, as in the flight
+    controllers' own viewer; other fields as logged. A log without its last mark is read to its end.
     """
     parser = _checks.library("orangebox", "blackbox", str(path)).Parser.load(str(path))
     names = parser.field_names
@@ -136,9 +137,10 @@ _CRAZYFLIE = 0xBC
 
 
 def crazyflie(path: Path, columns: Sequence[str]) -> Columns:
-    """The variables of a Crazyflie's µSD log by name, as `gyro.x`, and their `timestamp`, µs. They
-    are those of the event with most of the wanted names. Source: the format's description in the
-    firmware's documentation, "µSD card deck", versions 1 and 2.
+    """The variables of a Crazyflie's µSD log by name, as `gyro.x`, and their `timestamp`, µs.
+
+    They are those of the event with most of the wanted names. Source: the format's description in
+    the firmware's documentation, "µSD card deck", versions 1 and 2.
     """
     data = path.read_bytes()
     version, count = struct.unpack_from("<HH", data, 1)

@@ -81,8 +81,10 @@ TENSOR = dict(zip(Tensor.plain_names, COMPONENTS, strict=True))
 
 
 def undetermined(fit: "Fit") -> tuple[Combination, ...]:
-    """The combinations that the data do not determine at all, each of few numbers, one of which no
-    other has (reduced echelon form); initial attitudes in the axes, world or body, that need fewer.
+    """The combinations that the data do not determine at all, each of few numbers.
+
+    Each row has a number that no other has (reduced echelon form); initial attitudes are in the
+    axes, world or body, that need fewer numbers.
     """
     null = np.asarray(fit.null_directions)
     if not null.size:

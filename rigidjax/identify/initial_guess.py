@@ -53,10 +53,12 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> l
 
 
 def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
-    """The inertia from a regression on Euler's equations in integral form, moved to the nearest
-    real body. `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I: with a torque
-    they are found by least squares, without one as the smallest right singular vector (up to
-    scale). `None` if samples are too far apart, or the torque needs more than a rate.
+    """The inertia from a regression on Euler's equations in integral form.
+
+    `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. With a torque they are found
+    by least squares, without one as the smallest right singular vector (up to scale). The result
+    is moved to the nearest real body. It is `None` if samples are too far apart, or the torque
+    needs more than a rate.
     """
     found = []
     for recording in recordings:
@@ -78,8 +80,9 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
 
 
 def tensor_and_margin(matrix: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, float]:
-    """The components (6,) of a tensor by least squares, of trace one if all sides are zero. And the
-    smallest eigenvalue of its second moment over the largest: positive for a real body.
+    """The components (6,) of a tensor by least squares, of trace one if all sides are zero.
+
+    And the smallest eigenvalue of its second moment over the largest: positive for a real body.
     """
     if np.abs(side).max() > 0:
         components = np.linalg.lstsq(matrix, side, rcond=None)[0]

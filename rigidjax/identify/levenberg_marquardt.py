@@ -39,11 +39,12 @@ def _float(value: Any) -> np.ndarray:
 
 
 class Settings(eqx.Module):
-    """The settings of a search, as arrays: another value does not compile again. It ends at steps
-    of `tolerance` standard deviations (of each number alone); after `steps`; if it would need more
-    than `PATIENCE` steps at its pace to an `aim` of another search; if a step of about the
-    predicted gain gains less than `level` of what a fit gains from noise; at a cost of `near`. Zero
-    for none.
+    """The settings of a search, as arrays: another value does not compile again.
+
+    Steps of `tolerance` standard deviations (of each number alone) end it, and more than `steps`;
+    if it would need more than `PATIENCE` steps at its pace to an `aim` of another search; if a step
+    of about the predicted gain gains less than `level` of what a fit gains from noise; at a cost of
+    `near`. Zero for none.
     """
 
     tolerance: Any = eqx.field(converter=_float)

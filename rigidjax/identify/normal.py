@@ -95,6 +95,7 @@ def normal_of(
     blocks: Sequence[Array], where: Array, size: int, own: np.ndarray | None = None
 ) -> Normal:
     """Σ JᵀJ of blocks (R, T, j, m), their columns at the places `where` (R, m) of `size` numbers.
+
     The columns `own` are of one recording alone, and go out of the core; for `None` all are in it.
     """
     count, columns = where.shape

@@ -50,8 +50,9 @@ class AbstractIntegrator(eqx.Module):
 
     @abc.abstractmethod
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        """The states at `ts`, with a leading time axis. They are a `motion.Coupled` if a torque has
-        states of its own and a sensor needs them.
+        """The states at `ts`, with a leading time axis.
+
+        They are a `motion.Coupled` if a torque has states of its own and a sensor needs them.
         """
 
     def finer(self) -> "AbstractIntegrator | None":

@@ -45,9 +45,10 @@ class Quantity(eqx.Module):
     most: float = np.inf
 
     def interval(self, reach: float) -> tuple[float, float]:
-        """Low and high, `reach` standard deviations away; through the logarithm if positive. An end
-        is nearer if the body there would be past flat. The ends are 0 and infinity for a positive
-        number that is not known to a factor of 1e3.
+        """Low and high, `reach` standard deviations away; through the logarithm if positive.
+
+        An end is nearer if the body there would be past flat. The ends are 0 and infinity for a
+        positive number that is not known to a factor of 1e3.
         """
         low, high = (float(side) * self.deviation for side in cut_ends(reach, self.cuts))
         if not self.positive:
@@ -207,6 +208,7 @@ def cuts_of(
 
 def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
     """Standard deviations of functions with this derivative (…, n); all intervals use them.
+
     Infinite along a direction of `null` (k, n); NaN along one of negative variance or round-off, or
     of a number with a correlation beyond one.
     """

@@ -198,8 +198,10 @@ def _first_speed(t: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Places (n, 3) with these distances (n, k) to stations: differences of `|x|² − 2 s·x + |s|² =
-    d²` are linear in x; a component that they do not determine is that of the stations' centre.
+    """Places (n, 3) with these distances (n, k) to stations.
+
+    Differences of the equations `|x|² − 2 s·x + |s|² = d²` are linear in x. A component of x that
+    they do not determine is that of the stations' centre.
     """
     centre = stations.mean(axis=0)
     s = stations - centre

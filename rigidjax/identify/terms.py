@@ -67,8 +67,10 @@ def errors_of_one(
 
 
 def over_records(function: Any, problem: "Problem", mine: Any) -> Any:
-    """`function(mine, record, reference, which)` of every recording: on a CPU in turn, where XLA
-    makes one kernel of a loop over some dozen numbers, and inner loops run at half the speed.
+    """`function(mine, record, reference, which)` of every recording.
+
+    On a CPU one after another: XLA makes one kernel of a loop over a few dozen numbers, and scalars
+    within an inner loop run at half the speed.
     """
     trees = mine, problem.records, problem.reference, problem.which
     if problem.count == 1:

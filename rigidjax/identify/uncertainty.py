@@ -194,9 +194,10 @@ class Spread(eqx.Module):
 
 
 def of_white(linear: Linearised) -> Spread:
-    """`(JᵀWJ)⁻¹`; infinite for singular values below 1e-8 of the largest. Numbers of one recording
-    alone are eliminated first, each recording's by itself (Schur complement); the singular values
-    are those of their blocks and of what is left.
+    """`(JᵀWJ)⁻¹`; infinite for singular values below 1e-8 of the largest.
+
+    Numbers of one recording alone are eliminated first, each recording's by itself (Schur
+    complement); the singular values are those of their blocks and of what is left.
     """
     n, dense = linear.size, linear.dense
     if not (np.isfinite(dense).all() and np.isfinite(linear.extra_slopes).all()):
@@ -269,13 +270,14 @@ def _parts(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def spread(linear: Linearised, times: "Times", white: Spread | None = None) -> Spread:
-    """`(JᵀWJ)⁻¹` for white errors, else the sandwich `H⁻¹ M H⁻¹` with `M = Jᵀ C J` and the
-    information of priors, C the errors' covariance in time: of each channel what second differences
-    show is white, the rest decays. Fitted errors do not show the decay time well: each number gets
-    the largest variance over times from two samples to half a record. They are too small: `Jᵀ C J`
-    is multiplied by n/(n − p) for n independent errors. The variance between many recordings counts
-    if larger. Source: White 1980, doi:10.2307/1912934; Liang and Zeger 1986,
-    doi:10.1093/biomet/73.1.13.
+    """`(JᵀWJ)⁻¹` for white errors, else the sandwich `H⁻¹ M H⁻¹`.
+
+    `M = Jᵀ C J` and the information of priors, C the errors' covariance in time: of each channel
+    what second differences show is white, the rest decays. Fitted errors do not show the decay time
+    well, so that each number gets the largest variance over all times from two samples to half a
+    record; they are too small, so that `Jᵀ C J` is multiplied by n/(n − p) for n independent
+    errors. The variance between many recordings counts if it is larger. Source: White 1980,
+    doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
     """
     white = of_white(linear) if white is None else white
     if times.longest <= 1.5 or not np.isfinite(white.seen).all():

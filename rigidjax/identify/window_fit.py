@@ -281,9 +281,10 @@ def _remarks(scene: Any, value: Any, windows: Windows) -> list[str]:
 
 
 def _deviations(there: Search, point: np.ndarray, count: int) -> tuple[np.ndarray, list[str]]:
-    """Standard deviations (n,) by leaving out one stretch after the other, and remarks. One step of
-    Gauss and Newton's from the best point each: Miller 1974, doi:10.1093/biomet/61.1.1; of
-    neighbours in one block: Künsch 1989, doi:10.1214/aos/1176347265.
+    """Standard deviations (n,) by leaving out one stretch after the other, and remarks.
+
+    One step of Gauss and Newton's from the best point each: Miller 1974, doi:10.1093/biomet/61.1.1;
+    of neighbours in one block: Künsch 1989, doi:10.1214/aos/1176347265.
     """
     grams, slopes = (np.asarray(a) for a in there.found)
     gram, many, message = grams.sum(0), len(grams), []

@@ -87,10 +87,11 @@ class Rigid(eqx.Module):
 
 
 class EulerEquations(eqx.Module):
-    """Euler's equations `I dΩ/dt = IΩ × Ω + τ` as a vector field `f(t, y, args)`. `inertia` is
-    about the point that the body turns about; `torque` τ in the body frame, N m, or `None`. Source:
-    Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau and Lifshitz,
-    Mechanics, eq 36.4. A known rod or point is refused.
+    """Euler's equations `I dΩ/dt = IΩ × Ω + τ` as a vector field `f(t, y, args)`.
+
+    `inertia` is about the point that the body turns about; `torque` τ in the body frame, N m, or
+    `None`. Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau
+    and Lifshitz, Mechanics, eq 36.4. A known rod or point is refused.
     """
 
     inertia: Inertia
@@ -141,6 +142,7 @@ class AttitudeEquations(eqx.Module):
 
 class NewtonEuler(eqx.Module):
     """Newton–Euler equations about the centre of mass as a vector field (notes, eqs 1, 50, 56, 84).
+
     `m dv/dt = F`, `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`; `torque` gives τ, or a `Wrench`.
     """
 
@@ -178,9 +180,11 @@ def on_the_group(state: State) -> State:
 
 
 def _unit(q: Quat) -> Quat:
-    """q/|q|, with the same rounding in every program. XLA replaces q/√n by a product with 1/√n in
-    some programs. Reverse mode runs steps again in another program: a different last digit changes
-    step lengths, and the gradient belongs to another discretisation (an error of 7e-6 at a
-    tolerance of 1e-11). A separate root and quotient are exact.
+    """q/|q|, with the same rounding in every program.
+
+    XLA replaces q/√n by a product with 1/√n in some programs. Reverse mode runs steps again in
+    another program: a different last digit changes step lengths, and the gradient belongs to
+    another discretisation (an error of 7e-6 at a tolerance of 1e-11). A separate root and quotient
+    are exact.
     """
     return q / lax.optimization_barrier(jnp.sqrt(square4(components(q))))

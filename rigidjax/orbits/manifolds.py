@@ -46,8 +46,9 @@ class Manifold(eqx.Module):
 
 
 def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]:
-    """The multiplier λ of an orbit with the largest size, and its eigenvector, of length 1. From
-    traces, inverse iteration and one bordered solve; NaN if none is real and larger than 1.
+    """The multiplier λ of an orbit with the largest size, and its eigenvector, of length 1.
+
+    From traces, inverse iteration and one bordered solve; NaN if none is real and larger than 1.
     """
     index = continuation.stability_indices(monodromy)
     real = jnp.abs(index.imag) <= 1e-6 * jnp.abs(index)

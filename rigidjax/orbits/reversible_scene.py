@@ -15,8 +15,10 @@ from rigidjax.orbits.differential_correction import PeriodicOrbit
 
 
 class AbstractReversible(AbstractScene):
-    """A scene that does not change under (t, y) → (−t, −y): an orbit that crosses the xz-plane
-    twice at a right angle is periodic (Roy and Ovenden 1955, doi:10.1093/mnras/115.3.296).
+    """A scene that does not change under (t, y) → (−t, −y): `ThreeBody` and `Hill`.
+
+    An orbit that crosses the xz-plane at a right angle twice is then periodic (Roy and Ovenden
+    1955, doi:10.1093/mnras/115.3.296).
     """
 
     @abc.abstractmethod
@@ -49,8 +51,9 @@ class AbstractReversible(AbstractScene):
         return self.transition(orbit.state, orbit.period)
 
     def stability_indices(self, orbit: PeriodicOrbit) -> Complex[Array, "2"]:
-        """The two ν = ½(λ + 1/λ) of the multipliers λ that are not 1, larger real part first. The
-        orbit is stable to first order if both are real and |ν| ≤ 1. Many:
+        """The two ν = ½(λ + 1/λ) of the multipliers λ that are not 1, larger real part first.
+
+        The orbit is stable to first order if both are real and |ν| ≤ 1. Many:
         `jax.vmap(scene.stability_indices)(scene.family(…))`. Source: Howell 1984,
         doi:10.1007/BF01358403; from traces: Bray and Goudas 1967, Adv. Astron. Astrophys. 5, 71.
         """

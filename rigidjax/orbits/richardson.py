@@ -48,6 +48,7 @@ def guess(
     mu: Scalar, point: int, along_x: ScalarLike | None, along_z: ScalarLike | None
 ) -> PeriodicOrbit:
     """A start on the xz-plane near the orbit about L1, L2 or L3 (`point`) of the given amplitude.
+
     One of `along_x` (a planar Lyapunov orbit) and `along_z` (a halo orbit, its sign is the branch)
     is given, small beside the distance to the nearer body. Source: Richardson 1980, Celest. Mech.
     22, 241, doi:10.1007/BF01229511, at τ = 0.

@@ -245,8 +245,9 @@ def _box(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray, float]
 
 
 def box_of(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
-    """Half-lengths (3,) a of the uniform box with λ = m a²/3, and its axes (3, 3) in the body. In m
-    for `MassProperties`; for an `Inertia` the longest is 1.
+    """Half-lengths (3,) a of the uniform box with λ = m a²/3, and its axes (3, 3) in the body.
+
+    In m for `MassProperties`; for an `Inertia` the longest is 1.
     """
     second, q = principal(body.second_moment)
     size = np.sqrt(np.maximum(np.asarray(second, dtype=float), 0.0))

@@ -18,8 +18,9 @@ _DROPPED = jax.__version_info__ < (0, 11)
 
 
 def barrier(tree: Tree) -> Tree:
-    """The same numbers, computed once: `lax.optimization_barrier`, or `once` if XLA drops it. On a
-    GPU each barrier ends a kernel, which costs more than what is computed twice.
+    """The same numbers, computed once: `lax.optimization_barrier`, or `once` if XLA drops it.
+
+    On a GPU each barrier ends a kernel, which costs more than what is computed twice.
     """
     if jax.default_backend() != "cpu":
         return tree
@@ -30,17 +31,21 @@ def barrier(tree: Tree) -> Tree:
 
 
 def once(x: Array) -> Array:
-    """The same number, computed once for all uses, here and in the gradient, by a division by one
-    (by 2 if NaN): XLA on CPU computes a quotient once, but repeats anything cheaper.
+    """The same number, computed once for all uses, here and in the gradient.
+
+    It is divided by one (by 2 if NaN): XLA on CPU computes a quotient once, but repeats anything
+    cheaper, with all its inputs, for every component.
     """
     return x / jnp.where(x == x, 1, 2)
 
 
 def one_kernel(function: Function) -> Function:
-    """The same function of trees of arrays, compiled as one kernel if it is not batched. A kernel
-    of one body takes long to compile, whatever its size; XLA on CPU makes one of a loop with a
-    small state: here of one turn. XLA knows neither the number of turns nor that the arguments
-    stay, so it moves nothing out. Batches and derivatives use `function` itself.
+    """The same function of trees of arrays, compiled as one kernel if it is not batched.
+
+    A kernel of one body takes long to compile, whatever its size; XLA on CPU makes one of a loop
+    with a small state. This is a loop of one turn: XLA knows neither the number of turns nor that
+    the arguments stay, so it moves nothing out of the loop. Batches and derivatives use `function`
+    itself.
     """
     # Traced once for all the uses below.
     plain = jax.jit(function, inline=True)
@@ -81,9 +86,10 @@ def one_kernel(function: Function) -> Function:
 
 @jax.custom_jvp
 def batched_as(out: Any, args: Any) -> Any:
-    """`out`, all of it batched if any of `args` is, as `_batched` of `one_kernel` returns it. Under
-    `jit` JAX takes the axes of a batch from the function, and the values from the rule for its
-    derivative: where the two differ, arrays have wrong shapes, and nothing says so.
+    """`out`, all of it batched if any of `args` is, as `_batched` of `one_kernel` returns it.
+
+    Under `jit` JAX takes the axes of a batch from the function, and the values from the rule for
+    its derivative: where the two differ, arrays have wrong shapes, and nothing says so.
     """
     return _grown(out, args)
 

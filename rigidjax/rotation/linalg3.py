@@ -56,8 +56,10 @@ def square(v: Sequence[Scalar]) -> Scalar:
 
 
 def near_one(*parts: Scalar) -> Scalar:
-    """A power of two, with derivative zero, that brings the largest of some scalars near 1: all
-    digits stay, and no square overflows, in formulas that do not depend on the argument's length.
+    """A power of two that brings the largest of some scalars near 1, with derivative zero.
+
+    For formulas that do not depend on the length of their argument: times this number, it keeps all
+    its digits, and its squares do not overflow.
     """
     sizes = [jnp.abs(lax.stop_gradient(part)) for part in parts]
     info = jnp.finfo(sizes[0].dtype)

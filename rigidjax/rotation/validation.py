@@ -17,8 +17,9 @@ def tolerance(dtype: object) -> float:
 
 
 def direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
-    """Refuse a known vector without a direction: zero, NaN, infinity. Below the least normal
-    number, 2e-308, XLA takes a number for zero on some machines.
+    """Refuse a known vector without a direction: zero, NaN, infinity.
+
+    Below the least normal number, 2e-308, XLA takes a number for zero on some machines.
     """
     if _checks.known(v) and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest(v) < np.inf:
         _checks.finite(v, name)

@@ -22,9 +22,10 @@ from rigidjax.solve.linear_map import linear_map, refuse
 
 
 class Found(NamedTuple):
-    """The result of `adaptive`. **Fields:** `ys` the states at `ts`; `num_steps` accepted and
-    rejected, `num_rejected` of these; `result` a `diffrax.RESULTS`; `last` the state at the end,
-    `last_time`.
+    """The result of `adaptive`.
+
+    **Fields:** `ys` the states at `ts`; `num_steps` accepted and rejected, `num_rejected` of these;
+    `result` a `diffrax.RESULTS`; `last` the state at the end, `last_time`.
     """
 
     ys: Any

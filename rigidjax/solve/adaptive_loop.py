@@ -173,6 +173,7 @@ def controlled(
     norm: Array, order: int, t: Array, h: Array, kept: Array, last: Array, length: Array
 ) -> tuple[Array, Array]:
     """Whether a step is accepted, and the next one: 0 where none is left to try, NaN after a NaN.
+
     `norm` as of `tried`; `kept` the step wanted before it was cut short as the `last` before a
     stop; `length` of the run, whose round-off counts where that of `t` vanishes.
     """

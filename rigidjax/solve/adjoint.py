@@ -31,6 +31,7 @@ def of_saved(
     between: Array | None,
 ) -> tuple[Array | None, Step, Array]:  # fmt: skip
     """The transpose of the states at the times in a step, from number `first` to before `last`.
+
     `bars` (K, n, *bodies) are the cotangents of all states. **Returns** `between`, if it is not
     `None`, with the cotangents of the times added, and those of the step and its slopes.
     """
@@ -91,6 +92,7 @@ def cotangents(
     method: Method, constants: Arrays, run: Run, record: Record, bars: Arrays, timed: bool
 ) -> tuple[Arrays, Run]:
     """The transpose of the tangents of `replayed`: cotangents of the constants and of the run.
+
     `bars` are those of the states between and at the end. Times have some only where `timed`.
     """
     number, size = jnp.max(record.number), run.between.shape[0]

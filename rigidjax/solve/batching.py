@@ -53,6 +53,7 @@ def in_lanes(
     program: Program, constants: Arrays, each: Arrays, linear: int = 0, layout: Layout | None = None
 ) -> Arrays:
     """The result of `program`; under `jax.vmap` its arrays get longer last axes (the bodies).
+
     Bodies may share `constants`. The program is linear in the last `linear` of `each`: many
     directions of one motion are not counted as bodies.
     """

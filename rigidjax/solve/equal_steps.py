@@ -52,6 +52,7 @@ def change_and_slope(
     tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any = None
 ) -> tuple[Any, Any]:
     """The change in one step from `y`, written out and not projected, and the slope at its start.
+
     `end` is the time of the last stages, if it is not to be `t + h` rounded. Without the barriers
     XLA makes of each result one kernel, which repeats all stages before it.
     """

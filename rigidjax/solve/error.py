@@ -107,8 +107,9 @@ class Error(eqx.Module):
 
 @eqx.filter_jit
 def error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None) -> Error:
-    """The error of the states `ys` that `setup` gave at `ts` in `count` steps. By another run
-    `tried`, its tolerance and states, it is too large by up to ten.
+    """The error of the states `ys` that `setup` gave at `ts` in `count` steps.
+
+    By another run `tried`, its tolerance and states, it is too large by up to ten.
     """
     setup, ts, ys, count, tried = _still((setup, ts, ys, count, tried))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
@@ -165,8 +166,9 @@ def _with_round_off(
 
 
 def _cheaper(setup: Any, start: Any, ts: Array, ys: Any, count: Array) -> tuple[Any, Any, Any]:
-    """A set-up of fewer steps, its run, and what to multiply its round-off by. Roundings grow alike
-    at any tolerance; n of them add up to √n. float32 takes few steps anyway.
+    """A set-up of fewer steps, its run, and what to multiply its round-off by.
+
+    Roundings grow alike at any tolerance; n of them add up to √n. float32 takes few steps anyway.
     """
     if not isinstance(setup, Loop) or ts.dtype == jnp.float32:
         return setup, ys, 1.0
@@ -206,9 +208,10 @@ def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
 
 @eqx.filter_jit
 def solve_to(loop: Loop, state0: Any, ts: Array, accuracy: Array) -> tuple[Loop, Any, Any]:
-    """A run with a global error of `accuracy`, if there is one. The error of each run is its
-    distance to the next, and decreases as the tolerance does. **Returns** the loop at its
-    tolerance, its result, tolerance and states of the run before.
+    """A run with a global error of `accuracy`, if there is one.
+
+    The error of each run is its distance to the next, and decreases as the tolerance does.
+    **Returns** the loop at its tolerance, its result, tolerance and states of the run before.
     """
     still = _still((loop, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)

@@ -138,8 +138,9 @@ def _row(a: Array, i: Any) -> Array:
 def march(
     stepper: AnyStepper, h: Array, t0: Array, first: Array, count: int, y: Any, inputs: Any = None
 ) -> Any:
-    """`count` steps from number `first` on; `inputs` as for `step`. In reverse mode the states at
-    the starts of √count pieces are kept, and those in one piece.
+    """`count` steps from number `first` on; `inputs` as for `step`.
+
+    In reverse mode the states at the starts of √count pieces are kept, and those in one piece.
     """
 
     @functools.partial(jax.checkpoint, prevent_cse=False)

@@ -27,6 +27,7 @@ _ZERO: Any = ad.Zero
 
 def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) -> Arrays:
     """`function(*given, *tangents)`, linear in these; its transpose is `transposed(*given, *bars)`.
+
     Neither may close over tracers. Derivatives by `given` are taken in forward mode only.
     """
     outs = jax.eval_shape(lambda g, t: function(*g, *t), given, tangents)
@@ -44,9 +45,10 @@ def as_known(known: Any, moved: Any) -> Any:
 
 
 def nan_derivatives(tree: Any, inputs: Any) -> Any:
-    """The same numbers; one that is not finite has NaN derivatives by `inputs`, in both modes. A
-    state that a run did not reach is NaN by a `where`, whose derivative is 0: a wrong one. A number
-    that is not used has the cotangent 0 and leaves the gradient of the others as it is.
+    """The same numbers; one that is not finite has NaN derivatives by `inputs`, in both modes.
+
+    A state that a run did not reach is NaN by a `where`, whose derivative is 0: a wrong one. A
+    number that is not used has the cotangent 0 and leaves the gradient of the others as it is.
     """
     smooth, rest = eqx.partition(tree, eqx.is_inexact_array)
     outs, structure = jax.tree.flatten(smooth)

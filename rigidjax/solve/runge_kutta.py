@@ -76,8 +76,9 @@ def _sum(row: Array, slopes: Array) -> Array:
 def stages(
     tableau: Tableau, field: Field, constants: Arrays, step: Step, dense: Any = False
 ) -> Stages:
-    """All stages of a step, if `dense` also those of dense output; `end` is not projected. If
-    `dense` is traced and false, its stages are the state at the start, and their slopes 0.
+    """All stages of a step, if `dense` also those of dense output; `end` is not projected.
+
+    If `dense` is traced and false, its stages are the state at the start, and their slopes 0.
     """
     w = weights(tableau, step.y.dtype)
     count = w.plain if dense is False else w.c.size
@@ -124,6 +125,7 @@ def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Arr
 
 def nested(theta: Array, rows: Array) -> Array:
     """θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))) of rows (r, …) and θ from 0 to 1 in a step.
+
     Added to the state at the start it is dense output: Hairer, Nørsett and Wanner (1993), II.6.
     """
     total = jnp.zeros((), rows.dtype)
@@ -133,8 +135,10 @@ def nested(theta: Array, rows: Array) -> Array:
 
 
 def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) -> Array:
-    """The error of a step (n, *bodies): e5 |e5|/√(|e5|² + 0.01 |e3|²) of two estimates e5, e3 falls
-    as h⁸ (Hairer, Nørsett and Wanner 1993, II.10). Lengths are of each array, of `sizes` numbers.
+    """The error of a step (n, *bodies).
+
+    Two estimates e5, e3 make e5 |e5|/√(|e5|² + 0.01 |e3|²), which falls as h⁸ (Hairer, Nørsett and
+    Wanner 1993, II.10). The lengths are those of each array of the state, of `sizes` numbers.
     """
     dtype, ones = slopes.dtype, [1] * (slopes.ndim - 2)
     # All sums at once: for one body each is a kernel of its own.
@@ -156,6 +160,7 @@ def pulled(
     cotangent: Array, of_slopes: Array | None = None,
 ) -> tuple[Arrays, Array, Array, Array]:  # fmt: skip
     """The transpose of a step: cotangents of the constants, of time, of length, of the state.
+
     `cotangent` is of the state at the end, `of_slopes` (n, s, *bodies) of all slopes.
     """
     w, count = weights(tableau, step.y.dtype), there.slopes.shape[1]

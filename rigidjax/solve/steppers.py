@@ -53,8 +53,9 @@ class Stepper(NamedTuple):
 
 class Carrying(NamedTuple):
     """The same steps, which carry on what the last addition lost: round-off grows as √n, not as n.
-    Source: Kahan 1965, doi:10.1145/363707.363723; Dekker 1971, doi:10.1007/BF01397083, for |change|
-    ≤ |y|. The lost digits have no derivative.
+
+    Source: Kahan 1965, doi:10.1145/363707.363723; Dekker 1971, doi:10.1007/BF01397083, for
+    |change| ≤ |y|. The lost digits have no derivative.
     """
 
     of: Stepper

@@ -21,8 +21,9 @@ SIDES, HIGH = 2, 0.3
 
 
 class Sums(NamedTuple):
-    """Sums over times at f = −4/DENSE, −3/DENSE …; x is the time over the span, less ½. `window` is
-    Σ w² exp 2πi f x; `data` Σ w z exp 2πi f x; `total` Σ z².
+    """Sums over times at f = −4/DENSE, −3/DENSE …; x is the time over the span, less ½.
+
+    `window` is Σ w² exp 2πi f x; `data` Σ w z exp 2πi f x; `total` Σ z².
     """
 
     window: Complex[Array, " f"]

@@ -154,10 +154,12 @@ def _excess(w: Array, rest: Array) -> Array:
 
 
 def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """`∫ μ₀ μ dA` over the lit and visible part, over normals: dA = det E/(n·En)² dn. Over all that
-    is lit, with μ < 0 on its hidden part, it is `sun·T observer`, where `T = π det E ∫ (E + τ²)⁻¹
-    det(E + τ²)^(−½) dτ` from 0 on (both are one Gaussian integral). So `B(sun, observer) = sun·T
-    observer + B(sun, −observer)`, and the integral over the smaller lune is computed.
+    """`∫ μ₀ μ dA` over the lit and visible part, over normals: dA = det E/(n·En)² dn.
+
+    Over all that is lit, with μ < 0 on its hidden part, it is `sun·T observer`, where
+    `T = π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 on (both are one Gaussian integral). So
+    `B(sun, observer) = sun·T observer + B(sun, −observer)`, and the integral over the smaller lune
+    is computed.
     """
     minors = cofactors(shape)
     total, of_sun = shape[0, 0] + shape[1, 1] + shape[2, 2], apply(minors, sun)

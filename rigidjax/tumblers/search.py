@@ -136,8 +136,9 @@ def descended(
 def _many(
     starts: Parameters, problem: Problem, noise: Any, settings: Settings, count: Any
 ) -> Tried:
-    """The search from the first `count` starts, one after another, with slopes by differences. The
-    closed form without derivatives takes a hundredth of the time.
+    """The search from the first `count` starts, one after another, with slopes by differences.
+
+    The closed form without derivatives takes a hundredth of the time.
     """
 
     def one(given: tuple[Parameters, Array]) -> Tried:

@@ -42,10 +42,12 @@ class Candidate(NamedTuple):
 def candidates(
     pair: np.ndarray, mode: str, light: Any, half_way: np.ndarray, areas: Any, count: int
 ) -> list[Candidate]:
-    """The best of the grid whose precession and rotation have these frequencies, in order. `pair`:
-    the frequencies of the mean precession and of twice the rotation, 1/s; `mode` the circulated
-    axis; `light` times since the first, squared fluxes, ones over their noise; `half_way` (3,),
-    world frame; `areas` M (3,) of a known ellipsoid, or `None`; `count` of bodies.
+    """The best of the grid whose precession and rotation have these frequencies, in order.
+
+    `pair` has the frequencies of the mean precession and of twice the rotation, 1/s; `mode` is the
+    circulated axis; `light` times since the first, squared fluxes and ones over their noise;
+    `half_way` (3,) in the world frame; `areas` M (3,) of a known ellipsoid, or `None`; `count` of
+    bodies.
     """
     b, ratio = np.meshgrid(MIDDLE, SHORT, indexing="ij")
     semi_axes = np.stack([np.ones(b.size), b.ravel(), (b * ratio).ravel()], axis=1)

@@ -96,8 +96,9 @@ def measure(
 
 
 def worked_out(scene: Scene, gradients: bool = True) -> Reference:
-    """A reference for a scene without one: order 8 with fixed steps, and with half as many. Its
-    error is their difference, no less than a hundred units of round-off.
+    """A reference for a scene without one: order 8 with fixed steps, and with half as many.
+
+    Its error is their difference, no less than a hundred units of round-off.
     """
     counts = (4000, 2000)
     numbers, scale = scene.numbers, max(1.0, _turn(scene) / 50)
@@ -223,10 +224,12 @@ def long_drift(
     *,
     progress: Callable[[str], None] | None = None,
 ) -> list[Record]:
-    """Largest drift of energy and momentum over `steps` equal steps of an asymmetric heavy top, a
-    record of the first hundredth of the run and one of all of it: bounded if both agree, growing
-    with time if the second is a hundred times the first. `setting` is the length of a step, s;
-    `error` the energy's (the motion forgets its start long before the end).
+    """Largest drift of energy and momentum over `steps` equal steps of an asymmetric heavy top.
+
+    There are two records for each method, of the first hundredth of the run and of all of it. The
+    drift is bounded if they agree; it grows with time if the second is a hundred times the first.
+    `setting` is the length of a step, s; `error` is the energy's (the motion forgets its start long
+    before the end).
     """
     body = Inertia.from_principal(*BODY)
     start = Attitude([0.955336489125606, 0.29552020666133955, 0.0, 0.0], [0.4, 0.3, 1.2])

@@ -13,9 +13,10 @@ WANTED = (1e-4, 1e-7, 1e-10)
 
 
 def front(records: Iterable[Record]) -> list[Record]:
-    """The records of one scene and kind on the Pareto front of error and time. A record is compared
-    with the curves of the others, log–log between their settings, not only with the measured
-    points. The records come by falling error.
+    """The records of one scene and kind on the Pareto front of error and time.
+
+    A record is compared with the curves of the others, log–log between their settings, not only
+    with the measured points. The records come by falling error.
     """
     records = [r for r in listed(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
@@ -43,6 +44,7 @@ def first_answers(records: Iterable[Record]) -> list[Record]:
 
 def time_to(records: Iterable[Record], error: float) -> float:
     """Time, s, that the method of these records takes to an error, between its settings in log–log.
+
     It is the coarsest setting's if the error is smaller there already, NaN if it is never reached.
     """
     error = _checks.positive(error, "error")

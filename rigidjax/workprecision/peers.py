@@ -240,6 +240,7 @@ def _replayed(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any)
 
 def methods_outside() -> list[Method]:
     """The peers that can be imported here, of SciPy, numba, MuJoCo, heyoka and gradsolve.
+
     heyoka.py's adaptive Taylor method: Biscani and Izzo 2021, doi:10.1093/mnras/stab1032.
     gradsolve's replay of the recorded steps of Verner's method of order 7: arXiv:2609.02876.
     """

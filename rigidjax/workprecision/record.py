@@ -97,10 +97,11 @@ def read_csv(path: str | Path) -> list[Record]:
 
 
 def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str], list[str]]:
-    """The differences of two tables in words: (changed errors or steps, changed times). Lines that
-    both have are compared, without peers: an error more than three times as large or as small,
-    steps by more than 2 %; and the median time over that of `diffrax Dopri8` on the same scene, at
-    common settings, by more than a factor of 2.
+    """The differences of two tables in words: (changed errors or steps, changed times).
+
+    Lines that both have are compared, without peers: an error more than three times as large or as
+    small, steps by more than 2 %; and the median time over that of `diffrax Dopri8` on the same
+    scene, at common settings, by more than a factor of 2.
     """
     records, stored = listed(records), listed(stored, "stored")
     now = {_key(r): r for r in records if r.group != "peer"}

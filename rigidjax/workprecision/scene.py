@@ -43,8 +43,9 @@ class Reference(NamedTuple):
 
 @functools.cache
 def stored(name: str) -> Reference | None:
-    """The stored answer to the standard scene of this name, if there is one. They are made by
-    `tests/workprecision/make_references.py` at 40 digits and rounded to float64.
+    """The stored answer to the standard scene of this name, if there is one.
+
+    They are made by `tests/workprecision/make_references.py` at 40 digits and rounded to float64.
     """
     file = resources.files("rigidjax.workprecision").joinpath("references.json")
     row = json.loads(file.read_text()).get(name)

@@ -53,9 +53,11 @@ class LowPass(eqx.Module):
     def __call__(
         self, t: Float[Array, " times"], values: Float[Array, "times k"]
     ) -> Float[Array, "times k"]:
-        """The filtered samples of `values` (T, k), of any unit, at increasing times `t` (T,), s.
-        **Raises** `ValueError` for times that do not increase, NaN, and numbers whose cubes
-        overflow, if known.
+        """The filtered samples.
+
+        **Arguments:** `t` (T,) increasing times, s; `values` (T, k), of any unit. **Raises**
+        `ValueError` for times that do not increase, NaN, and numbers whose cubes overflow, if they
+        are known.
         """
         values = _checks.numbers(values, "values")
         if values.ndim != 2:

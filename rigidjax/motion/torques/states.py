@@ -57,8 +57,9 @@ def require_stateless(law: Any, what: str) -> None:
 
 
 def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
-    """The torque with its states put in, so that it can be called without them. `own` has the
-    states of each part with states, in their order in `law`, inner parts first.
+    """The torque with its states put in, so that it can be called without them.
+
+    `own` has the states of each part with states, in their order in `law`, inner parts first.
     """
     queue = list(own)
     if not queue and not has_states(law):
