@@ -111,7 +111,10 @@ def _check_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -
 
 
 def _keep_compiled() -> None:
-    """Keep compiled programs in the user's cache folder, unless it is compiling that is timed."""
+    """Keep compiled programs in the user's cache folder: the next start takes seconds.
+
+    Not those of `workprecision`, which measures how long compiling takes.
+    """
     if jax.__version_info__ < (0, 12):
         # XLA reports two flags of its own for each program that it loads, 2.6 kB a line, as errors.
         jax.config.update("jax_logging_level", "CRITICAL")

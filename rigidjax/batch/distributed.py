@@ -23,8 +23,10 @@ def connect(address: str, processes: int, process: int, *, patience: int = 20) -
 
     **Arguments:** `address` "host:port" of process 0; `processes` their number; `process` the index
     of this one, from 0; `patience` s after which a process without an answer counts as dead: every
-    process then ends, with a message and a non-zero exit code. **Raises:** `ValueError` for an
-    index out of range; `RuntimeError` if JAX is in use already or the others do not answer.
+    process then ends, with a message and a non-zero exit code.
+
+    **Raises:** `ValueError` for an index out of range; `RuntimeError` if JAX is in use already or
+    the others do not answer.
 
     >>> connect("localhost:1234", 2, 2)
     Traceback (most recent call last):
@@ -44,6 +46,7 @@ def share(tree: Any) -> Any:
     """This process's rows of a tree of arrays, ⌈N / processes⌉ or fewer.
 
     **Arguments:** `tree` of arrays with a leading axis of bodies; leave out what all bodies share.
+
     **Raises:** `ValueError` for fewer bodies than processes.
 
     >>> share(jnp.arange(5)).shape
@@ -67,9 +70,10 @@ def gather(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     """All processes' rows, on every process, in order.
 
     **Arguments:** `tree` arrays with this process's rows, as from `share`; `checkpoint` a folder to
-    `save` them to first. **Returns** the tree with the rows of all, in host memory. **Raises:**
-    `TypeError` for traced arrays; `RuntimeError` if another process has ended. This process should
-    end then: JAX's arrays are of no use any more.
+    `save` them to first. **Returns** the tree with the rows of all, in host memory.
+
+    **Raises:** `TypeError` for traced arrays; `RuntimeError` if another process has ended. This
+    process should end then: JAX's arrays are of no use any more.
 
     >>> gather(jnp.arange(3)).tolist()
     [0, 1, 2]
@@ -91,6 +95,7 @@ def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     """The sum over all processes, on every process, with the same bits.
 
     **Arguments:** `tree` arrays, the same shapes everywhere; `checkpoint` as for `gather`.
+
     **Raises:** as `gather`.
 
     >>> total(jnp.ones(2)).tolist()

@@ -118,7 +118,8 @@ def rollout(
       `rigidjax.torques.Delayed` input come later.
     - `chunk`: the number of bodies computed at a time; `None` fills the first cache, 128 in
       float64. It changes results in the last digits at most, as do:
-    - `devices`: `None` for one, `"all"` of this process, or a sequence of them; in equal shares.
+    - `devices`: `None` for one, `"all"` of this process, or a sequence of them; N is cut into
+      equal shares.
 
     **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
     (N, num_steps // save_every); with `reduce` the pair (last states, carried). Under a torque with

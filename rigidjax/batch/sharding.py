@@ -83,7 +83,10 @@ def chunk_of(chunk: int | None, dtype: Any, count: int) -> int:
 def over_bodies(
     one: Callable[[Any, Any], Any], shared: Any, each: Any, chunk: int, mesh: Mesh | None
 ) -> Any:
-    """`one(shared, a body's part of each)` for all bodies; devices exchange nothing."""
+    """`one(shared, a body's part of each)` for all bodies, stacked along a new first axis.
+
+    Arrays of `each` have a leading axis of bodies. Devices exchange nothing.
+    """
     count = jax.tree.leaves(each)[0].shape[0]
     parts = 1 if mesh is None else mesh.devices.size
     chunk = min(chunk, -(-count // parts))

@@ -90,13 +90,16 @@ def simulate(
       `Steps(size, number)` for fixed steps.
     - `solver`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
       under a torque, and the choice of `rollout` for `Steps`. With times any
-      `diffrax.AbstractSolver` may be given; our explicit ones run in our own loop.
+      `diffrax.AbstractSolver` may be given; the explicit ones of `rigidjax.solvers` run in our own
+      loop.
     - `rtol`, `atol`, `max_steps`, `adjoint`: as for `rigidjax.simulate`.
 
     Bodies are computed in the order of their initial rates: those of one chunk wait for the last.
-    The other bodies get the same bits whatever happens to one. **Returns** a `Batch`. Nothing is
-    raised for what happens during a run: look at `result`. **Raises:** as `rollout`; `ValueError`
-    for times that neither increase nor decrease.
+    The other bodies get the same bits whatever happens to one.
+
+    **Returns** a `Batch`. Nothing is raised for what happens during a run: look at `result`.
+
+    **Raises:** as `rollout`; `ValueError` for times that neither increase nor decrease.
 
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))

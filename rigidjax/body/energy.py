@@ -1,7 +1,8 @@
 """Kinetic energy and angular momentum of a turning body, and its ellipsoids.
 
-The notes' three forms of the energy of rotation agree but for the factor ½ that eqs 61–65 lack.
-`kinetic_energy` of `Inertia.from_second_moment(jnp.diag(λ))` is eqs 73–75, in principal axes.
+The notes write the energy of rotation in three forms. Printed eqs 61–65 lack the factor ½ of eqs 57
+and 73–75; here all have it and agree. `kinetic_energy` of `Inertia.from_second_moment(jnp.diag(λ))`
+is eqs 73–75, in principal axes.
 """
 
 from typing import Literal

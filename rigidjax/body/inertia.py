@@ -117,7 +117,8 @@ class Inertia(eqx.Module):
         """Principal moments, ascending, and the rotation principal axes → body axes.
 
         **Returns** `(moments, q)`, (3,) kg m² and (4,), with `I = R(q) diag(moments) R(q)ᵀ`.
-        Derivatives are finite for any body: see `rigidjax.body.principal`.
+        Derivatives are finite for any body; `rigidjax.body.principal` says what they mean at equal
+        moments.
 
         >>> Inertia.from_principal(3.0, 2.0, 2.5).principal()[0]
         Array([2. , 2.5, 3. ], dtype=float64)

@@ -21,7 +21,8 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     """The bodies with inertia in a URDF or MuJoCo XML file, by name, in their own frames.
 
     URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`, `inertia`. MuJoCo: `<inertial>` with
-    `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`; an inertia from geometry is not read.
+    `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`; an inertia that MuJoCo would compute from
+    geometry is not read.
 
     **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in order. **Raises:**
     `ValueError`, with file and body, for a file that is missing or of another format, an invalid

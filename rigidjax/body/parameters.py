@@ -213,7 +213,8 @@ def _root(s: Mat3) -> Mat3:
 
 @_root.defjvp
 def _root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
-    # dA of A dA + dA A = d𝔖 as nine equations: right at equal moments, too, without axes.
+    # dA of A dA + dA A = d𝔖 as nine equations: right at equal moments, too, where axes have no
+    # derivative.
     root, one = _root(*primals), jnp.eye(3, dtype=primals[0].dtype)
     sums = jnp.kron(root, one) + jnp.kron(one, root)
     change = 0.5 * (tangents[0] + tangents[0].T)

@@ -20,7 +20,8 @@ def points(
     """The body made of point masses: `𝔖 = Σ m (r − c)(r − c)ᵀ` (notes, eq 60).
 
     **Arguments:** `masses` (n,) kg, none negative; `positions` (n, 3) m, body frame, at any
-    distance from the origin. **Raises:** `ValueError` for a negative mass.
+    distance from the origin: they are shifted to the centre first. **Raises:** `ValueError` for a
+    negative mass.
 
     >>> points([1.0, 1.0], [[1.0, 0, 0], [-1.0, 0, 0]]).inertia.moments
     Array([0., 2., 2.], dtype=float64)
@@ -43,7 +44,8 @@ def voxels(
 
     It is exact for that density: each cell adds its own `m h²/12`. **Arguments:** `density` (nx,
     ny, nz) kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, m; `corner` (3,)
-    of the cell with least x, y, z, m, body frame. **Raises:** `ValueError` for a negative density.
+    of cell [0, 0, 0] with the smallest x, y, z, m, body frame. **Raises:** `ValueError` for a
+    negative density.
 
     >>> voxels(jnp.ones((1, 2, 3)), [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]).com
     Array([0.5, 1. , 1.5], dtype=float64)

@@ -37,7 +37,8 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
 
     **Arguments:** `tensor` (3, 3) symmetric: I (kg m²) or 𝔖 (kg m²), body frame. **Returns**
     `(moments, q)`: (3,), ascending, in the units of `tensor`, and (4,) a unit quaternion (w, x, y,
-    z) with `A = R(q) diag(moments) R(q)ᵀ`. Of four choices it is the smallest turn: `w ≥ ½`.
+    z) with `A = R(q) diag(moments) R(q)ᵀ`. Of the four right-handed choices it is the smallest
+    turn, hence `w ≥ ½`.
 
     The derivative is exact if the moments differ. Moments that are equal to round-off have one
     eigenspace: their derivatives are their own diagonal entries, and the axes do not turn inside
@@ -143,7 +144,8 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     1965; Higham 2008, "Functions of Matrices", section 3.2).
 
     **Arguments:** `function` f, scalar → scalar, written in `jax.numpy`, smooth on the spectrum; it
-    may depend on differentiated values; `tensor` (3, 3) symmetric, any units. **Returns** (3, 3).
+    may depend on differentiated values; `tensor` (3, 3) symmetric, I or 𝔖, any units. **Returns**
+    (3, 3), same frame.
 
     >>> matrix_function(jnp.sqrt, 4.0 * jnp.eye(3))[0]
     Array([2., 0., 0.], dtype=float64)

@@ -5,8 +5,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax._types import Mat3
-from rigidjax.rotation import linalg3
-from rigidjax.rotation.linalg3 import apply as apply, product as product
+from rigidjax.rotation.linalg3 import (
+    apply as apply,
+    cofactors,
+    determinant,
+    entries,
+    product as product,
+)
 
 
 @jax.custom_jvp
@@ -17,10 +22,10 @@ def inverse(a: Mat3) -> Mat3:
     zero moment gives infinities; `Inertia.invertible` refuses it in words.
     """
     # One split: indexed, each entry is a kernel.
-    xx, _, _, _, yy, _, _, _, zz = linalg3.entries(a)
+    xx, _, _, _, yy, _, _, _, zz = entries(a)
     scale = xx + yy + zz
     unit = a / scale
-    return linalg3.cofactors(unit) / linalg3.determinant(unit) / scale
+    return cofactors(unit) / determinant(unit) / scale
 
 
 @inverse.defjvp
@@ -48,6 +53,7 @@ def from_components(
 
 
 def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
+    """The matrix `a bᵀ`."""
     return a[:, None] * b[None, :]
 
 

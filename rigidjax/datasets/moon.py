@@ -44,8 +44,10 @@ class Moon(eqx.Module):
 
     **Fields:** `earth`, `sun` Chebyshev tables of their places as seen from the Moon, m, ICRF;
     `angles` of the 3-1-3 Euler angles (φ, θ, ψ), rad, body → ICRF; `constants` DE421's own, by
-    name, in its units (au, day, km); `first`. **Raises:** `ModuleNotFoundError` without the
-    package; `ValueError` for years outside of 1900 to 2199, or not in order.
+    name, in its units (au, day, km); `first`.
+
+    **Raises:** `ModuleNotFoundError` without the package; `ValueError` for years outside of 1900
+    to 2199, or not in order.
 
     >>> Moon(1970.0, 1971.0).earth.coefficients.shape  # doctest: +SKIP
     (104, 3, 13)

@@ -2,7 +2,8 @@
 
 Published figures: Y. Takahashi, M. W. Busch, D. J. Scheeres, "Spin state and moment of inertia
 characterization of 4179 Toutatis", The Astronomical Journal 146:95 (2013), table 3,
-doi:10.1088/0004-6256/146/4/95; from radar: R. S. Hudson and S. J. Ostro, Science 270:84 (1995).
+doi:10.1088/0004-6256/146/4/95; from the radar imaging of R. S. Hudson and S. J. Ostro, Science
+270:84 (1995).
 """
 
 from datetime import datetime

@@ -3,7 +3,8 @@
 R_F and R_D by duplication (Carlson 1995, doi 10.1007/BF02198293; DLMF 19.36(i)). Each step replaces
 every argument a by (a + λ)/4: this first halves the logarithm of the arguments' ratio, then divides
 their distance by four. In the end a Taylor series about their mean is exact to round-off. R_J is
-computed from its definition as an integral. Derivatives are such integrals (DLMF 19.18).
+computed from its definition as an integral. Derivatives are integrals of the same kind (DLMF
+19.18).
 """
 
 from functools import partial
@@ -26,7 +27,8 @@ def rf(x: Real, y: Real, z: Real) -> Result:
 
     **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, in one unit; the result has the power
     −½ of this unit. Two zeros give infinity, a negative argument gives NaN. **Returns:** R_F (DLMF
-    19.16.1), symmetric. Its derivative ∂R_F/∂z = −R_D(x, y, z)/6 (DLMF 19.18.1) is −∞ at z = 0.
+    19.16.1), symmetric in all three arguments. Its derivative ∂R_F/∂z = −R_D(x, y, z)/6 (DLMF
+    19.18.1) is −∞ at z = 0.
 
     >>> float(rf(4.0, 4.0, 4.0))
     0.5
@@ -37,8 +39,9 @@ def rf(x: Real, y: Real, z: Real) -> Result:
 def rd(x: Real, y: Real, z: Real) -> Result:
     """R_D(x, y, z) = (3/2) ∫₀^∞ dt / ((t+z) √((t+x)(t+y)(t+z))), of the second kind.
 
-    **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, in one unit. It is infinite for
-    z = 0 or x = y = 0, NaN for negative arguments. **Returns:** R_D (DLMF 19.16.5).
+    **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, in one unit. The result is
+    infinite for z = 0 or x = y = 0, and NaN for negative arguments. **Returns:** R_D (DLMF
+    19.16.5), symmetric in x and y.
 
     >>> float(rd(4.0, 4.0, 4.0))
     0.125
@@ -50,8 +53,9 @@ def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
     """R_J(x, y, z, p) = (3/2) ∫₀^∞ dt / ((t+p) √((t+x)(t+y)(t+z))), of the third kind.
 
     The underscore distinguishes the name from `import rigidjax as rj`. **Arguments:** `x`, `y`, `z`
-    ≥ 0, at most one of them 0, and `p` > 0, in one unit. p = 0 gives infinity, p < 0 NaN.
-    **Returns:** R_J (DLMF 19.16.2) by the trapezoidal rule in ln t, exact to round-off.
+    ≥ 0, at most one of them 0, and `p` > 0, in one unit. p = 0 gives infinity, p < 0 gives NaN (not
+    the principal value). **Returns:** R_J (DLMF 19.16.2) by the trapezoidal rule in ln t, exact to
+    round-off.
 
     >>> round(float(rj_(4.0, 4.0, 4.0, 4.0)), 14)
     0.125

@@ -7,7 +7,8 @@ imaginary transformation, §22.6(iv)),
     sn u = (B/k) Σᵢ (−1)ⁱ tanh(B(u − 2iK)),     i = −∞ … ∞,     e^(−2BK) = p.
 
 B, k and p are analytic in m1 at 0, so every derivative in m, at m = 1 and near it, is the
-derivative of an explicit sum. Through ∂F/∂m second derivatives lose all digits as m1 → 0.
+derivative of an explicit sum. The sums give the second derivatives, which lose all digits through
+∂F/∂m as m1 → 0.
 """
 
 from typing import Any

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -50,7 +50,8 @@ class LogDensity(eqx.Module):
     Call it with x (n,), real numbers without bounds: the problem's `Parameters` (body chart,
     `Free`s, initial states), then logarithms of factors of the noises that the fit estimates and of
     the process's numbers. `unpack(x)` gives body, states and values, `x0` is the fit. `covariance`
-    is Laplace's, for a sampler; it is smaller than the fit's if errors are autocorrelated.
+    is Laplace's, for a sampler's start and mass matrix; it is smaller than the fit's if errors are
+    autocorrelated.
 
     With a `process` the filter integrates the unknown torque out. Without it the readings are
     independent and normal about the motion: this is too narrow if errors are autocorrelated; keep
@@ -172,6 +173,14 @@ def of_draws(
     return jax.vmap(lambda one: function(density.unpack(one)))(x)
 
 
+class Curvature(NamedTuple):
+    """The cost, minus a log-density; Fisher's information `gram`; the gradient `slope`."""
+
+    cost: Scalar
+    gram: Float[Array, "n n"]
+    slope: Float[Array, " n"]
+
+
 def terms(density: LogDensity, x: Float[Array, " n"]) -> Terms:
     """The terms of all readings; derivatives recording by recording, in the numbers of each."""
     return _terms_of(_rows(density, x), density)
@@ -195,8 +204,8 @@ def _(primals: Any, tangents: Any) -> tuple[Terms, Terms]:
     return batched_as(out, (rows, eqx.filter(density, eqx.is_inexact_array))), moved
 
 
-def curvature(density: LogDensity, x: Float[Array, " n"]) -> tuple[Scalar, Array, Array]:
-    """Cost, Fisher's information (n, n), gradient (n,): normal errors, variances that x moves, too.
+def curvature(density: LogDensity, x: Float[Array, " n"]) -> Curvature:
+    """Cost, gradient and Fisher's information: normal errors with variances that x moves, too.
 
     `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta and Mehra 1974,
     doi:10.1109/TAC.1974.1100714, for the filter), and priors.
@@ -216,7 +225,7 @@ def curvature(density: LogDensity, x: Float[Array, " n"]) -> tuple[Scalar, Array
 
     extra, rest = with_jacobian(lambda x: prior_residuals(density, x), x)
     cost = 0.5 * jnp.sum(rest**2) - found.log_density
-    return cost, gram + extra.T @ extra, slope + rest @ extra
+    return Curvature(cost, gram + extra.T @ extra, slope + rest @ extra)
 
 
 def prior_residuals(density: LogDensity, x: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -264,7 +273,9 @@ def _with_blocks(density: LogDensity, rows: Array) -> tuple[Terms, Terms]:
 def _of_one(
     density: LogDensity, own: tuple[Array, Any], record: Recording, ref: Any, which: Any
 ) -> Terms:
-    """The terms of a recording, of its row and noises `own`; a filter integrates the torque out."""
+    """The terms of one recording, of its row `own` and the noises at the fit; the filter integrates
+    the unknown torque out.
+    """
     problem = density.problem
     restore = ravel_pytree(padding.one(own_numbers(density, density.x0), 0))[1]
     mine, steps, logs = restore(own[0])

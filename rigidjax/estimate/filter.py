@@ -76,7 +76,8 @@ def start(
     initial attitude and rate from the recording (`Spin` if no sensor shows an attitude). Then
     standard deviations, one number or three, zero for known values: `rate` of Ω, rad/s; `attitude`
     rad; `position` m and `velocity` m/s of a `Rigid`. Torques start from their model's stationary
-    distribution. **Returns** a `Belief`. **Raises:** `ValueError` for a missing or negative one.
+    distribution. **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing
+    or below zero.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
@@ -152,6 +153,7 @@ class Grid(NamedTuple):
 
 
 def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Grid:
+    """The times of the steps."""
     xp = _checks.namespace((recording.t, first.t))
     t, t0 = xp.asarray(recording.t), xp.asarray(first.t)
     if xp is np:
@@ -182,9 +184,10 @@ WORDS = (
 class Filtered(eqx.Module):
     """The result of `filter`.
 
-    **Fields:** `belief` a `Belief` at each time of the recording, after its readings; `readings` of
-    each sensor a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all;
-    `status` 0 followed, 1 lost, 2 stopped (`words` says it); `lost_at` s, NaN unless lost.
+    **Fields:** `belief` a `Belief` at each time of the recording, after its readings; `readings`,
+    for each sensor, a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all
+    readings; `status` 0 followed, 1 lost, 2 stopped (`words` says it); `lost_at` s, NaN unless
+    lost.
     """
 
     belief: Belief

@@ -176,6 +176,7 @@ Parts = dict[str, Any]
 
 
 def _moving(parts: Parts) -> Parts:
+    """The parts that change."""
     return {n: part for n, part in parts.items() if part is not None and part.ndim > _AXES[n]}
 
 

@@ -135,7 +135,8 @@ class Posterior(eqx.Module):
     def of(self, function: Callable[[Unpacked], Any]) -> Any:
         """`function(point)` of each draw, with leading axes of chains and samples.
 
-        Such as `drawn.of(lambda point: point.body.moments)`; `TypeError` if it is no function.
+        Such as `drawn.of(lambda point: point.body.moments)`. **Raises** `TypeError` if it is no
+        function.
         """
         _checks.function(function, "function", "of `Unpacked`, such as lambda point: point.body")
         found = of_draws(function, self.density, self.x.reshape(-1, self.x.shape[-1]))

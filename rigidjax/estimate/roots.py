@@ -108,6 +108,7 @@ class Terms(NamedTuple):
 
 
 def terms(innovation: Array, variance: Array, seen: Array) -> Terms:
+    """The terms of innovations."""
     error = jnp.where(seen, innovation * lax.rsqrt(variance), 0)
     return Terms(error, jnp.where(seen, jnp.log(2 * math.pi * variance), 0))
 

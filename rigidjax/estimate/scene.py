@@ -235,7 +235,9 @@ class Dynamics(eqx.Module):
     def predict(
         self, t: Scalar, h: Scalar, x: Extended, kicks: Array | None = None
     ) -> tuple[Extended, Float[Array, "n n"], Float[Array, "n m"]]:
-        """`x` after `h`; F (n, n) of its errors; G (n, m), root of noise at `kicks`, walks last."""
+        """`x` a time `h` later, F (n, n) of its errors, and the root G (n, m) of the noise, about
+        `kicks`; drifts of walks come last in G.
+        """
         kicks = jnp.zeros(self.kicks, x.motion.omega.dtype) if kicks is None else kicks
         after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
         moving = Extended(x.motion, x.torques, ())
@@ -276,6 +278,7 @@ def reset(
 
 
 def not_negative(value: Any, name: str) -> Array:
+    """Finite numbers, none below zero."""
     array, wanted = _checks.numbers(value, name), "a finite number that is not below zero"
     if not array.size:
         raise ValueError(f"{name}: wanted {wanted}, got none")
@@ -293,7 +296,9 @@ class Stops(NamedTuple):
 def linearised(
     dynamics: Dynamics, stop: Stops, x: Extended
 ) -> tuple[Float[Array, "k n"], Float[Array, " k"], Float[Array, " k"], Bool[Array, " k"]]:
-    """All numbers read at one time about x: matrix, errors, deviations of these, which are seen."""
+    """All numbers read at one time about the state x: the matrix of their predictions, their
+    errors, the deviations of these, and which are seen.
+    """
     dtype = x.motion.omega.dtype
     t = stop.t.astype(dtype)
     basis = jax.vmap(lambda e: tangent(x, e))(jnp.eye(dimension(x), dtype=dtype))
@@ -350,7 +355,9 @@ MEMORY_A_STEP = 0.25
 def steps_of(
     model: Model, ts: Any, state: Any, substeps: int | None, recording: Recording | None = None
 ) -> np.ndarray:
-    """Fixed steps from each of `ts` to the next: `substeps`, or by the rate if known, else one."""
+    """The number of fixed steps from each of the times `ts` to the next: `substeps`, or by the rate
+    of the `state` and of gyros, or one if numbers are not known.
+    """
     if substeps is not None:
         return np.full(ts.shape[0] - 1, _checks.whole(substeps, "substeps", 1))
     if not _checks.known((ts, state.omega, model.coloured)):

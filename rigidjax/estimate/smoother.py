@@ -80,13 +80,15 @@ def smooth(
 
     The motion of largest posterior density, by Gauss and Newton's method: each iteration linearises
     dynamics and sensors about the last motion, at first that of `filter`, and solves the linear
-    problem by a Kalman filter and Rauch, Tung and Striebel's pass (Bell 1994, doi:10.1137/0804035).
+    problem exactly by a Kalman filter and the pass of Rauch, Tung and Striebel (Bell 1994,
+    doi:10.1137/0804035).
 
     **Arguments:** as for `filter`; `iterations` at most; it ends when no number moved by more than
     `tolerance` of its standard deviation (the error that remains is about the square of that).
     **Returns** `belief`, `rows`, `pushes`, `readings`, `log_likelihood`, `change`, `iterations`,
     `status` and `lost_at` (`Smoothed`). It may be jitted, differentiated in forward mode, and
-    batched. **Raises:** as `filter`; with `throw` also if it moves by a deviation still.
+    batched. **Raises:** as `filter`; with `throw` also for a motion that still moves by a standard
+    deviation.
 
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)

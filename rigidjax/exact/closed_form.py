@@ -6,9 +6,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
-from rigidjax.exact import jacobi_duplication
 from rigidjax.exact.components3 import Four, Triple
-from rigidjax.exact.jacobi_duplication import Elliptic, HalfPeriod, Modulus
+from rigidjax.exact.jacobi_duplication import (
+    Elliptic,
+    HalfPeriod,
+    Modulus,
+    duplicate,
+    elliptic,
+    half_period,
+    until_rest,
+)
 from rigidjax.rotation.barrier import barrier, one_kernel
 
 
@@ -49,7 +56,7 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
     h = jnp.sqrt(p1 * p1 + p2 * p2 + p3 * p3)
     turn = d13 * h * mu
     m = Modulus(p, q, gap)
-    m, mu, turn, half = barrier((m, mu, turn, jacobi_duplication.half_period(m, mu, turn)))
+    m, mu, turn, half = barrier((m, mu, turn, half_period(m, mu, turn)))
     return Orbit(a, d12, d13, d23, (p1, p2, p3), h, m, mu, turn, half, swap)
 
 
@@ -64,7 +71,7 @@ class Reduced(NamedTuple):
 def reduced(u: Scalar, half: Scalar, m: Modulus) -> Reduced:
     count = jnp.round(u / half)
     rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half)
-    return Reduced(count, rest, jacobi_duplication.until_rest(rest, m))
+    return Reduced(count, rest, until_rest(rest, m))
 
 
 def restored(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar]:
@@ -118,13 +125,13 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
 def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
     """Body momentum at t, and the quaternion of the turn since t = 0, in principal axes."""
     u = reduced(0.5 * t, o.half.time, o.modulus)
-    return from_functions(o, jacobi_duplication.elliptic(u.near, o.modulus, o.mu, o.turn), u, t)
+    return from_functions(o, elliptic(u.near, o.modulus, o.mu, o.turn), u, t)
 
 
 def from_functions(o: Orbit, f: Elliptic, u: Reduced, t: Scalar) -> tuple[Triple, Four]:
     """Momentum and turn from the elliptic functions at `u.near`."""
     f, phase = barrier(restored(o, f, u))
-    full = barrier(jacobi_duplication.duplicate(f, o.modulus, o.mu, o.turn))
+    full = barrier(duplicate(f, o.modulus, o.mu, o.turn))
     _, k2, k3 = barrier(momentum_at(o, f))
     m1, m2, m3 = barrier(momentum_at(o, full))
 

@@ -19,6 +19,7 @@ def plus(a: Triple, b: Triple) -> Triple:
 
 
 def times(m: Six, v: Triple) -> Triple:
+    """A symmetric matrix times a vector."""
     a, b, c, x, y, z = m
     return (
         a * v[0] + x * v[1] + y * v[2],

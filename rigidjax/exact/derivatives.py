@@ -47,7 +47,8 @@ from rigidjax.rotation.linalg3 import components
 _STILL = {jnp.dtype("float32"): 5e-3, jnp.dtype("float64"): 5e-6}
 
 
-# Up to so many times a loop compiles sooner than a batch, as fast but for values of one body.
+# Up to so many times a loop over them compiles sooner than one batch, and is as fast but for the
+# values of one body.
 _LOOPED = 1000
 
 

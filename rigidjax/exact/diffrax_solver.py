@@ -35,7 +35,9 @@ class FreeSolver(dfx.AbstractSolver):
 
     Use it with `diffrax.ODETerm(rigidjax.equations_of_motion(inertia, y0))` of a `Spin` or an
     `Attitude`, with no torque. One step over the whole interval does. Events, dense output and
-    every adjoint work as with any solver. **Raises:** `ValueError` for another term, or a torque.
+    every adjoint work as with any solver.
+
+    **Raises:** `ValueError` for another term, or one with a torque.
 
     >>> import diffrax
     >>> y0 = rj.Spin([0.0, 1.0, 1e-4])

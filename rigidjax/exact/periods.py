@@ -27,9 +27,10 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     **Arguments:** `inertia` of the body about its centre of mass (kg m²); `omega0` (3,) Ω at any
     moment, rad/s, body frame. **Returns** a scalar, s.
 
-    `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, eᵢ the roots in `rigidjax.exact.sigma_form` (DLMF 19.8.5;
-    Landau and Lifshitz, Mechanics, eq 37.11). **Raises:** `ValueError`, `TypeError` for a wrong
-    shape or dtype, or a moment known to be zero.
+    `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, eᵢ the roots in `rigidjax.exact.sigma_form` (DLMF
+    19.8.5; Landau and Lifshitz, Mechanics, eq 37.11).
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
     >>> top = rj.Inertia.from_principal(1.0, 2.0, 2.0)
     >>> bool(abs(body_period(top, jnp.array([1.0, 0.5, 0.0])) - 4 * jnp.pi) < 1e-14)
@@ -48,8 +49,9 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     **Arguments:** as for `body_period`. **Returns** a scalar, s.
 
     The angle in one body period is `χ ∓ 2π`, χ the turn of the body about its momentum: a complete
-    integral of the third kind (DLMF 19.8.7). **Raises:** `ValueError`, `TypeError` for a wrong
-    shape or dtype, or a moment known to be zero.
+    integral of the third kind (DLMF 19.8.7).
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
     >>> top = rj.Inertia.from_principal(1.0, 2.0, 2.0)
     >>> precession_period(top, jnp.array([1.0, 0.5, 0.0]))  # 2π I₂/|L|

@@ -25,7 +25,8 @@ class InFrame(AbstractScene):
     - `inside`: force per mass in S', `(t, Point in S') → (3,)`, m/s², axes of S'.
     - `outside`: force per mass in S, `(t, Point in S) → (3,)`, m/s², axes of S.
     - `potential`: V(x') per mass, `(3,) → ()`, m²/s²; its force −∇V is taken by automatic
-      differentiation. In steady turning alone `conserved` has the Jacobi integral.
+      differentiation. In a uniformly turning frame without other forces `conserved` has the Jacobi
+      integral.
 
     >>> scene = InFrame(MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0])))
     >>> scene.acceleration(0.0, rj.frames.Point([2.0, 0, 0], [0.0, 0, 0])).tolist()

@@ -80,7 +80,8 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
     """A bead without friction on a hoop that turns about its vertical diameter.
 
     **Arguments:** `radius` R, m; `rate` Ω, rad/s; `gravity` m/s². Source: Goldstein, Mechanics,
-    sec. 2.7 (θ'' = sin θ (Ω² cos θ − g/R)); notes, eq 91. **Raises:** `ValueError` for R ≤ 0.
+    sec. 2.7 (θ'' = sin θ (Ω² cos θ − g/R)); notes, eq 91. **Raises:** `ValueError` for a radius
+    that is not positive.
 
     >>> hoop(1.0, 5.0).acceleration(0.0, Point([0.0, 0, -1], [0.0, 0, 0])).tolist()
     [0.0, 0.0, 0.0]

@@ -33,8 +33,9 @@ def libration(rate: ScalarLike) -> BodyInFrame:
     Orbital frame: x away from the planet, y along the motion, z along the orbit's normal; it turns
     at n about z. `q` takes body axes to it; `omega` is the rate relative to it, in body axes.
 
-    **Arguments:** `rate` n of the orbit, rad/s. Small librations in the orbital plane have the rate
-    n √(3 (b − a)/c) for moments a, b, c. Source: Hughes 1986, ch. 9; notes, eqs 50, 91.
+    **Arguments:** `rate` n of the orbit, rad/s. Small librations in the orbital plane of a body
+    with moments (a, b, c) about (x, y, z) have the rate n √(3 (b − a)/c). Source: Hughes 1986,
+    ch. 9; notes, eqs 50, 91.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> at_rest = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])

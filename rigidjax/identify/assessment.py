@@ -151,8 +151,10 @@ def _white(
     e: np.ndarray, kept: np.ndarray, slope: np.ndarray, covariance: np.ndarray, given: bool
 ) -> bool:
     """Whether whitened errors (R, T, k) are white; errors far below a `given` noise are no
-    evidence. Fitted numbers take `slope covariance slopeᵀ` away and leave them correlated, which
-    shows in many short recordings (Box and Pierce 1970, doi:10.1080/01621459.1970.10481180).
+    evidence.
+
+    Fitted numbers take `slope covariance slopeᵀ` of white errors away, and leave them correlated,
+    which shows in many short recordings (Box and Pierce 1970, doi:10.1080/01621459.1970.10481180).
     """
     from scipy.special import chdtrc
 

@@ -215,7 +215,8 @@ class Mass(AbstractBodyChart):
     parts that a fit may move: `"mass"` (the second moment keeps its ratio to the mass unless the
     inertia is free, too), `"inertia"` about the centre of mass, `"com"`: `["inertia"]` for a body
     that was weighed and balanced, `["mass"]` for a load of known shape, `["com"]` for a centre that
-    moved. **Raises:** `TypeError` for another guess; `ValueError` for another word, or none.
+    moved. **Raises:** `TypeError` for a guess of another type; `ValueError` for another word, or
+    none.
 
     >>> box = rj.shapes.box(2.0, [1.0, 1.0, 1.0])
     >>> float(Mass(box).body(jnp.zeros(10)).mass), Mass(box, ["inertia"]).log_names
@@ -428,5 +429,6 @@ def in_a_row(bodies: Any) -> list[Any]:
 
 
 def has_mass(chart: AbstractBodyChart) -> bool:
+    """Whether the chart's bodies have a mass."""
     sample: Any = eqx.filter_eval_shape(chart.body, jnp.zeros(chart.size))
     return isinstance(sample, MassProperties)

@@ -2,7 +2,8 @@
 
 Each cause has a direction: the change of the readings with it along the fitted motion. Errors are
 regressed on it together with all free numbers (a score test: Rao 1948,
-doi:10.1017/S0305004100023987). A cause that these could absorb explains nothing.
+doi:10.1017/S0305004100023987). A cause that the free numbers could absorb therefore explains
+nothing.
 """
 
 from collections.abc import Callable, Sequence
@@ -152,7 +153,9 @@ def causes(
 
 
 def clock(problem: Problem, noise: Noise, linear: Linearised, index: int) -> Cause | None:
-    """Time stamps that scatter by more than the jitter: errors are along the readings' change."""
+    """Time stamps that scatter, by more than the sensor's jitter: each error is along the change of
+    the readings.
+    """
     sensor, error = problem.records.readings[index].sensor, linear.raw[index]
     kept = linear.kept[index].all(axis=-1)
     if not (_of_three(sensor) and error[kept].any()):

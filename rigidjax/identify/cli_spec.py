@@ -128,9 +128,10 @@ def read_log(
 ) -> Recording:
     """One recording from a file, with the described sensors and wheels.
 
-    **Arguments:** `path`; `channels`; `time`, `time_unit` of the time column; `window` (from, to),
-    s, or `None` for all; `wheels`; `free` some of `bias`, `drag`, `delay`, which are put in for a
-    fit to move. An empty cell is a gap. **Raises** `LogError` as `read_table`.
+    **Arguments:** `path`; `channels`; `time`, `time_unit` the time column; `window` (from, to), s,
+    or `None` for all; `wheels`; `free` some of `bias`, `drag`, `delay`: sensors and torque get
+    these numbers, so that a fit can move them. An empty cell is a gap. **Raises** `LogError` as
+    `read_table`.
     """
     # Two wheels may share a column of their speed.
     turning = dict.fromkeys(w.column for w in wheels)

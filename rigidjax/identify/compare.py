@@ -22,7 +22,8 @@ class Comparison(eqx.Module):
 
     **Fields:** `name`; `free` the number of free numbers; `rms` of each sensor; `correlation` the
     samples over which its errors are autocorrelated; `information` its Bayesian information
-    criterion minus that of the best: 0 for the best, 10 and more is strong evidence against.
+    criterion minus that of the best: 0 for the best, 10 and more is strong evidence against the
+    model.
     """
 
     name: str
@@ -33,7 +34,8 @@ class Comparison(eqx.Module):
 
 
 def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
-    """Models of the same data, best first (Schwarz 1978, doi:10.1214/aos/1176344136).
+    """Models of the same data, best first, by Schwarz's criterion (1978,
+    doi:10.1214/aos/1176344136).
 
     `N log s² + p log N` with s² the mean square of each sensor's errors and N the number of
     independent readings, those read divided by the samples over which the errors of the best model
@@ -74,7 +76,9 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 
 
 def _log_squares(found: Fit) -> np.ndarray:
-    """Each sensor's log mean square error; with jitter, of white errors that are as likely."""
+    """The logarithm of each sensor's mean square error; with jitter, of white errors that are as
+    likely as these.
+    """
     out, problem = 2.0 * np.log(np.maximum(found.rms, 1e-300)), found.problem
     white = whitened(problem, evaluate(found.parameters, problem)[0][0], found.noises)
     for index, (reading, e, sigma) in enumerate(

@@ -81,8 +81,9 @@ def ulog(path: Path, columns: Sequence[str]) -> Columns:
 
 
 def mcap(path: Path, columns: Sequence[str]) -> Columns:
-    """`topic.field.part` of JSON and ROS 2 messages in an MCAP file, as `/imu.angular_velocity.x`;
-    `topic.log_time` and `topic.stamp` (of its header), s from the first message.
+    """`topic.field.part` of the JSON and ROS 2 messages in an MCAP file, as
+    `/imu.angular_velocity.x`; `topic.log_time` and `topic.stamp` (of its header), s from the first
+    message of the file.
     """
     make_reader = _checks.library("mcap.reader", "mcap", str(path)).make_reader
     ros = _checks.library("mcap_ros2.decoder", "mcap", str(path)).DecoderFactory

@@ -11,13 +11,20 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax.body.inertia import tensor_of
-from rigidjax.identify import quantities
 from rigidjax.identify.answers import FAILS, NOT_ENDED
 from rigidjax.identify.body_charts import BASIS, COMPONENTS, Bodies, Tensor, in_a_row
 from rigidjax.identify.full_scale import in_words
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.quantities import Quantity, charts, labels, vector
+from rigidjax.identify.quantities import (
+    Quantity,
+    charts,
+    labels,
+    quantile,
+    recording_names,
+    value_and_slope,
+    vector,
+)
 from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.identify.sensors import Gyro
 from rigidjax.motion.manifold import minus, parts
@@ -40,7 +47,8 @@ MOST, SEVERAL = 6, 5
 class Combination(eqx.Module):
     """Numbers that may change together without changing a reading.
 
-    **Fields:** `names`; small `changes` of each: relative if `relative`, else in its `units`.
+    **Fields:** `names`; small `changes` of each: relative if `relative` is true, else in its
+    `units`.
 
     >>> Combination(("I1", "I2"), (0.01, 0.01), ("", ""), (True, True)).in_words
     'I1 and I2 rise together: only I1/I2 is determined.'
@@ -148,7 +156,7 @@ def _names(problem: Problem) -> list[tuple[str, str, bool]]:
         ("v", "velocity", "m/s"),
     ):
         if hasattr(problem.reference.state, part):
-            for where in quantities.recording_names(problem):
+            for where in recording_names(problem):
                 out += [(f"the initial {name} {k}{where}", unit, False) for k in "xyz"]
     return out
 
@@ -231,7 +239,7 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         # A search that did not end may have moved along directions that the data do not determine.
         out += [] if lost else _unseen(fit)
         return (*out, *in_words(fit.problem.records.readings))
-    reach = quantities.quantile(fit, 0.95)
+    reach = quantile(fit, 0.95)
     out = []
     moments, first = [], 0
     for _, chart in charts(fit.problem):
@@ -317,9 +325,7 @@ def scale_is_unseen(fit: "Fit") -> bool:
 
 def correlations(fit: "Fit") -> list[str]:
     """Pairs of reported quantities (moments, not components) whose errors have |ρ| > 0.95."""
-    slope = np.asarray(quantities.value_and_slope(fit.problem, fit.beside)[1])[
-        : len(fit.quantities)
-    ]
+    slope = np.asarray(value_and_slope(fit.problem, fit.beside)[1])[: len(fit.quantities)]
     covariance = slope @ np.asarray(fit.seen) @ slope.T
     deviation = np.array([quantity.deviation for quantity in fit.quantities])
     good = np.isfinite(deviation) & (deviation > 0)

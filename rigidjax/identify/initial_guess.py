@@ -101,7 +101,9 @@ def of_rates(torque: Any) -> bool:
 
 
 def balance(recording: Recording, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Euler's equations integrated, rates turned by `turn`: rows (n, 6), sides, rows of momenta."""
+    """Euler's equations integrated over a recording, of rates turned by `turn`: rows (n, 6), right
+    sides (n,), rows of the momentum itself.
+    """
     t, w = rates(recording)
     w, pushed = w @ turn.T, np.zeros((t.size, 3))
     if recording.torque is not None:

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rigidjax.identify.normal import Normal
 
-# Damping over the diagonal of the normal equations (Marquardt's): one halves Gauss–Newton's step.
+# Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
+# long as Gauss and Newton's.
 CAREFUL, BOLD = 1.0, 1e-3
 # Numbers scaled to order one go no further than this in a step.
 LONGEST = 2.0
@@ -56,9 +57,10 @@ class Settings(eqx.Module):
 
 
 class Search(eqx.Module):
-    """The state of a search: the best `point` so far, `normal` and `slope` there; the `trial` next,
-    its `hoped` gain; `pace` of the logarithm of the cost; evaluations `taken`; `found` of the last
-    one, if `here` at the best point; `rise` of the last trial over its hoped gain, zero if better.
+    """The state of a search: the best `point` so far, with `normal` and `slope` there; the
+    `trial` next, and its `hoped` gain; `pace` of the logarithm of the cost; evaluations `taken`;
+    `found` of the last one, whether `here` at the best point; `rise` of the last trial over its
+    predicted gain, zero if it was better.
     """
 
     first: Float[Array, ""]

@@ -91,7 +91,8 @@ class Entropic(eqx.Module):
 
     D is `rigidjax.body.divergence` for a `Mass` chart, the same of 𝔖 alone for an inertia, and of
     the shapes for a chart without a scale; a sum of squares: with `L₀⁻¹ J L₀⁻ᵀ = C Cᵀ`, `D =
-    Σ_{i>j} c_ij² + Σ_i (c_ii² − 1 − 2 log c_ii)`. A weight w acts as w/2 readings of the guess.
+    Σ_{i>j} c_ij² + Σ_i (c_ii² − 1 − 2 log c_ii)`. A weight w has the effect of w/2 readings drawn
+    from the guess.
 
     **Arguments:** `guess` an `Inertia`, or `MassProperties` for a `Mass` chart; `weight` w > 0.
     Source: Lee, Wensing and Park 2020, doi:10.1109/TRO.2019.2926491 (the divergence).

@@ -25,7 +25,9 @@ WIDTHS = (1.0, 1e-1, 1e-2, 1e-3)
 
 
 class Links(Rows):
-    """Pieces of a recording: `on` (R,) one if another follows; `width` the deviation of a gap."""
+    """Pieces of a long recording: `on` (R,) one if it continues in the next, else zero; `width` the
+    standard deviation of the gap, in order-one numbers.
+    """
 
     on: Float[Array, " records"]
     width: Scalar

@@ -68,8 +68,9 @@ def _jitter(
     tau: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The most likely σ and τ (R,) of errors e (R, T, k) of covariances `σ² + τ² u uᵀ`, alike in a
-    group, `count` (R, T) channels; a `known` σ is 1, a known τ is given. In turn τ² by Fisher's
-    scoring of squares along u, of mean `σ² + τ² |u|²`, and σ² by expectation–maximisation.
+    group, `count` (R, T) channels seen; a `known` σ is 1, a known τ is given. In turn τ² by
+    Fisher's scoring of the squares along u, whose mean is `σ² + τ² |u|²`, and σ² by expectation and
+    maximisation.
     """
     size, total = np.sum(u**2, axis=-1), np.sum(e**2, axis=-1)
     seen = total > 0

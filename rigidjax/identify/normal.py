@@ -29,6 +29,7 @@ class Normal(eqx.Module):
 
     @property
     def diagonal(self) -> Float[Array, " n"]:
+        """Its diagonal."""
         own = self.alone and jnp.diagonal(self.alone.own, axis1=1, axis2=2)
         return self._joined(jnp.diagonal(self.core), own)
 

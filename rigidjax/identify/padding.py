@@ -99,7 +99,9 @@ def _is_table(node: Any) -> bool:
 
 
 def lengthened(recording: Recording, count: int, rows: int = 0, axis: int = 0) -> Recording:
-    """A recording with masked readings up to `count` times, tables of `rows`; times on `axis`."""
+    """The recording with masked readings at its last time, up to `count` times, and with tables of
+    `rows`; of several, stacked, with times along `axis` 1.
+    """
     missing = count - recording.t.shape[axis]
     # Sensors that read a moving object may hold tables of time, too.
     torque, sensors = jax.tree.map(

@@ -22,19 +22,21 @@ if TYPE_CHECKING:
 class Free(eqx.Module):
     """A number or array inside the recordings' torque or sensors that the fit may move.
 
-    **Arguments:** `where` picks it: `lambda r: r.readings[0].sensor.bias`, or `lambda r:
-    r.torque.coefficient`; the starting value is the recording's value there. `name` for reports,
-    `unit` too; `None` names that of a bias, a delay or a clock offset, a mounting or tilt, and a
-    place. `scale` its natural size: a step of one in the fit is one `scale`, in its unit. `each`:
-    `False` for one value for all recordings, `True` for one for each, `"body"` for one for each
-    body, or a sequence of labels, one for each recording: recordings with the same label share a
-    value. `positive`: the fit moves its logarithm, so that it keeps its sign. `prior` a standard
-    deviation around the starting value (a Gaussian prior, in its unit; relative for `positive`), or
-    `None`. `spread`: each recording deviates from the shared value by a number of its own, with
-    this standard deviation (in its unit; relative for `positive`), or `"estimated"` from the
-    deviations of three recordings or more, with one `scale` as first guess; or `None`.
+    **Arguments:** `where` picks it: `lambda r: r.readings[0].sensor.bias`, or
+    `lambda r: r.torque.coefficient`; the starting value is the recording's value there. `name`
+    for reports, `unit` too; `None` names that of a bias, a delay or a clock offset, a mounting or
+    tilt, and a place. `scale` its natural size: a step of one in the fit is one `scale`, in its
+    unit. `each`: `False` for one value for all recordings, `True` for one for each, `"body"` for
+    one for each body, or a sequence of labels, one for each recording: recordings with the same
+    label share a value. `positive`: the fit moves its logarithm, so that it keeps its sign. `prior`
+    a standard deviation around the starting value (a Gaussian prior, in its unit; relative for
+    `positive`), or `None`. `spread`: each recording deviates from the shared value by a number of
+    its own, with this standard deviation (in its unit; relative for `positive`), or `"estimated"`
+    from the deviations of three recordings or more, with one `scale` as first guess; `None` for no
+    deviations.
 
-    **Raises** `ValueError` for a scale, prior or spread ≤ 0, and for a spread with `each=True`.
+    **Raises** `ValueError` for a scale, prior or spread that is not positive, and for a spread if
+    each recording has its own value already.
 
     >>> Free(lambda r: r.readings[0].sensor.bias, "gyro bias", scale=0.01, spread=0.02).name
     'gyro bias'
@@ -285,7 +287,8 @@ def local(
     problem: "Problem", parameters: Parameters, fill: int = 0, join: Any = jnp.add
 ) -> Parameters:
     """What each recording depends on, with a leading axis: numbers of its body (padded by `fill` to
-    the largest chart), as `shared` a step for each `Free` (shared and own ones joined), its state.
+    the largest chart), as `shared` one step for each `Free` (shared and own ones joined), its
+    initial state.
     """
     steps = []
     for slot, shared, each in by_slot(problem, parameters):

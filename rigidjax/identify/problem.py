@@ -237,7 +237,8 @@ class Problem(eqx.Module):
         """The value of each `Free`, by name, in its unit.
 
         The shape is (R, …) with one value for each recording, (groups, …) with one for each group.
-        A `Free` with a `spread` gives the shared value, and each recording's under "name, own".
+        A `Free` with a `spread` gives the shared value, and each recording's value under "its name,
+        own".
         """
         return values_of(self, fits(self, parameters))
 

@@ -174,8 +174,9 @@ def what_turns(body: Any, rung: type) -> Any:
 def sensor_inputs(
     sensor: Any, body: Any, torque: Any, ts: Array, state0: Any, states: Any, late: Any = None
 ) -> tuple[Array, Any, Callable[[Array, Any], SensorInput]]:
-    """The times that a sensor shows at `ts` (T,), by its clock and `late` s later, a number or
-    (T,); the states then; its input at one time. `states` are `Coupled` if a torque has its own.
+    """The times that a sensor shows at `ts` (T,), by its clock, and `late` s later, one number or
+    (T,); the states then; its input at one time. `states` are `Coupled` if a torque has states of
+    its own.
     """
     turned = what_turns(body, type(state0))
     field = equations_of_motion(turned, state0, torque)

@@ -161,6 +161,7 @@ class Recording(eqx.Module):
 
 
 def readings_of(recording: Recording, kind: type) -> list[Any]:
+    """The readings of the sensors of one kind."""
     return [reading for reading in recording.readings if isinstance(reading.sensor, kind)]
 
 

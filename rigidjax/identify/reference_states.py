@@ -10,15 +10,26 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax.identify import padding, sensors
+from rigidjax.identify import padding
 from rigidjax.identify.recording import Recording, readings_of
+from rigidjax.identify.sensors import (
+    AttitudeSensor,
+    Direction,
+    Gyro,
+    Marker,
+    Position,
+    Range,
+    Velocity,
+)
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import names, plus
 from rigidjax.rotation import quaternion, so3
 
-# The turn, rad, between attitudes that give a rate: above noise, and the axis hardly moves.
+# The turn, rad, between two attitudes that give a rate: large against noise, small enough that the
+# axis hardly moves.
 _TURN = 0.3
-# A turn is undetermined if two singular values of Σ world bodyᵀ are below this share of the top.
+# A turn is undetermined if two singular values of Σ world bodyᵀ are below this share of the
+# largest.
 _FIRM = 1e-3
 
 
@@ -27,14 +38,14 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     attitude sensor, or by `rigidjax.so3.wahba` from three markers or two directions.
     """
     t = np.asarray(recording.t)
-    for reading in readings_of(recording, sensors.AttitudeSensor):
+    for reading in readings_of(recording, AttitudeSensor):
         q, mounting = np.asarray(reading.values)[reading.seen], reading.sensor.mounting
         if mounting is not None:
             back = quaternion.exp(-mounting)
             q = np.asarray(jax.vmap(quaternion.multiply, (0, None))(jnp.asarray(q), back))
         return t[reading.seen], q
     body, world, seen = [], [], np.ones(t.shape, bool)
-    markers = readings_of(recording, sensors.Marker)
+    markers = readings_of(recording, Marker)
     if len(markers) >= 3:
         places = np.stack([np.asarray(r.sensor.place) for r in markers])
         there = np.stack([np.asarray(r.values) for r in markers], axis=1)
@@ -42,7 +53,7 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
         body.append(np.broadcast_to((places - places.mean(axis=0)) / size, there.shape))
         world.append((there - there.mean(axis=1, keepdims=True)) / size)
         seen = seen & np.all([r.seen for r in markers], axis=0)
-    for reading in readings_of(recording, sensors.Direction):
+    for reading in readings_of(recording, Direction):
         along, sensor = np.asarray(reading.values), reading.sensor
         if sensor.mounting is not None:
             along = along @ np.asarray(so3.exp(sensor.mounting)).T
@@ -67,7 +78,7 @@ def _nearest(body: ArrayLike, world: ArrayLike) -> Array:
 
 def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,), s, and body rates (n, 3), rad/s: of a gyro, or between attitudes; n may be 0."""
-    for reading in readings_of(recording, sensors.Gyro):
+    for reading in readings_of(recording, Gyro):
         return np.asarray(recording.t)[reading.seen], np.asarray(reading.values)[reading.seen]
     return rates_of(*attitudes(recording))
 
@@ -134,7 +145,7 @@ def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates
 
 def _typical_rate(recording: Recording) -> float:
     _, w = rates(recording)
-    if readings_of(recording, sensors.Gyro):
+    if readings_of(recording, Gyro):
         return float(np.sqrt(np.mean(np.sum(w**2, axis=1)))) or 1.0
     rate = float(np.linalg.norm(w[0])) if len(w) else 0.0
     # Else by the first sensor whose readings show one.
@@ -152,12 +163,9 @@ def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     the body's frame if only markers were read.
     """
     t, when, x = np.asarray(recording.t), np.zeros(0), np.zeros((0, 3))
-    positions, markers = (
-        readings_of(recording, sensors.Position),
-        readings_of(recording, sensors.Marker),
-    )
-    ranges = readings_of(recording, sensors.Range)
-    speeds = [r for r in readings_of(recording, sensors.Velocity) if r.sensor.mounting is None]
+    positions, markers = readings_of(recording, Position), readings_of(recording, Marker)
+    ranges = readings_of(recording, Range)
+    speeds = [r for r in readings_of(recording, Velocity) if r.sensor.mounting is None]
     if positions:
         when, x = t[positions[0].seen], np.asarray(positions[0].values)[positions[0].seen]
     elif markers:
@@ -212,7 +220,7 @@ def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 
 def first_rates(records: Recording, counts: Any) -> Float[Array, "records 3"]:
     """`first_rate` of each of several recordings (a leading axis), also of traced ones."""
-    for reading in readings_of(records, sensors.Gyro):
+    for reading in readings_of(records, Gyro):
         xp: Any = np if _checks.known(reading) else jnp
         first = xp.argmax(xp.asarray(reading.mask), axis=1)[:, None, None]
         return jnp.asarray(xp.take_along_axis(xp.asarray(reading.values), first, axis=1)[:, 0])

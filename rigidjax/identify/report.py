@@ -307,6 +307,7 @@ def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str
 
 
 def _cells(lines: Iterable[tuple[str, ...]]) -> str:
+    """Lines of a table."""
     cells = ("".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in lines)
     return "".join(f"<tr>{line}</tr>" for line in cells)
 

@@ -220,7 +220,8 @@ class Fit(eqx.Module):
     def undetermined(self) -> tuple[Combination, ...]:
         """The combinations of numbers that the data do not determine at all, by name.
 
-        None if they determine all. Each has `names`, `changes` and `in_words`.
+        The list is empty if they determine all. Each combination has `names`, `changes` and
+        `in_words`.
         """
         return undetermined(self)
 

@@ -210,6 +210,7 @@ def evaluate(parameters: Parameters, problem: Problem) -> Any:
 
 
 def cost_of(parameters: Parameters, problem: Problem, noise: Noise) -> float:
+    """The misfit over the whole of the records."""
     return float(_at(parameters, problem, noise).cost)
 
 

@@ -56,7 +56,9 @@ def errors_of_one(
     which: Which,
     late: Array | None = None,
 ) -> tuple[tuple[Array, ...], Any]:
-    """Errors (T, k) of each sensor in a recording, clocks `late` s more behind; the last state."""
+    """The errors (T, k) of each sensor in one recording, all clocks `late` s more behind, and the
+    last state.
+    """
     record, body, state0, states = states_of_one(problem, mine, record, ref, which)
     out, motion = [], (body, record.torque, record.t, state0, states)
     for reading in record.readings:
@@ -293,4 +295,5 @@ def weights_of(problem: "Problem", errors: tuple, noise: Noise) -> tuple[Float[A
 
 
 def half_sum(tree: Any) -> Float[Array, ""]:
+    """Half the sum of the squares of all leaves."""
     return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

@@ -41,6 +41,7 @@ class Linearised(eqx.Module):
 
     @property
     def size(self) -> int:
+        """The number of free numbers."""
         return int(self.extra_slopes.shape[-1])
 
     @property
@@ -104,7 +105,9 @@ def linearise(
     found: Any = None,
     near: Parameters | None = None,
 ) -> Linearised:
-    """Errors, derivatives and weights; `found` of `evaluate`; derivatives `near` a flat body."""
+    """Errors, derivatives and weights as NumPy arrays; `found` that of `evaluate`, if known; `near`
+    the point of the derivatives beside a flat body.
+    """
     found = evaluate(parameters, problem) if found is None else found
     (errors, slopes, weights), where, beside = jax.tree.map(
         np.asarray, _linearised(problem, parameters, noise, found)
@@ -319,7 +322,11 @@ def distance(linear: Linearised, white: Spread, held: Sequence[np.ndarray] = ())
 
 
 def _sandwich(linear: Linearised, white: Spread, times: "Times") -> np.ndarray:
-    """White's covariance of dependent errors, in orthonormal columns: no variance below zero."""
+    """White's covariance of errors that are not independent.
+
+    Products of derivatives are taken in orthonormal columns: otherwise round-off could make
+    variances negative.
+    """
     columns, triangles = np.linalg.qr(linear.dense)
     longest = max(int(np.median((linear.weights[0] > 0).sum(axis=1))) // 2, 2)
     spans = 2.0 ** np.arange(1, np.log2(longest) + 1)
@@ -401,11 +408,14 @@ class Times(eqx.Module):
 
     @property
     def longest(self) -> float:
+        """The longest of all channels."""
         return max(span for sensor in self.spans for span in sensor)
 
 
 def correlation_times(linear: Linearised) -> Times:
-    """The times `1 + 2 Σ ρ_l` of channels, up to the first ρ below twice its scatter."""
+    """The autocorrelation time `1 + 2 Σ ρ_l` of each channel, up to the first ρ below twice its
+    scatter; readings at full scale take no part.
+    """
     spans, longest, closest, independent = [], 1.0, 0.0, 0.0
     for error, weight, kept in zip(linear.errors, linear.weights, linear.kept, strict=True):
         weighted, found = error * np.sqrt(weight)[..., None], []

@@ -62,6 +62,7 @@ def open_loop_errors(
 
 @eqx.filter_jit
 def all_errors(windows: Windows, scene: Any, value: Any) -> Float[Array, "windows steps n"]:
+    """The errors of a model with these numbers."""
     of = partial(open_loop_errors, scene, value)
     return lax.map(of, windows, batch_size=min(128, windows.count))
 

@@ -20,7 +20,8 @@ from rigidjax.rotation import euler, linalg3
 class Coordinates(eqx.Module):
     """The state of a Lagrangian system: coordinates and their rates.
 
-    **Arguments:** `q` (n,) generalised coordinates; `rate` (n,) their dq/dt, per second.
+    **Arguments:** `q` (n,) generalised coordinates, in the Lagrangian's units; `rate` (n,) dq/dt,
+    per second.
 
     >>> Coordinates([0.1, 0.2], [0.0, 1.0]).rate.shape
     (2,)
@@ -100,7 +101,8 @@ class EulerAngleTop(eqx.Module):
     **Arguments:** `inertia` about the fixed point (or the centre of mass, if free); `torque` one
     with a potential that does not depend on time, such as `HeavyTop`, or `None`. It is called with
     the angles (φ, θ, ψ), sequence 3-1-3, rad, and their rates, and returns L, J. It is singular at
-    sin θ = 0. Source: notes, eqs 33, 75, 81–83. **Raises:** `TypeError` without one.
+    sin θ = 0. Source: notes, eqs 33, 75, 81–83. **Raises:** `TypeError` for a torque without a
+    potential.
 
     >>> free = EulerAngleTop(rj.Inertia.from_principal(1.0, 1.0, 2.0))
     >>> free(jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))

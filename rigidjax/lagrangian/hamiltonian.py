@@ -93,7 +93,8 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
 
     **Arguments:** `hamiltonian` a callable, best a Module, `(Π, γ) → H`, J; for a heavy top
     `HeavyTopHamiltonian(inertia, top)`. H and the Casimirs |γ|² and Π·γ are conserved. Source: the
-    Lie–Poisson equations of se(3)*; Marsden and Ratiu, Mechanics and Symmetry, §1.4.
+    Lie–Poisson equations of se(3)*; Marsden and Ratiu, Introduction to Mechanics and Symmetry,
+    §1.4.
 
     >>> field = lie_poisson_with_direction(lambda p, g: 0.5 * dot(p, p) - g[2])
     >>> field(0.0, MomentumAndDirection([0.0, 0, 1], [1.0, 0, 0])).pi.tolist()

@@ -65,7 +65,8 @@ def conserved(
     - `momentum_about_origin` (3,), kg m²/s, world frame, `m x × v + R(IΩ + h)`: free, or attracted
       by the origin.
 
-    Source: Noether; Marsden and Ratiu, Introduction to Mechanics and Symmetry, §§1.3, 1.4.
+    Source: Noether's theorem; Marsden and Ratiu, Introduction to Mechanics and Symmetry, §§1.3,
+    1.4.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))

@@ -26,7 +26,8 @@ class ThreeBody(AbstractReversible):
 
     Rotating axes, origin at the common centre of mass, the first body (mass 1 − μ) at (−μ, 0, 0),
     the second (mass μ) at (1 − μ, 0, 0). Units: their distance, their total mass, and 1/(their
-    angular rate); their period is 2π. **Fields:** `mu` μ, scalar; `radii` (2,) for collisions.
+    angular rate); their period is 2π. **Fields:** `mu` μ, scalar; `radii` (2,) of the bodies, for
+    collisions.
 
     >>> scene = cr3bp(0.5)
     >>> [float(r) for r in scene.distances(jnp.array([0.0, 0.0, 0.0]))]

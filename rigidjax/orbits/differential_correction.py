@@ -212,7 +212,8 @@ def _corrected_jvp(primals: Any, tangents: Any) -> Any:
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents
     found, left = corrected(index, tolerance, scene, unknown, held)
-    # The derivatives of the miss as one matrix: the rule is linear in tangents, so transposable.
+    # All derivatives of the miss as one matrix, so that the rule stays linear in the tangents and
+    # can be transposed.
     numbers, rest = eqx.partition(scene, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(numbers)
     flat, unflatten = ravel_pytree((leaves, held, found))

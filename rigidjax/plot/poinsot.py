@@ -77,7 +77,8 @@ def polhode(
     twice_energy = float(np.sum(pi[0] ** 2 / i))
 
     ax = style.solid_axes(ax)
-    # matplotlib takes one depth for a whole surface, and would draw the sphere over the path.
+    # The order is set here. matplotlib takes one depth for a whole surface, and would draw the
+    # sphere over the path.
     ax.computed_zorder = False
     style.globe(ax, COLOURS[5], 0.15)
     semi_axes = np.sqrt(twice_energy * i)

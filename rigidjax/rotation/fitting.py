@@ -1,8 +1,9 @@
 """The rotation that fits best: projection, alignment, Wahba's problem, the mean of rotations.
 
-Singular values are not used: their derivatives are NaN at every rotation, where all three are 1.
-The best rotation R of a 3×3 matrix B, with the largest Tr(RᵀB), has the derivative dR = R hat(x),
-(Tr(S) 1 − S) x = 2 vee(Rᵀ dB), S = sym(RᵀB). It is regular if R is unique.
+Singular values and eigenvectors are not used: their derivatives are NaN at every rotation, where
+all three singular values are 1. The best rotation R of a 3×3 matrix B, with the largest Tr(RᵀB),
+has the derivative dR = R hat(x), (Tr(S) 1 − S) x = 2 vee(Rᵀ dB), S = sym(RᵀB). It is regular if R
+is unique.
 """
 
 from functools import partial

@@ -92,7 +92,8 @@ def vee(matrix: Mat3Like) -> Vec3:
 def basis(dtype: Any = float) -> Float[Array, "3 3 3"]:
     """The matrices J_1, J_2, J_3: J_i y = e_i × y, ½ Tr(J_iᵀ J_j) = δ_ij (notes, eqs 41–43, 53).
 
-    **Arguments:** `dtype` of the (3, 3, 3) array. Eq 16 of the notes prints −J_3; eq 42 is right.
+    **Arguments:** `dtype` of the (3, 3, 3) array. Eq 16 of the notes prints −J_3, the transpose of
+    J_3; eq 42 is right.
 
     >>> vee(basis()[2]).tolist()
     [0.0, 0.0, 1.0]

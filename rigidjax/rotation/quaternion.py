@@ -21,7 +21,15 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, ScalarLike, Vec3, Vec3Like
-from rigidjax.rotation import kernels
+from rigidjax.rotation.kernels import (
+    flipped,
+    hat_polynomial,
+    matrix_to_quaternion,
+    normalised,
+    product4,
+    quaternion_to_vector,
+    vector_to_quaternion,
+)
 from rigidjax.rotation.linalg3 import components, cross_components, dot, dot_components, near_one
 from rigidjax.rotation.validation import direction, rotation_matrix, turn, unit_quaternion
 
@@ -38,7 +46,7 @@ def exp(v: Vec3Like) -> Quat:
     >>> exp(jnp.array([0.0, 0.0, jnp.pi])).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    return kernels.vector_to_quaternion(turn(_checks.floating(v, (3,), "v"), "v"))
+    return vector_to_quaternion(turn(_checks.floating(v, (3,), "v"), "v"))
 
 
 def log(q: QuatLike) -> Vec3:
@@ -52,7 +60,7 @@ def log(q: QuatLike) -> Vec3:
     >>> abs(log(jnp.array([0.0, 0.0, 0.0, -1.0]))).round(6).tolist()
     [0.0, 0.0, 3.141593]
     """
-    return kernels.quaternion_to_vector(direction(_checks.floating(q, (4,), "q", hint=_HINT), "q"))
+    return quaternion_to_vector(direction(_checks.floating(q, (4,), "q", hint=_HINT), "q"))
 
 
 def multiply(p: QuatLike, q: QuatLike) -> Quat:
@@ -65,9 +73,7 @@ def multiply(p: QuatLike, q: QuatLike) -> Quat:
     [0.0, 0.0, 0.0, 1.0]
     """
     first = components(_checks.floating(p, (4,), "p", hint=_HINT))
-    return jnp.stack(
-        kernels.product4(first, components(_checks.floating(q, (4,), "q", hint=_HINT)))
-    )
+    return jnp.stack(product4(first, components(_checks.floating(q, (4,), "q", hint=_HINT))))
 
 
 def conjugate(q: QuatLike) -> Quat:
@@ -159,7 +165,7 @@ def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
     q = _checks.floating(q, (4,), "q", hint=_HINT)
     omega = _checks.floating(omega, (3,), "omega")
     dt = _checks.floating(dt, (), "dt").astype(omega.dtype)
-    return multiply(q, kernels.vector_to_quaternion(turn(dt * omega, "dt * omega")))
+    return multiply(q, vector_to_quaternion(turn(dt * omega, "dt * omega")))
 
 
 def rate(q: QuatLike, omega: Vec3Like) -> Quat:
@@ -187,9 +193,9 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
     True
     """
     p = _checks.floating(p, (4,), "p", hint=_HINT)
-    v = kernels.quaternion_to_vector(direction(multiply(conjugate(p), q), "p̄ q"))
+    v = quaternion_to_vector(direction(multiply(conjugate(p), q), "p̄ q"))
     part = turn(_checks.floating(s, (), "s").astype(v.dtype) * v, "s times the turn")
-    return multiply(p, kernels.vector_to_quaternion(part))
+    return multiply(p, vector_to_quaternion(part))
 
 
 def uniform(key: PRNGKeyArray, dtype: Any = float) -> Quat:
@@ -209,7 +215,7 @@ def normalise(q: QuatLike) -> Quat:
     >>> normalise(jnp.array([0.0, 4.0, 0.0, 0.0])).tolist()
     [0.0, 1.0, 0.0, 0.0]
     """
-    return kernels.normalised(direction(_checks.floating(q, (4,), "q", hint=_HINT), "q"))
+    return normalised(direction(_checks.floating(q, (4,), "q", hint=_HINT), "q"))
 
 
 def canonical(q: QuatLike) -> Quat:
@@ -219,14 +225,15 @@ def canonical(q: QuatLike) -> Quat:
     [1.0, -0.0, -0.0, -0.0]
     """
     q = _checks.floating(q, (4,), "q", hint=_HINT)
-    return jnp.where(kernels.flipped(components(q)), -q, q)
+    return jnp.where(flipped(components(q)), -q, q)
 
 
 def angle(q: QuatLike) -> Scalar:
     """The angle of a rotation, rad, in [0, π]; the same bits for q and −q.
 
-    **Arguments:** `q` (4,) of any length. The angle is 2 atan2(|q_v|, |q_w|). At the identity its
-    derivative is 0, the shortest subgradient. **Raises:** `ValueError` for zero or NaN.
+    **Arguments:** `q` (4,) of any length. The angle is 2 atan2(|q_v|, |q_w|). At the identity it
+    has no derivative: 0 is returned, the shortest subgradient. **Raises:** `ValueError` for zero or
+    NaN.
 
     >>> round(float(angle(exp(jnp.array([0.0, 1e-9, 0.0]))) * 1e9), 9)
     1.0
@@ -247,7 +254,7 @@ def to_matrix(q: QuatLike) -> Mat3:
     [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     w, *u = components(_checks.floating(q, (4,), "q", hint=_HINT))
-    return kernels.hat_polynomial(u, 2 * w, 2.0)
+    return hat_polynomial(u, 2 * w, 2.0)
 
 
 def from_matrix(matrix: Mat3Like) -> Quat:
@@ -262,7 +269,7 @@ def from_matrix(matrix: Mat3Like) -> Quat:
     [0.0, 0.0, 0.0, 1.0]
     """
     matrix = _checks.floating(matrix, (3, 3), "matrix", hint="a rotation matrix is wanted")
-    return kernels.matrix_to_quaternion(_checks.if_known(rotation_matrix, matrix, "matrix"))
+    return matrix_to_quaternion(_checks.if_known(rotation_matrix, matrix, "matrix"))
 
 
 def _turn(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:

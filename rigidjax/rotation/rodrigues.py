@@ -1,8 +1,9 @@
 """Rodrigues (Gibbs, Cayley) parameters g = n tan(θ/2).
 
-Rational in both directions, without a double cover, infinite at a half turn (`is_singular`). M = (1
-+ hat g)(1 − hat g)⁻¹ is Cayley's transform. Source: Schaub & Junkins, 2018, Analytical Mechanics of
-Space Systems, sec. 3.5.1. Range: any g; with rates, both up to 1e75 (float32: 1e9).
+Rational in both directions, and without a double cover. They are infinite at a half turn, for which
+`is_singular` tests. M = (1 + hat g)(1 − hat g)⁻¹ is Cayley's transform. Source: Schaub & Junkins,
+2018, Analytical Mechanics of Space Systems, sec. 3.5.1. Range: any g; with rates, both up to 1e75
+(float32: 1e9).
 """
 
 import jax.numpy as jnp

@@ -1,7 +1,8 @@
 """Rotation matrices M, active, body → world, and their tangent vectors.
 
 `exp` and `log` take and return one rotation; batch with `jax.vmap`. Every kernel is a smooth
-function of θ²: derivatives of any order are correct at θ = 0. Range: as in `rigidjax.quaternion`.
+function of θ²: values and derivatives of any order are correct at θ = 0. Range: as in
+`rigidjax.quaternion`.
 """
 
 from typing import Any
@@ -12,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Scalar, ScalarLike, Vec3, Vec3Like
-from rigidjax.rotation import kernels, linalg3, quaternion
+from rigidjax.rotation import kernels, quaternion
 from rigidjax.rotation.fitting import (
     align as align,
     mean as mean,
@@ -24,12 +25,14 @@ from rigidjax.rotation.kernels import hat_polynomial, matrix_to_quaternion, vect
 from rigidjax.rotation.linalg3 import (
     apply as apply,
     basis as basis,
+    components,
     cross as cross,
     determinant as determinant,
     dot as dot,
     hat as hat,
     product as product,
     solve as solve,
+    square,
     vee as vee,
 )
 from rigidjax.rotation.stumpff import stumpff
@@ -70,8 +73,8 @@ def left_jacobian(v: Vec3Like) -> Mat3:
     >>> left_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    parts = linalg3.components(turn(_checks.floating(v, (3,), "v"), "v"))
-    t = linalg3.square(parts)
+    parts = components(turn(_checks.floating(v, (3,), "v"), "v"))
+    t = square(parts)
     return hat_polynomial(parts, stumpff(2, t), stumpff(3, t))
 
 
@@ -217,7 +220,8 @@ def world_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
 def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     """The point at s of the shortest turn from a (s = 0) to b (s = 1): a exp(s log(aᵀb)).
 
-    **Arguments:** `a`, `b` (3, 3) rotations; `s`, also beyond [0, 1]. **Raises:** as `distance`.
+    **Arguments:** `a`, `b` (3, 3) rotations; `s` dimensionless, also beyond [0, 1]. **Raises:** as
+    `distance`.
 
     >>> interpolate(jnp.eye(3), exp(jnp.array([0.0, 0.0, 2.0])), 0.5).round(6)[0].tolist()
     [0.540302, -0.841471, 0.0]

@@ -74,7 +74,8 @@ def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
     remainder = jnp.clip(remainder, -2.0, 2.0)
     value = _polynomial(k, jnp.where(far, remainder * remainder, t), limit)
     value = value * jnp.where(far, remainder, 1) if k else value
-    # The sign by a division: XLA on CPU computes a quotient once, a polynomial for each use.
+    # The sign enters by a division, not a product: XLA on CPU computes a quotient once, but repeats
+    # a polynomial for each use.
     sign = parity(turns)
     return value / jnp.where(far, sign * theta if k else sign, 1)
 

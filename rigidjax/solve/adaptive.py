@@ -59,6 +59,7 @@ def adaptive(
 
     **Returns** a `Found`. A run that needs more than `max_steps`, is halted, or meets a NaN that no
     shorter step avoids, ends early: its `result` says so, and the states not reached are NaN.
+
     **Raises:** `TypeError` for a state of several dtypes, or of another than `ts`.
 
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])

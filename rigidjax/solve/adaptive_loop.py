@@ -93,6 +93,7 @@ def packed(loop: LoopState) -> Array:
 
 
 def unpacked(row: Array) -> LoopState:
+    """The inverse of `packed`."""
     head = len(LoopState._fields) - 1
     stop, steps, rejected = row[2:head].astype(jnp.int32)
     return LoopState(row[head:], row[0], row[1], stop, steps, rejected)
@@ -143,6 +144,7 @@ def at(a: Array, index: Array) -> Array:
 
 
 def finite(tree: Any) -> Bool[Array, ""]:
+    """Whether every number in `tree` is finite."""
     good = jnp.asarray(True)
     for leaf in jax.tree.leaves(tree):
         good = good & jnp.all(jnp.isfinite(leaf))

@@ -13,8 +13,23 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve import adaptive_loop, runge_kutta
-from rigidjax.solve.adaptive_loop import HEAD, STEP, Method, Record, Run, Segment, recorded
+from rigidjax.solve import runge_kutta
+from rigidjax.solve.adaptive_loop import (
+    HEAD,
+    STEP,
+    Method,
+    Record,
+    Run,
+    Segment,
+    going,
+    per_body,
+    recorded,
+    saved,
+    segment,
+    state_in_step,
+    times_of,
+    unpacked,
+)  # fmt: skip
 from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Step, stages
 
@@ -23,7 +38,7 @@ def passed(run: Run, part: Segment) -> Array:
     """The number of saved times passed at the start of each row, and at the end."""
     ends = jnp.concatenate([jnp.minimum(part.times, part.end[None]), part.end[None]])
     search = lambda ts, t: jnp.searchsorted(ts, t, side="right").astype(jnp.int32)  # noqa: E731
-    return adaptive_loop.per_body(run, search)(lax.stop_gradient(run.between), ends)
+    return per_body(run, search)(lax.stop_gradient(run.between), ends)
 
 
 def of_saved(
@@ -35,8 +50,8 @@ def of_saved(
     `bars` (K, n, *bodies) are the cotangents of all states. **Returns** `between`, if it is not
     `None`, with the cotangents of the times added, and those of the step and its slopes.
     """
-    state_at, most = partial(adaptive_loop.state_in_step, method), run.between.shape[0] - 1
-    pick = adaptive_loop.per_body(run, lambda a, index: a[index])
+    state_at, most = partial(state_in_step, method), run.between.shape[0] - 1
+    pick = per_body(run, lambda a, index: a[index])
 
     # One at a time: of many bodies few have as many in a step as one of them has.
     def one(state: Any) -> Any:
@@ -46,7 +61,7 @@ def of_saved(
         bar = jnp.where(inside[None], pick(bars, there), 0)
         by_t, *more = jax.vjp(state_at, t, step, slopes)[1](bar)
         if total is not None:
-            total = adaptive_loop.per_body(run, lambda a, i, b: a.at[i].add(b))(total, there, by_t)
+            total = per_body(run, lambda a, i, b: a.at[i].add(b))(total, there, by_t)
         return number + 1, total, jax.tree.map(jnp.add, by, more)
 
     start = (first, between, jax.tree.map(jnp.zeros_like, [step, slopes]))
@@ -68,15 +83,13 @@ def replayed(
         def step(k: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
             y, rows = both
             row = part.rows[k]
-            there = stages(
-                method.tableau, method.field, constants, Step(*adaptive_loop.times_of(run, row), y)
-            )
+            there = stages(method.tableau, method.field, constants, Step(*times_of(run, row), y))
             rows = lax.dynamic_update_index_in_dim(rows, row.at[HEAD:].set(y), k, 0)
             return jnp.where(lift(row[2] >= STEP, y), method.project(there.end), y), rows
 
         y, rows = lax.fori_loop(0, part.number, step, (y, part.rows))
         if run.between.shape[0]:
-            ys = adaptive_loop.saved(method, constants, run, part._replace(rows=rows), ys)
+            ys = saved(method, constants, run, part._replace(rows=rows), ys)
         return y, ys, starts, rows
 
     still, held = lax.stop_gradient(((constants, run), record))
@@ -105,7 +118,7 @@ def cotangents(
             total, of_run = sums
             k = part.number - 1 - k
             row = part.rows[k]
-            by = lambda t0, stops: adaptive_loop.times_of(run._replace(t0=t0, stops=stops), row)  # noqa: E731
+            by = lambda t0, stops: times_of(run._replace(t0=t0, stops=stops), row)  # noqa: E731
             (t, h, end), of_times = jax.vjp(by, run.t0, run.stops)
             here = Step(t, h, end, row[HEAD:])
             dense, seeds, of_slopes, between = False, None, None, of_run.between
@@ -147,13 +160,13 @@ def _where(there: Array, a: Array) -> Array:
 
 def _again(method: Method, constants: Arrays, run: Run, record: Record, number: Array) -> Segment:
     """A segment of the record; any but the last is run once more."""
-    loop, after = (adaptive_loop.unpacked(record.starts[i]) for i in (number, number + 1))
+    loop, after = (unpacked(record.starts[i]) for i in (number, number + 1))
     again = number < jnp.max(record.number) - 1
     # Nothing is left to do of the last one.
     until = jnp.where(again, after.t, -jnp.inf)
     end, rows, count = recorded(method, constants, run, loop, record.rows, until)
     # With too little room for its steps there would be wrong numbers: then there are none.
-    short = jnp.where(jnp.any(adaptive_loop.going(method, run, end, until)), jnp.nan, 0.0)
+    short = jnp.where(jnp.any(going(method, run, end, until)), jnp.nan, 0.0)
     rows = rows.at[:, HEAD:].add(short.astype(rows.dtype))
     count = jnp.where(again, count, jnp.max(record.filled))
-    return adaptive_loop.segment(rows, after.t, count)
+    return segment(rows, after.t, count)

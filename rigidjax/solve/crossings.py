@@ -67,8 +67,10 @@ class Event(eqx.Module):
       end of a step, or has one extremum within it.
 
     A start at a zero does not count, nor does a condition that is always zero to round-off (see
-    `crossings`). **Raises:** `TypeError`, `ValueError` for anything but a function, another
-    direction, a step that is not positive.
+    `crossings`).
+
+    **Raises:** `TypeError`, `ValueError` for anything but a function, another direction, a step
+    that is not positive.
 
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
     >>> flip = Event(lambda t, state, body: state.omega[1])
@@ -154,16 +156,18 @@ def crossings(
 
     A start on the section does not count, and a tangential contact may be missed. A zero counts if
     the condition goes through it 16 times as fast as round-off could make it (under a solver, times
-    the root of the number of steps): an energy minus its value has none. Batch it by `jax.vmap`.
+    the root of the number of steps): an energy minus its value has none. For many bodies use
+    `jax.vmap`.
 
     **Returns** a `Crossings`. Times and states have first and second derivatives with respect to
     all numbers of the scene, of `condition` and of `state0`, forward and reverse; near a tangential
     contact they grow without bound, as the true ones do.
 
     Source: Newton's method on the step from the last accepted state, instead of Hénon's change of
-    variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3). **Raises:** `TypeError`, `ValueError`
-    as `simulate`, for equal times, and for a condition that is no number, is NaN at the start, or
-    reads a part that the state does not have.
+    variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3).
+
+    **Raises:** `TypeError`, `ValueError` as `simulate`, for equal times, and for a condition that
+    is no number, is NaN at the start, or reads a part that the state does not have.
 
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
     >>> flips = crossings(body, start, 0.0, 40.0, lambda t, state, body: state.omega[1])

@@ -311,7 +311,10 @@ class FunctionError(eqx.Module):
 
     @property
     def known(self) -> Bool[Array, ""]:
-        """Whether a derivative's error is below half its length; else (chaos) it is worthless."""
+        """Whether the error of the derivative is below half of its length.
+
+        Where it is not, as in chaos, the derivative means nothing, finite or not.
+        """
         size = jnp.linalg.norm(ravel_pytree(self.derivative)[0])
         return jnp.linalg.norm(ravel_pytree(self.derivative_error)[0]) < _LOST * size
 
@@ -333,9 +336,11 @@ def error_of(
       where the value is a scalar, else in forward mode.
     - `rtol`, `atol`: those of the answer, by default those of `simulate`.
 
-    The second run has a fiftieth of them; where its distance is not far above round-off, three more
-    have the last digits of `x` changed (in a `vmap` always). See `Solution.error`. Each call
-    compiles anew: put it into a `jax.jit` of your own. **Returns** a `FunctionError`.
+    The second run has a fiftieth of them; where its distance is not far above round-off, three
+    more have the last digits of `x` changed (in a `vmap` always). See `Solution.error`. Each call
+    compiles anew: put it into a `jax.jit` of your own to call it often.
+
+    **Returns** a `FunctionError`.
 
     >>> body, law = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.torques.Damping([0.1, 0.1, 0.1])
     >>> def last(omega, **tolerances):

@@ -74,12 +74,14 @@ def lyapunov_exponents(
     - `solver`, `rtol`, `atol`, `max_steps` (in an interval): as for `simulate`.
 
     Each conserved quantity, and the direction of the motion itself, gives a zero; it decreases as
-    (log t)/t, a trend that `errors` does not include: look at `running`. **Returns** an
-    `Exponents`; NaN where a run fails: `result` says why.
+    (log t)/t, a trend that `errors` does not include: look at `running`.
+
+    **Returns** an `Exponents`; NaN where a run fails: `result` says why.
 
     Source: Dieci, Russell and Van Vleck 1997, doi:10.1137/S0036142993247311; for orthonormal
-    frames: Christiansen and Rugh 1997, doi:10.1088/0951-7715/10/5/004. **Raises:** `TypeError`,
-    `ValueError` for invalid numbers.
+    frames: Christiansen and Rugh 1997, doi:10.1088/0951-7715/10/5/004.
+
+    **Raises:** `TypeError`, `ValueError` for invalid numbers.
 
     >>> still = lambda t, y, args: jnp.array([0.5, -1.0]) * y
     >>> found = lyapunov_exponents(still, jnp.zeros(2), 40.0, intervals=40, transient=20)

@@ -38,6 +38,7 @@ def fixed(
     stop, traced as well (no reverse mode): later times get `y0`; `None` goes to the end.
 
     **Returns** the states at `ts`, with a leading time axis. Differentiable in both modes.
+
     **Raises:** `TypeError` for another solver, or as the solver does.
 
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])

@@ -60,8 +60,9 @@ class Magnus4(dfx.AbstractSolver):
 
     It does less work, with a smaller error, than `rigidjax.solvers.RungeKutta4` at the same step,
     and is the default of `rigidjax.batch.rollout`. A step should turn the body by less than a
-    radian. Source: Magnus 1954, doi:10.1002/cpa.3160070404; see `change_and_turn`. **Raises:**
-    `TypeError` for a torque that depends on the attitude, or another state.
+    radian. Source: Magnus 1954, doi:10.1002/cpa.3160070404; see `change_and_turn`.
+
+    **Raises:** `TypeError` for a torque that depends on the attitude, or another state.
 
     >>> import diffrax
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])

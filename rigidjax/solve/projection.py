@@ -44,7 +44,8 @@ class Projected(dfx.AbstractWrappedSolver):
 
     Each accepted step ends with q ← q/|q|, and so does every value of the dense output. The stages
     are unchanged, because a change there alters the order (jaxsim#192). A state without a
-    quaternion passes through. NaN or infinity end the run: `RESULTS.nonfinite`.
+    quaternion passes through. A step that gives NaN or infinity ends the run with
+    `RESULTS.nonfinite`.
 
     **Arguments:** `solver` any `diffrax.AbstractSolver` on `Spin`, `Attitude` or `Rigid` states.
 

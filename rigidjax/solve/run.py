@@ -17,9 +17,14 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
-from rigidjax.motion import Attitude, Rigid, Spin, equations
+from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, CoupledEquations, started
-from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
+from rigidjax.motion.equations import (
+    AttitudeEquations,
+    EulerEquations,
+    NewtonEuler,
+    on_the_group,
+)  # fmt: skip
 from rigidjax.motion.torques.base import Torque, jumps_of
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
@@ -84,7 +89,8 @@ def equations_of_motion(
     """The vector field of this body for states like `state0`, for plain `diffrax.ODETerm`.
 
     **Arguments** `body`, `state0`, `torque` as for `simulate`; under a torque with states of its
-    own `state0` is a `motion.coupled.Coupled`. **Raises** `TypeError` where they do not fit.
+    own `state0` is a `rigidjax.motion.coupled.Coupled`. **Raises** `TypeError` where they do not
+    fit.
 
     >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))
     <class 'rigidjax.motion.equations.EulerEquations'>
@@ -139,7 +145,7 @@ def solve(
     setup: Free | Loop | Setup, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
-    state0 = given = equations.on_the_group(state0)
+    state0 = given = on_the_group(state0)
     if isinstance(setup, Free):
         ys, stats, result = _free(setup, state0, ts)
     else:

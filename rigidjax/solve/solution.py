@@ -150,6 +150,7 @@ class Solution(eqx.Module, Generic[State]):
         """The state at any `t` between the first and the last of `ts`, s.
 
         The motion is computed again from the last saved state before `t`, with its own steps.
+
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if `t` is outside.
         """
         t = _checks.floating(t, (), "t").astype(self.ts.dtype)

@@ -39,6 +39,7 @@ def _rows(text: str) -> tuple[Row, ...]:
 
 
 def numbers(text: str) -> tuple[float, ...]:
+    """The numbers of a table."""
     return tuple(map(float, text.split()))
 
 

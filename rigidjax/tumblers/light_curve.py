@@ -124,7 +124,8 @@ def fit_light_curve(
 
     Intervals allow for a real shape by consider parameters (Tapley, Schutz and Born 2004,
     Statistical Orbit Determination, ch. 6): the brightness has a factor 1 + n·S n, where n is half
-    way between sun and observer, body frame, the entries of S independent, of deviation 4 %.
+    way between sun and observer, body frame, and the entries of S are independent with deviation 4
+    %.
 
     **Arguments:** `problem` of one recording with one `Brightness` sensor and no torque; let a
     `Free` move the sensor's `level` unless it is known. `shortest` period of a line in the

@@ -28,7 +28,8 @@ def light_curve(
     """A light curve against time, and below it folded with each of some periods.
 
     A body that turns about a principal axis gives one curve if it is folded with its period. A
-    tumbler gives a band: a second period moves the curve from cycle to cycle, shown by colour.
+    tumbler gives a band, since a second period moves the curve from cycle to cycle; the colour
+    shows the cycle.
 
     **Arguments:** `ts` (T,) s; `values` (T,) readings, NaN for a gap; `periods` s, one or several,
     or none; `model` (T,) the prediction of a motion at `ts`, such as `values − fit.residuals[0][:,

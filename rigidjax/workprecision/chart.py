@@ -20,7 +20,10 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
     included; its points are ringed. The coloured band is the front of the methods in JAX. Error
     bars are quartiles of the time.
 
-    **Arguments:** `records` as measured; `title` of the whole. **Returns** a `matplotlib` figure.
+    **Arguments:** `records` as measured; `title` of the whole.
+
+    **Returns** a `matplotlib` figure.
+
     **Raises:** `ModuleNotFoundError` if matplotlib is missing (`pip install 'rigidjax[view]'`);
     `ValueError` if there is nothing to draw.
     """

@@ -53,6 +53,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def add(commands: Any) -> None:
+    """Add the subcommand to an `argparse` parser's commands."""
     parser = commands.add_parser(
         "workprecision",
         help="error against cost of each method, of values and gradients",

@@ -60,13 +60,15 @@ def measure(
 ) -> list[Record]:
     """Error and cost of each method at each of its settings, of the value and of its gradient.
 
-    All runs are in this process, in turn, round after round; compilation is timed separately.
-    Methods that cannot do the scene, and errors above half a radian (or 100 %), are omitted.
+    All runs are in this process, in turn, round after round; compilation is timed separately. The
+    records omit methods that cannot do the scene, and runs with an error of more than half a radian
+    (or 100 %).
 
     **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more of them;
     `gradients` whether gradients are measured, too; `thin` takes every `thin`-th setting; `rounds`
-    the least number of timings of each run; `progress` is called with a line of text. **Raises:**
-    `TypeError` for something that is no `Scene` or `Method`.
+    the least number of timings of each run; `progress` is called with a line of text.
+
+    **Raises:** `TypeError` for something that is no `Scene` or `Method`.
     """
     made = 'standard ones are made by rj.workprecision.scenes()["heavy-top"]()'
     _checks.instance(scene, Scene, "scene", wanted="a Scene", hint=made)

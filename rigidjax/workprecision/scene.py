@@ -26,8 +26,9 @@ A, B, C = (0.6, -0.48, 0.64), (0.36, 0.8, -0.48), (0.28, -0.5, 0.82)
 class Reference(NamedTuple):
     """The end of a scene, and the gradient of its scalar.
 
-    **Fields:** `end` the state as one tuple; `error` of its largest number, as its own method
-    estimates it; `gradient`, `gradient_error` the same, or empty; `source` words.
+    **Fields:** `end` the state as one tuple; `error` of its largest number, as estimated by the
+    method that made it; `gradient`, `gradient_error` the same, empty where there is none;
+    `source` words.
 
     >>> top = stored("heavy top")
     >>> top is None or top.error < 1e-12
@@ -161,7 +162,8 @@ class Ready(NamedTuple):
     """A method prepared for a scene.
 
     **Fields:** `run` setting → (the last state, or the gradient, as one vector; steps taken),
-    complete when it returns; `compile` s, `memory` bytes of temporaries, each NaN where unknown.
+    complete when it returns; `compile` s that making it took, `memory` bytes of temporaries, each
+    NaN where unknown.
 
     >>> ready = Ready(lambda setting: ([0.0, 1.0], 1 / setting))
     >>> ready.run(1e-2)[1], ready.compile

@@ -432,9 +432,9 @@ def test_the_information_is_the_covariance_of_the_gradient(fitted, process):
         return curvature(eqx.tree_at(where, density, omega[None]), density.x0)
 
     keys = jax.random.split(jax.random.key(5), many)
-    _, gram, slope = jax.jit(lambda keys: jax.lax.map(one, keys))(keys)
-    root = np.linalg.cholesky(np.mean(gram, axis=0))
-    normal = np.linalg.solve(root, np.asarray(slope).T)
+    found = jax.jit(lambda keys: jax.lax.map(one, keys))(keys)
+    root = np.linalg.cholesky(np.mean(found.gram, axis=0))
+    normal = np.linalg.solve(root, np.asarray(found.slope).T)
     assert normal.shape[0] == (6 if process is None else 7)
     # Mean squares of independent standard normal numbers, to four of their deviations.
     np.testing.assert_allclose(

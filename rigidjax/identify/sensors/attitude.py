@@ -118,9 +118,11 @@ class Direction(ClockedSensor):
         return -jnp.stack([dot(first, seen), dot(second, seen)]) / half
 
     def reading_of(self, now: SensorInput, error: Float[Array, "2"]) -> Vec3:
-        """A reading (3,) with an error as long as this one (2,), and equal if small.
+        """A reading (3,) with an error of the same length as this one (2,), and equal for small
+        errors.
 
-        The axes across the prediction are those across the reading, turned by the angle between.
+        The two axes across the prediction are the axes across the reading, turned by the angle
+        between.
         """
         seen = self._seen(now)
         first, second = _across(seen)

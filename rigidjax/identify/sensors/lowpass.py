@@ -32,7 +32,8 @@ class LowPass(eqx.Module):
     first four, before a sample after a gap of more than three intervals a straight line.
 
     **Arguments:** `cutoff` Hz, the frequency of gain 1/√2 (a `Free` may move it); `order` 1 or 2.
-    **Raises** `ValueError` for other values. Source: Butterworth 1930, Experimental Wireless 7:536.
+    **Raises** `ValueError` for a cutoff that is not positive, another order. Source: Butterworth
+    1930, Experimental Wireless 7:536.
 
     >>> slow = LowPass(0.5)(jnp.arange(4.0), jnp.ones((4, 1)))
     >>> bool(jnp.allclose(slow, 1.0))

@@ -62,8 +62,9 @@ class Gyro(_Vector):
     of mass and `None` unless given.
 
     With jitter a reading is also wrong along the change of the prediction, by the change in the
-    stamp's error: to first order, for motions that turn little in that time. **Raises**
-    `ValueError` for a noise, limit or jitter that is not positive, a wrong shape, NaN.
+    stamp's error: to first order, for motions that turn little in that time.
+
+    **Raises** `ValueError` for a noise, limit or jitter that is not positive, a wrong shape, NaN.
 
     >>> Gyro(noise=0.01).noise.shape
     (3,)

@@ -91,7 +91,8 @@ class ChangingInertia(eqx.Module):
     in a straight line from the centre; else add their momentum as a `Flywheel` to `torque`. Ejected
     fuel carries its share of İΩ away: then add İΩ to `torque`.
 
-    Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; without τ `R I(t) Ω` is conserved.
+    Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; the momentum `R I(t) Ω` is conserved
+    without τ.
 
     >>> grows = ChangingInertia(lambda t: (1.0 + t) * jnp.eye(3))
     >>> body = rj.Inertia(jnp.eye(3))

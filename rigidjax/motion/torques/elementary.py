@@ -33,7 +33,8 @@ class InSpace(base.OfTime):
     """A torque given in the world frame: `τ = Rᵀ τ_w`.
 
     **Arguments:** `torque` τ_w, N m, world frame: (3,), or a callable Module of time, t → (3,),
-    such as `Linear(times, values)`. A constant τ_w conserves the momentum across it.
+    such as `Linear(times, values)`. A constant τ_w adds τ_w t to the angular momentum; the part
+    across it is conserved.
 
     >>> turned = rj.Attitude([0.0, 1.0, 0.0, 0.0], [0.0, 0, 0])  # half a turn about x
     >>> InSpace([0.0, 0.0, 1.0])(0.0, turned, None).tolist()  # in body axes

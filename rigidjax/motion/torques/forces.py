@@ -119,7 +119,8 @@ class Rotors(base.AbstractForce):
     `Held(times, values)`, or `Input("speeds")`. Source: Mahony, Kumar and Corke 2012, Multirotor
     aerial vehicles, eqs 4–6, doi:10.1109/MRA.2012.2206474.
 
-    **Raises:** `ValueError` for a direction that is not a unit vector, or a spin not ±1.
+    **Raises:** `ValueError` for a direction that is not a unit vector, or a spin that is not 1 or
+    −1.
 
     >>> up = Rotors([[0.1, 0.0, 0.0]], [[0.0, 0.0, 1.0]], [1.0], 2.0, 0.5, [3.0])
     >>> rest = rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])

@@ -39,7 +39,8 @@ class Linear(_Table):
     `ChangingInertia`. Both may be traced. The derivative at a row is the slope of the line after
     it. `Series` is a cubic spline through evenly spaced rows, which has no kinks.
 
-    **Raises:** `ValueError` for fewer than two rows, other counts, times that do not increase, NaN.
+    **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
+    increase, NaN.
 
     >>> Linear([0.0, 2.0], [[0.0, 0, 0], [0.0, 0, 4]])(1.0)
     Array([0., 0., 2.], dtype=float64)
@@ -143,7 +144,8 @@ class Pulses(AbstractTorque):
 
 def _row(times: Float[Array, " n"], t: Scalar) -> Any:
     """The last row whose time is not after t. At a jump this is the piece that begins."""
-    # A comparison with all rows keeps a short table in the solver's one kernel; a search loops.
+    # A comparison with all rows keeps a short table inside the solver's one kernel; a search is a
+    # loop.
     method = "compare_all" if times.shape[0] <= 128 else "scan"
     return jnp.searchsorted(times, t, side="right", method=method) - 1
 

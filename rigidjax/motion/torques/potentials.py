@@ -23,7 +23,8 @@ class HeavyTop(base.AbstractTorque):
     **Arguments:** `mass` m, kg; `com` (3,) c, from the fixed point to the centre of mass, m, body
     frame; `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81]. The body's `Inertia` is the
     one **about the fixed point** (`MassProperties.inertia_about`, `Inertia.shifted`). Any top is
-    allowed: Lagrange's, Kovalevskaya's, a general one, the physical pendulum.
+    allowed: Lagrange's, Kovalevskaya's, Goryachev–Chaplygin's, a general one, the physical
+    pendulum.
 
     It conserves the energy and the momentum along g. Source: Landau and Lifshitz, Mechanics, §35;
     Arnold, Mathematical Methods of Classical Mechanics, §30. **Raises:** `TypeError` on a `Rigid`,

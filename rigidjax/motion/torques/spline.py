@@ -106,7 +106,8 @@ class Wheel(eqx.Module):
     rad/s, relative to the body, a callable Module of time such as `Series(times, speeds)`; `delay`
     s: the log's value at t belongs to t − delay; `tilt` (2,) tangents (rad, if small) of the axis's
     tilt towards two directions across it (about x, y and z: the next two axes in turn, y and z, z
-    and x, x and y). `None` is no delay, no tilt. **Raises:** `ValueError` unless |a| = 1.
+    and x, x and y). `None` is no delay, no tilt. **Raises:** `ValueError` for an axis that is not a
+    unit vector.
 
     >>> speed = Series([0.0, 1.0, 2.0, 3.0], [0.0, 10.0, 20.0, 30.0])
     >>> bool(abs(Wheel(2.0, [0.0, 0.0, 1.0], speed)(0.5)[2] - 10.0) < 1e-12)
