@@ -94,7 +94,9 @@ def batched_as(out: Any, args: Any) -> Any:
     return _grown(out, args)
 
 
-batched_as.defjvp(lambda primals, tangents: (batched_as(*primals), tangents[0]))
+@batched_as.defjvp
+def _batched_as_jvp(primals: Any, tangents: Any) -> Any:
+    return batched_as(*primals), tangents[0]
 
 
 @jax.custom_batching.custom_vmap
@@ -104,7 +106,7 @@ def _grown(out: Any, args: Any) -> Any:
 
 
 @_grown.def_vmap
-def _(size: int, batched: Any, out: Any, args: Any) -> Any:
+def _grown_batched(size: int, batched: Any, out: Any, args: Any) -> Any:
     del args
     if not any(jax.tree.leaves(batched)):
         return out, batched[0]
