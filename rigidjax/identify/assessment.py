@@ -12,6 +12,7 @@ from rigidjax.identify import flat_limit, uncertainty
 from rigidjax.identify.answers import EXPLAINS, FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
 from rigidjax.identify.causes import clock
 from rigidjax.identify.flat_limit import of_charts
+from rigidjax.identify.freedom import freedom_of
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import charts, quantities as quantities_of, values_and_slopes
 from rigidjax.identify.result import Fit, Start
@@ -218,6 +219,8 @@ def assess(
     white = uncertainty.of_white(linear)
     spread = uncertainty.spread(linear, times, white)
     numbers, of = values_and_slopes(problem, value, near), charts(problem)
+    freedom = freedom_of(problem, value, linear, times, white.seen)
+    degrees = freedom.of(numbers[1])
     limits = flat_limit.limits(problem, numbers, -white.seen @ linear.slope, [n for n, _ in of])
     # Steps stay short in a long curved valley, although hardly anything is left to gain.
     held = [limit.slope for limit in limits if limit.free < 0]
@@ -258,10 +261,11 @@ def assess(
         times.independent,
         jnp.asarray(spread.singular_values),
         jnp.asarray(spread.null_directions),
-        quantities_of(problem, numbers, spread.seen, spread.null_directions, limits),
+        quantities_of(problem, numbers, spread.seen, spread.null_directions, limits, degrees),
         _search(best_cost, done, rival, interrupted, remarks),
         model,
         left,
         limits,
         near,
+        freedom,
     )

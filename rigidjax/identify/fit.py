@@ -143,6 +143,13 @@ def _as_given(given: Problem, fitted: Problem) -> Problem:
     return eqx.tree_at(lambda p: p.records, fitted, records)
 
 
+# Rounds of the search for noise, and for the width of the recordings' deviations from a shared
+# number, the latter by expectation and maximisation (Dempster, Laird and Rubin 1977; Laird and Ware
+# 1982, doi:10.2307/2529876); the relative change at which they end; a width below so much of the
+# first one is zero.
+_ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
+
+
 def _cost(tried: Tried) -> float:
     cost = float(tried.cost)
     return cost if np.isfinite(cost) else np.inf
@@ -154,15 +161,18 @@ def _with_noise(best: Tried, task: Task) -> tuple[Tried, Task]:
         return best, task
 
     def estimated(best: Tried, task: Task) -> Task:
-        (errors, _), _ = _evaluated(best, task.problem).found
-        problem, noise = estimate_noise(task.problem, errors, task.noise, best.parameters)
+        found = _evaluated(best, task.problem).found
+        problem, noise = estimate_noise(task.problem, found, task.noise, best.parameters)
         return task._replace(problem=problem, noise=noise)
 
-    # Twice: the weights of the channels and the robust loss both depend on the noise.
-    for _ in range(2):
-        task = estimated(best, task)
+    # Weights, the robust loss, and what the fit takes from few readings depend on the noise.
+    for turn in range(_ROUNDS):
+        before, task = task.noise, estimated(best, task)
+        pairs = zip(before, task.noise, strict=True)
+        if turn > 1 and all(np.allclose(b, a, rtol=_SETTLED, atol=0.0) for a, b in pairs):
+            break
         best = search.again(best, task)
-    return best, estimated(best, task)
+    return best, task
 
 
 def _from_pieces(problem: Problem, count: int, tolerance: float, max_steps: int) -> Parameters:
@@ -329,12 +339,6 @@ def _first_noise(problem: Problem) -> Noise:
             size = jnp.sqrt(jnp.mean(jnp.sum(values**2, axis=-1)) + 1e-300)
             out.append(jnp.full((problem.count, sensor.components), 0.1) * size)
     return tuple(out)
-
-
-# The width of the recordings' deviations from a shared number, by expectation and maximisation
-# (Dempster, Laird and Rubin 1977; Laird and Ware 1982, doi:10.2307/2529876): its rounds, the
-# relative change at which they end; a width below so much of the first one is zero.
-_ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
 
 
 def _with_widths(best: Tried, task: Task) -> tuple[Tried, Task]:

@@ -46,7 +46,7 @@ class Limit(eqx.Module):
 
 
 def ends(
-    reach: float, correlation: np.ndarray | float, away: float
+    reach: np.ndarray | float, correlation: np.ndarray | float, away: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The ends of an interval from its middle, in standard deviations, cut at a flat body.
 

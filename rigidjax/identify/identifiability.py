@@ -13,6 +13,7 @@ from jaxtyping import Array
 from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.answers import FAILS, NOT_ENDED
 from rigidjax.identify.body_charts import BASIS, COMPONENTS, Bodies, Tensor, in_a_row
+from rigidjax.identify.freedom import quantile
 from rigidjax.identify.full_scale import in_words
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
@@ -20,7 +21,6 @@ from rigidjax.identify.quantities import (
     Quantity,
     charts,
     labels,
-    quantile,
     recording_names,
     value_and_slope,
     vector,
@@ -239,14 +239,13 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         # A search that did not end may have moved along directions that the data do not determine.
         out += [] if lost else _unseen(fit)
         return (*out, *in_words(fit.problem.records.readings))
-    reach = quantile(fit, 0.95)
     out = []
     moments, first = [], 0
     for _, chart in charts(fit.problem):
         moments += fit.quantities[first : first + len(chart.log_names)]
         first += len(chart.log_names) + len(chart.plain_names)
     for quantity in moments:
-        wide = reach * quantity.deviation
+        wide = _half(quantity)
         # Half-width over value for a narrow interval; a factor for a wide one.
         if not np.isfinite(wide) or wide > 1.5:
             out.append(f"{quantity.name} is not determined by these data.")
@@ -262,10 +261,10 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         f"A flat body{limit.where} fits as well: (I1 + I2 − I3)/I3 ≤ "
         f"{limit.bound(seen):.2g} (95 %). Intervals end at the limit of real bodies."
         for limit in fit.limits
-        if limit.is_near(seen, reach)
+        if limit.is_near(seen, float(quantile(0.95, fit.degrees(limit.slope))))
     ]
     count = fit.problem.count
-    out.append(_rate(fit.quantities[first : first + 3 * count], count, reach))
+    out.append(_rate(fit.quantities[first : first + 3 * count], count))
     out += _unseen(fit)
     out += correlations(fit)
     if fit.problem.torque is None:
@@ -282,12 +281,17 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
     return tuple(out)
 
 
-def _rate(rates: Sequence[Quantity], count: int, reach: float) -> str:
+def _half(quantity: Quantity) -> float:
+    """Half of the 95 % interval, of the logarithm if positive."""
+    return float(quantile(0.95, quantity.freedom)) * quantity.deviation
+
+
+def _rate(rates: Sequence[Quantity], count: int) -> str:
     shares = []
     for index in range(count):
         three = rates[3 * index : 3 * index + 3]
         length = np.linalg.norm([q.value for q in three])
-        shares.append(reach * np.max([q.deviation for q in three]) / max(length, 1e-300))
+        shares.append(np.max([_half(q) for q in three]) / max(length, 1e-300))
     wide = np.max(shares)
     what = "The initial body rate is" if count == 1 else "The initial body rates are"
     if not wide < 1.0:

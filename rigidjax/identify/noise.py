@@ -7,27 +7,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rigidjax.identify.freedom import leverages
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.terms import Noise, changes, weights_of
+from rigidjax.identify.uncertainty import linearise, of_white
 
 # Rounds of the search for two variances.
 ROUNDS = 500
 
 
 def estimate_noise(
-    problem: Problem, errors: tuple, noise: Noise, parameters: Parameters
+    problem: Problem, found: Any, noise: Noise, parameters: Parameters
 ) -> tuple[Problem, Noise]:
     """Noise (R, k) of each sensor: as given, or the weighted scatter of its errors, one figure for
     all channels and the recordings of a group. The problem with the jitter of its sensors likewise.
+
+    Fitted numbers take a part of the errors away, of few readings a large one: each sensor's is its
+    leverage at this noise, as by restricted maximum likelihood. **Arguments:** `found` errors and
+    derivatives as `evaluate` gives them, at `parameters`.
     """
-    free = sum(leaf.size for leaf in jax.tree.leaves(parameters))
+    errors = found[0][0]
     weights = weights_of(problem, errors, noise)
-    share = max(1.0 - free / problem.records.size, 0.1)
     groups, out = np.asarray(problem.noise_groups), []
+    shares = _shares(problem, found, noise, parameters)
     readings = list(problem.records.readings)
-    for index, (reading, error, sigma, weight) in enumerate(
-        zip(readings, errors, noise, weights, strict=True)
+    for index, (reading, error, sigma, weight, share) in enumerate(
+        zip(readings, errors, noise, weights, shares, strict=True)
     ):
         # The error of a reading at full scale is no noise.
         sensor, kept = cast(Any, reading.sensor), reading.kept
@@ -41,12 +47,13 @@ def estimate_noise(
             variance = np.bincount(groups, squares) / np.maximum(np.bincount(groups, seen), 1)
             # Data without noise must not divide by zero: the least noise is round-off.
             floor = 1e-15 * float(np.abs(np.asarray(reading.values)).max() + 1e-300)
-            found = np.maximum(np.sqrt(variance / share), floor)[groups]
-            found = np.broadcast_to(found[:, None], sigma.shape)
-            sigma = jnp.asarray(found.astype(sigma.dtype))
+            each = np.maximum(np.sqrt(variance / share), floor)[groups]
+            each = np.broadcast_to(each[:, None], sigma.shape)
+            sigma = jnp.asarray(each.astype(sigma.dtype))
         if reading.late is not None:
             change = changes(parameters, problem)[index]
-            root, size = np.sqrt(np.asarray(weight, float) / share), np.asarray(sigma, float)
+            root = np.sqrt(np.asarray(weight, float) / share[groups][:, None])
+            size = np.asarray(sigma, float)
             e, u = (np.where(kept, np.asarray(x) / size[:, None], 0.0) for x in (error, change))
             tau = None if sensor.jitter.estimated else np.asarray(sensor.jitter.deviation)
             both = _jitter(e * root[..., None], u, kept.sum(axis=-1), groups, known, tau)
@@ -57,6 +64,19 @@ def estimate_noise(
     if any(reading.late is not None for reading in readings):
         problem = eqx.tree_at(lambda p: p.records.readings, problem, tuple(readings))
     return problem, tuple(out)
+
+
+def _shares(problem: Problem, found: Any, noise: Noise, parameters: Parameters) -> list[np.ndarray]:
+    """The share of its errors that fitted numbers leave each sensor and group of recordings."""
+    groups, readings = np.asarray(problem.noise_groups), problem.records.readings
+    sizes = [np.bincount(groups, one.kept.sum(axis=(1, 2))) for one in readings]
+    if len(readings) * sizes[0].size == 1:
+        taken = [np.array([sum(leaf.size for leaf in jax.tree.leaves(parameters))])]
+    else:
+        linear = linearise(problem, parameters, noise, found)
+        taken = leverages(linear, linear.information, of_white(linear).seen)
+        taken = [np.bincount(groups, each) for each in taken]
+    return [np.maximum(1.0 - n / np.maximum(m, 1), 0.1) for n, m in zip(taken, sizes, strict=True)]
 
 
 def _jitter(

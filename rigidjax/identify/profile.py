@@ -10,6 +10,7 @@ from jaxtyping import Array, Int
 
 from rigidjax._types import Scalar
 from rigidjax.identify import padding, quantities
+from rigidjax.identify.freedom import quantile
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, Rows
 from rigidjax.identify.result import Fit, one_fit
@@ -57,9 +58,9 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     names = [quantity.name for quantity in fit.quantities]
     if not isinstance(name, str) or name not in names:
         raise ValueError(f"profile: no quantity {name!r}; wanted one of {', '.join(names)}")
-    reach = quantities.quantile(fit, level)
     index = names.index(name)
     quantity = fit.quantities[index]
+    reach = float(quantile(level, quantity.freedom))
     middle = np.log(quantity.value) if quantity.positive else quantity.value
     deviation = quantity.deviation
     wide = np.log(1e3) if quantity.positive else 1e3 * max(abs(middle), 1e-12)

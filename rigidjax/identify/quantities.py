@@ -1,7 +1,7 @@
 """The quantities that a fit reports by name, their values, standard deviations and intervals."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,15 +10,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from rigidjax import _checks
 from rigidjax.identify import flat_limit
 from rigidjax.identify.body_charts import AbstractBodyChart, Bodies, Ratios, in_a_row
+from rigidjax.identify.freedom import quantile
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, values_of
-
-if TYPE_CHECKING:
-    from rigidjax.identify.result import Fit
-
 
 # An interval wider than this factor says nothing about a positive number.
 FARTHEST = 1e3
@@ -28,10 +24,11 @@ class Quantity(eqx.Module):
     """A number with a name: its value, standard deviation (of the logarithm if positive), unit.
 
     `cuts` are its correlation with the flatness of each body, and the flatness in standard
-    deviations (`rigidjax.identify.flat_limit`); `most` is an upper limit for all bodies.
+    deviations (`rigidjax.identify.flat_limit`); `most` is an upper limit for all bodies; `freedom`
+    the degrees of freedom of its variance, infinite if all noise is given.
 
     >>> mass = Quantity("mass", 2.0, 0.01, "kg", True)
-    >>> low, high = mass.interval(1.96)
+    >>> low, high = mass.interval(0.95)
     >>> round(low, 3), round(high, 3)
     (1.961, 2.04)
     """
@@ -43,13 +40,16 @@ class Quantity(eqx.Module):
     positive: bool
     cuts: tuple[tuple[float, float], ...] = ()
     most: float = np.inf
+    freedom: float = np.inf
 
-    def interval(self, reach: float) -> tuple[float, float]:
-        """Low and high, `reach` standard deviations away; through the logarithm if positive.
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Low and high of the interval; through the logarithm if positive.
 
         An end is nearer if the body there would be past flat. The ends are 0 and infinity for a
-        positive number that is not known to a factor of 1e3.
+        positive number that is not known to a factor of 1e3. **Arguments:** `level` the probability
+        that it holds the true value. **Raises** `ValueError` outside (0, 1).
         """
+        reach = float(quantile(level, self.freedom))
         low, high = (float(side) * self.deviation for side in cut_ends(reach, self.cuts))
         if not self.positive:
             return self.value + low, self.value + high
@@ -58,7 +58,7 @@ class Quantity(eqx.Module):
         return float(self.value * np.exp(low)), min(float(self.value * np.exp(high)), self.most)
 
 
-def cut_ends(reach: float, cuts: Sequence[tuple[Any, float]]) -> tuple[Any, Any]:
+def cut_ends(reach: np.ndarray | float, cuts: Sequence[tuple[Any, float]]) -> tuple[Any, Any]:
     """The ends of an interval in standard deviations, for each limit that cuts it."""
     low: Any = -reach
     high: Any = reach
@@ -152,14 +152,17 @@ def quantities(
     covariance: np.ndarray,
     null: np.ndarray,
     limits: tuple[flat_limit.Limit, ...] = (),
+    freedom: np.ndarray | float = np.inf,
 ) -> tuple[Quantity, ...]:
     """Every reported quantity with its standard deviation, of `values_and_slopes`; `covariance`
-    within the determined directions, `null` (k, n) the others; `limits` cut the intervals.
+    within the determined directions, `null` (k, n) the others; `limits` cut the intervals;
+    `freedom` of the variances.
     """
     names = labels(problem)
     values, slope = (part[: len(names)] for part in found)
     deviations = carried(slope, covariance, null)
     cuts = cuts_of(slope, covariance, deviations, limits)
+    freedom = np.broadcast_to(freedom, found[0].shape)
     # A number that changes with no fitted number is not determined.
     deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
     out = []
@@ -171,7 +174,8 @@ def quantities(
         most = 1.0 if name.startswith(Ratios.log_names) else np.inf
         mine = tuple((float(rho[index]), away) for rho, away in cuts)
         deviation = float(np.maximum(deviation, least))
-        out.append(Quantity(name, shown, deviation, unit, positive, mine, most))
+        own = float(freedom[index])
+        out.append(Quantity(name, shown, deviation, unit, positive, mine, most, own))
     return tuple(out)
 
 
@@ -180,7 +184,7 @@ def around(
     slope: np.ndarray,
     covariance: np.ndarray,
     null: np.ndarray,
-    reach: float,
+    reach: np.ndarray | float,
     limits: tuple[flat_limit.Limit, ...] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
     """The interval of functions of value `middle` and derivative `slope`; else as `quantities`."""
@@ -241,17 +245,3 @@ def _deviations(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     variance = along**2 @ np.maximum(values, 0.0)
     lost = (length > 0) & (unreal | (variance <= least * length**2))
     return np.where(lost, np.nan, np.sqrt(variance))
-
-
-def quantile(fit: "Fit", level: float) -> float:
-    """Half-width of an interval in standard deviations: Student's where the noise is estimated, by
-    the number of independent errors.
-    """
-    level = _checks.fraction(level, "level", "a level between 0 and 1")
-    from scipy.special import ndtri, stdtrit
-
-    tail = 0.5 * (1 + level)
-    sensors = fit.problem.records.sensors
-    if all(sensor.noise is not None for sensor in sensors) and fit.correlation <= 1.5:
-        return float(ndtri(tail))
-    return float(stdtrit(max(fit.independent - fit.covariance.shape[0], 2.0), tail))

@@ -14,10 +14,11 @@ from rigidjax.identify import answers, identifiability, uncertainty
 from rigidjax.identify.answers import Answer, Cause
 from rigidjax.identify.causes import causes
 from rigidjax.identify.flat_limit import Limit
+from rigidjax.identify.freedom import Freedom, quantile
 from rigidjax.identify.identifiability import Combination, undetermined
 from rigidjax.identify.parameters import Parameters, Unpacked
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.quantities import Quantity, around, quantile
+from rigidjax.identify.quantities import Quantity, around
 from rigidjax.identify.search import evaluate
 from rigidjax.identify.terms import Noise
 
@@ -54,7 +55,8 @@ class Fit(eqx.Module):
     by name; `search` the first answer, whose `word` is `found`, `not alone` or `not ended`; `model`
     the second one: `explains the readings`, `leaves a part`, `does not explain the readings`;
     `left` the indices of the sensors whose errors it does not explain; `limits` the distance of
-    each body from a flat one; `near` the point of the derivatives beside a flat body, else `None`.
+    each body from a flat one; `near` the point of the derivatives beside a flat body, else `None`;
+    `freedom` what the degrees of freedom of variances follow from.
 
     >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
     >>> [quantity.name for quantity in found.quantities[:2]], found.covariance.shape
@@ -80,6 +82,7 @@ class Fit(eqx.Module):
     left: tuple[int, ...]
     limits: tuple[Limit, ...] = ()
     near: Parameters | None = None
+    freedom: Freedom | None = None
 
     @property
     def status(self) -> str:
@@ -187,8 +190,7 @@ class Fit(eqx.Module):
         The interval of a positive quantity goes through its logarithm. **Arguments:** `level` the
         probability that an interval holds the true value. **Raises** `ValueError` outside (0, 1).
         """
-        reach = quantile(self, level)
-        return {quantity.name: quantity.interval(reach) for quantity in self.quantities}
+        return {quantity.name: quantity.interval(level) for quantity in self.quantities}
 
     def interval_of(
         self, of: Callable[[Unpacked], Any], level: float = 0.95
@@ -214,7 +216,12 @@ class Fit(eqx.Module):
         middle = np.asarray(_checks.finite(value(flat), "of(point)"))
         slope = np.asarray(jax.jacfwd(value)(ravel_pytree(self.beside)[0]))
         seen, null = np.asarray(self.seen), np.asarray(self.null_directions)
-        return around(middle, slope, seen, null, quantile(self, level), self.limits)
+        reach = quantile(level, self.degrees(slope))
+        return around(middle, slope, seen, null, reach, self.limits)
+
+    def degrees(self, slope: np.ndarray) -> np.ndarray:
+        """Degrees of freedom of the variances of functions with derivative `slope` (…, n)."""
+        return np.full(slope.shape[:-1], np.inf) if self.freedom is None else self.freedom.of(slope)
 
     @property
     def undetermined(self) -> tuple[Combination, ...]:

@@ -53,11 +53,20 @@ class Linearised(eqx.Module):
     @property
     def dense(self) -> np.ndarray:
         """All slopes (R, N, m) of each recording, each row weighted."""
-        parts = [
+        return np.concatenate(self.rows, axis=1)
+
+    @property
+    def rows(self) -> list[np.ndarray]:
+        """The slopes (R, T k, m) of each sensor, each row weighted."""
+        return [
             (slope * np.sqrt(weight)[..., None, None]).reshape(len(slope), -1, slope.shape[-1])
             for slope, weight in zip(self.slopes, self.weights, strict=True)
         ]
-        return np.concatenate(parts, axis=1)
+
+    @property
+    def information(self) -> tuple[np.ndarray, ...]:
+        """That of the readings of each sensor, (R, m, m) of each recording's numbers."""
+        return tuple(rows.swapaxes(1, 2) @ rows for rows in self.rows)
 
     def along(self, step: np.ndarray) -> float:
         """The square of the change of all residuals with a step (n,) of the numbers."""

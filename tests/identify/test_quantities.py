@@ -83,7 +83,7 @@ def test_a_fitted_number_has_a_width():
         np.zeros((0, 5)),
     )
     for number in exact:
-        low, high = number.interval(1.96)
+        low, high = number.interval(0.95)
         assert low < number.value < high
     still = quantities(
         found.problem,

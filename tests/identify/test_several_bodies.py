@@ -1,5 +1,6 @@
 """Several bodies read by one sensor: what is shared, what a group or a recording has of its own."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -128,7 +129,9 @@ def test_noise_is_estimated_by_group(records, each, wanted):
     rng = np.random.default_rng(3)
     errors = (np.array([0.02, 0.05, 0.1, 0.1])[:, None, None] * rng.normal(size=(4, 60, 3)),)
     first = (jnp.ones((4, 3)),)
-    _, (noise,) = estimate_noise(problem, errors, first, problem.start())
+    (_, ends), blocks = evaluate(problem.start(), problem)
+    found = (jax.tree.map(jnp.asarray, errors), ends), blocks
+    _, (noise,) = estimate_noise(problem, found, first, problem.start())
     np.testing.assert_allclose(noise[:, 0], wanted, rtol=0.15)
 
 

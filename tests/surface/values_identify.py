@@ -1,5 +1,6 @@
 """A second way for fits and filters: charts and sensors in words, Gaussians by conditioning."""
 
+import math
 import tempfile
 from pathlib import Path
 
@@ -652,10 +653,10 @@ way(
 way(
     "identify.Quantity.interval",
     lambda x, d, r: [
-        *Quantity("x", x, d, "m", True).interval(r),
-        *Quantity("x", x, d, "m", False).interval(r),
+        *Quantity("x", x, d, "m", True).interval(math.erf(r / 2**0.5)),
+        *Quantity("x", x, d, "m", False).interval(math.erf(r / 2**0.5)),
     ],
-    (scale(), between(0, 1), between(0, 3)),
+    (scale(), between(0, 1), between(0.1, 3)),
     lambda x, d, r: [x * mp.exp(-d * r), x * mp.exp(d * r), x - d * r, x + d * r], batched=False,
 )  # fmt: skip
 leave_out(
