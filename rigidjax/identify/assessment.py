@@ -13,6 +13,7 @@ from rigidjax.identify.answers import EXPLAINS, FAILS, FOUND, LEAVES, NOT_ALONE,
 from rigidjax.identify.causes import clock
 from rigidjax.identify.flat_limit import of_charts
 from rigidjax.identify.freedom import freedom_of
+from rigidjax.identify.noise import median_of_chi2
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import charts, quantities as quantities_of, values_and_slopes
 from rigidjax.identify.result import Fit, Start
@@ -136,16 +137,6 @@ def _median_above(squares: np.ndarray, size: int) -> float:
     # The deviation of a sample's median is 1 / (2 f √n), f the density there.
     wide = 0.5 / (density * np.sqrt(squares.size))
     return float(np.sqrt(middle / half)) if middle > half + 5 * wide else 1.0
-
-
-def median_of_chi2(size: int) -> tuple[float, float]:
-    """The median of χ² with `size` degrees of freedom, and the density there."""
-    from scipy.special import chdtri, gammaln
-
-    median = float(chdtri(size, 0.5))
-    power = 0.5 * size - 1
-    density = 0.5 * np.exp(power * np.log(0.5 * median) - 0.5 * median - gammaln(0.5 * size))
-    return median, float(density)
 
 
 def _white(

@@ -20,8 +20,8 @@ class Freedom(eqx.Module):
     `covariance` (n, n) of the numbers for white errors; `places` (R, m) of those of a recording;
     `groups` (R,) of recordings with a common noise; of each sensor `blocks` (R, m, m), the
     information of its readings, and `left` (G,), its independent errors less what the fit takes,
-    infinite for a given noise; of each estimated width the places of its deviations, its square,
-    and its degrees.
+    infinite for a given noise; `widths` of each width that is estimated the places of its
+    deviations, its square, and its degrees.
     """
 
     covariance: np.ndarray

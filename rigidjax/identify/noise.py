@@ -20,7 +20,7 @@ ROUNDS = 500
 def estimate_noise(
     problem: Problem, found: Any, noise: Noise, parameters: Parameters
 ) -> tuple[Problem, Noise]:
-    """Noise (R, k) of each sensor: as given, or the weighted scatter of its errors, one figure for
+    """Noise (R, k) of each sensor: as given, or the scatter of its errors, one figure for
     all channels and the recordings of a group. The problem with the jitter of its sensors likewise.
 
     Fitted numbers take a part of the errors away, of few readings a large one: each sensor's is its
@@ -41,10 +41,12 @@ def estimate_noise(
         if known:
             sigma = sensor.noise
         else:
-            squares = np.asarray(weight)[..., None] * np.asarray(error) ** 2
-            squares = np.sum(np.where(kept, squares, 0.0), axis=(1, 2))
-            seen = kept.sum(axis=(1, 2))
-            variance = np.bincount(groups, squares) / np.maximum(np.bincount(groups, seen), 1)
+            squares = np.sum(np.where(kept, np.asarray(error) ** 2, 0.0), axis=2)
+            if problem.loss is None:
+                parts = np.bincount(groups, squares.sum(axis=1))
+                variance = parts / np.maximum(np.bincount(groups, kept.sum(axis=(1, 2))), 1)
+            else:
+                variance = _by_median(squares, kept, groups)
             # Data without noise must not divide by zero: the least noise is round-off.
             floor = 1e-15 * float(np.abs(np.asarray(reading.values)).max() + 1e-300)
             each = np.maximum(np.sqrt(variance / share), floor)[groups]
@@ -64,6 +66,27 @@ def estimate_noise(
     if any(reading.late is not None for reading in readings):
         problem = eqx.tree_at(lambda p: p.records.readings, problem, tuple(readings))
     return problem, tuple(out)
+
+
+def _by_median(squares: np.ndarray, kept: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """The variance of each group by the median of whole readings: outliers do not change it.
+
+    Weights of a loss would make it too small without outliers, and too large with many.
+    """
+    half, _ = median_of_chi2(kept.shape[-1])
+    whole = kept.all(axis=-1)
+    rows = (squares[groups == g][whole[groups == g]] for g in range(groups.max() + 1))
+    return np.array([np.median(row) / half if row.size else 0.0 for row in rows])
+
+
+def median_of_chi2(size: int) -> tuple[float, float]:
+    """The median of χ² with `size` degrees of freedom, and the density there."""
+    from scipy.special import chdtri, gammaln
+
+    median = float(chdtri(size, 0.5))
+    power = 0.5 * size - 1
+    density = 0.5 * np.exp(power * np.log(0.5 * median) - 0.5 * median - gammaln(0.5 * size))
+    return median, float(density)
 
 
 def _shares(problem: Problem, found: Any, noise: Noise, parameters: Parameters) -> list[np.ndarray]:

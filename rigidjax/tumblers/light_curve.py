@@ -264,7 +264,7 @@ def _with_shape(best: Fit) -> Fit:
         covariance=jnp.asarray(covariance),
         seen=jnp.asarray(seen),
         covariance_kind=f"sandwich: a shape {SHAPE:.0%} off the ellipsoid; {best.covariance_kind}",
-        quantities=quantities(best.problem, found, seen, null, best.limits),
+        quantities=quantities(best.problem, found, seen, null, best.limits, best.degrees(found[1])),
     )
 
 

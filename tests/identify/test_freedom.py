@@ -92,3 +92,17 @@ def test_quantiles():
     np.testing.assert_allclose(quantile(0.9, degrees), wanted, rtol=1e-12)
     with pytest.raises(ValueError, match=r"level: wanted a level between 0 and 1, got 1\.96"):
         identify.fit(rj.datasets.toutatis.problem()).quantities[0].interval(1.96)
+
+
+@pytest.mark.parametrize(
+    ("share", "loss"), [(0.0, identify.SoftL1(1.0)), (0.1, identify.Huber())], ids=["none", "many"]
+)
+def test_the_noise_beside_a_loss_is_that_of_ordinary_readings(share, loss):
+    """Weighted squares gave half of it without outliers, and twice of it with a tenth of them."""
+    random = np.random.default_rng(0)
+    errors = 0.02 * random.normal(size=(300, 3))
+    errors[random.random(300) < share] *= 20.0
+    record = identify.Recording(jnp.linspace(0.0, 1.0, 300), (identify.Gyro(), 1.0 + errors))
+    found = identify.fit(identify.Problem(record, identify.Known(SPHERE), loss=loss), starts=1)
+    # A tenth of outliers moves the median of the others to 0.556, and the noise by 8 %.
+    np.testing.assert_allclose(found.noise[0], 0.02 * (1.0 + 0.8 * share), rtol=0.06)

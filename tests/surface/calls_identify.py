@@ -173,6 +173,7 @@ records = (
     "Comparison",
     "Own",
     "Limit",
+    "Freedom",
     "Parameters",
     "Unpacked",
 )

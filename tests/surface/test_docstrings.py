@@ -43,6 +43,7 @@ WITHOUT_EXAMPLE = {
             "estimate.Smoothed",
             "identify.Comparison",
             "identify.Limit",
+            "identify.Freedom",
         ),
         "is given by a function or is part of what is given, whose example is it",
     ),

@@ -688,6 +688,10 @@ leave_out(
     "identify.Limit.deviation", "identify.Limit.is_near",
 )  # fmt: skip
 leave_out(
+    "compared with the intervals of Welch and Student: tests/identify/test_freedom.py",
+    "identify.Fit.degrees", "identify.Freedom", "identify.Freedom.of",
+)  # fmt: skip
+leave_out(
     "abstract: made by subclassing",
     "identify.AbstractBodyChart", "identify.AbstractBodyChart.plain", "identify.AbstractLoss",
     "identify.AbstractSensor",
