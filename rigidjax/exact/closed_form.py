@@ -115,8 +115,9 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
     y3 = p3 * f.D - o.d12 * p1 * p2 * f.S * f.C
     size = jnp.maximum(jnp.maximum(jnp.abs(y1), jnp.abs(y2)), jnp.abs(y3))
     still = size <= 0
-    r = 1.0 / jnp.where(still, 1.0, size)
-    y1, y2, y3 = y1 * r, y2 * r, y3 * r
+    size = jnp.where(still, 1.0, size)
+    # Quotients: of a steady spin ±1 exactly, and its momentum stays to the last digit.
+    y1, y2, y3 = y1 / size, y2 / size, y3 / size
     r = o.h / jnp.sqrt(jnp.where(still, 1.0, y1 * y1 + y2 * y2 + y3 * y3))
     return y1 * r, y2 * r, y3 * r
 

@@ -183,8 +183,8 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
     weights = [c * (t * a + b) for c, a, b in zip(HALF, squares, g, strict=True)]
 
     def column(e, change):
-        e12, e23, o12, o13, o23, e1, e2, e3, e11, et = e
-        d_k, start = (e11, e11 - e12, e11 - e12 - e23, o12, o13, o23), (e1, e2, e3)
+        e12, e23, o12, o13, o23, e1, e2, e3, e33, et = e
+        d_k, start = (e33 + e12 + e23, e33 + e23, e33, o12, o13, o23), (e1, e2, e3)
         d_out = tuple(a + b for a, b in zip(start, change, strict=True))
         back = turned_back(turn, start)
         across = cross(out, tuple(a - b for a, b in zip(back, change, strict=True)))
@@ -209,9 +209,12 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
 
 
 def inputs_of(moments: Six, momentum: Triple) -> tuple[Scalar, ...]:
-    """d12, d23, k12, k13, k23, Π(0), k11: the variables of all derivatives, besides the time."""
+    """d12, d23, k12, k13, k23, Π(0), k33: the variables of all derivatives, besides the time.
+
+    k33 is the least of K: a rod's thickness moves d12 alone (k11 and d12 by 1/I₁², which cancel).
+    """
     body, k, _ = reciprocal(moments, momentum)
-    return body.d12, body.d23, body.k12, body.k13, body.k23, *momentum, k[0]
+    return body.d12, body.d23, body.k12, body.k13, body.k23, *momentum, k[2]
 
 
 @jax.custom_jvp

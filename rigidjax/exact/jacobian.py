@@ -39,7 +39,7 @@ def jacobian_and_integral(
     whole: Scalar,
     mean: Scalar,
 ) -> tuple[tuple, Six]:
-    """d(Π(t) − Π(0)) by (d12, d23, k12, k13, k23, Π(0), k11, t) as three rows, and G = ∫ Π Πᵀ dt.
+    """d(Π(t) − Π(0)) by (d12, d23, k12, k13, k23, Π(0), k33, t) as three rows, and G = ∫ Π Πᵀ dt.
 
     Off-diagonal entries must be zero. `before` at half of a time that was reduced by `halves` half
     periods, `whole` in all, its C and D as in `body`; `mean` of S².

@@ -274,6 +274,7 @@ GRADED = [
     ("oblate", 5.0),
     ("prolate", 5.0),
     ("sphere", 3.0),
+    ("rod", 10.0),
     ("plate", 5.0),
     ("nearly equal", 5.0),
     ("nearly symmetric", 50.0),
