@@ -72,6 +72,11 @@ class Force(AbstractScene):
         if self.force is not None:
             _checks.function(self.force, "force", "(t, state, body) → (3,) per mass")
 
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """Times, s, where the force jumps or has a kink: its own `jump_times`, if it has them."""
+        return jumps_within(self.force)
+
     def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
         if self.force is None:
             return jnp.zeros_like(state.x)
@@ -85,6 +90,12 @@ def per_mass(value: Any, force: object) -> Vec3:
     """The value of a force, its shape checked: a user's force may return anything."""
     name = getattr(force, "__name__", type(force).__name__)
     return _checks.floating(value, (3,), f"force {name}", hint="force per mass, m/s²")
+
+
+def jumps_within(*laws: Any) -> Float[Array, " n"]:
+    """The `jump_times` of the laws that have them, s: a solver does not see those of inner ones."""
+    found = [jnp.asarray(law.jump_times, float) for law in laws if hasattr(law, "jump_times")]
+    return jnp.concatenate([jnp.zeros(0), *found])
 
 
 def like(x: Array, *values: Array) -> tuple[Array, ...]:

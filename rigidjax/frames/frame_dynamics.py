@@ -6,11 +6,12 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia
-from rigidjax.frames.base import AbstractScene, Force, per_mass
+from rigidjax.frames.base import AbstractScene, Force, jumps_within, per_mass
 from rigidjax.frames.moving import MovingFrame, require_frame
 from rigidjax.frames.rotation_models import Uniform
 from rigidjax.rotation import linalg3, quaternion
@@ -45,6 +46,11 @@ class InFrame(AbstractScene):
                 _checks.function(getattr(self, name), name, "(t, state) → (3,)")
         if self.potential is not None:
             _checks.function(self.potential, "potential", "of a place (3,) to a number, m²/s²")
+
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """Times, s, where a force jumps or has a kink."""
+        return jumps_within(self.inside, self.outside)
 
     def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
         now = self.frame.at(t)
@@ -99,7 +105,8 @@ class BodyInFrame(eqx.Module):
 
     and the centre of mass moves as a `Point` does (eq 91). **Arguments:** `frame` the `MovingFrame`
     S'; `torque` the real τ, `(t, state in S', body) → (3,)`, N m, body axes, or a model of it that
-    gives a `Wrench`, with its force in the axes of S'; or `None`. Source: notes, eqs 50, 91, for a
+    gives a `Wrench`, with its force in the axes of S'; or `None`. `simulate` refuses laws of the
+    absolute rate beside it or inside: wheels, `ChangingInertia`. Source: notes, eqs 50, 91, for a
     body instead of a point. **Raises:** `TypeError` for a force on a state that only turns.
 
     >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
@@ -116,6 +123,11 @@ class BodyInFrame(eqx.Module):
         require_frame(self.frame, "BodyInFrame")
         if self.torque is not None:
             _checks.function(self.torque, "torque", "(t, state, body) → (3,), N m, or a law")
+
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """Times, s, where the torque jumps or has a kink."""
+        return jumps_within(self.torque)
 
     def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | FrameWrench:
         now = self.frame.at(t)

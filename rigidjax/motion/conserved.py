@@ -93,7 +93,9 @@ def conserved(
             found["momentum_along_axis"] = dot(momentum, axis) / jnp.where(length > 0, length, 1)
     if isinstance(turning, HasPose) and isinstance(body, MassProperties):
         plain = [(part, part.law if isinstance(part, Frozen) else part) for part in parts]
-        pushed = [part for part, law in plain if not isinstance(law, AbstractTorque)]
+        # A torque that feels the place may return a force, too.
+        turns = lambda law: isinstance(law, AbstractTorque) and law.feels is not HasPose  # noqa: E731
+        pushed = [part for part, law in plain if not turns(law)]
         if not pushed:
             found["linear_momentum"] = body.mass * turning.v
         if all(isinstance(part, CentralGravity) for part in [*outside, *pushed]):

@@ -36,6 +36,17 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
         return on_the_group(jax.tree.map(value, self.y0, self.coefficients))
 
 
+def onward(terms: Any, t0: Any, t1: Any) -> tuple[Array, Array]:
+    """The direction of a step, 1 or −1, and its length.
+
+    Backwards diffrax counts −t, so that `t1` is above `t0` all the same; only the control is
+    negative. A step is then one forwards, with slopes of the other sign: its stages are between.
+    """
+    h = jnp.asarray(terms.contr(t0, t1))
+    way = jnp.where(h < 0, -jnp.ones_like(h), jnp.ones_like(h))
+    return way, way * h
+
+
 def cubic_rows(rise: Any, h: Any, left: Any, right: Any) -> tuple[Any, Any, Any]:
     """F0, F1, F2 of the cubic with this `rise` over a step `h` and slopes `left` and `right`."""
     return rise, h * left - rise, 2 * rise - h * (left + right)
@@ -59,11 +70,11 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
     ) -> Any:
         validation.one_dtype(y0, "state")
         numbers, tree = ravel_pytree(y0)
+        way, h = onward(terms, t0, t1)
 
         def field(_: Any, t: Any, y: Array) -> Array:
-            return ravel_pytree(terms.vf(t, tree(y), args))[0]
+            return way.astype(y.dtype) * ravel_pytree(terms.vf(t, tree(y), args))[0]
 
-        h = jnp.asarray(terms.contr(t0, t1))
         step = Step(jnp.asarray(t0), h, jnp.asarray(t1), numbers)
         there = stages(self.tableau, field, [], step)
         # Once, after the stages: inside them it changes the order (jaxsim#192).

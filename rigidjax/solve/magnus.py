@@ -20,7 +20,7 @@ from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import product4
 from rigidjax.solve.components import join, split
 from rigidjax.solve.equal_steps import change_and_slope
-from rigidjax.solve.explicit import NestedInterpolation, cubic_rows
+from rigidjax.solve.explicit import NestedInterpolation, cubic_rows, onward
 from rigidjax.solve.tableaus import KUTTA4
 
 
@@ -87,20 +87,24 @@ class Magnus4(dfx.AbstractSolver):
     ) -> Any:
         start = split(y0)
         q, omega = start[:4], start[4:]
-        h = jnp.asarray(terms.contr(t0, t1), y0.omega.dtype)
+        way, h = (part.astype(y0.omega.dtype) for part in onward(terms, t0, t1))
         # A law that says that it does not depend on the attitude gets none.
         nowhere = jnp.full_like(y0.q, jnp.nan)
 
         def slope(t: Any, omega: Triple) -> Triple:
-            return split(terms.vf(t, Attitude(nowhere, jnp.stack(omega)), args).omega)
+            return split(way * terms.vf(t, Attitude(nowhere, jnp.stack(omega)), args).omega)
 
-        change, turn = change_and_turn(slope, lambda omega: omega, t0, t1, h, omega)
+        def rate(omega: Triple) -> Triple:
+            a, b, c = omega
+            return way * a, way * b, way * c
+
+        change, turn = change_and_turn(slope, rate, t0, t1, h, omega)
         change = join((*product4(q, turn), *change), y0)
         y1 = on_the_group(jax.tree.map(jnp.add, y0, change))
         left, right = terms.vf(t0, y0, args), terms.vf(t1, y1, args)
 
         def rows(a: Array, b: Array, k: Array, m: Array) -> Array:
-            return jnp.stack(cubic_rows(b - a, h, k, m))
+            return jnp.stack(cubic_rows(b - a, way * h, k, m))
 
         dense = dict(y0=y0, coefficients=jax.tree.map(rows, y0, y1, left, right))
         return y1, None, dense, None, dfx.RESULTS.successful

@@ -21,7 +21,7 @@ from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import evaluate, sees_rate
 from rigidjax.rotation import quaternion
-from rigidjax.solve.explicit import NestedInterpolation, cubic_rows
+from rigidjax.solve.explicit import NestedInterpolation, cubic_rows, onward
 from rigidjax.solve.magnus import require_attitude
 from rigidjax.solve.tableaus import numbers
 
@@ -231,17 +231,18 @@ def compose(
 
 def _dense_rows(terms: Any, t0: Any, t1: Any, args: Any, y0: Any, y1: Any) -> Any:
     """The quintic through both ends with first and second derivatives: of order 6."""
-    h = terms.contr(t0, t1)
+    way, length = onward(terms, t0, t1)
+    h = way * length
 
     def slopes(t: Any, y: Any) -> tuple[Any, Any]:
         t = jnp.asarray(t, y.q.dtype)
-        rate = terms.vf(t, y, args)
-        _, second = jax.jvp(lambda s, z: terms.vf(s, z, args), (t, y), (jnp.ones_like(t), rate))
+        rate, ahead = terms.vf(t, y, args), way.astype(t.dtype)
+        _, second = jax.jvp(lambda s, z: terms.vf(s, z, args), (t, y), (ahead, rate))
         return rate, second
 
     (f0, s0), (f1, s1) = slopes(t0, y0), slopes(t1, y1)
 
-    # Backwards, diffrax turns time round: the second derivative along the step keeps its sign.
+    # Backwards, diffrax's time falls as t rises; the second derivative keeps its sign.
     def rows(a: Array, b: Array, k: Array, m: Array, u: Array, v: Array) -> Array:
         step = jnp.asarray(h, a.dtype)
         rise, second, third = cubic_rows(b - a, step, k, m)

@@ -13,11 +13,12 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.validation import possible
-from rigidjax.frames import AbstractScene, MovingFrame, Point
+from rigidjax.frames import AbstractScene, BodyInFrame, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.torques import GravityGradient
+from rigidjax.motion.torques import ChangingInertia, GravityGradient
 from rigidjax.motion.torques.base import require_rung
+from rigidjax.motion.torques.composite import parts_of
 from rigidjax.rotation.validation import tolerance
 
 
@@ -52,6 +53,7 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
         scene_of(torque)
     if torque is not None and not isinstance(torque, AbstractScene | MovingFrame):
         require_rung(torque, state0)
+        _require_one_frame(torque)
     if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
         raise TypeError(
             f"Rigid moves as well as turns: wanted MassProperties, got {type(body).__name__}"
@@ -64,6 +66,23 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
         )
     if body is not None:
         _checks.single(body, type(body), "body")
+
+
+def _require_one_frame(torque: Any) -> None:
+    """Refuse laws of the absolute body rate in a moving frame, where states have a relative one."""
+
+    def within(law: Any) -> list[Any]:
+        inner = [p.torque for p in parts_of(law) if isinstance(p, BodyInFrame | ChangingInertia)]
+        return [*parts_of(law), *(part for one in inner for part in within(one))]
+
+    laws = within(torque)
+    for law in laws if any(isinstance(law, BodyInFrame) for law in laws) else ():
+        if hasattr(law, "internal_momentum") or isinstance(law, ChangingInertia):
+            raise TypeError(
+                f"{type(law).__name__} needs the body rate in an inertial frame, got one in a "
+                "moving frame (BodyInFrame, libration); solve in an inertial frame, for an orbit "
+                "with GravityGradient(mu, position) and a position of time"
+            )
 
 
 def one_dtype(tree: Any, name: str) -> Any:

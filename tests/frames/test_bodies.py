@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from frames.test_moving import NUMBERS, TIGHT, wobbly
+from surface.scenes import Kick
 
 import rigidjax as rj
 from rigidjax.frames import BodyInFrame, MovingFrame, Point
@@ -148,3 +149,36 @@ def test_a_force_on_what_only_turns_is_refused():
     law = BodyInFrame(FRAME, rj.torques.UniformGravity([0.0, 0, -9.8]))
     with pytest.raises(TypeError, match="UniformGravity gives a force, got a state Attitude"):
         law(0.0, ATTITUDE, BODY)
+
+
+# 10 ms of 20 after 2 s: steps of an adaptive solver pass over it.
+KICK = Kick(rj.torques.Held([0.0, 2.0, 2.01], [[0.0, 0, 0], [0.0, 0, 20.0], [0.0, 0, 0]]))
+TURN = MovingFrame(rj.frames.Uniform([0.0, 0, 0.3]))
+
+
+@pytest.mark.parametrize("scene", [InFrame(TURN, KICK), rj.frames.Force(KICK)])
+def test_a_scene_passes_on_the_times_at_which_its_force_jumps(scene):
+    motion = rj.simulate(None, Point([0.1, 0.2, 0.0], [0.0, 0.0, 0.5]), [0.0, 5.0], scene).ys
+    np.testing.assert_allclose(motion.v[-1, 2], 0.7, rtol=0, atol=1e-9)
+
+
+def test_a_body_in_a_frame_feels_a_short_pulse():
+    sphere, start = rj.Inertia(2.0 * jnp.eye(3)), rj.Attitude([1.0, 0, 0, 0], np.zeros(3))
+    turned = rj.simulate(sphere, start, [0.0, 5.0], BodyInFrame(TURN, KICK)).ys
+    np.testing.assert_allclose(turned.omega[-1, 2], 0.1, rtol=0, atol=1e-9)
+
+
+@pytest.mark.usefixtures("unhooked")
+@pytest.mark.parametrize(
+    "law",
+    [
+        rj.torques.Sum(rj.scenes.libration(0.3), rj.torques.Flywheel([0.0, 0, 2.0])),
+        BodyInFrame(TURN, rj.torques.Flywheel([0.0, 0, 2.0])),
+        rj.torques.ChangingInertia(lambda t: (1 + t) * jnp.eye(3), BodyInFrame(TURN)),
+    ],
+    ids=["sum", "inside", "outside"],
+)
+def test_a_law_of_the_absolute_rate_is_refused_in_a_moving_frame(law):
+    # The states in S' have the relative rate: h × Ω was wrong by h × W, and nothing said so.
+    with pytest.raises(TypeError, match="needs the body rate in an inertial frame"):
+        rj.simulate(INERTIA, ATTITUDE, [0.0, 1.0], law)

@@ -11,6 +11,7 @@ from once import once
 
 import rigidjax as rj
 from rigidjax import torques
+from rigidjax.motion import HasPose
 from rigidjax.motion.conserved import conserved, drift, energy
 from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
 from rigidjax.motion.torques import base
@@ -139,6 +140,13 @@ FALL, CENTRE = torques.UniformGravity([0.3, -0.4, -9.7]), torques.CentralGravity
 ALL = ["momentum", "momentum_squared"]
 
 
+class Push(torques.AbstractTorque):
+    feels = HasPose
+
+    def __call__(self, t, state, body):
+        return torques.Wrench([1.0, 0.0, 0.0])
+
+
 @pytest.mark.parametrize(
     ("law", "state", "names"),
     [
@@ -162,6 +170,7 @@ ALL = ["momentum", "momentum_squared"]
         (torques.Sum(CENTRE, WHEEL), RIGID, ["energy", "momentum_about_origin"]),
         (torques.Sum(FALL, torques.Drag(0.3)), RIGID, []),
         (torques.Sum(FALL, DIPOLE), RIGID, ["energy", "momentum_along_axis"]),
+        (Push(), RIGID, []),
     ],
 )
 def test_what_is_said_to_be_conserved_is(law, state, names):

@@ -173,3 +173,16 @@ def records() -> tuple:
         for name in ("a", "b")
         for k in (3, 6, 9)
     )
+
+
+class Kick(eqx.Module):
+    """A force per mass, or a torque, from a schedule."""
+
+    schedule: rj.torques.Held
+
+    @property
+    def jump_times(self):
+        return self.schedule.jump_times
+
+    def __call__(self, t, state, body=None):
+        return self.schedule(t)

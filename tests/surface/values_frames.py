@@ -6,7 +6,7 @@ import mpmath as mp
 import numpy as np
 from scipy.integrate import solve_ivp
 from surface import values as v
-from surface.scenes import Place, Quadratic
+from surface.scenes import Kick, Place, Quadratic
 from surface.values import between, fixed, leave_out, one_of, scale, way
 from surface.values_bodies import tensor_of
 from surface.values_motion import slope
@@ -183,6 +183,23 @@ way(
     lambda axis, k, place, t, s, q, w: frames.BodyInFrame(moving(axis, k, place))(
         t, rj.Attitude(q, w), rj.Inertia.from_second_moment(s)),
     (*FRAME, lambda rng, i: v.second_moment(rng, 0), v.quaternion, v.ordinary), in_body, norm=True,
+)  # fmt: skip
+
+
+def jumping(ts):
+    kick, frame = (
+        Kick(rj.torques.Held(ts, jnp.ones((3, 3)))),
+        frames.MovingFrame(frames.Uniform(ts)),
+    )
+    scene = InFrame(frame, inside=kick, outside=Kick(rj.torques.Held(3 + ts, jnp.ones((3, 3)))))
+    laws = frames.Force(kick), frames.BodyInFrame(frame, kick), frames.BodyInFrame(frame), scene
+    return [law.jump_times for law in laws]
+
+
+way(
+    "frames.Force.jump_times frames.BodyInFrame.jump_times frames.InFrame.jump_times",
+    jumping, fixed(np.array([1.0, 2.0, 3.5])),
+    lambda ts: [ts, ts, np.zeros(0), np.array([*ts, *(3 + ts)])],
 )  # fmt: skip
 
 
