@@ -14,6 +14,7 @@ from rigidjax.identify.causes import clock
 from rigidjax.identify.flat_limit import of_charts
 from rigidjax.identify.freedom import freedom_of
 from rigidjax.identify.noise import median_of_chi2
+from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import charts, quantities as quantities_of, values_and_slopes
 from rigidjax.identify.result import Fit, Start
@@ -192,6 +193,19 @@ def _search(
     return Answer(FOUND, (*interrupted, *remarks))
 
 
+def _rivals(
+    good: Sequence[Start], best_cost: float, margin: float, linear: Linearised, value: Parameters
+) -> int:
+    """How many of the starts that fit as well ended elsewhere."""
+    count = 0
+    for item in good:
+        if item.converged and item.cost > best_cost + 0.01 * margin:
+            away = ravel_pytree(item.parameters)[0] - ravel_pytree(value)[0]
+            # In a flat valley readings do not tell two points apart.
+            count += linear.along(np.asarray(away)) > 2 * margin
+    return count
+
+
 def assess(
     problem: Problem,
     best: Tried,
@@ -211,7 +225,6 @@ def assess(
     spread = uncertainty.spread(linear, times, white)
     numbers, of = values_and_slopes(problem, value, near), charts(problem)
     freedom = freedom_of(problem, value, linear, times, white.seen)
-    degrees = freedom.of(numbers[1])
     limits = flat_limit.limits(problem, numbers, -white.seen @ linear.slope, [n for n, _ in of])
     # Steps stay short in a long curved valley, although hardly anything is left to gain.
     held = [limit.slope for limit in limits if limit.free < 0]
@@ -224,16 +237,10 @@ def assess(
     margin = 10.0 * unit * max(times.longest, 1.0)
 
     level = best_cost + margin if believable else -np.inf
-    starts, rivals = [], []
-    for item in tried:
-        cost, found = float(item.cost), bool(item.converged)
-        starts.append(Start(item.parameters, cost, found, cost <= level))
-        if cost <= level and found and cost > best_cost + 0.01 * margin:
-            away = ravel_pytree(item.parameters)[0] - ravel_pytree(value)[0]
-            # In a flat valley readings do not tell two points apart.
-            if linear.along(np.asarray(away)) > 2 * margin:
-                rivals.append(item)
-    rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere" if rivals else ""
+    ends = [(t.parameters, float(t.cost), bool(t.converged)) for t in tried]
+    starts = [Start(*end, end[1] <= level) for end in ends]
+    rivals = _rivals([s for s in starts if s.fits], best_cost, margin, linear, value)
+    rival = f"{rivals} of {len(starts)} starts fit as well elsewhere" if rivals else ""
     if believable and not any(start.fits for start in starts):
         remarks = ("no single start came near the best point", *remarks)
     unreal = of_charts(of, flat_limit.bodies_of(problem, value))
@@ -252,7 +259,9 @@ def assess(
         times.independent,
         jnp.asarray(spread.singular_values),
         jnp.asarray(spread.null_directions),
-        quantities_of(problem, numbers, spread.seen, spread.null_directions, limits, degrees),
+        quantities_of(
+            problem, numbers, spread.seen, spread.null_directions, limits, freedom.of(numbers[1])
+        ),
         _search(best_cost, done, rival, interrupted, remarks),
         model,
         left,
