@@ -191,6 +191,24 @@ def test_what_is_said_to_be_conserved_is(law, state, names):
         np.testing.assert_allclose(rate, np.zeros_like(rate), atol=2e-13, err_msg=name)
 
 
+HELD = torques.Held([0.0, 1.0], np.zeros((2, 3)))
+
+
+@pytest.mark.usefixtures("unhooked")
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: torques.Flywheel(HELD),
+        lambda: torques.Flywheel(torques.Delayed(torques.Input("h"), 0.1)),
+        lambda: torques.ChangingInertia(torques.Held([0.0, 1.0], np.zeros((2, 3, 3)))),
+    ],
+)
+def test_a_momentum_that_jumps_is_refused(make):
+    # Its derivative was zero everywhere: the body did not feel that the wheel was spun up.
+    with pytest.raises(TypeError, match="wanted a function of time without jumps"):
+        make()
+
+
 def test_damping_takes_the_energy_that_it_should():
     law = torques.Sum(torques.Damping([0.1, 0.2, 0.3]), torques.QuadraticDamping([0.3, 0.1, 0.2]))
     rate = EulerEquations(INERTIA, law)(0.0, SPIN)

@@ -13,6 +13,7 @@ from rigidjax._types import HasAttitude, HasSpin, Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import Inertia, tensor_of, with_tensor
 from rigidjax.body.symmetric3 import from_components
 from rigidjax.motion.torques import base
+from rigidjax.motion.torques.inputs import require_no_jumps
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, components, cross, dot, solve
 
@@ -83,8 +84,9 @@ class ChangingInertia(eqx.Module):
     **Arguments:** `inertia` kg m², body frame, about the point that the body turns about (the
     centre of mass of a `Rigid`): a function of time, t → (3, 3), such as `Linear(times, tensors)`,
     or a Module with `feels` (as torques have) of `(t, state, body)`, such as `Tide`. Its derivative
-    along the motion is taken. `torque` all other torques, or `None`: give them here, not beside it
-    in a `Sum`, because their τ acts on I, and they get the body with I.
+    along the motion is taken: it must not jump (`Held`). `torque` all other torques, or `None`:
+    give them here, not beside it in a `Sum`, because their τ acts on I, and they get the body with
+    I.
 
     A function of time replaces the inertia of the body given to `simulate`. Parts that move inside
     must have no momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend
@@ -108,6 +110,7 @@ class ChangingInertia(eqx.Module):
             base.require_law(inertia, "inertia")
         else:
             _checks.function(inertia, "inertia", "of time to (3, 3), kg m²")
+            require_no_jumps(inertia, "inertia")
         self.inertia = inertia
         if torque is not None:
             base.require_law(torque)

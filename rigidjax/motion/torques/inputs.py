@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.motion.torques.base import jumps_of
+from rigidjax.motion.torques.piecewise import Held
 from rigidjax.motion.torques.states import has_states
 
 Law = TypeVar("Law")
@@ -145,6 +146,16 @@ class Lagged(eqx.Module):
 
     def __call__(self, t: ScalarLike, own: Array) -> Array:
         return own
+
+
+def require_no_jumps(source: Any, name: str) -> None:
+    """Raise `TypeError` for held samples: a law that takes their derivative loses the jumps."""
+    inner = source.source if isinstance(source, Delayed) else source
+    if isinstance(inner, Held | Input):
+        raise TypeError(
+            f"{name}: wanted a function of time without jumps, since its derivative acts on the "
+            f"body, got {type(inner).__name__}; take Linear(times, values)"
+        )
 
 
 def _channels(value: Any, name: str) -> Array:

@@ -13,6 +13,7 @@ from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import Body, Inertia, MassProperties, tensor_of, with_tensor
 from rigidjax.body.symmetric3 import outer
 from rigidjax.motion.torques import base
+from rigidjax.motion.torques.inputs import require_no_jumps
 from rigidjax.motion.torques.states import has_states
 from rigidjax.rotation.linalg3 import cross
 
@@ -25,7 +26,8 @@ class Flywheel(base.OfTime):
     """The torque of internal wheels on the body: `τ = h × Ω − dh/dt`.
 
     **Arguments:** `momentum` h, N m s, body frame, the sum over all wheels: (3,) for wheels of
-    constant speed, or a callable Module of time, t → (3,), such as `Linear(times, values)`.
+    constant speed, or a callable Module of time, t → (3,), such as `Linear(times, values)`; not one
+    that jumps (`Held`, `Input`): dh/dt acts on the body.
 
     The body's `Inertia` must fit h. If it includes the wheels as locked, h is their momentum
     relative to the body. If the wheels' axial moments are subtracted (I − Σ J a aᵀ), h is their
@@ -46,6 +48,7 @@ class Flywheel(base.OfTime):
         if has_states(momentum):
             words = "wanted a momentum whose derivative by time is known, got one with states"
             raise TypeError(f"Flywheel: {words}; see ReactionWheels")
+        require_no_jumps(momentum, "momentum")
 
     def internal_momentum(self, t: ScalarLike) -> Vec3:
         """The wheels' momentum h at `t`, (3,), N m s, body frame."""
