@@ -61,7 +61,7 @@ def ends(
     def end(side: float) -> np.ndarray:
         free = middle + side * np.sqrt(square)
         held = middle - rho * away
-        held = held + side * np.sqrt((1.0 - rho**2) * max(square - away**2, 0.0))
+        held = held + side * np.sqrt((1.0 - rho**2) * np.maximum(square - away**2, 0.0))
         return np.where(away + rho * (free - middle) >= 0, free, held)
 
     return end(-1.0), end(1.0)
