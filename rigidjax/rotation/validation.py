@@ -78,13 +78,15 @@ def near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"
 def unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
     """Normalise a quaternion that is nearly a unit one; refuse any other."""
     q = _checks.finite(q, name)
-    known = _checks.known(q)
-    length = jnp.sqrt((q * q).sum(-1, keepdims=True))
+    # Under `jit` JAX traces what is computed from known numbers, too; NumPy does not.
+    xp = _checks.namespace(q)
+    with np.errstate(over="ignore"):
+        length = xp.sqrt((xp.asarray(q) ** 2).sum(-1, keepdims=True))
     words = f"{name}: zero quaternion; it is no rotation (w, x, y, z)"
     q = _checks.refuse(q, (length == 0).any(), words)
-    off = jnp.abs(length - 1)
+    off = xp.abs(length - 1)
     limit = tolerance(q.dtype)
-    found = f", its length is {float(length.ravel()[jnp.argmax(off)]):.6g}" if known else ""
+    found = f", its length is {length.ravel()[off.argmax()]:.6g}" if xp is np else ""
     words = f"{name}: not a unit quaternion{found} (limit 1 ± {limit:g}); use quaternion.normalise"
     q = _checks.refuse(q, ~(off.max() <= limit), words)
     return q / length

@@ -88,3 +88,13 @@ def test_wrong_shapes_and_types(unhooked):
     # Whole numbers are promoted.
     np.testing.assert_allclose(so3.exp(np.array([0, 0, 1])), so3.exp(np.array([0.0, 0.0, 1.0])))
     assert quaternion.exp([0, 0, 1]).dtype == jnp.result_type(float)
+
+
+def test_known_quaternions_within_a_compiled_function():
+    turn = jnp.array([np.cos(0.2), np.sin(0.2), 0.0, 0.0])
+    both = jnp.stack([jnp.array([1.0, 0.0, 0.0, 0.0]), turn])
+    found = jax.jit(lambda w: so3.mean_quaternion(both, w))(jnp.ones(2))
+    np.testing.assert_allclose(found, [np.cos(0.1), np.sin(0.1), 0, 0], atol=1e-15)
+    large = 1e200 * both
+    with pytest.raises(ValueError, match="its length is inf"):
+        jax.jit(lambda w: so3.mean_quaternion(large, w))(jnp.ones(2))
