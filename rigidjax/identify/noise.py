@@ -93,7 +93,9 @@ def _shares(problem: Problem, found: Any, noise: Noise, parameters: Parameters) 
     """The share of its errors that fitted numbers leave each sensor and group of recordings."""
     groups, readings = np.asarray(problem.noise_groups), problem.records.readings
     sizes = [np.bincount(groups, one.kept.sum(axis=(1, 2))) for one in readings]
-    if len(readings) * sizes[0].size == 1:
+    held = problem.prior, problem.rows, *((slot.prior, slot.spread) for slot in problem.slots)
+    if len(readings) * sizes[0].size == 1 and not jax.tree.leaves(held):
+        # All numbers come from the readings of one noise.
         taken = [np.array([sum(leaf.size for leaf in jax.tree.leaves(parameters))])]
     else:
         linear = linearise(problem, parameters, noise, found)

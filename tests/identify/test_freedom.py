@@ -86,6 +86,16 @@ def test_a_shared_number_of_few_recordings_has_the_interval_of_student():
     )
 
 
+def test_a_number_that_a_prior_knows_takes_nothing_from_the_errors():
+    random, times = np.random.default_rng(1), jnp.linspace(0.0, 1.0, 4)
+    rates = 1.0 + 0.1 * random.normal(size=(4, 3))
+    record = identify.Recording(times, (identify.Gyro(bias=[0.0, 0.0, 0.0]), rates))
+    bias = identify.Free(lambda r: r.readings[0].sensor.bias, "bias", prior=1e-6)
+    found = identify.fit(identify.Problem(record, identify.Known(SPHERE), free=[bias]), starts=1)
+    wanted = np.sqrt(np.sum((rates - rates.mean(axis=0)) ** 2) / (3 * 3))
+    np.testing.assert_allclose(found.noise[0], wanted, rtol=1e-3)
+
+
 def test_quantiles():
     degrees = np.array([1.0, 2.0, 5.0, 300.0, np.inf])
     wanted = [*scipy.stats.t.ppf(0.95, degrees[:-1]), scipy.stats.norm.ppf(0.95)]
