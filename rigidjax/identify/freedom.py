@@ -10,7 +10,7 @@ from rigidjax.identify.parameters import Parameters, by_slot, numbered
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.uncertainty import Linearised, Times
 
-# From so many degrees on, an interval is at most 1.3 % wider than with infinitely many.
+# From so many degrees on, a 95 % interval is at most 1.3 % wider than with infinitely many.
 PLENTY = 100.0
 
 
@@ -34,8 +34,8 @@ class Freedom(eqx.Module):
     def of(self, slope: np.ndarray) -> np.ndarray:
         """Degrees of freedom of the variance of functions with this derivative (…, n).
 
-        Each noise and each width counts by its share of the variance. Source: Satterthwaite 1946,
-        doi:10.2307/3002019.
+        Each noise and each width counts by its share of the variance; where all noises have
+        `PLENTY`, the least counts for all. Source: Satterthwaite 1946, doi:10.2307/3002019.
         """
         along = slope @ self.covariance
         variance = np.maximum(np.sum(along * slope, axis=-1), 1e-300)
@@ -91,7 +91,10 @@ def leverages(
 
 
 def quantile(level: float, freedom: np.ndarray | float) -> np.ndarray:
-    """Half-width of an interval in standard deviations: Student's, Gauss' for infinite freedom."""
+    """Half-width of an interval in standard deviations: Student's, Gauss' for infinite freedom.
+
+    **Raises** `ValueError` for a `level` outside (0, 1).
+    """
     level = _checks.fraction(level, "level", "a level between 0 and 1")
     from scipy.special import ndtri, stdtrit
 
