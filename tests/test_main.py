@@ -19,7 +19,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import __main__ as command
 from rigidjax.__main__ import main
-from rigidjax.identify.answers import Answer
+from rigidjax.identify.answer.answers import Answer
 
 GOOD = "t,wx,wy,wz\n" + "\n".join(f"{k},{np.cos(k):.6f},{np.sin(k):.6f},1.0" for k in range(12))
 

@@ -19,7 +19,7 @@ from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia
-from rigidjax.identify.body_charts import AbstractBodyChart
+from rigidjax.identify.model.charts import AbstractBodyChart
 from rigidjax.motion import Attitude
 from rigidjax.motion.torques import ChangingInertia, Chebyshev, GravityGradient, Sum, Tide
 from rigidjax.motion.torques.base import evaluate

@@ -17,12 +17,12 @@ from jaxtyping import Array
 from rigidjax import exact
 from rigidjax._names import show
 from rigidjax.body import spatial_angular_momentum
-from rigidjax.identify.body_charts import PrincipalRatios
-from rigidjax.identify.loss import SoftL1
-from rigidjax.identify.problem import Problem
-from rigidjax.identify.recording import Recording
+from rigidjax.identify.answer.result import Fit
+from rigidjax.identify.data.recording import Recording
+from rigidjax.identify.model.charts import PrincipalRatios
+from rigidjax.identify.model.priors import SoftL1
+from rigidjax.identify.model.problem import Problem
 from rigidjax.identify.report import Row
-from rigidjax.identify.result import Fit
 from rigidjax.identify.sensors import AttitudeSensor, Gyro
 from rigidjax.rotation import euler
 

@@ -6,26 +6,26 @@ motion under random torques.
 """
 
 from rigidjax._names import show
-from rigidjax.estimate.density import LogDensity as LogDensity
-from rigidjax.estimate.filter import (
+from rigidjax.identify.filtering.filter import (
     filter as filter,
     log_likelihood as log_likelihood,
     start as start,
     step as step,
 )
-from rigidjax.estimate.linear import (
+from rigidjax.identify.filtering.linear import (
     LinearModel as LinearModel,
     linear_filter as linear_filter,
     linear_smooth as linear_smooth,
 )
-from rigidjax.estimate.posterior import (
+from rigidjax.identify.filtering.smoother import smooth as smooth
+from rigidjax.identify.filtering.steps import Model as Model, Walk as Walk, sample as sample
+from rigidjax.identify.inference.density import LogDensity as LogDensity
+from rigidjax.identify.inference.draws import (
     Nuts as Nuts,
     Posterior as Posterior,
     Refit as Refit,
     posterior as posterior,
     refit as refit,
 )
-from rigidjax.estimate.scene import Model as Model, Walk as Walk, sample as sample
-from rigidjax.estimate.smoother import smooth as smooth
 
 show(__name__)

@@ -2,7 +2,19 @@
 
 from rigidjax._names import show
 from rigidjax.identify import report as report
-from rigidjax.identify.body_charts import (
+from rigidjax.identify.answer.fit import fit as fit
+from rigidjax.identify.answer.result import Fit as Fit
+from rigidjax.identify.csv_io import read_table as read_table
+from rigidjax.identify.data.recording import Recording as Recording
+from rigidjax.identify.data.windows import Windows as Windows, windows as windows
+from rigidjax.identify.inference.compare import compare as compare, cross_validate as cross_validate
+from rigidjax.identify.inference.design import (
+    best_first_rate as best_first_rate,
+    expected as expected,
+    fisher as fisher,
+)
+from rigidjax.identify.inference.profile import profile as profile
+from rigidjax.identify.model.charts import (
     AbstractBodyChart as AbstractBodyChart,
     Known as Known,
     Mass as Mass,
@@ -11,34 +23,25 @@ from rigidjax.identify.body_charts import (
     Ratios as Ratios,
     Tensor as Tensor,
 )
-from rigidjax.identify.compare import compare as compare, cross_validate as cross_validate
-from rigidjax.identify.csv_io import read_table as read_table
-from rigidjax.identify.design import (
-    best_first_rate as best_first_rate,
-    expected as expected,
-    fisher as fisher,
+from rigidjax.identify.model.free import (
+    Free as Free,
+    Parameters as Parameters,
+    Unpacked as Unpacked,
 )
-from rigidjax.identify.fit import fit as fit
-from rigidjax.identify.loss import (
+from rigidjax.identify.model.predict import (
+    Adaptive as Adaptive,
+    FixedSteps as FixedSteps,
+    simulate_readings as simulate_readings,
+)
+from rigidjax.identify.model.priors import (
     AbstractLoss as AbstractLoss,
     Entropic as Entropic,
     Huber as Huber,
     SoftL1 as SoftL1,
 )
-from rigidjax.identify.parameters import (
-    Free as Free,
-    Parameters as Parameters,
-    Unpacked as Unpacked,
-)
-from rigidjax.identify.problem import Problem as Problem
-from rigidjax.identify.profile import profile as profile
-from rigidjax.identify.propagation import (
-    Adaptive as Adaptive,
-    FixedSteps as FixedSteps,
-    simulate_readings as simulate_readings,
-)
-from rigidjax.identify.recording import Recording as Recording
-from rigidjax.identify.result import Fit as Fit
+from rigidjax.identify.model.problem import Problem as Problem
+from rigidjax.identify.search.stochastic_gradient import Descent as Descent
+from rigidjax.identify.search.window_fit import WindowFit as WindowFit, fit_windows as fit_windows
 from rigidjax.identify.sensors import (
     AbstractSensor as AbstractSensor,
     Accelerometer as Accelerometer,
@@ -53,8 +56,5 @@ from rigidjax.identify.sensors import (
     SensorInput as SensorInput,
     Velocity as Velocity,
 )
-from rigidjax.identify.stochastic_gradient import Descent as Descent
-from rigidjax.identify.window_fit import WindowFit as WindowFit, fit_windows as fit_windows
-from rigidjax.identify.windows import Windows as Windows, windows as windows
 
 show(__name__)

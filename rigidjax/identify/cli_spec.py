@@ -11,23 +11,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax.identify import body_charts, csv_io
+from rigidjax.identify import csv_io
 from rigidjax.identify.csv_io import UNITS, USUAL as USUAL, LogError, layout_of as layout_of
-from rigidjax.identify.loss import Huber, SoftL1
-from rigidjax.identify.parameters import Free
-from rigidjax.identify.problem import Problem
-from rigidjax.identify.recording import Recording
+from rigidjax.identify.data.recording import Recording
+from rigidjax.identify.model import charts
+from rigidjax.identify.model.free import Free
+from rigidjax.identify.model.priors import Huber, SoftL1
+from rigidjax.identify.model.problem import Problem
 from rigidjax.identify.sensors import AbstractSensor, Accelerometer, AttitudeSensor, Gyro
 from rigidjax.motion.torques import Damping, Flywheel, Series, Sum, Wheel
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation import euler
 
 # Of the typical size of a moment, kg m².
-MODELS: dict[str, Callable[[float], body_charts.AbstractBodyChart]] = {
-    "ratios": lambda _: body_charts.Ratios(),
-    "principal-ratios": lambda _: body_charts.PrincipalRatios(),
-    "tensor": body_charts.Tensor,
-    "principal": body_charts.Principal,
+MODELS: dict[str, Callable[[float], charts.AbstractBodyChart]] = {
+    "ratios": lambda _: charts.Ratios(),
+    "principal-ratios": lambda _: charts.PrincipalRatios(),
+    "tensor": charts.Tensor,
+    "principal": charts.Principal,
 }
 LOSSES = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}
 # The units of each kind of sensor, the usual one first; angles have those of "euler".

@@ -13,7 +13,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax._names import show
-from rigidjax.identify.result import Fit, one_fit
+from rigidjax.identify.answer.result import Fit, one_fit
 
 _UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
 Row = tuple[str, float, float, float, str]

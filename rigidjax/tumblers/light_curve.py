@@ -13,15 +13,17 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks, exact
 from rigidjax.body.inertia import Inertia, tensor_of
-from rigidjax.identify import answers, padding, uncertainty
-from rigidjax.identify.answers import FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
-from rigidjax.identify.body_charts import Bodies
-from rigidjax.identify.fit import fit
-from rigidjax.identify.parameters import Parameters
-from rigidjax.identify.problem import Problem, one_problem
-from rigidjax.identify.quantities import carried, quantities, values_and_slopes
-from rigidjax.identify.result import Fit
-from rigidjax.identify.search import Tried
+from rigidjax.identify.answer import answers
+from rigidjax.identify.answer.answers import FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
+from rigidjax.identify.answer.fit import fit
+from rigidjax.identify.answer.result import Fit
+from rigidjax.identify.data import stacking
+from rigidjax.identify.model.charts import Bodies
+from rigidjax.identify.model.free import Parameters
+from rigidjax.identify.model.problem import Problem, one_problem
+from rigidjax.identify.search.stages import Tried
+from rigidjax.identify.uncertainty import covariance as uncertainty
+from rigidjax.identify.uncertainty.quantities import carried, quantities, values_and_slopes
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot
 from rigidjax.tumblers.search import MAGNITUDE, descended, noise_of, relative_flux, starts_of
@@ -153,7 +155,7 @@ def fit_light_curve(
     say(f"{used} pairs of frequencies, χ² {found.misfits[0]:.6g} of {found.dof}")
     say(f"{len(starts)} starts")
     sigma = noise_of(problem, reading, flux, found)
-    whole = padding.of_few_lengths(problem)
+    whole = stacking.of_few_lengths(problem)
     ends = descended(whole, starts, sigma, tolerance)
     aliases = _aliases(whole, ends)
     say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
@@ -183,7 +185,7 @@ def _only(problem: Problem) -> Any:
         raise ValueError("fit_light_curve: wanted one body, got several by name")
     if problem.records.torque is not None:
         raise ValueError("fit_light_curve: wanted a free body, got a torque")
-    return padding.one(readings[0], 0)
+    return stacking.one(readings[0], 0)
 
 
 @eqx.filter_jit
@@ -236,7 +238,7 @@ def _half_way(parameters: Parameters, problem: Problem) -> Float[Array, "times 3
     """Directions half way between sun and observer, body frame."""
     body, state0 = problem.unpack(parameters)
     motion, t = exact.FreeBody(Inertia(tensor_of(body)), state0), problem.records.t[0]
-    sensor = padding.one(problem.records.readings[0], 0).sensor
+    sensor = stacking.one(problem.records.readings[0], 0).sensor
 
     def at(now: Array) -> Array:
         state: Any = motion(now - t[0])
@@ -248,7 +250,7 @@ def _half_way(parameters: Parameters, problem: Problem) -> Float[Array, "times 3
 def _with_shape(best: Fit) -> Fit:
     """The fit with a covariance that allows for a body that is no ellipsoid."""
     linear = uncertainty.linearise(best.problem, best.parameters, best.noises, near=best.near)
-    reading, weight = padding.one(best.problem.records.readings[0], 0), linear.weights[0][0]
+    reading, weight = stacking.one(best.problem.records.readings[0], 0), linear.weights[0][0]
     flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
     size = np.full(weight.shape, 1.0 / MAGNITUDE) if reading.sensor.unit == "mag" else flux
     n = np.asarray(_half_way(best.parameters, best.problem))

@@ -10,11 +10,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import Inertia
-from rigidjax.identify.levenberg_marquardt import CAREFUL, Settings, search
-from rigidjax.identify.normal import Normal
-from rigidjax.identify.parameters import Parameters
-from rigidjax.identify.problem import Problem
-from rigidjax.identify.search import Tried
+from rigidjax.identify.model.free import Parameters
+from rigidjax.identify.model.problem import Problem
+from rigidjax.identify.search.least_squares import CAREFUL, Settings, search
+from rigidjax.identify.search.normal import Normal
+from rigidjax.identify.search.stages import Tried
 from rigidjax.rotation import quaternion
 from rigidjax.tumblers import starts
 from rigidjax.tumblers.sensor import half_way

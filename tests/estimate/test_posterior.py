@@ -14,8 +14,8 @@ from estimate import records
 
 import rigidjax as rj
 from rigidjax import estimate, identify
-from rigidjax.estimate.density import curvature
-from rigidjax.identify.answers import Answer
+from rigidjax.identify.answer.answers import Answer
+from rigidjax.identify.inference.density import curvature
 
 
 @functools.cache

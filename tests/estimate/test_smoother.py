@@ -10,7 +10,7 @@ from once import once
 
 import rigidjax as rj
 from rigidjax import estimate, identify
-from rigidjax.estimate.scene import Dynamics, Extended
+from rigidjax.identify.filtering.steps import Dynamics, Extended
 from rigidjax.motion.manifold import minus, plus
 
 COUNT = 5

@@ -27,9 +27,9 @@ jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
 from rigidjax import identify, torques
-from rigidjax.identify import window_fit
-from rigidjax.identify.levenberg_marquardt import Settings
-from rigidjax.identify.windows import by_horizon
+from rigidjax.identify.data.windows import by_horizon
+from rigidjax.identify.search import window_fit
+from rigidjax.identify.search.least_squares import Settings
 
 _spec = importlib.util.spec_from_file_location(
     "nanodrone", Path(__file__).with_name("bench_nanodrone.py")

@@ -7,7 +7,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.quantities import quantities, values_and_slopes
+from rigidjax.identify.uncertainty.quantities import quantities, values_and_slopes
 
 RECORDS = 200
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.reference_states import attitudes, rates
+from rigidjax.identify.data.reference_states import attitudes, rates
 
 TS = np.linspace(0.0, 1.0, 30)
 PLACES = np.array([[0.1, 0.0, 0.0], [0.0, 0.2, 0.0], [-0.1, -0.1, 0.15], [0.0, 0.1, -0.1]])

@@ -16,7 +16,6 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify import padding
 
 BRICK = Path(__file__).parents[3] / "shared" / "data" / "nesc_brick" / "tumbling_brick.csv"
 MOMENTS = np.array([1.0, 1.6, 2.1])
@@ -287,7 +286,7 @@ def test_a_record_of_another_length_is_the_same_program(caplog):
     assert not programs & {"descend", "_errors_alone", "_linearised", "value_and_slope"}
     assert short.residuals[0].shape == (92, 3) and short.problem.recording.t.shape == (92,)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(padding, "of_few_lengths", lambda problem: problem)
+        patch.setattr(stacking, "of_few_lengths", lambda problem: problem)
         plain = fitted(92)
     assert short.status == plain.status and short.independent == plain.independent
     assert jax.tree.structure(short) == jax.tree.structure(plain)

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify import flat_limit
+from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.rotation import so3
 
 T = jnp.linspace(0.0, 0.8, 80)

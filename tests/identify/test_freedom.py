@@ -7,7 +7,7 @@ import scipy.stats
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.freedom import quantile
+from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
 SPHERE = rj.Inertia.from_principal(1.0, 1.0, 1.0)
 

@@ -7,8 +7,8 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import estimate, identify
-from rigidjax.estimate.scene import sensors_of
-from rigidjax.identify.terms import independent
+from rigidjax.identify.filtering.steps import sensors_of
+from rigidjax.identify.model.terms import independent
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
 TRUTH = np.array([1.0 / 2.1, 1.6 / 2.1])

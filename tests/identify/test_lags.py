@@ -6,7 +6,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify, torques
-from rigidjax.identify.multiple_shooting import pieces
+from rigidjax.identify.search.multiple_shooting import pieces
 
 BODY = rj.Inertia.from_principal(1.0, 2.0, 2.5)
 TS = np.linspace(0.0, 4.0, 81)

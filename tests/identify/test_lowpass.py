@@ -9,10 +9,10 @@ from scipy import signal
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.padding import one
-from rigidjax.identify.parameters import local
+from rigidjax.identify.data.stacking import one
+from rigidjax.identify.model.free import local
+from rigidjax.identify.model.terms import errors_of_one
 from rigidjax.identify.sensors import SensorInput
-from rigidjax.identify.terms import errors_of_one
 
 BODY = rj.Inertia.from_principal(1.0, 2.0, 2.7)
 

@@ -17,13 +17,15 @@ from jax.flatten_util import ravel_pytree
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.__main__ import main
-from rigidjax.identify import checkpoint, cli_spec, quantities, search
+from rigidjax.identify import cli_spec
 from rigidjax.identify.csv_io import LogError
-from rigidjax.identify.multiple_shooting import pieces
-from rigidjax.identify.padding import one
-from rigidjax.identify.parameters import local, places
-from rigidjax.identify.search import Tried
-from rigidjax.identify.terms import errors_of_one, with_blocks
+from rigidjax.identify.data.stacking import one
+from rigidjax.identify.model.free import local, places
+from rigidjax.identify.model.terms import errors_of_one, with_blocks
+from rigidjax.identify.search import checkpoint
+from rigidjax.identify.search.multiple_shooting import pieces
+from rigidjax.identify.search.stages import Tried
+from rigidjax.identify.uncertainty import quantities
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
 DRAG = [0.05, 0.08, 0.02]
@@ -252,7 +254,7 @@ def test_many_starts_in_one_vmap_end_where_they_do_one_by_one(free_record):
 def test_a_fit_killed_after_any_stride_ends_at_the_same_bits(short_record, tmp_path, monkeypatch):
     """The damping of the strides to come depends on those that were, not on the process."""
     # Steps in strides of three, so that one start has many of them.
-    monkeypatch.setattr(search, "STRIDE", 3)
+    monkeypatch.setattr(stages, "STRIDE", 3)
     problem = identify.Problem(short_record, identify.PrincipalRatios())
     path, save = tmp_path / "fit.npz", checkpoint.Checkpoint.save
     places = []

@@ -9,10 +9,11 @@ from jax.flatten_util import ravel_pytree
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify import padding, uncertainty
-from rigidjax.identify.multiple_shooting import pieces
-from rigidjax.identify.normal import Alone, Normal, normal_of
-from rigidjax.identify.parameters import columns_alone, local, places
+from rigidjax.identify.data import stacking
+from rigidjax.identify.model.free import columns_alone, local, places
+from rigidjax.identify.search.multiple_shooting import pieces
+from rigidjax.identify.search.normal import Alone, Normal, normal_of
+from rigidjax.identify.uncertainty import covariance as uncertainty
 
 RNG = np.random.default_rng(0)
 TS = np.linspace(0.0, 2.0, 20)
@@ -52,7 +53,7 @@ def start_of(problem):
 def blocks_of(problem, start, dtype=float):
     where = np.asarray(places(problem, start))
     rows = RNG.normal(size=(problem.count, 30, 3, where.shape[1])).astype(dtype)
-    alone = columns_alone(problem, padding.one(local(problem, start), 0))
+    alone = columns_alone(problem, stacking.one(local(problem, start), 0))
     return rows, where, ravel_pytree(start)[0].size, alone
 
 
@@ -72,7 +73,7 @@ def test_columns_of_one_recording_alone():
     start = start_of(problem)
     where, size = np.asarray(places(problem, start)), ravel_pytree(start)[0].size
     counts = np.bincount(where.ravel(), minlength=size + 1)
-    alone = columns_alone(problem, padding.one(local(problem, start), 0))
+    alone = columns_alone(problem, stacking.one(local(problem, start), 0))
     # Scale, rate and the deviation of the bias, each three numbers.
     assert alone.size == 9 and (counts[where[:, alone]] == 1).all()
     others = np.setdiff1d(np.arange(where.shape[1]), alone)

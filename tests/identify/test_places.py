@@ -6,7 +6,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.reference_states import reference_of
+from rigidjax.identify.data.reference_states import reference_of
 
 Q = np.array([0.8, 0.4, -0.4, 0.2])
 BODY = rj.MassProperties(2.0, [0.1, -0.2, 0.3], np.diag([0.2, 0.3, 0.4]))

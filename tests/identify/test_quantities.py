@@ -11,7 +11,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import report
-from rigidjax.identify.quantities import carried, quantities, values_and_slopes
+from rigidjax.identify.uncertainty.quantities import carried, quantities, values_and_slopes
 
 NONE = np.zeros((0, 2))
 TIMES = np.linspace(0.0, 10.0, 80)

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.flat_limit import of_charts, unreal
+from rigidjax.identify.uncertainty.flat_limit import of_charts, unreal
 
 T = np.linspace(0.0, 3.0, 61)
 TORQUE = np.array([0.1, -0.2, 0.15])

@@ -7,8 +7,8 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify import uncertainty
-from rigidjax.identify.quantities import carried
+from rigidjax.identify.uncertainty import covariance as uncertainty
+from rigidjax.identify.uncertainty.quantities import carried
 
 TS = jnp.linspace(0.0, 10.0, 80)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)

@@ -12,10 +12,11 @@ from jaxtyping import Array
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify import levenberg_marquardt, search
-from rigidjax.identify.levenberg_marquardt import Search, Settings
-from rigidjax.identify.normal import Normal
-from rigidjax.identify.search import (
+from rigidjax.identify.model.terms import half_sum, residuals
+from rigidjax.identify.search import least_squares, stages
+from rigidjax.identify.search.least_squares import Search, Settings
+from rigidjax.identify.search.normal import Normal
+from rigidjax.identify.search.stages import (
     SearchState,
     Task,
     Tried,
@@ -25,7 +26,6 @@ from rigidjax.identify.search import (
     settle,
     whole,
 )
-from rigidjax.identify.terms import half_sum, residuals
 
 TS = np.linspace(0.0, 1.0, 8)
 
@@ -57,8 +57,8 @@ def test_a_stride_that_is_lost_leaves_where_it_began_and_its_misfit(problem, mon
     def lost(start, *_):
         return Tried(start, jnp.asarray(jnp.inf), jnp.asarray(False))
 
-    monkeypatch.setattr(search, "least_squares", lost)
-    monkeypatch.setattr(search, "cost_of", lambda point, *_: 7.0)
+    monkeypatch.setattr(stages, "least_squares", lost)
+    monkeypatch.setattr(stages, "cost_of", lambda point, *_: 7.0)
     seen = []
 
     def note(tried, strides, over):
@@ -80,8 +80,8 @@ def test_a_part_is_not_fitted_at_the_cost_of_the_whole(problem, monkeypatch, bey
         tried = Tried(at(problem, 1.0), jnp.asarray(1e3), jnp.asarray(True))
         return tried, an_end(1.0)
 
-    monkeypatch.setattr(search, "descend", step)
-    monkeypatch.setattr(search, "cost_of", lambda point, *_: 1.0 if place(point) == 0.0 else beyond)
+    monkeypatch.setattr(stages, "descend", step)
+    monkeypatch.setattr(stages, "cost_of", lambda point, *_: 1.0 if place(point) == 0.0 else beyond)
     climb(SearchState(0, 0, Tried(at(problem, 0.0))), Task(problem, (), 1e-4, 25))
     assert [shown for _, shown in begun] == [1.0, 0.25, 0.5, 1.0]
     assert [start for start, _ in begun] == [0.0, 0.0, kept, kept]
@@ -95,7 +95,7 @@ def test_what_explains_the_whole_record_at_once_is_not_fitted_in_parts(problem, 
         tried = Tried(at(problem, 1.0), jnp.asarray(12.0), jnp.asarray(True))
         return tried, an_end(1.0)
 
-    monkeypatch.setattr(search, "descend", step)
+    monkeypatch.setattr(stages, "descend", step)
     out = climb(SearchState(0, 0, Tried(at(problem, 0.0))), Task(problem, (), 1e-4, 25))
     assert begun == [1.0] and place(out.parameters) == 1.0 and bool(out.converged)
 
@@ -176,7 +176,7 @@ def test_a_search_ends_in_the_noise_of_its_cost():
         return (), cost, Normal(jnp.diag(scale**2)), scale * error
 
     settings = Settings(1e-15, 1.0, 100)
-    end = jax.jit(lambda x: levenberg_marquardt.search(evaluated, x, jnp.ones(3), settings, ()))(
+    end = jax.jit(lambda x: least_squares.search(evaluated, x, jnp.ones(3), settings, ()))(
         jnp.zeros(3)
     )
     assert bool(end.converged) and int(end.taken) < 15

@@ -7,9 +7,9 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.noise import estimate_noise
-from rigidjax.identify.parameters import local, places
-from rigidjax.identify.search import evaluate
+from rigidjax.identify.model.free import local, places
+from rigidjax.identify.search.noise import estimate_noise
+from rigidjax.identify.search.stages import evaluate
 
 BODIES = {
     "box": rj.Inertia.from_principal(1.0, 1.6, 2.1),

@@ -7,7 +7,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.full_scale import plateau
+from rigidjax.identify.data.full_scale import plateau
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
 PLATE = rj.Inertia.from_principal(0.7, 1.3, 1.95)

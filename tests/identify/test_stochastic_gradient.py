@@ -9,8 +9,8 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.stochastic_gradient import _misfit_of, descend, only
-from rigidjax.identify.terms import half_sum, residuals
+from rigidjax.identify.model.terms import half_sum, residuals
+from rigidjax.identify.search.stochastic_gradient import _misfit_of, descend, only
 
 TS = jnp.linspace(0.0, 4.0, 25)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)

@@ -10,7 +10,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import report
-from rigidjax.identify.uncertainty import correlation_times, inverted, linearise, spread
+from rigidjax.identify.uncertainty.covariance import correlation_times, inverted, linearise, spread
 
 TOSSES = Path(__file__).parents[3] / "shared" / "data" / "tennis_racket" / "tosses.csv"
 

@@ -9,8 +9,8 @@ from jax.flatten_util import ravel_pytree
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.answers import Answer
-from rigidjax.identify.identifiability import Combination
+from rigidjax.identify.answer.answers import Answer
+from rigidjax.identify.answer.undetermined import Combination
 
 TS = np.linspace(0.0, 1.0, 5)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rigidjax as rj
-from rigidjax.estimate.scene import Extended
+from rigidjax.identify.filtering.steps import Extended
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.manifold import (
     coordinates,

@@ -7,7 +7,7 @@ from surface.calls import KINDS, row
 from surface.scenes import V, W
 
 import rigidjax as rj
-from rigidjax.identify.windows import Horizons
+from rigidjax.identify.data.windows import Horizons
 from rigidjax.motion.coupled import Coupled
 
 AXES = np.eye(3)[:2]

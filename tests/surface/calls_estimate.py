@@ -103,14 +103,14 @@ row(
     groups=("stranger",),
     transforms=(),
 )
-leave_out("made by start and by each filter", "estimate.Belief")
+leave_out("made by start and by each filter", "identify.Belief")
 leave_out(
     "what a function returns",
     *(
-        f"estimate.{name}"
+        f"identify.{name}"
         for name in ("Filtered", "Smoothed", "Push", "Sampled", "Read", "Extended")
     ),
-    "estimate.LinearEstimate",
+    "identify.LinearEstimate",
 )
 leave_out("made of a fit, which takes long; see tests/estimate", "estimate.LogDensity")
 leave_out(

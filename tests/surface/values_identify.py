@@ -30,8 +30,8 @@ from surface.values_solve import TOP, TS as TIMES_OF_RUN, law_of, textbook, top_
 
 import rigidjax as rj
 from rigidjax import estimate, identify, tumblers
-from rigidjax.identify.quantities import Quantity
-from rigidjax.identify.recording import Reading
+from rigidjax.identify.data.recording import Reading
+from rigidjax.identify.uncertainty.quantities import Quantity
 from rigidjax.motion.equations import EulerEquations, NewtonEuler
 from rigidjax.rotation import quaternion as q4, so3
 
@@ -390,8 +390,8 @@ def our_filtered(f, g, h, r, y, mean, root):
 
 
 way(
-    "estimate.LinearModel estimate.linear_filter estimate.linear_smooth estimate.LinearEstimate "
-    "estimate.LinearEstimate.covariance estimate.LinearEstimate.deviation",
+    "estimate.LinearModel estimate.linear_filter estimate.linear_smooth identify.LinearEstimate "
+    "identify.LinearEstimate.covariance identify.LinearEstimate.deviation",
     our_filtered,
     (v.normal(3, 3), v.normal(3, 2), v.normal(2, 3), between(0.1, 1.0, 2), v.normal(4, 2),
      v.ordinary, v.normal(3, 3)),
@@ -435,9 +435,9 @@ def our_ball(j, d, noise, y, w):
 
 way(
     "estimate.Model estimate.start estimate.filter estimate.smooth estimate.step "
-    "estimate.log_likelihood estimate.Belief estimate.Belief.covariance estimate.Belief.deviation "
-    "estimate.Belief.state estimate.Filtered estimate.Filtered.states estimate.Smoothed "
-    "estimate.Smoothed.states",
+    "estimate.log_likelihood identify.Belief identify.Belief.covariance identify.Belief.deviation "
+    "identify.Belief.state identify.Filtered identify.Filtered.states identify.Smoothed "
+    "identify.Smoothed.states",
     our_ball, (scale(-1, 1), scale(-2, 0), between(0.1, 0.5), v.normal(4, 3), v.ordinary), ball,
     norm=True, ulps=64, cost=2,
 )  # fmt: skip
@@ -646,7 +646,7 @@ def our_sample(j, q, w):
 
 
 way(
-    "estimate.sample estimate.Sampled identify.SensorInput.rate", our_sample,
+    "estimate.sample identify.Sampled identify.SensorInput.rate", our_sample,
     (between(0.5, 2.0), v.quaternion, v.ordinary),
     lambda j, q, w: (v.matrix_of(q) @ v.rotation(w), w, q[:3] / j), norm=True, rtol=1e-8, cost=2,
 )  # fmt: skip
@@ -661,7 +661,7 @@ way(
 )  # fmt: skip
 leave_out(
     "a truth value, a count, a kind, a name or words",
-    "estimate.Filtered.words", "estimate.Smoothed.words", "estimate.LinearModel.size",
+    "identify.Filtered.words", "identify.Smoothed.words", "estimate.LinearModel.size",
     "estimate.LogDensity.size", "identify.Accelerometer.feels", "identify.Marker.feels",
     "identify.Combination.in_words", "identify.Fit.ok", "tumblers.LightCurve.ok",
     "identify.Fit.status", "tumblers.LightCurve.status", "identify.Fit.advice", "identify.Fit.causes",
@@ -671,8 +671,8 @@ leave_out(
 )  # fmt: skip
 leave_out(
     "holds what it was given, or numbers of a row above",
-    "estimate.Belief.torques", "estimate.Belief.walks", "estimate.Filtered.t",
-    "estimate.Smoothed.t", "estimate.Walk", "estimate.Push", "estimate.Extended", "identify.Start",
+    "identify.Belief.torques", "identify.Belief.walks", "identify.Filtered.t",
+    "identify.Smoothed.t", "estimate.Walk", "identify.Push", "identify.Extended", "identify.Start",
     "identify.Problem.recording", "identify.Problem.recordings", "identify.Problem.torque",
     "identify.Problem.bodies", "identify.Problem.scenes",
     "identify.Recording.sensors", "identify.Fit.values",
@@ -708,7 +708,7 @@ leave_out(
     "estimate.Nuts", "estimate.refit", "estimate.Refit", "estimate.Refit.effective",
     "estimate.Refit.interval_of", "estimate.Refit.point", "estimate.LogDensity",
     "estimate.LogDensity.grown", "estimate.LogDensity.unpack", "identify.Unpacked",
-    "estimate.Filtered.nis", "estimate.Read",
+    "identify.Filtered.nis", "identify.Read",
 )  # fmt: skip
 leave_out(
     "searches of many fits, tens of seconds each: tests/identify hold them against motions known",

@@ -11,7 +11,7 @@ from tumblers import simulated
 
 from rigidjax import identify, tumblers
 from rigidjax.identify import Gyro
-from rigidjax.identify.padding import of_few_lengths
+from rigidjax.identify.data.stacking import of_few_lengths
 from rigidjax.tumblers import Brightness, lattice_series, two_frequencies
 from rigidjax.tumblers.two_frequencies import with_aliases
 

@@ -1,0 +1,306 @@
+"""The most likely cause of the errors of a fit.
+
+Each cause has a direction: the change of the readings with it along the fitted motion. Errors are
+regressed on it together with all free numbers (a score test: Rao 1948,
+doi:10.1017/S0305004100023987). A cause that the free numbers could absorb therefore explains
+nothing.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from rigidjax.identify.answer.answers import Cause
+from rigidjax.identify.data import stacking
+from rigidjax.identify.data.recording import Recording, readings_of
+from rigidjax.identify.data.reference_states import attitudes, rates_of
+from rigidjax.identify.model.charts import in_a_row, tensor_of
+from rigidjax.identify.model.free import Parameters, numbered
+from rigidjax.identify.model.problem import Problem
+from rigidjax.identify.model.terms import Noise, in_deviations
+from rigidjax.identify.search.stages import evaluate
+from rigidjax.identify.search.starts import balance, of_rates, tensor_and_margin
+from rigidjax.identify.sensors import Gyro
+from rigidjax.identify.uncertainty.covariance import Linearised
+
+# Corrected rates must leave less than this share of the error as read, and of the whole signal.
+BETTER, LITTLE = 0.5, 0.3
+# As good as the best: these records cannot tell them apart.
+EQUAL = 1.1
+_SAME = np.eye(3)
+
+# Mistakes in rates, and the matrix that corrects each.
+RATES = {
+    "deg/s read as rad/s": _SAME * np.pi / 180,
+    "rad/s read as deg/s": _SAME * 180 / np.pi,
+    "the x axis mirrored": np.diag([-1.0, 1.0, 1.0]),
+    "the y axis mirrored": np.diag([1.0, -1.0, 1.0]),
+    "the z axis mirrored": np.diag([1.0, 1.0, -1.0]),
+    "all signs turned round": -_SAME,
+    "x and y swapped": _SAME[[1, 0, 2]],
+    "y and z swapped": _SAME[[0, 2, 1]],
+    "x and z swapped": _SAME[[2, 1, 0]],
+    "axes in the order y, z, x": _SAME[[2, 0, 1]],
+    "axes in the order z, x, y": _SAME[[1, 2, 0]],
+}
+ATTITUDES = {
+    "the quaternion's scalar last, not first": lambda q: np.roll(q, 1, axis=-1),
+    "the quaternion from world to body": lambda q: q * [1.0, -1.0, -1.0, -1.0],
+}
+
+
+def misread(recordings: Sequence[Recording]) -> Cause | None:
+    """The mistake in reading the rates of one body, if there is one.
+
+    Rates are compared with those between attitudes, or else with Euler's equations for the best
+    body: a correction counts only if that is real. A mirrored axis shows only under a torque.
+    """
+    gyros = readings_of(recordings[0], Gyro)
+    if not gyros:
+        return None
+    turn, scale = (getattr(gyros[0].sensor, name) for name in ("mounting", "scale"))
+    # Given axes and scales that are far from those of the body are no mistake.
+    if turn is not None and np.abs(turn).max() >= 0.1:
+        return None
+    if scale is not None and np.abs(np.asarray(scale) - 1).max() >= 0.1:
+        return None
+    known = [attitudes(recording) for recording in recordings]
+    if all(len(t) > 10 for t, _ in known):
+        bound = BETTER * _of_attitudes(recordings, known, _SAME)
+        found = {name: _of_attitudes(recordings, known, turn) for name, turn in RATES.items()}
+        for name, change in ATTITUDES.items():
+            changed = [(t, change(q)) for t, q in known]
+            found[name] = _of_attitudes(recordings, changed, _SAME)
+    elif all(of_rates(recording.torque) for recording in recordings):
+        bound, margin = _of_euler(recordings, _SAME)
+        # Sensor errors alone can give numbers of no real body.
+        bound *= BETTER if margin > -0.8 else EQUAL
+        tried = {name: _of_euler(recordings, turn) for name, turn in RATES.items()}
+        if recordings[0].torque is not None:
+            tried["the torque with the other sign"] = _of_euler(recordings, _SAME, -1.0)
+        # Any rates are a free motion of a ball.
+        found = {name: left if -0.01 < m < 0.8 else np.inf for name, (left, m) in tried.items()}
+    else:
+        return None
+    least = min(found.values())
+    if not least < min(bound, LITTLE):
+        return None
+    words = " or ".join(name for name, left in found.items() if left <= EQUAL * least)
+    return Cause("misread", "Gyro", 1.0, f"most likely {words}", f"read the log again: {words}")
+
+
+def _of_euler(
+    recordings: Sequence[Recording], turn: np.ndarray, sign: float = 1.0
+) -> tuple[float, float]:
+    """The residual of Euler's equations, and the margin by which the best body is real."""
+    found = [balance(recording, turn) for recording in recordings]
+    matrix, side, momentum = (np.concatenate(part) for part in zip(*found, strict=True))
+    components, margin = tensor_and_margin(matrix, sign * side)
+    left = np.linalg.norm(matrix @ components - sign * side)
+    return float(left / np.linalg.norm(momentum @ components)), margin
+
+
+def _of_attitudes(recordings: Sequence[Recording], known: Sequence[Any], turn: np.ndarray) -> float:
+    """The relative difference of rates from the rates between attitudes."""
+    left, size = 0.0, 1e-300
+    for recording, (t, q) in zip(recordings, known, strict=True):
+        when, wanted = rates_of(t, jnp.asarray(q))
+        reading = readings_of(recording, Gyro)[0]
+        at, w = np.asarray(recording.t)[reading.seen], np.asarray(reading.values)[reading.seen]
+        shown = np.stack([np.interp(when, at, axis) for axis in (w @ turn.T).T], axis=1)
+        left += float(np.sum((shown - wanted) ** 2))
+        size += float(np.sum(wanted**2))
+    return float(np.sqrt(left / size))
+
+
+# A cause is named if it explains so much of the squared errors, or nearly as much as the best.
+ENOUGH, NEARLY = 0.7, 0.95
+# A direction is dropped if the free numbers absorb all of it but this part.
+APART = 0.05
+# Only small changes of axes and scales are causes.
+LINEAR, SMALL = ("scale", "mounting", "skew"), 0.5
+# What x shows of y, x of z, and y of z.
+SKEW = np.zeros((3, 3, 3))
+SKEW[1, 0, 0] = SKEW[2, 0, 1] = SKEW[2, 1, 2] = 1.0
+
+
+def causes(
+    problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, which: Sequence[int]
+) -> tuple[Cause, ...]:
+    """The most likely cause of the errors of each sensor in `which`, if there is one."""
+    given = zip(stacking.on_host(problem.records, problem.counts), problem.of, strict=True)
+    wrong = misread([recording for recording, of in given if of == problem.of[0]])
+    if wrong is not None:
+        return (wrong,)
+    if not np.isfinite(linear.dense).all():
+        return ()
+    free = np.linalg.qr(linear.dense)[0]
+    found = []
+    for index in which:
+        sensor: Any = problem.records.readings[index].sensor
+        cause = clock(problem, noise, linear, index)
+        if cause is None and _of_three(sensor):
+            rows = _table(problem, parameters, noise, linear, index)
+            given = problem, noise, linear, index, free
+            shares = [_explained(*given, row[1]) for row in rows]
+            cause = _largest(sensor, rows, shares)
+        if cause is None and hasattr(sensor, "suspect"):
+            cause = Cause(sensor.suspect[0], type(sensor).__name__, None, *sensor.suspect[1:])
+        found += [] if cause is None else [cause]
+    return tuple(found)
+
+
+def clock(problem: Problem, noise: Noise, linear: Linearised, index: int) -> Cause | None:
+    """Time stamps that scatter, by more than the sensor's jitter: each error is along the change of
+    the readings.
+    """
+    sensor, error = problem.records.readings[index].sensor, linear.raw[index]
+    kept = linear.kept[index].all(axis=-1)
+    if not (_of_three(sensor) and error[kept].any()):
+        return None
+    slope = _slope(problem, np.asarray(problem.records.readings[index].values) - error)
+    late = problem.records.readings[index].late
+    both = np.asarray(in_deviations(np.stack([error, slope], -1), noise[index], late))
+    error, slope = both[..., 0], both[..., 1]
+    moved = np.sum(slope**2, axis=-1) * kept
+    moving = moved > 1e-2 * moved.max()
+    if not moving.any():
+        return None
+    along = np.sum(np.sum(error * slope, axis=-1)[moving] ** 2 / moved[moving])
+    channels = np.sum(error[kept] ** 2, axis=0)
+    # Random errors of these channels' sizes have so much along this direction.
+    ways = np.mean(slope[moving] ** 2 / moved[moving][:, None], axis=0)
+    chance, share = float(ways @ channels / channels.sum()), float(along / channels.sum())
+    if not share > chance + 0.5 * (1.0 - chance) + 1.0 / np.sqrt(moving.sum()):
+        return None
+    scatter = 1e3 * np.sqrt(along / moved[moving].sum())
+    return _cause(
+        "clock", sensor, share, f"time stamps that scatter by {scatter:.2g} ms",
+        "take times from the sensor's own count of samples, or give it jitter=\"estimated\"",
+    )  # fmt: skip
+
+
+def _cause(name: str, sensor: Any, share: float, words: str, remedy: str) -> Cause:
+    kind = type(sensor).__name__
+    explained = f"{100 * share:.0f} % of the squared errors of the {kind}"
+    return Cause(name, kind, share, f"most likely {words}: {explained}", remedy)
+
+
+def _largest(sensor: Any, rows: Sequence[tuple], shares: Sequence[tuple]) -> Cause | None:
+    """The cause that explains the most, and other causes that explain about as much."""
+    told = [
+        (share, name, words.format(size=", ".join(f"{x:.2g}" for x in size)), remedy)
+        for (name, _, words, remedy), (share, size) in zip(rows, shares, strict=True)
+        if name not in LINEAR
+        or np.abs(size).max() < SMALL
+        # A unit: g read as m/s².
+        or (name == "scale" and np.ptp(size) < 0.1 * abs(size.mean()))
+    ]
+    most = max((share for share, *_ in told), default=0.0)
+    if not most > ENOUGH:
+        return None
+    best = [row for share, *row in told if share >= NEARLY * most]
+    names, words, remedies = (" or ".join(column) for column in zip(*best, strict=True))
+    return _cause(names, sensor, most, words, remedies)
+
+
+def _of_three(sensor: Any) -> bool:
+    """Whether errors are readings minus predictions along three axes."""
+    return sensor.reading_shape == (3,) and sensor.components == 3
+
+
+def _slope(problem: Problem, shown: np.ndarray) -> np.ndarray:
+    """The time derivative of a sensor's prediction (R, T, k), zero for a masked reading."""
+    t, out = np.asarray(problem.records.t), np.zeros_like(shown)
+    for row, count in enumerate(problem.counts):
+        if count > 2:
+            out[row, :count] = np.gradient(shown[row, :count], t[row, :count], axis=0)
+    return out
+
+
+def _table(
+    problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, index: int
+) -> tuple[tuple[str, np.ndarray, str, str], ...]:
+    """Name, direction (R, T, 3, c), words and remedy of each cause."""
+    reading = problem.records.readings[index]
+    t, shown = np.asarray(problem.records.t), np.asarray(reading.values) - linear.raw[index]
+    axes = np.broadcast_to(np.eye(3), (*shown.shape, 3))
+    turned = np.cross(shown[..., None, :], axes).swapaxes(-1, -2)
+    unit, itself = reading.sensor.unit, shown[..., None] * axes
+    response = _response(problem, parameters, noise, linear, index)
+    return (
+        ("lag", _slope(problem, shown)[..., None], "a clock offset of {size} s",
+         "let a Free move the sensor's offset, or the delay of the torque's log"),
+        ("bias", axes, f"a bias left out, ({{size}}) {unit}", "let a Free move the sensor's bias"),
+        ("scale", itself,
+         "scale errors of ({size}) (all equal: a unit, or a clock that runs fast or slow)",
+         "look at the sensor's unit, or let a Free move its scale"),
+        ("drag", response(-itself), "a torque against the rate, such as drag of the air",
+         "add a Damping or QuadraticDamping whose coefficient is free"),
+        ("wheel", response(turned), "a constant internal angular momentum, such as a wheel's",
+         "add a Flywheel whose momentum is free"),
+        ("mounting", turned, "axes turned by ({size}) rad",
+         "let a Free move the sensor's mounting, or take a chart of the full tensor"),
+        ("skew", np.einsum("rti,ijk->rtjk", shown, SKEW),
+         "axes not orthogonal by ({size}) rad", "let a Free move the sensor's skew"),
+        ("push", response(axes), "a constant torque in the body's axes",
+         "add a ConstantTorque whose value is free"),
+        ("drift", axes * (t - t[:, :1])[..., None, None],
+         f"a bias that drifts by ({{size}}) {unit} a second",
+         "cut the record into pieces with a bias each"),
+    )  # fmt: skip
+
+
+def _response(
+    problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, index: int
+) -> Callable[[np.ndarray], np.ndarray]:
+    """The effect of torques (R, T, 3, c) on rates: `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt`, Φ = dΩ/dΩ₀ of the fit."""
+    if not isinstance(problem.records.readings[index].sensor, Gyro):
+        return np.zeros_like
+    first = np.asarray(numbered(parameters).own.spin)[0]
+    columns = (linear.places[0][:, None] == first).argmax(axis=0)
+    slopes = evaluate(parameters, problem)[1][0][index]
+    flow = np.asarray(slopes)[..., columns]
+    tensors = np.stack([np.asarray(tensor_of(b)) for b in in_a_row(problem.bodies(parameters))])
+    of = np.zeros(problem.count, int) if problem.which is None else np.asarray(problem.which)
+    back = np.linalg.pinv(flow) @ np.linalg.inv(tensors)[of][:, None]
+    steps = np.diff(np.asarray(problem.records.t), axis=1)[..., None, None]
+
+    def response(torque: np.ndarray) -> np.ndarray:
+        pushed = back @ torque
+        middle = 0.5 * (pushed[:, 1:] + pushed[:, :-1]) * steps
+        return flow @ np.concatenate([0 * pushed[:, :1], np.cumsum(middle, axis=1)], axis=1)
+
+    return response
+
+
+def _explained(
+    problem: Problem,
+    noise: Noise,
+    linear: Linearised,
+    index: int,
+    free: np.ndarray,
+    direction: np.ndarray,
+) -> tuple[float, np.ndarray]:
+    """The share of a sensor's squared errors that a direction (R, T, k, c) explains beside the
+    orthonormal columns `free` (R, N, m) of the free numbers, and its coefficient.
+    """
+    roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
+    errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]
+    late = problem.records.readings[index].late
+    scaled = np.asarray(in_deviations(direction, noise[index], late)) * roots[index][..., None]
+    size = np.sqrt(np.sum(scaled**2, axis=(0, 1, 2)))
+    size[size == 0] = 1.0
+    columns = [np.zeros((*error.shape, size.size)) for error in errors]
+    columns[index] = scaled / size
+
+    def besides(parts: Sequence[np.ndarray], width: int) -> np.ndarray:
+        x = np.concatenate([part.reshape(len(part), -1, width) for part in parts], axis=1)
+        return (x - free @ (free.swapaxes(1, 2) @ x)).reshape(-1, width)
+
+    u, s, v = np.linalg.svd(besides(columns, size.size), full_matrices=False)
+    told = np.where(s > APART, u.T @ besides(errors, 1)[:, 0], 0.0)
+    total = float(np.sum(errors[index] ** 2))
+    return min(float(told @ told) / total, 1.0), v.T @ (told / np.maximum(s, APART)) / size

@@ -1,0 +1,351 @@
+"""The numbers that a fit determines, and those that it does not, in words."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from rigidjax.body.inertia import tensor_of
+from rigidjax.identify.answer.answers import FAILS, NOT_ENDED
+from rigidjax.identify.data.full_scale import in_words
+from rigidjax.identify.data.reference_states import ReferenceStates
+from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, in_a_row
+from rigidjax.identify.model.free import Parameters
+from rigidjax.identify.model.problem import Problem
+from rigidjax.identify.sensors import Gyro
+from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
+from rigidjax.identify.uncertainty.quantities import (
+    Quantity,
+    charts,
+    labels,
+    recording_names,
+    value_and_slope,
+    vector,
+)
+from rigidjax.motion.manifold import minus, parts
+from rigidjax.rotation import quaternion
+
+if TYPE_CHECKING:
+    from rigidjax.identify.answer.result import Fit
+
+
+# A number takes part if it changes by more than this share of the largest change.
+PART = 1e-3
+# A rest of a direction below this share is round-off.
+ROUND_OFF = 1e-5
+# Two changes count as the same factor if they differ by less than this share.
+EVEN = 0.01
+# The largest number of names written for a combination, and of combinations.
+MOST, SEVERAL = 6, 5
+
+
+class Combination(eqx.Module):
+    """Numbers that may change together without changing a reading.
+
+    **Fields:** `names`; small `changes` of each: relative if `relative` is true, else in its
+    `units`.
+
+    >>> Combination(("I1", "I2"), (0.01, 0.01), ("", ""), (True, True)).in_words
+    'I1 and I2 rise together: only I1/I2 is determined.'
+    >>> Combination(("Ωx", "bias x"), (0.1, -0.1), ("rad/s", "rad/s"), (False, False)).in_words
+    'No reading changes where these change together: Ωx by +0.1 rad/s, bias x by −0.1 rad/s.'
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    changes: tuple[float, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+    relative: tuple[bool, ...] = eqx.field(static=True)
+
+    @property
+    def in_words(self) -> str:
+        """One sentence."""
+        names, sizes = self.names, np.array(self.changes)
+        if len(names) == 1:
+            name = names[0][0].upper() + names[0][1:]
+            return f"{name} is not determined: no reading changes with it."
+        even = all(self.relative) and np.ptp(np.abs(sizes)) < EVEN * np.abs(sizes).max()
+        if even and (sizes > 0).all():
+            listed = f"{', '.join(names[:-1])} and {names[-1]}"
+            only = f"{names[0]}/{names[1]} is" if len(names) == 2 else "their ratios are"
+            return f"{listed} rise together: only {only} determined."
+        if even and len(names) == 2:
+            return (
+                f"{names[0]} rises as {names[1]} falls: only {names[0]}·{names[1]} is determined."
+            )
+        parts = []
+        for name, size, unit, ratio in zip(names, sizes, self.units, self.relative, strict=True):
+            size = f"{100 * size if ratio else size:+.2g}".replace("-", "−")
+            parts.append(f"{name} by {size} {'%' if ratio else unit}".rstrip())
+        more = "" if len(parts) <= MOST else f", and {len(parts) - MOST} more"
+        return f"No reading changes where these change together: {', '.join(parts[:MOST])}{more}."
+
+
+TENSOR = dict(zip(Tensor.plain_names, COMPONENTS, strict=True))
+
+
+def undetermined(fit: "Fit") -> tuple[Combination, ...]:
+    """The combinations that the data do not determine at all, each of few numbers.
+
+    Each row has a number that no other has (reduced echelon form); initial attitudes are in the
+    axes, world or body, that need fewer numbers.
+    """
+    null = np.asarray(fit.null_directions)
+    if not null.size:
+        return ()
+    best = None
+    slopes, values = map(np.asarray, _slopes(fit.problem, fit.beside))
+    names, many = _names(fit.problem), len(charts(fit.problem))
+    first, turns = len(labels(fit.problem)), 3 * fit.problem.count
+    for other in (1, 0):
+        # Attitudes about the world's axes, or about the body's.
+        begin = first + 6 * many + other * turns
+        rows = np.delete(np.arange(len(names)), slice(begin, begin + turns))
+        here, slope = [names[row] for row in rows], slopes[rows]
+        # The free numbers are of order one: a number's largest derivative is its own size.
+        size = np.abs(slope).max(axis=1)
+        tensors = size[first : first + 6 * many].reshape(many, 6)
+        tensors[:] = tensors.max(axis=1, keepdims=True)
+        relative = np.array([one[2] for one in here])
+        size = np.where(relative | (size == 0), 1.0, size)
+        changes = null @ slope.T / size
+        kept = _kept(fit, [one[0] for one in here], changes)
+        found = _reduced(np.where(kept, changes, 0.0))
+        if best is None or np.count_nonzero(found) < np.count_nonzero(best[0]):
+            best = found, here, size, values[rows]
+    assert best is not None
+    # In the order of their first numbers: the order of the directions depends on round-off.
+    found = sorted((row for row in best[0] if row.any()), key=lambda row: np.flatnonzero(row)[0])
+    return tuple(_combination(row, *best[1:]) for row in found)
+
+
+def _combination(
+    row: np.ndarray, names: list[tuple[str, str, bool]], size: np.ndarray, values: np.ndarray
+) -> Combination:
+    order = np.flatnonzero(row)
+    # The largest change: a hundredth of the number, or of its size; the first number goes up.
+    changes = 0.01 * np.sign(row[order[0]]) * row / np.abs(row).max() * size
+    relative = np.array([name[2] for name in names])
+    # Numbers with the same factor get a shorter sentence.
+    shares = np.where(relative, changes, changes / np.where(values == 0, np.inf, values))[order]
+    if np.ptp(np.abs(shares)) < EVEN * np.abs(shares).max():
+        changes[order] = 0.01 * shares / np.abs(shares).max()
+        relative[order] = True
+    return Combination(
+        tuple(names[i][0] for i in order),
+        tuple(float(changes[i]) for i in order),
+        tuple("" if relative[i] else names[i][1] for i in order),
+        tuple(bool(relative[i]) for i in order),
+    )
+
+
+def _names(problem: Problem) -> list[tuple[str, str, bool]]:
+    """Name, unit, and whether relative, of the numbers of `_slopes`."""
+    out = labels(problem)
+    for name, chart in charts(problem):
+        unit = chart.unit.replace("SI", "kg m²")
+        out += [(f"{part}{name}", unit, False) for part in TENSOR]
+    for part, name, unit in (
+        ("q", "attitude about the world's", "rad"),
+        ("q", "attitude about the body's", "rad"),
+        ("x", "position", "m"),
+        ("v", "velocity", "m/s"),
+    ):
+        if hasattr(problem.reference.state, part):
+            for where in recording_names(problem):
+                out += [(f"the initial {name} {k}{where}", unit, False) for k in "xyz"]
+    return out
+
+
+@eqx.filter_jit
+def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
+    """Derivatives (M, n) of the reported numbers, tensors and initial states; their values (M,)."""
+    flat, restore = ravel_pytree(parameters)
+    reference = problem.reference
+    start = jax.vmap(ReferenceStates.moved)(reference, parameters.own)
+
+    def value(x: Array) -> Array:
+        moved = restore(x)
+        shown = [vector(problem, moved)]
+        for body in in_a_row(problem.bodies(moved)):
+            tensor = tensor_of(body)
+            shown.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
+        now = jax.vmap(ReferenceStates.moved)(reference, moved.own)
+        one = jax.tree.map(lambda leaf: leaf[0], now)
+        change = parts(one, jax.vmap(minus)(now, start))
+        offset = parts(one, jax.vmap(minus)(now, reference.state))
+        if "q" in change:
+            shown += [jax.vmap(quaternion.rotate)(start.q, change["q"]), change["q"]]
+        shown += [offset[name] for name in ("x", "v") if name in offset]
+        return jnp.concatenate([part.reshape(-1) for part in shown])
+
+    return jax.jacfwd(value)(flat), value(flat)
+
+
+def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
+    """The numbers that name changes (k, M): moments, or the tensor's components if axes turn."""
+    rows = in_a_row(fit.problem.bodies(fit.beside))
+    kept = np.ones(len(names), bool)
+    for (where, chart), body in zip(charts(fit.problem), rows, strict=True):
+        # A chart may report these components, too: the last entries exist for all charts.
+        every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]
+        places = [some[-1] for some in every]
+        kept[[i for some in every for i in some]] = False
+        moments = [names.index(f"{log}{where}") for log in chart.log_names if log != "mass"]
+        if moments and _turns(np.asarray(tensor_of(body)), changes[:, places]):
+            kept[moments], kept[places] = False, True
+    return kept
+
+
+def _turns(tensor: np.ndarray, changes: np.ndarray) -> bool:
+    """Whether some change (k, 6) of a tensor (3, 3) turns its principal axes."""
+    steps = np.einsum("mk,kij->mij", changes, BASIS)
+    _, axes = np.linalg.eigh(tensor)
+    along = np.einsum("ia,kij,jb->kab", axes, steps, axes)
+    across = along - along * np.eye(3)
+    return bool(np.abs(across).max() > PART * max(np.abs(along).max(), 1e-6))
+
+
+def _reduced(rows: np.ndarray) -> np.ndarray:
+    """The reduced row echelon form of rows (k, M), by complete pivoting; small parts are 0."""
+    rows = np.array(rows)
+    size, done = np.abs(rows).max(), 0
+    while done < len(rows):
+        i, j = np.unravel_index(np.argmax(np.abs(rows[done:])), rows[done:].shape)
+        if np.abs(rows[done + i, j]) <= ROUND_OFF * size:
+            break
+        rows[[done, done + i]] = rows[[done + i, done]]
+        rows[done] /= rows[done, j]
+        others = np.arange(len(rows)) != done
+        rows[others] -= np.outer(rows[others, j], rows[done])
+        done += 1
+    rows = rows[:done]
+    return np.where(np.abs(rows) > PART * np.abs(rows).max(axis=1, keepdims=True), rows, 0.0)
+
+
+def identifiability(fit: "Fit") -> tuple[str, ...]:
+    """The quantities that the data determine well, weakly, and not at all."""
+    lost = fit.model.word == FAILS
+    if lost or fit.search.word == NOT_ENDED:
+        why = "does not explain the data" if lost else "did not end in a minimum"
+        out = [
+            f"This fit {why}, so it determines nothing: its numbers and intervals belong to the "
+            "best point found, and say nothing about the body."
+        ]
+        # A search that did not end may have moved along directions that the data do not determine.
+        out += [] if lost else _unseen(fit)
+        return (*out, *in_words(fit.problem.records.readings))
+    out = []
+    moments, first = [], 0
+    for _, chart in charts(fit.problem):
+        moments += fit.quantities[first : first + len(chart.log_names)]
+        first += len(chart.log_names) + len(chart.plain_names)
+    for quantity in moments:
+        wide = _half(quantity)
+        # Half-width over value for a narrow interval; a factor for a wide one.
+        if not np.isfinite(wide) or wide > 1.5:
+            out.append(f"{quantity.name} is not determined by these data.")
+        elif wide > 0.05:
+            out.append(
+                f"{quantity.name} is weakly determined: its 95 % interval is "
+                f"{2 * np.sinh(wide):.0%} of its value."
+            )
+        else:
+            out.append(f"{quantity.name} is well determined, to ±{wide:.2g} of its value.")
+    seen = np.asarray(fit.seen)
+    out += [
+        f"A flat body{limit.where} fits as well: (I1 + I2 − I3)/I3 ≤ "
+        f"{limit.bound(seen):.2g} (95 %). Intervals end at the limit of real bodies."
+        for limit in fit.limits
+        if limit.is_near(seen, float(quantile(0.95, fit.degrees(limit.slope))))
+    ]
+    count = fit.problem.count
+    out.append(_rate(fit.quantities[first : first + 3 * count], count))
+    out += _unseen(fit)
+    out += correlations(fit)
+    if fit.problem.torque is None:
+        out.append(
+            "Free motion cannot show the absolute inertia, only ratios of moments; nor the mass or "
+            "the centre of mass."
+        )
+        if all(isinstance(sensor, Gyro) for sensor in fit.problem.records.sensors):
+            out.append(
+                "Rates of free motion with an axis mirrored or two axes swapped fit another body "
+                "as well: they cannot show such a mistake."
+            )
+    out += in_words(fit.problem.records.readings)
+    return tuple(out)
+
+
+def _half(quantity: Quantity) -> float:
+    """Half of the 95 % interval, of the logarithm if positive."""
+    return float(quantile(0.95, quantity.freedom)) * quantity.deviation
+
+
+def _rate(rates: Sequence[Quantity], count: int) -> str:
+    shares = []
+    for index in range(count):
+        three = rates[3 * index : 3 * index + 3]
+        length = np.linalg.norm([q.value for q in three])
+        shares.append(np.max([_half(q) for q in three]) / max(length, 1e-300))
+    wide = np.max(shares)
+    what = "The initial body rate is" if count == 1 else "The initial body rates are"
+    if not wide < 1.0:
+        return f"{what} not determined by these data."
+    grade = "well" if wide < 0.1 else "weakly"
+    its = "its length" if count == 1 else "their lengths"
+    return f"{what} {grade} determined, to ±{wide:.2g} of {its}."
+
+
+def _unseen(fit: "Fit") -> list[str]:
+    found = undetermined(fit)
+    if not found:
+        return []
+    out = []
+    if scale_is_unseen(fit):
+        out.append("The data determine the inertia only up to scale.")
+    out += [one.in_words for one in found[:SEVERAL]]
+    if len(found) > SEVERAL:
+        out.append(f"{len(found) - SEVERAL} more combinations of numbers are not determined.")
+    out.append("Intervals of quantities that depend on these are infinite.")
+    return out
+
+
+def scale_is_unseen(fit: "Fit") -> bool:
+    """Whether an undetermined direction scales the whole body and changes nothing else."""
+    null = np.asarray(fit.null_directions)
+    if not len(null) or isinstance(fit.problem.body, Bodies):
+        return False
+    first = len(labels(fit.problem))
+    slopes, values = (np.asarray(a) for a in _slopes(fit.problem, fit.beside))
+    here, moved = values[first : first + 6], slopes[first : first + 6] @ null.T
+    wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)
+    return bool(np.linalg.norm(moved @ wanted - here) < 1e-3 * np.linalg.norm(here))
+
+
+def correlations(fit: "Fit") -> list[str]:
+    """Pairs of reported quantities (moments, not components) whose errors have |ρ| > 0.95."""
+    slope = np.asarray(value_and_slope(fit.problem, fit.beside)[1])[: len(fit.quantities)]
+    covariance = slope @ np.asarray(fit.seen) @ slope.T
+    deviation = np.array([quantity.deviation for quantity in fit.quantities])
+    good = np.isfinite(deviation) & (deviation > 0)
+    follow = {f"{plain}{name}" for name, c in charts(fit.problem) for plain in c.plain_names}
+    names = [quantity.name for quantity in fit.quantities]
+    good &= np.array([name not in follow or name.startswith("com") for name in names])
+    scaled = np.where(good, deviation, 1.0)
+    rho = np.where(np.outer(good, good), covariance / np.outer(scaled, scaled), 0.0)
+    pairs = [
+        (i, j)
+        for i in range(len(rho))
+        for j in range(i)
+        if np.isfinite(rho[i, j]) and abs(rho[i, j]) > 0.95
+    ]
+    pairs.sort(key=lambda pair: -abs(rho[pair]))
+    return [
+        f"{names[j]} and {names[i]} are strongly correlated (ρ = {rho[i, j]:+.3f})."
+        for i, j in pairs[:5]
+    ]

@@ -1,0 +1,1 @@
+"""Recordings: times, readings, inputs, and what the first readings show."""

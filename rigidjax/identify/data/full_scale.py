@@ -1,0 +1,81 @@
+"""Readings at full scale: their detection, their weight as "at least that much", their report."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from rigidjax.identify.data.recording import Recording
+
+# A plateau has so many readings in a row at the largest value.
+RUN = 3
+# A record with a larger share than this at its largest value is constant, or was cut.
+MOST = 0.7
+
+
+def plateau(values: np.ndarray) -> float | None:
+    """The full scale of one channel (T,) if its largest readings are cut off: more readings in a
+    row than the `2 √(2d/a)` at the top of a smooth wave of last digit d, second differences a.
+    """
+    size = np.abs(values)
+    top = float(size.max(initial=0.0))
+    at = size >= top * (1 - 1e-9)
+    if not top > 0 or at.sum() < RUN or at.mean() > MOST:
+        return None
+    steps = np.abs(np.diff(values))
+    bends = np.abs(np.diff(values, 2))[~at[1:-1]]
+    bend = float(np.median(bends)) if bends.size else 0.0
+    if not (steps > 0).any() or not bend > 0:
+        return None
+    smooth = 1.0 + 2.0 * np.sqrt(2.0 * steps[steps > 0].min() / bend)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]]).astype(int)))
+    longest = max(end - first for first, end in edges.reshape(-1, 2))
+    return top if longest >= max(RUN, 2.0 * smooth) else None
+
+
+def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings, with the full scale found in the sensors that have no `limit` yet."""
+    out = list(recordings)
+    for index in range(max(len(r.readings) for r in recordings)):
+        found = {}
+        for place, recording in enumerate(recordings):
+            for reading in recording.readings[index : index + 1]:
+                sensor: Any = reading.sensor
+                plain = sensor.reading_shape == (sensor.components,)
+                if plain and getattr(sensor, "limit", 0) is None:
+                    values = np.asarray(reading.values)[reading.seen]
+                    levels = [plateau(channel) for channel in values.T]
+                    found[place] = np.array([np.inf if one is None else one for one in levels])
+        if not any(np.isfinite(limits).any() for limits in found.values()):
+            continue
+        for place, limits in found.items():
+            out[place] = eqx.tree_at(
+                lambda r, i=index: r.readings[i].sensor.limit,
+                out[place],
+                jnp.asarray(limits, out[place].t.dtype),
+                is_leaf=lambda node: node is None,
+            )
+    return out
+
+
+def in_words(readings: Sequence[Any]) -> list[str]:
+    """The readings at full scale, for a report."""
+    out = []
+    for reading in readings:
+        count = (reading.seen[..., None] & ~reading.kept).sum(axis=(0, 1))
+        if not count.any():
+            continue
+        sensor = reading.sensor
+        level = np.asarray(sensor.limit)
+        parts = []
+        for channel in np.flatnonzero(count):
+            sizes = level[:, channel][np.isfinite(level[:, channel])]
+            name = "xyz"[channel] if channel < 3 else str(channel)
+            parts.append(f"{count[channel]} of {name} at {sizes.min():.4g} {sensor.unit}")
+        out.append(
+            f"Readings of the {type(sensor).__name__} at full scale ({', '.join(parts)}) count as "
+            "at least that much."
+        )
+    return out

@@ -1,0 +1,236 @@
+"""The reference of the initial states of a fit: the first readings of each recording."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax.identify.data import stacking
+from rigidjax.identify.data.recording import Recording, readings_of
+from rigidjax.identify.sensors import (
+    AttitudeSensor,
+    Direction,
+    Gyro,
+    Marker,
+    Position,
+    Range,
+    Velocity,
+)
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.manifold import names, plus
+from rigidjax.rotation import quaternion, so3
+
+# The turn, rad, between two attitudes that give a rate: large against noise, small enough that the
+# axis hardly moves.
+_TURN = 0.3
+# A turn is undetermined if two singular values of Σ world bodyᵀ are below this share of the
+# largest.
+_FIRM = 1e-3
+
+
+def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,), s, and attitudes (n, 4), body → world, that the readings show; n may be 0: of an
+    attitude sensor, or by `rigidjax.so3.wahba` from three markers or two directions.
+    """
+    t = np.asarray(recording.t)
+    for reading in readings_of(recording, AttitudeSensor):
+        q, mounting = np.asarray(reading.values)[reading.seen], reading.sensor.mounting
+        if mounting is not None:
+            back = quaternion.exp(-mounting)
+            q = np.asarray(jax.vmap(quaternion.multiply, (0, None))(jnp.asarray(q), back))
+        return t[reading.seen], q
+    body, world, seen = [], [], np.ones(t.shape, bool)
+    markers = readings_of(recording, Marker)
+    if len(markers) >= 3:
+        places = np.stack([np.asarray(r.sensor.place) for r in markers])
+        there = np.stack([np.asarray(r.values) for r in markers], axis=1)
+        size = np.linalg.norm(places - places.mean(axis=0), axis=1).max() or 1.0
+        body.append(np.broadcast_to((places - places.mean(axis=0)) / size, there.shape))
+        world.append((there - there.mean(axis=1, keepdims=True)) / size)
+        seen = seen & np.all([r.seen for r in markers], axis=0)
+    for reading in readings_of(recording, Direction):
+        along, sensor = np.asarray(reading.values), reading.sensor
+        if sensor.mounting is not None:
+            along = along @ np.asarray(so3.exp(sensor.mounting)).T
+        body.append(along[:, None, :])
+        world.append(np.broadcast_to(np.asarray(sensor.world), along.shape)[:, None, :])
+        seen = seen & reading.seen
+    if not body:
+        return np.zeros(0), np.zeros((0, 4))
+    rows, sides = np.concatenate(body, axis=1)[seen], np.concatenate(world, axis=1)[seen]
+    b = np.einsum("tni,tnj->tij", sides, rows)
+    s = np.linalg.svd(b, compute_uv=False)
+    firm = s[:, 1] + np.sign(np.linalg.det(b)) * s[:, 2] > _FIRM * s[:, 0]
+    if not firm.any():
+        return np.zeros(0), np.zeros((0, 4))
+    return t[seen][firm], np.asarray(_nearest(rows[firm], sides[firm]))
+
+
+@jax.jit
+def _nearest(body: ArrayLike, world: ArrayLike) -> Array:
+    return jax.vmap(lambda a, b: quaternion.from_matrix(so3.wahba(a, b)))(body, world)
+
+
+def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,), s, and body rates (n, 3), rad/s: of a gyro, or between attitudes; n may be 0."""
+    for reading in readings_of(recording, Gyro):
+        return np.asarray(recording.t)[reading.seen], np.asarray(reading.values)[reading.seen]
+    return rates_of(*attitudes(recording))
+
+
+def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) and body rates (n, 3) between attitudes (n, 4) at times (n,)."""
+    if t.size < 2:
+        return np.zeros(0), np.zeros((0, 3))
+    turned = np.concatenate([[0.0], np.cumsum(np.linalg.norm(_turns(q[:-1], q[1:]), axis=1))])
+    first = np.arange(t.size - 1)
+    last = np.searchsorted(turned, turned[first] + _TURN, side="right") - 1
+    last = np.clip(np.maximum(last, first + 1), 1, t.size - 1)
+    gap = t[last] - t[first]
+    return 0.5 * (t[first] + t[last]), np.asarray(_turns(q[first], q[last])) / gap[:, None]
+
+
+@jax.jit
+def _turns(p: ArrayLike, q: ArrayLike) -> Array:
+    """Rotation vectors (n, 3) from p to q, body axes, the short way, whatever the signs."""
+
+    def turn(a: Array, b: Array) -> Array:
+        return quaternion.log(quaternion.multiply(quaternion.conjugate(a), b))
+
+    return jax.vmap(turn)(jnp.asarray(p), jnp.asarray(q))
+
+
+class ReferenceStates(eqx.Module):
+    """The reference state of a recording, at rest, and the units of changes from it."""
+
+    state: Any
+    rate: Float[Array, "*records"]
+    length: Float[Array, "*records"]
+
+    @property
+    def units(self) -> Float[Array, "*records n"]:
+        """The size of a change of order one, number by number."""
+        sizes = {
+            "x": self.length,
+            "v": self.length * self.rate,
+            "q": jnp.ones_like(self.rate),
+            "omega": self.rate,
+        }
+        return jnp.repeat(jnp.stack([sizes[name] for name in names(self.state)], -1), 3, -1)
+
+    def moved(self, own: Any) -> Any:
+        """The initial state of one recording."""
+        parts = (own.place, own.speed, own.turn, own.spin)
+        change = jnp.concatenate([part for part in parts if part is not None])
+        return plus(self.state, self.units * change)
+
+
+def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates:
+    """From the first readings of each recording, for the kind of state in use."""
+    turns = [[*attitudes(r)[1], np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
+    places = [_first_place(r) for r in recordings]
+    dtype = recordings[0].t.dtype
+    # Arrays, not floats: another recording must not compile again.
+    x, v, length = (jnp.asarray(np.stack(part), dtype) for part in zip(*places, strict=True))
+    q, still = jnp.asarray(np.stack(turns), dtype), jnp.zeros_like(x)
+    states = {Spin: Spin(still), Attitude: Attitude(q, still), Rigid: Rigid(x, v, q, still)}
+    typical = jnp.asarray([_typical_rate(r) for r in recordings], dtype)
+    return ReferenceStates(states[rung], typical, length)
+
+
+def _typical_rate(recording: Recording) -> float:
+    _, w = rates(recording)
+    if readings_of(recording, Gyro):
+        return float(np.sqrt(np.mean(np.sum(w**2, axis=1)))) or 1.0
+    rate = float(np.linalg.norm(w[0])) if len(w) else 0.0
+    # Else by the first sensor whose readings show one.
+    for reading in recording.readings if rate == 0 else ():
+        sensor: Any = reading.sensor
+        if hasattr(sensor, "typical_rate"):
+            t, values = np.asarray(recording.t), np.asarray(reading.values)
+            rate = sensor.typical_rate(t[reading.seen], values[reading.seen])
+            break
+    return rate if rate > 0 else 1.0
+
+
+def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
+    """First position and velocity, m and m/s, and a typical length, m: of the centre of mass, or of
+    the body's frame if only markers were read.
+    """
+    t, when, x = np.asarray(recording.t), np.zeros(0), np.zeros((0, 3))
+    positions, markers = readings_of(recording, Position), readings_of(recording, Marker)
+    ranges = readings_of(recording, Range)
+    speeds = [r for r in readings_of(recording, Velocity) if r.sensor.mounting is None]
+    if positions:
+        when, x = t[positions[0].seen], np.asarray(positions[0].values)[positions[0].seen]
+    elif markers:
+        when, x = _from_markers(recording, markers)
+    elif ranges:
+        seen = np.all([r.seen for r in ranges], axis=0)
+        stations = np.stack([np.asarray(r.sensor.station) for r in ranges])
+        lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[seen]
+        when, x = t[seen], _from_ranges(stations, lengths)
+    if speeds and (positions or not markers):
+        v = np.asarray(speeds[0].values)[speeds[0].seen][0]
+    else:
+        v = _first_speed(when, x)
+    x = x if when.size else np.zeros((1, 3))
+    # The largest distance from the mean; 1 if the places are all the same.
+    return x[0], v, float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
+
+
+def _from_markers(recording: Recording, markers: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) and places (n, 3), of the first marker alone if all are never seen at once."""
+    seen = np.all([r.seen for r in markers], axis=0)
+    if not seen.any():
+        markers, seen = markers[:1], markers[0].seen
+    t = np.asarray(recording.t)[seen]
+    x = np.mean([np.asarray(r.values)[seen] for r in markers], axis=0)
+    place = np.mean([np.asarray(r.sensor.place) for r in markers], axis=0)
+    known, q = attitudes(recording)
+    if np.isin(t, known).all():
+        arms = jax.vmap(lambda turn: quaternion.rotate(turn, place))(q[np.isin(known, t)])
+        x = x - np.asarray(arms)
+    return t, x
+
+
+def _first_speed(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The slope of a line through the first places (n, 3); zero of one place."""
+    few = slice(0, max(2, min(5, t.size)))
+    return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
+
+
+def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Places (n, 3) with these distances (n, k) to stations.
+
+    Differences of the equations `|x|² − 2 s·x + |s|² = d²` are linear in x. A component of x that
+    they do not determine is that of the stations' centre.
+    """
+    centre = stations.mean(axis=0)
+    s = stations - centre
+    sides = (s * s).sum(axis=1)[None] - lengths**2
+    sides = 0.5 * (sides - sides.mean(axis=1, keepdims=True))
+    return centre + np.linalg.lstsq(s, sides.T, rcond=1e-9)[0].T
+
+
+def first_rates(records: Recording, counts: Any) -> Float[Array, "records 3"]:
+    """`first_rate` of each of several recordings (a leading axis), also of traced ones."""
+    for reading in readings_of(records, Gyro):
+        xp: Any = np if _checks.known(reading) else jnp
+        first = xp.argmax(xp.asarray(reading.mask), axis=1)[:, None, None]
+        return jnp.asarray(xp.take_along_axis(xp.asarray(reading.values), first, axis=1)[:, 0])
+    if not _checks.known(records):
+        return jnp.zeros((len(counts), 3), records.t.dtype)
+    found = [first_rate(recording) for recording in stacking.on_host(records, counts)]
+    return jnp.asarray(np.stack(found), records.t.dtype)
+
+
+def first_rate(recording: Recording) -> np.ndarray:
+    """The initial body rate (3,), rad/s, of `rates`; zero without any."""
+    _, w = rates(recording)
+    return w[0] if len(w) else np.zeros(3)

@@ -1,0 +1,152 @@
+"""Several recordings of one body as one tree with a leading axis, so that one program fits them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rigidjax import _checks
+from rigidjax.identify.data.recording import Reading, Recording
+from rigidjax.motion.torques import Linear, Series
+
+
+def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
+    """One recording with a leading axis, and the number of times of each: shorter ones are
+    continued with masked readings at their last time, tables of time with their last value.
+    """
+    counts = np.array([r.t.shape[0] for r in recordings], np.int32)
+    rows = max(_rows(recording, 0) for recording in recordings)
+    alike = [lengthened(r, int(counts.max()), rows) for r in recordings]
+    forms = [(jax.tree.structure(r), [np.shape(x) for x in jax.tree.leaves(r)]) for r in alike]
+    for index, form in enumerate(forms):
+        if form != forms[0]:
+            raise ValueError(
+                f"recordings: the one at index {index} differs from the first in its sensors or "
+                "its torque; give all recordings the same kinds in the same order, with the same "
+                "options"
+            )
+    return jax.tree.map(_stacked, *alike), counts
+
+
+def of_few_lengths(problem: Any) -> Any:
+    """The problem with masked readings up to one of four lengths an octave: few programs."""
+    records = problem.records
+    longer = lengthened(records, _length(records.t.shape[1]), _length(_rows(records, 1)), 1)
+    return eqx.tree_at(lambda p: p.records, problem, longer)
+
+
+def _rows(recording: Recording, axis: int) -> int:
+    """The rows of the longest table of time in the torque and the sensors, 0 without one."""
+    parts = recording.torque, recording.sensors
+    tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))
+    return max((int(table.values.shape[axis]) for table in tables), default=0)
+
+
+def _length(count: int) -> int:
+    """The least of these lengths that is not below `count`."""
+    if not count:
+        return 0
+    octaves = np.array([-1, 0]) + np.ceil(4.0 * np.log2(count))
+    lengths = 16 * np.ceil(2.0 ** (octaves / 4.0) / 16)
+    return int(lengths[0] if lengths[0] >= count else lengths[1])
+
+
+def _stacked(*leaves: Any) -> Any:
+    # By NumPy if the numbers are known: JAX compiles a program for each shape.
+    if _checks.known(leaves):
+        return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))
+    return jnp.stack(leaves)
+
+
+def one(records: Any, index: Any) -> Any:
+    """The tree at an index of the leading axis, or at several."""
+
+    def pick(leaf: Any) -> Any:
+        if not eqx.is_array(leaf):
+            return leaf
+        known = _checks.known((leaf, index))
+        return jnp.asarray(np.asarray(leaf)[index]) if known else leaf[index]
+
+    return jax.tree.map(pick, records)
+
+
+def on_host(records: Recording, counts: Any) -> tuple[Recording, ...]:
+    """The recordings one by one, in NumPy's arrays, so that no JAX operation is needed."""
+    known = jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, records)
+    return tuple(
+        cut(jax.tree.map(lambda x, i=i: x[i] if isinstance(x, np.ndarray) else x, known), n)
+        for i, n in enumerate(np.asarray(counts).tolist())
+    )
+
+
+def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
+    """The rows from `begin` to before `end` of a recording: without those that `stack` appended."""
+    if recording.t.shape[0] == end - begin:
+        return recording
+
+    def long(r: Recording) -> list[Any]:
+        parts = [(reading.values, reading.mask, reading.late) for reading in r.readings]
+        return jax.tree.leaves((r.t, parts))
+
+    return eqx.tree_at(long, recording, [leaf[begin:end] for leaf in long(recording)])
+
+
+def _is_table(node: Any) -> bool:
+    return isinstance(node, Linear | Series)
+
+
+def lengthened(recording: Recording, count: int, rows: int = 0, axis: int = 0) -> Recording:
+    """The recording with masked readings at its last time, up to `count` times, and with tables of
+    `rows`; of several, stacked, with times along `axis` 1.
+    """
+    missing = count - recording.t.shape[axis]
+    # Sensors that read a moving object may hold tables of time, too.
+    torque, sensors = jax.tree.map(
+        lambda node: _table(node, rows, axis) if _is_table(node) else node,
+        (recording.torque, recording.sensors),
+        is_leaf=_is_table,
+    )
+    t = recording.t
+    parts = [(r.values, r.mask, r.late) for r in recording.readings]
+    if missing:
+        t = _repeat_last(t, missing, axis)
+        parts = [
+            (
+                _repeat_last(values, missing, axis),
+                _repeat_last(mask, missing, axis, False),
+                None if late is None else _repeat_last(late, missing, axis),
+            )
+            for values, mask, late in parts
+        ]
+    return eqx.tree_at(
+        lambda r: (r.t, r.torque, r.readings),
+        recording,
+        (t, torque, tuple(Reading(s, *part) for s, part in zip(sensors, parts, strict=True))),
+        is_leaf=lambda node: node is None,
+    )
+
+
+def _table(table: Any, rows: int, axis: int) -> Any:
+    missing = rows - table.values.shape[axis]
+    if missing <= 0:
+        return table
+    values = _repeat_last(table.values, missing, axis)
+    if isinstance(table, Series):
+        slopes = _repeat_last(table.slopes, missing, axis, 0.0)
+        return eqx.tree_at(lambda s: (s.values, s.slopes), table, (values, slopes))
+    last = table.times[..., -1:]
+    more = last + (last - table.times[..., -2:-1]) * np.arange(1, missing + 1, dtype=last.dtype)
+    times = jnp.concatenate([table.times, more], axis=-1)
+    return eqx.tree_at(lambda s: (s.times, s.values), table, (times, values))
+
+
+def _repeat_last(values: Any, count: int, axis: int, last: Any = None) -> Any:
+    # By NumPy where the numbers are known: JAX compiles a program for each shape.
+    xp: Any = np if _checks.known(values) else jnp
+    values = xp.asarray(values)
+    edge = values[(slice(None),) * axis + (slice(-1, None),)]
+    more = xp.repeat(edge if last is None else xp.full_like(edge, last), count, axis)
+    return jnp.asarray(xp.concatenate([values, more], axis))

@@ -1,0 +1,188 @@
+"""The iterated smoother: the most probable motion, given all readings."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from rigidjax import _checks
+from rigidjax._types import Scalar
+from rigidjax.identify.data.recording import Recording
+from rigidjax.identify.filtering import roots, steps
+from rigidjax.identify.filtering.filter import (
+    WORDS,
+    Belief,
+    Given,
+    looked_at,
+    scan_filter,
+    status_of,
+    told,
+)
+from rigidjax.identify.filtering.linear import LinearEstimate, solved
+from rigidjax.identify.filtering.steps import Dynamics, Extended, Model, Read, Stops
+from rigidjax.motion.manifold import minus, plus
+
+
+class Push(NamedTuple):
+    """The estimate of a white torque, averaged over the step that ends at each time.
+
+    **Fields:** `mean`, `deviation` (N, 3) N m, body frame; the deviation is large for short steps,
+    since white noise has no value at a time.
+    """
+
+    mean: Float[Array, "stops 3"]
+    deviation: Float[Array, "stops 3"]
+
+
+class Smoothed(eqx.Module):
+    """The result of `smooth`.
+
+    **Fields:** `belief` a `Belief` at each stop: the times of the recording and, where these are
+    far apart, some between; `rows` (T,) which of them are of the recording; `pushes` a `Push` for
+    each `RandomTorque` (a `CorrelatedTorque` is in `belief.torques`); `readings` a `Read` for each
+    sensor, of the last linearisation, (N, k); `log_likelihood` of all readings, by Laplace's method
+    about this motion; `change` how far the last iteration moved it, in standard deviations at most;
+    `iterations`; `status`, `lost_at` as of `Filtered`.
+    """
+
+    belief: Belief
+    rows: Int[Array, " times"]
+    pushes: tuple[Push, ...]
+    readings: tuple[Read, ...]
+    log_likelihood: Scalar
+    change: Scalar
+    iterations: Int[Array, ""]
+    status: Int[Array, ""]
+    lost_at: Scalar
+
+    @property
+    def words(self) -> str:
+        """The status in words."""
+        return WORDS[int(self.status)]
+
+    @property
+    def t(self) -> Float[Array, " stops"]:
+        """The times of all stops, s."""
+        return self.belief.t
+
+    @property
+    def states(self) -> Any:
+        """The most probable states at the times of the recording, with a leading time axis."""
+        return jax.tree.map(lambda leaf: leaf[self.rows], self.belief.state)
+
+
+def smooth(
+    model: Model,
+    recording: Recording,
+    first: Belief,
+    *,
+    iterations: int = 10,
+    tolerance: float = 1e-2,
+    substeps: int | None = None,
+    throw: bool = True,
+) -> Smoothed:
+    """Attitude, rate, unknown torque and sensor errors from all readings, with their deviations.
+
+    The motion of largest posterior density, by Gauss and Newton's method: each iteration linearises
+    dynamics and sensors about the last motion, at first that of `filter`, and solves the linear
+    problem exactly by a Kalman filter and the pass of Rauch, Tung and Striebel (Bell 1994,
+    doi:10.1137/0804035).
+
+    **Arguments:** as for `filter`; `iterations` at most; it ends when no number moved by more than
+    `tolerance` of its standard deviation (the error that remains is about the square of that).
+    **Returns** `belief`, `rows`, `pushes`, `readings`, `log_likelihood`, `change`, `iterations`,
+    `status` and `lost_at` (`Smoothed`). It may be jitted, differentiated in forward mode, and
+    batched. **Raises:** as `filter`; with `throw` also for a motion that still moves by a standard
+    deviation.
+
+    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(1.0))
+    >>> found = rj.estimate.smooth(model, record, rj.estimate.start(model, record, rate=1.0))
+    >>> found.pushes[0].mean.shape, found.rows.tolist()  # of three stops two are readings
+    ((3, 3), [0, 2])
+    """
+    _checks.whole(iterations, "iterations", 1)
+    _checks.positive(tolerance, "tolerance")
+    out = _smooth(looked_at(model, recording, first, substeps), iterations, tolerance)
+    if not throw:
+        return out
+    words = (
+        "smooth: the motion still moves by a standard deviation after the last iteration; give "
+        "more iterations, a better initial state, or a model that the readings fit; throw=False "
+        "returns it"
+    )
+    return _checks.refuse(told(out), out.change > 1, words)
+
+
+@eqx.filter_jit
+def _smooth(given: Given, iterations: int, tolerance: float) -> Smoothed:
+    _, sensors, _, first, grid = given
+    dynamics, stops, kept = scan_filter(given, lambda belief, read: (belief, read))
+    beliefs, read = grid.of_rows(kept)
+    status, lost_at = status_of(beliefs, steps.by_sensor(sensors, read), first.t)
+    path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, kept[0].x)
+
+    def more(state: tuple) -> Array:
+        return (state[3] < iterations) & (state[2] > tolerance)
+
+    def again(state: tuple) -> tuple:
+        path, found, _, count = state
+        out = _iterate(dynamics, first, stops, path, found.kicks[:, : dynamics.kicks])
+        return *out, count + 1
+
+    still = jnp.zeros((stops.t.shape[0], dynamics.kicks), first.root.dtype)
+    # Nothing is solved yet: one copy of an iteration is compiled, not two.
+    blank = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
+        jax.eval_shape(lambda: _iterate(dynamics, first, stops, path, still)[1]),
+    )
+    far = jnp.asarray(jnp.inf, first.root.dtype)
+    path, found, change, count = lax.while_loop(more, again, (path, blank, far, jnp.asarray(0)))
+    h = jnp.diff(stops.t, prepend=first.t).astype(first.root.dtype)
+    pushes = []
+    for index, root in enumerate(dynamics.white):
+        mine = slice(6 * index, 6 * index + 3)
+        size = roots.inverse_root(h)[:, None] * root[None]
+        variance = jnp.diagonal(found.kick_covariance, axis1=1, axis2=2)[:, mine]
+        pushes.append(Push(size * found.kicks[:, mine], size * jnp.sqrt(variance)))
+    belief = Belief(stops.t, jax.tree.map(lambda leaf: leaf[1:], path), found.root[1:])
+    reads = steps.by_sensor(sensors, Read(found.innovation[1:], found.variance[1:], kept[1].seen))
+    status = jnp.where(jnp.isfinite(change), status, 2)
+    total = found.log_likelihood
+    return Smoothed(belief, grid.rows, tuple(pushes), reads, total, change, count, status, lost_at)
+
+
+def _iterate(
+    dynamics: Dynamics, first: Belief, stops: Stops, path: Extended, kicks: Array
+) -> tuple[Extended, LinearEstimate, Scalar]:
+    """One linearisation about `path` and the `kicks` between its times, and its exact solution."""
+    dtype = first.root.dtype
+
+    def about(now: tuple) -> tuple:
+        """The step to a stop, and its readings, about the path."""
+        t0, stop, x, y, kick = now
+        after, grown, noise = dynamics.predict(
+            t0.astype(dtype), (stop.t - t0).astype(dtype), x, kick
+        )
+        off = minus(after, y)
+        grown, noise = (steps.reset(y, off, part, back=True) for part in (grown, noise))
+        push = off - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
+        return (grown, noise, push), steps.linearised(dynamics, stop, y)
+
+    before = jnp.concatenate([first.t[None], stops.t[:-1]])
+    x0, earlier, later = (
+        jax.tree.map(lambda leaf, at=at: leaf[at], path) for at in (0, slice(-1), slice(1, None))
+    )
+    steps, rows = lax.map(about, (before, stops, earlier, later, kicks))
+    # Nothing is read at the first time.
+    matrix, error, deviation, seen = (jnp.pad(a, [(1, 0)] + [(0, 0)] * (a.ndim - 1)) for a in rows)
+    parts = dict(zip(("transition", "noise", "push"), steps, strict=True))
+    parts |= {"matrix": matrix, "deviation": deviation, "offset": None}
+    off = minus(x0, first.x)
+    found = solved(parts, error, -off, steps.reset(x0, off, first.root), seen, back=True)
+    change = jnp.max(jnp.abs(found.mean) * roots.inverse_root(jnp.sum(found.root**2, -1)))
+    return jax.vmap(plus)(path, found.mean), found, change

@@ -1,0 +1,1 @@
+"""Posterior densities, profiles, comparison of models, and design of experiments."""

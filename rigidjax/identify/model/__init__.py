@@ -1,0 +1,1 @@
+"""From free numbers to bodies, motions and the errors of all readings."""

@@ -1,0 +1,89 @@
+"""The state of a search in a file, so that a killed search can continue."""
+
+import dataclasses
+import hashlib
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from rigidjax.identify.search.stages import SearchState, Tried
+
+
+def bare(tried: Tried) -> Tried:
+    """The same without its large arrays."""
+    return tried if tried.found is None else dataclasses.replace(tried, found=None)
+
+
+def require_folder(path: str | Path) -> None:
+    """Raise `ValueError` unless a file can be at `path`: before the search, not after a stride."""
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise ValueError(f"checkpoint {path}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise ValueError(f"checkpoint {path}: wanted a file, this is a folder")
+
+
+def fingerprint(*trees: Any) -> str:
+    """A hash of numbers and structure, the same in every process; a function counts by its name."""
+    leaves, structure = jax.tree.flatten(trees)
+    words, found = [repr(structure)], hashlib.sha256()
+    for leaf in leaves:
+        array = np.asarray(leaf)
+        words.append(f"{array.dtype} {array.shape}")
+        found.update(array.tobytes())
+    # An address in memory differs between processes.
+    found.update(re.sub("0x[0-9a-f]+", "", "\n".join(words)).encode())
+    return found.hexdigest()
+
+
+class Checkpoint:
+    """The results of a long search so far, on disk after every stride of steps.
+
+    `like` is a `Tried` of the right shapes, `print_of` the `fingerprint` of all that the search
+    depends on. A file of another problem raises `ValueError`, and is not overwritten.
+    """
+
+    def __init__(self, path: str | Path | None, like: Tried, print_of: str):
+        self.path, self.like = None if path is None else Path(path), like
+        self.print_of = print_of
+        self.done: list[Tried] = []
+        self.position = SearchState(0, 0, like)
+        if self.path is not None and self.path.exists():
+            self._read(self.path)
+
+    def save(self, done: Sequence[Tried], position: SearchState) -> None:
+        """Write the finished starts and the state of the search, replacing the file at once."""
+        if self.path is None:
+            return
+        stage, strides, current = position
+        head = dict(print_of=self.print_of, done=len(done), stage=stage, strides=strides)
+        beside = self.path.with_name(self.path.name + ".new")
+        with beside.open("wb") as file:
+            file.write(json.dumps(head).encode() + b"\n")
+            eqx.tree_serialise_leaves(file, [bare(item) for item in (*done, current)])
+        beside.replace(self.path)
+
+    def _read(self, path: Path) -> None:
+        try:
+            with path.open("rb") as file:
+                head = json.loads(file.readline())
+                same = head["print_of"] == self.print_of
+                if same:
+                    like = [self.like] * (int(head["done"]) + 1)
+                    *self.done, tried = eqx.tree_deserialise_leaves(file, like)
+                    self.position = SearchState(head["stage"], head["strides"], tried)
+        except Exception as error:
+            raise ValueError(
+                f"{path}: no checkpoint of a fit, or a damaged one ({type(error).__name__}); "
+                "delete it, or name another file"
+            ) from None
+        if not same:
+            raise ValueError(
+                f"{path}: the checkpoint of another problem, or of other options; name another file"
+            )

@@ -1,0 +1,141 @@
+"""The size of errors, estimated from those of a fit: noise of sensors, jitter of their clocks."""
+
+from typing import Any, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rigidjax.identify.model.free import Parameters
+from rigidjax.identify.model.problem import Problem
+from rigidjax.identify.model.terms import Noise, changes, weights_of
+from rigidjax.identify.uncertainty.covariance import linearise, of_white
+from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
+
+# Rounds of the search for two variances.
+ROUNDS = 500
+
+
+def estimate_noise(
+    problem: Problem, found: Any, noise: Noise, parameters: Parameters
+) -> tuple[Problem, Noise]:
+    """Noise (R, k) of each sensor: as given, or the scatter of its errors, one figure for
+    all channels and the recordings of a group. The problem with the jitter of its sensors likewise.
+
+    Fitted numbers take a part of the errors away, of few readings a large one: each sensor's is its
+    leverage at this noise, as by restricted maximum likelihood. **Arguments:** `found` errors and
+    derivatives as `evaluate` gives them, at `parameters`.
+    """
+    errors = found[0][0]
+    weights = weights_of(problem, errors, noise)
+    groups, out = np.asarray(problem.noise_groups), []
+    shares = _shares(problem, found, noise, parameters)
+    readings = list(problem.records.readings)
+    for index, (reading, error, sigma, weight, share) in enumerate(
+        zip(readings, errors, noise, weights, shares, strict=True)
+    ):
+        # The error of a reading at full scale is no noise.
+        sensor, kept = cast(Any, reading.sensor), reading.kept
+        known = sensor.noise is not None
+        if known:
+            sigma = sensor.noise
+        else:
+            squares = np.sum(np.where(kept, np.asarray(error) ** 2, 0.0), axis=2)
+            if problem.loss is None:
+                parts = np.bincount(groups, squares.sum(axis=1))
+                variance = parts / np.maximum(np.bincount(groups, kept.sum(axis=(1, 2))), 1)
+            else:
+                variance = _by_median(squares, kept, groups)
+            # Data without noise must not divide by zero: the least noise is round-off.
+            floor = 1e-15 * float(np.abs(np.asarray(reading.values)).max() + 1e-300)
+            each = np.maximum(np.sqrt(variance / share), floor)[groups]
+            each = np.broadcast_to(each[:, None], sigma.shape)
+            sigma = jnp.asarray(each.astype(sigma.dtype))
+        if reading.late is not None:
+            change = changes(parameters, problem)[index]
+            root = np.sqrt(np.asarray(weight, float) / share[groups][:, None])
+            size = np.asarray(sigma, float)
+            e, u = (np.where(kept, np.asarray(x) / size[:, None], 0.0) for x in (error, change))
+            tau = None if sensor.jitter.estimated else np.asarray(sensor.jitter.deviation)
+            both = _jitter(e * root[..., None], u, kept.sum(axis=-1), groups, known, tau)
+            grown, tau = (jnp.asarray(each, sigma.dtype) for each in both)
+            sigma = sigma * grown[:, None]
+            readings[index] = reading.scattered(tau[:, None, None] * change, tau)
+        out.append(sigma)
+    if any(reading.late is not None for reading in readings):
+        problem = eqx.tree_at(lambda p: p.records.readings, problem, tuple(readings))
+    return problem, tuple(out)
+
+
+def _by_median(squares: np.ndarray, kept: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """The variance of each group by the median of whole readings: outliers do not change it.
+
+    Weights of a loss would make it too small without outliers, and too large with many.
+    """
+    half, _ = median_of_chi2(kept.shape[-1])
+    whole = kept.all(axis=-1)
+    rows = (squares[groups == g][whole[groups == g]] for g in range(groups.max() + 1))
+    return np.array([np.median(row) / half if row.size else 0.0 for row in rows])
+
+
+def median_of_chi2(size: int) -> tuple[float, float]:
+    """The median of χ² with `size` degrees of freedom, and the density there."""
+    from scipy.special import chdtri, gammaln
+
+    median = float(chdtri(size, 0.5))
+    power = 0.5 * size - 1
+    density = 0.5 * np.exp(power * np.log(0.5 * median) - 0.5 * median - gammaln(0.5 * size))
+    return median, float(density)
+
+
+def _shares(problem: Problem, found: Any, noise: Noise, parameters: Parameters) -> list[np.ndarray]:
+    """The share of its errors that fitted numbers leave each sensor and group of recordings."""
+    groups, readings = np.asarray(problem.noise_groups), problem.records.readings
+    sizes = [np.bincount(groups, one.kept.sum(axis=(1, 2))) for one in readings]
+    held = problem.prior, problem.rows, *((slot.prior, slot.spread) for slot in problem.slots)
+    if len(readings) * sizes[0].size == 1 and not jax.tree.leaves(held):
+        # All numbers come from the readings of one noise.
+        taken = [np.array([sum(leaf.size for leaf in jax.tree.leaves(parameters))])]
+    else:
+        linear = linearise(problem, parameters, noise, found)
+        taken = leverages(linear, linear.information, of_white(linear).seen)
+        taken = [np.bincount(groups, each) for each in taken]
+    return [np.maximum(1.0 - n / np.maximum(m, 1), 0.1) for n, m in zip(taken, sizes, strict=True)]
+
+
+def _jitter(
+    e: np.ndarray,
+    u: np.ndarray,
+    count: np.ndarray,
+    groups: np.ndarray,
+    known: bool,
+    tau: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The most likely σ and τ (R,) of errors e (R, T, k) of covariances `σ² + τ² u uᵀ`, alike in a
+    group, `count` (R, T) channels seen; a `known` σ is 1, a known τ is given. In turn τ² by
+    Fisher's scoring of the squares along u, whose mean is `σ² + τ² |u|²`, and σ² by expectation and
+    maximisation.
+    """
+    size, total = np.sum(u**2, axis=-1), np.sum(e**2, axis=-1)
+    seen = total > 0
+    dot = np.sum(e * u, axis=-1)
+    along = dot**2 / np.maximum(size, 1e-300)
+
+    def ratio(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        x, y = (np.bincount(groups, np.sum(each * seen, axis=1)) for each in (x, y))
+        return (x / np.maximum(y, 1e-300))[groups][:, None]
+
+    p, q = np.ones((len(e), 1)), np.zeros((len(e), 1)) if tau is None else tau[:, None] ** 2
+    for _ in range(ROUNDS):
+        before, weight = (p, q), (p + q * size) ** -2.0
+        if tau is None:
+            q = np.maximum(ratio(weight * size * (along - p), weight * size**2), 0.0)
+        if not known:
+            wide = p + q * size
+            delay, unsure = q * dot / wide, p * q / wide
+            left = total - 2 * delay * dot + size * (delay**2 + unsure)
+            p = np.maximum(ratio(left, count), 1e-12)
+        if np.allclose((p, q), before, rtol=1e-9, atol=0.0):
+            break
+    return np.sqrt(p[:, 0]), np.sqrt(q[:, 0])

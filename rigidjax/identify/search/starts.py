@@ -1,0 +1,128 @@
+"""The starts of a fit: a linear regression if the data allow it, and scattered points around it."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from rigidjax._types import HasSpin
+from rigidjax.body.inertia import Inertia
+from rigidjax.identify.data import stacking
+from rigidjax.identify.data.recording import Recording
+from rigidjax.identify.data.reference_states import rates
+from rigidjax.identify.model.charts import BASIS, Bodies
+from rigidjax.identify.model.free import Parameters
+from rigidjax.identify.model.problem import Problem
+from rigidjax.motion import Spin
+from rigidjax.motion.torques.base import Torque, evaluate
+from rigidjax.motion.torques.states import has_states
+
+
+def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> list[Parameters]:
+    """`count` starting points: the regression first, then scattered around it or over the whole
+    chart, the rate by a tenth. A `Free` starts at its given value.
+    """
+    recordings = stacking.on_host(problem.records, problem.counts)
+    if isinstance(problem.body, Bodies):
+        rows = list(zip(recordings, problem.of, strict=True))
+        found = {
+            name: regress_inertia(tuple(record for record, of in rows if of == name))
+            for name in problem.body.names
+        }
+        regressed = {name: body for name, body in found.items() if body is not None} or None
+    else:
+        regressed = regress_inertia(recordings)
+    start = problem.start(regressed)
+    spins = np.asarray(start.own.spin)
+    centre = np.asarray(start.body)
+    # NumPy's generator: that of JAX takes seconds to compile.
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)
+    out = []
+    for index in range(count):
+        wide = 0.0 if index == 0 else (0.5 if regressed is not None and index % 2 else 1.5)
+        middle = centre if (index == 0 or wide < 1) else 0 * centre
+        body = middle + wide * rng.normal(size=centre.shape)
+        spin = spins + (0.0 if index == 0 else 0.1) * rng.normal(size=spins.shape)
+        kind = start.own.spin.dtype
+        moved = jnp.asarray(body, kind), jnp.asarray(spin, kind)
+        out.append(eqx.tree_at(lambda p: (p.body, p.own.spin), start, moved))
+    return out
+
+
+def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
+    """The inertia from a regression on Euler's equations in integral form.
+
+    `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. With a torque they are found
+    by least squares, without one as the smallest right singular vector (up to scale). The result
+    is moved to the nearest real body. It is `None` if samples are too far apart, or the torque
+    needs more than a rate.
+    """
+    found = []
+    for recording in recordings:
+        t, w = rates(recording)
+        if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
+            return None
+        if not of_rates(recording.torque):
+            return None
+        found.append(balance(recording, np.eye(3)))
+    matrix, side, _ = (np.concatenate(part) for part in zip(*found, strict=True))
+    components, _ = tensor_and_margin(matrix, side)
+    if not components[:3].sum() > 0:
+        return None
+    tensor = np.einsum("k,kij->ij", components, BASIS)
+    values, axes = np.linalg.eigh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
+    values = np.maximum(values, 1e-2 * values.max())
+    second_moment = (axes * values) @ axes.T
+    return Inertia(jnp.asarray(np.trace(second_moment) * np.eye(3) - second_moment))
+
+
+def tensor_and_margin(matrix: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, float]:
+    """The components (6,) of a tensor by least squares, of trace one if all sides are zero.
+
+    And the smallest eigenvalue of its second moment over the largest: positive for a real body.
+    """
+    if np.abs(side).max() > 0:
+        components = np.linalg.lstsq(matrix, side, rcond=None)[0]
+    else:
+        components = np.linalg.svd(matrix, full_matrices=False)[2][-1]
+        components = components * np.sign(components[:3].sum())
+        components = components / components[:3].sum()
+    tensor = np.einsum("k,kij->ij", components, BASIS)
+    values = np.linalg.eigvalsh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
+    return components, float(values[0] / max(np.abs(values).max(), 1e-300))
+
+
+def of_rates(torque: Any) -> bool:
+    """Whether there is no torque, or it depends on time and rate alone."""
+    return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
+
+
+def balance(recording: Recording, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Euler's equations integrated over a recording, of rates turned by `turn`: rows (n, 6), right
+    sides (n,), rows of the momentum itself.
+    """
+    t, w = rates(recording)
+    w, pushed = w @ turn.T, np.zeros((t.size, 3))
+    if recording.torque is not None:
+        pushed = np.asarray(_torques(recording.torque, t, w))
+    momenta = np.einsum("kij,tj->tki", BASIS, w)
+    turned = np.concatenate([np.cross(w[:, None, :], momenta), pushed[:, None, :]], axis=1)
+    steps = 0.5 * (turned[1:] + turned[:-1]) * np.diff(t)[:, None, None]
+    integral = np.concatenate([np.zeros_like(turned[:1]), np.cumsum(steps, axis=0)])
+    total, impulse = momenta + integral[:, :-1], integral[:, -1:]
+
+    def about_the_mean(x: np.ndarray) -> np.ndarray:
+        # A conserved momentum is constant: compare it with its mean over the record.
+        some = (x - x.mean(axis=0))[:: max(1, t.size // 60)]
+        return some.transpose(0, 2, 1).reshape(-1, x.shape[1])
+
+    return about_the_mean(total), about_the_mean(impulse)[:, 0], about_the_mean(momenta)
+
+
+@eqx.filter_jit
+def _torques(torque: Torque, t: Any, w: Any) -> Any:
+    body = Inertia(jnp.eye(3))
+    return jax.vmap(lambda time, omega: evaluate(torque, time, Spin(omega), body))(t, w)

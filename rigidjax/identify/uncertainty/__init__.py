@@ -1,0 +1,1 @@
+"""Covariances of a fit, flat bodies, and intervals of named quantities."""

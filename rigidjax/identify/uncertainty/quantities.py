@@ -1,0 +1,247 @@
+"""The quantities that a fit reports by name, their values, standard deviations and intervals."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from rigidjax.identify.model.charts import AbstractBodyChart, Bodies, Ratios, in_a_row
+from rigidjax.identify.model.free import Parameters
+from rigidjax.identify.model.problem import Problem, values_of
+from rigidjax.identify.uncertainty import flat_limit
+from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
+
+# An interval wider than this factor says nothing about a positive number.
+FARTHEST = 1e3
+
+
+class Quantity(eqx.Module):
+    """A number with a name: its value, standard deviation (of the logarithm if positive), unit.
+
+    `cuts` are its correlation with the flatness of each body, and the flatness in standard
+    deviations (`rigidjax.identify.flat_limit`); `most` is an upper limit for all bodies; `freedom`
+    the degrees of freedom of its variance, infinite if all noise is given.
+
+    >>> mass = Quantity("mass", 2.0, 0.01, "kg", True)
+    >>> low, high = mass.interval(0.95)
+    >>> round(low, 3), round(high, 3)
+    (1.961, 2.04)
+    """
+
+    name: str
+    value: float
+    deviation: float
+    unit: str
+    positive: bool
+    cuts: tuple[tuple[float, float], ...] = ()
+    most: float = np.inf
+    freedom: float = np.inf
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Low and high of the interval; through the logarithm if positive.
+
+        An end is nearer if the body there would be past flat. The ends are 0 and infinity for a
+        positive number that is not known to a factor of 1e3. **Arguments:** `level` the probability
+        that it holds the true value. **Raises** `ValueError` outside (0, 1).
+        """
+        reach = float(quantile(level, self.freedom))
+        low, high = (float(side) * self.deviation for side in cut_ends(reach, self.cuts))
+        if not self.positive:
+            return self.value + low, self.value + high
+        if max(-low, high) > np.log(FARTHEST):
+            return 0.0, self.most
+        return float(self.value * np.exp(low)), min(float(self.value * np.exp(high)), self.most)
+
+
+def cut_ends(reach: np.ndarray | float, cuts: Sequence[tuple[Any, float]]) -> tuple[Any, Any]:
+    """The ends of an interval in standard deviations, for each limit that cuts it."""
+    low: Any = -reach
+    high: Any = reach
+    for correlation, away in cuts:
+        least, most = flat_limit.ends(reach, correlation, away)
+        low, high = np.maximum(low, least), np.minimum(high, most)
+    return low, high
+
+
+def labels(problem: Problem) -> list[tuple[str, str, bool]]:
+    """Name, unit and whether positive, in the order of `vector`."""
+    out = []
+    for name, chart in charts(problem):
+        out += [(f"{log}{name}", chart.unit, True) for log in chart.log_names]
+        out += [(f"{plain}{name}", chart.unit, False) for plain in chart.plain_names]
+    names = recording_names(problem)
+    for where in names:
+        out += [(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]
+    for slot in problem.slots:
+        shape = np.shape(slot.read(problem.records))[1:]
+        parts = [""] if not shape else [f" {_place(i)}" for i in np.ndindex(shape)]
+        ends = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
+        ends = ends if slot.spread is None else [*ends, *(f", own{where}" for where in names)]
+        called = [f"{slot.name}{part}{end}" for end in ends for part in parts]
+        out += [(name, slot.unit, slot.positive) for name in called]
+    return out
+
+
+def charts(problem: Problem) -> list[tuple[str, AbstractBodyChart]]:
+    """The chart of each body, and the suffix of the names of its quantities."""
+    if not isinstance(problem.body, Bodies):
+        return [("", problem.body)]
+    return [(f" [{n}]", c) for n, c in zip(problem.body.names, problem.body.charts, strict=True)]
+
+
+def recording_names(problem: Problem) -> list[str]:
+    """The suffix of the names of a recording's quantities: its number in its body's list."""
+    if problem.count == 1:
+        return [""]
+    out: list[str] = []
+    for index, name in enumerate(problem.of):
+        number = problem.of[:index].count(name)
+        out.append(f" [{name} {number}]" if name else f" [{number}]")
+    return out
+
+
+def _place(index: tuple[int, ...]) -> str:
+    return "xyz"[index[0]] if len(index) == 1 and index[0] < 3 else str(index)
+
+
+def vector(problem: Problem, parameters: Parameters) -> Array:
+    """The reported quantities, with logarithms of the positive ones."""
+    rates = parameters.own.spin * problem.reference.rate[:, None]
+    parts, bodies = [], in_a_row(problem.bodies(parameters))
+    for (_, chart), body in zip(charts(problem), bodies, strict=True):
+        parts += [chart.logs(body), chart.plain(body)]
+    parts.append(rates.reshape(-1))
+    values = values_of(problem, parameters)
+    for slot in problem.slots:
+        for name in (slot.name, f"{slot.name}, own")[: 1 + (slot.spread is not None)]:
+            value = values[name].reshape(-1)
+            parts.append(jnp.log(value) if slot.positive else value)
+    return jnp.concatenate([part.astype(rates.dtype) for part in parts])
+
+
+@eqx.filter_jit
+def value_and_slope(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
+    """The reported quantities and the flatness of each body, and their derivatives."""
+    flat, restore = ravel_pytree(parameters)
+
+    def value(x: Array) -> Array:
+        moved = restore(x)
+        return jnp.concatenate([vector(problem, moved), flat_limit.flatness(problem, moved)])
+
+    return value(flat), jax.jacfwd(value)(flat)
+
+
+def values_and_slopes(
+    problem: Problem, parameters: Parameters, near: Parameters | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The reported quantities and the flatness of each body, with their derivatives at `near`."""
+    values, slopes = (np.asarray(x) for x in value_and_slope(problem, parameters))
+    if near is not None:
+        slopes = np.asarray(value_and_slope(problem, near)[1])
+    return values, slopes
+
+
+def quantities(
+    problem: Problem,
+    found: tuple[np.ndarray, np.ndarray],
+    covariance: np.ndarray,
+    null: np.ndarray,
+    limits: tuple[flat_limit.Limit, ...] = (),
+    freedom: np.ndarray | float = np.inf,
+) -> tuple[Quantity, ...]:
+    """Every reported quantity with its standard deviation, of `values_and_slopes`; `covariance`
+    within the determined directions, `null` (k, n) the others; `limits` cut the intervals;
+    `freedom` of the variances.
+    """
+    names = labels(problem)
+    values, slope = (part[: len(names)] for part in found)
+    deviations = carried(slope, covariance, null)
+    cuts = cuts_of(slope, covariance, deviations, limits)
+    freedom = np.broadcast_to(freedom, found[0].shape)
+    # A number that changes with no fitted number is not determined.
+    deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
+    out = []
+    for index, (name, unit, positive) in enumerate(names):
+        value, deviation = values[index], deviations[index]
+        shown = float(np.exp(value)) if positive else float(value)
+        # A number is not known better than its round-off.
+        least = np.finfo(float).eps * (1.0 if positive else abs(shown))
+        most = 1.0 if name.startswith(Ratios.log_names) else np.inf
+        mine = tuple((float(rho[index]), away) for rho, away in cuts)
+        deviation = float(np.maximum(deviation, least))
+        own = float(freedom[index])
+        out.append(Quantity(name, shown, deviation, unit, positive, mine, most, own))
+    return tuple(out)
+
+
+def around(
+    middle: np.ndarray,
+    slope: np.ndarray,
+    covariance: np.ndarray,
+    null: np.ndarray,
+    reach: np.ndarray | float,
+    limits: tuple[flat_limit.Limit, ...] = (),
+) -> tuple[np.ndarray, np.ndarray]:
+    """The interval of functions of value `middle` and derivative `slope`; else as `quantities`."""
+    wide = carried(slope, covariance, null)
+    low, high = cut_ends(reach, cuts_of(slope, covariance, wide, limits))
+    return np.asarray(middle + low * wide), np.asarray(middle + high * wide)
+
+
+def cuts_of(
+    slope: np.ndarray,
+    covariance: np.ndarray,
+    deviations: np.ndarray,
+    limits: tuple[flat_limit.Limit, ...],
+) -> list[tuple[np.ndarray, float]]:
+    """The correlations of functions with each limit, and the distance from it."""
+    out = []
+    for limit in limits:
+        wide = limit.deviation(covariance)
+        if np.isfinite(wide) and wide > 0:
+            with np.errstate(invalid="ignore", divide="ignore"):
+                rho = slope @ (covariance @ limit.slope) / (deviations * wide)
+            out.append((np.where(np.isfinite(rho), rho, 0.0), limit.free / wide))
+    return out
+
+
+def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
+    """Standard deviations of functions with this derivative (…, n); all intervals use them.
+
+    Infinite along a direction of `null` (k, n); NaN along one of negative variance or round-off, or
+    of a number with a correlation beyond one.
+    """
+    if not np.isfinite(covariance).all():
+        return np.full(slope.shape[:-1], np.nan)
+    size = np.abs(slope).max(axis=-1, initial=1e-300)
+    touched = np.abs(slope @ null.T).max(axis=-1, initial=0.0) > 1e-6 * size
+    unit = np.sqrt(np.abs(np.diag(covariance)))
+    unit = np.where(unit > 0, unit, 1.0)
+    rows, scaled = (slope * unit).reshape(-1, unit.size), covariance / np.outer(unit, unit)
+    beyond, found = np.abs(scaled).max(axis=0, initial=0.0) > 1.0 + 1e-6, np.zeros(len(rows))
+    # Functions of the same few numbers, such as the state of one recording, at once.
+    alike: dict[bytes, list[int]] = {}
+    for index, row in enumerate(rows):
+        alike.setdefault((row != 0).tobytes(), []).append(index)
+    for key, mine in alike.items():
+        some = np.frombuffer(key, bool)
+        own = _deviations(rows[mine][:, some], scaled[np.ix_(some, some)])
+        found[mine] = np.nan if beyond[some].any() else own
+    return np.where(touched, np.inf, found.reshape(slope.shape[:-1]))
+
+
+def _deviations(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations (m,) of functions with this derivative (m, n), NaN as in `carried`."""
+    values, axes = np.linalg.eigh(covariance)
+    along = slope @ axes
+    length = np.linalg.norm(along, axis=-1)
+    least = 10 * values.size * np.finfo(float).eps * np.abs(values).max(initial=0.0)
+    unreal = np.linalg.norm(along[..., values < -least], axis=-1) > 1e-6 * length
+    variance = along**2 @ np.maximum(values, 0.0)
+    lost = (length > 0) & (unreal | (variance <= least * length**2))
+    return np.where(lost, np.nan, np.sqrt(variance))
