@@ -20,8 +20,8 @@ from rigidjax.body import spatial_angular_momentum
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.model.charts import PrincipalRatios
+from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.priors import SoftL1
-from rigidjax.identify.model.problem import Problem
 from rigidjax.identify.report import Row
 from rigidjax.identify.sensors import AttitudeSensor, Gyro
 from rigidjax.rotation import euler
@@ -73,13 +73,15 @@ def recording() -> Recording:
     return Recording(t, (sensor, np.stack(attitudes)), (gyro, rates))
 
 
-def problem() -> Problem:
-    """Free motion with the body axes principal; a robust loss counts outliers linearly.
+def model() -> Model:
+    """Return the model of a free motion with principal body axes and a robust loss.
 
-    >>> problem().body.log_names
+    The loss counts outliers linearly.
+
+    >>> model().chart.log_names
     ('Ix/Iz', 'Iy/Iz')
     """
-    return Problem(recording(), PrincipalRatios(), loss=SoftL1())
+    return Model(recording(), PrincipalRatios(), loss=SoftL1())
 
 
 @jax.jit
@@ -99,7 +101,7 @@ def _direction(body: Any, state: Any) -> Array:
 def rows(fit: Fit) -> list[Row]:
     """Periods and the direction of the angular momentum as rows for `report.table`.
 
-    **Arguments:** `fit` of `problem()`. **Returns** rows (name, value, low, high, unit): days, and
+    **Arguments:** `fit` of `model()`. **Returns** rows (name, value, low, high, unit): days, and
     degrees of ecliptic longitude and latitude (J2000), with 95 % intervals.
     """
 

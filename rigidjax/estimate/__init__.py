@@ -18,7 +18,7 @@ from rigidjax.identify.filtering.linear import (
     linear_smooth as linear_smooth,
 )
 from rigidjax.identify.filtering.smoother import smooth as smooth
-from rigidjax.identify.filtering.steps import Model as Model, Walk as Walk, sample as sample
+from rigidjax.identify.filtering.steps import NoiseModel as NoiseModel, Walk as Walk, sample as sample
 from rigidjax.identify.inference.density import LogDensity as LogDensity
 from rigidjax.identify.inference.draws import (
     Nuts as Nuts,
@@ -27,5 +27,7 @@ from rigidjax.identify.inference.draws import (
     posterior as posterior,
     refit as refit,
 )
+
+Model = NoiseModel
 
 show(__name__)

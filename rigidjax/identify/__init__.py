@@ -23,11 +23,8 @@ from rigidjax.identify.model.charts import (
     Ratios as Ratios,
     Tensor as Tensor,
 )
-from rigidjax.identify.model.free import (
-    Free as Free,
-    Parameters as Parameters,
-    Unpacked as Unpacked,
-)
+from rigidjax.identify.model.free import Free as Free
+from rigidjax.identify.model.model import Model as Model, Unpacked as Unpacked
 from rigidjax.identify.model.predict import (
     Adaptive as Adaptive,
     FixedSteps as FixedSteps,
@@ -39,7 +36,7 @@ from rigidjax.identify.model.priors import (
     Huber as Huber,
     SoftL1 as SoftL1,
 )
-from rigidjax.identify.model.problem import Problem as Problem
+from rigidjax.identify.model.scene import Scene as Scene
 from rigidjax.identify.search.stochastic_gradient import Descent as Descent
 from rigidjax.identify.search.window_fit import WindowFit as WindowFit, fit_windows as fit_windows
 from rigidjax.identify.sensors import (

@@ -16,8 +16,8 @@ from rigidjax.identify.csv_io import UNITS, USUAL as USUAL, LogError, layout_of 
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.model import charts
 from rigidjax.identify.model.free import Free
+from rigidjax.identify.model.model import Model as Problem
 from rigidjax.identify.model.priors import Huber, SoftL1
-from rigidjax.identify.model.problem import Problem
 from rigidjax.identify.sensors import AbstractSensor, Accelerometer, AttitudeSensor, Gyro
 from rigidjax.motion.torques import Damping, Flywheel, Series, Sum, Wheel
 from rigidjax.motion.torques.base import Torque

@@ -24,7 +24,7 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
 
     **Arguments:** `fit`; `rate_unit` of the initial body rate: `rad/s`, `deg/s`, `deg/day`.
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> name, value, low, high, unit = rows(found)[0]
     >>> name, round(value, 1), low < value < high
     ('Ix/Iz', 3.1, True)
@@ -109,19 +109,19 @@ def verdict(fit: Fit) -> str:
 
     **Arguments:** `fit` a result of `rigidjax.identify.fit`.
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> verdict(found).splitlines()[0]
     'status: ok'
     """
     one_fit(fit)
     good = [start for start in fit.starts if start.converged and start.fits]
-    lines = ["status: ok"] if fit.ok else [f"search: {fit.search}", f"model: {fit.model}"]
+    lines = ["status: ok"] if fit.ok else [f"search: {fit.search}", f"model: {fit.explanation}"]
     lines += [str(cause) for cause in fit.causes] + [fit.advice]
     lines.append(
         f"starts: {len(good)} of {len(fit.starts)} reached a motion that fits as well as the best"
         + (", all the same one" if fit.ok and len(good) > 1 else "")
     )
-    for sensor, tau in zip(fit.problem.records.sensors, fit.jitter, strict=True):
+    for sensor, tau in zip(fit.model.records.sensors, fit.jitter, strict=True):
         if tau is not None:
             size = " or ".join(f"{1e3 * each:.3g}" for each in np.unique(np.asarray(tau)))
             lines.append(f"time stamps of the {type(sensor).__name__} scatter by {size} ms")
@@ -135,7 +135,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
     **Arguments:** `fit`; `files` the names of the files that were read; `more` rows of further
     quantities.
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> as_dict(found)["status"]
     'ok'
     """
@@ -150,7 +150,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
         "files": list(files),
         "status": fit.status,
         "search": {"answer": fit.search.word, "reasons": list(fit.search.reasons)},
-        "model": {"answer": fit.model.word, "reasons": list(fit.model.reasons)},
+        "model": {"answer": fit.explanation.word, "reasons": list(fit.explanation.reasons)},
         "causes": [dataclasses.asdict(cause) for cause in fit.causes],
         "advice": fit.advice,
         "quantities": {
@@ -194,7 +194,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
 def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
     """Name, rms of each component without readings at full scale, and unit of sensors."""
     out = []
-    for error, reading in zip(fit.residuals, fit.problem.records.readings, strict=True):
+    for error, reading in zip(fit.residuals, fit.model.records.readings, strict=True):
         kept = reading.kept
         squares = np.where(kept, np.asarray(error).reshape(kept.shape) ** 2, 0.0)
         mean = squares.sum(axis=(0, 1)) / np.maximum(kept.sum(axis=(0, 1)), 1)
@@ -211,7 +211,7 @@ def write_json(
     **Arguments:** `fit`; `path` of the file, written over; `files` and `more` as for `as_dict`.
 
     >>> import json, tempfile
-    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_json(found, folder + "/fit.json")
     ...     json.loads(Path(folder, "fit.json").read_text())["status"]
@@ -239,7 +239,7 @@ def write_html(
     read; `more` rows of further quantities.
 
     >>> import tempfile
-    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_html(found, folder + "/fit.html")
     ...     Path(folder, "fit.html").read_text(encoding="utf-8")[:15].lower()
@@ -289,7 +289,7 @@ def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str
 
     **Arguments:** `fit`; `rate_unit` as for `rows`; `more` rows of further quantities.
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> as_html(found).startswith("<p") and "Ix/Iz" in as_html(found)
     True
     """

@@ -5,7 +5,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
@@ -63,18 +62,18 @@ def _given(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
     """The body, and bodies drawn from the Gaussian of a fit (a leading axis), `None` without."""
     if isinstance(body, Inertia | MassProperties):
         return _checks.single(body, (Inertia, MassProperties), "body"), None
-    if not hasattr(body, "parameters") or not hasattr(body, "problem"):
+    if not hasattr(body, "x") or not hasattr(body, "model"):
         words = "inertia_ellipsoid: wanted an Inertia, a MassProperties or a Fit, got "
         raise TypeError(words + _checks.kind(body))
     if isinstance(body.body, dict):
         words = "wanted one body, got a Fit of several: give fit.body[name]"
         raise ValueError(f"inertia_ellipsoid: {words}")
-    flat, restore = ravel_pytree(body.beside)
+    x = body.derivative_point
     values, vectors = np.linalg.eigh(np.asarray(body.seen))
     # A fixed seed: the same fit gives the same picture.
     steps = np.random.default_rng(0).standard_normal((samples, values.size))
-    steps = jnp.asarray(steps * np.sqrt(np.maximum(values, 0.0)) @ vectors.T, flat.dtype)
-    return body.body, jax.vmap(lambda step: body.problem.unpack(restore(flat + step))[0])(steps)
+    steps = jnp.asarray(steps * np.sqrt(np.maximum(values, 0.0)) @ vectors.T, x.dtype)
+    return body.body, jax.vmap(lambda step: body.model.bodies(x + step))(steps)
 
 
 def _outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:

@@ -19,7 +19,7 @@ def fit(
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s` or
     `day`; `rate_unit` `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib figure.
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> fit(found).axes[-1].get_xlabel()
     'time, s'
     """
@@ -46,13 +46,13 @@ def fit(
 
 def _between(found: Any, record: Any, index: int) -> tuple[np.ndarray, Any] | None:
     """Times and states between sparse samples of a free body, for a smooth line; else `None`."""
-    problem, body, state0 = found.problem, found.body, found.state0
-    if problem.torque is not None or record.t.shape[0] > 300:
+    model, body, state0 = found.model, found.body, found.state0
+    if model.torque is not None or record.t.shape[0] > 300:
         return None
-    if problem.count > 1:
+    if model.count > 1:
         state0 = jax.tree.map(lambda leaf: leaf[index], state0)
     if isinstance(body, dict):
-        body = body[problem.of[index]]
+        body = body[model.body_names[index]]
     dense = jnp.linspace(record.t[0], record.t[-1], 800)
     return np.asarray(dense), simulate(body, state0, dense).ys
 

@@ -24,7 +24,7 @@ def residuals(
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`,
     `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> residuals(found)[0, 2].get_xlabel()
     'lag, samples'
     """

@@ -36,13 +36,13 @@ def of_fit(found: Any, index: Any) -> tuple[Any, list[np.ndarray], list[np.ndarr
     """A recording of a fit, residuals and their deviations; raises in words if it has none."""
     if np.shape(getattr(found, "chi2", 0.0)) != ():
         raise ValueError("found: wanted one Fit, got one with leading axes; draw them one by one")
-    wanted = ("problem", "parameters", "residuals")
+    wanted = ("model", "x", "residuals")
     if isinstance(found, type) or not all(hasattr(found, name) for name in wanted):
         raise TypeError(f"found: wanted a Fit of rigidjax.identify, got {type(found).__name__}")
-    index, count = _checks.whole(index, "index", 0), found.problem.count
+    index, count = _checks.whole(index, "index", 0), found.model.count
     if index >= count:
         raise ValueError(f"index: wanted one of {count} recordings, from 0, got {index}")
-    record, which = found.problem.recordings[index], ... if count == 1 else index
+    record, which = found.model.recordings[index], ... if count == 1 else index
     errors = [np.asarray(e[which])[: record.t.shape[0]] for e in found.residuals]
     lates = [0.0 if reading.late is None else reading.late for reading in record.readings]
     noises = zip(found.noise, lates, strict=True)

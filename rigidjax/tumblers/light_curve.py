@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, exact
@@ -19,9 +18,8 @@ from rigidjax.identify.answer.fit import fit
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.model.charts import Bodies
-from rigidjax.identify.model.free import Parameters
-from rigidjax.identify.model.problem import Problem, one_problem
-from rigidjax.identify.search.stages import Tried
+from rigidjax.identify.model.model import Model, require_one
+from rigidjax.identify.search.stages import Attempt
 from rigidjax.identify.uncertainty import covariance as uncertainty
 from rigidjax.identify.uncertainty.quantities import carried, quantities, values_and_slopes
 from rigidjax.rotation import quaternion
@@ -47,13 +45,13 @@ LEAST, ABOVE = 12, 40.0
 class Alias(eqx.Module):
     """A motion found by a search.
 
-    **Fields:** `parameters`; `cost` half of χ²; `rotation` the body period, s, `precession` the
+    **Fields:** `x` (n,) the free numbers; `cost` half of χ²; `rotation` the body period, s, `precession` the
     mean precession period, s (`rigidjax.exact.body_period`, `precession_period`); `mode` `"long"`
     or `"short"`: the circulated axis; `ratios` (2,) the two smaller moments over the largest;
     `explains` whether it explains the data nearly as well as the best.
     """
 
-    parameters: Parameters
+    x: Float[Array, " n"]
     cost: float
     rotation: float
     precession: float
@@ -75,7 +73,7 @@ class LightCurve(eqx.Module):
     **Fields:** `fit` of the best motion, whose covariance allows for a body that is no ellipsoid;
     `aliases` all motions found, in the order of their misfits; `deviations` (4,) relative standard
     deviations of the best one's rotation, precession and two ratios; `pairs` their frequencies;
-    `search` and `model` the two answers as of a `Fit`. The search is also `not alone` if another
+    `search` and `explanation` the two answers as of a `Fit`. The search is also `not alone` if another
     alias explains the data nearly as well; the model `leaves a part` also if χ² is three deviations
     above its mean for the given noise.
     """
@@ -85,12 +83,12 @@ class LightCurve(eqx.Module):
     deviations: Float[np.ndarray, "4"]
     pairs: TwoFrequencies
     search: Answer
-    model: Answer
+    explanation: Answer
 
     @property
     def status(self) -> str:
         """Both answers in one line; `ok` if both are good and have no reasons."""
-        return answers.status(self.search, self.model)
+        return answers.status(self.search, self.explanation)
 
     @property
     def ok(self) -> bool:
@@ -108,7 +106,7 @@ class LightCurve(eqx.Module):
 
 
 def fit_light_curve(
-    problem: Problem,
+    model: Model,
     *,
     shortest: float | None = None,
     count: int = 48,
@@ -129,71 +127,72 @@ def fit_light_curve(
     way between sun and observer, body frame, and the entries of S are independent with deviation 4
     %.
 
-    **Arguments:** `problem` of one recording with one `Brightness` sensor and no torque; let a
+    **Arguments:** `model` of one recording with one `Brightness` sensor and no torque; let a
     `Free` move the sensor's `level` unless it is known. `shortest` period of a line in the
     spectrum, s, `None` for four times the median distance of the samples; `count` the largest
     number of pairs of frequencies. Pairs that fit worse are not tried; if more than `count` fit,
     the search has `not ended`. `tolerance` as of `fit`; `progress` is called with a line of text.
 
     Sources: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021; Kaasalainen 2001,
-    A&A 376:302, doi:10.1051/0004-6361:20010935. **Raises:** `ValueError` for a problem with other
+    A&A 376:302, doi:10.1051/0004-6361:20010935. **Raises:** `ValueError` for a model with other
     sensors, several recordings or a torque; `TypeError` under a trace.
     """
-    reading = _only(problem)
+    reading = _only(model)
     _checks.whole(count, "count", 1)
     _checks.positive(tolerance, "tolerance")
     say = lambda line: None  # noqa: E731
     if progress is not None:
         say = _checks.function(progress, "progress", "of a line of text, such as print")
-    t, flux, noise = relative_flux(problem, reading)
+    t, flux, noise = relative_flux(model, reading)
     squares, spread = flux**2, None if noise is None else 2.0 * flux * noise
     found = two_frequencies(t, squares, spread, shortest=shortest, count=count)
     # The pairs that fit well enough to be tried.
     above = ABOVE * max(1.0, float(found.misfits[0]) / found.dof)
     used = max(LEAST, int((found.misfits <= found.misfits[0] + above).sum()))
-    starts = starts_of(problem, reading, t, squares, spread, found, used)
+    starts = starts_of(model, reading, t, squares, spread, found, used)
     say(f"{used} pairs of frequencies, χ² {found.misfits[0]:.6g} of {found.dof}")
     say(f"{len(starts)} starts")
-    sigma = noise_of(problem, reading, flux, found)
-    whole = stacking.of_few_lengths(problem)
+    sigma = noise_of(model, reading, flux, found)
+    whole = stacking.of_few_lengths(model)
     ends = descended(whole, starts, sigma, tolerance)
     aliases = _aliases(whole, ends)
     say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
-    best = fit(whole, starts=1, initial=aliases[0].parameters, tolerance=tolerance)
+    best = fit(whole, starts=1, initial=aliases[0].x, tolerance=tolerance)
     told = _told(best, aliases, found, used >= count)
     # Of the readings as they were given.
-    own = eqx.tree_at(lambda p: p.slots, problem, best.problem.slots)
-    return eqx.tree_at(lambda one: one.fit.problem, told, own)
+    own = eqx.tree_at(lambda m: m.slots, model, best.model.slots)
+    linear = best.linear and best.linear.first_times(model.records.t.shape[1])
+    return eqx.tree_at(lambda one: (one.fit.model, one.fit.linear), told, (own, linear))
 
 
-def _only(problem: Problem) -> Any:
+def _only(model: Model) -> Any:
     """The reading of the only sensor, one light curve of a free body."""
-    one_problem(problem)
-    if not _checks.known(problem):
+    require_one(model)
+    if not _checks.known(model):
         words = "got traced ones; call it outside of jax.jit, jax.grad and jax.vmap"
-        raise TypeError(f"problem: wanted known numbers, {words}")
-    readings = problem.records.readings
+        raise TypeError(f"model: wanted known numbers, {words}")
+    readings = model.records.readings
     kinds = ", ".join(type(r.sensor).__name__ for r in readings)
     if len(readings) != 1 or not isinstance(readings[0].sensor, Brightness):
         raise ValueError(f"fit_light_curve: wanted one Brightness sensor, got {kinds}")
-    if problem.count != 1:
+    if model.count != 1:
         raise ValueError(
-            f"fit_light_curve: wanted one recording, got {problem.count}; fit the longest, then "
+            f"fit_light_curve: wanted one recording, got {model.count}; fit the longest, then "
             "all of them with rigidjax.identify.fit from what it found"
         )
-    if isinstance(problem.body, Bodies):
+    if isinstance(model.chart, Bodies):
         raise ValueError("fit_light_curve: wanted one body, got several by name")
-    if problem.records.torque is not None:
+    if model.torque is not None:
         raise ValueError("fit_light_curve: wanted a free body, got a torque")
     return stacking.one(readings[0], 0)
 
 
 @eqx.filter_jit
-def _read(parameters: Parameters, problem: Problem) -> tuple[Array, Array]:
+def _read(x: Float[Array, " n"], model: Model) -> tuple[Array, Array]:
     """Logarithms (4,) of both periods and both ratios, and h²/2T over the middle moment."""
-    body: Any = problem.bodies(parameters)
+    body: Any = model.bodies(x)
     inertia = Inertia(tensor_of(body))
-    omega = parameters.own.spin[0] * problem.reference.rate[0]
+    omega = x[model.index.start[0, -3:]] * model.reference.rate[0]
     moments, momentum = inertia.moments, apply(inertia.tensor, omega)
     both = exact.body_period(inertia, omega), exact.precession_period(inertia, omega)
     numbers = jnp.log(jnp.concatenate([jnp.stack(both), moments[:2] / moments[2]]))
@@ -201,26 +200,25 @@ def _read(parameters: Parameters, problem: Problem) -> tuple[Array, Array]:
 
 
 @eqx.filter_jit
-def _slopes(parameters: Parameters, problem: Problem) -> Float[Array, "4 n"]:
-    flat, restore = ravel_pytree(parameters)
-    return jax.jacfwd(lambda x: _read(restore(x), problem)[0])(flat)
+def _slopes(x: Float[Array, " n"], model: Model) -> Float[Array, "4 n"]:
+    return jax.jacfwd(lambda x: _read(x, model)[0])(x)
 
 
-def _alias(problem: Problem, parameters: Parameters, cost: float) -> Alias:
-    numbers, middle = (np.asarray(v) for v in _read(parameters, problem))
+def _alias(model: Model, x: Array, cost: float) -> Alias:
+    numbers, middle = (np.asarray(v) for v in _read(x, model))
     rotation, precession, *ratios = np.exp(numbers)
     mode = "long" if middle < 1 else "short"
     found = float(rotation), float(precession), mode, np.array(ratios)
-    return Alias(parameters, cost, *found, explains=False)
+    return Alias(x, cost, *found, explains=False)
 
 
-def _aliases(problem: Problem, ends: list[Tried]) -> list[Alias]:
+def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
     """The different motions, the best first."""
     out: list[Alias] = []
     for end in sorted(ends, key=lambda one: float(one.cost)):
         if not np.isfinite(float(end.cost)):
             continue
-        alias = _alias(problem, end.parameters, float(end.cost))
+        alias = _alias(model, end.x, float(end.cost))
         if not any(_same(alias, other, SAME) for other in out):
             out.append(alias)
     if not out:
@@ -234,11 +232,12 @@ def _same(a: Alias, b: Alias, near: np.ndarray) -> bool:
 
 
 @eqx.filter_jit
-def _half_way(parameters: Parameters, problem: Problem) -> Float[Array, "times 3"]:
+def _half_way(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
     """Directions half way between sun and observer, body frame."""
-    body, state0 = problem.unpack(parameters)
-    motion, t = exact.FreeBody(Inertia(tensor_of(body)), state0), problem.records.t[0]
-    sensor = stacking.one(problem.records.readings[0], 0).sensor
+    point = model.unpack(x)
+    body, state0 = point.body, point.state0
+    motion, t = exact.FreeBody(Inertia(tensor_of(body)), state0), model.records.t[0]
+    sensor = stacking.one(model.records.readings[0], 0).sensor
 
     def at(now: Array) -> Array:
         state: Any = motion(now - t[0])
@@ -249,29 +248,29 @@ def _half_way(parameters: Parameters, problem: Problem) -> Float[Array, "times 3
 
 def _with_shape(best: Fit) -> Fit:
     """The fit with a covariance that allows for a body that is no ellipsoid."""
-    linear = uncertainty.linearise(best.problem, best.parameters, best.noises, near=best.near)
-    reading, weight = stacking.one(best.problem.records.readings[0], 0), linear.weights[0][0]
+    linear: Any = best.linear
+    reading, weight = stacking.one(best.model.records.readings[0], 0), linear.weights[0][0]
     flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
     size = np.full(weight.shape, 1.0 / MAGNITUDE) if reading.sensor.unit == "mag" else flux
-    n = np.asarray(_half_way(best.parameters, best.problem))
+    n = np.asarray(_half_way(best.x, best.model))
     change = SHAPE / float(best.noises[0][0, 0]) * size[:, None, None] * n[:, :, None] * n[:, None]
     slopes = linear.slopes[0][0, :, 0] * weight[:, None]
     kept = weight > 0
     shift = uncertainty.of_white(linear).covariance @ slopes[kept].T @ change[kept].reshape(-1, 9)
     covariance, seen = (np.asarray(c) + shift @ shift.T for c in (best.covariance, best.seen))
     null = np.asarray(best.null_directions)
-    found = values_and_slopes(best.problem, best.parameters, best.near)
+    found = values_and_slopes(best.model, best.x, best.near)
     return dataclasses.replace(
         best,
         covariance=jnp.asarray(covariance),
         seen=jnp.asarray(seen),
         covariance_kind=f"sandwich: a shape {SHAPE:.0%} off the ellipsoid; {best.covariance_kind}",
-        quantities=quantities(best.problem, found, seen, null, best.limits, best.degrees(found[1])),
+        quantities=quantities(best.model, found, seen, null, best.limits, best.degrees(found[1])),
     )
 
 
 def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> LightCurve:
-    slopes, wider = np.asarray(_slopes(best.beside, best.problem)), _with_shape(best)
+    slopes, wider = np.asarray(_slopes(best.derivative_point, best.model)), _with_shape(best)
     own, deviations = (
         carried(slopes, np.asarray(one.seen), np.asarray(one.null_directions))
         for one in (best, wider)
@@ -279,25 +278,25 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
     # A search that stopped on its way to the same motion is no rival.
     near = np.fmax(SAME, REACH * own)
     # Costs of the search, all with one noise: a fit may have estimated another.
-    first = _alias(best.problem, best.parameters, aliases[0].cost)
+    first = _alias(best.model, best.x, aliases[0].cost)
     others = [alias for alias in aliases if not _same(alias, first, near)]
     # Misfits count for less if the noise is larger than given.
-    count = int(best.problem.records.readings[0].seen.sum())
+    count = int(best.model.records.readings[0].seen.sum())
     margin = MARGIN * max(1.0, 2.0 * first.cost / count) * max(best.correlation, 1.0)
     marked = tuple(
         eqx.tree_at(lambda a: a.explains, alias, alias.cost <= first.cost + margin)
         for alias in (first, *others)
     )
     rivals = sum(alias.explains for alias in marked) - 1
-    search, model = best.search, best.model
-    if rivals and search.word != NOT_ENDED and model.word != FAILS:
+    search, explanation = best.search, best.explanation
+    if rivals and search.word != NOT_ENDED and explanation.word != FAILS:
         some = "another motion explains" if rivals == 1 else f"{rivals} other motions explain"
         search = Answer(NOT_ALONE, (f"{some} the light curve nearly as well",))
     elif cut and best.ok:
         search = Answer(NOT_ENDED, ("more pairs of frequencies fit than were tried",))
     # Outliers dominate χ² under a robust loss.
-    above = best.chi2 - best.dof if best.problem.loss is None else 0.0
+    above = best.chi2 - best.dof if best.model.loss is None else 0.0
     if search == Answer(FOUND) and best.ok and above > CONTENT * np.sqrt(2.0 * best.dof):
         why = "another motion that was not found, or more noise than given"
-        model = Answer(LEAVES, (f"χ² is {best.chi2:.6g} of {best.dof}: {why}",))
-    return LightCurve(wider, marked, deviations, found, search, model)
+        explanation = Answer(LEAVES, (f"χ² is {best.chi2:.6g} of {best.dof}: {why}",))
+    return LightCurve(wider, marked, deviations, found, search, explanation)

@@ -6,15 +6,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import Inertia
-from rigidjax.identify.model.free import Parameters
-from rigidjax.identify.model.problem import Problem
-from rigidjax.identify.search.least_squares import CAREFUL, Settings, search
+from rigidjax.identify.model.free import leaf_at
+from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.terms import template
+from rigidjax.identify.search.least_squares import CAREFUL, Settings, minimise
 from rigidjax.identify.search.normal import Normal
-from rigidjax.identify.search.stages import Tried
+from rigidjax.identify.search.stages import Attempt
 from rigidjax.rotation import quaternion
 from rigidjax.tumblers import starts
 from rigidjax.tumblers.sensor import half_way
@@ -28,9 +28,9 @@ DIFFERENCE = 1e-6
 MAGNITUDE = 0.4 * np.log(10.0)
 
 
-def relative_flux(problem: Problem, reading: Any) -> tuple[np.ndarray, np.ndarray, Any]:
+def relative_flux(model: Model, reading: Any) -> tuple[np.ndarray, np.ndarray, Any]:
     """Times since the first, s, fluxes relative to their mean and their noise."""
-    t = np.asarray(problem.records.t[0])
+    t = np.asarray(model.records.t[0])
     keep, sensor = reading.seen, reading.sensor
     values = np.asarray(reading.values, float)[keep]
     noise = None if sensor.noise is None else float(np.asarray(sensor.noise)[0])
@@ -44,19 +44,19 @@ def relative_flux(problem: Problem, reading: Any) -> tuple[np.ndarray, np.ndarra
 
 
 def starts_of(
-    problem: Problem,
+    model: Model,
     reading: Any,
     t: np.ndarray,
     squares: np.ndarray,
     spread: np.ndarray | None,
     found: TwoFrequencies,
     used: int,
-) -> list[Parameters]:
-    """The best starting points over all pairs of frequencies."""
+) -> list[Array]:
+    """Return the best starting points over all pairs of frequencies."""
     sensor = reading.sensor
     sigma = np.ones(t.shape) if spread is None else spread
     light = padded(t, squares, 1.0 / sigma)
-    middle = np.asarray(half_way(sensor, problem.records.t[0][0] + 0.5 * t[-1]))
+    middle = np.asarray(half_way(sensor, model.records.t[0][0] + 0.5 * t[-1]))
     order, areas = np.arange(3), None
     if sensor.semi_axes is not None:
         axes = np.asarray(sensor.semi_axes)
@@ -75,16 +75,18 @@ def starts_of(
     # The rotation whose columns are the body's axes of ascending moments.
     turn = np.eye(3)[:, order]
     turn = turn * np.array([1.0, 1.0, np.linalg.det(turn)])
-    return [_parameters(problem, one, turn) for one in all_of]
+    return [_free_numbers(model, one, turn) for one in all_of]
 
 
-def _parameters(problem: Problem, one: starts.Candidate, turn: np.ndarray) -> Parameters:
+def _free_numbers(model: Model, one: starts.Candidate, turn: np.ndarray) -> Array:
+    """Return the free numbers (n,) of a candidate."""
     moments = turn @ np.diag(one.moments) @ turn.T
-    start = problem.start(Inertia(jnp.asarray(moments)))
-    reference = problem.reference
+    start = model.start(Inertia(jnp.asarray(moments)))
+    reference = model.reference
     q = _place(jnp.asarray(one.q), jnp.asarray(turn), reference.state.q[0])
-    spin = jnp.asarray(turn @ one.omega)[None] / reference.rate[:, None]
-    return eqx.tree_at(lambda p: (p.own.spin, p.own.turn), start, (spin, q[None]))
+    spin = jnp.asarray(turn @ one.omega) / reference.rate[0]
+    # An initial state of an `Attitude` is its turn and its rate.
+    return start.at[model.index.start[0]].set(jnp.concatenate([q, spin]))
 
 
 @jax.jit
@@ -95,7 +97,7 @@ def _place(q: Array, turn: Array, reference: Array) -> Array:
 
 
 def noise_of(
-    problem: Problem, reading: Any, flux: np.ndarray, found: TwoFrequencies
+    model: Model, reading: Any, flux: np.ndarray, found: TwoFrequencies
 ) -> tuple[Float[Array, "1 1"], ...]:
     """The noise (1, 1) in the sensor's unit; if it is not known, the residuals of the series."""
     sensor = reading.sensor
@@ -106,19 +108,17 @@ def noise_of(
     return (jnp.full((1, 1), max(left * unit, 1e-12)),)
 
 
-def descended(
-    problem: Problem, starts: list[Parameters], noise: Any, tolerance: float
-) -> list[Tried]:
-    """A few steps from all starts, then the best of them to convergence."""
-    parameters, costs = [], []
+def descended(model: Model, starts: list[Array], noise: Any, tolerance: float) -> list[Attempt]:
+    """Return the ends of a few steps from all starts, then the best of them to convergence."""
+    points, costs = [], []
     for first in range(0, len(starts), FIRST):
         # Always as many: one program.
         some = [starts[first + k % len(starts[first:])] for k in range(FIRST)]
-        stacked = _levelled(jax.tree.map(lambda *leaves: jnp.stack(leaves), *some), problem)
-        found = _many(stacked, problem, noise, Settings(tolerance, CAREFUL, STEPS), np.int32(FIRST))
-        parameters.append(found.parameters)
+        stacked = _levelled(jnp.stack(some), model)
+        found = _many(stacked, model, noise, Settings(tolerance, CAREFUL, STEPS), np.int32(FIRST))
+        points.append(found.x)
         costs.append(np.asarray(found.cost))
-    all_of = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parameters)
+    all_of = jnp.concatenate(points)
     cost_of = np.concatenate(costs)
     kept: list[int] = []
     for index in np.argsort(cost_of):
@@ -127,29 +127,25 @@ def descended(
             kept.append(int(index))
     kept = kept[:SECOND]
     rows = jnp.asarray(np.resize(kept, FIRST))
-    nearer = jax.tree.map(lambda leaf: leaf[rows], all_of)
-    last = _many(nearer, problem, noise, Settings(tolerance, 1e-2, MORE), np.int32(len(kept)))
+    last = _many(all_of[rows], model, noise, Settings(tolerance, 1e-2, MORE), np.int32(len(kept)))
     return [jax.tree.map(lambda leaf, k=k: leaf[k], last) for k in range(len(kept))]
 
 
 @eqx.filter_jit
-def _many(
-    starts: Parameters, problem: Problem, noise: Any, settings: Settings, count: Any
-) -> Tried:
-    """The search from the first `count` starts, one after another, with slopes by differences.
+def _many(starts: Array, model: Model, noise: Any, settings: Settings, count: Any) -> Attempt:
+    """Return the end of the search from the first `count` starts, one after another, with slopes by differences.
 
     The closed form without derivatives takes a hundredth of the time.
     """
 
-    def one(given: tuple[Parameters, Array]) -> Tried:
+    def one(given: tuple[Array, Array]) -> Attempt:
         start, number = given
-        flat, restore = ravel_pytree(start)
 
         def errors(point: Array) -> Array:
-            return problem.errors(restore(point))[0][:, 0] / noise[0][0, 0]
+            return model.errors(point)[0][:, 0] / noise[0][0, 0]
 
         def evaluated(point: Array) -> tuple[Any, Array, Normal, Array]:
-            steps = jnp.concatenate([jnp.zeros((1, flat.size)), jnp.eye(flat.size)])
+            steps = jnp.concatenate([jnp.zeros((1, start.size)), jnp.eye(start.size)])
             moved = point[None] + DIFFERENCE * steps
             e = jax.lax.map(errors, moved)
             rows = (e[1:] - e[:1]) / DIFFERENCE
@@ -157,35 +153,33 @@ def _many(
 
         steps = jnp.where(number < count, settings.steps, 0)
         mine = eqx.tree_at(lambda s: s.steps, settings, steps)
-        end = search(evaluated, flat, jnp.ones_like(flat), mine, ())
-        return Tried(restore(end.point), end.cost, end.converged)
+        end = minimise(evaluated, start, jnp.ones_like(start), mine, ())
+        return Attempt(end.point, end.cost, end.converged)
 
     return jax.lax.map(one, (starts, jnp.arange(FIRST, dtype=jnp.int32)))
 
 
 @eqx.filter_jit
-def _levelled(starts: Parameters, problem: Problem) -> Parameters:
-    """Starts with the level at which they fit best, if it is free."""
-    leaves, structure = jax.tree.flatten(problem.records)
-    numbered: Any = jax.tree.unflatten(structure, list(range(len(leaves))))
-    at = numbered.readings[0].sensor.level
-    mine = [k for k, slot in enumerate(problem.slots) if slot.leaf == at and not slot.each]
+def _levelled(starts: Float[Array, "starts n"], model: Model) -> Float[Array, "starts n"]:
+    """Return the starts with the level at which they fit best, if it is free."""
+    scene = template(model, model.records)
+    path = leaf_at(lambda s: s.sensors[0].level, scene, "level", "the sensor")[0]
+    mine = [slot for slot in model.slots if slot.path == path and slot.shared is not None]
     if not mine:
         return starts
-    which = sum(1 for slot in problem.slots[: mine[0]] if not slot.each)
-    slot, reading = problem.slots[mine[0]], problem.records.readings[0]
+    slot, reading = mine[0], model.records.readings[0]
     sensor: Any = reading.sensor
     level = sensor.level[0]
 
-    def one(start: Parameters) -> Parameters:
-        error = problem.errors(start)[0][:, 0]
+    def one(start: Array) -> Array:
+        error = model.errors(start)[0][:, 0]
         seen = reading.mask[0]
         if sensor.unit == "mag":
             better = level + jnp.sum(error) / jnp.sum(seen.astype(error.dtype))
         else:
             shape = jnp.where(seen, reading.values[0] - error, 0.0)
             better = level * jnp.sum(shape * reading.values[0]) / jnp.sum(shape * shape)
-        step = slot.step(level, better).reshape(start.shared[which].shape)
-        return eqx.tree_at(lambda p: p.shared[which], start, step)
+        step = slot.step(level, better)
+        return start.at[slot.shared].set(step.reshape(slot.shared.shape))
 
     return jax.vmap(one)(starts)

@@ -5,7 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
 
 from rigidjax import _show
 from rigidjax.identify.answer.answers import (
@@ -19,11 +19,10 @@ from rigidjax.identify.answer.answers import (
 )
 from rigidjax.identify.answer.causes import clock
 from rigidjax.identify.answer.result import Fit, Start
-from rigidjax.identify.model.free import Parameters
-from rigidjax.identify.model.problem import Problem
+from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.search.noise import median_of_chi2
-from rigidjax.identify.search.stages import Tried
+from rigidjax.identify.search.stages import Attempt, errors_and_slopes
 from rigidjax.identify.uncertainty import covariance as uncertainty, flat_limit
 from rigidjax.identify.uncertainty.covariance import Linearised, Times, scatter
 from rigidjax.identify.uncertainty.degrees_of_freedom import freedom_of
@@ -43,7 +42,7 @@ HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
 def goodness(
-    problem: Problem, noise: Noise, linear: Linearised, times: Times, covariance: np.ndarray
+    model: Model, noise: Noise, linear: Linearised, times: Times, covariance: np.ndarray
 ) -> tuple[float, int, Answer, tuple[int, ...]]:
     """χ² and its degrees of freedom (sensors of given noise), the answer, the sensors left over.
 
@@ -55,7 +54,7 @@ def goodness(
     chi2, count, word, free = 0.0, 0, EXPLAINS, linear.size
     words: list[str] = []
     sensors: list[int] = []
-    own, readings = linear.blocks(covariance), problem.records.readings
+    own, readings = linear.blocks(covariance), model.records.readings
     parts = zip(readings, linear.raw, linear.errors, linear.weights, linear.kept, strict=True)
     for index, (reading, error, e, weight, kept) in enumerate(parts):
         given = reading.sensor.noise is not None
@@ -66,13 +65,13 @@ def goodness(
             chi2, count = chi2 + total, count + many
             dof = max(many - free, 1)
             factor = float(np.sqrt(total / dof)) if total > dof + 5 * np.sqrt(2 * dof) else 1.0
-            if problem.loss is not None and many:
+            if model.loss is not None and many:
                 squares = np.sum(e[kept.all(axis=-1)] ** 2, axis=-1)
                 factor = _median_above(squares, e.shape[-1])
         root = np.sqrt(weight)[..., None]
         slope = linear.slopes[index] * root[..., None]
         white = left <= tiny or _white(e * root, kept, slope, own, given)
-        late = left > tiny and clock(problem, noise, linear, index) is not None
+        late = left > tiny and clock(model, noise, linear, index) is not None
         # Errors below a given noise cannot hide a missing part of the model.
         small = given or left <= QUARTER * varies + tiny
         if factor == 1.0 and white and small and not late:
@@ -87,12 +86,12 @@ def goodness(
         alike = int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
         share = left / varies if varies > tiny and alike else None
         span = None if white else times.longest
-        words.append(_in_words(problem, reading, error, kept, factor, share, span))
+        words.append(_in_words(model, reading, error, kept, factor, share, span))
     return chi2, max(count - free, 1), Answer(word, tuple(words)), tuple(sensors)
 
 
 def _in_words(
-    problem: Problem,
+    model: Model,
     reading: Any,
     error: np.ndarray,
     kept: np.ndarray,
@@ -115,21 +114,21 @@ def _in_words(
         over = np.sqrt(np.mean(np.concatenate(rows) ** 2) / apart) if apart > 0 else np.inf
         words.append(f"{over:.3g} times their scatter between neighbours")
         words.append(f"autocorrelated over {span:.0f} samples")
-    return f"{', '.join(words)}, {_where(problem, error, kept)}"
+    return f"{', '.join(words)}, {_where(model, error, kept)}"
 
 
-def _where(problem: Problem, error: np.ndarray, kept: np.ndarray) -> str:
+def _where(model: Model, error: np.ndarray, kept: np.ndarray) -> str:
     """The shortest time in which half of the squared errors are."""
     squares = np.sum(np.where(kept, error, 0.0) ** 2, axis=-1)
     row = int(np.argmax(squares.sum(axis=1)))
-    count = int(problem.counts[row])
-    t, total = np.asarray(problem.records.t)[row, :count], np.cumsum(squares[row, :count])
+    count = int(model.counts[row])
+    t, total = np.asarray(model.records.t)[row, :count], np.cumsum(squares[row, :count])
     last = np.searchsorted(total, total - squares[row, :count] + 0.5 * total[-1])
     first = int(np.argmin(np.where(last < count, t[np.minimum(last, count - 1)] - t, np.inf)))
     begin, end = t[first], t[min(last[first], count - 1)]
     if end - begin > 0.4 * (t[-1] - t[0]):
         return "all along"
-    of = f" of recording {row}" if problem.count > 1 else ""
+    of = f" of recording {row}" if model.count > 1 else ""
     times = " to ".join(_show.time(when, t[-1] - t[0], 4) for when in (begin, end))
     return f"half of the squared ones from {times} s{of}"
 
@@ -206,60 +205,62 @@ def _search(
 
 
 def _rivals(
-    good: Sequence[Start], best_cost: float, margin: float, linear: Linearised, value: Parameters
+    good: Sequence[Start], best_cost: float, margin: float, linear: Linearised, x: Array
 ) -> int:
     """How many of the starts that fit as well ended elsewhere."""
     count = 0
     for item in good:
         if item.converged and item.cost > best_cost + 0.01 * margin:
-            away = ravel_pytree(item.parameters)[0] - ravel_pytree(value)[0]
+            away = item.x - x
             # In a flat valley readings do not tell two points apart.
             count += linear.along(np.asarray(away)) > 2 * margin
     return count
 
 
 def assess(
-    problem: Problem,
-    best: Tried,
+    model: Model,
+    best: Attempt,
     noise: Noise,
-    tried: list[Tried],
+    attempts: list[Attempt],
     best_cost: float,
-    shown: Problem,
+    shown: Model,
     interrupted: Sequence[str],
     remarks: Sequence[str],
 ) -> Fit:
-    """The `Fit` of the best point of all starts, converged or not, with the problem `shown`."""
-    value = best.parameters
-    near = flat_limit.beside(problem, value)
-    linear = uncertainty.linearise(problem, value, noise, best.found, near)
+    """The `Fit` of the best point of all starts, converged or not, with the model `shown`."""
+    x = best.x
+    near = flat_limit.thickened(model, x)
+    thickened = None if near is None else (near, errors_and_slopes(model, near))
+    linear = uncertainty.linearise(model, x, noise, best.blocks, thickened)
     times = uncertainty.correlation_times(linear)
     white = uncertainty.of_white(linear)
     spread = uncertainty.spread(linear, times, white)
-    numbers, of = values_and_slopes(problem, value, near), charts(problem)
-    freedom = freedom_of(problem, value, linear, times, white.seen)
-    limits = flat_limit.limits(problem, numbers, -white.seen @ linear.slope, [n for n, _ in of])
+    numbers, of = values_and_slopes(model, x, near), charts(model)
+    freedom = freedom_of(model, linear, times, white.seen)
+    limits = flat_limit.limits(model, numbers, -white.seen @ linear.slope, [n for n, _ in of])
     # Steps stay short in a long curved valley, although hardly anything is left to gain.
     held = [limit.slope for limit in limits if limit.free < 0]
     done = bool(best.converged) or uncertainty.distance(linear, white, held) < AT_THE_END
-    chi2, dof, model, left = goodness(problem, noise, linear, times, white.seen)
-    believable = model.word != FAILS
+    chi2, dof, explanation, left = goodness(model, noise, linear, times, white.seen)
+    believable = explanation.word != FAILS
     # Ten units of log-likelihood, of the noise as estimated; autocorrelated errors count as fewer.
-    guessed = not all(reading.known_noise for reading in problem.records.readings)
-    unit = 2 * best_cost / problem.records.size if guessed else 1.0
+    guessed = not all(reading.known_noise for reading in model.records.readings)
+    unit = 2 * best_cost / model.records.size if guessed else 1.0
     margin = 10.0 * unit * max(times.longest, 1.0)
 
     level = best_cost + margin if believable else -np.inf
-    ends = [(t.parameters, float(t.cost), bool(t.converged)) for t in tried]
+    ends = [(one.x, float(one.cost), bool(one.converged)) for one in attempts]
     starts = [Start(*end, end[1] <= level) for end in ends]
-    rivals = _rivals([s for s in starts if s.fits], best_cost, margin, linear, value)
+    rivals = _rivals([s for s in starts if s.fits], best_cost, margin, linear, x)
     rival = f"{rivals} of {len(starts)} starts fit as well elsewhere" if rivals else ""
     if believable and not any(start.fits for start in starts):
         remarks = ("no single start came near the best point", *remarks)
-    unreal = of_charts(of, flat_limit.bodies_of(problem, value))
-    model = Answer(model.word, (*unreal, *model.reasons)) if best_cost < np.inf else Answer(FAILS)
+    unreal = of_charts(of, flat_limit.bodies_of(model, x))
+    reasons = (*unreal, *explanation.reasons)
+    explanation = Answer(explanation.word, reasons) if best_cost < np.inf else Answer(FAILS)
     return Fit(
         shown,
-        value,
+        x,
         jnp.asarray(spread.covariance),
         jnp.asarray(spread.seen),
         spread.kind,
@@ -272,12 +273,13 @@ def assess(
         jnp.asarray(spread.singular_values),
         jnp.asarray(spread.null_directions),
         quantities_of(
-            problem, numbers, spread.seen, spread.null_directions, limits, freedom.of(numbers[1])
+            model, numbers, spread.seen, spread.null_directions, limits, freedom.of(numbers[1])
         ),
         _search(best_cost, done, rival, interrupted, remarks),
-        model,
+        explanation,
         left,
         limits,
         near,
         freedom,
+        linear.first_times(shown.records.t.shape[1]),
     )

@@ -16,11 +16,9 @@ from rigidjax.identify.answer.answers import Cause
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, readings_of
 from rigidjax.identify.data.reference_states import attitudes, rates_of
-from rigidjax.identify.model.charts import in_a_row, tensor_of
-from rigidjax.identify.model.free import Parameters, numbered
-from rigidjax.identify.model.problem import Problem
+from rigidjax.identify.model.charts import as_list, tensor_of
+from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, in_deviations
-from rigidjax.identify.search.stages import evaluate
 from rigidjax.identify.search.starts import balance, of_rates, tensor_and_margin
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.uncertainty.covariance import Linearised
@@ -51,8 +49,8 @@ ATTITUDES = {
 }
 
 
-def misread(recordings: Sequence[Recording]) -> Cause | None:
-    """The mistake in reading the rates of one body, if there is one.
+def misread(recordings: Sequence[Recording], torque: Any) -> Cause | None:
+    """Return the mistake in reading the rates of one body, if there is one.
 
     Rates are compared with those between attitudes, or else with Euler's equations for the best
     body: a correction counts only if that is real. A mirrored axis shows only under a torque.
@@ -73,13 +71,13 @@ def misread(recordings: Sequence[Recording]) -> Cause | None:
         for name, change in ATTITUDES.items():
             changed = [(t, change(q)) for t, q in known]
             found[name] = _of_attitudes(recordings, changed, _SAME)
-    elif all(of_rates(recording.torque) for recording in recordings):
-        bound, margin = _of_euler(recordings, _SAME)
+    elif of_rates(torque):
+        bound, margin = _of_euler(recordings, torque, _SAME)
         # Sensor errors alone can give numbers of no real body.
         bound *= BETTER if margin > -0.8 else EQUAL
-        tried = {name: _of_euler(recordings, turn) for name, turn in RATES.items()}
-        if recordings[0].torque is not None:
-            tried["the torque with the other sign"] = _of_euler(recordings, _SAME, -1.0)
+        tried = {name: _of_euler(recordings, torque, turn) for name, turn in RATES.items()}
+        if torque is not None:
+            tried["the torque with the other sign"] = _of_euler(recordings, torque, _SAME, -1.0)
         # Any rates are a free motion of a ball.
         found = {name: left if -0.01 < m < 0.8 else np.inf for name, (left, m) in tried.items()}
     else:
@@ -92,10 +90,10 @@ def misread(recordings: Sequence[Recording]) -> Cause | None:
 
 
 def _of_euler(
-    recordings: Sequence[Recording], turn: np.ndarray, sign: float = 1.0
+    recordings: Sequence[Recording], torque: Any, turn: np.ndarray, sign: float = 1.0
 ) -> tuple[float, float]:
     """The residual of Euler's equations, and the margin by which the best body is real."""
-    found = [balance(recording, turn) for recording in recordings]
+    found = [balance(recording, torque, turn) for recording in recordings]
     matrix, side, momentum = (np.concatenate(part) for part in zip(*found, strict=True))
     components, margin = tensor_and_margin(matrix, sign * side)
     left = np.linalg.norm(matrix @ components - sign * side)
@@ -127,11 +125,12 @@ SKEW[1, 0, 0] = SKEW[2, 0, 1] = SKEW[2, 1, 2] = 1.0
 
 
 def causes(
-    problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, which: Sequence[int]
+    model: Model, x: Any, noise: Noise, linear: Linearised, which: Sequence[int]
 ) -> tuple[Cause, ...]:
     """The most likely cause of the errors of each sensor in `which`, if there is one."""
-    given = zip(stacking.on_host(problem.records, problem.counts), problem.of, strict=True)
-    wrong = misread([recording for recording, of in given if of == problem.of[0]])
+    given = zip(stacking.on_host(model.records, model.counts), model.body_names, strict=True)
+    mine = [recording for recording, name in given if name == model.body_names[0]]
+    wrong = misread(mine, model.torque)
     if wrong is not None:
         return (wrong,)
     if not np.isfinite(linear.dense).all():
@@ -139,11 +138,11 @@ def causes(
     free = np.linalg.qr(linear.dense)[0]
     found = []
     for index in which:
-        sensor: Any = problem.records.readings[index].sensor
-        cause = clock(problem, noise, linear, index)
+        sensor: Any = model.records.readings[index].sensor
+        cause = clock(model, noise, linear, index)
         if cause is None and _of_three(sensor):
-            rows = _table(problem, parameters, noise, linear, index)
-            given = problem, noise, linear, index, free
+            rows = _table(model, x, noise, linear, index)
+            given = model, noise, linear, index, free
             shares = [_explained(*given, row[1]) for row in rows]
             cause = _largest(sensor, rows, shares)
         if cause is None and hasattr(sensor, "suspect"):
@@ -152,16 +151,16 @@ def causes(
     return tuple(found)
 
 
-def clock(problem: Problem, noise: Noise, linear: Linearised, index: int) -> Cause | None:
+def clock(model: Model, noise: Noise, linear: Linearised, index: int) -> Cause | None:
     """Time stamps that scatter, by more than the sensor's jitter: each error is along the change of
     the readings.
     """
-    sensor, error = problem.records.readings[index].sensor, linear.raw[index]
+    sensor, error = model.records.readings[index].sensor, linear.raw[index]
     kept = linear.kept[index].all(axis=-1)
     if not (_of_three(sensor) and error[kept].any()):
         return None
-    slope = _slope(problem, np.asarray(problem.records.readings[index].values) - error)
-    late = problem.records.readings[index].late
+    slope = _slope(model, np.asarray(model.records.readings[index].values) - error)
+    late = model.records.readings[index].late
     both = np.asarray(in_deviations(np.stack([error, slope], -1), noise[index], late))
     error, slope = both[..., 0], both[..., 1]
     moved = np.sum(slope**2, axis=-1) * kept
@@ -211,27 +210,27 @@ def _of_three(sensor: Any) -> bool:
     return sensor.reading_shape == (3,) and sensor.components == 3
 
 
-def _slope(problem: Problem, shown: np.ndarray) -> np.ndarray:
+def _slope(model: Model, shown: np.ndarray) -> np.ndarray:
     """The time derivative of a sensor's prediction (R, T, k), zero for a masked reading."""
-    t, out = np.asarray(problem.records.t), np.zeros_like(shown)
-    for row, count in enumerate(problem.counts):
+    t, out = np.asarray(model.records.t), np.zeros_like(shown)
+    for row, count in enumerate(model.counts):
         if count > 2:
             out[row, :count] = np.gradient(shown[row, :count], t[row, :count], axis=0)
     return out
 
 
 def _table(
-    problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, index: int
+    model: Model, x: Any, noise: Noise, linear: Linearised, index: int
 ) -> tuple[tuple[str, np.ndarray, str, str], ...]:
     """Name, direction (R, T, 3, c), words and remedy of each cause."""
-    reading = problem.records.readings[index]
-    t, shown = np.asarray(problem.records.t), np.asarray(reading.values) - linear.raw[index]
+    reading = model.records.readings[index]
+    t, shown = np.asarray(model.records.t), np.asarray(reading.values) - linear.raw[index]
     axes = np.broadcast_to(np.eye(3), (*shown.shape, 3))
     turned = np.cross(shown[..., None, :], axes).swapaxes(-1, -2)
     unit, itself = reading.sensor.unit, shown[..., None] * axes
-    response = _response(problem, parameters, noise, linear, index)
+    response = _response(model, x, noise, linear, index)
     return (
-        ("lag", _slope(problem, shown)[..., None], "a clock offset of {size} s",
+        ("lag", _slope(model, shown)[..., None], "a clock offset of {size} s",
          "let a Free move the sensor's offset, or the delay of the torque's log"),
         ("bias", axes, f"a bias left out, ({{size}}) {unit}", "let a Free move the sensor's bias"),
         ("scale", itself,
@@ -254,19 +253,17 @@ def _table(
 
 
 def _response(
-    problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, index: int
+    model: Model, x: Any, noise: Noise, linear: Linearised, index: int
 ) -> Callable[[np.ndarray], np.ndarray]:
     """The effect of torques (R, T, 3, c) on rates: `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt`, Φ = dΩ/dΩ₀ of the fit."""
-    if not isinstance(problem.records.readings[index].sensor, Gyro):
+    if not isinstance(model.records.readings[index].sensor, Gyro):
         return np.zeros_like
-    first = np.asarray(numbered(parameters).own.spin)[0]
-    columns = (linear.places[0][:, None] == first).argmax(axis=0)
-    slopes = evaluate(parameters, problem)[1][0][index]
-    flow = np.asarray(slopes)[..., columns]
-    tensors = np.stack([np.asarray(tensor_of(b)) for b in in_a_row(problem.bodies(parameters))])
-    of = np.zeros(problem.count, int) if problem.which is None else np.asarray(problem.which)
+    width = model.index.width
+    flow = linear.raw_slopes[index][..., width - 3 : width]
+    tensors = np.stack([np.asarray(tensor_of(b)) for b in as_list(model.bodies(x))])
+    of = np.zeros(model.count, int) if model.which is None else np.asarray(model.which)
     back = np.linalg.pinv(flow) @ np.linalg.inv(tensors)[of][:, None]
-    steps = np.diff(np.asarray(problem.records.t), axis=1)[..., None, None]
+    steps = np.diff(np.asarray(model.records.t), axis=1)[..., None, None]
 
     def response(torque: np.ndarray) -> np.ndarray:
         pushed = back @ torque
@@ -277,7 +274,7 @@ def _response(
 
 
 def _explained(
-    problem: Problem,
+    model: Model,
     noise: Noise,
     linear: Linearised,
     index: int,
@@ -289,7 +286,7 @@ def _explained(
     """
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]
-    late = problem.records.readings[index].late
+    late = model.records.readings[index].late
     scaled = np.asarray(in_deviations(direction, noise[index], late)) * roots[index][..., None]
     size = np.sqrt(np.sum(scaled**2, axis=(0, 1, 2)))
     size[size == 0] = 1.0

@@ -1,12 +1,13 @@
 """The result of a fit: the best point, its uncertainty, and the end of each start."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -14,11 +15,9 @@ from rigidjax.identify.answer import answers, undetermined as identifiability
 from rigidjax.identify.answer.answers import Answer, Cause
 from rigidjax.identify.answer.causes import causes
 from rigidjax.identify.answer.undetermined import Combination, undetermined
-from rigidjax.identify.model.free import Parameters, Unpacked
-from rigidjax.identify.model.problem import Problem
+from rigidjax.identify.model.model import Model, Unpacked, unpacked
 from rigidjax.identify.model.terms import Noise
-from rigidjax.identify.search.stages import evaluate
-from rigidjax.identify.uncertainty import covariance as uncertainty
+from rigidjax.identify.uncertainty.covariance import Linearised
 from rigidjax.identify.uncertainty.degrees_of_freedom import Freedom, quantile
 from rigidjax.identify.uncertainty.flat_limit import Limit
 from rigidjax.identify.uncertainty.quantities import Quantity, around
@@ -27,16 +26,16 @@ from rigidjax.identify.uncertainty.quantities import Quantity, around
 class Start(eqx.Module):
     """The result of one start: the end of the search, and whether it explains the data.
 
-    **Fields:** `parameters` at its end; `cost` half of the sum of squares there; `converged`
+    **Fields:** `x` (n,) the free numbers at its end; `cost` half of the sum of squares there; `converged`
     whether the search did; `fits` whether it explains the data as well as the best point does.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
-    >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
-    >>> Start(problem.start(), 0.0, True, True).fits
+    >>> model = rj.identify.Model(record, rj.identify.PrincipalRatios())
+    >>> Start(model.start(), 0.0, True, True).fits
     True
     """
 
-    parameters: Parameters
+    x: Float[Array, " n"]
     cost: float
     converged: bool
     fits: bool
@@ -45,27 +44,28 @@ class Start(eqx.Module):
 class Fit(eqx.Module):
     """The result of `fit`: the best point and its uncertainty.
 
-    **Fields:** `problem` that was fitted; `parameters` the free numbers at the best point;
-    `covariance` (n, n) of them, flattened in order, infinite for undetermined numbers, `seen` the
+    **Fields:** `model` that was fitted; `x` (n,) the free numbers at the best point; `covariance`
+    (n, n) of them, infinite for undetermined numbers, `seen` the
     same within the determined directions, `covariance_kind` its method; `noises` (R, k) for each
     sensor; `starts` a `Start` each; `chi2` and `dof` of the whitened errors of the sensors whose
     noise was given; `correlation` the number of samples over which the errors are autocorrelated, 1
     for white ones, and `independent` the number of independent errors; `singular_values` (n,) of
     the whitened Jacobian, its columns of length one, with the numbers of one recording alone apart;
     `null_directions` (k, n) that the data do not determine; `quantities` all reported quantities,
-    by name; `search` the first answer, whose `word` is `found`, `not alone` or `not ended`; `model`
+    by name; `search` the first answer, whose `word` is `found`, `not alone` or `not ended`; `explanation`
     the second one: `explains the readings`, `leaves a part`, `does not explain the readings`;
     `left` the indices of the sensors whose errors it does not explain; `limits` the distance of
     each body from a flat one; `near` the point of the derivatives beside a flat body, else `None`;
-    `freedom` what the degrees of freedom of variances follow from.
+    `freedom` what the degrees of freedom of variances follow from;
+    `linear` errors and derivatives there, which all of these come from.
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> [quantity.name for quantity in found.quantities[:2]], found.covariance.shape
     (['Ix/Iz', 'Iy/Iz'], (8, 8))
     """
 
-    problem: Problem
-    parameters: Parameters
+    model: Model
+    x: Float[Array, " n"]
     covariance: Float[Array, "n n"]
     seen: Float[Array, "n n"]
     covariance_kind: str
@@ -79,16 +79,17 @@ class Fit(eqx.Module):
     null_directions: Float[Array, "unseen n"]
     quantities: tuple[Quantity, ...]
     search: Answer
-    model: Answer
+    explanation: Answer
     left: tuple[int, ...]
     limits: tuple[Limit, ...] = ()
-    near: Parameters | None = None
+    near: Float[Array, " n"] | None = None
     freedom: Freedom | None = None
+    linear: Linearised | None = None
 
     @property
     def status(self) -> str:
         """Both answers in one line; `ok` if both are good and have no reasons."""
-        return answers.status(self.search, self.model)
+        return answers.status(self.search, self.explanation)
 
     @property
     def ok(self) -> bool:
@@ -96,9 +97,9 @@ class Fit(eqx.Module):
         return self.status == "ok"
 
     @property
-    def beside(self) -> Parameters:
-        """The free numbers of `covariance`: `parameters`, with a flat body made thicker."""
-        return self.parameters if self.near is None else self.near
+    def derivative_point(self) -> Float[Array, " n"]:
+        """The free numbers where derivatives are taken: x, with a flat body made thicker."""
+        return self.x if self.near is None else self.near
 
     @property
     def causes(self) -> tuple[Cause, ...]:
@@ -106,17 +107,18 @@ class Fit(eqx.Module):
 
         Each has `name`, `sensor`, `share`, `words` and `remedy`.
         """
-        if not self.left:
+        if not self.left or self.linear is None:
             return ()
-        linear = uncertainty.linearise(self.problem, self.parameters, self.noises, near=self.near)
-        return causes(self.problem, self.parameters, self.noises, linear, self.left)
+        return causes(self.model, self.x, self.noises, self.linear, self.left)
 
     @property
     def advice(self) -> str:
         """Advice: whether the intervals can be trusted, and what to try."""
         # Outliers dominate χ² under a robust loss.
-        above = np.sqrt(self.chi2 / self.dof) if self.problem.loss is None else 1.0
-        return answers.advice(self.search, self.model, self.causes, self.covariance_kind, above)
+        above = np.sqrt(self.chi2 / self.dof) if self.model.loss is None else 1.0
+        return answers.advice(
+            self.search, self.explanation, self.causes, self.covariance_kind, above
+        )
 
     def __str__(self) -> str:
         from rigidjax.identify import report
@@ -131,28 +133,28 @@ class Fit(eqx.Module):
     @property
     def body(self) -> Any:
         """The body, of `scale` "arbitrary" if its chart has none; for several a dict by name."""
-        return self.problem.unpack(self.parameters)[0]
+        return self.model.bodies(self.x)
 
     @property
     def state0(self) -> Any:
         """The state at the first time; with several recordings, one for each (leading axis)."""
-        return self.problem.unpack(self.parameters)[1]
+        return self.model.unpack(self.x).state0
 
     @property
     def values(self) -> dict[str, Array]:
         """The value of each `Free` by name, in its unit."""
-        return self.problem.values(self.parameters)
+        return self.model.values(self.x)
 
     @property
     def spreads(self) -> dict[str, Array]:
         """The spread of each `Free` that has one, by name, in its unit: given or estimated."""
-        slots = self.problem.slots
+        slots = self.model.slots
         return {s.name: s.spread * s.scale for s in slots if s.spread is not None}
 
     @property
     def noise(self) -> tuple[Float[Array, "*records _"], ...]:
         """One (k,) standard deviation per sensor, given or estimated; (R, k) of R recordings."""
-        return tuple(n[0] for n in self.noises) if self.problem.count == 1 else self.noises
+        return tuple(n[0] for n in self.noises) if self.model.count == 1 else self.noises
 
     @property
     def jitter(self) -> tuple[Float[Array, "*records"] | None, ...]:
@@ -160,8 +162,8 @@ class Fit(eqx.Module):
 
         With several recordings (R,).
         """
-        first: Any = 0 if self.problem.count == 1 else slice(None)
-        sensors = self.problem.records.sensors
+        first: Any = 0 if self.model.count == 1 else slice(None)
+        sensors = self.model.records.sensors
         found = (getattr(sensor, "jitter", None) for sensor in sensors)
         return tuple(None if one is None else one.deviation[first] for one in found)
 
@@ -171,15 +173,22 @@ class Fit(eqx.Module):
 
         With several recordings a leading axis.
         """
-        errors = evaluate(self.parameters, self.problem)[0][0]
-        return tuple(e[0] for e in errors) if self.problem.count == 1 else errors
+        errors = self._errors
+        return tuple(e[0] for e in errors) if self.model.count == 1 else errors
+
+    @property
+    def _errors(self) -> tuple[Float[Array, "records times _"], ...]:
+        if self.linear is None:
+            raise ValueError("Fit: it holds no errors; identify.fit makes one that does")
+        counts = self.model.records.t.shape[1]
+        return tuple(jnp.asarray(error[:, :counts]) for error in self.linear.raw)
 
     @property
     def rms(self) -> tuple[float, ...]:
         """Root mean square length of each sensor's error, in its unit; without full scale."""
         out = []
-        errors = evaluate(self.parameters, self.problem)[0][0]
-        for error, reading in zip(errors, self.problem.records.readings, strict=True):
+        errors = self._errors
+        for error, reading in zip(errors, self.model.records.readings, strict=True):
             kept = reading.kept.all(axis=-1)
             lengths = np.sum(np.asarray(error) ** 2, axis=-1)[kept if kept.any() else reading.seen]
             out.append(float(np.sqrt(lengths.mean())))
@@ -201,21 +210,19 @@ class Fit(eqx.Module):
         It comes from the covariance and the function's derivative. **Raises** as `interval`.
         """
         _checks.function(of, "of", "of `Unpacked` to an array")
-        if not _checks.known(self.parameters):
+        if not _checks.known(self.x):
             raise TypeError(
                 "Fit: wanted known numbers, got traced ones; intervals are made on the host: call "
                 "interval_of outside of jax.jit, jax.grad and jax.vmap"
             )
-        flat, restore = ravel_pytree(self.parameters)
 
         def value(x: Array) -> Array:
-            parameters = restore(x)
-            body, state0 = self.problem.unpack(parameters)
-            point = Unpacked(parameters, body, state0, self.problem.values(parameters), self.noises)
+            point = unpacked(self.model, x)
+            point = dataclasses.replace(point, noise=self.noises)
             return _checks.numbers(of(point), "of(point)")
 
-        middle = np.asarray(_checks.finite(value(flat), "of(point)"))
-        slope = np.asarray(jax.jacfwd(value)(ravel_pytree(self.beside)[0]))
+        middle = np.asarray(_checks.finite(value(self.x), "of(point)"))
+        slope = np.asarray(jax.jacfwd(value)(self.derivative_point))
         seen, null = np.asarray(self.seen), np.asarray(self.null_directions)
         reach = quantile(level, self.degrees(slope))
         return around(middle, slope, seen, null, reach, self.limits)

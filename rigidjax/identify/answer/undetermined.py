@@ -7,16 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.answer.answers import FAILS, NOT_ENDED
 from rigidjax.identify.data.full_scale import in_words
 from rigidjax.identify.data.reference_states import ReferenceStates
-from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, in_a_row
-from rigidjax.identify.model.free import Parameters
-from rigidjax.identify.model.problem import Problem
+from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, as_list
+from rigidjax.identify.model.model import Model
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 from rigidjax.identify.uncertainty.quantities import (
@@ -98,9 +96,9 @@ def undetermined(fit: "Fit") -> tuple[Combination, ...]:
     if not null.size:
         return ()
     best = None
-    slopes, values = map(np.asarray, _slopes(fit.problem, fit.beside))
-    names, many = _names(fit.problem), len(charts(fit.problem))
-    first, turns = len(labels(fit.problem)), 3 * fit.problem.count
+    slopes, values = map(np.asarray, _slopes(fit.model, fit.derivative_point))
+    names, many = _names(fit.model), len(charts(fit.model))
+    first, turns = len(labels(fit.model)), 3 * fit.model.count
     for other in (1, 0):
         # Attitudes about the world's axes, or about the body's.
         begin = first + 6 * many + other * turns
@@ -143,10 +141,10 @@ def _combination(
     )
 
 
-def _names(problem: Problem) -> list[tuple[str, str, bool]]:
+def _names(model: Model) -> list[tuple[str, str, bool]]:
     """Name, unit, and whether relative, of the numbers of `_slopes`."""
-    out = labels(problem)
-    for name, chart in charts(problem):
+    out = labels(model)
+    for name, chart in charts(model):
         unit = chart.unit.replace("SI", "kg m²")
         out += [(f"{part}{name}", unit, False) for part in TENSOR]
     for part, name, unit in (
@@ -155,26 +153,26 @@ def _names(problem: Problem) -> list[tuple[str, str, bool]]:
         ("x", "position", "m"),
         ("v", "velocity", "m/s"),
     ):
-        if hasattr(problem.reference.state, part):
-            for where in recording_names(problem):
+        if hasattr(model.reference.state, part):
+            for where in recording_names(model):
                 out += [(f"the initial {name} {k}{where}", unit, False) for k in "xyz"]
     return out
 
 
 @eqx.filter_jit
-def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
-    """Derivatives (M, n) of the reported numbers, tensors and initial states; their values (M,)."""
-    flat, restore = ravel_pytree(parameters)
-    reference = problem.reference
-    start = jax.vmap(ReferenceStates.moved)(reference, parameters.own)
+def _slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Return derivatives (M, n) of the reported numbers, tensors and initial states at a point of
+    the free numbers, and their values (M,).
+    """
+    reference = model.reference
+    start = jax.vmap(ReferenceStates.moved)(reference, point[model.index.start])
 
     def value(x: Array) -> Array:
-        moved = restore(x)
-        shown = [vector(problem, moved)]
-        for body in in_a_row(problem.bodies(moved)):
+        shown = [vector(model, x)]
+        for body in as_list(model.bodies(x)):
             tensor = tensor_of(body)
             shown.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
-        now = jax.vmap(ReferenceStates.moved)(reference, moved.own)
+        now = jax.vmap(ReferenceStates.moved)(reference, x[model.index.start])
         one = jax.tree.map(lambda leaf: leaf[0], now)
         change = parts(one, jax.vmap(minus)(now, start))
         offset = parts(one, jax.vmap(minus)(now, reference.state))
@@ -183,14 +181,14 @@ def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
         shown += [offset[name] for name in ("x", "v") if name in offset]
         return jnp.concatenate([part.reshape(-1) for part in shown])
 
-    return jax.jacfwd(value)(flat), value(flat)
+    return jax.jacfwd(value)(point), value(point)
 
 
 def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
     """The numbers that name changes (k, M): moments, or the tensor's components if axes turn."""
-    rows = in_a_row(fit.problem.bodies(fit.beside))
+    rows = as_list(fit.model.bodies(fit.derivative_point))
     kept = np.ones(len(names), bool)
-    for (where, chart), body in zip(charts(fit.problem), rows, strict=True):
+    for (where, chart), body in zip(charts(fit.model), rows, strict=True):
         # A chart may report these components, too: the last entries exist for all charts.
         every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]
         places = [some[-1] for some in every]
@@ -229,7 +227,7 @@ def _reduced(rows: np.ndarray) -> np.ndarray:
 
 def identifiability(fit: "Fit") -> tuple[str, ...]:
     """The quantities that the data determine well, weakly, and not at all."""
-    lost = fit.model.word == FAILS
+    lost = fit.explanation.word == FAILS
     if lost or fit.search.word == NOT_ENDED:
         why = "does not explain the data" if lost else "did not end in a minimum"
         out = [
@@ -238,10 +236,10 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         ]
         # A search that did not end may have moved along directions that the data do not determine.
         out += [] if lost else _unseen(fit)
-        return (*out, *in_words(fit.problem.records.readings))
+        return (*out, *in_words(fit.model.records.readings))
     out = []
     moments, first = [], 0
-    for _, chart in charts(fit.problem):
+    for _, chart in charts(fit.model):
         moments += fit.quantities[first : first + len(chart.log_names)]
         first += len(chart.log_names) + len(chart.plain_names)
     for quantity in moments:
@@ -263,21 +261,21 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         for limit in fit.limits
         if limit.is_near(seen, float(quantile(0.95, fit.degrees(limit.slope))))
     ]
-    count = fit.problem.count
+    count = fit.model.count
     out.append(_rate(fit.quantities[first : first + 3 * count], count))
     out += _unseen(fit)
     out += correlations(fit)
-    if fit.problem.torque is None:
+    if fit.model.torque is None:
         out.append(
             "Free motion cannot show the absolute inertia, only ratios of moments; nor the mass or "
             "the centre of mass."
         )
-        if all(isinstance(sensor, Gyro) for sensor in fit.problem.records.sensors):
+        if all(isinstance(sensor, Gyro) for sensor in fit.model.records.sensors):
             out.append(
                 "Rates of free motion with an axis mirrored or two axes swapped fit another body "
                 "as well: they cannot show such a mistake."
             )
-    out += in_words(fit.problem.records.readings)
+    out += in_words(fit.model.records.readings)
     return tuple(out)
 
 
@@ -318,10 +316,10 @@ def _unseen(fit: "Fit") -> list[str]:
 def scale_is_unseen(fit: "Fit") -> bool:
     """Whether an undetermined direction scales the whole body and changes nothing else."""
     null = np.asarray(fit.null_directions)
-    if not len(null) or isinstance(fit.problem.body, Bodies):
+    if not len(null) or isinstance(fit.model.chart, Bodies):
         return False
-    first = len(labels(fit.problem))
-    slopes, values = (np.asarray(a) for a in _slopes(fit.problem, fit.beside))
+    first = len(labels(fit.model))
+    slopes, values = (np.asarray(a) for a in _slopes(fit.model, fit.derivative_point))
     here, moved = values[first : first + 6], slopes[first : first + 6] @ null.T
     wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)
     return bool(np.linalg.norm(moved @ wanted - here) < 1e-3 * np.linalg.norm(here))
@@ -329,11 +327,11 @@ def scale_is_unseen(fit: "Fit") -> bool:
 
 def correlations(fit: "Fit") -> list[str]:
     """Pairs of reported quantities (moments, not components) whose errors have |ρ| > 0.95."""
-    slope = np.asarray(value_and_slope(fit.problem, fit.beside)[1])[: len(fit.quantities)]
+    slope = np.asarray(value_and_slope(fit.model, fit.derivative_point)[1])[: len(fit.quantities)]
     covariance = slope @ np.asarray(fit.seen) @ slope.T
     deviation = np.array([quantity.deviation for quantity in fit.quantities])
     good = np.isfinite(deviation) & (deviation > 0)
-    follow = {f"{plain}{name}" for name, c in charts(fit.problem) for plain in c.plain_names}
+    follow = {f"{plain}{name}" for name, c in charts(fit.model) for plain in c.plain_names}
     names = [quantity.name for quantity in fit.quantities]
     good &= np.array([name not in follow or name.startswith("com") for name in names])
     scaled = np.where(good, deviation, 1.0)

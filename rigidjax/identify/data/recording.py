@@ -1,24 +1,22 @@
-"""A recording: times, the readings of each sensor, and the torque on the body."""
+"""A recording: times, the readings of each sensor, and logged inputs."""
 
 import warnings
-from types import FunctionType
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks, _show
 from rigidjax.identify.sensors import AbstractSensor
-from rigidjax.motion.torques.base import Torque, require_law
 
 
 class Reading(eqx.Module):
     """The readings of one sensor: `values` (T, …) and `mask` (T,), true where there is a reading.
 
-    Inside a `Problem` all arrays have a leading axis over recordings. `late` (T, k), of a sensor
+    Inside a `Model` all arrays have a leading axis over recordings. `late` (T, k), of a sensor
     with jitter, is the error by a time stamp one standard deviation off, as a fit found it.
 
     >>> record = Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]]))
@@ -75,8 +73,10 @@ class Recording(eqx.Module):
     there is a reading (what it masks may be NaN). A time at which no sensor read anything is
     dropped: a masked reading and an absent one are the same. Sensors with their own times share
     the union of these.
-    `torque`, by keyword, is what turned this body besides its own spin: a wheel whose speed was
-    logged, a law with coefficients that a `Free` may move; `None` for none.
+    `inputs`, by keyword, are what was logged beside the readings, by name: the speed of a wheel, the
+    commands of motors. Each is a function of time such as `rigidjax.torques.Series(times, speeds)`,
+    or samples (T, …) at `t`, each held until the next one. The torque of a `Model` reads an input
+    by its name, `rigidjax.torques.Input("speed")`.
 
     **Raises** `TypeError` for traced numbers (the times that are kept depend on them) and for
     anything but a sensor; `ValueError` for times that do not increase, also after rounding to
@@ -89,10 +89,10 @@ class Recording(eqx.Module):
 
     t: Float[Array, "*records times"]
     readings: tuple[Reading, ...]
-    torque: Torque | None
+    inputs: dict[str, Any]
     dropped: int = eqx.field(static=True)
 
-    def __init__(self, t: Any, *readings: tuple, torque: Torque | None = None):
+    def __init__(self, t: Any, *readings: tuple, inputs: Mapping[str, Any] | None = None):
         for pair in readings:
             if not isinstance(pair, tuple) or len(pair) not in (2, 3):
                 raise TypeError(
@@ -116,9 +116,13 @@ class Recording(eqx.Module):
         if not readings:
             raise ValueError("Recording: wanted at least one pair (sensor, values)")
         rows = [_reading(t, *reading) for reading in readings]
+        self.inputs = _checked_inputs(t, {} if inputs is None else inputs)
         used = np.any([mask for _, _, mask in rows], axis=0)
         if used.sum() < 2:
             raise ValueError("Recording: wanted readings at two times at least; the rest is masked")
+        if any(not callable(source) for source in self.inputs.values()):
+            # A sample is held until the next one, whether or not a sensor read anything then.
+            used = np.ones(t.size, bool)
         # For reports; a fit does not use it.
         self.dropped = int((~used).sum())
         # A long recording must not be copied more than needed.
@@ -129,11 +133,6 @@ class Recording(eqx.Module):
             Reading(sensor, jnp.asarray(values[kept]), jnp.asarray(mask[kept]))
             for sensor, values, mask in rows
         )
-        if torque is not None:
-            require_law(torque)
-        # A function is no array, and must be no leaf under transformations.
-        plain = isinstance(torque, FunctionType)
-        self.torque = jax.tree_util.Partial(torque) if plain else torque
 
     def __repr__(self) -> str:
         if not _checks.known(self) or np.ndim(self.t) != 1:
@@ -145,8 +144,8 @@ class Recording(eqx.Module):
             first = _show.shown(np.asarray(reading.values)[int(np.argmax(reading.seen))])
             name, count = type(reading.sensor).__name__, int(reading.seen.sum())
             parts.append(f"{name}: {count} readings from {first}")
-        if self.torque is not None:
-            parts.append(f"torque: {type(self.torque).__name__}")
+        if self.inputs:
+            parts.append(f"inputs: {', '.join(self.inputs)}")
         return f"Recording({'; '.join(parts)})"
 
     @property
@@ -168,6 +167,25 @@ def readings_of(recording: Recording, kind: type) -> list[Any]:
 def count_of(reading: Reading) -> int:
     """The number of numbers read: unmasked readings times the components of an error."""
     return reading.sensor.components * int(reading.seen.sum())
+
+
+def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
+    """Return the inputs by name: functions of time as they are, samples (T, …) as arrays."""
+    _checks.instance(inputs, Mapping, "inputs", wanted="samples or functions of time by name")
+    out = {}
+    for name, source in inputs.items():
+        _checks.instance(name, str, "inputs: name")
+        if not callable(source):
+            samples = _checks.on_host(source, f"inputs[{name!r}]")
+            if samples.shape[:1] != t.shape:
+                raise ValueError(
+                    f"inputs[{name!r}]: wanted a sample for each of {t.size} times, got shape "
+                    f"{samples.shape}; for samples at other times give a function of time such as "
+                    "rigidjax.torques.Series(times, samples)"
+                )
+            source = jnp.asarray(_checks.finite(samples, f"inputs[{name!r}]"))
+        out[name] = source
+    return out
 
 
 def _require_digits(given: np.ndarray, dtype: Any) -> None:

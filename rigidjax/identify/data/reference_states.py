@@ -123,10 +123,8 @@ class ReferenceStates(eqx.Module):
         }
         return jnp.repeat(jnp.stack([sizes[name] for name in names(self.state)], -1), 3, -1)
 
-    def moved(self, own: Any) -> Any:
-        """The initial state of one recording."""
-        parts = (own.place, own.speed, own.turn, own.spin)
-        change = jnp.concatenate([part for part in parts if part is not None])
+    def moved(self, change: Float[Array, " n"]) -> Any:
+        """Return the initial state of one recording, a `change` of order one away."""
         return plus(self.state, self.units * change)
 
 

@@ -25,22 +25,22 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
         if form != forms[0]:
             raise ValueError(
                 f"recordings: the one at index {index} differs from the first in its sensors or "
-                "its torque; give all recordings the same kinds in the same order, with the same "
+                "its inputs; give all recordings the same kinds in the same order, with the same "
                 "options"
             )
     return jax.tree.map(_stacked, *alike), counts
 
 
-def of_few_lengths(problem: Any) -> Any:
-    """The problem with masked readings up to one of four lengths an octave: few programs."""
-    records = problem.records
+def of_few_lengths(model: Any) -> Any:
+    """Return the model with masked readings up to one of four lengths an octave: few programs."""
+    records = model.records
     longer = lengthened(records, _length(records.t.shape[1]), _length(_rows(records, 1)), 1)
-    return eqx.tree_at(lambda p: p.records, problem, longer)
+    return eqx.tree_at(lambda m: m.records, model, longer)
 
 
 def _rows(recording: Recording, axis: int) -> int:
-    """The rows of the longest table of time in the torque and the sensors, 0 without one."""
-    parts = recording.torque, recording.sensors
+    """Return the rows of the longest table of time in the inputs and the sensors, 0 without one."""
+    parts = recording.inputs, recording.sensors
     tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))
     return max((int(table.values.shape[axis]) for table in tables), default=0)
 
@@ -55,6 +55,15 @@ def _length(count: int) -> int:
 
 
 def _stacked(*leaves: Any) -> Any:
+    if not eqx.is_array_like(leaves[0]):
+        if any(leaf is not leaves[0] for leaf in leaves):
+            raise ValueError(
+                "recordings: their inputs or sensors hold different functions "
+                f"({', '.join(dict.fromkeys(getattr(f, '__name__', str(f)) for f in leaves))}), "
+                "and one program serves all recordings; give all the same function, and what "
+                "differs as numbers"
+            )
+        return leaves[0]
     # By NumPy if the numbers are known: JAX compiles a program for each shape.
     if _checks.known(leaves):
         return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))
@@ -89,7 +98,8 @@ def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
 
     def long(r: Recording) -> list[Any]:
         parts = [(reading.values, reading.mask, reading.late) for reading in r.readings]
-        return jax.tree.leaves((r.t, parts))
+        samples = [source for source in r.inputs.values() if eqx.is_array(source)]
+        return jax.tree.leaves((r.t, parts, samples))
 
     return eqx.tree_at(long, recording, [leaf[begin:end] for leaf in long(recording)])
 
@@ -104,14 +114,18 @@ def lengthened(recording: Recording, count: int, rows: int = 0, axis: int = 0) -
     """
     missing = count - recording.t.shape[axis]
     # Sensors that read a moving object may hold tables of time, too.
-    torque, sensors = jax.tree.map(
+    inputs, sensors = jax.tree.map(
         lambda node: _table(node, rows, axis) if _is_table(node) else node,
-        (recording.torque, recording.sensors),
+        (recording.inputs, recording.sensors),
         is_leaf=_is_table,
     )
     t = recording.t
     parts = [(r.values, r.mask, r.late) for r in recording.readings]
     if missing:
+        inputs = {
+            name: _repeat_last(source, missing, axis) if eqx.is_array(source) else source
+            for name, source in inputs.items()
+        }
         t = _repeat_last(t, missing, axis)
         parts = [
             (
@@ -122,9 +136,9 @@ def lengthened(recording: Recording, count: int, rows: int = 0, axis: int = 0) -
             for values, mask, late in parts
         ]
     return eqx.tree_at(
-        lambda r: (r.t, r.torque, r.readings),
+        lambda r: (r.t, r.inputs, r.readings),
         recording,
-        (t, torque, tuple(Reading(s, *part) for s, part in zip(sensors, parts, strict=True))),
+        (t, inputs, tuple(Reading(s, *part) for s, part in zip(sensors, parts, strict=True))),
         is_leaf=lambda node: node is None,
     )
 

@@ -14,7 +14,7 @@ from rigidjax._types import HasSpin, Scalar, ScalarLike
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.data.reference_states import attitudes, first_rate
 from rigidjax.identify.filtering import roots, steps
-from rigidjax.identify.filtering.steps import Dynamics, Extended, Model, Read, Sensors, Stops
+from rigidjax.identify.filtering.steps import Dynamics, Extended, NoiseModel, Read, Sensors, Stops
 from rigidjax.motion import Attitude, Spin
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.manifold import names, plus
@@ -60,7 +60,7 @@ class Belief(eqx.Module):
 
 
 def start(
-    model: Model,
+    model: NoiseModel,
     recording: Recording,
     state: Any = None,
     *,
@@ -80,13 +80,12 @@ def start(
     or below zero.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
+    >>> model = NoiseModel(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
     >>> start(model, record, rate=0.1).deviation.tolist()
     [0.1, 0.1, 0.1]
     """
-    _checks.instance(model, Model, "model")
+    _checks.instance(model, NoiseModel, "model")
     _checks.instance(recording, Recording, "recording")
-    model = steps.with_torque(model, recording.torque)
     sensors = steps.sensors_of(recording.sensors, model)
     if state is None:
         state = _shown(recording)
@@ -106,8 +105,7 @@ def start(
             )
     parts = [_spread(given[name], (3,), name, dtype) for name in wanted]
     parts += [law.deviation.astype(dtype) for law in model.coloured]
-    numbers = jax.tree.leaves(sensors.readings)
-    walks = tuple(jnp.asarray(numbers[leaf]).astype(dtype) for leaf in sensors.leaves)
+    walks = tuple(value.astype(dtype) for value in sensors.first_walks)
     for walk, value in zip(model.walks, walks, strict=True):
         parts.append(_spread(walk.deviation, value.shape, "deviation", dtype).reshape(-1))
         _spread(walk.density, value.shape, "density", dtype)
@@ -152,7 +150,7 @@ class Grid(NamedTuple):
         return kept if same else jax.tree.map(lambda leaf: leaf[self.rows], kept)
 
 
-def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Grid:
+def grid_of(model: NoiseModel, recording: Recording, first: Belief, substeps: int | None) -> Grid:
     """The times of the steps."""
     xp = _checks.namespace((recording.t, first.t))
     t, t0 = xp.asarray(recording.t), xp.asarray(first.t)
@@ -224,7 +222,7 @@ class Filtered(eqx.Module):
 
 
 def filter(
-    model: Model,
+    model: NoiseModel,
     recording: Recording,
     first: Belief,
     *,
@@ -270,7 +268,7 @@ def told(out: Any) -> Any:
 
 
 def log_likelihood(
-    model: Model, recording: Recording, first: Belief, *, substeps: int | None = None
+    model: NoiseModel, recording: Recording, first: Belief, *, substeps: int | None = None
 ) -> Scalar:
     """The logarithm of the density of all readings, the unknown torques integrated out.
 
@@ -287,12 +285,12 @@ def log_likelihood(
     return _log_likelihood(looked_at(model, recording, first, substeps))
 
 
-def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belief:
+def step(model: NoiseModel, belief: Belief, t: ScalarLike, *readings: tuple) -> Belief:
     """The belief at `t`, after the readings at `t`: for use while the body moves.
 
     **Arguments:** `model`; `belief` of `start` or the last `step`; `t` s, not before it; `readings`
     pairs `(sensor, value)` or triples `(sensor, value, seen)`, `seen` a truth value. The walks'
-    `where` finds the sensors as `r.readings[i].sensor`, in this order, so each call gives them all.
+    `where` finds the sensors as `s.sensors[i]`, in this order, so each call gives them all.
     This is one step of the classical method: the time between readings must be short against a
     turn. **Returns** the `Belief` at `t`. **Raises:** `ValueError` for a `t` before the belief, or
     a reading with NaN, if the numbers are known.
@@ -304,7 +302,7 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     >>> rj.estimate.step(model, belief, 0.1, (gyro, jnp.array([1.0, 0.0, 0.0]))).t
     Array(0.1, dtype=float64)
     """
-    _checks.instance(model, Model, "model")
+    _checks.instance(model, NoiseModel, "model")
     _checks.instance(belief, Belief, "belief")
     if belief.t.shape != ():
         raise ValueError(
@@ -330,7 +328,7 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
 
 @eqx.filter_jit
 def _step(
-    model: Model, sensors: Sensors, belief: Belief, t: Array, values: tuple, masks: tuple
+    model: NoiseModel, sensors: Sensors, belief: Belief, t: Array, values: tuple, masks: tuple
 ) -> Belief:
     # A unit vector in the place of a missing reading keeps derivatives finite.
     units = (jnp.eye(1, value.size, dtype=value.dtype).reshape(value.shape) for value in values)
@@ -352,7 +350,7 @@ def _one(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, Read]
 
 
 # The checked arguments of a filter: see `looked_at`.
-Given = tuple[Model, Sensors, Recording, Belief, Grid]
+Given = tuple[NoiseModel, Sensors, Recording, Belief, Grid]
 
 
 def scan_filter(given: Given, keep: Any) -> tuple[Dynamics, Stops, Any]:
@@ -404,15 +402,16 @@ def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Arra
     return status, jnp.where(lost.any(), t[jnp.argmax(lost)], jnp.nan)
 
 
-def looked_at(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Given:
+def looked_at(
+    model: NoiseModel, recording: Recording, first: Belief, substeps: int | None
+) -> Given:
     """The checked arguments of `filter` and `smooth`: model, sensors, recording, belief, times."""
-    _checks.instance(model, Model, "model")
+    _checks.instance(model, NoiseModel, "model")
     _checks.instance(recording, Recording, "recording")
     _checks.instance(first, Belief, "first", hint="estimate.start makes it")
     for sensor in recording.sensors:
         if not isinstance(first.x.motion, sensor.feels):
             kind, got = sensor.feels.__name__, type(first.x.motion).__name__
             raise TypeError(f"first: a sensor needs a state with {kind}, got a {got}")
-    model = steps.with_torque(model, recording.torque)
     sensors = steps.sensors_of(recording.sensors, model)
     return steps.bare(model), sensors, recording, first, grid_of(model, recording, first, substeps)

@@ -22,7 +22,7 @@ from rigidjax.identify.filtering.filter import (
     told,
 )
 from rigidjax.identify.filtering.linear import LinearEstimate, solved
-from rigidjax.identify.filtering.steps import Dynamics, Extended, Model, Read, Stops
+from rigidjax.identify.filtering.steps import Dynamics, Extended, NoiseModel, Read, Stops
 from rigidjax.motion.manifold import minus, plus
 
 
@@ -75,7 +75,7 @@ class Smoothed(eqx.Module):
 
 
 def smooth(
-    model: Model,
+    model: NoiseModel,
     recording: Recording,
     first: Belief,
     *,

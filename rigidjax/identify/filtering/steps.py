@@ -18,7 +18,8 @@ from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.filtering import roots
 from rigidjax.identify.model.free import leaf_at
-from rigidjax.identify.model.predict import shifted, what_turns
+from rigidjax.identify.model.model import TURN_OF_A_FILTER_STEP
+from rigidjax.identify.model.predict import body_of_equations, shifted
 from rigidjax.identify.sensors import AbstractSensor, Gyro, SensorInput
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.manifold import coordinates, dimension, tangent, turns
@@ -35,12 +36,12 @@ from rigidjax.solve.tableaus import KUTTA4
 class Walk(eqx.Module):
     """An unknown sensor error that drifts: `dx = √density dW`, a random walk.
 
-    **Arguments:** `where` picks it as a `Free` does: `lambda r: r.readings[0].sensor.bias`; its
+    **Arguments:** `where` picks it as a `Free` does: `lambda s: s.sensors[0].bias`; its
     value in the recording is the initial value; `deviation` of that value, one number or one for
     each component, in its unit; `density` of the drift, unit² / s, ≥ 0: zero for a constant error.
     **Raises** `ValueError` for a deviation or density below zero.
 
-    >>> Walk(lambda r: r.readings[0].sensor.bias, 0.01).density.tolist()
+    >>> Walk(lambda s: s.sensors[0].bias, 0.01).density.tolist()
     0.0
     """
 
@@ -49,20 +50,20 @@ class Walk(eqx.Module):
     density: Array
 
     def __init__(self, where: Callable[[Any], Any], deviation: Any, density: Any = 0.0):
-        words = "of a recording, such as lambda r: r.readings[0].sensor.bias"
+        words = "of a scene, such as lambda s: s.sensors[0].bias"
         self.where = _checks.function(where, "where", words)
         self.deviation = not_negative(deviation, "deviation")
         self.density = not_negative(density, "density")
 
 
-class Model(eqx.Module):
+class NoiseModel(eqx.Module):
     """A body, its known and unknown torques, and the errors of its sensors that drift.
 
     **Arguments:** `body` an `Inertia`, or `MassProperties` for a `Rigid` state; `torque` any
     torques, among them `RandomTorque` and `CorrelatedTorque`, several in a `Sum`; `None` for a free
     body without noise; `walks` the `Walk`s.
 
-    >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
+    >>> model = NoiseModel(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
     >>> len(model.white), len(model.coloured), model.torque
     (1, 0, None)
     """
@@ -91,15 +92,7 @@ class Model(eqx.Module):
         self.walks = walks
 
 
-def with_torque(model: Model, torque: Torque | None) -> Model:
-    """The model with a recording's own torque beside its torques."""
-    if torque is None:
-        return model
-    laws = Sum(*parts_of(model.torque), torque, *model.white, *model.coloured)
-    return Model(model.body, laws, walks=model.walks)
-
-
-def bare(model: Model) -> Model:
+def bare(model: NoiseModel) -> NoiseModel:
     """The model without its walks, whose functions would have each new one compiled again."""
     return eqx.tree_at(lambda m: m.walks, model, ())
 
@@ -115,31 +108,30 @@ class Extended(eqx.Module):
     walks: tuple[Array, ...]
 
 
-class Mounted(eqx.Module):
-    """A sensor without its readings; `Walk.where` finds it as in a `Recording`."""
-
-    sensor: AbstractSensor
-
-
 class Sensors(eqx.Module):
-    """The sensors without readings, and the leaves that drift. No function is kept: a second model
-    of the same form does not compile again.
+    """The sensors, and the paths and densities of their numbers that drift. No function is kept: a
+    second model of the same form does not compile again.
     """
 
-    readings: tuple[Mounted, ...]
-    leaves: tuple[int, ...] = eqx.field(static=True)
+    sensors: tuple[AbstractSensor, ...]
+    paths: tuple[tuple[Any, ...], ...] = eqx.field(static=True)
     densities: tuple[Array, ...]
 
-    def drifted(self, walks: Sequence[Array]) -> tuple[Mounted, ...]:
-        """The sensors with the walks' values in them."""
-        leaves, structure = jax.tree.flatten(self.readings)
-        for leaf, value in zip(self.leaves, walks, strict=True):
-            leaves[leaf] = value
-        return jax.tree.unflatten(structure, leaves)
+    @property
+    def first_walks(self) -> tuple[Array, ...]:
+        """The first value of each number that drifts."""
+        leaves = dict(jax.tree.leaves_with_path(self))
+        return tuple(jnp.asarray(leaves[path]) for path in self.paths)
+
+    def drifted(self, walks: Sequence[Array]) -> tuple[AbstractSensor, ...]:
+        """Return the sensors with the values of `walks` in them."""
+        pairs, structure = jax.tree.flatten_with_path(self)
+        leaves = dict(pairs) | dict(zip(self.paths, walks, strict=True))
+        return jax.tree.unflatten(structure, [leaves[path] for path, _ in pairs]).sensors
 
 
-def sensors_of(sensors: Sequence[AbstractSensor], model: Model) -> Sensors:
-    """The checked sensors: each has a noise, and each walk finds its numbers."""
+def sensors_of(sensors: Sequence[AbstractSensor], model: NoiseModel) -> Sensors:
+    """Return the checked sensors: each has a noise, and each walk finds its numbers."""
     for sensor in sensors:
         _checks.instance(sensor, AbstractSensor, "sensor")
         name = type(sensor).__name__
@@ -158,10 +150,9 @@ def sensors_of(sensors: Sequence[AbstractSensor], model: Model) -> Sensors:
                 f"{name}: jitter makes errors that depend on each other, which the filter takes as "
                 "independent; leave it out, and give more noise"
             )
-    readings = tuple(Mounted(sensor) for sensor in sensors)
-    tree = Sensors(readings, (), ())
-    leaves = tuple(leaf_at(walk.where, tree, "Walk", "the sensor")[0] for walk in model.walks)
-    return Sensors(readings, leaves, tuple(walk.density for walk in model.walks))
+    tree = Sensors(tuple(sensors), (), ())
+    paths = tuple(leaf_at(walk.where, tree, "Walk", "the sensor")[0] for walk in model.walks)
+    return Sensors(tree.sensors, paths, tuple(walk.density for walk in model.walks))
 
 
 NO_SENSORS = Sensors((), (), ())
@@ -178,9 +169,9 @@ class Dynamics(eqx.Module):
     walks: tuple[Array, ...]
     sensors: Sensors
 
-    def __init__(self, model: Model, x: Extended, sensors: Sensors = NO_SENSORS):
+    def __init__(self, model: NoiseModel, x: Extended, sensors: Sensors = NO_SENSORS):
         dtype = x.motion.omega.dtype
-        self.body = what_turns(in_precision(model.body, dtype), type(x.motion))
+        self.body = body_of_equations(in_precision(model.body, dtype), type(x.motion))
         self.field = equations_of_motion(self.body, x.motion, in_precision(model.torque, dtype))
         self.inverse = inverse(tensor_of(self.body))
         self.white = tuple(jnp.sqrt(law.density.astype(dtype)) for law in model.white)
@@ -304,10 +295,10 @@ def linearised(
     basis = jax.vmap(lambda e: tangent(x, e))(jnp.eye(dimension(x), dtype=dtype))
     out = []
     for index, (value, mask) in enumerate(zip(stop.values, stop.masks, strict=True)):
-        sensor = in_precision(dynamics.sensors.readings[index].sensor, dtype)
+        sensor = in_precision(dynamics.sensors.sensors[index], dtype)
 
         def error(y: Extended, index: int = index, value: Array = value) -> Array:
-            seeing = in_precision(dynamics.sensors.drifted(y.walks)[index].sensor, dtype)
+            seeing = in_precision(dynamics.sensors.drifted(y.walks)[index], dtype)
 
             def field(t: Any, state: Any, args: Any = None) -> Any:
                 return dynamics.pushed(dynamics.field(t, state, args), y.torques)
@@ -342,18 +333,16 @@ class Read(NamedTuple):
 
 def by_sensor(sensors: Sensors, read: Read) -> tuple[Read, ...]:
     """The `Read` of each sensor, from that of all numbers in a row."""
-    ends = np.cumsum([mounted.sensor.components for mounted in sensors.readings])[:-1]
+    ends = np.cumsum([sensor.components for sensor in sensors.sensors])[:-1]
     return tuple(Read(*own) for own in zip(*(jnp.split(a, ends, -1) for a in read), strict=True))
 
 
-# The turn in a step of the classical method of order 4, rad: its error is 5e-8 of the turn.
-TURN_A_STEP = 0.05
 # The longest step as a fraction of a torque's correlation time.
 MEMORY_A_STEP = 0.25
 
 
 def steps_of(
-    model: Model, ts: Any, state: Any, substeps: int | None, recording: Recording | None = None
+    model: NoiseModel, ts: Any, state: Any, substeps: int | None, recording: Recording | None = None
 ) -> np.ndarray:
     """The number of fixed steps from each of the times `ts` to the next: `substeps`, or by the rate
     of the `state` and of gyros, or one if numbers are not known.
@@ -368,7 +357,7 @@ def steps_of(
             values = np.asarray(reading.values, float)[reading.seen]
             rate = max(rate, float(np.quantile(np.linalg.norm(values, axis=1), 0.99)))
     times = [MEMORY_A_STEP * float(law.time) for law in model.coloured]
-    longest = min([TURN_A_STEP / rate if rate > 0 else math.inf, *times])
+    longest = min([TURN_OF_A_FILTER_STEP / rate if rate > 0 else math.inf, *times])
     return np.maximum(1, np.ceil(np.diff(ts) / longest * (1 - 1e-9))).astype(int)
 
 
@@ -384,7 +373,9 @@ class Sampled(eqx.Module):
     torques: tuple[Float[Array, "times 3"], ...]
 
 
-def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None = None) -> Sampled:
+def sample(
+    key: Any, model: NoiseModel, state0: Any, ts: Any, *, substeps: int | None = None
+) -> Sampled:
     """One motion that the model's random torques could have made.
 
     Each step draws the integral and the first moment of the white noise, and follows the equations
@@ -405,7 +396,7 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
     ((3, 3), ())
     """
     _checks.key(key)
-    _checks.instance(model, Model, "model")
+    _checks.instance(model, NoiseModel, "model")
     _checks.single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
     times = _checks.rows(ts, (), "ts")
     if times.shape[0] < 2:
@@ -418,7 +409,7 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
 
 
 @eqx.filter_jit
-def _sample(key: PRNGKeyArray, model: Model, state0: Any, ts: Array, pieces: int) -> Sampled:
+def _sample(key: PRNGKeyArray, model: NoiseModel, state0: Any, ts: Array, pieces: int) -> Sampled:
     dtype = state0.omega.dtype
     first, later = jax.random.split(key)
     keys = jax.random.split(first, len(model.coloured))

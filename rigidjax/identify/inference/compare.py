@@ -5,16 +5,20 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from rigidjax import _checks
 from rigidjax.identify.answer.fit import fit
 from rigidjax.identify.answer.result import Fit
+from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, count_of
-from rigidjax.identify.model.charts import Known
-from rigidjax.identify.model.problem import Problem
-from rigidjax.identify.model.terms import independent, whitened
-from rigidjax.identify.search.stages import evaluate
+from rigidjax.identify.model.charts import Known, places_of
+from rigidjax.identify.model.free import put
+from rigidjax.identify.model.index import index_of
+from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.terms import independent, template, whitened
+from rigidjax.identify.search.stages import errors_and_slopes
 
 
 class Comparison(eqx.Module):
@@ -43,7 +47,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     for each `name`, `free`, `rms`, `correlation` and `information` (`Comparison`). **Raises**
     `ValueError` for none, or for fits of other readings.
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> best = compare({"one": found, "the same again": found})[0]
     >>> best.name, best.free, best.information  # free: two ratios, initial attitude and rate
     ('one', 8, 0.0)
@@ -53,16 +57,16 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
         _checks.instance(found, Fit, f"fits[{name!r}]")
     if not fits:
         raise ValueError("compare: wanted at least one fit")
-    readings = {name: found.problem.records.readings for name, found in fits.items()}
+    readings = {name: found.model.records.readings for name, found in fits.items()}
     counts = {name: tuple(map(count_of, some)) for name, some in readings.items()}
     if len(set(counts.values())) > 1:
         raise ValueError(f"compare: wanted fits of the same readings, got {counts}")
     shortest = max(min(found.correlation for found in fits.values()), 1.0)
     rows = []
     for name, found in fits.items():
-        jitters = [getattr(s, "jitter", None) for s in found.problem.records.sensors]
-        several = int(np.max(found.problem.noise_groups)) + 1
-        size = int(found.covariance.shape[0])
+        jitters = [getattr(s, "jitter", None) for s in found.model.records.sensors]
+        several = int(np.max(found.model.noise_groups)) + 1
+        size = found.x.size
         size += several * sum(jitter is not None and jitter.estimated for jitter in jitters)
         many = np.array(counts[name]) / shortest
         misfit = many @ _log_squares(found)
@@ -79,10 +83,11 @@ def _log_squares(found: Fit) -> np.ndarray:
     """The logarithm of each sensor's mean square error; with jitter, of white errors that are as
     likely as these.
     """
-    out, problem = 2.0 * np.log(np.maximum(found.rms, 1e-300)), found.problem
-    white = whitened(problem, evaluate(found.parameters, problem)[0][0], found.noises)
+    out, model = 2.0 * np.log(np.maximum(found.rms, 1e-300)), found.model
+    errors, _ = errors_and_slopes(model, found.x)
+    white = whitened(model, errors, found.noises)
     for index, (reading, e, sigma) in enumerate(
-        zip(problem.records.readings, white, found.noises, strict=True)
+        zip(model.records.readings, white, found.noises, strict=True)
     ):
         if reading.late is not None:
             wider = np.asarray(independent(e, reading.late / sigma[:, None])[1])[reading.seen]
@@ -92,13 +97,13 @@ def _log_squares(found: Fit) -> np.ndarray:
 
 
 def cross_validate(
-    build: Callable[[Sequence[Recording]], Problem], recordings: Sequence[Recording], **options: Any
+    build: Callable[[Sequence[Recording]], Model], recordings: Sequence[Recording], **options: Any
 ) -> tuple[tuple[float, ...], ...]:
     """The errors of each recording under a body fitted to all other recordings.
 
     The body and all shared numbers come from the others; the fit to the recording left out moves
     only its initial state and the `Free`s with one value for each. **Arguments:** `build` the
-    problem of a sequence of recordings; `recordings` two at least; `options` for `fit`. **Returns**
+    model of a sequence of recordings; `recordings` two at least; `options` for `fit`. **Returns**
     for each recording the root mean square error of each sensor: the model with the smallest
     predicts best. **Raises** `ValueError` for fewer than two recordings.
 
@@ -106,7 +111,7 @@ def cross_validate(
     Traceback (most recent call last):
     ValueError: cross_validate: wanted at least two recordings, got 0
     """
-    _checks.function(build, "build", "of a sequence of recordings → Problem")
+    _checks.function(build, "build", "of a sequence of recordings → Model")
     _checks.instance(recordings, Sequence, "recordings", wanted="a sequence of Recording")
     for item in recordings:
         _checks.instance(item, Recording, "recordings")
@@ -120,16 +125,26 @@ def cross_validate(
     return tuple(out)
 
 
-def _with_shared(problem: Problem, found: Fit) -> Problem:
-    """The problem with the body and all shared values of a fit, no longer free."""
-    here = problem.start()
-    here = eqx.tree_at(lambda p: p.shared, here, found.parameters.shared)
-    records = problem.scenes(here)
+def _with_shared(model: Model, found: Fit) -> Model:
+    """Return the model with the body and all shared values of a fit, no longer free."""
+    x = model.start()
+    for slot, fitted in zip(model.slots, found.model.slots, strict=True):
+        if slot.shared is not None and fitted.shared is not None:
+            x = x.at[slot.shared].set(found.x[fitted.shared])
+    record = stacking.one(model.records, 0)
+    scene = put(template(model, record), model.slots, model.index.rows(x)[0])
+    sensors = jax.tree.map(lambda leaf: leaf[None] if eqx.is_array(leaf) else leaf, scene.sensors)
     own = [
         slot if slot.each else dataclasses.replace(slot, each=True, prior=slot.spread, spread=None)
-        for slot in problem.slots
-        if slot.each or slot.spread is not None
+        for slot in model.slots
+        if slot.own is not None
     ]
+    chart = Known(found.body)
+    kinds = model.index.start.shape[1] // 3
+    index, slots = index_of(places_of(chart, None, model.count), chart.size, own, kinds)
     return eqx.tree_at(
-        lambda p: (p.body, p.records, p.slots), problem, (Known(found.body), records, tuple(own))
+        lambda m: (m.chart, m.torque, [r.sensor for r in m.records.readings], m.slots, m.index),
+        model,
+        (chart, scene.torque, list(sensors), slots, index),
+        is_leaf=lambda node: node is None,
     )

@@ -6,79 +6,79 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
-from rigidjax.identify.model.free import Parameters, places
-from rigidjax.identify.model.problem import Problem, fits, one_problem
-from rigidjax.identify.model.terms import changes, in_deviations, with_blocks
+from rigidjax.identify.model.model import Model, require_numbers, require_one
+from rigidjax.identify.model.terms import blocks, changes, in_deviations
 from rigidjax.identify.search.normal import normal_of
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.covariance import inverted
 from rigidjax.identify.uncertainty.quantities import Quantity, quantities, values_and_slopes
 
 
-def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
+def expected(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, ...]:
     """The expected report of a fit of such a recording, with its standard deviations.
 
-    **Arguments:** `problem` whose recordings give times, sensors with known noise, and torques (the
-    readings themselves do not matter); `parameters` the motion that is planned. **Returns** the
+    **Arguments:** `model` whose recordings give times, sensors with known noise, and torques (the
+    readings themselves do not matter); `x` (n,) the free
+    numbers of the motion that is planned, as `Model.start` gives them. **Returns** the
     quantities of `Fit.quantities` (`name`, `value`, `deviation`, `unit`) with the standard
     deviations of the Cramér–Rao bound, infinite where the motion would show nothing. **Raises:**
     `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
 
-    >>> problem = rj.datasets.toutatis.problem()
-    >>> plan = problem.start(rj.Inertia.from_principal(3.1, 3.2, 1.0))
-    >>> bool(expected(problem, plan)[0].deviation < 1.0)
+    >>> model = rj.datasets.toutatis.model()
+    >>> plan = model.start(rj.Inertia.from_principal(3.1, 3.2, 1.0))
+    >>> bool(expected(model, plan)[0].deviation < 1.0)
     True
     """
-    _on_host(problem, parameters)
-    _look(problem, parameters)
-    near = flat_limit.beside(problem, parameters)
-    information = np.asarray(_fisher(problem, parameters if near is None else near))
+    _on_host(model, x)
+    _require_noise(model, x)
+    near = flat_limit.thickened(model, x)
+    information = np.asarray(_fisher(model, x if near is None else near))
     if not np.isfinite(information).all():
         raise ValueError(
-            "expected: Fisher's information has NaN or infinity in it: problem holds NaN in its "
-            "recordings, or the motion of these parameters is beyond the dtype"
+            "expected: Fisher's information has NaN or infinity in it: model holds NaN in its "
+            "recordings, or the motion of these numbers is beyond the dtype"
         )
-    found = values_and_slopes(problem, parameters, near)
+    found = values_and_slopes(model, x, near)
     half, null = inverted(information)
-    return quantities(problem, found, half @ half.T, null)
+    return quantities(model, found, half @ half.T, null)
 
 
-def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
+def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
     """Fisher's information (n, n) of the free numbers: `Jᵀ Σ⁻¹ J` of the predictions.
 
-    **Arguments:** `problem` with known noises; `parameters` the motion. It is differentiable in the
-    parameters, for a design by gradients. **Raises** `ValueError` for a sensor without noise.
+    **Arguments:** `model` with known noises; `x` (n,) the free numbers of the motion. It is
+    differentiable in x, for a design by gradients. **Raises** `ValueError` for a sensor without noise.
 
-    >>> problem = rj.datasets.toutatis.problem()
-    >>> fisher(problem, problem.start()).shape
+    >>> model = rj.datasets.toutatis.model()
+    >>> fisher(model, model.start()).shape
     (8, 8)
     """
-    _look(problem, parameters)
-    return _fisher(problem, parameters)
+    _require_noise(model, x)
+    return _fisher(model, x)
 
 
 @eqx.filter_jit
-def _fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
-    sensors = problem.records.sensors
+def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+    sensors = model.records.sensors
     noises: list[Any] = [sensor.noise for sensor in sensors]
-    blocks = with_blocks(parameters, problem)[1][0]
+    _, slopes = blocks(model, x)
     rows = []
-    for index, (sensor, noise, block) in enumerate(zip(sensors, noises, blocks, strict=True)):
+    for index, (sensor, noise, block) in enumerate(zip(sensors, noises, slopes, strict=True)):
         jitter, late = getattr(sensor, "jitter", None), None
         if jitter is not None:
-            late = jitter.deviation[:, None, None] * changes(parameters, problem)[index]
+            late = jitter.deviation[:, None, None] * changes(model, x)[index]
         rows.append(in_deviations(block, noise, late))
-    return normal_of(rows, places(problem, parameters), ravel_pytree(parameters)[0].size).core
+    return normal_of(rows, model.index.places, model.size).core
 
 
-def _look(problem: Problem, parameters: Parameters) -> None:
-    fits(problem, parameters)
-    for sensor in problem.records.sensors:
+def _require_noise(model: Model, x: Float[Array, " n"]) -> None:
+    """Raise `ValueError` for a sensor whose noise or jitter is not known."""
+    require_numbers(model, x)
+    for sensor in model.records.sensors:
         if sensor.noise is None:
             raise ValueError(
                 f"design: wanted a {type(sensor).__name__} with known noise, got noise=None"
@@ -87,44 +87,44 @@ def _look(problem: Problem, parameters: Parameters) -> None:
             raise ValueError(f"design: wanted a {type(sensor).__name__} with known jitter, in s")
 
 
-def _on_host(problem: Problem, motion: Any) -> None:
-    if not _checks.known((problem, motion)):
+def _on_host(model: Model, motion: Any) -> None:
+    if not _checks.known((model, motion)):
         raise TypeError(
-            "problem, parameters, body, omega: wanted known numbers, got traced ones; this works "
+            "model, x, body, omega: wanted known numbers, got traced ones; this works "
             "on the host: call it outside of jax.jit, and differentiate fisher"
         )
 
 
 def best_first_rate(
-    problem: Problem, body: Any, omega: Any, *, max_steps: int = 60
+    model: Model, body: Any, omega: Any, *, max_steps: int = 60
 ) -> tuple[Vec3, tuple[Quantity, ...]]:
     """The direction of the initial rate that determines the body best; its length is kept.
 
     It minimises the mean logarithm of the standard deviations of the body's free numbers
     (D-optimality, other numbers free as well), by BFGS of optimistix near `omega`: try several.
-    **Arguments:** `problem`, `body` as for `Problem.start`; `omega` (3,) rad/s, body frame, where
+    **Arguments:** `model`, `body` as for `Model.start`; `omega` (3,) rad/s, body frame, where
     the search starts and how fast the body can be thrown; `max_steps`. **Returns** the rate (3,)
     and what to expect from it (`expected`). **Raises:** as `fisher`.
     """
-    one_problem(problem)
+    require_one(model)
     max_steps = _checks.whole(max_steps, "max_steps", 1)
-    _on_host(problem, (body, omega))
-    _look(problem, problem.start(body, omega))
-    start = _checks.floating(omega, (3,), "omega").astype(problem.records.t.dtype)
+    _on_host(model, (body, omega))
+    _require_noise(model, model.start(body, omega))
+    start = _checks.floating(omega, (3,), "omega").astype(model.records.t.dtype)
     size = jnp.sqrt(jnp.sum(start**2))
-    found = _search(problem, body, start / size, size, max_steps)
+    found = _search(model, body, start / size, size, max_steps)
     rate = size * found / jnp.sqrt(jnp.sum(found**2))
-    return rate, expected(problem, problem.start(body, rate))
+    return rate, expected(model, model.start(body, rate))
 
 
 @eqx.filter_jit
-def _search(problem: Problem, body: Any, start: Array, size: Array, max_steps: int) -> Array:
+def _search(model: Model, body: Any, start: Array, size: Array, max_steps: int) -> Array:
     minimise: Any = optx.minimise
     out = minimise(
         _doubt,
         optx.BFGS(rtol=1e-4, atol=1e-4),
         start,
-        (problem, body, size),
+        (model, body, size),
         options={"autodiff_mode": "fwd"},
         max_steps=max_steps,
         throw=False,
@@ -134,10 +134,10 @@ def _search(problem: Problem, body: Any, start: Array, size: Array, max_steps: i
 
 def _doubt(direction: Array, args: Any) -> Scalar:
     """½ log det of the body's covariance over its size, plus a penalty on the length."""
-    problem, body, size = args
+    model, body, size = args
     length = jnp.sqrt(jnp.sum(direction**2))
-    information = fisher(problem, problem.start(body, size * direction / length))
-    n = problem.body.size
+    information = fisher(model, model.start(body, size * direction / length))
+    n = model.index.bodies
     # The body's information with the other numbers free: Schur's complement.
     mine, across, rest = information[:n, :n], information[:n, n:], information[n:, n:]
     scale = jnp.sqrt(jnp.diagonal(rest))

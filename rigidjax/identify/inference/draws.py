@@ -13,17 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.body.inertia import tensor_of
-from rigidjax.identify.inference.density import LogDensity, curvature, of_draws
-from rigidjax.identify.model.free import Unpacked
-from rigidjax.identify.search.least_squares import Settings, search
+from rigidjax.identify.filtering.terms import curvature
+from rigidjax.identify.inference.density import LogDensity, of_draws
+from rigidjax.identify.model.model import Unpacked
+from rigidjax.identify.search.least_squares import Settings, minimise
 from rigidjax.identify.search.normal import Normal
-from rigidjax.identify.search.stages import made_of
+from rigidjax.identify.search.stages import is_order_one
 from rigidjax.identify.uncertainty.quantities import around
 
 # A sampler: key, log-density of z, a first z (n,) → draws (samples, n).
@@ -178,7 +178,7 @@ def posterior(
 
     >>> import jax
     >>> record, chart = rj.datasets.toutatis.recording(), rj.identify.PrincipalRatios()
-    >>> density = rj.estimate.LogDensity(rj.identify.fit(rj.identify.Problem(record, chart)))
+    >>> density = rj.estimate.LogDensity(rj.identify.fit(rj.identify.Model(record, chart)))
     >>> # Instead of Nuts(), a sampler of one's own: normal draws, which is Laplace's method.
     >>> normal = lambda key, log_density, start: jax.random.normal(key, (200, start.size))
     >>> drawn = posterior(density, jax.random.key(0), sampler=normal)
@@ -207,7 +207,7 @@ def _draw(density: LogDensity, root: Array, keys: Array, sampler: Any) -> Array:
         return jax.vmap(of)(sampler(later, lambda z: density(of(z)), start))
 
     # One after another no chain waits for the longest step of the others.
-    if density.problem.count >= _FULL:
+    if density.model.count >= _FULL:
         return lax.map(chain, keys)
     return jax.vmap(chain)(keys)
 
@@ -309,7 +309,7 @@ def refit(
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> found = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()))
     >>> best = refit(rj.estimate.LogDensity(found))
     >>> bool(jnp.allclose(best.point.state0.omega, jnp.array([1.0, 0.1, 1.0]), atol=1e-3))
     True
@@ -326,13 +326,11 @@ def refit(
 @eqx.filter_jit
 def _refit(density: LogDensity, settings: Settings, key: Any, count: int) -> Refit:
     def evaluated(x: Array) -> Any:
-        cost, gram, slope = curvature(density, x)
+        cost, gram, slope = curvature(density.model, x)
         return None, cost, Normal(gram), slope
 
-    parameters, factors, logs = density.like
-    ones = jax.tree.map(jnp.ones_like, (factors, logs))
-    made = ravel_pytree((made_of(parameters), *ones))[0]
-    end = search(evaluated, density.x0, made, settings, None)
+    order_one = is_order_one(density.model, density.x0.dtype)
+    end = minimise(evaluated, density.x0, order_one, settings, None)
     covariance = jnp.linalg.inv(end.normal.core)
     draws, weights = _weighted(density, end.point, covariance, key, count)
     converged = end.converged & jnp.isfinite(weights).all()

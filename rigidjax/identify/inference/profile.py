@@ -6,14 +6,13 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from rigidjax._types import Scalar
 from rigidjax.identify.answer.result import Fit, one_fit
 from rigidjax.identify.data import stacking
-from rigidjax.identify.model.free import Parameters
-from rigidjax.identify.model.problem import Problem, Rows
-from rigidjax.identify.search.stages import Task, Tried, again, cost_of
+from rigidjax.identify.model.model import AbstractPull, Model
+from rigidjax.identify.search.stages import Attempt, Task, cost_of, polish
 from rigidjax.identify.uncertainty import quantities
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
@@ -21,20 +20,16 @@ from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 PULL = 0.3
 
 
-class Pull(Rows):
-    """A quantity (at `index`) pulled to a `target` to a `width`, after the problem's `own` rows."""
+class Pull(AbstractPull):
+    """The residual that pulls a quantity (number `index`) to a `target`, of deviation `width`."""
 
-    own: Rows | None
     index: Int[Array, ""]
     target: Scalar
     width: Scalar
 
-    def __call__(self, problem: Problem, parameters: Parameters, ends: Any) -> Array:
-        value = quantities.vector(problem, parameters)[self.index]
-        pull = ((value - self.target) / self.width)[None]
-        if self.own is None:
-            return pull
-        return jnp.append(self.own(problem, parameters, ends).reshape(-1), pull)
+    def __call__(self, model: Model, x: Float[Array, " n"]) -> Float[Array, "1"]:
+        value = quantities.vector(model, x)[self.index]
+        return ((value - self.target) / self.width)[None]
 
 
 def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
@@ -50,7 +45,7 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     **Raises:** `ValueError` for a name that is not reported, a level outside (0, 1). Source: Raue
     et al. 2009, doi:10.1093/bioinformatics/btp358.
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> low, high = profile(found, "Ix/Iz")
     >>> low < 3.1 < high
     True
@@ -67,12 +62,12 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     wide = np.log(1e3) if quantity.positive else 1e3 * max(abs(middle), 1e-12)
     if not np.isfinite(deviation) or deviation <= 0:
         deviation = wide / 10
-    problem, kind = stacking.of_few_lengths(fit.problem), fit.problem.records.t.dtype
-    bottom = 2.0 * cost_of(fit.parameters, problem, fit.noises)
+    model, kind = stacking.of_few_lengths(fit.model), fit.model.records.t.dtype
+    bottom = 2.0 * cost_of(model, fit.x, fit.noises)
     shares = max(fit.correlation, 1.0)
     ends = []
     for side in (-1.0, 1.0):
-        point = fit.parameters
+        point = fit.x
 
         @functools.cache
         def pulled(steps: float, side: float = side) -> tuple[float, float]:
@@ -80,11 +75,13 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
             nonlocal point
             size = middle + side * steps * deviation, PULL * deviation
             target, width = (jnp.asarray(x, kind) for x in size)
-            pull = Pull(problem.rows, jnp.asarray(index, jnp.int32), target, width)
-            held = eqx.tree_at(lambda p: p.rows, problem, pull, is_leaf=lambda node: node is None)
-            point = again(Tried(point), Task(held, fit.noises, 1e-4, 100)).parameters
-            grown = (2.0 * cost_of(point, problem, fit.noises) - bottom) / shares - reach**2
-            return grown, float(_value(problem, point)[index])
+            pull = Pull(jnp.asarray(index, jnp.int32), target, width)
+            pulled_model = eqx.tree_at(
+                lambda m: m.pull, model, pull, is_leaf=lambda node: node is None
+            )
+            point = polish(Attempt(point), Task(pulled_model, fit.noises, 1e-4, 100)).x
+            grown = (2.0 * cost_of(model, point, fit.noises) - bottom) / shares - reach**2
+            return grown, float(_value(model, point)[index])
 
         ends.append(_end(pulled, reach, wide / deviation, side))
     low, high = (np.exp(end) if quantity.positive else end for end in ends)

@@ -49,7 +49,7 @@ class AbstractBodyChart(eqx.Module):
     log_names: eqx.AbstractVar[tuple[str, ...]]
     plain_names: ClassVar[tuple[str, ...]] = ()
     unit: ClassVar[str] = ""
-    # Of the bodies that `Problem` hands out; within a fit a torque on them is no mistake.
+    # Of the bodies that `Model` hands out; within a fit a torque on them is no mistake.
     scale: ClassVar[str | None] = None
 
     @abc.abstractmethod
@@ -384,30 +384,30 @@ def scaled(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassPropertie
     return Inertia(body.tensor, chart.scale)
 
 
-def spread(
-    body: AbstractBodyChart | Bodies,
-    vector: Array,
-    which: Int[Array, " records"] | None,
-    count: int,
-    fill: int = 0,
-) -> Array:
-    """The numbers of each recording's body, (R, K), padded with `fill`."""
+def places_of(
+    body: AbstractBodyChart | Bodies, which: Int[Array, " records"] | None, count: int
+) -> Int[np.ndarray, "records numbers"]:
+    """Return the places of the numbers of each recording's body among those of all bodies.
+
+    Rows of smaller charts are filled with −1. `which` (R,) is the index of each recording's body.
+    """
     if not isinstance(body, Bodies):
-        return jnp.broadcast_to(vector, (count, body.size))
+        return np.broadcast_to(np.arange(body.size), (count, body.size))
     widest = max(chart.size for chart in body.charts)
-    rows = [
-        jnp.concatenate([part, jnp.full(widest - part.shape[0], fill, part.dtype)])
-        for part in numbers_of(body, vector)
-    ]
-    return jnp.stack(rows)[which]
+    parts = numbers_of(body, np.arange(body.size))
+    rows = [np.pad(part, (0, widest - part.size), constant_values=-1) for part in parts]
+    return np.stack(rows)[np.asarray(which)]
 
 
-def matter(
+def body_of_recording(
     body: AbstractBodyChart | Bodies, vector: Numbers, which: Int[Array, ""] | None
 ) -> Inertia | MassProperties:
-    """The body of one recording."""
+    """Return the body of one recording from the row that begins with its numbers.
+
+    `which` is its index among several bodies, `None` of one.
+    """
     if not isinstance(body, Bodies):
-        return body.body(vector)
+        return body.body(vector[: body.size])
     assert which is not None
     return body.body(vector, which)
 
@@ -417,14 +417,14 @@ def charts_of(body: Any) -> tuple[Any, ...]:
     return body.charts if isinstance(body, Bodies) else (body,)
 
 
-def numbers_of(body: Any, vector: Array) -> list[Array]:
+def numbers_of(body: Any, vector: Any) -> list[Any]:
     """The numbers of each chart of a problem's body or bodies."""
     sizes = [chart.size for chart in charts_of(body)]
     return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
 
 
-def in_a_row(bodies: Any) -> list[Any]:
-    """The bodies of `Problem.bodies`, of one or of several."""
+def as_list(bodies: Any) -> list[Any]:
+    """Return the bodies of `Model.bodies`, of one or of several."""
     return list(bodies.values()) if isinstance(bodies, dict) else [bodies]
 
 

@@ -136,11 +136,11 @@ class Adaptive(AbstractIntegrator):
         return Adaptive(rtol, self.atol * (rtol / self.rtol))
 
 
-def integrator_for(widest: float, rate: float) -> AbstractIntegrator:
-    """The integrator for samples at most `widest` s apart of a body that turns at `rate` rad/s."""
-    if widest * rate <= TURN_OF_ORDER_4:
+def integrator_for(turn: float) -> AbstractIntegrator:
+    """Return the integrator for a body that turns by at most `turn` rad between two samples."""
+    if turn <= TURN_OF_ORDER_4:
         return FixedSteps(1, solvers.RungeKutta4())
-    substeps = max(1, math.ceil(widest * rate / TURN_A_STEP))
+    substeps = max(1, math.ceil(turn / TURN_A_STEP))
     return FixedSteps(substeps) if substeps <= 20 else Adaptive()
 
 
@@ -166,7 +166,7 @@ def shifted(field: Callable[..., Any], t: Array, state: Any, offset: Array) -> A
     return state
 
 
-def what_turns(body: Any, rung: type) -> Any:
+def body_of_equations(body: Any, rung: type) -> Any:
     """The body of the equations of motion: a body at a fixed point needs no mass."""
     return body.inertia if isinstance(body, MassProperties) and rung is not Rigid else body
 
@@ -178,7 +178,7 @@ def sensor_inputs(
     (T,); the states then; its input at one time. `states` are `Coupled` if a torque has states of
     its own.
     """
-    turned = what_turns(body, type(state0))
+    turned = body_of_equations(body, type(state0))
     field = equations_of_motion(turned, state0, torque)
     offset, times = getattr(sensor, "offset", None), ts
     if late is not None:
@@ -277,7 +277,7 @@ def simulate_readings(
     for one in sensors:
         _fits(one, state0, key)
     start: Any = state0
-    sol = simulate(what_turns(body, type(state0)), start, ts, torque)
+    sol = simulate(body_of_equations(body, type(state0)), start, ts, torque)
     states = sol.ys if sol.own is None else Coupled(sol.ys, sol.own)
     count = len(sensors)
     keys = [None] * count if key is None else jax.random.split(_checks.key(key), count)

@@ -7,188 +7,203 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.data.reference_states import ReferenceStates
-from rigidjax.identify.model.charts import Bodies, matter
-from rigidjax.identify.model.free import Parameters, by_slot, columns, local, places, put
-from rigidjax.identify.model.predict import errors_along, sensor_inputs, states_at, what_turns
-from rigidjax.motion.coupled import motion_of
+from rigidjax.identify.model.charts import Bodies, body_of_recording
+from rigidjax.identify.model.free import put
+from rigidjax.identify.model.predict import (
+    body_of_equations,
+    errors_along,
+    sensor_inputs,
+    states_at,
+)
+from rigidjax.identify.model.scene import Scene
+from rigidjax.motion.torques.inputs import bind
 from rigidjax.rotation.barrier import batched_as
 
 if TYPE_CHECKING:
-    from rigidjax.identify.model.problem import Problem
+    from rigidjax.identify.model.model import Model
 
-
-# The index of a recording's body; `None` of one body.
+# The row of a recording's free numbers; the index of its body, `None` of one body.
+Row = Float[Array, " columns"]
 Which = Array | None
-
-
-def filled(problem: "Problem", mine: Parameters, record: Recording) -> Recording:
-    """One recording with the values of the free numbers in it."""
-    values = [
-        slot.move(slot.read(record), step)
-        for slot, step in zip(problem.slots, mine.shared, strict=True)
-    ]
-    return put(record, problem.slots, values)
-
-
-def states_of_one(
-    problem: "Problem", mine: Parameters, record: Recording, ref: ReferenceStates, which: Which
-) -> tuple[Recording, Any, Any, Any]:
-    """One recording with its values filled in, its body, initial state and states."""
-    record = filled(problem, mine, record)
-    body = matter(problem.body, mine.body, which)
-    state0 = ref.moved(mine.own)
-    turned = what_turns(body, problem.rung)
-    states = states_at(problem.integrator, turned, state0, record.t, record.torque)
-    return record, body, state0, states
-
-
-def errors_of_one(
-    problem: "Problem",
-    mine: Parameters,
-    record: Recording,
-    ref: ReferenceStates,
-    which: Which,
-    late: Array | None = None,
-) -> tuple[tuple[Array, ...], Any]:
-    """The errors (T, k) of each sensor in one recording, all clocks `late` s more behind, and the
-    last state.
-    """
-    record, body, state0, states = states_of_one(problem, mine, record, ref, which)
-    out, motion = [], (body, record.torque, record.t, state0, states)
-    for reading in record.readings:
-        sensor = reading.sensor
-        errors = errors_along(sensor, reading.values, *sensor_inputs(sensor, *motion, late))
-        out.append(jnp.where(reading.mask[:, None], errors, 0.0))
-    return tuple(out), jax.tree.map(lambda leaf: leaf[-1], motion_of(states))
-
-
-def over_records(function: Any, problem: "Problem", mine: Any) -> Any:
-    """`function(mine, record, reference, which)` of every recording.
-
-    On a CPU one after another: XLA makes one kernel of a loop over a few dozen numbers, and scalars
-    within an inner loop run at half the speed.
-    """
-    trees = mine, problem.records, problem.reference, problem.which
-    if problem.count == 1:
-        # Without the outer loop it compiles to a smaller program.
-        out = function(*(stacking.one(tree, 0) for tree in trees))
-        return jax.tree.map(lambda leaf: leaf[None], out)
-    if jax.default_backend() == "cpu":
-        return lax.map(lambda each: function(*each), trees, batch_size=1)
-    return jax.vmap(function)(*trees)
-
-
-@eqx.filter_custom_jvp
-def all_errors(parameters: Parameters, problem: "Problem") -> tuple[tuple[Array, ...], Any]:
-    """The errors (R, T, k) of each sensor, and the last states; derivatives by recordings."""
-
-    def of_one(*trees: Any) -> Any:
-        return errors_of_one(problem, *trees)
-
-    return batched_as(over_records(of_one, problem, local(problem, parameters)), parameters)
-
-
-@all_errors.def_jvp
-def _all_errors_jvp(primals: Any, tangents: Any) -> Any:
-    parameters, problem = primals
-    step, beside = tangents
-    if jax.tree.leaves(beside):
-        raise TypeError(
-            "all_errors: only derivatives in the parameters are taken block by block; use "
-            "errors_of_one for those in the problem"
-        )
-    out, blocks = with_blocks(parameters, problem)
-    zeros = jax.tree.map(
-        lambda p, s: jnp.zeros_like(p) if s is None and p is not None else s,
-        parameters,
-        step,
-        is_leaf=lambda node: node is None,
-    )
-    return batched_as(out, parameters), along(problem, blocks, zeros)
-
-
-@eqx.filter_jit
-def changes(parameters: Parameters, problem: "Problem") -> tuple[Float[Array, "..."], ...]:
-    """The time derivative (R, T, k) of the errors of each sensor."""
-
-    def of_one(*trees: Any) -> Any:
-        now = jnp.zeros((), problem.records.t.dtype)
-        return jax.jvp(lambda s: errors_of_one(problem, *trees, late=s)[0], (now,), (now + 1,))[1]
-
-    return over_records(of_one, problem, local(problem, parameters))
-
-
-def along(problem: "Problem", blocks: Any, step: Parameters) -> Any:
-    """The derivatives of `with_blocks` along a step of all parameters."""
-    flat = ravel_pytree(step)[0]
-    where = places(problem, step)
-    moved = jnp.concatenate([flat, jnp.zeros(1, flat.dtype)])[where]
-    return jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, moved), blocks)
-
-
-def with_blocks(parameters: Parameters, problem: "Problem") -> tuple[Any, Any]:
-    """Errors and last states, and derivatives (…, n) in the numbers of a recording (`places`)."""
-    mine = local(problem, parameters)
-    single = stacking.one(mine, 0)
-    twice = columns(problem, single)
-
-    def of_one(one: Parameters, record: Recording, ref: ReferenceStates, which: Which) -> Any:
-        flat, restore = ravel_pytree(one)
-        blocks, out = with_jacobian(
-            lambda vector: errors_of_one(problem, restore(vector), record, ref, which), flat
-        )
-        if twice.size > flat.size:
-            blocks = jax.tree.map(lambda block: block[..., twice], blocks)
-        return out, blocks
-
-    return over_records(of_one, problem, mine)
-
-
-def with_jacobian(function: Callable[[Array], Any], at: Float[Array, " n"]) -> tuple[Any, Any]:
-    """The derivative (…, n) of a function, in forward mode, and its value (…)."""
-
-    def twice(at: Array) -> tuple[Any, Any]:
-        found = function(at)
-        return found, found
-
-    return jax.jacfwd(twice, has_aux=True)(at)
-
-
 # One (R, k) for each sensor: R recordings, k components.
 Noise = tuple[Float[Array, "records _"], ...]
 
 
-def whitened(problem: "Problem", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """Errors in standard deviations, (R, T, k) for each sensor: see `standardised`."""
+def template(model: "Model", record: Recording) -> Scene:
+    """Return the scene of a recording with the starting values of all free numbers."""
+    return Scene(None, model.torque, model.process, record.sensors, None)
+
+
+def scene_of(
+    model: "Model", row: Row, record: Recording, reference: ReferenceStates, which: Which
+) -> Scene:
+    """Return the scene of one recording from the row of its free numbers."""
+    scene = put(template(model, record), model.slots, row)
+    body = body_of_recording(model.chart, row, which)
+    start = reference.moved(row[model.index.first :])
+    return Scene(body, scene.torque, scene.process, scene.sensors, start)
+
+
+def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[Any, Any]:
+    """Return the states at the times of a recording, and the torque with its inputs."""
+    torque = bind(scene.torque, record.inputs)
+    body: Any = body_of_equations(scene.body, model.state_kind)
+    return states_at(model.integrator, body, scene.start, record.t, torque), torque
+
+
+def errors_of_one(
+    model: "Model",
+    row: Row,
+    record: Recording,
+    reference: ReferenceStates,
+    which: Which,
+    late: Array | None = None,
+) -> tuple[Array, ...]:
+    """Return the errors (T, k) of each sensor in one recording, in its unit; zero where masked.
+
+    All clocks are `late` s more behind.
+    """
+    scene = scene_of(model, row, record, reference, which)
+    return errors_of_scene(model, scene, record, late)
+
+
+def errors_of_scene(
+    model: "Model", scene: Scene, record: Recording, late: Array | None = None
+) -> tuple[Array, ...]:
+    """Return the errors of `errors_of_one` from the scene of the recording."""
+    states, torque = motion_of_scene(model, scene, record)
+    out, motion = [], (scene.body, torque, record.t, scene.start, states)
+    for reading, sensor in zip(record.readings, scene.sensors, strict=True):
+        errors = errors_along(sensor, reading.values, *sensor_inputs(sensor, *motion, late))
+        out.append(jnp.where(reading.mask[:, None], errors, 0.0))
+    return tuple(out)
+
+
+def over_records(function: Any, model: "Model", *rows: Any) -> Any:
+    """Return `function(*rows, record, reference, which)` of every recording.
+
+    On a CPU one after another: XLA makes one kernel of a loop over a few dozen numbers, and scalars
+    within an inner loop run at half the speed.
+    """
+    trees = *rows, model.records, model.reference, model.which
+    arrays, rest = eqx.partition(trees, eqx.is_array)
+
+    def of_one(some: Any) -> Any:
+        return function(*eqx.combine(some, rest))
+
+    if model.count == 1:
+        # Without the outer loop it compiles to a smaller program.
+        return jax.tree.map(lambda leaf: leaf[None], of_one(stacking.one(arrays, 0)))
+    if jax.default_backend() == "cpu":
+        return lax.map(of_one, arrays, batch_size=1)
+    return jax.vmap(of_one)(arrays)
+
+
+def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
+    """Return the errors (R, T, k) of each sensor; derivatives in x go recording by recording."""
+    return by_recording(model.index.rows(x), model, errors_of_one)
+
+
+@eqx.filter_custom_jvp
+def by_recording(rows: Float[Array, "records columns"], model: "Model", function: Any) -> Any:
+    """Return `function(model, row, record, reference, which)` of every recording.
+
+    Its derivatives, in the rows alone, are those of `blocks`.
+    """
+
+    def of_one(row: Row, *rest: Any) -> Any:
+        return function(model, row, *rest)
+
+    return batched_as(over_records(of_one, model, rows), rows)
+
+
+@by_recording.def_jvp
+def _by_recording_jvp(primals: Any, tangents: Any) -> Any:
+    (rows, model, function), (step, *rest) = primals, tangents
+    if jax.tree.leaves(rest):
+        raise TypeError(
+            "model: wanted derivatives in the free numbers x alone, not in the numbers of the "
+            "model; make them free by a Free(where, name)"
+        )
+    out, slopes = _with_slopes(model, rows, function)
+    along = jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, step), slopes)
+    return batched_as(out, rows), along
+
+
+def blocks(model: "Model", x: Float[Array, " n"], function: Any = errors_of_one) -> tuple[Any, Any]:
+    """Return `function` of every recording, and its derivatives (R, …, m) in the columns of
+    `model.index`. No other place differentiates readings by free numbers.
+    """
+    out, slopes = _with_slopes(model, model.index.rows(x), function)
+    columns = jnp.asarray(model.index.columns, jnp.int32)
+    if columns.size > model.index.width:
+        slopes = jax.tree.map(lambda block: block[..., columns], slopes)
+    return out, slopes
+
+
+def _with_slopes(model: "Model", rows: Array, function: Any) -> tuple[Any, Any]:
+    def of_one(row: Row, *rest: Any) -> Any:
+        # A dozen numbers and one long loop: forward mode is cheaper to compile and to run.
+        slopes, out = with_jacobian(lambda row: function(model, row, *rest), row)
+        return out, slopes
+
+    return over_records(of_one, model, rows)
+
+
+@eqx.filter_jit
+def changes(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
+    """Return the time derivative (R, T, k) of the errors of each sensor."""
+
+    def of_one(row: Row, *rest: Any) -> Any:
+        now = jnp.zeros((), model.records.t.dtype)
+        return jax.jvp(lambda s: errors_of_one(model, row, *rest, late=s), (now,), (now + 1,))[1]
+
+    return over_records(of_one, model, model.index.rows(x))
+
+
+def with_jacobian(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tuple[Any, Any]:
+    """Return the derivative (…, n) of a function at x, in forward mode, and its value (…)."""
+
+    def twice(x: Array) -> tuple[Any, Any]:
+        value = function(x)
+        return value, value
+
+    return jax.jacfwd(twice, has_aux=True)(x)
+
+
+def whitened(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
+    """Return errors in standard deviations, (R, T, k) for each sensor: see `standardised`."""
     out = []
-    for reading, error, sigma in zip(problem.records.readings, errors, noise, strict=True):
+    for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
         limit = getattr(reading.sensor, "limit", None)
-        given = reading.values, reading.mask, error, sigma, limit, reading.late
-        out.append(jax.vmap(standardised)(*given)[0])
+        parts = reading.values, reading.mask, error, sigma, limit, reading.late
+        out.append(jax.vmap(standardised)(*parts)[0])
     return tuple(out)
 
 
 def independent(
     e: Float[Array, "*rows k"], v: Float[Array, "*rows k"]
 ) -> tuple[Float[Array, "*rows k"], Float[Array, "*rows k"]]:
-    """Errors of covariance `1 + v vᵀ` made independent, of variance one: `L⁻¹ e`, L the factor of
-    Cholesky; and the logarithms of its squared diagonal, the variance of each given those before.
+    """Return errors e of covariance `1 + v vᵀ` made independent, of variance one: `L⁻¹ e`, L the
+    factor of Cholesky; and the logarithms of its squared diagonal, the variance of each error given
+    those before it.
     """
-    told, total = jnp.cumsum(v * e, axis=-1), 1.0 + jnp.cumsum(v * v, axis=-1)
+    along, total = jnp.cumsum(v * e, axis=-1), 1.0 + jnp.cumsum(v * v, axis=-1)
     none = jnp.zeros_like(total[..., :1])
-    told = jnp.concatenate([none, told[..., :-1]], axis=-1)
+    along = jnp.concatenate([none, along[..., :-1]], axis=-1)
     before = jnp.concatenate([none + 1.0, total[..., :-1]], axis=-1)
-    return (e - v * told / before) * jnp.sqrt(before / total), jnp.log(total / before)
+    return (e - v * along / before) * jnp.sqrt(before / total), jnp.log(total / before)
 
 
 def in_deviations(x: Any, sigma: Array, late: Array | None) -> Float[Array, "..."]:
-    """Changes (R, T, k, n) of a sensor's errors in standard deviations, as `standardised`."""
+    """Return changes (R, T, k, n) of a sensor's errors in standard deviations, as `standardised`
+    counts them.
+    """
     x = x / sigma[:, None, :, None]
     if late is None:
         return x
@@ -203,10 +218,12 @@ def standardised(
     limit: Float[Array, " k"] | None,
     late: Float[Array, "times k"] | None,
 ) -> tuple[Float[Array, "times k"], Bool[Array, "times k"], Float[Array, "times k"] | None]:
-    """Errors in standard deviations, and the mask of saturated channels: these say "at least that
-    much", and count as `√(−2 log Φ(z))`, z the prediction's excess over the limit (Tobin 1958,
-    doi:10.2307/1907382). `late` is the error by a time stamp one standard deviation off; the last
-    part is the logarithm of what it multiplies the variances by.
+    """Return errors in standard deviations, the mask of saturated channels, and the logarithm of
+    what `late` multiplies the variances by, `None` without it.
+
+    A saturated channel says "at least that much", and counts as `√(−2 log Φ(z))`, z the
+    prediction's excess over the limit (Tobin 1958, doi:10.2307/1907382). `late` is the error by a
+    time stamp one standard deviation off.
     """
     scaled, wider = error / sigma[None], None
     full = jnp.zeros(scaled.shape, bool)
@@ -226,74 +243,65 @@ def standardised(
     return jnp.where(full, -side * jnp.where(z < 5.0, root, 0.0), scaled), full, wider
 
 
-def residuals(parameters: Parameters, args: Any) -> Any:
-    """All residuals of a fit, as a tree, of `args`: problem, noise of sensors, weights (R, T)."""
-    problem, noise, weights = args
-    errors, ends = all_errors(parameters, problem)
-    return seen(problem, errors, noise, weights), beside(parameters, problem, ends)
-
-
-def seen(problem: "Problem", errors: tuple, noise: Noise, weights: Array) -> tuple[Array, ...]:
-    """The readings' residuals (R, T, k) for least squares."""
-    read = []
-    for scaled in whitened(problem, errors, noise):
-        if problem.loss is not None:
-            scaled = jax.vmap(jax.vmap(problem.loss.shrink))(scaled)
-        read.append(scaled * weights[..., None])
-    return tuple(read)
-
-
-def with_rows(of: Callable[[tuple], tuple], errors: tuple, blocks: tuple) -> tuple[tuple, tuple]:
-    """`of(errors)`, and its derivatives (R, T, k, n) of those of the errors, `blocks`."""
-    # Each residual depends on the errors of its reading alone: a product of small matrices.
-    read, push = jax.linearize(of, errors)
-    return read, jax.vmap(push, in_axes=-1, out_axes=-1)(blocks)
-
-
-def beside(parameters: Parameters, problem: "Problem", ends: Any) -> tuple[Array, ...]:
-    """Residuals that are no readings: of `firm`, and those of `linked`."""
-    pulled = jax.tree.map(jnp.multiply, firm(parameters, problem), parameters)
-    return (*jax.tree.leaves(pulled), *linked(parameters, problem, ends))
-
-
-def firm(parameters: Parameters, problem: "Problem") -> Parameters:
-    """One over the deviation of each number about zero, by its prior or spread; zero without."""
-    shared, each = [], []
-    for slot, of_all, of_each in by_slot(problem, parameters):
-        if of_all is not None:
-            shared.append(_pull(of_all, slot.prior))
-        if of_each is not None:
-            each.append(_pull(of_each, slot.prior if of_all is None else slot.spread))
-    none = jax.tree.map(jnp.zeros_like, parameters)
-    return eqx.tree_at(lambda p: (p.shared, p.own.each), none, (tuple(shared), tuple(each)))
-
-
-def _pull(number: Array, width: Array | None) -> Array:
-    return jnp.zeros_like(number) if width is None else jnp.ones_like(number) / width
-
-
-def linked(parameters: Parameters, problem: "Problem", ends: Any) -> tuple[Array, ...]:
-    """Residuals of several numbers at once: the prior of the body, and the problem's own rows."""
+def reading_residuals(
+    model: "Model", errors: tuple, noise: Noise, weights: Float[Array, "records times"]
+) -> tuple[Array, ...]:
+    """Return the residuals (R, T, k) of the readings of each sensor, for least squares."""
     out = []
-    if problem.prior is not None:
-        assert not isinstance(problem.body, Bodies)
-        body = problem.body.body(parameters.body)
-        out.append(problem.prior.residuals(body, scaled=problem.body.unit != ""))
-    if problem.rows is not None:
-        out.append(problem.rows(problem, parameters, ends))
+    for scaled in whitened(model, errors, noise):
+        if model.loss is not None:
+            scaled = jax.vmap(jax.vmap(model.loss.shrink))(scaled)
+        out.append(scaled * weights[..., None])
     return tuple(out)
 
 
-def weights_of(problem: "Problem", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """The weight (R, T) of each reading in the normal equations: the loss's, zero if masked."""
-    masks = [reading.mask for reading in problem.records.readings]
-    if problem.loss is None:
+def with_rows(of: Callable[[tuple], tuple], errors: tuple, slopes: tuple) -> tuple[tuple, tuple]:
+    """Return `of(errors)`, and its derivatives (R, T, k, n) from those of the errors, `slopes`."""
+    # Each residual depends on the errors of its reading alone: a product of small matrices.
+    value, push = jax.linearize(of, errors)
+    return value, jax.vmap(push, in_axes=-1, out_axes=-1)(slopes)
+
+
+def prior_weights(model: "Model") -> Float[Array, " n"]:
+    """Return one over the deviation of each free number about zero, zero without a prior."""
+    weights = jnp.zeros(model.index.size, model.records.t.dtype)
+    for slot in model.slots:
+        about = (slot.shared, slot.prior), (slot.own, slot.prior if slot.each else slot.spread)
+        for places, deviation in about:
+            if places is not None and deviation is not None:
+                weights = weights.at[places].set((1.0 / deviation).astype(weights.dtype))
+    return weights
+
+
+def extra_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
+    """Return residuals of several numbers at once: of the prior of the body, and of a pull."""
+    out = [jnp.zeros(0, x.dtype)]
+    if model.prior is not None:
+        assert not isinstance(model.chart, Bodies)
+        body = model.chart.body(x[: model.index.bodies])
+        out.append(model.prior.residuals(body, scaled=model.chart.unit != "").reshape(-1))
+    if model.pull is not None:
+        out.append(model.pull(model, x))
+    return jnp.concatenate(out)
+
+
+def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]:
+    """Return all residuals that are no readings: n of the priors, then `extra_residuals`."""
+    return jnp.concatenate([prior_weights(model) * x, extra_residuals(model, x)])
+
+
+def weights_of(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
+    """Return the weight (R, T) of each reading in the normal equations, of the loss; zero where
+    masked.
+    """
+    masks = [reading.mask for reading in model.records.readings]
+    if model.loss is None:
         return tuple(mask.astype(e.dtype) for mask, e in zip(masks, errors, strict=True))
-    weight = jax.vmap(jax.vmap(problem.loss.weight))
-    scaled = whitened(problem, errors, noise)
+    weight = jax.vmap(jax.vmap(model.loss.weight))
+    scaled = whitened(model, errors, noise)
     return tuple(jnp.where(mask, weight(e), 0.0) for mask, e in zip(masks, scaled, strict=True))
 
 
 def half_sum(tree: Any) -> Float[Array, ""]:
-    """Half the sum of the squares of all leaves."""
+    """Return half the sum of the squares of all leaves."""
     return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

@@ -12,16 +12,16 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from rigidjax.identify.search.stages import SearchState, Tried
+from rigidjax.identify.search.stages import Attempt
 
 
-def bare(tried: Tried) -> Tried:
-    """The same without its large arrays."""
-    return tried if tried.found is None else dataclasses.replace(tried, found=None)
+def without_arrays(attempt: Attempt) -> Attempt:
+    """Return an attempt without its errors and derivatives, which need memory."""
+    return attempt if attempt.blocks is None else dataclasses.replace(attempt, blocks=None)
 
 
 def require_folder(path: str | Path) -> None:
-    """Raise `ValueError` unless a file can be at `path`: before the search, not after a stride."""
+    """Raise `ValueError` unless a file can be at `path`: before the search, not after a start."""
     path = Path(path)
     if not path.parent.is_dir():
         raise ValueError(f"checkpoint {path}: there is no folder {path.parent}")
@@ -30,7 +30,7 @@ def require_folder(path: str | Path) -> None:
 
 
 def fingerprint(*trees: Any) -> str:
-    """A hash of numbers and structure, the same in every process; a function counts by its name."""
+    """Return a hash of numbers and structure, the same in every process; a function counts by its name."""
     leaves, structure = jax.tree.flatten(trees)
     words, found = [repr(structure)], hashlib.sha256()
     for leaf in leaves:
@@ -43,31 +43,29 @@ def fingerprint(*trees: Any) -> str:
 
 
 class Checkpoint:
-    """The results of a long search so far, on disk after every stride of steps.
+    """The ends of the starts of a long search so far, on disk after every start.
 
-    `like` is a `Tried` of the right shapes, `print_of` the `fingerprint` of all that the search
-    depends on. A file of another problem raises `ValueError`, and is not overwritten.
+    `like` is an `Attempt` of the right shapes, `print_of` the `fingerprint` of all that the search
+    depends on. A file of another model raises `ValueError`, and is not overwritten.
     """
 
-    def __init__(self, path: str | Path | None, like: Tried, print_of: str):
+    def __init__(self, path: str | Path | None, like: Attempt, print_of: str):
         self.path, self.like = None if path is None else Path(path), like
         self.print_of = print_of
-        self.done: list[Tried] = []
-        self.position = SearchState(0, 0, like)
+        self.done: list[Attempt] = []
         if self.path is not None and self.path.exists():
             self._read(self.path)
 
-    def save(self, done: Sequence[Tried], position: SearchState) -> None:
-        """Write the finished starts and the state of the search, replacing the file at once."""
+    def save(self, done: Sequence[Attempt]) -> None:
+        """Write the finished starts, replacing the file at once."""
         if self.path is None:
             return
-        stage, strides, current = position
-        head = dict(print_of=self.print_of, done=len(done), stage=stage, strides=strides)
-        beside = self.path.with_name(self.path.name + ".new")
-        with beside.open("wb") as file:
+        head = dict(print_of=self.print_of, done=len(done))
+        new = self.path.with_name(self.path.name + ".new")
+        with new.open("wb") as file:
             file.write(json.dumps(head).encode() + b"\n")
-            eqx.tree_serialise_leaves(file, [bare(item) for item in (*done, current)])
-        beside.replace(self.path)
+            eqx.tree_serialise_leaves(file, [without_arrays(item) for item in done])
+        new.replace(self.path)
 
     def _read(self, path: Path) -> None:
         try:
@@ -75,9 +73,8 @@ class Checkpoint:
                 head = json.loads(file.readline())
                 same = head["print_of"] == self.print_of
                 if same:
-                    like = [self.like] * (int(head["done"]) + 1)
-                    *self.done, tried = eqx.tree_deserialise_leaves(file, like)
-                    self.position = SearchState(head["stage"], head["strides"], tried)
+                    like = [self.like] * int(head["done"])
+                    self.done = eqx.tree_deserialise_leaves(file, like)
         except Exception as error:
             raise ValueError(
                 f"{path}: no checkpoint of a fit, or a damaged one ({type(error).__name__}); "
@@ -85,5 +82,5 @@ class Checkpoint:
             ) from None
         if not same:
             raise ValueError(
-                f"{path}: the checkpoint of another problem, or of other options; name another file"
+                f"{path}: the checkpoint of another model, or of other options; name another file"
             )

@@ -56,11 +56,14 @@ class Settings(eqx.Module):
     near: Any = eqx.field(converter=_float, default=0.0)
 
 
-class Search(eqx.Module):
-    """The state of a search: the best `point` so far, with `normal` and `slope` there; the
-    `trial` next, and its `hoped` gain; `pace` of the logarithm of the cost; evaluations `taken`;
-    `found` of the last one, whether `here` at the best point; `rise` of the last trial over its
-    predicted gain, zero if it was better.
+class LMState(eqx.Module):
+    """The state of a search by Levenberg and Marquardt.
+
+    `first` is the cost at the start; `point` the best so far, with `cost`, `normal` and `slope`
+    there; `trial` the next point, `hoped` its predicted gain; `pace` by how much the logarithm of
+    the cost falls in a step; `taken` the number of evaluations; `kept` the values kept from the
+    last one, and `kept_at_best` whether that was at the best point; `rise` the rise of the cost at
+    the last trial over its predicted gain, zero if the trial was better.
     """
 
     first: Float[Array, ""]
@@ -75,24 +78,24 @@ class Search(eqx.Module):
     taken: Int[Array, ""]
     done: Bool[Array, ""]
     converged: Bool[Array, ""]
-    found: Any
-    here: Bool[Array, ""]
+    kept: Any
+    kept_at_best: Bool[Array, ""]
     rise: Float[Array, ""]
 
 
-def search(
+def minimise(
     evaluated: Callable[[Array], tuple[Any, Array, Normal, Array]],
     start: Float[Array, " n"],
-    made: Float[Array, " n"],
+    order_one: Float[Array, " n"],
     settings: Settings,
     nothing: Any,
     empty: Normal | None = None,
     by_noise: Callable[[Any, Normal], Array] | None = None,
-) -> Search:
+) -> LMState:
     """At most `settings.steps` steps down from `start`; with none, `start` is evaluated.
 
     **Arguments:** `evaluated` point → values to keep, cost, normal matrix, gradient: of half a sum
-    of squares, or minus a log-density with Fisher's information (scoring); `made` (n,) one for
+    of squares, or minus a log-density with Fisher's information (scoring); `order_one` (n,) one for
     numbers of order one, which no step moves far, else zero; `nothing` zeros like the kept values,
     `empty` like the normal matrix, if that has more than a core; `by_noise` of them and the normal
     matrix: the expected excess of the cost at the true numbers.
@@ -100,7 +103,7 @@ def search(
     Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares problems, section 3.2.
     """
     number, kind = start.size, start.dtype
-    begun = Search(
+    begun = LMState(
         jnp.asarray(jnp.inf, kind),
         start,
         jnp.asarray(jnp.inf, kind),
@@ -118,21 +121,21 @@ def search(
         jnp.zeros((), kind),
     )
 
-    def step(now: Search) -> Search:
-        return _after(now, evaluated(now.trial), made, settings, by_noise)
+    def step(now: LMState) -> LMState:
+        return _after(now, evaluated(now.trial), order_one, settings, by_noise)
 
     return lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
 
 
 def _after(
-    now: Search,
+    now: LMState,
     trial: tuple[Any, Array, Normal, Array],
-    made: Array,
+    order_one: Array,
     settings: Settings,
     by_noise: Callable[[Any, Normal], Array] | None,
-) -> Search:
+) -> LMState:
     """The state of the search after an evaluation of the trial point, with the next trial."""
-    found, cost, normal, slope = trial
+    kept, cost, normal, slope = trial
     parts = jax.tree.leaves((cost, normal, slope))
     finite = jnp.stack([jnp.isfinite(part).all() for part in parts]).all()
     first = now.taken == 0
@@ -148,7 +151,7 @@ def _after(
     pace = jnp.where(first, now.pace, 0.5 * (now.pace + fell))
     level = better & ~first & (ratio > FAIR) & (now.damping <= FREE)
     if by_noise is not None:
-        level = level & (now.cost - cost < settings.level * by_noise(found, normal))
+        level = level & (now.cost - cost < settings.level * by_noise(kept, normal))
     rise = jnp.where(better | ~finite, 0.0, -ratio)
     noisy = (now.rise > 0) & (rise > jnp.maximum(now.rise, NOISY)) & (now.hoped < LITTLE * now.cost)
     point, cost, normal, slope = jax.tree.map(
@@ -156,7 +159,7 @@ def _after(
         (now.trial, cost, normal, slope),
         (now.point, now.cost, now.normal, now.slope),
     )
-    move, root = _damped(normal, slope, made, damping)
+    move, root = _damped(normal, slope, order_one, damping)
     sound = jnp.isfinite(move).all()
     move = jnp.where(sound, move, 0.0)
     hoped = -(slope @ move) - 0.5 * move @ (normal @ move)
@@ -170,7 +173,7 @@ def _after(
     done = done | ((settings.aim > 0) & (cost > settings.aim * jnp.exp(PATIENCE * pace)))
     done = done | ((settings.near > 0) & (cost <= settings.near))
     damping = jnp.where(sound, damping, 8.0 * damping)
-    return Search(
+    return LMState(
         jnp.where(first & finite, cost, now.first),
         point,
         cost,
@@ -183,19 +186,19 @@ def _after(
         now.taken + 1,
         done,
         converged,
-        found,
+        kept,
         better,
         rise,
     )
 
 
-def _damped(normal: Normal, slope: Array, made: Array, damping: Array) -> tuple[Array, Array]:
+def _damped(normal: Normal, slope: Array, order_one: Array, damping: Array) -> tuple[Array, Array]:
     """The step (n,), and the root of the diagonal of the normal matrix (n,)."""
     felt = normal.diagonal
     felt = jnp.maximum(felt, jnp.maximum(1e-12 * jnp.max(felt), 1e-300))
     # Columns of length one: the factor of Cholesky loses no digits to units.
     root = jnp.sqrt(felt)
-    damped = damping * jnp.maximum(felt, made) / root**2
+    damped = damping * jnp.maximum(felt, order_one) / root**2
     move = -normal.scaled(1.0 / root).plus(damped).solve(slope / root) / root
-    far = jnp.max(jnp.abs(move) * made)
+    far = jnp.max(jnp.abs(move) * order_one)
     return move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300)), root

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
-from rigidjax.identify.model.free import Parameters
-from rigidjax.identify.model.problem import Problem
+from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, changes, weights_of
 from rigidjax.identify.uncertainty.covariance import linearise, of_white
 from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
@@ -17,21 +17,19 @@ from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
 ROUNDS = 500
 
 
-def estimate_noise(
-    problem: Problem, found: Any, noise: Noise, parameters: Parameters
-) -> tuple[Problem, Noise]:
+def estimate_noise(model: Model, x: Array, blocks: Any, noise: Noise) -> tuple[Model, Noise]:
     """Noise (R, k) of each sensor: as given, or the scatter of its errors, one figure for
-    all channels and the recordings of a group. The problem with the jitter of its sensors likewise.
+    all channels and the recordings of a group. The model with the jitter of its sensors likewise.
 
     Fitted numbers take a part of the errors away, of few readings a large one: each sensor's is its
-    leverage at this noise, as by restricted maximum likelihood. **Arguments:** `found` errors and
-    derivatives as `evaluate` gives them, at `parameters`.
+    leverage at this noise, as by restricted maximum likelihood. **Arguments:** `x` (n,) the free
+    numbers; `blocks` the errors and derivatives there, as `terms.blocks` gives them.
     """
-    errors = found[0][0]
-    weights = weights_of(problem, errors, noise)
-    groups, out = np.asarray(problem.noise_groups), []
-    shares = _shares(problem, found, noise, parameters)
-    readings = list(problem.records.readings)
+    errors = blocks[0]
+    weights = weights_of(model, errors, noise)
+    groups, out = np.asarray(model.noise_groups), []
+    shares = _shares(model, x, blocks, noise)
+    readings = list(model.records.readings)
     for index, (reading, error, sigma, weight, share) in enumerate(
         zip(readings, errors, noise, weights, shares, strict=True)
     ):
@@ -42,7 +40,7 @@ def estimate_noise(
             sigma = sensor.noise
         else:
             squares = np.sum(np.where(kept, np.asarray(error) ** 2, 0.0), axis=2)
-            if problem.loss is None:
+            if model.loss is None:
                 parts = np.bincount(groups, squares.sum(axis=1))
                 variance = parts / np.maximum(np.bincount(groups, kept.sum(axis=(1, 2))), 1)
             else:
@@ -53,7 +51,7 @@ def estimate_noise(
             each = np.broadcast_to(each[:, None], sigma.shape)
             sigma = jnp.asarray(each.astype(sigma.dtype))
         if reading.late is not None:
-            change = changes(parameters, problem)[index]
+            change = changes(model, x)[index]
             root = np.sqrt(np.asarray(weight, float) / share[groups][:, None])
             size = np.asarray(sigma, float)
             e, u = (np.where(kept, np.asarray(x) / size[:, None], 0.0) for x in (error, change))
@@ -64,8 +62,8 @@ def estimate_noise(
             readings[index] = reading.scattered(tau[:, None, None] * change, tau)
         out.append(sigma)
     if any(reading.late is not None for reading in readings):
-        problem = eqx.tree_at(lambda p: p.records.readings, problem, tuple(readings))
-    return problem, tuple(out)
+        model = eqx.tree_at(lambda p: p.records.readings, model, tuple(readings))
+    return model, tuple(out)
 
 
 def _by_median(squares: np.ndarray, kept: np.ndarray, groups: np.ndarray) -> np.ndarray:
@@ -89,16 +87,16 @@ def median_of_chi2(size: int) -> tuple[float, float]:
     return median, float(density)
 
 
-def _shares(problem: Problem, found: Any, noise: Noise, parameters: Parameters) -> list[np.ndarray]:
+def _shares(model: Model, x: Array, blocks: Any, noise: Noise) -> list[np.ndarray]:
     """The share of its errors that fitted numbers leave each sensor and group of recordings."""
-    groups, readings = np.asarray(problem.noise_groups), problem.records.readings
+    groups, readings = np.asarray(model.noise_groups), model.records.readings
     sizes = [np.bincount(groups, one.kept.sum(axis=(1, 2))) for one in readings]
-    held = problem.prior, problem.rows, *((slot.prior, slot.spread) for slot in problem.slots)
+    held = model.prior, model.pull, *((slot.prior, slot.spread) for slot in model.slots)
     if len(readings) * sizes[0].size == 1 and not jax.tree.leaves(held):
         # All numbers come from the readings of one noise.
-        taken = [np.array([sum(leaf.size for leaf in jax.tree.leaves(parameters))])]
+        taken = [np.array([x.size])]
     else:
-        linear = linearise(problem, parameters, noise, found)
+        linear = linearise(model, x, noise, blocks)
         taken = leverages(linear, linear.information, of_white(linear).seen)
         taken = [np.bincount(groups, each) for each in taken]
     return [np.maximum(1.0 - n / np.maximum(m, 1), 0.1) for n, m in zip(taken, sizes, strict=True)]

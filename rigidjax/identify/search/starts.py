@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
@@ -14,46 +14,44 @@ from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.data.reference_states import rates
 from rigidjax.identify.model.charts import BASIS, Bodies
-from rigidjax.identify.model.free import Parameters
-from rigidjax.identify.model.problem import Problem
+from rigidjax.identify.model.model import Model
 from rigidjax.motion import Spin
 from rigidjax.motion.torques.base import Torque, evaluate
+from rigidjax.motion.torques.inputs import bind
 from rigidjax.motion.torques.states import has_states
 
 
-def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> list[Parameters]:
-    """`count` starting points: the regression first, then scattered around it or over the whole
+def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[Float[Array, " n"]]:
+    """Return `count` starting points: the regression first, then scattered around it or over the whole
     chart, the rate by a tenth. A `Free` starts at its given value.
     """
-    recordings = stacking.on_host(problem.records, problem.counts)
-    if isinstance(problem.body, Bodies):
-        rows = list(zip(recordings, problem.of, strict=True))
+    recordings = stacking.on_host(model.records, model.counts)
+    if isinstance(model.chart, Bodies):
+        rows = list(zip(recordings, model.body_names, strict=True))
         found = {
-            name: regress_inertia(tuple(record for record, of in rows if of == name))
-            for name in problem.body.names
+            name: regress_inertia(tuple(record for record, of in rows if of == name), model.torque)
+            for name in model.chart.names
         }
         regressed = {name: body for name, body in found.items() if body is not None} or None
     else:
-        regressed = regress_inertia(recordings)
-    start = problem.start(regressed)
-    spins = np.asarray(start.own.spin)
-    centre = np.asarray(start.body)
+        regressed = regress_inertia(recordings, model.torque)
+    start = model.start(regressed)
+    bodies, spins = slice(model.index.bodies), np.asarray(model.index.start)[:, -3:]
     # NumPy's generator: that of JAX takes seconds to compile.
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)
     out = []
     for index in range(count):
         wide = 0.0 if index == 0 else (0.5 if regressed is not None and index % 2 else 1.5)
-        middle = centre if (index == 0 or wide < 1) else 0 * centre
-        body = middle + wide * rng.normal(size=centre.shape)
-        spin = spins + (0.0 if index == 0 else 0.1) * rng.normal(size=spins.shape)
-        kind = start.own.spin.dtype
-        moved = jnp.asarray(body, kind), jnp.asarray(spin, kind)
-        out.append(eqx.tree_at(lambda p: (p.body, p.own.spin), start, moved))
+        x = np.array(start)
+        middle = x[bodies] if (index == 0 or wide < 1) else 0 * x[bodies]
+        x[bodies] = middle + wide * rng.normal(size=middle.shape)
+        x[spins] += (0.0 if index == 0 else 0.1) * rng.normal(size=spins.shape)
+        out.append(jnp.asarray(x, start.dtype))
     return out
 
 
-def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
-    """The inertia from a regression on Euler's equations in integral form.
+def regress_inertia(recordings: tuple[Recording, ...], torque: Any) -> Inertia | None:
+    """Return the inertia from a regression on Euler's equations in integral form.
 
     `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. With a torque they are found
     by least squares, without one as the smallest right singular vector (up to scale). The result
@@ -65,9 +63,9 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
         t, w = rates(recording)
         if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
             return None
-        if not of_rates(recording.torque):
+        if not of_rates(torque):
             return None
-        found.append(balance(recording, np.eye(3)))
+        found.append(balance(recording, torque, np.eye(3)))
     matrix, side, _ = (np.concatenate(part) for part in zip(*found, strict=True))
     components, _ = tensor_and_margin(matrix, side)
     if not components[:3].sum() > 0:
@@ -100,14 +98,17 @@ def of_rates(torque: Any) -> bool:
     return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
 
 
-def balance(recording: Recording, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Euler's equations integrated over a recording, of rates turned by `turn`: rows (n, 6), right
-    sides (n,), rows of the momentum itself.
+def balance(
+    recording: Recording, torque: Any, turn: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Euler's equations integrated over a recording, of rates turned by `turn`.
+
+    These are rows (n, 6), right sides (n,), and rows of the momentum itself.
     """
     t, w = rates(recording)
     w, pushed = w @ turn.T, np.zeros((t.size, 3))
-    if recording.torque is not None:
-        pushed = np.asarray(_torques(recording.torque, t, w))
+    if torque is not None:
+        pushed = np.asarray(_torques(bind(torque, recording.inputs), t, w))
     momenta = np.einsum("kij,tj->tki", BASIS, w)
     turned = np.concatenate([np.cross(w[:, None, :], momenta), pushed[:, None, :]], axis=1)
     steps = 0.5 * (turned[1:] + turned[:-1]) * np.diff(t)[:, None, None]

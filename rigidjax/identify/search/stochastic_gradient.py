@@ -11,9 +11,14 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
 from rigidjax.identify.data import stacking
-from rigidjax.identify.model.free import Parameters
-from rigidjax.identify.model.problem import Problem
-from rigidjax.identify.model.terms import Noise, half_sum, residuals
+from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.terms import (
+    Noise,
+    all_errors,
+    half_sum,
+    prior_residuals,
+    reading_residuals,
+)
 
 if TYPE_CHECKING:
     import optax
@@ -51,71 +56,69 @@ class Descent(eqx.Module):
 
 
 def descend(
-    start: Parameters,
-    problem: Problem,
+    start: Float[Array, " n"],
+    model: Model,
     noise: Noise,
     how: Descent,
     key: PRNGKeyArray,
     progress: Callable[[str], Any] | None = None,
-) -> tuple[Parameters, bool]:
-    """The end of the steps, or the last point before a NaN; and whether it was not interrupted."""
-    if how.batch > problem.count:
+) -> tuple[Float[Array, " n"], bool]:
+    """Return the end of the steps, or the last point before a NaN; and whether it was not interrupted."""
+    if how.batch > model.count:
         raise ValueError(
-            f"Descent: wanted a batch of at most {problem.count} recordings, got {how.batch}"
+            f"Descent: wanted a batch of at most {model.count} recordings, got {how.batch}"
         )
-    if problem.rows is not None:
-        raise ValueError("Descent: pieces of one recording depend on one another; fit them at once")
     init: Any = how.optimiser.init
-    point, memory = start, init(start)
+    x, memory = start, init(start)
     try:
         for first in range(0, how.steps, STRIDE):
             key, own = jax.random.split(key)
             keys = jax.random.split(own, min(STRIDE, how.steps - first))
-            after, memory, costs = _stride(point, memory, problem, noise, how, keys)
+            after, memory, costs = _stride(x, memory, model, noise, how, keys)
             if not np.isfinite(np.asarray(costs)).all():
                 break
-            point = after
+            x = after
             if progress is not None:
                 done = first + keys.shape[0]
                 progress(f"descent {done}/{how.steps}: misfit {float(costs.mean()):.6g}")
     except KeyboardInterrupt:
-        return point, False
-    return point, True
+        return x, False
+    return x, True
 
 
 @eqx.filter_jit
 def _stride(
-    point: Parameters, memory: Any, problem: Problem, noise: Noise, how: Descent, keys: Array
-) -> tuple[Parameters, Any, Float[Array, " steps"]]:
+    x: Float[Array, " n"], memory: Any, model: Model, noise: Noise, how: Descent, keys: Array
+) -> tuple[Float[Array, " n"], Any, Float[Array, " steps"]]:
     def step(carry: Any, key: Array) -> Any:
-        point, memory = carry
+        x, memory = carry
         update: Any = how.optimiser.update
-        rows = jax.random.choice(key, problem.count, (how.batch,), replace=False)
-        cost, slope = jax.value_and_grad(_misfit_of)(point, problem, noise, rows)
+        rows = jax.random.choice(key, model.count, (how.batch,), replace=False)
+        cost, slope = jax.value_and_grad(misfit_of)(x, model, noise, rows)
         # optax counts its steps in integers, which strict promotion forbids to meet floats.
         with jax.numpy_dtype_promotion("standard"):
-            move, memory = update(slope, memory, point)
-        return (jax.tree.map(jnp.add, point, move), memory), cost
+            move, memory = update(slope, memory, x)
+        return (x + move, memory), cost
 
-    (point, memory), costs = jax.lax.scan(step, (point, memory), keys)
-    return point, memory, costs
+    (x, memory), costs = jax.lax.scan(step, (x, memory), keys)
+    return x, memory, costs
 
 
-def _misfit_of(point: Parameters, problem: Problem, noise: Noise, rows: Array) -> Float[Array, ""]:
-    """These recordings' misfit times the number of batches; priors count once."""
-    few, (mine, theirs) = only(problem, rows), stacking.one((point.own, noise), rows)
+def misfit_of(x: Float[Array, " n"], model: Model, noise: Noise, rows: Array) -> Float[Array, ""]:
+    """Return the misfit of the recordings `rows` times the number of batches; priors count once."""
+    few, sizes = chosen_recordings(model, rows), stacking.one(noise, rows)
     weights = jnp.ones_like(few.records.t)
-    read, beside = residuals(Parameters(point.body, point.shared, mine), (few, theirs, weights))
-    return half_sum(read) * (problem.count / rows.shape[0]) + half_sum(beside)
+    residuals = reading_residuals(few, all_errors(few, x), sizes, weights)
+    scale = model.count / rows.shape[0]
+    return half_sum(residuals) * scale + half_sum(prior_residuals(model, x))
 
 
-def only(problem: Problem, rows: Array) -> Problem:
-    """The problem of some recordings (traced indices), for misfits: they keep their padding."""
+def chosen_recordings(model: Model, rows: Array) -> Model:
+    """Return the model of the recordings `rows` (traced indices), with the same free numbers.
 
-    def pick(at: Any, whole: Any) -> Any:
-        return whole if at(whole) is None else eqx.tree_at(at, whole, stacking.one(at(whole), rows))
-
-    for at in (lambda p: p.records, lambda p: p.reference, lambda p: p.which):
-        problem = pick(at, problem)
-    slots = tuple(pick(lambda slot: slot.groups, slot) for slot in problem.slots)
-    return eqx.tree_at(lambda p: p.slots, problem, slots) if slots else problem
+    The recordings keep their padding.
+    """
+    parts = lambda m: (m.records, m.reference, m.which, m.index.places, m.index.start)  # noqa: E731
+    return eqx.tree_at(
+        parts, model, stacking.one(parts(model), rows), is_leaf=lambda node: node is None
+    )

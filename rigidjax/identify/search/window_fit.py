@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax.identify.data.windows import Horizons, Windows, by_horizon, held_errors
 from rigidjax.identify.model.terms import with_jacobian
-from rigidjax.identify.search.least_squares import BOLD, Search, Settings, search
+from rigidjax.identify.search.least_squares import BOLD, LMState, Settings, minimise
 from rigidjax.identify.search.normal import Normal
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.covariance import inverted
@@ -235,7 +235,7 @@ def fit_windows(
     padded, count = _padded(windows), np.asarray(windows.count, np.int32)
     own = min(stretches, windows.count)
 
-    def searched(value: Any, settings: Settings, steps: int) -> Search:
+    def searched(value: Any, settings: Settings, steps: int) -> LMState:
         units = scales if steps == whole else _scales(windows, steps, noise)
         return _searched(scene, value, padded, count, units, firm, settings, np.int32(steps), own)
 
@@ -253,7 +253,7 @@ def fit_windows(
         raise ValueError("guess: the runs from it are not finite; is the scene right?")
     value, taken = back(end.point), int(end.taken) - 1
     # Evaluated once more at the best point, if the last trial was no better.
-    there = end if end.here else searched(value, evaluated, whole)
+    there = end if end.kept_at_best else searched(value, evaluated, whole)
     converged = bool(end.converged)
     message = [] if converged else [f"stopped after {taken} steps: its best point"]
     deviation, words = _deviations(there, np.asarray(end.point), windows.count)
@@ -281,13 +281,13 @@ def _remarks(scene: Any, value: Any, windows: Windows) -> list[str]:
     return [remark for remark in found if remark]
 
 
-def _deviations(there: Search, point: np.ndarray, count: int) -> tuple[np.ndarray, list[str]]:
+def _deviations(there: LMState, point: np.ndarray, count: int) -> tuple[np.ndarray, list[str]]:
     """Standard deviations (n,) by leaving out one stretch after the other, and remarks.
 
     One step of Gauss and Newton's from the best point each: Miller 1974, doi:10.1093/biomet/61.1.1;
     of neighbours in one block: Künsch 1989, doi:10.1214/aos/1176347265.
     """
-    grams, slopes = (np.asarray(a) for a in there.found)
+    grams, slopes = (np.asarray(a) for a in there.kept)
     gram, many, message = grams.sum(0), len(grams), []
     nulls = [inverted(gram)[1]]
     if len(nulls[0]):
@@ -399,7 +399,7 @@ def _searched(
     settings: Settings,
     steps: Any,
     stretches: int,
-) -> Search:
+) -> LMState:
     """The search from `guess` over the first `steps` of the first `count` windows; it keeps normal
     matrix and gradient of each stretch of them, (C, n, n) and (C, n).
     """
@@ -441,7 +441,7 @@ def _searched(
         jnp.zeros((stretches, x.size, x.size), x.dtype),
         jnp.zeros((stretches, x.size), x.dtype),
     )
-    return search(evaluated, x, jnp.zeros_like(x), settings, nothing, by_noise=_by_noise)
+    return minimise(evaluated, x, jnp.zeros_like(x), settings, nothing, by_noise=_by_noise)
 
 
 def _by_noise(parts: tuple[Array, Array], normal: Normal) -> Array:

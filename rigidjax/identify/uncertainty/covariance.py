@@ -7,12 +7,18 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
 
-from rigidjax.identify.model.free import Parameters, places
-from rigidjax.identify.model.problem import Problem
-from rigidjax.identify.model.terms import Noise, firm, weights_of, whitened, with_rows
-from rigidjax.identify.search.stages import evaluate, linked_rows
+from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.terms import (
+    Noise,
+    extra_residuals,
+    prior_weights,
+    weights_of,
+    whitened,
+    with_jacobian,
+    with_rows,
+)
 
 # A direction is undetermined if its singular value is below this share of the largest.
 BLIND = 1e-8
@@ -21,14 +27,15 @@ WEAKEST = 1e-6
 
 
 class Linearised(eqx.Module):
-    """A problem about its best point. For each sensor `raw` errors (R, T, k) in its unit, whitened
-    `errors`, `slopes` (R, T, k, m) in a recording's numbers, `weights` (R, T), `kept` (R, T, k) if
+    """A model about its best point. For each sensor `raw` errors (R, T, k) in its unit, whitened
+    `errors`, `raw_slopes` and `slopes` (R, T, k, m) of both in a recording's numbers, `weights` (R, T), `kept` (R, T, k) if
     they have weight and are below full scale; the `places` (R, m) of a recording's numbers among
     all n; `pulls` (n,) of these to zero by priors, `firm` (n,) one over their deviations; `extra`
     (j,), `extra_slopes` (j, n) of the prior of a body and of joints.
     """
 
     raw: tuple[np.ndarray, ...]
+    raw_slopes: tuple[np.ndarray, ...]
     errors: tuple[np.ndarray, ...]
     slopes: tuple[np.ndarray, ...]
     weights: tuple[np.ndarray, ...]
@@ -43,6 +50,12 @@ class Linearised(eqx.Module):
     def size(self) -> int:
         """The number of free numbers."""
         return int(self.extra_slopes.shape[-1])
+
+    def first_times(self, count: int) -> "Linearised":
+        """Return the same of the first `count` times, without those that a fit appends."""
+        long = ("raw", "raw_slopes", "errors", "slopes", "weights", "kept")
+        parts = {name: tuple(a[:, :count] for a in getattr(self, name)) for name in long}
+        return dataclasses.replace(self, **parts)
 
     @property
     def slope(self) -> np.ndarray:
@@ -98,36 +111,36 @@ class Linearised(eqx.Module):
 
 
 @eqx.filter_jit
-def _linearised(problem: Problem, parameters: Parameters, noise: Noise, found: Any) -> Any:
-    (errors, ends), (blocks, end_blocks) = found
-    out, slopes = with_rows(lambda e: whitened(problem, e, noise), errors, blocks)
-    flat, restore = ravel_pytree(parameters)
-    beside = linked_rows(problem, flat, restore, ends, end_blocks)
-    weights, held = weights_of(problem, errors, noise), ravel_pytree(firm(parameters, problem))[0]
-    return (out, slopes, weights), places(problem, parameters), (held * flat, held, *beside)
+def _linearised(model: Model, x: Array, noise: Noise, blocks: Any) -> Any:
+    errors, slopes = blocks
+    out, slopes = with_rows(lambda e: whitened(model, e, noise), errors, slopes)
+    extra_slopes, extra = with_jacobian(lambda x: extra_residuals(model, x), x)
+    weights, prior = weights_of(model, errors, noise), prior_weights(model)
+    return (out, slopes, weights), model.index.places, (prior * x, prior, extra, extra_slopes)
 
 
 def linearise(
-    problem: Problem,
-    parameters: Parameters,
+    model: Model,
+    x: Array,
     noise: Noise,
-    found: Any = None,
-    near: Parameters | None = None,
+    blocks: Any,
+    thickened: tuple[Array, Any] | None = None,
 ) -> Linearised:
-    """Errors, derivatives and weights as NumPy arrays; `found` that of `evaluate`, if known; `near`
-    the point of the derivatives beside a flat body.
+    """Return errors, derivatives and weights at x as NumPy arrays.
+
+    `blocks` are the errors and derivatives there, as `terms.blocks` gives them. If x is at a flat
+    body, derivatives are taken at a point beside it: `thickened` is that point, and its blocks.
     """
-    found = evaluate(parameters, problem) if found is None else found
     (errors, slopes, weights), where, beside = jax.tree.map(
-        np.asarray, _linearised(problem, parameters, noise, found)
+        np.asarray, _linearised(model, x, noise, blocks)
     )
-    raw = tuple(np.asarray(error) for error in found[0][0])
-    if near is not None:
-        aside = linearise(problem, near, noise)
-        slopes, beside = aside.slopes, (*beside[:-1], aside.extra_slopes)
-    pairs = zip(problem.records.readings, weights, strict=True)
+    raw, raw_slopes = (tuple(map(np.asarray, part)) for part in blocks)
+    if thickened is not None:
+        thick = linearise(model, thickened[0], noise, thickened[1])
+        slopes, beside = thick.slopes, (*beside[:-1], thick.extra_slopes)
+    pairs = zip(model.records.readings, weights, strict=True)
     kept = tuple(reading.kept & (weight > 0)[..., None] for reading, weight in pairs)
-    return Linearised(raw, errors, slopes, weights, kept, where, *beside)
+    return Linearised(raw, raw_slopes, errors, slopes, weights, kept, where, *beside)
 
 
 class Root(eqx.Module):

@@ -6,8 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax.identify.model.free import Parameters, by_slot, numbered
-from rigidjax.identify.model.problem import Problem
+from rigidjax.identify.model.model import Model
 from rigidjax.identify.uncertainty.covariance import Linearised, Times
 
 # From so many degrees on, a 95 % interval is at most 1.3 % wider than with infinitely many.
@@ -58,25 +57,24 @@ class Freedom(eqx.Module):
 
 
 def freedom_of(
-    problem: Problem,
-    parameters: Parameters,
+    model: Model,
     linear: Linearised,
     times: Times,
     covariance: np.ndarray,
 ) -> Freedom:
     """The `Freedom` of a fit; `covariance` that for white errors."""
-    groups, left, blocks = np.asarray(problem.noise_groups), [], linear.information
+    groups, left, blocks = np.asarray(model.noise_groups), [], linear.information
     taken = leverages(linear, blocks, covariance)
     for sensor, kept, spans, lost in zip(
-        problem.records.sensors, linear.kept, times.spans, taken, strict=True
+        model.records.sensors, linear.kept, times.spans, taken, strict=True
     ):
         found = np.bincount(groups, np.sum(kept.sum(axis=1) / np.asarray(spans), axis=1) - lost)
         given = cast(Any, sensor).noise is not None and times.longest <= 1.5
         left.append(np.full(found.shape, np.inf) if given else np.maximum(found, 1.0))
     widths = []
-    for slot, _, own in by_slot(problem, numbered(parameters)):
+    for slot in model.slots:
         if slot.estimated:
-            mine, size = np.ravel(own).astype(int), float(cast(Any, slot.spread)) ** 2
+            mine, size = np.ravel(slot.own).astype(int), float(cast(Any, slot.spread)) ** 2
             shown = np.eye(mine.size) - covariance[np.ix_(mine, mine)] / size
             widths.append((mine, size, max(float(np.sum(shown**2)), 1e-12)))
     return Freedom(covariance, linear.places, groups, blocks, tuple(left), tuple(widths))

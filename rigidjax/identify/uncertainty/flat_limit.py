@@ -9,9 +9,8 @@ from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import swap_trace
-from rigidjax.identify.model.charts import AbstractBodyChart, charts_of, in_a_row, numbers_of
-from rigidjax.identify.model.free import Parameters
-from rigidjax.identify.model.problem import Problem
+from rigidjax.identify.model.charts import AbstractBodyChart, as_list, charts_of, numbers_of
+from rigidjax.identify.model.model import Model
 
 # Derivatives are taken where the least second moment is at least this share of the trace.
 THIN = 1e-4
@@ -21,7 +20,7 @@ ONE_SIDED = 1.645
 
 class Limit(eqx.Module):
     """The distance of a body from a flat one: `flatness = (I1 + I2 − I3) / I3` at the best point,
-    `free` its value in the linear problem, which may be negative, `slope` (n,) its derivative;
+    `free` its value in the linear model, which may be negative, `slope` (n,) its derivative;
     `where` is the suffix of the names of the body's quantities.
     """
 
@@ -79,25 +78,25 @@ def in_words(body: Inertia | MassProperties) -> str | None:
     )
 
 
-def beside(problem: Problem, parameters: Parameters) -> Parameters | None:
-    """The same numbers, but flat bodies a little thicker; `None` if no body is flat.
+def thickened(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
+    """Return the free numbers x with flat bodies a little thicker; `None` if no body is flat.
 
     The chart has a derivative of zero at a flat body; the information about the tensor itself is
     regular there and hardly changes over such a small thickness.
     """
-    thick = list(map(_thicker, charts_of(problem.body), bodies_of(problem, parameters)))
+    thick = list(map(_thicker, charts_of(model.chart), bodies_of(model, x)))
     if all(one is None for one in thick):
         return None
-    pairs = zip(numbers_of(problem.body, parameters.body), thick, strict=True)
+    pairs = zip(numbers_of(model.chart, x[: model.index.bodies]), thick, strict=True)
     vectors = [old if new is None else new for old, new in pairs]
-    return eqx.tree_at(lambda p: p.body, parameters, jnp.concatenate(vectors))
+    return jnp.concatenate([*vectors, x[model.index.bodies :]])
 
 
 @eqx.filter_jit
-def bodies_of(problem: Problem, parameters: Parameters) -> list[Any]:
-    """The bodies of a fit, in the order of their charts."""
+def bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
+    """Return the bodies of a fit, in the order of their charts."""
     # As one program: outside of a trace each operation of JAX costs as much as a run of 100 steps.
-    return in_a_row(problem.bodies(parameters))
+    return as_list(model.bodies(x))
 
 
 def _thicker(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
@@ -126,13 +125,13 @@ def _has_limit(chart: AbstractBodyChart) -> bool:
     )
 
 
-def flatness(problem: Problem, parameters: Parameters) -> Float[Array, " bodies"]:
-    """(I1 + I2 − I3) / I3 of each body; 1 of one whose moments are not free."""
+def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
+    """Return (I1 + I2 − I3) / I3 of each body; 1 of one whose moments are not free."""
     out = []
-    bodies = in_a_row(problem.bodies(parameters))
-    for chart, body in zip(charts_of(problem.body), bodies, strict=True):
+    bodies = as_list(model.bodies(x))
+    for chart, body in zip(charts_of(model.chart), bodies, strict=True):
         if not _has_limit(chart):
-            out.append(jnp.ones((), parameters.own.spin.dtype))
+            out.append(jnp.ones((), x.dtype))
             continue
         # Up to scale, as they are reported: two ratios, or three moments after a mass.
         logs = chart.logs(body)[-3:]
@@ -144,15 +143,15 @@ def flatness(problem: Problem, parameters: Parameters) -> Float[Array, " bodies"
 
 
 def limits(
-    problem: Problem, found: tuple[np.ndarray, np.ndarray], step: np.ndarray, names: list[str]
+    model: Model, found: tuple[np.ndarray, np.ndarray], step: np.ndarray, names: list[str]
 ) -> tuple[Limit, ...]:
     """The limit of each body whose moments are free.
 
     `found` are numbers and derivatives, the flatness of each body last; `step` (n,) leads to the
-    least misfit of the linear problem; `names` are the suffixes of the bodies' quantities.
+    least misfit of the linear model; `names` are the suffixes of the bodies' quantities.
     """
     rows = zip(names, *(part[-len(names) :] for part in found), strict=True)
-    kept = [_has_limit(chart) for chart in charts_of(problem.body)]
+    kept = [_has_limit(chart) for chart in charts_of(model.chart)]
     return tuple(
         Limit(name, float(value), float(value + min(slope @ step, 0.0)), slope)
         for (name, value, slope), one in zip(rows, kept, strict=True)

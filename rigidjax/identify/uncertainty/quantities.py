@@ -7,12 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from rigidjax.identify.model.charts import AbstractBodyChart, Bodies, Ratios, in_a_row
-from rigidjax.identify.model.free import Parameters
-from rigidjax.identify.model.problem import Problem, values_of
+from rigidjax.identify.model.charts import AbstractBodyChart, Bodies, Ratios, as_list
+from rigidjax.identify.model.model import Model, values_of
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
@@ -68,17 +66,17 @@ def cut_ends(reach: np.ndarray | float, cuts: Sequence[tuple[Any, float]]) -> tu
     return low, high
 
 
-def labels(problem: Problem) -> list[tuple[str, str, bool]]:
+def labels(model: Model) -> list[tuple[str, str, bool]]:
     """Name, unit and whether positive, in the order of `vector`."""
     out = []
-    for name, chart in charts(problem):
+    for name, chart in charts(model):
         out += [(f"{log}{name}", chart.unit, True) for log in chart.log_names]
         out += [(f"{plain}{name}", chart.unit, False) for plain in chart.plain_names]
-    names = recording_names(problem)
+    names = recording_names(model)
     for where in names:
         out += [(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]
-    for slot in problem.slots:
-        shape = np.shape(slot.read(problem.records))[1:]
+    for slot in model.slots:
+        shape = slot.shape
         parts = [""] if not shape else [f" {_place(i)}" for i in np.ndindex(shape)]
         ends = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
         ends = ends if slot.spread is None else [*ends, *(f", own{where}" for where in names)]
@@ -87,20 +85,20 @@ def labels(problem: Problem) -> list[tuple[str, str, bool]]:
     return out
 
 
-def charts(problem: Problem) -> list[tuple[str, AbstractBodyChart]]:
+def charts(model: Model) -> list[tuple[str, AbstractBodyChart]]:
     """The chart of each body, and the suffix of the names of its quantities."""
-    if not isinstance(problem.body, Bodies):
-        return [("", problem.body)]
-    return [(f" [{n}]", c) for n, c in zip(problem.body.names, problem.body.charts, strict=True)]
+    if not isinstance(model.chart, Bodies):
+        return [("", model.chart)]
+    return [(f" [{n}]", c) for n, c in zip(model.chart.names, model.chart.charts, strict=True)]
 
 
-def recording_names(problem: Problem) -> list[str]:
+def recording_names(model: Model) -> list[str]:
     """The suffix of the names of a recording's quantities: its number in its body's list."""
-    if problem.count == 1:
+    if model.count == 1:
         return [""]
     out: list[str] = []
-    for index, name in enumerate(problem.of):
-        number = problem.of[:index].count(name)
+    for index, name in enumerate(model.body_names):
+        number = model.body_names[:index].count(name)
         out.append(f" [{name} {number}]" if name else f" [{number}]")
     return out
 
@@ -109,15 +107,15 @@ def _place(index: tuple[int, ...]) -> str:
     return "xyz"[index[0]] if len(index) == 1 and index[0] < 3 else str(index)
 
 
-def vector(problem: Problem, parameters: Parameters) -> Array:
-    """The reported quantities, with logarithms of the positive ones."""
-    rates = parameters.own.spin * problem.reference.rate[:, None]
-    parts, bodies = [], in_a_row(problem.bodies(parameters))
-    for (_, chart), body in zip(charts(problem), bodies, strict=True):
+def vector(model: Model, x: Float[Array, " n"]) -> Array:
+    """Return the reported quantities, with logarithms of the positive ones."""
+    rates = x[model.index.start[:, -3:]] * model.reference.rate[:, None]
+    parts, bodies = [], as_list(model.bodies(x))
+    for (_, chart), body in zip(charts(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
     parts.append(rates.reshape(-1))
-    values = values_of(problem, parameters)
-    for slot in problem.slots:
+    values = values_of(model, x)
+    for slot in model.slots:
         for name in (slot.name, f"{slot.name}, own")[: 1 + (slot.spread is not None)]:
             value = values[name].reshape(-1)
             parts.append(jnp.log(value) if slot.positive else value)
@@ -125,29 +123,30 @@ def vector(problem: Problem, parameters: Parameters) -> Array:
 
 
 @eqx.filter_jit
-def value_and_slope(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
-    """The reported quantities and the flatness of each body, and their derivatives."""
-    flat, restore = ravel_pytree(parameters)
+def value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Return the reported quantities and the flatness of each body, and their derivatives."""
 
     def value(x: Array) -> Array:
-        moved = restore(x)
-        return jnp.concatenate([vector(problem, moved), flat_limit.flatness(problem, moved)])
+        return jnp.concatenate([vector(model, x), flat_limit.flatness(model, x)])
 
-    return value(flat), jax.jacfwd(value)(flat)
+    return value(x), jax.jacfwd(value)(x)
 
 
 def values_and_slopes(
-    problem: Problem, parameters: Parameters, near: Parameters | None
+    model: Model, x: Float[Array, " n"], near: Float[Array, " n"] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The reported quantities and the flatness of each body, with their derivatives at `near`."""
-    values, slopes = (np.asarray(x) for x in value_and_slope(problem, parameters))
+    """Return the reported quantities and the flatness of each body, with their derivatives.
+
+    These are taken at x, or at the point `near` if x is at a flat body.
+    """
+    values, slopes = (np.asarray(part) for part in value_and_slope(model, x))
     if near is not None:
-        slopes = np.asarray(value_and_slope(problem, near)[1])
+        slopes = np.asarray(value_and_slope(model, near)[1])
     return values, slopes
 
 
 def quantities(
-    problem: Problem,
+    model: Model,
     found: tuple[np.ndarray, np.ndarray],
     covariance: np.ndarray,
     null: np.ndarray,
@@ -158,7 +157,7 @@ def quantities(
     within the determined directions, `null` (k, n) the others; `limits` cut the intervals;
     `freedom` of the variances.
     """
-    names = labels(problem)
+    names = labels(model)
     values, slope = (part[: len(names)] for part in found)
     deviations = carried(slope, covariance, null)
     cuts = cuts_of(slope, covariance, deviations, limits)

@@ -1,0 +1,115 @@
+"""The terms of a log-density: of every number read, given those before it."""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax._types import HasSpin, Scalar
+from rigidjax.identify.data.recording import Recording
+from rigidjax.identify.filtering import roots
+from rigidjax.identify.filtering.filter import Belief, grid_of, scan_filter
+from rigidjax.identify.filtering.roots import Terms
+from rigidjax.identify.filtering.steps import Extended, NoiseModel, sensors_of
+from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.predict import body_of_equations
+from rigidjax.identify.model.terms import (
+    Which,
+    blocks,
+    by_recording,
+    errors_of_scene,
+    prior_residuals,
+    scene_of,
+    standardised,
+    with_jacobian,
+)
+from rigidjax.identify.search.normal import normal_of
+from rigidjax.motion.manifold import dimension
+from rigidjax.motion.torques import Sum
+from rigidjax.motion.torques.composite import parts_of
+from rigidjax.motion.torques.inputs import bind
+
+
+def terms_of_one(
+    model: Model, row: Array, record: Recording, reference: Any, which: Which
+) -> Terms:
+    """Return the terms of the readings of one recording.
+
+    They are normal about the motion; where the scene has an unknown torque, the filter integrates
+    it out, and they are normal about its predictions.
+    """
+    scene = scene_of(model, row, record, reference, which)
+    if scene.process is None:
+        return _terms_of_motion(model, scene, record)
+    start: Any = scene.start
+    body = body_of_equations(scene.body, model.state_kind)
+    law = bind(scene.torque, record.inputs)
+    noise = NoiseModel(body, Sum(*parts_of(law), *parts_of(scene.process)))
+    sensors = sensors_of(scene.sensors, noise)
+    state: HasSpin = start
+    torques = tuple(jnp.zeros(3, state.omega.dtype) for _ in noise.coloured)
+    known = jnp.zeros(dimension(state), state.omega.dtype)
+    deviations = jnp.concatenate([known, *(law.deviation for law in noise.coloured)])
+    first = Belief(record.t[0], Extended(state, torques, ()), jnp.diag(deviations))
+    grid = grid_of(noise, record, first, model.filter_steps)
+    _, _, read = scan_filter((noise, sensors, record, first, grid), lambda _, read: read)
+    return jax.tree.map(jnp.ravel, roots.terms(*read))
+
+
+def _terms_of_motion(model: Model, scene: Any, record: Recording) -> Terms:
+    """Return the terms of one recording without an unknown torque: normal about the motion."""
+    errors = errors_of_scene(model, scene, record)
+    scaled, log_variance = [], []
+    for reading, sensor, error in zip(record.readings, scene.sensors, errors, strict=True):
+        limit, noise = getattr(sensor, "limit", None), sensor.noise
+        one, full, wider = standardised(
+            reading.values, reading.mask, error, noise, limit, reading.late
+        )
+        scaled.append(one)
+        # What a channel at its limit counts is a probability, not a density.
+        seen = reading.mask[:, None] & ~full
+        logs = jnp.log(2 * math.pi * noise**2)[None]
+        log_variance.append(jnp.where(seen, logs if wider is None else logs + wider, 0))
+    return Terms(
+        *(jnp.concatenate([a.reshape(-1) for a in part]) for part in (scaled, log_variance))
+    )
+
+
+def terms(model: Model, x: Float[Array, " n"]) -> Terms:
+    """Return the terms (R, N) of all readings; derivatives in x go recording by recording."""
+    return by_recording(model.index.rows(x), model, terms_of_one)
+
+
+def log_density(model: Model, x: Float[Array, " n"]) -> Scalar:
+    """Return the logarithm of the density of all readings and of the priors of x."""
+    return terms(model, x).log_density - 0.5 * jnp.sum(prior_residuals(model, x) ** 2)
+
+
+class Curvature(NamedTuple):
+    """The cost, minus a log-density; Fisher's information `gram`; the gradient `slope`."""
+
+    cost: Scalar
+    gram: Float[Array, "n n"]
+    slope: Float[Array, " n"]
+
+
+def curvature(model: Model, x: Float[Array, " n"]) -> Curvature:
+    """Return cost, gradient and Fisher's information of normal errors whose variances x moves, too.
+
+    The information is `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta
+    and Mehra 1974, doi:10.1109/TAC.1974.1100714, for the filter), and that of the priors.
+    """
+    value, slopes = blocks(model, x, terms_of_one)
+    # d(ν/√s) = dν/√s − ½ ν/√s d(log s).
+    moved = slopes.error + 0.5 * value.error[..., None] * slopes.log_variance
+    both = jnp.concatenate([moved, 0.5**0.5 * slopes.log_variance], axis=1)
+    places, size = model.index.places, model.size
+    gram = normal_of([both[:, :, None, :]], places, size).core
+    each = jnp.einsum("rn,rni->ri", value.error, slopes.error)
+    each = each + 0.5 * jnp.sum(slopes.log_variance, 1)
+    slope = jnp.zeros(size + 1, x.dtype).at[places].add(each)[:-1]
+    rows, rest = with_jacobian(lambda x: prior_residuals(model, x), x)
+    cost = 0.5 * jnp.sum(rest**2) - value.log_density
+    return Curvature(cost, gram + rows.T @ rows, slope + rest @ rows)

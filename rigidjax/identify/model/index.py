@@ -1,0 +1,101 @@
+"""The places of a recording's numbers among all free numbers: the only index of a model."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from rigidjax.identify.model.free import Slot
+
+
+class Index(eqx.Module):
+    """The places of a recording's numbers among the n free numbers x of a model.
+
+    x holds the numbers of the bodies, the shared steps of the slots, then what one recording has
+    alone: its initial state, kind by kind, and its own steps. The row of a recording holds the
+    numbers of its body, the step of each slot, and its initial state (`start`, from column
+    `first`). A slot with deviations has one step in the row and two numbers in x, which add up:
+    `places` has a second column for it, and `columns` says which column of the row each column of
+    `places` adds to. `size` n is the place of a column without a number: charts may differ in size.
+    """
+
+    places: Int[Array, "records columns"]
+    start: Int[Array, "records n"]
+    columns: tuple[int, ...] = eqx.field(static=True)
+    alone: tuple[int, ...] = eqx.field(static=True)
+    width: int = eqx.field(static=True)
+    bodies: int = eqx.field(static=True)
+    first: int = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "records row"]:
+        """Return the row of each recording."""
+        wide = jnp.append(x, jnp.zeros(1, x.dtype))[self.places]
+        twice = np.asarray(self.columns[self.width :], int)
+        if not twice.size:
+            return wide
+        return wide[:, : self.width].at[:, twice].add(wide[:, self.width :])
+
+
+def index_of(
+    bodies: Int[np.ndarray, "records numbers"],
+    size: int,
+    slots: Sequence[Slot],
+    kinds: int,
+) -> tuple[Index, tuple[Slot, ...]]:
+    """Return the index, and the slots with their places.
+
+    **Arguments:** `bodies` (R, K) the places of the numbers of each recording's body, −1 for none;
+    `size` the number of the numbers of all bodies; `kinds` how many kinds of three numbers an
+    initial state has.
+    """
+    count, end = len(bodies), size
+
+    def take(*shape: int) -> np.ndarray:
+        nonlocal end
+        places = end + np.arange(int(np.prod(shape, dtype=int)))
+        end += places.size
+        return places.reshape(shape)
+
+    shared = [None if s.each else take(max(len(s.labels), 1), *s.shape) for s in slots]
+    start = np.concatenate([take(count, 3) for _ in range(kinds)], axis=1)
+    own = [take(count, *s.shape) if s.each or s.spread is not None else None for s in slots]
+    blocks, twice, columns, column = [bodies], [], [], bodies.shape[1]
+    placed = []
+    for slot, of_all, of_each in zip(slots, shared, own, strict=True):
+        width = int(np.prod(slot.shape, dtype=int))
+        if of_all is None:
+            blocks.append(np.asarray(of_each).reshape(count, width))
+        else:
+            group = np.zeros(count, int) if slot.groups is None else np.asarray(slot.groups)
+            blocks.append(of_all[group].reshape(count, width))
+            if of_each is not None:
+                twice.append(of_each.reshape(count, width))
+                columns += range(column, column + width)
+        parts = (None if x is None else jnp.asarray(x, jnp.int32) for x in (of_all, of_each))
+        placed.append(_placed(slot, column, *parts))
+        column += width
+    blocks.append(start)
+    width = column + start.shape[1]
+    places = np.concatenate([*blocks, *twice], axis=1)
+    places = np.where(places < 0, end, places)
+    first_alone = start.min(initial=end)
+    alone = tuple(np.flatnonzero((places >= first_alone).all(axis=0) & (places < end).all(axis=0)))
+    index = Index(
+        jnp.asarray(places, jnp.int32),
+        jnp.asarray(start, jnp.int32),
+        (*range(width), *columns),
+        tuple(int(place) for place in alone),
+        width,
+        size,
+        column,
+        end,
+    )
+    return index, tuple(placed)
+
+
+def _placed(slot: Slot, column: int, shared: Array | None, own: Array | None) -> Slot:
+    return dataclasses.replace(slot, column=column, shared=shared, own=own)

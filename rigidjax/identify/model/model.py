@@ -1,0 +1,510 @@
+"""The model of a fit: from free numbers to the scene of each recording."""
+
+import abc
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, HasPose, Scalar
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.identify.data import stacking
+from rigidjax.identify.data.full_scale import with_limits
+from rigidjax.identify.data.recording import Recording
+from rigidjax.identify.data.reference_states import ReferenceStates, first_rates, reference_of
+from rigidjax.identify.model.charts import (
+    AbstractBodyChart,
+    Bodies,
+    charts_of,
+    has_mass,
+    places_of,
+    scaled,
+)
+from rigidjax.identify.model.free import Free, Slot, checked_labels, find_slots, group_of_each
+from rigidjax.identify.model.index import Index, index_of
+from rigidjax.identify.model.predict import AbstractIntegrator, integrator_for
+from rigidjax.identify.model.priors import AbstractLoss, Entropic
+from rigidjax.identify.model.scene import Process, Scene
+from rigidjax.identify.model.terms import (
+    all_errors,
+    motion_of_scene,
+    over_records,
+    scene_of,
+    template,
+)
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.coupled import motion_of
+from rigidjax.motion.manifold import dimension
+from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
+from rigidjax.motion.torques.base import AbstractForce, Torque, require_law
+from rigidjax.motion.torques.composite import parts_of
+from rigidjax.motion.torques.inputs import inputs_of
+
+# The turn, rad, in a step of the filter, by the classical method of order 4: its error is 5e-8 of
+# the turn.
+TURN_OF_A_FILTER_STEP = 0.05
+
+
+class AbstractPull(eqx.Module):
+    """Residuals of a fit beside those of readings and priors."""
+
+    @abc.abstractmethod
+    def __call__(self, model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
+        """Return the residuals, in standard deviations."""
+
+
+class Unpacked(eqx.Module):
+    """The quantities that the free numbers of a model represent.
+
+    **Fields:** `x` (n,) the free numbers; `body`, of several bodies a dict by name; `state0` the
+    initial state, of several recordings with a leading axis; `values` of the `Free`s by name, in
+    their units; `noise` (R, k) of each sensor, in its unit, and `process`, the random torque of a
+    density, or `None`.
+
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> low, high = found.interval_of(lambda point: point.state0.omega)  # a function of `Unpacked`
+    >>> bool((low < high).all())
+    True
+    """
+
+    x: Float[Array, " n"]
+    body: Any
+    state0: Any
+    values: dict[str, Array]
+    noise: tuple[Array, ...] | None = None
+    process: Any = None
+
+
+class Model(eqx.Module):
+    """The recordings of one body or several, and what is free in them: n numbers x → scenes.
+
+    **Arguments:**
+
+    - `recording`: one `Recording`, or a sequence of them with the same sensors: each has its own
+      initial state, all share the body.
+    - `chart`: the chart of the body: `Ratios()` (the full tensor up to scale), `PrincipalRatios()`
+      (body axes known to be principal), `Tensor()`, `Principal()` (with the scale), `Mass(guess)`
+      (all ten numbers), `Known(body)`. For several bodies give recordings and charts by the bodies'
+      names, as in
+      `Model({"proof": [a, b], "box": [c]}, {"proof": Known(body), "box": Tensor(1e-3)})`.
+    - `torque`: the torque on the body in every recording, or `None`. It reads the inputs of a
+      recording by name: `rigidjax.torques.Input("speed")`.
+    - `process`: an unknown torque as noise, a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of
+      them, for `filter`, `smooth` and `LogDensity`, which integrate it out; `None` follows the
+      motion.
+    - `free`: what else is free, a sequence of `Free(where, name, …)`: one value for all, for each
+      body, group or recording.
+    - `loss`: the weight of an outlier: `SoftL1()`, `Huber()`, or `None` for plain least squares.
+    - `prior`: `Entropic(guess, weight)`, a prior around a roughly known body, or `None`.
+    - `integrator`: `FixedSteps(n)` or `Adaptive(rtol, atol)` for a forced motion; `None` chooses by
+      the sampling. `Adaptive()` is quicker if the torque is smooth and the body turns by 0.1 rad or
+      more between readings, and slow if the torque reads a noisy log. A free body is followed by
+      the closed form.
+    - `noise_each`: an estimated noise is one figure for all recordings (`False`), for each
+      (`True`), for each body (`"body"`), or for recordings with the same label (a sequence).
+
+    The model finds channels that were cut off at full scale; their readings there count as "at
+    least that much", as with a sensor's `limit`.
+
+    The motion starts at the first time of each recording. Its state is the smallest that sensors
+    and torque need: `Spin`, `Attitude`, `Rigid`. **Raises:** `TypeError` for arguments of another
+    type; `ValueError` if they do not fit together.
+
+    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
+    >>> model = rj.identify.Model(record, rj.identify.Ratios())
+    >>> model.size, model.typical_rate  # five numbers of the body, three of the initial rate
+    (8, Array(1., dtype=float64))
+    """
+
+    records: Recording
+    counts: Int[np.ndarray, " records"]
+    chart: AbstractBodyChart | Bodies
+    body_names: tuple[str, ...] = eqx.field(static=True)
+    which: Int[Array, " records"] | None
+    torque: Torque | None
+    process: Process | None
+    slots: tuple[Slot, ...]
+    index: Index
+    noise_groups: Int[Array, " records"]
+    loss: AbstractLoss | None
+    prior: Entropic | None
+    pull: AbstractPull | None
+    integrator: AbstractIntegrator | None
+    state_kind: type = eqx.field(static=True)
+    filter_steps: int = eqx.field(static=True)
+    reference: ReferenceStates
+
+    def __init__(
+        self,
+        recording: Recording | Sequence[Recording] | Mapping[str, Recording | Sequence[Recording]],
+        chart: AbstractBodyChart | Mapping[str, AbstractBodyChart],
+        *,
+        torque: Torque | None = None,
+        process: Process | None = None,
+        free: Sequence[Free] = (),
+        loss: AbstractLoss | None = None,
+        prior: Entropic | None = None,
+        integrator: AbstractIntegrator | None = None,
+        noise_each: bool | str | Sequence[Any] = False,
+    ):
+        recordings, charts, names = _by_body(recording, chart)
+        _are_recordings(recordings)
+        for one in charts_of(charts):
+            known = isinstance(one, Inertia | MassProperties)
+            hint = "give a known body as Known(body)" if known else ""
+            hint = "was () forgotten?" if isinstance(one, type) else hint
+            wanted = "what of the body is free, such as Ratios() or PrincipalRatios()"
+            _checks.instance(one, AbstractBodyChart, "Model", wanted=wanted, hint=hint)
+        if isinstance(free, str):
+            free = (free,)  # pyright: ignore[reportAssignmentType]
+        _checks.instance(free, Sequence, "free", wanted="a sequence of Free(where, name)")
+        for name, value, kind in (
+            ("loss", loss, AbstractLoss),
+            ("prior", prior, Entropic),
+            ("integrator", integrator, AbstractIntegrator),
+        ):
+            if value is not None:
+                _checks.instance(value, kind, name)
+        if torque is not None:
+            require_law(torque)
+        if process is not None:
+            _require_process(process)
+        recordings = with_limits(recordings)
+        _require_inputs(torque, recordings)
+        self.records, self.counts = stacking.stack(recordings)
+        self.chart, self.torque, self.process = charts, torque, process
+        self.loss, self.prior = loss, prior
+        self.body_names, self.which, self.pull = names, None, None
+        if isinstance(charts, Bodies):
+            self.which = jnp.asarray([charts.names.index(name) for name in names], jnp.int32)
+            if prior is not None:
+                raise ValueError("Model: a prior is about one body, got several; give None")
+        apart = checked_labels(noise_each, "noise_each")
+        if isinstance(apart, bool):
+            apart = tuple(range(len(names))) if apart else ("",) * len(names)
+        self.noise_groups, _ = group_of_each(apart, names, "noise_each")
+        self.state_kind = _state_kind(recordings[0], torque, charts)
+        self.reference = reference_of(recordings, self.state_kind)
+        slots = find_slots(free, Scene(None, torque, process, recordings[0].sensors, None), names)
+        taken = {name for one in charts_of(charts) for name in (*one.log_names, *one.plain_names)}
+        for slot in slots:
+            if slot.name in taken | {"Ωx", "Ωy", "Ωz"}:
+                wanted = "a quantity of the body has this name; give another"
+                raise ValueError(f"Free {slot.name!r}: {wanted}")
+        bodies = places_of(charts, self.which, len(names))
+        kinds = dimension(stacking.one(self.reference.state, 0)) // 3
+        self.index, self.slots = index_of(bodies, charts.size, slots, kinds)
+        widest = max(float(np.diff(r.t).max()) for r in recordings)
+        turn = 1.5 * widest * float(np.max(self.reference.rate))
+        if integrator is None and torque is not None:
+            integrator = integrator_for(turn)
+        self.integrator = integrator
+        self.filter_steps = max(1, math.ceil(turn / TURN_OF_A_FILTER_STEP))
+
+    @property
+    def size(self) -> int:
+        """The number of free numbers."""
+        return self.index.size
+
+    @property
+    def count(self) -> int:
+        """The number of recordings."""
+        return int(self.records.t.shape[0])
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """The recordings, one by one."""
+        return tuple(
+            stacking.cut(stacking.one(self.records, index), count)
+            for index, count in enumerate(np.asarray(self.counts).tolist())
+        )
+
+    @property
+    def recording(self) -> Recording:
+        """The only recording, or the first."""
+        return self.recordings[0]
+
+    @property
+    def typical_rate(self) -> Scalar:
+        """The size of the body rate in the first recording, rad/s: the unit of its free numbers."""
+        return self.reference.rate[0]
+
+    def start(self, body: Any = None, omega: Any = None) -> Float[Array, " n"]:
+        """Return free numbers where a fit may start, or of a motion that is planned.
+
+        **Arguments:** `body` an `Inertia` or `MassProperties`, a sphere for `None`; of several
+        bodies a dict of those that are known about. `omega` (3,) initial rate, rad/s, body frame,
+        of all recordings; for `None` the first readings of a gyro, or the turn between attitudes (0
+        where these are traced). What else is free stays as the scenes give it. **Raises:**
+        `ValueError` for a body that the chart does not hold, or a wrong shape.
+        """
+        require_one(self)
+        if isinstance(self.chart, Bodies):
+            some = dict(body) if isinstance(body, Mapping) else {}
+            names, charts = self.chart.names, self.chart.charts
+            if not isinstance(body, Mapping | None) or set(some) - set(names):
+                raise ValueError(f"body: wanted bodies by name, of {', '.join(names)}, or None")
+            vector = jnp.concatenate(
+                [_numbers(chart, some.get(n)) for n, chart in zip(names, charts, strict=True)]
+            )
+        else:
+            vector = _numbers(self.chart, body)
+        kind = jnp.result_type(float)
+        if omega is None:
+            rates = first_rates(self.records, self.counts)
+        else:
+            rates = _checks.floating(omega, (3,), "omega").astype(kind)[None]
+        xp: Any = np if _checks.known((vector, rates, self.reference.rate)) else jnp
+        spin = xp.asarray(rates) / xp.asarray(self.reference.rate)[:, None]
+        spin = xp.broadcast_to(spin, (self.count, 3)).astype(kind)
+        rest = self.size - vector.size - spin.size
+        own = sum(s.own.size for s in self.slots if s.own is not None)
+        zeros = xp.zeros(rest - own, kind), xp.zeros(own, kind)
+        # The initial rates come last of what each recording has alone, but for its own steps.
+        parts = [xp.asarray(vector, kind), zeros[0], spin.reshape(-1), zeros[1]]
+        return jnp.asarray(xp.concatenate(parts))
+
+    def unpack(self, x: Float[Array, " n"]) -> Unpacked:
+        """Return what the free numbers x represent: body, initial state, values of the `Free`s.
+
+        With several recordings the states have a leading axis.
+        """
+        return unpacked(self, require_numbers(self, x))
+
+    def bodies(self, x: Float[Array, " n"]) -> Any:
+        """Return the body that the free numbers x represent; for several bodies a dict by name."""
+        numbers = x[: self.index.bodies]
+        if isinstance(self.chart, Bodies):
+            return self.chart.all(numbers)
+        return scaled(self.chart, numbers)
+
+    def scenes(self, x: Float[Array, " n"]) -> Scene:
+        """Return the scene of each recording, with a leading axis."""
+        return scenes_of(self, require_numbers(self, x))
+
+    def values(self, x: Float[Array, " n"]) -> dict[str, Array]:
+        """Return the value of each `Free`, by name, in its unit.
+
+        The shape is (R, …) with one value for each recording, (groups, …) with one for each group.
+        A `Free` with a `spread` gives the shared value, and each recording's value under "its name,
+        own".
+        """
+        return values_of(self, require_numbers(self, x))
+
+    def motion(self, x: Float[Array, " n"]) -> Any:
+        """Return the states at the recording's times, with a leading time axis.
+
+        With several recordings another axis leads.
+        """
+        require_numbers(self, x)
+
+        def of_one(row: Array, record: Recording, *rest: Any) -> Any:
+            scene = scene_of(self, row, record, *rest)
+            return motion_of(motion_of_scene(self, scene, record)[0])
+
+        states = over_records(of_one, self, self.index.rows(x))
+        return stacking.one(states, 0) if self.count == 1 else states
+
+    def errors(self, x: Float[Array, " n"]) -> tuple[Float[Array, "*records times _"], ...]:
+        """Return reading minus prediction for each sensor, in its unit; zero where masked."""
+        require_numbers(self, x)
+        out = all_errors(self, x)
+        return tuple(e[0] for e in out) if self.count == 1 else out
+
+
+def unpacked(model: Model, x: Float[Array, " n"]) -> Unpacked:
+    """Return `Model.unpack` without a check of x."""
+    starts = jax.vmap(ReferenceStates.moved)(model.reference, x[model.index.start])
+    state0 = stacking.one(starts, 0) if model.count == 1 else starts
+    return Unpacked(x, model.bodies(x), state0, values_of(model, x))
+
+
+def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
+    """Return `Model.scenes` without a check of x."""
+
+    def of_one(row: Array, *rest: Any) -> Scene:
+        return scene_of(model, row, *rest)
+
+    rows = model.index.rows(x)
+    return eqx.filter_vmap(of_one)(rows, model.records, model.reference, model.which)
+
+
+def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
+    """Return `Model.values` without a check of x."""
+    rows, out = model.index.rows(x), {}
+    starts = starting_values(model)
+    for slot, start in zip(model.slots, starts, strict=True):
+        steps = rows[:, slot.columns].reshape(model.count, *slot.shape)
+        own = slot.move(start, steps)
+        if slot.shared is None:
+            out[slot.name] = own
+            continue
+        first: Any = np.zeros(1, int)
+        if slot.groups is not None:
+            groups = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
+            first = jnp.argmax(slot.groups[None, :] == groups[:, None], axis=1)
+        value = slot.move(start[first], x[slot.shared])
+        out[slot.name] = value[0] if slot.groups is None else value
+        if slot.spread is not None:
+            out[f"{slot.name}, own"] = own
+    return out
+
+
+def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
+    """Return the value at which each slot starts in each recording."""
+    leaves, out = dict(jax.tree.leaves_with_path(template(model, model.records))), []
+    for slot in model.slots:
+        leaf = jnp.asarray(leaves[slot.path])
+        of_each = slot.path[0].name == "sensors"
+        out.append(leaf if of_each else jnp.broadcast_to(leaf, (model.count, *leaf.shape)))
+    return out
+
+
+def require_one(model: Any) -> Model:
+    """Return `model`, if it is one `Model`; else raise `TypeError` or `ValueError`."""
+    _checks.instance(model, Model, "model")
+    records, rate = model.records, model.reference.rate
+    shapes = {records.t.shape, *(reading.mask.shape for reading in records.readings)}
+    if len(shapes) > 1 or records.t.ndim != 2 or rate.shape != records.t.shape[:1]:
+        raise ValueError(
+            "model: wanted one, as Model(recording, …) makes it, got times and masks of shapes "
+            f"{sorted(shapes)}; take many one by one"
+        )
+    _checks.numbers(records.t, "model")
+    if _checks.known(rate):
+        _checks.finite(rate, "model: its typical rate")
+    return model
+
+
+def require_numbers(model: Model, x: Any) -> Float[Array, " n"]:
+    """Return x, if these are free numbers of this model; else raise `TypeError`, `ValueError`."""
+    require_one(model)
+    hint = "model.start(body) makes them"
+    numbers = _checks.numbers(x, "x")
+    if numbers.shape != (model.size,):
+        raise ValueError(
+            f"x: wanted the {model.size} free numbers of this model, got shape {numbers.shape}; "
+            f"{hint}"
+        )
+    if numbers.dtype != model.records.t.dtype:
+        raise TypeError(
+            f"x: wanted {model.records.t.dtype}, as the recordings have, got {numbers.dtype}"
+        )
+    if _checks.known(numbers):
+        _checks.finite(numbers, "x")
+    return numbers
+
+
+def _require_process(process: Any) -> None:
+    """Raise `TypeError` for anything but unknown torques."""
+    for part in parts_of(process):
+        wanted = "a RandomTorque, a CorrelatedTorque or a Sum of them"
+        _checks.instance(part, (RandomTorque, CorrelatedTorque), "process", wanted=wanted)
+
+
+def _require_inputs(torque: Torque | None, recordings: Sequence[Recording]) -> None:
+    """Raise `ValueError` if the torque reads an input that a recording lacks."""
+    for number, recording in enumerate(recordings):
+        missing = [name for name in inputs_of(torque) if name not in recording.inputs]
+        if missing:
+            raise ValueError(
+                f"torque: it reads {', '.join(map(repr, missing))}, and recording {number} has "
+                f"{', '.join(map(repr, recording.inputs)) or 'no inputs'}; give "
+                "Recording(…, inputs={name: samples or a function of time})"
+            )
+
+
+def _by_body(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
+    """Return the recordings in a row, the chart or charts, and the name of each recording's body."""
+    if isinstance(recording, Mapping) or isinstance(body, Mapping):
+        if not (isinstance(recording, Mapping) and isinstance(body, Mapping)):
+            raise TypeError(
+                "Model: of several bodies wanted both recordings and charts by name, got "
+                f"{type(recording).__name__} and {type(body).__name__}"
+            )
+        if set(recording) != set(body) or not body:
+            raise ValueError(
+                f"Model: wanted a chart for each body, got recordings of {sorted(recording)} and "
+                f"charts of {sorted(body)}"
+            )
+        for chart in body.values():
+            _checks.instance(chart, AbstractBodyChart, "body", wanted="a chart such as Tensor()")
+        rows, of = [], []
+        for name in body:
+            found = recording[name]
+            some = [found] if isinstance(found, Recording) else list(found)
+            if not some:
+                raise ValueError(f"Model: no recording of {name!r}")
+            rows += some
+            of += [name] * len(some)
+        return rows, Bodies(body), tuple(of)
+    if isinstance(recording, Recording):
+        return [recording], body, ("",)
+    rows = list(recording) if isinstance(recording, Sequence) else [recording]
+    return rows, body, ("",) * len(rows)
+
+
+def _are_recordings(recordings: Sequence[Any]) -> None:
+    if not recordings:
+        raise ValueError("Model: wanted at least one Recording, got an empty sequence")
+    for item in recordings:
+        _checks.instance(item, Recording, "Model", wanted="a Recording")
+        if not _checks.known((item.t, [reading.values for reading in item.readings])):
+            raise TypeError(
+                "recording: wanted known readings, got traced ones; make the Model outside "
+                "of jax.jit, jax.grad and jax.vmap, and give it to them as an argument"
+            )
+        lengths = {item.t.shape, *(reading.mask.shape for reading in item.readings)}
+        if len(lengths) > 1 or item.t.ndim != 1:
+            raise ValueError(
+                "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
+                f"shapes {sorted(lengths)}; for many give a sequence"
+            )
+        _checks.numbers(item.t, "recording")
+
+
+def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
+    """Return the chart's numbers of a guess, or its default start."""
+    if body is None:
+        return _zeros(chart.size)
+    _checks.single(body, (Inertia, MassProperties), "body")
+    if _checks.known(body):
+        jax.tree.map(lambda leaf: _checks.finite(leaf, "body"), body)
+    vector = eqx.filter_jit(chart.vector)(body)
+    if _checks.known(vector):
+        _checks.refuse(
+            vector,
+            not np.isfinite(vector).all(),
+            f"body: {type(chart).__name__} has no finite numbers for it; wanted principal "
+            "moments above zero, the largest below the sum of the others",
+        )
+    return vector
+
+
+def _zeros(*shape: int) -> Array:
+    """Return zeros by NumPy: JAX compiles a program for each shape."""
+    return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
+
+
+def _state_kind(recording: Recording, torque: Any, body: AbstractBodyChart | Bodies) -> type:
+    """Return the smallest kind of state that sensors and torque need."""
+    felt = [reading.sensor.feels for reading in recording.readings]
+    if torque is not None:
+        felt.append(getattr(torque, "feels", HasAttitude))
+    forced = any(isinstance(part, AbstractForce) for part in parts_of(torque))
+    if HasPose in felt or forced:
+        for chart in charts_of(body):
+            if not has_mass(chart):
+                raise ValueError(
+                    "Model: a sensor or force needs a body that moves, whose mass is known or "
+                    "free: wanted Mass(guess) or Known(MassProperties), got "
+                    f"{type(chart).__name__}"
+                )
+        return Rigid
+    return Attitude if HasAttitude in felt else Spin

@@ -1,0 +1,35 @@
+"""The scene of a recording: all that its readings depend on."""
+
+import equinox as eqx
+
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.identify.sensors import AbstractSensor
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
+from rigidjax.motion.torques.base import Torque
+
+# An unknown torque: white, correlated in time, or several of these.
+Process = RandomTorque | CorrelatedTorque | Sum
+
+
+class Scene(eqx.Module):
+    """All that the readings of one recording depend on.
+
+    `Free(where, …)` picks a number of it: `lambda s: s.torque.coefficient`, or
+    `lambda s: s.sensors[0].bias`.
+
+    **Fields:** `body`; `torque` on it, or `None`; `process`, the unknown torque on it as noise, or
+    `None` for none; `sensors` in the order of the readings; `start`, the state at the first time of
+    the recording. `Model.scenes(x)` makes them of free numbers.
+
+    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
+    >>> model = rj.identify.Model(record, rj.identify.PrincipalRatios())
+    >>> model.scenes(model.start()).start.omega.tolist()
+    [[1.0, 0.0, 0.0]]
+    """
+
+    body: Inertia | MassProperties | None
+    torque: Torque | None
+    process: Process | None
+    sensors: tuple[AbstractSensor, ...]
+    start: Spin | Attitude | Rigid | None
