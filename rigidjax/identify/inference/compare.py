@@ -16,7 +16,7 @@ from rigidjax.identify.data.recording import Recording, count_of
 from rigidjax.identify.model.charts import Known, places_of
 from rigidjax.identify.model.free import put
 from rigidjax.identify.model.index import index_of
-from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.model import Model, with_parts
 from rigidjax.identify.model.terms import independent, template, whitened
 from rigidjax.identify.search.stages import errors_and_slopes
 
@@ -142,9 +142,8 @@ def _with_shared(model: Model, found: Fit) -> Model:
     chart = Known(found.body)
     kinds = model.index.start.shape[1] // 3
     index, slots = index_of(places_of(chart, None, model.count), chart.size, own, kinds)
-    return eqx.tree_at(
-        lambda m: (m.chart, m.torque, [r.sensor for r in m.records.readings], m.slots, m.index),
-        model,
-        (chart, scene.torque, list(sensors), slots, index),
-        is_leaf=lambda node: node is None,
+    records = eqx.tree_at(
+        lambda r: [reading.sensor for reading in r.readings], model.records, list(sensors)
     )
+    parts = dict(chart=chart, torque=scene.torque, records=records, slots=slots, index=index)
+    return with_parts(model, **parts)

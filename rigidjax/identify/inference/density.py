@@ -19,7 +19,7 @@ from rigidjax.identify.filtering.terms import log_density
 from rigidjax.identify.model.charts import places_of
 from rigidjax.identify.model.free import Slot
 from rigidjax.identify.model.index import index_of
-from rigidjax.identify.model.model import Model, Unpacked, scenes_of, unpacked
+from rigidjax.identify.model.model import Model, Unpacked, scenes_of, unpacked, with_parts
 from rigidjax.identify.model.scene import Scene
 from rigidjax.identify.model.terms import template
 from rigidjax.identify.uncertainty.covariance import of_white
@@ -203,12 +203,13 @@ def _with_slots(
         for before, after in ((old.shared, new.shared), (old.own, new.own)):
             if before is not None:
                 places[np.asarray(before)] = np.asarray(after)
-    new_model = eqx.tree_at(
-        lambda m: ([r.sensor.noise for r in m.records.readings], m.process, m.slots, m.index),
-        model,
-        (list(noises), process, placed, index),
+    records = eqx.tree_at(
+        lambda r: [reading.sensor.noise for reading in r.readings],
+        model.records,
+        list(noises),
         is_leaf=lambda node: node is None,
     )
+    new_model = with_parts(model, records=records, process=process, slots=placed, index=index)
     return new_model, places
 
 

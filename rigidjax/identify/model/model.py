@@ -1,6 +1,7 @@
 """The model of a fit: from free numbers to the scene of each recording."""
 
 import abc
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -399,6 +400,18 @@ def require_numbers(model: Model, x: Any) -> Float[Array, " n"]:
     if _checks.known(numbers):
         _checks.finite(numbers, "x")
     return numbers
+
+
+def with_parts(model: Model, **parts: Any) -> Model:
+    """Return the model with these fields in the place of its own, as they are.
+
+    `dataclasses.replace` would call `Model(…)`, and `equinox.tree_at` cannot replace a tuple without
+    leaves.
+    """
+    new = object.__new__(Model)
+    for field in dataclasses.fields(Model):
+        object.__setattr__(new, field.name, parts.get(field.name, getattr(model, field.name)))
+    return new
 
 
 def _require_process(process: Any) -> None:
