@@ -30,7 +30,7 @@ def found():
     ts = jnp.linspace(0.0, 10.0, 60)
     motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    return rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=1)
+    return rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()), starts=1)
 
 
 @pytest.fixture
@@ -126,8 +126,8 @@ def test_names_of_columns_and_parameters_are_escaped_on_the_page(tmp_path):
     motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     gyro = rj.identify.Gyro(0.01, bias=[0.0, 0.0, 0.0])
     record = rj.identify.Recording(ts, (gyro, motion.ys.omega))
-    free = rj.identify.Free(lambda r: r.readings[0].sensor.bias, "<script>$", scale=0.01)
-    problem = rj.identify.Problem(record, rj.identify.PrincipalRatios(), free=[free])
+    free = rj.identify.Free(lambda s: s.sensors[0].bias, "<script>$", scale=0.01)
+    problem = rj.identify.Model(record, rj.identify.PrincipalRatios(), free=[free])
     found = rj.identify.fit(problem, starts=1)
     page = tmp_path / "page.html"
     rj.identify.report.write_html(found, page, title="<script>", files=["<script>"])

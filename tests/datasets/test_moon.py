@@ -115,7 +115,7 @@ def test_a_fit_of_six_years(parts, most, ok):
     mas = np.radians(1 / 3.6e6)
     record = rj.identify.Recording(ts, (rj.identify.AttitudeSensor(mas), seen))
     steps = rj.identify.Adaptive(1e-9, 1e-15)
-    problem = rj.identify.Problem(record, read.chart(core=core), torque=read.torque(**parts), integrator=steps)  # fmt: skip
+    problem = rj.identify.Model(record, read.chart(core=core), torque=read.torque(**parts), integrator=steps)  # fmt: skip
     start = problem.start(read.body(core=core), read.attitude(0.0).omega)
     fit = rj.identify.fit(problem, initial=start, starts=1)
     rms = np.sqrt(np.mean(np.asarray(fit.residuals[0]) ** 2, axis=0)) / mas / 1e3

@@ -14,7 +14,7 @@ from rigidjax.datasets import toutatis
 
 @pytest.fixture(scope="module")
 def found():
-    return rj.identify.fit(toutatis.problem(), starts=8)
+    return rj.identify.fit(toutatis.model(), starts=8)
 
 
 def test_fit_is_as_close_as_the_published_one(found):
@@ -42,15 +42,15 @@ def test_every_start_that_reports_success_agrees(found):
     good = [s for s in found.starts if s.converged and s.fits]
     assert len(good) >= 3
     # Two vectors of a chart may stand for one body.
-    best = found.problem.unpack(found.parameters)
+    best = found.model.unpack(found.x)
     for start in good:
-        mine = found.problem.unpack(start.parameters)
+        mine = found.model.unpack(start.x)
         for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(best), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
 
 
 def test_one_outlying_observation_does_not_move_the_result(found):
-    problem = toutatis.problem()
+    problem = toutatis.model()
     attitudes = problem.recording.readings[0]
     spoiled = attitudes.values.at[8].set(
         rj.quaternion.multiply(attitudes.values[8], rj.quaternion.exp(jnp.array([2.0, 1.0, -1.5])))
@@ -61,21 +61,21 @@ def test_one_outlying_observation_does_not_move_the_result(found):
         (problem.recording.readings[1].sensor, problem.recording.readings[1].values),
     )
     moved = rj.identify.fit(
-        rj.identify.Problem(recording, problem.body, loss=problem.loss),
+        rj.identify.Model(recording, problem.body, loss=problem.loss),
         starts=1,
-        initial=found.parameters,
+        initial=found.x,
     )
-    middle = np.exp(np.asarray(found.problem.body.logs(found.body)))
-    shifted = np.exp(np.asarray(moved.problem.body.logs(moved.body)))
-    for name, a, b in zip(found.problem.body.log_names, middle, shifted, strict=True):
+    middle = np.exp(np.asarray(found.model.body.logs(found.body)))
+    shifted = np.exp(np.asarray(moved.model.body.logs(moved.body)))
+    for name, a, b in zip(found.model.body.log_names, middle, shifted, strict=True):
         low, high = found.interval(0.95)[name]
         assert abs(a - b) < 0.25 * (high - low) / 2
 
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth_in_ninety_of_a_hundred_records(found):
-    problem, rng = toutatis.problem(), np.random.default_rng(0)
-    motion = problem.motion(found.parameters)
+    problem, rng = toutatis.model(), np.random.default_rng(0)
+    motion = problem.motion(found.x)
     attitude, gyro = (reading.sensor for reading in problem.recording.readings)
     truth = np.concatenate(
         [np.exp(np.asarray(problem.body.logs(found.body))), np.asarray(found.state0.omega)]
@@ -89,7 +89,7 @@ def test_intervals_hold_the_truth_in_ninety_of_a_hundred_records(found):
         rates = motion.omega + np.radians(10.0) / 86400 * rng.normal(size=(17, 3))
         record = rj.identify.Recording(problem.recording.t, (attitude, read), (gyro, rates))
         again = rj.identify.fit(
-            rj.identify.Problem(record, problem.body, loss=problem.loss),
+            rj.identify.Model(record, problem.body, loss=problem.loss),
             starts=16,
             key=jax.random.key(number),
         )

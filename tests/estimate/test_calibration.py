@@ -58,7 +58,7 @@ def density(ts, read, law, directions):
     """The posterior density of one record."""
     sensors = [identify.Gyro(NOISE), *(identify.Direction(world, NOISE) for world in directions)]
     record = identify.Recording(ts, *zip(sensors, read, strict=True))
-    problem = identify.Problem(record, identify.PrincipalRatios())
+    problem = identify.Model(record, identify.PrincipalRatios())
     # A first guess: without the torque no motion explains the longer records.
     first = identify.fit(problem, starts=1, max_steps=1)
     return estimate.LogDensity(first, law, deviation=PRIOR)

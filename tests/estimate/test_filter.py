@@ -65,7 +65,7 @@ def test_a_sphere_with_a_torque_that_remembers_and_a_bias_that_drifts_is_a_linea
     model = estimate.Model(
         rj.Inertia.from_principal(moment, moment, moment),
         rj.torques.CorrelatedTorque(density, memory),
-        walks=[estimate.Walk(lambda r: r.readings[0].sensor.bias, 0.2, drift)],
+        walks=[estimate.Walk(lambda s: s.sensors[0].bias, 0.2, drift)],
     )
     record = identify.Recording(
         DT * np.arange(COUNT), (identify.Gyro(noise, bias=[0.0, 0.0, 0.0]), readings)
@@ -388,7 +388,7 @@ class TestBadInput:
         with pytest.raises(ValueError, match="time: wanted a positive correlation time"):
             rj.torques.CorrelatedTorque(1.0, 0.0)
         with pytest.raises(ValueError, match="density: wanted a finite"):
-            estimate.Walk(lambda r: r.readings[0].sensor.bias, 1.0, -1.0)
+            estimate.Walk(lambda s: s.sensors[0].bias, 1.0, -1.0)
 
     def test_readings_out_of_order(self):
         with pytest.raises(ValueError, match="out of order"):
@@ -410,12 +410,12 @@ class TestBadInput:
 
     def test_a_walk_that_finds_nothing(self):
         model = estimate.Model(
-            records.BODY, walks=[estimate.Walk(lambda r: r.readings[0].sensor.bias, 1.0)]
+            records.BODY, walks=[estimate.Walk(lambda s: s.sensors[0].bias, 1.0)]
         )
         with pytest.raises(ValueError, match="None is there; give the sensor a starting value"):
             estimate.start(model, self.record, rate=0.1)
         model = estimate.Model(
-            records.BODY, walks=[estimate.Walk(lambda r: r.readings[3].sensor, 1.0)]
+            records.BODY, walks=[estimate.Walk(lambda s: s.sensors[3], 1.0)]
         )
         with pytest.raises(ValueError, match="nothing is there"):
             estimate.start(model, self.record, rate=0.1)

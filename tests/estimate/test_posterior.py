@@ -24,7 +24,7 @@ def problem():
     real = jax.vmap(rj.exact.FreeBody(records.BODY, rj.Spin(records.START.omega)))(ts)
     omega = records.gyro(jax.random.key(3), real.omega, 0.02)
     record = identify.Recording(ts, (identify.Gyro(0.02), omega))
-    return identify.Problem(record, identify.PrincipalRatios())
+    return identify.Model(record, identify.PrincipalRatios())
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_without_a_process_it_is_normal_about_the_motion(fitted):
     density = estimate.LogDensity(fitted)
     assert density.size == 5
     x = density.x0 + 0.01
-    errors = fitted.problem.errors(density.unpack(x).parameters)
+    errors = fitted.model.errors(density.unpack(x).x)
     wanted = sum(scipy.stats.norm.logpdf(e, scale=0.02).sum() for e in errors)
     assert abs(float(density(x)) / wanted - 1) < 1e-12
     np.testing.assert_allclose(density.covariance, fitted.covariance)
@@ -64,7 +64,7 @@ def test_its_width_is_that_of_white_errors_whatever_the_intervals_allow_for(fitt
     density = estimate.LogDensity(wide)
     columns, h = [], 1e-5
     for step in h * np.eye(5):
-        up, down = (density.unpack(density.x0 + s * step).parameters for s in (1, -1))
+        up, down = (density.unpack(density.x0 + s * step).x for s in (1, -1))
         apart = problem().errors(up)[0] - problem().errors(down)[0]
         columns.append(np.ravel(apart) / (2 * h * 0.02))
     wanted = np.linalg.inv(np.array(columns) @ np.array(columns).T)
@@ -81,12 +81,12 @@ def test_its_width_is_that_of_white_errors_whatever_the_intervals_allow_for(fitt
 def test_a_noise_that_is_unknown_is_one_number_as_in_the_fit(fitted):
     record = problem().recordings[0]
     unknown = (identify.Gyro(), record.readings[0].values)
-    other = identify.Problem(identify.Recording(record.t, unknown), identify.PrincipalRatios())
+    other = identify.Model(identify.Recording(record.t, unknown), identify.PrincipalRatios())
     density = estimate.LogDensity(dataclasses.replace(fitted, problem=other))
     assert density.size == 6
     np.testing.assert_allclose(density.covariance[-1, -1], 1 / (2 * 180))
     x = density.x0.at[-1].set(np.log(2.0))
-    wanted = scipy.stats.norm.logpdf(problem().errors(fitted.parameters)[0], scale=0.04).sum()
+    wanted = scipy.stats.norm.logpdf(problem().errors(fitted.x)[0], scale=0.04).sum()
     np.testing.assert_allclose(density(x), wanted, rtol=1e-12)
     np.testing.assert_allclose(density.unpack(x).noise[0], 0.04)
 
@@ -146,14 +146,14 @@ def test_a_density_that_is_unknown_is_one_number_more(fitted):
 def test_a_noise_that_is_unknown_moves_no_other_number(fitted):
     # Inside the filter the sensor has a noise, and with it one leaf more than in the problem.
     record = problem().recordings[0]
-    bias = identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.1, prior=0.1)
+    bias = identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.1, prior=0.1)
     values = []
     for noise in (None, 0.02):
         gyro = identify.Gyro(noise, bias=[0.01, -0.02, 0.03])
         seen = identify.Recording(record.t, (gyro, record.readings[0].values))
-        other = identify.Problem(seen, identify.PrincipalRatios(), free=[bias])
+        other = identify.Model(seen, identify.PrincipalRatios(), free=[bias])
         at = other.start(records.BODY)
-        at = eqx.tree_at(lambda p: p.own.spin, at, fitted.parameters.own.spin)
+        at = eqx.tree_at(lambda p: p.own.spin, at, fitted.x.own.spin)
         at = eqx.tree_at(lambda p: p.shared[0], at, jnp.array([1.0, -1.0, 0.5]))
         covariance = 1e-4 * jnp.eye(8)
         found = dataclasses.replace(
@@ -174,8 +174,8 @@ def test_the_gradient_with_a_process_is_right_recording_by_recording(fitted):
         identify.Recording(record.t[k : k + 12], (reading[0], reading[1][k : k + 12]))
         for k in (0, 20)
     ]
-    bias = identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.1, spread=0.1)
-    both = identify.Problem(cut, identify.PrincipalRatios(), free=[bias], noise_each=True)
+    bias = identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.1, spread=0.1)
+    both = identify.Model(cut, identify.PrincipalRatios(), free=[bias], noise_each=True)
     at = both.start(records.BODY)
     size = sum(leaf.size for leaf in jax.tree.leaves(at))
     covariance = 1e-4 * jnp.eye(size)
@@ -217,7 +217,7 @@ def test_any_sampler_will_do(fitted):
 
 
 def test_chains_of_many_recordings_are_those_of_their_keys_too(fitted):
-    many = identify.Problem([problem().recordings[0]] * 8, identify.PrincipalRatios())
+    many = identify.Model([problem().recordings[0]] * 8, identify.PrincipalRatios())
     at = many.start(records.BODY)
     covariance = jnp.diag(jnp.linspace(1e-4, 1e-2, 26))
     found = dataclasses.replace(
@@ -281,7 +281,7 @@ def test_several_bodies_go_to_arviz_by_name(fitted):
     arviz = pytest.importorskip("arviz")
     record = problem().recordings[0]
     chart = identify.PrincipalRatios()
-    both = identify.Problem({"a": record, "b": record}, {"a": chart, "b": chart})
+    both = identify.Model({"a": record, "b": record}, {"a": chart, "b": chart})
     at = both.start({"a": records.BODY, "b": records.BODY})
     size = sum(leaf.size for leaf in jax.tree.leaves(at))
     covariance = 1e-4 * jnp.eye(size)
@@ -346,7 +346,7 @@ def test_a_torque_that_the_fit_knows_nothing_of():
         real = records.truth(keys[0], model, spin, ts, 2)
         omega = records.gyro(keys[1], real.states.omega, 0.02)
         made.append(identify.Recording(ts, (identify.Gyro(0.02), omega)))
-    plain = identify.fit(identify.Problem(made, identify.PrincipalRatios()), starts=2)
+    plain = identify.fit(identify.Model(made, identify.PrincipalRatios()), starts=2)
     assert not plain.ok
     found = estimate.refit(estimate.LogDensity(plain, rj.torques.RandomTorque(1e-4)))
     assert found.converged
@@ -397,14 +397,14 @@ def test_weighted_draws_stand_for_the_density(fitted):
     # Where the draws are worth nothing the curvature is taken: what is linear in x is normal.
     one = jnp.zeros_like(found.weights).at[0].set(1.0)
     poor = eqx.tree_at(lambda f: f.weights, found, one)
-    low, high = poor.interval_of(lambda point: point.parameters.own.spin)
-    at = poor.point.parameters.own.spin
+    low, high = poor.interval_of(lambda point: point.x.own.spin)
+    at = poor.point.x.own.spin
     np.testing.assert_allclose(0.5 * (low + high), at, atol=1e-12)
-    low2, high2 = found.interval_of(lambda point: point.parameters.own.spin)
+    low2, high2 = found.interval_of(lambda point: point.x.own.spin)
     np.testing.assert_allclose(high2 - low2, high - low, rtol=0.15)
     early = eqx.tree_at(lambda f: f.converged, poor, jnp.asarray(False))
     with pytest.raises(ValueError, match="the search did not reach the maximum"):
-        early.interval_of(lambda point: point.parameters.own.spin)
+        early.interval_of(lambda point: point.x.own.spin)
     with pytest.raises(ValueError, match="draws: wanted"):
         estimate.refit(density, draws=0)
 
@@ -417,7 +417,7 @@ def test_the_information_is_the_covariance_of_the_gradient(fitted, process):
     body = rj.Inertia.from_principal(4.0 / 11, 8.0 / 11, 10.0 / 11)
 
     seen = identify.Recording(ts, (identify.Gyro(), jnp.ones((25, 3))))
-    other = identify.Problem(seen, identify.PrincipalRatios())
+    other = identify.Model(seen, identify.PrincipalRatios())
     at = other.start(records.BODY)
     at = eqx.tree_at(lambda p: p.own.spin, at, records.START.omega[None] / other.typical_rate)
     found = dataclasses.replace(fitted, problem=other, parameters=at)
@@ -428,7 +428,7 @@ def test_the_information_is_the_covariance_of_the_gradient(fitted, process):
         model = estimate.Model(body, process)
         real = records.truth(keys[0], model, rj.Spin(records.START.omega), ts, 2)
         omega = records.gyro(keys[1], real.states.omega, 0.02)
-        where = lambda d: d.problem.records.readings[0].values
+        where = lambda d: d.model.records.readings[0].values
         return curvature(eqx.tree_at(where, density, omega[None]), density.x0)
 
     keys = jax.random.split(jax.random.key(5), many)

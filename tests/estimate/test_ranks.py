@@ -37,7 +37,7 @@ def drawn_body(key):
     """The chart's numbers, drawn from the entropic prior: a cell of a fine grid, and a place in it."""
     cell = 0.02
     line = cell * jnp.arange(-150.0, 150.0)
-    centre = identify.Problem(record(np.ones((TS.size, 3))), CHART).start(PRIOR.guess)
+    centre = identify.Model(record(np.ones((TS.size, 3))), CHART).start(PRIOR.guess)
     points = centre.body[None] + jnp.stack(jnp.meshgrid(line, line), axis=-1).reshape(-1, 2)
     log = jax.vmap(lambda x: -0.5 * jnp.sum(PRIOR.residuals(CHART.body(x), scaled=False) ** 2))
     # Of the numbers of a body those whose root has no negative eigenvalue: a flat body, which the
@@ -78,10 +78,10 @@ def made(key, body, process):
 
 def density_of(read, process):
     bias = identify.Free(
-        lambda r: r.readings[0].sensor.bias, "bias", scale=BIAS_SPREAD, prior=BIAS_SPREAD
+        lambda s: s.sensors[0].bias, "bias", scale=BIAS_SPREAD, prior=BIAS_SPREAD
     )
     free = [] if process else [bias]
-    problem = identify.Problem(record(read), CHART, free=free, prior=PRIOR)
+    problem = identify.Model(record(read), CHART, free=free, prior=PRIOR)
     if not process:
         return estimate.LogDensity(identify.fit(problem, starts=1))
     first = identify.fit(problem, starts=1, max_steps=1)
@@ -89,7 +89,7 @@ def density_of(read, process):
 
 
 def numbers(point):
-    out = {"body": point.parameters.body, "rate": point.state0.omega, **point.values}
+    out = {"body": point.x.body, "rate": point.state0.omega, **point.values}
     if point.process is not None:
         out["process"] = jnp.log(point.process.density / LAW.density)[:1]
     return out

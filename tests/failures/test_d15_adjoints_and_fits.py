@@ -65,6 +65,6 @@ def test_d15_a_forced_recording_is_fitted(loss):
     truth = rj.simulate(body, rj.Spin([0.4, 1.2, -0.3]), ts, law).ys.omega
     record = identify.Recording(ts, (identify.Gyro(1e-3), truth), torque=law)
     options = {} if loss is None else {"loss": loss}
-    found = identify.fit(identify.Problem(record, identify.Principal(1.5), **options), starts=1)
+    found = identify.fit(identify.Model(record, identify.Principal(1.5), **options), starts=1)
     moments = np.asarray(found.body.moments)
     np.testing.assert_allclose(np.sort(moments), [1.0, 1.6, 2.1], rtol=1e-5)

@@ -19,7 +19,7 @@ MOTION = rj.simulate(BODY, rj.Attitude([1.0, 0, 0, 0], [0.9, 1.6, -0.7]), TS).ys
 
 def fitted(q):
     record = identify.Recording(TS, (identify.AttitudeSensor(0.01), q))
-    return identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=1)
+    return identify.fit(identify.Model(record, identify.PrincipalRatios()), starts=1)
 
 
 @pytest.mark.slow
@@ -36,7 +36,7 @@ def test_signs_and_turns_do_not_matter():
     plain, signs, wraps = (fitted(x) for x in (q, flipped, again))
     assert plain.ok and signs.ok and wraps.ok
     for a, b in zip(
-        jax.tree.leaves(plain.parameters), jax.tree.leaves(signs.parameters), strict=True
+        jax.tree.leaves(plain.x), jax.tree.leaves(signs.x), strict=True
     ):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_allclose(wraps.body.moments, plain.body.moments, rtol=1e-6)

@@ -40,8 +40,8 @@ def attitudes(random, few, states):
         (identify.AttitudeSensor(), turned.as_quat(scalar_first=True), seen),
         (identify.Gyro(bias=[0.0, 0, 0]), rates),
     )
-    bias = identify.Free(lambda r: r.readings[1].sensor.bias, "bias", scale=0.1)
-    found = identify.fit(identify.Problem(record, identify.Ratios(), free=[bias]), starts=1)
+    bias = identify.Free(lambda s: s.sensors[1].bias, "bias", scale=0.1)
+    found = identify.fit(identify.Model(record, identify.Ratios(), free=[bias]), starts=1)
     return list(zip(found.interval().values(), [0.4, 0.8, *RATE, *BIAS], strict=True))
 
 
@@ -53,9 +53,9 @@ def widths(random, count, width):
         rates = np.exp(-own * times)[:, None] * [1.0, 2.0, 0.0]
         gyro = identify.Gyro(0.01), rates + 0.01 * random.normal(size=(40, 3))
         records.append(identify.Recording(times, gyro, torque=Fading(0.2)))
-    free = [identify.Free(lambda r: r.torque.coefficient, "c", scale=0.1, spread="estimated")]
+    free = [identify.Free(lambda s: s.torque.coefficient, "c", scale=0.1, spread="estimated")]
     sphere = identify.Known(rj.Inertia.from_principal(1.0, 1.0, 1.0))
-    found = identify.fit(identify.Problem(records, sphere, free=free), starts=1)
+    found = identify.fit(identify.Model(records, sphere, free=free), starts=1)
     return [(found.interval()["c"], 0.3)]
 
 

@@ -62,7 +62,7 @@ motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1.0, 0.1
 read = motion.ys.omega + 0.01 * np.random.default_rng(0).normal(size=(200, 3))
 def fitted(read):
     record = identify.Recording(t, (identify.Gyro(0.01), read), torque=LAW)
-    return identify.fit(identify.Problem(record, identify.CHART), starts=1)
+    return identify.fit(identify.Model(record, identify.CHART), starts=1)
 begun = time.process_time()
 fitted(read)
 first = time.process_time()
@@ -84,28 +84,28 @@ def real():
     loaded = importlib.util.spec_from_file_location("throws", places / "throws.py")
     throws = importlib.util.module_from_spec(loaded)
     loaded.loader.exec_module(throws)
-    free = [identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=1e-5)]
+    free = [identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=1e-5)]
     out = []
     for path in throws.paths("object_empty"):
         record = throws.record(path)
         momentum = record.torque.parts[0].momentum
         h = np.asarray(jax.vmap(momentum.speed)(record.t)) * throws.WHEEL
         scene = np.asarray(record.readings[0].values), h, np.gradient(h, STEP)
-        made = identify.Problem(record, identify.Tensor(UNIT), free=free)
+        made = identify.Model(record, identify.Tensor(UNIT), free=free)
         out.append((scene, made, start(made, scene[0])))
     return out
 
 
 def problem(readings, integrator=None):
     record = identify.Recording(T, (identify.Gyro(SIGMA), readings), torque=law([0.0, 0.0, 0.0]))
-    free = [identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=1e-5)]
-    return identify.Problem(record, identify.Tensor(UNIT), free=free, integrator=integrator)
+    free = [identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=1e-5)]
+    return identify.Model(record, identify.Tensor(UNIT), free=free, integrator=integrator)
 
 
 def driven(readings):
     push = rj.torques.ConstantTorque(TORQUE)
     record = identify.Recording(T, (identify.Gyro(SIGMA), readings), torque=push)
-    return identify.Problem(record, identify.Tensor(UNIT))
+    return identify.Model(record, identify.Tensor(UNIT))
 
 
 def start(of, readings):
@@ -273,7 +273,7 @@ def cold():
 def many(readings):
     print("\n1000 starts in one vmap, 70 samples, free motion")
     short = identify.Recording(T[::10], (identify.Gyro(SIGMA), readings[::10]))
-    ratios = identify.Problem(short, identify.PrincipalRatios())
+    ratios = identify.Model(short, identify.PrincipalRatios())
     for name in ("first call", "warm"):
         begun = time.process_time()
         identify.fit(ratios, starts=1000, together=1000)
@@ -284,7 +284,7 @@ def recordings(counts=(100, 500, 1000)):
     """Recordings of a free body by one gyro, each with a rate and a bias of its own."""
     body, ts, rng = rj.Inertia.from_principal(1.0, 2.0, 2.5), T[:600:10], np.random.default_rng(0)
     move = jax.jit(jax.vmap(lambda w: rj.simulate(body, rj.Spin(w), 5.0 * ts).ys.omega))
-    bias = lambda r: r.readings[0].sensor.bias
+    bias = lambda s: s.sensors[0].bias
     free = [identify.Free(bias, "bias", scale=0.02, spread=0.02)]
     for count in counts:
         rates = np.asarray(move(jnp.asarray(3.0 * rng.normal(size=(count, 3)))))
@@ -293,7 +293,7 @@ def recordings(counts=(100, 500, 1000)):
         records = [identify.Recording(5.0 * ts, (gyro, row)) for row in read]
         for name in ("first call", "warm"):
             begun = time.perf_counter()
-            made = identify.Problem(records, identify.PrincipalRatios(), free=free)
+            made = identify.Model(records, identify.PrincipalRatios(), free=free)
             found = identify.fit(made, starts=1)
             size = found.covariance.shape[0]
             print(
@@ -334,14 +334,14 @@ def steps():
         ts = np.arange(0.0, 100.0, apart / np.linalg.norm(rates))
         read = np.asarray(rj.simulate(body, rj.Spin(rates), ts, smooth).ys.omega)
         record = identify.Recording(ts, (identify.Gyro(0.01), read), torque=smooth)
-        made = identify.Problem(record, identify.Principal(1.2))
+        made = identify.Model(record, identify.Principal(1.2))
         tasks[f"smooth, {apart} rad apart"] = made, made.start(body)
     places = Path(__file__).parent
     loaded = importlib.util.spec_from_file_location("bench_throws", places / "bench_throws.py")
     bench = importlib.util.module_from_spec(loaded)
     loaded.loader.exec_module(bench)
     record = bench.record(bench.throws.paths("object_empty")[0], 1, 0.53)
-    made = identify.Problem(record, identify.Tensor(3e-4))
+    made = identify.Model(record, identify.Tensor(3e-4))
     tasks["a throw with its log"] = made, made.start(rj.Inertia(GUESS))
     print("\none evaluation of errors and derivatives, ms")
     for name, (made, at) in tasks.items():
@@ -387,7 +387,7 @@ def main():
 
         def misfit(found):
             # As SciPy counts it, from the noise that was estimated.
-            left = found.problem.records.size - found.covariance.shape[0]
+            left = found.model.records.size - found.covariance.shape[0]
             return 0.5 * left * float(found.noises[0][0, 0] / SIGMA) ** 2
 
         tasks["ours from the same start"] = lambda draw: misfit(

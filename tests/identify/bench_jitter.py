@@ -54,7 +54,7 @@ def main(count=120):
             errors, held, found_of, good = [], [], [], 0
             for rates in records:
                 record = identify.Recording(TS, (gyro(), rates))
-                found = identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=1)
+                found = identify.fit(identify.Model(record, identify.PrincipalRatios()), starts=1)
                 ends = np.array([found.interval()[f"{axis}/Iz"] for axis in ("Ix", "Iy")])
                 errors.append(np.log([q.value for q in found.quantities[:2]] / TRUTH))
                 held.append((ends[:, 0] <= TRUTH) & (ends[:, 1] >= TRUTH))

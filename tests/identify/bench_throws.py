@@ -70,23 +70,23 @@ def record(path, every, end):
 
 def free(own_bias, drag):
     return [
-        identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05, **own_bias),
-        identify.Free(lambda r: r.torque.parts[0].momentum.delay, "delay", scale=1e-3, each=True),
-        identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=1e-5, **drag),
+        identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05, **own_bias),
+        identify.Free(lambda s: s.torque.parts[0].momentum.delay, "delay", scale=1e-3, each=True),
+        identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=1e-5, **drag),
     ]
 
 
 SENSOR = [
-    identify.Free(lambda r: r.readings[0].sensor.scale, "scale", scale=0.01),
-    identify.Free(lambda r: r.readings[0].sensor.skew, "skew", scale=0.01),
-    identify.Free(lambda r: r.torque.parts[0].momentum.tilt, "tilt", scale=0.01),
+    identify.Free(lambda s: s.sensors[0].scale, "scale", scale=0.01),
+    identify.Free(lambda s: s.sensors[0].skew, "skew", scale=0.01),
+    identify.Free(lambda s: s.torque.parts[0].momentum.tilt, "tilt", scale=0.01),
 ]
 
 
 def together(records):
     charts = {name: identify.Tensor(3e-4) for name in records}
     moves = [*free({"spread": OWN_BIAS}, {"each": "body"}), *SENSOR]
-    problem = identify.Problem(records, charts, free=moves, noise_each="body")
+    problem = identify.Model(records, charts, free=moves, noise_each="body")
     return identify.fit(problem, starts=1)
 
 
@@ -97,11 +97,11 @@ def alone(name, row, joint):
 
 def some(name, rows, joint):
     """Throws of one body; each has a bias and a delay of its own."""
-    first = joint.problem.of.index(name)
-    scenes = joint.problem.scenes(joint.parameters)
+    first = joint.model.of.index(name)
+    scenes = joint.model.scenes(joint.x)
     chosen = [
         eqx.tree_at(
-            lambda r: r.readings[0].sensor.bias,
+            lambda s: s.sensors[0].bias,
             jax.tree.map(lambda a, i=first + row: a[i] if eqx.is_array(a) else a, scenes),
             joint.values["bias"],
         )
@@ -112,16 +112,16 @@ def some(name, rows, joint):
         q.deviation for q in joint.quantities if q.name in [f"drag {a} [{name}]" for a in "xyz"]
     )
     moves = free({"prior": OWN_BIAS, "each": True}, {"prior": drag})
-    problem = identify.Problem(chosen, identify.Tensor(3e-4), free=moves)
+    problem = identify.Model(chosen, identify.Tensor(3e-4), free=moves)
     start = problem.start(joint.body[name])
-    spin = joint.parameters.own.spin[jnp.asarray(rows) + first]
+    spin = joint.x.own.spin[jnp.asarray(rows) + first]
     start = eqx.tree_at(lambda p: p.own.spin, start, spin)
     return identify.fit(problem, starts=1, initial=start)
 
 
 def with_torque(found, law):
     """The fit of throws, an unknown torque integrated out; nothing else is new."""
-    ts = found.problem.recordings[0].t
+    ts = found.model.recordings[0].t
     # First guesses: all of the misfit is what the torque does to the rate in the time of the throw,
     # and the torque lasts as long as the errors are autocorrelated.
     momentum = jnp.mean(found.noise[0]) * jnp.trace(found.body.tensor) / 3
@@ -149,7 +149,7 @@ def throws_with_torque(law, joint, records, levers, whole=False):
     those of all throws of a body as one problem (`whole`). Returns which intervals of means (or of
     those problems) hold.
     """
-    keys = iter(jax.random.split(jax.random.key(0), joint.problem.count))
+    keys = iter(jax.random.split(jax.random.key(0), joint.model.count))
     totals = {}
     for name, rows in records.items():
         each = [[*range(len(rows))]] if whole else [[row] for row in range(len(rows))]
@@ -274,8 +274,8 @@ def of_all(name, joint, levers, rows=None):
 def copies(joint, levers, count):
     """Print how many intervals of the joint fit hold in simulated copies of the experiment."""
     rng = np.random.default_rng(0)
-    errors, of = np.asarray(joint.residuals[0]), np.array(joint.problem.of)
-    clean = np.asarray(joint.problem.records.readings[0].values) - errors
+    errors, of = np.asarray(joint.residuals[0]), np.array(joint.model.of)
+    clean = np.asarray(joint.model.records.readings[0].values) - errors
     rows = {name: throws.levers(name) for name in levers}
     truth = {n: log_moments(n, joint.body[n].tensor, joint.body, levers) for n in TRUTH}
     held, reaches = [], []
@@ -286,9 +286,9 @@ def copies(joint, levers, count):
             sign = rng.choice([-1.0, 1.0], mine.size)[:, None, None]
             readings[mine] += sign * errors[rng.permutation(mine)]
         problem = eqx.tree_at(
-            lambda p: p.records.readings[0].values, joint.problem, jnp.asarray(readings)
+            lambda p: p.records.readings[0].values, joint.model, jnp.asarray(readings)
         )
-        found = identify.fit(problem, starts=1, initial=joint.parameters)
+        found = identify.fit(problem, starts=1, initial=joint.x)
         scattered = {
             n: levers[n] + rng.multivariate_normal(np.zeros(3), np.cov(r.T), len(r))
             for n, r in rows.items()
@@ -325,7 +325,7 @@ def main(every=1, end=0.53, laws=(), whole=False, count=0):
     records, levers = given(every, end)
     began = time.perf_counter()
     joint = together(records)
-    print(f"{joint.problem.count} throws together: {time.perf_counter() - began:.1f} s")
+    print(f"{joint.model.count} throws together: {time.perf_counter() - began:.1f} s")
     print(f"status: {joint.status}")
     for name, value in joint.values.items():
         if name in ("bias", "scale", "skew", "tilt"):
@@ -350,7 +350,7 @@ def main(every=1, end=0.53, laws=(), whole=False, count=0):
             )
             errors.append(0.5 * (low + high) - np.log(truth))
             reaches.append(np.hypot((high - low) / 2, beside))
-            words.append(one.model.word)
+            words.append(one.explanation.word)
         print("  status:", ", ".join(f"{words.count(word)} {word}" for word in sorted(set(words))))
         alone_held.append(
             show(f"{name}, {len(errors)} throws", np.array(errors), np.array(reaches)).ravel()

@@ -68,7 +68,7 @@ def test_a_free_centre_is_found_from_where_a_body_turns_about():
         (identify.AttitudeSensor(1e-3), states.q),
         torque=rj.torques.UniformGravity([0.0, 0.0, 0.0]),
     )
-    found = identify.fit(identify.Problem(record, identify.Mass(guess, ["com"])), starts=1)
+    found = identify.fit(identify.Model(record, identify.Mass(guess, ["com"])), starts=1)
     np.testing.assert_allclose(found.body.com, BOX.com, rtol=0, atol=3e-3)
     np.testing.assert_allclose(found.body.second_moment, BOX.second_moment, rtol=0, atol=1e-13)
     for axis, value in zip("xyz", BOX.com, strict=True):
@@ -98,12 +98,12 @@ def test_bodies_with_and_without_a_scale_in_one_problem():
     known = rj.Inertia(jnp.diag(jnp.array([0.5, 0.7, 0.8])), "arbitrary")
     charts = {"a": identify.Ratios(), "b": identify.Tensor(1.0), "c": identify.PrincipalRatios()}
     steps = identify.Adaptive(1e-6, 1e-9)
-    problem = identify.Problem({name: record for name in charts}, charts, integrator=steps)
+    problem = identify.Model({name: record for name in charts}, charts, integrator=steps)
     start = problem.start()
     assert np.isfinite(np.asarray(problem.errors(start)[0])).all()
     bodies, _ = problem.unpack(start)
     assert [bodies[name].scale for name in "abc"] == ["arbitrary", None, "arbitrary"]
     mixed = {"a": identify.Known(known), "b": identify.Tensor(1.0)}
-    problem = identify.Problem({name: record for name in mixed}, mixed)
+    problem = identify.Model({name: record for name in mixed}, mixed)
     assert np.isfinite(np.asarray(problem.errors(problem.start())[0])).all()
     assert problem.unpack(problem.start())[0]["a"].scale == "arbitrary"

@@ -41,7 +41,7 @@ def attitude_and_biased_gyro(rng):
         (identify.AttitudeSensor(0.05), turned(ys.q, rng, 0.05)),
         (identify.Gyro(0.02, bias=[0.0, 0.0, 0.0]), read),
     )
-    free = [identify.Free(lambda r: r.readings[1].sensor.bias, "bias", scale=0.02)]
+    free = [identify.Free(lambda s: s.sensors[1].bias, "bias", scale=0.02)]
     return record, identify.PrincipalRatios(), free
 
 
@@ -52,7 +52,7 @@ def wheel_and_drag(rng):
     ys = rj.simulate(BODY, rj.Spin(OMEGA), TS, law).ys
     read = ys.omega + 0.02 * rng.normal(size=(60, 3))
     record = identify.Recording(TS, (identify.Gyro(0.02), read), torque=law)
-    free = [identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=0.05)]
+    free = [identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=0.05)]
     return record, identify.Principal(1.5), free
 
 
@@ -86,7 +86,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(scene):
     truth, held = None, []
     for _ in range(RECORDS):
         record, chart, free = scene(rng)
-        problem = identify.Problem(record, chart, free=free)
+        problem = identify.Model(record, chart, free=free)
         omega = [0.4, 1.2, 1.5] if scene is two_directions_of_a_top else OMEGA
         plan = problem.start(BODY, omega)
         if truth is None:
@@ -120,7 +120,7 @@ MOMENTS = {"Ix/Iz": 1.0 / 2.1, "Iy/Iz": 1.6 / 2.1}
 def cut_off(rng):
     read = (CLEAN + 0.02 * rng.normal(size=(60, 3))).clip(-0.95, 0.95)
     record = identify.Recording(TS, (identify.Gyro(0.02), read))
-    return identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=1)
+    return identify.fit(identify.Model(record, identify.PrincipalRatios()), starts=1)
 
 
 def slow_errors(rng):
@@ -131,7 +131,7 @@ def slow_errors(rng):
         slow[k] = 0.85 * slow[k - 1] + np.sqrt(1 - 0.85**2) * steps[k]
     read = CLEAN + slow[100:] + 0.005 * rng.normal(size=(60, 3))
     record = identify.Recording(TS, (identify.Gyro(), read))
-    return identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=1)
+    return identify.fit(identify.Model(record, identify.PrincipalRatios()), starts=1)
 
 
 SKEW = np.array([0.02, -0.01, 0.03])
@@ -152,10 +152,10 @@ def skew_and_own_biases(rng):
         gyro = identify.Gyro(bias=[0.0] * 3, skew=[0.0] * 3)
         records.append(identify.Recording(TS, (gyro, read)))
     free = [
-        identify.Free(lambda r: r.readings[0].sensor.skew, "skew", scale=0.02),
-        identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05, spread=0.02),
+        identify.Free(lambda s: s.sensors[0].skew, "skew", scale=0.02),
+        identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05, spread=0.02),
     ]
-    problem = identify.Problem(
+    problem = identify.Model(
         {"known": records[:1], "new": records[1:]},
         {"known": identify.Known(BODY), "new": identify.PrincipalRatios()},
         free=free,

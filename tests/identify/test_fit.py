@@ -34,7 +34,7 @@ def test_nasa_brick_returns_its_ratios():
     # NASA/TM-2015-218675, case 2: I = (0.00189422, 0.006211019, 0.007194665) slug ft².
     t, *rates = rj.identify.read_table(BRICK, ("t", "p_deg_s", "q_deg_s", "r_deg_s")).values()
     record = rj.identify.Recording(t, (rj.identify.Gyro(), np.deg2rad(rates).T))
-    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
+    found = rj.identify.fit(rj.identify.Model(record, rj.identify.Ratios()), starts=2)
     assert found.ok
     moments = np.asarray(found.body.moments)
     np.testing.assert_allclose(
@@ -46,7 +46,7 @@ def test_nasa_brick_returns_its_ratios():
 def test_full_tensor_comes_back_from_exact_rates(tumble):
     body, ts, ys = tumble
     record = rj.identify.Recording(ts, (rj.identify.Gyro(1e-3), ys.omega))
-    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
+    found = rj.identify.fit(rj.identify.Model(record, rj.identify.Ratios()), starts=2)
     assert found.ok
     scaled = np.asarray(found.body.tensor) / np.trace(found.body.tensor) * np.trace(body.tensor)
     np.testing.assert_allclose(scaled, body.tensor, atol=1e-7)
@@ -62,10 +62,10 @@ def test_a_masked_reading_is_an_absent_one(tumble):
     for filler in (np.nan, 1e6):
         values = np.where(mask[:, None], noisy, filler)
         record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), values, mask))
-        problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+        problem = rj.identify.Model(record, rj.identify.PrincipalRatios())
         results.append(rj.identify.fit(problem, starts=1))
     for a, b in zip(
-        jax.tree.leaves(results[0].parameters), jax.tree.leaves(results[1].parameters), strict=True
+        jax.tree.leaves(results[0].x), jax.tree.leaves(results[1].x), strict=True
     ):
         np.testing.assert_array_equal(a, b)
 
@@ -80,7 +80,7 @@ def test_estimated_noise_is_the_noise(tumble):
     attitude = jax.vmap(lambda q, e: rj.quaternion.multiply(q, rj.quaternion.exp(e)))(ys.q, turns)
     readings = [(rj.identify.Gyro(), gyro), (rj.identify.AttitudeSensor(), -attitude)]
     record = rj.identify.Recording(ts, *readings)
-    problem = rj.identify.Problem(record, rj.identify.Ratios(), loss=rj.identify.SoftL1())
+    problem = rj.identify.Model(record, rj.identify.Ratios(), loss=rj.identify.SoftL1())
     found = rj.identify.fit(problem, starts=2)
     assert found.ok
     # 80 × 3 readings: the estimate has a standard error of 5 %; a tenth of that is the loss's.
@@ -94,8 +94,8 @@ def test_a_wrong_motion_is_not_called_success(tumble, noise):
     _, ts, _ = tumble
     readings = np.random.default_rng(3).normal(size=(80, 3))
     record = rj.identify.Recording(ts, (rj.identify.Gyro(noise), readings))
-    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=2)
-    assert found.model.word == "does not explain the readings"
+    found = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()), starts=2)
+    assert found.explanation.word == "does not explain the readings"
     assert not any("well determined" in words for words in found.identifiability)
 
 
@@ -105,8 +105,8 @@ def test_a_wrong_motion_is_not_called_outliers(tumble, loss):
     _, ts, _ = tumble
     rng = np.random.default_rng(3)
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), rng.normal(size=(80, 3))))
-    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios(), loss=loss), starts=2)
-    assert found.model.word == "does not explain the readings"
+    found = rj.identify.fit(rj.identify.Model(record, rj.identify.Ratios(), loss=loss), starts=2)
+    assert found.explanation.word == "does not explain the readings"
     assert not any("well determined" in words for words in found.identifiability)
 
 
@@ -121,7 +121,7 @@ def test_a_recording_prints_what_it_holds():
     )
     lately = rj.identify.Recording(1.7e9 + np.linspace(0.0, 10.0, 5), gyro)
     assert repr(lately).startswith("Recording(5 times 1700000000 … 1700000010 s; ")
-    problem = rj.identify.Problem([record, record], rj.identify.PrincipalRatios())
+    problem = rj.identify.Model([record, record], rj.identify.PrincipalRatios())
     # With a leading axis it has no words of its own.
     assert "values=f64[2,5,3]" in repr(problem)
 
@@ -131,7 +131,7 @@ def test_a_plain_function_turns_a_body_in_a_recording(tumble):
     gyro = (rj.identify.Gyro(0.01), ys.omega)
     # A push of none: the ratios are those of the free body.
     record = rj.identify.Recording(ts, gyro, torque=lambda t, state, body: 0 * state.omega)
-    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
+    found = rj.identify.fit(rj.identify.Model(record, rj.identify.Ratios()), starts=2)
     moments, wanted = (np.linalg.eigvalsh(one.tensor) for one in (found.body, body))
     np.testing.assert_allclose(moments / moments[-1], wanted / wanted[-1], rtol=1e-4)
 
@@ -139,7 +139,7 @@ def test_a_plain_function_turns_a_body_in_a_recording(tumble):
 def test_a_fit_that_stops_early_says_so_and_keeps_its_best(tumble):
     _, ts, ys = tumble
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), ys.omega))
-    problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+    problem = rj.identify.Model(record, rj.identify.PrincipalRatios())
     stopped, later = (rj.identify.fit(problem, starts=1, max_steps=n) for n in (1, 2))
     assert not stopped.ok and not stopped.starts[0].converged
     assert np.isfinite(stopped.body.tensor).all()
@@ -156,7 +156,7 @@ def test_interrupting_keeps_what_was_found(tumble):
         raise KeyboardInterrupt
 
     found = rj.identify.fit(
-        rj.identify.Problem(record, rj.identify.Ratios()), starts=4, progress=stop
+        rj.identify.Model(record, rj.identify.Ratios()), starts=4, progress=stop
     )
     assert len(found.starts) == 1
     assert not found.ok and "search: found (interrupted after 1 of 4 starts)" in found.status
@@ -168,14 +168,14 @@ def test_interrupting_is_said_whatever_else_is(tumble, good):
     _, ts, ys = tumble
     read = ys.omega if good else np.random.default_rng(3).normal(size=ys.omega.shape)
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), read))
-    problem = rj.identify.Problem(record, rj.identify.Ratios())
+    problem = rj.identify.Model(record, rj.identify.Ratios())
 
     def stop(line):
         raise KeyboardInterrupt
 
     model = "explains the readings" if good else "does not explain the readings"
     found = rj.identify.fit(problem, starts=4, together=2, progress=stop)
-    assert not found.ok and found.model.word == model
+    assert not found.ok and found.explanation.word == model
     assert "interrupted after 2 of 4 starts" in found.search.reasons
 
     def in_descent(line):
@@ -184,7 +184,7 @@ def test_interrupting_is_said_whatever_else_is(tumble, good):
 
     how = rj.identify.Descent(optax.sgd(1e-9), steps=2, batch=1)
     found = rj.identify.fit(problem, starts=3, descent=how, progress=in_descent)
-    assert not found.ok and found.model.word == model
+    assert not found.ok and found.explanation.word == model
     assert "interrupted in the descent of start 1 of 3" in found.search.reasons
     assert len(found.starts) == 1
 
@@ -195,15 +195,15 @@ def test_two_numbers_of_one_name_are_refused(tumble):
     gyro = rj.identify.Gyro(0.01, bias=[0.0, 0.0, 0.0])
     record = rj.identify.Recording(ts, (gyro, ys.omega), (gyro, ys.omega))
     free = [
-        rj.identify.Free(lambda r: r.readings[0].sensor.bias, "bias"),
-        rj.identify.Free(lambda r: r.readings[1].sensor.bias, "bias"),
+        rj.identify.Free(lambda s: s.sensors[0].bias, "bias"),
+        rj.identify.Free(lambda s: s.sensors[1].bias, "bias"),
     ]
     with pytest.raises(ValueError, match="Free 'bias': another Free has this name"):
-        rj.identify.Problem(record, rj.identify.Ratios(), free=free)
+        rj.identify.Model(record, rj.identify.Ratios(), free=free)
     for name in ("I1/I3", "Ωx"):
-        free = [rj.identify.Free(lambda r: r.readings[0].sensor.bias, name)]
+        free = [rj.identify.Free(lambda s: s.sensors[0].bias, name)]
         with pytest.raises(ValueError, match=f"Free '{name}': a quantity of the body has this"):
-            rj.identify.Problem(record, rj.identify.Ratios(), free=free)
+            rj.identify.Model(record, rj.identify.Ratios(), free=free)
 
 
 def test_what_cannot_be_seen_is_said():
@@ -212,7 +212,7 @@ def test_what_cannot_be_seen_is_said():
     omega = np.broadcast_to([0.0, 0.0, 1.0], (80, 3))
     noisy = omega + 0.01 * np.random.default_rng(4).normal(size=(80, 3))
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), noisy))
-    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=3)
+    found = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()), starts=3)
     words = " ".join(found.identifiability)
     assert "is not determined by these data" in words
     assert "cannot show the absolute inertia" in words
@@ -240,21 +240,21 @@ def test_mistakes_in_a_recording_are_named(arguments, words):
 def test_other_mistakes_are_named(tumble):
     _, ts, ys = tumble
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), ys.omega))
-    problem = rj.identify.Problem(record, rj.identify.Ratios())
+    problem = rj.identify.Model(record, rj.identify.Ratios())
     with pytest.raises(TypeError, match="wanted a Problem, got Recording"):
         rj.identify.fit(record)
     half = eqx.tree_at(lambda r: r.t, record, record.t.astype(jnp.float16))
     with pytest.raises(TypeError, match="recording: wanted float32 or float64, got float16"):
-        rj.identify.Problem(half, rj.identify.Ratios())
+        rj.identify.Model(half, rj.identify.Ratios())
     broken = rj.Inertia(np.diag([1.0, 2.0, np.nan]))
     with pytest.raises(ValueError, match="body: contains NaN"):
-        rj.identify.Problem(record, rj.identify.PrincipalRatios()).start(broken)
+        rj.identify.Model(record, rj.identify.PrincipalRatios()).start(broken)
     with pytest.raises(ValueError, match=r"rtol: wanted one number, got shape \(2,\)"):
         rj.identify.Adaptive(rtol=np.ones(2))
     with pytest.raises(TypeError, match=r"such as Ratios\(\) or .*got Inertia"):
-        rj.identify.Problem(record, rj.Inertia.from_principal(1.0, 2.0, 3.0))
+        rj.identify.Model(record, rj.Inertia.from_principal(1.0, 2.0, 3.0))
     with pytest.raises(TypeError, match="wanted a Recording, got Problem"):
-        rj.identify.Problem(problem, rj.identify.Ratios())
+        rj.identify.Model(problem, rj.identify.Ratios())
     with pytest.raises(TypeError, match="got ndarray for a sensor"):
         rj.identify.Recording(ts, (np.zeros(3), ys.omega))
     with pytest.raises(ValueError, match="starts: wanted a whole number of at least 1, got 0"):
@@ -276,7 +276,7 @@ def test_a_record_of_another_length_is_the_same_program(caplog):
         motion = rj.simulate(rj.Inertia.from_principal(1.0, 1.6, 2.1), rj.Spin([0.4, 1.2, -0.3]), ts, law)  # fmt: skip
         noise = np.random.default_rng(0).normal(size=(100, 3))[:count]
         record = identify.Recording(ts, (identify.Gyro(), motion.ys.omega + 0.01 * noise), torque=law)  # fmt: skip
-        return identify.fit(identify.Problem(record, identify.Tensor(1.0)), starts=1)
+        return identify.fit(identify.Model(record, identify.Tensor(1.0)), starts=1)
 
     fitted(95)
     with jax.log_compiles(), caplog.at_level("WARNING"):
@@ -284,7 +284,7 @@ def test_a_record_of_another_length_is_the_same_program(caplog):
     # `simulate` is another one, with what it does beside.
     programs = set(re.findall(r"Compiling jit\((\w+)\)", caplog.text))
     assert not programs & {"descend", "_errors_alone", "_linearised", "value_and_slope"}
-    assert short.residuals[0].shape == (92, 3) and short.problem.recording.t.shape == (92,)
+    assert short.residuals[0].shape == (92, 3) and short.model.recording.t.shape == (92,)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stacking, "of_few_lengths", lambda problem: problem)
         plain = fitted(92)

@@ -27,7 +27,7 @@ def fitted(moments, seed, turn=None, noise=0.05):
     rates = identify.simulate_readings(gyro, body, rj.Spin(spin), T, None, key=jax.random.key(seed))
     if turn is not None:
         rates = rates @ turn.T
-    return identify.fit(identify.Problem(identify.Recording(T, (gyro, rates)), identify.Ratios()))
+    return identify.fit(identify.Model(identify.Recording(T, (gyro, rates)), identify.Ratios()))
 
 
 def holds(found, moments):
@@ -177,7 +177,7 @@ def test_real_tosses_of_a_racket_one_by_one():
     for toss in list(rows.values())[:30]:
         data = np.array(toss)[:60]
         record = identify.Recording(data[:, 0], (identify.Gyro(), data[:, 1:]))
-        found = identify.fit(identify.Problem(record, identify.Ratios()))
+        found = identify.fit(identify.Model(record, identify.Ratios()))
         assert found.search.word != "not ended"
         held += all(holds(found, BODIES["racket"]))
     assert held >= 28

@@ -24,8 +24,8 @@ def two_gyros(few, *, count=60, noises=(0.02, 0.1), given=(False, False)):
         (identify.Gyro(kinds[0]), first),
         (identify.Gyro(kinds[1], bias=[0.0, 0.0, 0.0]), second, seen),
     )
-    bias = identify.Free(lambda r: r.readings[1].sensor.bias, "bias")
-    found = identify.fit(identify.Problem(record, identify.Known(SPHERE), free=[bias]), starts=1)
+    bias = identify.Free(lambda s: s.sensors[1].bias, "bias")
+    found = identify.fit(identify.Model(record, identify.Known(SPHERE), free=[bias]), starts=1)
     return found, first, second[seen]
 
 
@@ -76,8 +76,8 @@ def test_a_shared_number_of_few_recordings_has_the_interval_of_student():
         )
         for bias in own
     ]
-    move = identify.Free(lambda r: r.readings[1].sensor.bias, "bias", scale=0.1, spread="estimated")
-    problem = identify.Problem(records, identify.Known(SPHERE), free=[move])
+    move = identify.Free(lambda s: s.sensors[1].bias, "bias", scale=0.1, spread="estimated")
+    problem = identify.Model(records, identify.Known(SPHERE), free=[move])
     low, high = identify.fit(problem, starts=1).interval_of(lambda point: point.values["bias"])
     size = np.sqrt(np.sum((own - own.mean(axis=0)) ** 2) / (3 * (count - 1)))
     half = scipy.stats.t.ppf(0.975, 3 * (count - 1)) * size / np.sqrt(count)
@@ -90,8 +90,8 @@ def test_a_number_that_a_prior_knows_takes_nothing_from_the_errors():
     random, times = np.random.default_rng(1), jnp.linspace(0.0, 1.0, 4)
     rates = 1.0 + 0.1 * random.normal(size=(4, 3))
     record = identify.Recording(times, (identify.Gyro(bias=[0.0, 0.0, 0.0]), rates))
-    bias = identify.Free(lambda r: r.readings[0].sensor.bias, "bias", prior=1e-6)
-    found = identify.fit(identify.Problem(record, identify.Known(SPHERE), free=[bias]), starts=1)
+    bias = identify.Free(lambda s: s.sensors[0].bias, "bias", prior=1e-6)
+    found = identify.fit(identify.Model(record, identify.Known(SPHERE), free=[bias]), starts=1)
     wanted = np.sqrt(np.sum((rates - rates.mean(axis=0)) ** 2) / (3 * 3))
     np.testing.assert_allclose(found.noise[0], wanted, rtol=1e-3)
 
@@ -101,7 +101,7 @@ def test_quantiles():
     wanted = [*scipy.stats.t.ppf(0.95, degrees[:-1]), scipy.stats.norm.ppf(0.95)]
     np.testing.assert_allclose(quantile(0.9, degrees), wanted, rtol=1e-12)
     with pytest.raises(ValueError, match=r"level: wanted a level between 0 and 1, got 1\.96"):
-        identify.fit(rj.datasets.toutatis.problem()).quantities[0].interval(1.96)
+        identify.fit(rj.datasets.toutatis.model()).quantities[0].interval(1.96)
 
 
 @pytest.mark.parametrize(
@@ -113,6 +113,6 @@ def test_the_noise_beside_a_loss_is_that_of_ordinary_readings(share, loss):
     errors = 0.02 * random.normal(size=(300, 3))
     errors[random.random(300) < share] *= 20.0
     record = identify.Recording(jnp.linspace(0.0, 1.0, 300), (identify.Gyro(), 1.0 + errors))
-    found = identify.fit(identify.Problem(record, identify.Known(SPHERE), loss=loss), starts=1)
+    found = identify.fit(identify.Model(record, identify.Known(SPHERE), loss=loss), starts=1)
     # A tenth of outliers moves the median of the others to 0.556, and the noise by 8 %.
     np.testing.assert_allclose(found.noise[0], 0.02 * (1.0 + 0.8 * share), rtol=0.06)

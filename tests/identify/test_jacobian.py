@@ -22,9 +22,9 @@ def test_errors_have_the_derivatives_of_central_differences_in_both_modes():
         omega = rj.simulate(BODY, rj.Spin(spin), ts).ys.omega
         gyro = identify.Gyro(0.01, bias=[0.0, 0.0, 0.0])
         made.append(identify.Recording(ts, (gyro, omega), torque=law))
-    drag = identify.Free(lambda r: r.torque.coefficient, "drag", scale=0.1)
-    bias = identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.1, spread=0.1)
-    problem = identify.Problem(made, identify.PrincipalRatios(), free=[drag, bias])
+    drag = identify.Free(lambda s: s.torque.coefficient, "drag", scale=0.1)
+    bias = identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.1, spread=0.1)
+    problem = identify.Model(made, identify.PrincipalRatios(), free=[drag, bias])
     flat, restore = ravel_pytree(problem.start(BODY))
 
     def errors(x):

@@ -26,7 +26,7 @@ def throw(seed, tau=TAU):
 
 def fitted(gyro, rates):
     record = identify.Recording(TS, (gyro, rates))
-    return identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=1)
+    return identify.fit(identify.Model(record, identify.PrincipalRatios()), starts=1)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -95,7 +95,7 @@ def test_noise_and_jitter_at_once_and_the_report():
 def test_a_known_jitter_widens_what_is_expected():
     def deviation(jitter):
         record = identify.Recording(TS, (identify.Gyro(SIGMA, jitter=jitter), np.ones((101, 3))))
-        problem = identify.Problem(record, identify.PrincipalRatios())
+        problem = identify.Model(record, identify.PrincipalRatios())
         plan = problem.start(BODY, [5.0, 4.0, 4.0])
         return identify.expected(problem, plan)[0].deviation
 
@@ -137,7 +137,7 @@ def test_where_jitter_has_no_meaning_it_is_refused_in_words():
 def test_the_log_density_is_that_of_the_full_covariance():
     found = fitted(identify.Gyro(SIGMA, jitter="estimated"), throw(3))
     wanted = 0.0
-    late = np.asarray(found.problem.records.readings[0].late[0])
+    late = np.asarray(found.model.records.readings[0].late[0])
     for e, v in zip(np.asarray(found.residuals[0]), late, strict=True):
         covariance = SIGMA**2 * np.eye(3) + np.outer(v, v)
         wanted -= 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]

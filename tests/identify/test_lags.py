@@ -34,8 +34,8 @@ def recording(start):
 
 
 def test_moments_and_a_motors_lag_come_back():
-    lag = identify.Free(lambda r: r.torque.source.time, "lag", scale=0.1, positive=True)
-    problem = identify.Problem(recording(0.1), identify.Principal(1.5), free=[lag])
+    lag = identify.Free(lambda s: s.torque.source.time, "lag", scale=0.1, positive=True)
+    problem = identify.Model(recording(0.1), identify.Principal(1.5), free=[lag])
     found = identify.fit(problem, starts=1)
     assert found.ok
     for name, value in {"Ix": 1.0, "Iy": 2.0, "Iz": 2.5, "lag": 0.15}.items():
@@ -46,4 +46,4 @@ def test_moments_and_a_motors_lag_come_back():
 
 def test_pieces_are_refused():
     with pytest.raises(ValueError, match="the torque has states of its own"):
-        pieces(identify.Problem(recording(0.1), identify.Principal(1.5)), 4)
+        pieces(identify.Model(recording(0.1), identify.Principal(1.5)), 4)

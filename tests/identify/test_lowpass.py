@@ -76,8 +76,8 @@ def test_the_model_goes_through_the_filter_and_so_do_its_derivatives():
     t = fine[::20]
     gyro = identify.Gyro(0.01, lowpass=identify.LowPass(6.0, 2))
     record = identify.Recording(t, (gyro, filtered[::20]))
-    move = identify.Free(lambda r: r.readings[0].sensor.lowpass.cutoff, "cutoff", positive=True)
-    problem = identify.Problem(record, identify.PrincipalRatios(), free=[move])
+    move = identify.Free(lambda s: s.sensors[0].lowpass.cutoff, "cutoff", positive=True)
+    problem = identify.Model(record, identify.PrincipalRatios(), free=[move])
     truth = problem.start(BODY, [3.0, 0.5, 4.0])
     flat, back = ravel_pytree(one(local(problem, truth), 0))
 
@@ -106,7 +106,7 @@ def test_a_fit_of_filtered_rates_needs_the_filter():
     found = {}
     for lowpass in (None, identify.LowPass(4.0, 2)):
         record = identify.Recording(t, (identify.Gyro(1e-3, lowpass=lowpass), seen + noise))
-        problem = identify.Problem(record, identify.PrincipalRatios())
+        problem = identify.Model(record, identify.PrincipalRatios())
         found[lowpass is None] = identify.fit(problem, starts=1)
     assert found[False].ok, found[False].status
     low, high = found[False].interval(0.99)["Ix/Iz"]
@@ -159,7 +159,7 @@ def test_a_shorter_record_is_filtered_as_if_it_were_alone(order):
     long, short = (identify.Recording(t[:n], (gyro, omega[:n])) for n in (30, 17))
     errors = []
     for records in ([short], [long, short]):
-        problem = identify.Problem(records, identify.PrincipalRatios())
+        problem = identify.Model(records, identify.PrincipalRatios())
         errors.append(problem.errors(problem.start(BODY, [3.0, 0.5, 4.0]))[0])
     np.testing.assert_allclose(errors[1][1, :17], errors[0][:17], rtol=0, atol=1e-13)
     assert np.isfinite(errors[1]).all()

@@ -49,8 +49,8 @@ def throw(omega, bias, count=60, seed=0, sigma=0.005):
 
 
 FREE = [
-    identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=0.05),
-    identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05, each=True),
+    identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=0.05),
+    identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05, each=True),
 ]
 BIASES = ([0.02, -0.03, 0.01], [0.0, 0.05, 0.0], [-0.04, 0.0, 0.02])
 
@@ -65,7 +65,7 @@ def records():
 
 @pytest.fixture(scope="module")
 def joint(records):
-    problem = identify.Problem(records, identify.Tensor(1.5), free=FREE)
+    problem = identify.Model(records, identify.Tensor(1.5), free=FREE)
     return identify.fit(problem, starts=1)
 
 
@@ -90,7 +90,7 @@ def test_three_throws_of_different_lengths_give_one_body_with_its_scale(joint):
 
 @pytest.mark.slow
 def test_the_blocks_are_the_derivative(joint):
-    problem, at = joint.problem, joint.parameters
+    problem, at = joint.model, joint.x
     (errors, _), (blocks, _) = with_blocks(at, problem)
     where = np.asarray(places(problem, at))
     flat, restore = ravel_pytree(at)
@@ -110,12 +110,12 @@ def test_the_blocks_are_the_derivative(joint):
 
 @pytest.mark.slow
 def test_models_are_compared_and_the_right_one_wins(records, joint):
-    plain = identify.Problem(records, identify.Tensor(1.5), free=FREE[1:])
+    plain = identify.Model(records, identify.Tensor(1.5), free=FREE[1:])
     rows = identify.compare({"drag": joint, "no drag": identify.fit(plain, starts=1)})
     assert [row.name for row in rows] == ["drag", "no drag"]
     assert rows[0].information == 0 and rows[1].information > 10
     short = identify.fit(
-        identify.Problem(records[:1], identify.Tensor(1.5), free=FREE[1:]), starts=1
+        identify.Model(records[:1], identify.Tensor(1.5), free=FREE[1:]), starts=1
     )
     with pytest.raises(ValueError, match="wanted fits of the same readings"):
         identify.compare({"all": joint, "one": short})
@@ -125,7 +125,7 @@ def test_models_are_compared_and_the_right_one_wins(records, joint):
 def test_the_left_out_throw_is_predicted_best_by_the_right_model(records):
     with_drag, without = (
         identify.cross_validate(
-            lambda r, free=free: identify.Problem(r, identify.Tensor(1.5), free=free),
+            lambda r, free=free: identify.Model(r, identify.Tensor(1.5), free=free),
             records,
             starts=1,
         )
@@ -138,7 +138,7 @@ def test_the_left_out_throw_is_predicted_best_by_the_right_model(records):
 def test_priors_hold_what_the_data_cannot_see(records):
     free = [
         identify.Free(
-            lambda r: r.torque.parts[0].momentum.inertia,
+            lambda s: s.torque.parts[0].momentum.inertia,
             "wheel",
             scale=0.2,
             positive=True,
@@ -147,7 +147,7 @@ def test_priors_hold_what_the_data_cannot_see(records):
         FREE[0],
         FREE[1],
     ]
-    found = identify.fit(identify.Problem(records, identify.Tensor(1.5), free=free), starts=1)
+    found = identify.fit(identify.Model(records, identify.Tensor(1.5), free=free), starts=1)
     low, high = found.interval(0.95)["wheel"]
     # The scale of everything hangs on the wheel: its prior is all that is known of it.
     np.testing.assert_allclose(np.log(high / low) / (2 * 1.96), 0.1, rtol=0.1)
@@ -188,7 +188,7 @@ def short_record():
 
 @pytest.mark.slow
 def test_pieces_meet_and_give_the_start(free_record):
-    problem = identify.Problem(free_record, identify.PrincipalRatios())
+    problem = identify.Model(free_record, identify.PrincipalRatios())
     whole = identify.fit(problem, starts=1, pieces=6)
     assert whole.ok
     np.testing.assert_allclose(
@@ -212,7 +212,7 @@ def test_pieces_meet_and_give_the_start(free_record):
 
 @pytest.mark.slow
 def test_profile_agrees_with_the_covariance_where_the_misfit_is_quadratic(free_record):
-    problem = identify.Problem(free_record, identify.PrincipalRatios())
+    problem = identify.Model(free_record, identify.PrincipalRatios())
     found = identify.fit(problem, starts=1)
     low, high = identify.profile(found, "Ix/Iz")
     np.testing.assert_allclose([low, high], found.interval()["Ix/Iz"], rtol=2e-3)
@@ -222,19 +222,19 @@ def test_profile_agrees_with_the_covariance_where_the_misfit_is_quadratic(free_r
 
 @pytest.mark.oldest
 def test_a_design_expects_what_a_fit_then_finds(short_record):
-    problem = identify.Problem(short_record, identify.PrincipalRatios())
+    problem = identify.Model(short_record, identify.PrincipalRatios())
     found = identify.fit(problem, starts=1)
     plan = problem.start(BODY, [0.4, 1.2, -0.3])
     for before, after in zip(identify.expected(problem, plan), found.quantities, strict=True):
         np.testing.assert_allclose(before.deviation, after.deviation, rtol=0.05)
     silent = identify.Recording(short_record.t, (identify.Gyro(), short_record.readings[0].values))
     with pytest.raises(ValueError, match="a Gyro with known noise"):
-        identify.expected(identify.Problem(silent, identify.PrincipalRatios()), plan)
+        identify.expected(identify.Model(silent, identify.PrincipalRatios()), plan)
 
 
 @pytest.mark.slow
 def test_the_best_first_rate_shows_more(free_record):
-    problem = identify.Problem(free_record, identify.PrincipalRatios())
+    problem = identify.Model(free_record, identify.PrincipalRatios())
     start = [0.05, 0.1, 1.3]
     rate, promise = identify.best_first_rate(problem, BODY, start)
     poor = identify.expected(problem, problem.start(BODY, start))
@@ -245,17 +245,17 @@ def test_the_best_first_rate_shows_more(free_record):
 
 @pytest.mark.slow
 def test_many_starts_in_one_vmap_end_where_they_do_one_by_one(free_record):
-    problem = identify.Problem(free_record, identify.PrincipalRatios())
+    problem = identify.Model(free_record, identify.PrincipalRatios())
     alone, at_once = (identify.fit(problem, starts=4, together=n) for n in (1, 4))
     assert len(at_once.starts) == 4
-    np.testing.assert_allclose(at_once.parameters.body, alone.parameters.body, atol=1e-6)
+    np.testing.assert_allclose(at_once.x.body, alone.x.body, atol=1e-6)
 
 
 def test_a_fit_killed_after_any_stride_ends_at_the_same_bits(short_record, tmp_path, monkeypatch):
     """The damping of the strides to come depends on those that were, not on the process."""
     # Steps in strides of three, so that one start has many of them.
     monkeypatch.setattr(stages, "STRIDE", 3)
-    problem = identify.Problem(short_record, identify.PrincipalRatios())
+    problem = identify.Model(short_record, identify.PrincipalRatios())
     path, save = tmp_path / "fit.npz", checkpoint.Checkpoint.save
     places = []
 
@@ -274,7 +274,7 @@ def test_a_fit_killed_after_any_stride_ends_at_the_same_bits(short_record, tmp_p
         return identify.fit(problem, starts=2, max_steps=30, checkpoint=path)
 
     def bits(found):
-        return np.concatenate([np.ravel(x) for x in jax.tree.leaves(found.parameters)])
+        return np.concatenate([np.ravel(x) for x in jax.tree.leaves(found.x)])
 
     whole, count = bits(fit()), len(places)
     # The last horizon took several strides: there is something to be lost.
@@ -286,7 +286,7 @@ def test_a_fit_killed_after_any_stride_ends_at_the_same_bits(short_record, tmp_p
         np.testing.assert_array_equal(bits(fit()), whole, err_msg=f"killed after {last}")
         # Nothing is done twice.
         assert len(places) == count - last
-    other = identify.Problem(short_record, identify.PrincipalRatios(), loss=identify.Huber(0.5))
+    other = identify.Model(short_record, identify.PrincipalRatios(), loss=identify.Huber(0.5))
     with pytest.raises(ValueError, match="the checkpoint of another problem"):
         identify.fit(other, starts=2, checkpoint=path)
 
@@ -297,7 +297,7 @@ def test_a_checkpoint_is_known_by_all_that_the_search_depends_on(short_record):
 
     def print_of(values, noise=0.01, body=None, count=2):
         record = identify.Recording(short_record.t, (identify.Gyro(noise), values))
-        problem = identify.Problem(record, body or identify.PrincipalRatios())
+        problem = identify.Model(record, body or identify.PrincipalRatios())
         odd = jnp.asarray([jnp.inf, jnp.nan])
         return checkpoint.fingerprint([problem.start()] * count, problem, odd, 1e-4)
 
@@ -317,10 +317,10 @@ def test_a_checkpoint_is_known_by_all_that_the_search_depends_on(short_record):
 
 
 def test_a_checkpoint_of_other_options_is_refused(short_record, tmp_path):
-    problem, path = identify.Problem(short_record, identify.PrincipalRatios()), tmp_path / "fit.npz"
+    problem, path = identify.Model(short_record, identify.PrincipalRatios()), tmp_path / "fit.npz"
     found = identify.fit(problem, starts=1, max_steps=20, checkpoint=path)
     again = identify.fit(problem, starts=1, max_steps=20, checkpoint=path)
-    np.testing.assert_array_equal(found.parameters.body, again.parameters.body)
+    np.testing.assert_array_equal(found.x.body, again.x.body)
     for other in ({"max_steps": 21}, {"tolerance": 1e-3}):
         with pytest.raises(ValueError, match="of another problem, or of other options"):
             identify.fit(problem, starts=1, checkpoint=path, **{"max_steps": 20, **other})
@@ -341,7 +341,7 @@ def test_sensors_and_wheels_of_one_kind_have_names_of_their_own(tmp_path):
 
 @pytest.mark.parametrize("kind", ["empty", "cut", "text", "table", "fewer"])
 def test_a_damaged_checkpoint_is_told_in_words(short_record, tmp_path, kind):
-    problem = identify.Problem(short_record, identify.PrincipalRatios())
+    problem = identify.Model(short_record, identify.PrincipalRatios())
     path = tmp_path / "fit.npz"
     like = Tried(problem.start(), jnp.asarray(1.0), jnp.asarray(True))
     checkpoint.Checkpoint(path, like, "2").save([like], checkpoint.SearchState(1, 0, like))
@@ -363,7 +363,7 @@ def test_a_damaged_checkpoint_is_told_in_words(short_record, tmp_path, kind):
 
 
 def test_a_checkpoint_needs_its_folder_before_the_search_begins(short_record, tmp_path):
-    problem = identify.Problem(short_record, identify.PrincipalRatios())
+    problem = identify.Model(short_record, identify.PrincipalRatios())
     with pytest.raises(ValueError, match=r"there is no folder .*absent"):
         identify.fit(problem, starts=1, checkpoint=tmp_path / "absent" / "fit.npz")
     with pytest.raises(ValueError, match="wanted a file, this is a folder"):
@@ -378,9 +378,9 @@ from rigidjax import identify
 ts = jnp.linspace(0.0, 30.0, 121)
 omega = rj.simulate(rj.Inertia.from_principal(1.0, 1.6, 2.1), rj.Spin([0.4, 1.2, -0.3]), ts).ys.omega
 read = np.asarray(omega) + 0.01 * np.random.default_rng(9).normal(size=omega.shape)
-problem = identify.Problem(identify.Recording(ts, (identify.Gyro(0.01), read)), identify.Ratios())
+problem = identify.Model(identify.Recording(ts, (identify.Gyro(0.01), read)), identify.Ratios())
 found = identify.fit(problem, starts=int(sys.argv[2]), checkpoint=sys.argv[1], progress=print)
-np.save(sys.argv[3], np.concatenate([np.ravel(x) for x in jax.tree.leaves(found.parameters)]))
+np.save(sys.argv[3], np.concatenate([np.ravel(x) for x in jax.tree.leaves(found.x)]))
 """
 
 
@@ -436,7 +436,7 @@ def test_the_command_line_reads_wheels_and_writes_reports(
     assert "http" not in text
     assert "throw1.csv" in text and "95 % interval" in text
     if not own:
-        _asks_for(asked, joint.problem)
+        _asks_for(asked, joint.model)
 
 
 def _asks_for(asked, wanted):
@@ -503,20 +503,20 @@ MISTAKES = [
 @pytest.mark.usefixtures("unhooked")
 def test_what_is_free_is_checked(records, free, words):
     with pytest.raises(ValueError, match=words):
-        identify.Problem(records, identify.Tensor(1.5), free=[free(records)])
+        identify.Model(records, identify.Tensor(1.5), free=[free(records)])
 
 
 @pytest.mark.usefixtures("unhooked")
 def test_other_mistakes_are_named(records, short_record):
     with pytest.raises(ValueError, match="the one at index 1 differs from the first"):
-        identify.Problem([records[0], short_record], identify.Tensor(1.5))
+        identify.Model([records[0], short_record], identify.Tensor(1.5))
     with pytest.raises(ValueError, match="at least one Recording, got an empty sequence"):
-        identify.Problem([], identify.Tensor(1.5))
+        identify.Model([], identify.Tensor(1.5))
     with pytest.raises(ValueError, match="has a torque of its own; put both in it"):
-        identify.Problem(records, identify.Tensor(1.5), torque=rj.torques.Damping([1.0, 1, 1]))
+        identify.Model(records, identify.Tensor(1.5), torque=rj.torques.Damping([1.0, 1, 1]))
     marker = identify.Recording([0.0, 1.0], (identify.Marker([0.0, 0, 0]), np.zeros((2, 3))))
     with pytest.raises(ValueError, match=r"wanted Mass\(guess\) or Known"):
-        identify.Problem(marker, identify.Tensor(1.0))
+        identify.Model(marker, identify.Tensor(1.0))
     with pytest.raises(ValueError, match="wanted a positive moment of inertia"):
         identify.Tensor(-1.0)
     with pytest.raises(ValueError, match="substeps: wanted a whole number of at least 1, got 0"):
@@ -535,10 +535,10 @@ def test_free_numbers_are_reported_with_their_units():
     sensor = lambda name: lambda r: getattr(r.readings[0].sensor, name)
     free = [rj.identify.Free(sensor(name), name) for name in ("bias", "scale", "offset")]
     free += [
-        rj.identify.Free(lambda r: r.torque.parts[0].momentum.tilt, "tilt"),
-        rj.identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", unit="N m s"),
+        rj.identify.Free(lambda s: s.torque.parts[0].momentum.tilt, "tilt"),
+        rj.identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", unit="N m s"),
     ]
-    problem = rj.identify.Problem(record, rj.identify.Principal(1e-3), free=free)
+    problem = rj.identify.Model(record, rj.identify.Principal(1e-3), free=free)
     units = {name.split()[0]: unit for name, unit, _ in quantities.labels(problem)}
     wanted = {"bias": "rad/s", "scale": "", "offset": "s", "tilt": "rad", "drag": "N m s"}
     assert {name: units[name] for name in wanted} == wanted
@@ -551,8 +551,8 @@ def test_steps_that_were_asked_for_are_kept_where_they_do():
     record = identify.Recording(ts, (identify.Gyro(0.01), omega), torque=law)
     # More than a fit would take by itself before it goes on with steps as they are needed.
     steps = identify.FixedSteps(40)
-    found = identify.fit(identify.Problem(record, identify.Known(body), integrator=steps), starts=1)
-    assert found.problem.integrator == steps
+    found = identify.fit(identify.Model(record, identify.Known(body), integrator=steps), starts=1)
+    assert found.model.integrator == steps
     np.testing.assert_allclose(found.state0.omega, omega[0], atol=1e-6)
 
 
@@ -562,11 +562,11 @@ def test_steps_that_are_too_long_become_finer(steps):
     law, start = rj.torques.Damping([0.1, 0.2, 0.1]), rj.Spin([0.3, 2.0, 0.2])
     omega = rj.simulate(body, start, ts, law).ys.omega
     record = identify.Recording(ts, (identify.Gyro(1e-4), omega), torque=law)
-    problem = identify.Problem(record, identify.Known(body), integrator=steps)
+    problem = identify.Model(record, identify.Known(body), integrator=steps)
     there = eqx.tree_at(lambda p: p.own.spin, problem.start(), omega[:1] / problem.typical_rate)
     assert np.abs(problem.errors(there)[0]).max() > 1e-4
     found = identify.fit(problem, starts=1)
-    assert found.problem.integrator != steps
+    assert found.model.integrator != steps
     np.testing.assert_allclose(found.state0.omega, omega[0], atol=1e-5)
 
 
@@ -580,6 +580,6 @@ def test_a_motion_that_outlasts_its_digits_is_named():
     ys = rj.simulate(body, start, ts, top).ys
     sensors = ((identify.AttitudeSensor(0.01), ys.q), (identify.Gyro(0.01), ys.omega))
     record = identify.Recording(ts, *sensors, torque=top)
-    problem = identify.Problem(record, identify.Known(body), integrator=identify.Adaptive())
+    problem = identify.Model(record, identify.Known(body), integrator=identify.Adaptive())
     found = identify.fit(problem, starts=1, max_steps=2)
     assert "the shortest steps still change readings by" in found.status

@@ -18,9 +18,9 @@ from rigidjax.identify.uncertainty import covariance as uncertainty
 RNG = np.random.default_rng(0)
 TS = np.linspace(0.0, 2.0, 20)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
-BIAS = lambda r: r.readings[0].sensor.bias
-SCALE = lambda r: r.readings[0].sensor.scale
-SKEW = lambda r: r.readings[0].sensor.skew
+BIAS = lambda s: s.sensors[0].bias
+SCALE = lambda s: s.sensors[0].scale
+SKEW = lambda s: s.sensors[0].skew
 
 
 def records(count, noise=0.01):
@@ -42,7 +42,7 @@ def several(count=9):
         identify.Free(BIAS, "bias", scale=0.02, each=labels, spread=0.01),
         identify.Free(SKEW, "skew", scale=0.01, prior=0.05),
     ]
-    return identify.Problem(records(count), identify.Ratios(), free=free)
+    return identify.Model(records(count), identify.Ratios(), free=free)
 
 
 def start_of(problem):
@@ -133,7 +133,7 @@ def linear_at(problem, sigma=0.01):
 
 def near_a_guess():
     """A problem of one recording, with a prior of the body."""
-    return identify.Problem(records(1), identify.Ratios(), prior=identify.Entropic(BODY, 50.0))
+    return identify.Model(records(1), identify.Ratios(), prior=identify.Entropic(BODY, 50.0))
 
 
 @pytest.mark.parametrize("count", [1, 3, 9])
@@ -174,7 +174,7 @@ def test_the_sandwich_is_the_product_of_its_definition(count):
 def test_what_is_not_determined_is_found_in_the_shared_numbers_and_in_those_of_one_recording():
     # Free motion shows no scale, and a gyro without bias, scale and noise of its own none either:
     # of nine recordings the third has no weight at all.
-    problem = identify.Problem(records(9), identify.Tensor(1.0))
+    problem = identify.Model(records(9), identify.Tensor(1.0))
     linear = linear_at(problem)
     slopes = linear.slopes[0].copy()
     slopes[2] = 0.0
@@ -204,7 +204,7 @@ def test_numbers_that_rows_tie_together_stay_in_the_core():
     # Joints of pieces tie the state of a piece to that of the next one.
     ts = np.linspace(0.0, 8.0, 90)
     rates = np.asarray(rj.simulate(BODY, rj.Spin([1.0, 2.0, 0.5]), ts).ys.omega)
-    whole = identify.Problem(
+    whole = identify.Model(
         identify.Recording(ts, (identify.Gyro(0.01), rates)), identify.Ratios()
     )
     linear = linear_at(pieces(whole, 9, width=0.1))
@@ -226,7 +226,7 @@ def test_fewer_readings_than_numbers_are_told():
         identify.Free(where, name, scale=0.01, each=True)
         for where, name in ((SKEW, "skew"), (SCALE, "scale"))
     ]
-    linear = linear_at(identify.Problem(few, identify.Ratios(), free=free))
+    linear = linear_at(identify.Model(few, identify.Ratios(), free=free))
     found = uncertainty.of_white(linear)
     # Six numbers read and nine of its own in each recording, and five of all.
     assert len(found.null_directions) == linear.size - 54 == 32
@@ -236,7 +236,7 @@ def test_many_recordings_are_fitted_as_few_are():
     problem = several(18)
     found = identify.fit(problem, starts=1)
     assert found.search.word == "found"
-    linear = uncertainty.linearise(problem, found.parameters, found.noises)
+    linear = uncertainty.linearise(problem, found.x, found.noises)
     step = found.seen @ linear.slope
     # At the least misfit the gradient vanishes, in standard deviations.
     assert np.abs(step / np.sqrt(np.diag(np.asarray(found.seen)))).max() < 1e-3

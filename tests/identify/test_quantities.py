@@ -20,7 +20,7 @@ TIMES = np.linspace(0.0, 10.0, 80)
 def fitted():
     motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), TIMES)
     record = identify.Recording(TIMES, (identify.Gyro(0.01), motion.ys.omega))
-    return identify.fit(identify.Problem(record, identify.PrincipalRatios()))
+    return identify.fit(identify.Model(record, identify.PrincipalRatios()))
 
 
 def test_deviations_of_a_good_covariance():
@@ -56,8 +56,8 @@ def test_an_indefinite_information_is_told():
     seen = np.asarray(found.seen).copy()
     seen[0, 0] = -seen[0, 0]
     numbers = quantities(
-        found.problem,
-        values_and_slopes(found.problem, found.parameters, None),
+        found.model,
+        values_and_slopes(found.model, found.x, None),
         seen,
         np.asarray(found.null_directions),
     )
@@ -77,8 +77,8 @@ def test_a_fitted_number_has_a_width():
     # Exact readings whose noise is estimated: round-off is all there is.
     found = fitted()
     exact = quantities(
-        found.problem,
-        values_and_slopes(found.problem, found.parameters, None),
+        found.model,
+        values_and_slopes(found.model, found.x, None),
         1e-40 * np.asarray(found.seen),
         np.zeros((0, 5)),
     )
@@ -86,8 +86,8 @@ def test_a_fitted_number_has_a_width():
         low, high = number.interval(0.95)
         assert low < number.value < high
     still = quantities(
-        found.problem,
-        values_and_slopes(found.problem, found.parameters, None),
+        found.model,
+        values_and_slopes(found.model, found.x, None),
         np.zeros((5, 5)),
         np.zeros((0, 5)),
     )

@@ -35,10 +35,10 @@ def recordings(round_):
 
 def fitted(round_, starts):
     free = [
-        identify.Free(lambda r: r.torque.coefficient, "drag", scale=0.01),
-        identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05),
+        identify.Free(lambda s: s.torque.coefficient, "drag", scale=0.01),
+        identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05),
     ]
-    problem = identify.Problem(recordings(round_), identify.Ratios(), free=free)
+    problem = identify.Model(recordings(round_), identify.Ratios(), free=free)
     return identify.fit(problem, starts=starts, progress=print)
 
 
@@ -55,7 +55,7 @@ def rounds():
 def test_both_rounds_fit_from_blind_starts(rounds):
     for found in rounds:
         print(found.status, found.rms, found.correlation, found.interval(), found.values)
-        assert found.search.word == "found" and found.model.word != "does not explain the readings"
+        assert found.search.word == "found" and found.explanation.word != "does not explain the readings"
         good = [s for s in found.starts if s.converged and s.fits]
         assert len(good) >= 2
 

@@ -63,9 +63,9 @@ def test_a_fit_of_readings_that_no_body_makes(moments):
     read = found.y.T + 1e-3 * np.random.default_rng(0).normal(size=(T.size, 3))
     torque = rj.torques.ConstantTorque(TORQUE)
     record = identify.Recording(T, (identify.Gyro(1e-3), read), torque=torque)
-    fit = identify.fit(identify.Problem(record, Moments()), starts=1)
+    fit = identify.fit(identify.Model(record, Moments()), starts=1)
     np.testing.assert_allclose(jnp.diag(fit.body.tensor), moments, rtol=0.03)
     if moments[2] == 1.9:
         assert fit.ok
     else:
-        assert not fit.ok and fit.model.reasons[0].startswith("no real body has these numbers")
+        assert not fit.ok and fit.explanation.reasons[0].startswith("no real body has these numbers")

@@ -26,12 +26,12 @@ def noisy(values, sigma, seed=0):
 def gyro_problem(values, sensor=None, chart=None, ts=TS, **options):
     sensor = identify.Gyro(0.01) if sensor is None else sensor
     record = identify.Recording(ts, (sensor, values))
-    return identify.Problem(record, chart or identify.PrincipalRatios(), **options)
+    return identify.Model(record, chart or identify.PrincipalRatios(), **options)
 
 
 def off(found):
     """Error of the two log ratios, the larger one."""
-    return np.abs(np.asarray(found.problem.body.logs(found.body)) - RATIOS).max()
+    return np.abs(np.asarray(found.model.body.logs(found.body)) - RATIOS).max()
 
 
 def test_i1_only_ratios_from_free_motion_and_it_says_so():
@@ -116,7 +116,7 @@ def test_i3_no_start_is_called_right_that_is_wrong():
             assert off(found) < 0.05
             right += 1
         else:
-            assert found.search.word == "not ended" or found.model.word != "explains the readings"
+            assert found.search.word == "not ended" or found.explanation.word != "explains the readings"
     assert right >= 30
 
 
@@ -145,7 +145,7 @@ def test_i4_outliers(loss):
 def test_i5_a_bias_in_the_model_is_found():
     bias = np.array([0.03, -0.02, 0.03])
     values = noisy(rates(), 0.01, 3) + bias
-    free = [identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05)]
+    free = [identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05)]
     sensor = identify.Gyro(0.01, bias=[0.0, 0.0, 0.0])
     found = identify.fit(gyro_problem(values, sensor, free=free), starts=2)
     assert found.ok
@@ -186,8 +186,8 @@ def test_i7_a_clock_that_is_late_is_found():
         (identify.AttitudeSensor(0.01), motion.q),
         (identify.Gyro(0.05, offset=0.0), noisy(np.asarray(shifted), 0.05, 5)),
     )
-    free = [identify.Free(lambda r: r.readings[1].sensor.offset, "offset", scale=0.01)]
-    problem = identify.Problem(record, identify.PrincipalRatios(), free=free)
+    free = [identify.Free(lambda s: s.sensors[1].offset, "offset", scale=0.01)]
+    problem = identify.Model(record, identify.PrincipalRatios(), free=free)
     found = identify.fit(problem, starts=1)
     assert found.ok
     low, high = found.interval(0.997)["offset"]
@@ -204,10 +204,10 @@ def test_i8_a_masked_sample_is_an_absent_one_bit_for_bit():
     masked = identify.Recording(TS, (identify.Gyro(0.01), gaps, mask))
     absent = identify.Recording(np.asarray(TS)[mask], (identify.Gyro(0.01), values[mask]))
     found = [
-        identify.fit(identify.Problem(r, identify.PrincipalRatios()), starts=1)
+        identify.fit(identify.Model(r, identify.PrincipalRatios()), starts=1)
         for r in (masked, absent)
     ]
-    for a, b in zip(*(jax.tree.leaves(f.parameters) for f in found), strict=True):
+    for a, b in zip(*(jax.tree.leaves(f.x) for f in found), strict=True):
         np.testing.assert_array_equal(a, b)
     with pytest.raises(ValueError, match="Gyro: the reading at index 7 contains NaN; mask it"):
         identify.Recording(TS, (identify.Gyro(0.01), gaps))

@@ -33,7 +33,7 @@ TS = np.linspace(0.0, 1.0, 8)
 @pytest.fixture
 def problem():
     record = identify.Recording(TS, (identify.Gyro(0.1), np.ones((8, 3))))
-    return identify.Problem(record, identify.PrincipalRatios())
+    return identify.Model(record, identify.PrincipalRatios())
 
 
 def at(problem, value):
@@ -65,7 +65,7 @@ def test_a_stride_that_is_lost_leaves_where_it_began_and_its_misfit(problem, mon
         seen.append((strides, over))
 
     out = settle(Tried(at(problem, 2.0)), Task(problem, (), 1e-4, 100), jnp.ones((1, 8)), note)
-    assert place(out.parameters) == 2.0 and float(out.cost) == 7.0
+    assert place(out.x) == 2.0 and float(out.cost) == 7.0
     assert not bool(out.converged) and seen == [(1, True)]
 
 
@@ -97,7 +97,7 @@ def test_what_explains_the_whole_record_at_once_is_not_fitted_in_parts(problem, 
 
     monkeypatch.setattr(stages, "descend", step)
     out = climb(SearchState(0, 0, Tried(at(problem, 0.0))), Task(problem, (), 1e-4, 25))
-    assert begun == [1.0] and place(out.parameters) == 1.0 and bool(out.converged)
+    assert begun == [1.0] and place(out.x) == 1.0 and bool(out.converged)
 
 
 class Blast(rj.torques.AbstractTorque):
@@ -121,7 +121,7 @@ def pushed():
         torque = rj.torques.Sum(law, Blast(jnp.asarray(lost_after)))
         record = identify.Recording(ts, (identify.Gyro(0.01), read), torque=torque)
         chart = identify.Principal(1.5)
-        return identify.Problem(record, chart, integrator=identify.FixedSteps(2))
+        return identify.Model(record, chart, integrator=identify.FixedSteps(2))
 
     return problem
 

@@ -140,7 +140,7 @@ def test_a_sensor_of_ones_own():
     ys = rj.simulate(body, rj.Spin([0.3, 1.2, 0.4]), ts).ys
     squares = jnp.sum(ys.omega**2, axis=1, keepdims=True)
     record = rj.identify.Recording(ts, (Tachometer(), squares), (rj.identify.Gyro(1e-4), ys.omega))
-    problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+    problem = rj.identify.Model(record, rj.identify.PrincipalRatios())
     truth = problem.start(body, ys.omega[0])
     for error in problem.errors(truth):
         np.testing.assert_allclose(error, 0, atol=1e-12)
@@ -161,7 +161,7 @@ def test_mistakes_in_a_sensor_of_ones_own_are_named():
     def errors(sensor):
         gyro = (rj.identify.Gyro(1e-4), jnp.ones((40, 3)))
         record = rj.identify.Recording(ts, (sensor, readings), gyro)
-        problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+        problem = rj.identify.Model(record, rj.identify.PrincipalRatios())
         return problem.errors(problem.start(body, [1.0, 1.0, 1.0]))
 
     with pytest.raises(ValueError, match=r"Scalar.error: wanted .* of shape \(1,\), .*got \(\)"):

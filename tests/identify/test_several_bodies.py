@@ -41,9 +41,9 @@ def throw(name, omega, own, seed):
 
 
 FREE = [
-    identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=0.05, each="body"),
-    identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05, spread=0.01),
-    identify.Free(lambda r: r.readings[0].sensor.skew, "skew", scale=0.02),
+    identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=0.05, each="body"),
+    identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05, spread=0.01),
+    identify.Free(lambda s: s.sensors[0].skew, "skew", scale=0.02),
 ]
 BIAS = np.array([0.03, -0.02, 0.01])
 
@@ -63,7 +63,7 @@ def records():
 @pytest.fixture(scope="module")
 def found(records):
     charts = {"box": identify.Tensor(1.5), "rod": identify.Known(BODIES["rod"])}
-    return identify.fit(identify.Problem(records, charts, free=FREE), starts=1)
+    return identify.fit(identify.Model(records, charts, free=FREE), starts=1)
 
 
 def test_one_sensor_is_found_from_two_bodies_of_which_one_is_known(found):
@@ -93,7 +93,7 @@ def test_the_shared_bias_is_as_sure_as_its_spread_allows(found):
 
 
 def test_each_recording_depends_on_its_own_body_and_group(found):
-    problem, at = found.problem, found.parameters
+    problem, at = found.model, found.x
     mine = local(problem, at)
     # Of the known body no number is free: its columns are those of no number.
     where = np.asarray(places(problem, at))
@@ -125,7 +125,7 @@ def test_noise_is_estimated_by_group(records, each, wanted):
         for name, rows in records.items()
     }
     charts = {name: identify.Known(body) for name, body in BODIES.items()}
-    problem = identify.Problem(silent, charts, noise_each=each)
+    problem = identify.Model(silent, charts, noise_each=each)
     rng = np.random.default_rng(3)
     errors = (np.array([0.02, 0.05, 0.1, 0.1])[:, None, None] * rng.normal(size=(4, 60, 3)),)
     first = (jnp.ones((4, 3)),)
@@ -163,14 +163,14 @@ def test_mistakes_are_named(records, change, kind, words):
     charts = {"box": identify.Tensor(1.5), "rod": identify.Known(BODIES["rod"])}
     given = {"recording": records, "body": charts} | change(records)
     with pytest.raises(kind, match=words):
-        identify.Problem(given.pop("recording"), given.pop("body"), **given)
+        identify.Model(given.pop("recording"), given.pop("body"), **given)
 
 
 @pytest.mark.usefixtures("unhooked")
 def test_a_spread_needs_a_shared_value():
     with pytest.raises(ValueError, match="each=True has none; give prior"):
-        identify.Free(lambda r: r.readings[0].sensor.bias, "b", each=True, spread=0.1)
+        identify.Free(lambda s: s.sensors[0].bias, "b", each=True, spread=0.1)
     with pytest.raises(ValueError, match=r"each: wanted .*body.*got .*throw"):
-        identify.Free(lambda r: r.readings[0].sensor.bias, "b", each="throw")
+        identify.Free(lambda s: s.sensors[0].bias, "b", each="throw")
     with pytest.raises(TypeError, match="each: wanted True, False"):
-        identify.Free(lambda r: r.readings[0].sensor.bias, "b", each=None)
+        identify.Free(lambda s: s.sensors[0].bias, "b", each=None)

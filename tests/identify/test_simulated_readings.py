@@ -105,6 +105,6 @@ def test_mistakes_are_named():
         simulate_readings(identify.Gyro(), spin, TOP, TS)
     record = identify.Recording([0.0, 1.0], (identify.Gyro(), np.ones((2, 3))))
     with pytest.raises(TypeError, match=r"got Inertia; give a known body as Known\(body\)"):
-        identify.Problem(record, TOP)
+        identify.Model(record, TOP)
     with pytest.raises(TypeError, match=r"typical: .*one number, kg m², got Inertia; give a known"):
         identify.Principal(TOP)

@@ -37,7 +37,7 @@ def gyro(rates, noise=SIGMA, chart=None, ts=TS, starts=2, **options):
     """A gyro alone."""
     record = identify.Recording(ts, (identify.Gyro(noise), rates), **options)
     return identify.fit(
-        identify.Problem(record, chart or identify.PrincipalRatios()), starts=starts
+        identify.Model(record, chart or identify.PrincipalRatios()), starts=starts
     )
 
 
@@ -46,21 +46,21 @@ def both(rates, turns, ts=TS, **sensor):
     record = identify.Recording(
         ts, (identify.Gyro(**sensor), rates), (identify.AttitudeSensor(), turns)
     )
-    return identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=2)
+    return identify.fit(identify.Model(record, identify.PrincipalRatios()), starts=2)
 
 
 def wheel(rates, named, free=True):
     """A gyro on a body with a wheel and drag."""
-    moves = [identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=0.05)]
+    moves = [identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=0.05)]
     record = identify.Recording(TS, (identify.Gyro(), rates), torque=named)
-    problem = identify.Problem(record, identify.Principal(1.5), free=moves if free else [])
+    problem = identify.Model(record, identify.Principal(1.5), free=moves if free else [])
     return identify.fit(problem, starts=2)
 
 
 def together(*readings):
     """Throws of one body."""
     records = [identify.Recording(TS, (identify.Gyro(SIGMA), r)) for r in readings]
-    return identify.fit(identify.Problem(records, identify.PrincipalRatios()), starts=2)
+    return identify.fit(identify.Model(records, identify.PrincipalRatios()), starts=2)
 
 
 def unlike(rates):
@@ -96,7 +96,7 @@ def weighed(unit):
     read = identify.simulate_readings(sensors, BODY, start, TS, key=jax.random.key(0))
     unknown = identify.Accelerometer(place=[0.3, 0.0, 0.1])
     record = identify.Recording(TS, (sensors[0], read[0]), (unknown, read[1] / unit))
-    return identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=2)
+    return identify.fit(identify.Model(record, identify.PrincipalRatios()), starts=2)
 
 
 def still(momentum=0.1):
@@ -218,7 +218,7 @@ def test_no_wrong_set_up_is_called_ok(name):
     said = " ".join(str(cause) for cause in found.causes)
     assert (CAUSES[name] in said) if name in CAUSES else not found.causes, said
     # Wrong all the same where the errors are as small as those of real records.
-    sizes = found.model.reasons
+    sizes = found.explanation.reasons
     assert sizes and sizes[0].startswith("the errors of the ")
 
 
@@ -233,11 +233,11 @@ def test_every_right_set_up_is_called_ok(name):
 
 def test_a_fit_prints_its_table_its_answers_and_what_follows():
     found = gyro(tumble()[0] + BIAS)
-    assert (found.search.word, found.model.word) == ("found", "leaves a part")
+    assert (found.search.word, found.explanation.word) == ("found", "leaves a part")
     table, words = str(found).split("\n\n")
     assert table == identify.report.table(identify.report.rows(found))
     lines = words.splitlines()
-    assert lines[:2] == ["search: found", f"model: {found.model}"]
+    assert lines[:2] == ["search: found", f"model: {found.explanation}"]
     assert "2.25 times the noise" in lines[1] and lines[2] == str(found.causes[0])
     assert lines[3] == found.advice and "let a Free move the sensor's bias" in found.advice
     # The other body that has these rates with an axis mirrored.
@@ -245,7 +245,7 @@ def test_a_fit_prints_its_table_its_answers_and_what_follows():
     assert "Ix/Iz" in found._repr_html_() and "search: found" in found._repr_html_()
     held = identify.report.as_dict(found)
     assert held["search"] == {"answer": "found", "reasons": []}
-    assert held["model"] == {"answer": "leaves a part", "reasons": list(found.model.reasons)}
+    assert held["model"] == {"answer": "leaves a part", "reasons": list(found.explanation.reasons)}
     assert held["causes"][0]["name"] == "bias" and held["advice"] == found.advice
 
 
@@ -287,7 +287,7 @@ def test_time_stamps_that_scatter_are_named_and_can_be_a_sensor():
         rates = rates + 0.02 * rng.normal(size=(101, 3))
         for gyro in (identify.Gyro(0.02), identify.Gyro(0.02, jitter=5e-3)):
             record = identify.Recording(ts, (gyro, rates))
-            found = identify.fit(identify.Problem(record, identify.Ratios()), starts=2)
+            found = identify.fit(identify.Model(record, identify.Ratios()), starts=2)
             assert found.ok == (gyro.jitter is not None)
             if not found.ok:
                 assert "time stamps that scatter" in str(found)
@@ -305,5 +305,5 @@ def test_many_short_recordings_are_no_correlated_errors():
     motions = jax.vmap(lambda rate: rj.simulate(BODY, rj.Spin(rate), ts).ys.omega)(rates)
     read = np.asarray(motions) + SIGMA * np.random.default_rng(1).normal(size=motions.shape)
     records = [identify.Recording(ts, (identify.Gyro(SIGMA), rows)) for rows in read]
-    found = identify.fit(identify.Problem(records, identify.Ratios()), starts=1)
+    found = identify.fit(identify.Model(records, identify.Ratios()), starts=1)
     assert found.status == "ok"

@@ -26,7 +26,7 @@ def problem():
         clean = rj.simulate(BODY, rj.Spin(omega), TS).ys.omega
         read = clean + SIGMA * rng.normal(size=clean.shape)
         records.append(identify.Recording(TS, (identify.Gyro(SIGMA), read)))
-    return identify.Problem(records, identify.PrincipalRatios())
+    return identify.Model(records, identify.PrincipalRatios())
 
 
 NOISE = (jnp.full((24, 3), SIGMA),)

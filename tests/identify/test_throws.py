@@ -50,7 +50,7 @@ def test_no_throw_diverges_from_a_blind_start(found, model):
     for group in GROUPS:
         # Errors of tenths of a per cent are not white: the status says so.
         assert {f.search.word for f in found[group][model]} == {"found"}
-        assert "does not explain the readings" not in {f.model.word for f in found[group][model]}
+        assert "does not explain the readings" not in {f.explanation.word for f in found[group][model]}
 
 
 def test_a_right_throw_has_no_cause_of_its_errors_and_one_read_wrong_has_its_own(found, model):
@@ -69,7 +69,7 @@ def test_a_right_throw_has_no_cause_of_its_errors_and_one_read_wrong_has_its_own
     def rates(r):
         return r.readings[0].values
 
-    words = changed(lambda r: r.torque.parts[0].momentum.inertia, lambda x: -x)
+    words = changed(lambda s: s.torque.parts[0].momentum.inertia, lambda x: -x)
     assert words == "most likely the torque with the other sign"
     assert changed(rates, np.degrees) == "most likely deg/s read as rad/s"
     words = changed(rates, lambda w: w * np.array([1.0, -1.0, 1.0]))
@@ -151,14 +151,14 @@ def test_a_drag_that_can_drive_does_not_lose_a_throw():
     # Fitted to a quarter of this throw, quadratic drag and bias run away beyond it.
     record = throws.record(throws.FOLDER / "object_empty_log00184.csv")
     law = rj.torques.Sum(record.torque.parts[0], rj.torques.QuadraticDamping([0.0, 0.0, 0.0]))
-    record = eqx.tree_at(lambda r: r.torque, record, law)
+    record = eqx.tree_at(lambda s: s.torque, record, law)
     free = [
-        identify.Free(lambda r: r.torque.parts[0].momentum.delay, "delay", scale=1e-3, each=True),
-        identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=1e-6),
-        identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05),
+        identify.Free(lambda s: s.torque.parts[0].momentum.delay, "delay", scale=1e-3, each=True),
+        identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=1e-6),
+        identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05),
     ]
-    found = identify.fit(identify.Problem(record, identify.Tensor(3e-4), free=free), starts=1)
-    assert found.search.word == "found" and found.model.word != "does not explain the readings"
+    found = identify.fit(identify.Model(record, identify.Tensor(3e-4), free=free), starts=1)
+    assert found.search.word == "found" and found.explanation.word != "does not explain the readings"
     # Linear drag explains the same throw with 0.05 rad/s.
     assert found.rms[0] < 0.1
 

@@ -26,7 +26,7 @@ def toss():
 
 
 def test_a_real_flat_body_has_intervals_with_a_width(toss):
-    found = identify.fit(identify.Problem(toss, identify.Ratios()))
+    found = identify.fit(identify.Model(toss, identify.Ratios()))
     for low, high in found.interval().values():
         assert low < high
     values = np.linalg.eigvalsh(np.asarray(found.seen))
@@ -34,7 +34,7 @@ def test_a_real_flat_body_has_intervals_with_a_width(toss):
     words = " ".join(found.identifiability)
     assert "±0 " not in words and "I1/I3 is well determined" not in words
     # In principal axes nothing is so weakly seen: deviations of the same ratios, same order.
-    other = identify.fit(identify.Problem(toss, identify.PrincipalRatios()))
+    other = identify.fit(identify.Model(toss, identify.PrincipalRatios()))
     wanted = other.quantities[1].deviation
     assert 0.5 * wanted < found.quantities[0].deviation < 2.5 * wanted
     assert all(len(cell) < 12 for row in report.rows(found) for cell in report.numbers(*row[1:4]))
@@ -42,8 +42,8 @@ def test_a_real_flat_body_has_intervals_with_a_width(toss):
 
 def test_the_sandwich_is_that_of_its_definition(toss):
     # H⁻¹ M H⁻¹ from the slopes themselves where nothing is weakly seen, M's errors in time by hand.
-    found = identify.fit(identify.Problem(toss, identify.PrincipalRatios()))
-    linear = linearise(found.problem, found.parameters, found.noises)
+    found = identify.fit(identify.Model(toss, identify.PrincipalRatios()))
+    linear = linearise(found.model, found.x, found.noises)
     times = correlation_times(linear)
     got = spread(linear, times)
     slopes = linear.slopes[0][0] * np.sqrt(linear.weights[0][0])[:, None, None]
@@ -92,8 +92,8 @@ def test_what_a_prior_tells_is_as_sure_beside_errors_that_are_autocorrelated():
     for k in range(1, len(errors)):
         errors[k] = 0.8 * errors[k - 1] + 0.6 * errors[k]
     record = identify.Recording(ts, (identify.Gyro(0.01), rates + 0.01 * errors), torque=law)
-    wheel = identify.Free(lambda r: r.torque.momentum.inertia, "wheel", positive=True, prior=0.05)
-    found = identify.fit(identify.Problem(record, identify.Principal(3e-4), free=[wheel]), starts=1)
+    wheel = identify.Free(lambda s: s.torque.momentum.inertia, "wheel", positive=True, prior=0.05)
+    found = identify.fit(identify.Model(record, identify.Principal(3e-4), free=[wheel]), starts=1)
     assert found.covariance_kind.startswith("sandwich")
 
     def half(power):

@@ -26,8 +26,8 @@ def fit_with(chart, directions, search="found", model="explains the readings", m
     record = identify.Recording(
         TS, (gyro, np.ones((5, 3))), (identify.AttitudeSensor(0.01), turned)
     )
-    bias = identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05)
-    problem = identify.Problem(record, chart, free=[bias])
+    bias = identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05)
+    problem = identify.Model(record, chart, free=[bias])
     here = problem.start(BODY)
     nothing = jax.tree.map(jnp.zeros_like, here)
     null = np.stack([np.asarray(ravel_pytree(make(nothing))[0]) for make in directions])
@@ -63,7 +63,7 @@ def test_combinations_are_told_apart_and_named():
         return eqx.tree_at(lambda p: p.shared, moved, (jnp.array([0.0, 0.0, -20.0]),))
 
     probe = fit_with(identify.Principal(1.5), [grown])
-    first, step_rate = probe.problem.unpack(probe.parameters)[1].q, 1 / probe.problem.typical_rate
+    first, step_rate = probe.model.unpack(probe.x)[1].q, 1 / probe.model.typical_rate
     assert rj.quaternion.angle(first) > 0.1  # so that the world's axes are not the body's
     mix = np.random.default_rng(0).normal(size=(3, 3))
     found = fit_with(identify.Principal(1.5), [grown, heading, spun], mix=mix).undetermined

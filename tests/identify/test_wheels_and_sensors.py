@@ -103,7 +103,7 @@ def test_what_sensors_feel_of_the_motors(integrator):
     )
     values = (omega, late, omega + force @ SENSITIVITY.T, force, speeds)
     body = law.without_wheels(LOCKED)
-    problem = identify.Problem(
+    problem = identify.Model(
         record(law, sensors, values), identify.Known(body), integrator=integrator
     )
     spin = jnp.asarray(OMEGA)[None] / problem.typical_rate
@@ -123,11 +123,11 @@ def test_an_accelerometer_off_the_centre_finds_the_bearings_friction():
     sensors = (identify.Gyro(1e-3), identify.Accelerometer(0.02, place=[0.2, 0.0, 0.4]))
     values = (omega + 1e-3 * noise[0], force + 0.02 * noise[1])
     free = [
-        identify.Free(lambda r: r.torque.viscous, "friction", scale=0.02),
-        identify.Free(lambda r: r.readings[1].sensor.place, "place", scale=0.1),
+        identify.Free(lambda s: s.torque.viscous, "friction", scale=0.02),
+        identify.Free(lambda s: s.sensors[1].place, "place", scale=0.1),
     ]
     body = identify.Known(guess.without_wheels(LOCKED))
-    problem = identify.Problem(record(guess, sensors, values), body, free=free)
+    problem = identify.Model(record(guess, sensors, values), body, free=free)
     found = identify.fit(problem, starts=1)
     assert found.ok
     np.testing.assert_allclose(found.values["friction"], FRICTION, rtol=0, atol=1e-3)

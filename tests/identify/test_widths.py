@@ -28,9 +28,9 @@ def spread_of(random, width, count=8, noise=0.02):
             identify.Recording(TIMES, (identify.AttitudeSensor(1e-4), states.q), (gyro, rates))
         )
         means.append(own + error.mean(axis=0))
-    move = identify.Free(lambda r: r.readings[1].sensor.bias, "bias", scale=0.1, spread="estimated")
+    move = identify.Free(lambda s: s.sensors[1].bias, "bias", scale=0.1, spread="estimated")
     chart = identify.Known(sphere)
-    found = identify.fit(identify.Problem(records, chart, free=[move]), starts=1)
+    found = identify.fit(identify.Model(records, chart, free=[move]), starts=1)
     means = np.stack(means)
     between = np.sum((means - means.mean(axis=0)) ** 2) / (3 * (count - 1))
     return found, np.sqrt(max(between - noise**2 / 20, 0.0))
@@ -48,13 +48,13 @@ def test_the_width_is_that_of_the_one_way_model():
 def test_a_given_spread_stays_and_mistakes_are_named():
     rates = jnp.ones((20, 3))
     records = [identify.Recording(TIMES, (identify.Gyro(0.1, bias=[0, 0, 0]), rates))] * 3
-    bias = lambda r: r.readings[0].sensor.bias
+    bias = lambda s: s.sensors[0].bias
     given = identify.Free(bias, "bias", spread=0.3)
-    problem = identify.Problem(records, identify.PrincipalRatios(), free=[given])
+    problem = identify.Model(records, identify.PrincipalRatios(), free=[given])
     assert not problem.slots[0].estimated
     estimated = identify.Free(bias, "bias", spread="estimated")
     with pytest.raises(ValueError, match="from three recordings or more, got 2; give it"):
-        identify.Problem(records[:2], identify.PrincipalRatios(), free=[estimated])
+        identify.Model(records[:2], identify.PrincipalRatios(), free=[estimated])
     for wrong in ("guessed", -1.0):
         with pytest.raises((TypeError, ValueError), match="Free 'bias': spread: wanted"):
             identify.Free(bias, "bias", spread=wrong)

@@ -52,13 +52,13 @@ def record(path):
 
 def problem(recordings, model):
     free = [
-        identify.Free(lambda r: r.torque.parts[0].momentum.delay, "delay", scale=1e-3, each=True)
+        identify.Free(lambda s: s.torque.parts[0].momentum.delay, "delay", scale=1e-3, each=True)
     ]
     if "drag" in model:
-        free.append(identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=1e-5))
+        free.append(identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=1e-5))
     if "bias" in model:
-        free.append(identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05))
-    return identify.Problem(recordings, identify.Tensor(3e-4), free=free)
+        free.append(identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05))
+    return identify.Model(recordings, identify.Tensor(3e-4), free=free)
 
 
 def fits(group, model):

@@ -233,7 +233,7 @@ def found():
     rates = rj.simulate(SOLID, rj.Spin([1.0, 0.2, 0.8]), TS).ys.omega
     noise = 0.01 * np.random.default_rng(1).standard_normal(rates.shape)
     record = rj.identify.Recording(TS, (rj.identify.Gyro(0.01), rates + noise))
-    return rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=1)
+    return rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()), starts=1)
 
 
 @pytest.mark.slow

@@ -75,7 +75,7 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ("rotation.so3.determinant", "a: huge", "a silent NaN*", OVERFLOW),
     ("body.parameters.unpack_*", "vector: huge", "a silent NaN*", OVERFLOW),
     ("body.parameters.flat_bend", "shape: huge", "a silent NaN*", OVERFLOW),
-    ("identify.Problem.unpack", "parameters: huge", "a silent NaN*", OVERFLOW),
+    ("identify.Model.unpack", "parameters: huge", "a silent NaN*", OVERFLOW),
     # Domains.
     (
         "body.matrix_function",

@@ -45,7 +45,7 @@ row(
 )
 row(
     "estimate.Walk",
-    dict(where=lambda r: r.readings[0].sensor.bias, deviation=0.1, density=0.2),
+    dict(where=lambda s: s.sensors[0].bias, deviation=0.1, density=0.2),
     arguments=("deviation", "density"),
     groups=("stranger", "nan", "inf"),
     transforms=(),

@@ -78,13 +78,13 @@ row("identify.Adaptive", dict(rtol=1e-6, atol=1e-9), **HOST)
 row("identify.FixedSteps", dict(substeps=2), transforms=())
 row(
     "identify.Free",
-    dict(where=lambda r: r.readings[0].sensor.noise, name="noise", scale=0.1, prior=0.5),
+    dict(where=lambda s: s.sensors[0].noise, name="noise", scale=0.1, prior=0.5),
     arguments=("where", "scale", "prior"),
     **HOST,
 )
 row("identify.Descent", lambda: dict(optimiser=optax.adam(1e-2), steps=3, batch=1), transforms=())
 row(
-    "identify.Problem",
+    "identify.Model",
     lambda: dict(
         recording=s.recording(),
         body=rj.identify.PrincipalRatios(),
@@ -96,14 +96,14 @@ row(
     **HOST,
 )
 row(
-    "identify.Problem.start",
+    "identify.Model.start",
     lambda: dict(self=s.problem(), body=s.inertia(), omega=W),
     arguments=("body", "omega"),
 )
 plan = lambda: s.problem().start(s.inertia())
 for name in ("unpack", "values", "scenes", "motion", "errors"):
     row(
-        f"identify.Problem.{name}",
+        f"identify.Model.{name}",
         lambda: dict(self=s.problem(), parameters=plan()),
         arguments=("parameters",),
         traced=("parameters",),
@@ -149,7 +149,7 @@ row("identify.compare", lambda: dict(fits={"a": s.found(), "b": s.found()}), tra
 row(
     "identify.cross_validate",
     lambda: dict(
-        build=lambda records: rj.identify.Problem(records, rj.identify.PrincipalRatios()),
+        build=lambda records: rj.identify.Model(records, rj.identify.PrincipalRatios()),
         recordings=[s.recording(), s.recording()],
     ),
     run=lambda build, recordings: rj.identify.cross_validate(build, recordings, starts=1),

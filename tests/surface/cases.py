@@ -684,19 +684,19 @@ def fits() -> list[Case]:
         ("free, repeated reads", [whole, short], None),
         ("forced, repeated reads", [whole, short], s.damping()),
     ):
-        problem = identify.Problem(
+        problem = identify.Model(
             recordings, identify.Ratios() if torque is None else identify.Tensor(2.0), torque=torque,
             integrator=None if torque is None else identify.FixedSteps(2),
         )  # fmt: skip
         flat, restore = jax.flatten_util.ravel_pytree(problem.start(s.inertia()))
         found.append(
             Case(
-                f"identify.Problem.errors, {name}",
+                f"identify.Model.errors, {name}",
                 lambda x, problem=problem, restore=restore: problem.errors(restore(x)),
                 {"start": np.asarray(flat), "elsewhere": np.asarray(flat) + 0.05 * np.cos(np.arange(flat.size))},
                 step=0.01, rtol=1e-7,
                 without_second="a fit takes the first only; the closed form's is in tests/exact",
-                covers=("identify.Problem.errors", "identify.Problem.motion"),
+                covers=("identify.Model.errors", "identify.Model.motion"),
             )
         )  # fmt: skip
     states = {"ordinary": join(Q, W), "identity, at rest": join(ONE, np.zeros(3))}

@@ -142,8 +142,8 @@ def recording() -> rj.identify.Recording:
 
 
 @functools.cache
-def problem() -> rj.identify.Problem:
-    return rj.identify.Problem(recording(), rj.identify.PrincipalRatios())
+def problem() -> rj.identify.Model:
+    return rj.identify.Model(recording(), rj.identify.PrincipalRatios())
 
 
 @functools.cache

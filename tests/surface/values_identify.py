@@ -465,23 +465,23 @@ def fitted(y, noise):
 
 def our_fit(y, noise):
     recording = identify.Recording(np.arange(float(len(y))), (identify.Gyro(float(noise)), y))
-    problem = identify.Problem(recording, identify.Known(rj.Inertia(jnp.eye(3))))
+    problem = identify.Model(recording, identify.Known(rj.Inertia(jnp.eye(3))))
     fit = identify.fit(problem, starts=1)
     low, high = zip(*fit.interval().values(), strict=True)
     ends = fit.interval_of(lambda point: point.state0.omega)
-    planned = identify.expected(problem, fit.parameters)
+    planned = identify.expected(problem, fit.x)
     return [
         fit.state0.omega, np.array([q.deviation for q in fit.quantities[-3:]]), fit.chi2, fit.dof,
         fit.residuals[0], np.array(low[-3:]), np.array(high[-3:]), *ends,
-        np.array([q.deviation for q in planned[-3:]]), problem.motion(fit.parameters).omega,
-        problem.unpack(fit.parameters)[1].omega,
+        np.array([q.deviation for q in planned[-3:]]), problem.motion(fit.x).omega,
+        problem.unpack(fit.x)[1].omega,
     ]  # fmt: skip
 
 
 way(
     "identify.fit identify.Fit identify.Fit.interval identify.Fit.interval_of identify.Fit.body "
-    "identify.Fit.state0 identify.Fit.residuals identify.Problem identify.Problem.motion "
-    "identify.Problem.unpack identify.expected identify.Quantity",
+    "identify.Fit.state0 identify.Fit.residuals identify.Model identify.Model.motion "
+    "identify.Model.unpack identify.expected identify.Quantity",
     our_fit,
     (back_and_forth, fixed(0.01)), fitted,
     batched=False, rtol=1e-6, cost=2,
@@ -499,9 +499,9 @@ def our_plan(w, b, y):
     recording = identify.Recording(
         np.arange(float(len(y))), (identify.Gyro(1.0, bias=jnp.zeros(3)), np.zeros(np.shape(y)))
     )
-    problem = identify.Problem(
+    problem = identify.Model(
         recording, identify.Known(rj.Inertia(jnp.eye(3))),
-        free=[identify.Free(lambda r: r.readings[0].sensor.bias, "bias")],
+        free=[identify.Free(lambda s: s.sensors[0].bias, "bias")],
     )  # fmt: skip
     plan = problem.start(rj.Inertia(jnp.eye(3)), w)
     plan = eqx.tree_at(lambda p: p.shared[0], plan, b)
@@ -513,8 +513,8 @@ def our_plan(w, b, y):
 
 
 way(
-    "identify.Problem.start identify.Problem.errors identify.Problem.values identify.fisher "
-    "identify.Free identify.Parameters identify.Own identify.Problem.typical_rate",
+    "identify.Model.start identify.Model.errors identify.Model.values identify.fisher "
+    "identify.Free identify.Parameters identify.Own identify.Model.typical_rate",
     our_plan, (v.ordinary, v.ordinary, v.normal(4, 3)),
     lambda w, b, y: [
         w, y - w - b, b,
@@ -666,15 +666,15 @@ leave_out(
     "identify.Combination.in_words", "identify.Fit.ok", "tumblers.LightCurve.ok",
     "identify.Fit.status", "tumblers.LightCurve.status", "identify.Fit.advice", "identify.Fit.causes",
     "identify.Answer", "identify.Cause",
-    "identify.Problem.count", "identify.Recording.size",
+    "identify.Model.count", "identify.Recording.size",
     "identify.Descent", "identify.Combination",
 )  # fmt: skip
 leave_out(
     "holds what it was given, or numbers of a row above",
     "identify.Belief.torques", "identify.Belief.walks", "identify.Filtered.t",
     "identify.Smoothed.t", "estimate.Walk", "identify.Push", "identify.Extended", "identify.Start",
-    "identify.Problem.recording", "identify.Problem.recordings", "identify.Problem.torque",
-    "identify.Problem.bodies", "identify.Problem.scenes",
+    "identify.Model.recording", "identify.Model.recordings", "identify.Model.torque",
+    "identify.Model.bodies", "identify.Model.scenes",
     "identify.Recording.sensors", "identify.Fit.values",
     "identify.Fit.spreads", "identify.Fit.noise", "identify.Fit.jitter", "identify.Fit.rms", "tumblers.Alias",
     "tumblers.LightCurve", "tumblers.LightCurve.rivals", "identify.Comparison",
@@ -684,7 +684,7 @@ leave_out(
     "taken: tests/identify/test_flat_limit.py",
     *(f"identify.{name}.bend" for name in (
         "AbstractBodyChart", "Mass", "Principal", "PrincipalRatios", "Ratios", "Tensor")),
-    "body.parameters.flat_bend", "identify.Fit.beside", "identify.Limit", "identify.Limit.bound",
+    "body.parameters.flat_bend", "identify.Fit.derivative_point", "identify.Limit", "identify.Limit.bound",
     "identify.Limit.deviation", "identify.Limit.is_near",
 )  # fmt: skip
 leave_out(

@@ -37,7 +37,7 @@ def main(count: int, first: int) -> None:
         )
         if what == "WRONG" and listed:
             what = "rival"
-        status = found.status if found.ok else f"{found.search.word}, {found.model.word}"
+        status = found.status if found.ok else f"{found.search.word}, {found.explanation.word}"
         said[what, status] += 1
         print(
             f"{seed:3d} {one.mode:5s} {one.rotation / HOUR:7.2f} h {one.precession / HOUR:7.2f} h "

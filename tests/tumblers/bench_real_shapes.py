@@ -32,7 +32,7 @@ def main(count: int, first: int, rough: float, noise: float, told: int) -> None:
         right = found.aliases[0].mode == one.mode and np.abs(error[:2]).max() < 2e-2
         said.append(
             (
-                found.status if found.ok else f"{found.search.word}, {found.model.word}",
+                found.status if found.ok else f"{found.search.word}, {found.explanation.word}",
                 right,
                 error,
                 deviations,

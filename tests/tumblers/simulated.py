@@ -159,9 +159,9 @@ def level(recording: Any) -> Any:
     return recording.readings[0].sensor.level
 
 
-def problem(recording: identify.Recording) -> identify.Problem:
+def problem(recording: identify.Recording) -> identify.Model:
     free = [identify.Free(level, "level")]
-    return identify.Problem(recording, identify.PrincipalRatios(), free=free)
+    return identify.Model(recording, identify.PrincipalRatios(), free=free)
 
 
 def off(one: Tumbler, alias: Alias) -> tuple[float, float]:

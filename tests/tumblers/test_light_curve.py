@@ -115,8 +115,8 @@ def test_another_length_is_the_same_program(caplog):
     assert found.ok and max(simulated.off(one, found.aliases[0])) < 0.05
     # Of the readings as they were given.
     assert found.fit.residuals[0].shape == (380, 1) and found.fit.independent == 380
-    assert found.fit.problem.recording.t.shape == (380,)
-    errors = of_few_lengths(of(380)).errors(found.fit.parameters)[0]
+    assert found.fit.model.recording.t.shape == (380,)
+    errors = of_few_lengths(of(380)).errors(found.fit.x)[0]
     np.testing.assert_allclose(errors[:380], found.fit.residuals[0], rtol=0, atol=1e-12)
     assert errors.shape == (432, 1) and not errors[380:].any()
 
@@ -144,7 +144,7 @@ def test_the_allowance_for_shape_is_what_such_shapes_do_to_a_fit():
     def refitted(change):
         values = np.asarray(reading.values) - 2.5 * np.log10(1 + size * change)
         moved = simulated.problem(identify.Recording(one.recording.t, (reading.sensor, values)))
-        fitted = identify.fit(moved, starts=1, initial=found.fit.parameters, tolerance=1e-6)
+        fitted = identify.fit(moved, starts=1, initial=found.fit.x, tolerance=1e-6)
         return fitted.quantities[:2]
 
     plain = refitted(np.zeros(n.shape[0]))
@@ -182,7 +182,7 @@ def problem(*readings, torque=None, count=1):
     t = np.linspace(0.0, 10.0, 60)
     record = identify.Recording(t, *readings, torque=torque)
     rows: Any = record if count == 1 else [record] * count
-    return identify.Problem(rows, identify.PrincipalRatios())
+    return identify.Model(rows, identify.PrincipalRatios())
 
 
 def test_what_is_refused():
@@ -212,5 +212,5 @@ def test_the_typical_rate_is_half_the_strongest_frequency():
     t = np.sort(RNG.uniform(0, 1e5, 200))
     values = 5 + np.sin(2 * np.pi * t / 8000.0)
     sensor = Brightness([1.0, 0, 0], [0, 1.0, 0], noise=0.1)
-    found = identify.Problem(identify.Recording(t, (sensor, values)), identify.PrincipalRatios())
+    found = identify.Model(identify.Recording(t, (sensor, values)), identify.PrincipalRatios())
     np.testing.assert_allclose(found.typical_rate, np.pi / 8000.0, rtol=0.05)

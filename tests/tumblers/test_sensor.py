@@ -52,7 +52,7 @@ def test_tables_of_other_lengths_are_stacked():
         table = rj.torques.Linear(t, np.stack([np.cos(t), np.sin(t), 0 * t], axis=1))
         return identify.Recording(TS[:20], (Brightness(table, OBSERVER, noise=0.1), np.ones(20)))
 
-    problem = identify.Problem([record(5), record(9)], identify.PrincipalRatios())
+    problem = identify.Model([record(5), record(9)], identify.PrincipalRatios())
     table: Any = problem.records.readings[0].sensor.sun
     short = jax.tree.map(lambda leaf: leaf[0], table)
     for t in (0.0, 4.0, 10.0, 12.0):
@@ -82,13 +82,13 @@ def test_a_fit_and_a_design():
         return r.readings[0].sensor.level
 
     level = identify.Free(level_of, "level")
-    problem = identify.Problem(record, identify.PrincipalRatios(), free=[level])
+    problem = identify.Model(record, identify.PrincipalRatios(), free=[level])
     start = problem.start(BODY, [0.3, 1.02, 0.4])
     fit = identify.fit(problem, initial=start, starts=1)
     assert fit.ok and abs(fit.chi2 - fit.dof) < 5 * np.sqrt(2 * fit.dof)
     moments = np.asarray(BODY.moments)
     truth = {"Ix/Iz": moments[0] / moments[2], "Iy/Iz": moments[1] / moments[2], "level": 0.0}
-    planned = identify.expected(problem, fit.parameters)
+    planned = identify.expected(problem, fit.x)
     for quantity, bound in zip(fit.quantities, planned, strict=True):
         np.testing.assert_allclose(quantity.deviation, bound.deviation, rtol=0.2)
         if quantity.name in truth:

@@ -149,13 +149,19 @@ class Lagged(eqx.Module):
 
 
 def require_no_jumps(source: Any, name: str) -> None:
-    """Raise `TypeError` for held samples: a law that takes their derivative loses the jumps."""
-    inner = source.source if isinstance(source, Delayed) else source
-    if isinstance(inner, Held | Input):
-        raise TypeError(
-            f"{name}: wanted a function of time without jumps, since its derivative acts on the "
-            f"body, got {type(inner).__name__}; take Linear(times, values)"
-        )
+    """Raise `TypeError` for held samples: a law that takes their derivative loses the jumps.
+
+    An `Input` is looked at where it has a value: `bind` may give it a smooth function of time.
+    """
+    jumping = (Held, _Now)
+    nodes = jax.tree.leaves(source, is_leaf=lambda node: isinstance(node, jumping))
+    for node in nodes:
+        if isinstance(node, jumping):
+            what = "an Input with held samples" if isinstance(node, _Now) else type(node).__name__
+            raise TypeError(
+                f"{name}: wanted a function of time without jumps, since its derivative acts on "
+                f"the body, got {what}; take Linear(times, values) or Series(times, values)"
+            )
 
 
 def _channels(value: Any, name: str) -> Array:

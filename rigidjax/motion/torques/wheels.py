@@ -27,7 +27,7 @@ class Flywheel(base.OfTime):
 
     **Arguments:** `momentum` h, N m s, body frame, the sum over all wheels: (3,) for wheels of
     constant speed, or a callable Module of time, t → (3,), such as `Linear(times, values)`; not one
-    that jumps (`Held`, `Input`): dh/dt acts on the body.
+    that jumps (`Held`, samples of an `Input`): dh/dt acts on the body.
 
     The body's `Inertia` must fit h. If it includes the wheels as locked, h is their momentum
     relative to the body. If the wheels' axial moments are subtracted (I − Σ J a aᵀ), h is their
@@ -62,6 +62,7 @@ class Flywheel(base.OfTime):
         source: Any = self.momentum
         if not callable(source):
             return cross(source, state.omega)
+        require_no_jumps(source, "momentum")
         t = jnp.asarray(t, state.omega.dtype)
         h, rate = jax.jvp(self.internal_momentum, (t,), (jnp.ones_like(t),))
         return cross(h, state.omega) - rate
