@@ -13,6 +13,7 @@ from rigidjax.identify.inference.design import (
     expected as expected,
     fisher as fisher,
 )
+from rigidjax.identify.inference.horizons import predict_windows as predict_windows
 from rigidjax.identify.inference.profile import profile as profile
 from rigidjax.identify.model.charts import (
     AbstractBodyChart as AbstractBodyChart,
@@ -38,7 +39,6 @@ from rigidjax.identify.model.priors import (
 )
 from rigidjax.identify.model.scene import Scene as Scene
 from rigidjax.identify.search.stochastic_gradient import Descent as Descent
-from rigidjax.identify.search.window_fit import WindowFit as WindowFit, fit_windows as fit_windows
 from rigidjax.identify.sensors import (
     AbstractSensor as AbstractSensor,
     Accelerometer as Accelerometer,

@@ -35,6 +35,11 @@ from rigidjax.identify.uncertainty.quantities import (
     quantities as quantities_of,
     values_and_slopes,
 )
+from rigidjax.identify.uncertainty.stretches import (
+    by_stretches,
+    remarks as remarks_on,
+    stretches_of,
+)
 
 # The false-alarm rate of the test for autocorrelated errors.
 RARE = 1e-5
@@ -237,7 +242,12 @@ def assess(
     linear = uncertainty.linearise(model, x, noise, best.blocks, thickened)
     times = uncertainty.correlation_times(linear)
     white = uncertainty.of_white(linear)
-    spread = uncertainty.spread(linear, times, white)
+    stretches = stretches_of(model, linear)
+    if stretches is None:
+        spread = uncertainty.spread(linear, times, white)
+    else:
+        spread = by_stretches(stretches, white)
+        remarks = (*remarks, *remarks_on(stretches, model, x, _names_of_places(model)))
     numbers, of = values_and_slopes(model, x, near), charts(model)
     parts = considered.considerations(model, linear, noise, white.seen)
     spread = _with_considered(spread, parts, model)
@@ -313,6 +323,16 @@ def _allowance(
     known = rows if np.isfinite(linear.dense).all() and np.isfinite(covariance).all() else []
     moves = considered.unit_moves(model, linear, noise, covariance, slopes[known]) if known else []
     return allowance(model, parts, moves, [quantities[i] for i in known])
+
+
+def _names_of_places(model: Model) -> dict[int, str]:
+    """Return the name of each shared number by its place among the free numbers."""
+    names = {}
+    for slot in model.slots:
+        for index, place in np.ndenumerate(np.asarray(slot.shared if slot.own is None else ())):
+            inner = "".join(f" {'xyz'[i] if i < 3 else i}" for i in index[1:])
+            names[int(place)] = f"{slot.name}{inner}"
+    return names
 
 
 def _with_considered(

@@ -22,6 +22,7 @@ from rigidjax.identify.uncertainty.quantities import (
     charts,
     labels,
     recording_names,
+    reports_starts,
     value_and_slope,
     vector,
 )
@@ -153,7 +154,7 @@ def _names(model: Model) -> list[tuple[str, str, bool]]:
         ("x", "position", "m"),
         ("v", "velocity", "m/s"),
     ):
-        if hasattr(model.reference.state, part):
+        if hasattr(model.reference.state, part) and reports_starts(model):
             for where in recording_names(model):
                 out += [(f"the initial {name} {k}{where}", unit, False) for k in "xyz"]
     return out
@@ -167,18 +168,22 @@ def _slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
     reference = model.reference
     start = jax.vmap(ReferenceStates.moved)(reference, point[model.index.start])
 
+    def _starts(x: Array) -> list[Array]:
+        now = jax.vmap(ReferenceStates.moved)(reference, x[model.index.start])
+        one, shown = jax.tree.map(lambda leaf: leaf[0], now), []
+        change = parts(one, jax.vmap(minus)(now, start))
+        offset = parts(one, jax.vmap(minus)(now, reference.state))
+        if "q" in change:
+            shown += [jax.vmap(quaternion.rotate)(start.q, change["q"]), change["q"]]
+        return [*shown, *(offset[name] for name in ("x", "v") if name in offset)]
+
     def value(x: Array) -> Array:
         shown = [vector(model, x)]
         for body in as_list(model.bodies(x)):
             tensor = tensor_of(body)
             shown.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
-        now = jax.vmap(ReferenceStates.moved)(reference, x[model.index.start])
-        one = jax.tree.map(lambda leaf: leaf[0], now)
-        change = parts(one, jax.vmap(minus)(now, start))
-        offset = parts(one, jax.vmap(minus)(now, reference.state))
-        if "q" in change:
-            shown += [jax.vmap(quaternion.rotate)(start.q, change["q"]), change["q"]]
-        shown += [offset[name] for name in ("x", "v") if name in offset]
+        if reports_starts(model):
+            shown += _starts(x)
         return jnp.concatenate([part.reshape(-1) for part in shown])
 
     return jax.jacfwd(value)(point), value(point)
@@ -262,7 +267,8 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         if limit.is_near(seen, float(quantile(0.95, fit.degrees(limit.slope))))
     ]
     count = fit.model.count
-    out.append(_rate(fit.quantities[first : first + 3 * count], count))
+    if reports_starts(fit.model):
+        out.append(_rate(fit.quantities[first : first + 3 * count], count))
     out += _unseen(fit)
     out += correlations(fit)
     if fit.model.torque is None:

@@ -159,6 +159,15 @@ class Recording(eqx.Module):
         return tuple(reading.sensor for reading in self.readings)
 
 
+def recording_of(t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]) -> Recording:
+    """Return a recording of these parts as they are, such as several with a leading axis."""
+    record = object.__new__(Recording)
+    parts = {"t": t, "readings": readings, "inputs": inputs, "dropped": 0}
+    for name, part in parts.items():
+        object.__setattr__(record, name, part)
+    return record
+
+
 def readings_of(recording: Recording, kind: type) -> list[Any]:
     """The readings of the sensors of one kind."""
     return [reading for reading in recording.readings if isinstance(reading.sensor, kind)]
@@ -183,7 +192,8 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
                     f"{samples.shape}; for samples at other times give a function of time such as "
                     "rigidjax.torques.Series(times, samples)"
                 )
-            source = jnp.asarray(_checks.finite(samples, f"inputs[{name!r}]"))
+            # The last sample is held beyond the last time.
+            source = jnp.asarray(_checks.finite(samples, f"inputs[{name!r}]")[:-1])
         out[name] = source
     return out
 

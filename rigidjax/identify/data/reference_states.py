@@ -106,26 +106,22 @@ def _turns(p: ArrayLike, q: ArrayLike) -> Array:
 
 
 class ReferenceStates(eqx.Module):
-    """The reference state of a recording, at rest, and the units of changes from it."""
+    """The reference state of a recording, and the units of changes from it.
+
+    `units` (n,) is the size of a change of order one, number by number; `rate` the typical body
+    rate, rad/s.
+    """
 
     state: Any
     rate: Float[Array, "*records"]
-    length: Float[Array, "*records"]
-
-    @property
-    def units(self) -> Float[Array, "*records n"]:
-        """The size of a change of order one, number by number."""
-        sizes = {
-            "x": self.length,
-            "v": self.length * self.rate,
-            "q": jnp.ones_like(self.rate),
-            "omega": self.rate,
-        }
-        return jnp.repeat(jnp.stack([sizes[name] for name in names(self.state)], -1), 3, -1)
+    units: Float[Array, "*records n"]
 
     def moved(self, change: Float[Array, " n"]) -> Any:
-        """Return the initial state of one recording, a `change` of order one away."""
-        return plus(self.state, self.units * change)
+        """Return the initial state of one recording, a `change` of order one away.
+
+        An empty change is none: the state is known.
+        """
+        return plus(self.state, self.units * change) if change.size else self.state
 
 
 def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates:
@@ -138,7 +134,9 @@ def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates
     q, still = jnp.asarray(np.stack(turns), dtype), jnp.zeros_like(x)
     states = {Spin: Spin(still), Attitude: Attitude(q, still), Rigid: Rigid(x, v, q, still)}
     typical = jnp.asarray([_typical_rate(r) for r in recordings], dtype)
-    return ReferenceStates(states[rung], typical, length)
+    sizes = {"x": length, "v": length * typical, "q": jnp.ones_like(typical), "omega": typical}
+    units = [sizes[name] for name in names(states[rung])]
+    return ReferenceStates(states[rung], typical, jnp.repeat(jnp.stack(units, -1), 3, -1))
 
 
 def _typical_rate(recording: Recording) -> float:

@@ -98,10 +98,15 @@ def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
 
     def long(r: Recording) -> list[Any]:
         parts = [(reading.values, reading.mask, reading.late) for reading in r.readings]
-        samples = [source for source in r.inputs.values() if eqx.is_array(source)]
-        return jax.tree.leaves((r.t, parts, samples))
+        return jax.tree.leaves((r.t, parts))
 
-    return eqx.tree_at(long, recording, [leaf[begin:end] for leaf in long(recording)])
+    shorter = eqx.tree_at(long, recording, [leaf[begin:end] for leaf in long(recording)])
+    # A sample is held until the next time: there is none for the last.
+    inputs = {
+        name: source[begin : end - 1] if eqx.is_array(source) else source
+        for name, source in recording.inputs.items()
+    }
+    return eqx.tree_at(lambda r: r.inputs, shorter, inputs) if inputs else shorter
 
 
 def _is_table(node: Any) -> bool:

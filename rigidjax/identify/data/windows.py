@@ -4,16 +4,19 @@ A record of measured states is cut into windows. The model runs open-loop from t
 driven by the recorded inputs, and is compared with the measured states at every step.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from rigidjax import _checks
+from rigidjax.identify.data.recording import Reading, Recording, recording_of
+from rigidjax.identify.data.reference_states import ReferenceStates
+from rigidjax.identify.sensors.states import StateSensor
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import minus_small, names, parts
 
@@ -57,7 +60,8 @@ class Windows(eqx.Module):
 
     **Fields:** `step` s between samples; `starts` N states; `wanted` the L states that follow each
     start, with leading axes (N, L); `inputs` by name (N, before + L, *k), row before + i held
-    through step i, if there is no delay; `before` the number of rows before the start.
+    through step i, if there is no delay; `before` the number of rows before the start; `noise` and
+    `start_deviation` by kind, as `windows` has them.
 
     >>> found = windows(np.arange(6.0), Spin(np.ones((6, 3))), length=2, stride=2)
     >>> found.count, found.length, found.wanted.omega.shape
@@ -69,6 +73,8 @@ class Windows(eqx.Module):
     wanted: Any
     inputs: dict[str, Array]
     before: int = eqx.field(static=True, default=0)
+    noise: dict[str, float] | None = eqx.field(static=True, default=None)
+    start_deviation: dict[str, float] | None = eqx.field(static=True, default=None)
 
     @property
     def count(self) -> int:
@@ -79,6 +85,35 @@ class Windows(eqx.Module):
     def length(self) -> int:
         """The number of steps of each."""
         return int(self.wanted.omega.shape[1])
+
+    @property
+    def scales(self) -> Float[Array, " m"]:
+        """The unit of each number of an error: `noise`, else the rms of a prediction that holds
+        the state at the start.
+        """
+        if self.noise is not None:
+            return jnp.asarray(np.repeat([self.noise[kind] for kind in names(self.starts)], 3))
+        squares = np.mean(np.asarray(held_errors(self.starts, self.wanted)) ** 2, (0, 1))
+        each = np.sqrt(np.mean(squares.reshape(-1, 3), 1))
+        return jnp.asarray(np.repeat(np.where(each == 0, 1.0, each), 3))
+
+    def records(self) -> Recording:
+        """Return the windows as recordings, with a leading axis, that read the whole state.
+
+        The first time of each is its start, which is no reading.
+        """
+        kind, scales = type(self.starts), np.asarray(self.scales)
+        steps = np.arange(self.length + 1, dtype=self.wanted.omega.dtype)
+        t = np.broadcast_to(self.step * steps, (self.count, steps.size))
+        first = [np.asarray(leaf)[:, None] for leaf in jax.tree.leaves(self.starts)]
+        later = [np.asarray(leaf) for leaf in jax.tree.leaves(self.wanted)]
+        rows = [np.concatenate(pair, axis=1) for pair in zip(first, later, strict=True)]
+        mask = np.broadcast_to(steps > 0, t.shape)
+        noise = jnp.asarray(np.broadcast_to(scales, (self.count, scales.size)).astype(t.dtype))
+        sensor = StateSensor(kind, noise, self.noise is None)
+        values = jnp.asarray(np.concatenate(rows, axis=-1))
+        reading = Reading(sensor, values, jnp.asarray(mask))
+        return recording_of(jnp.asarray(t), (reading,), self.inputs)
 
     def held(self) -> Horizons:
         """The errors of a prediction that holds the state at the start: what a model must beat.
@@ -96,10 +131,23 @@ class Windows(eqx.Module):
         if not parts:
             raise ValueError("Windows.joined: wanted at least one Windows")
         kinds = {
-            (p.step, p.length, tuple(sorted(p.inputs)), type(p.starts), p.before) for p in parts
+            (
+                p.step,
+                p.length,
+                tuple(sorted(p.inputs)),
+                type(p.starts),
+                p.before,
+                str(p.noise),
+                str(p.start_deviation),
+            )
+            for p in parts
         }
         if len(kinds) > 1:
-            got = [f"{k[0]:g} s, {k[1]}, {k[3].__name__}, {k[2]}, before={k[4]}" for k in kinds]
+            got = [
+                f"{k[0]:g} s, {k[1]}, {k[3].__name__}, {k[2]}, before={k[4]}, noise={k[5]}, "
+                f"starts={k[6]}"
+                for k in kinds
+            ]
             raise ValueError(
                 "Windows.joined: wanted one step, length, kind of state and the same inputs, got "
                 + "; ".join(got)
@@ -117,6 +165,8 @@ def windows(
     length: int,
     stride: int = 1,
     before: int = 0,
+    noise: Mapping[str, float] | None = None,
+    starts: Mapping[str, float] | None = None,
 ) -> Windows:
     """Cut a record of measured states into windows of `length` steps, one every `stride` samples.
 
@@ -158,13 +208,45 @@ def windows(
     kind = jnp.result_type(float)
     arrays = jax.tree.map(lambda a: np.asarray(a, kind), states)
     samples = {k: np.asarray(v, kind) for k, v in (inputs or {}).items()}
+    kinds = names(states)
+    if noise is not None:
+        noise = _by_kind(noise, kinds, "noise", _checks.positive)
+    if starts is not None:
+        if noise is None:
+            raise ValueError(
+                "starts: deviations of the starts need the noise of the readings: give noise={…}, "
+                "too"
+            )
+        starts = _by_kind(starts, kinds, "starts", _deviation)
     return Windows(
         round(h, 12),
         jax.tree.map(lambda a: jnp.asarray(a[begin]), arrays),
         jax.tree.map(lambda a: jnp.asarray(a[follow]), arrays),
         {k: jnp.asarray(v[rows_of]) for k, v in samples.items()},
         before,
+        noise,
+        starts,
     )
+
+
+def _by_kind(
+    numbers: Any, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
+) -> dict[str, float]:
+    """Return the checked numbers of a mapping with these keys."""
+    _checks.instance(numbers, Mapping, name, wanted="numbers by kind")
+    if set(numbers) != set(kinds):
+        raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(numbers)}")
+    return {kind: float(check(numbers[kind], f"{name}[{kind!r}]")) for kind in kinds}
+
+
+def _deviation(value: Any, name: str) -> float:
+    number = _checks.number(value, name)
+    if not number > 0:
+        raise ValueError(
+            f"{name}: wanted a positive deviation, or infinity for a start that is free, got "
+            f"{number}"
+        )
+    return number
 
 
 def _require_rows(times: np.ndarray, states: Any, inputs: Mapping[str, Any]) -> None:
@@ -205,3 +287,34 @@ def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
             f"others are {h:.6g} s apart; resample first"
         )
     return h, even
+
+
+def require_windows(windows: Any) -> None:
+    """Raise `TypeError` or `ValueError` unless these are several windows of finite numbers."""
+    _checks.instance(windows, Windows, "windows", wanted="what identify.windows returns")
+    for name, wanted in (("starts", 2), ("wanted", 3)):
+        for leaf in jax.tree.leaves(getattr(windows, name)):
+            if leaf.ndim != wanted or not leaf.shape[0]:
+                raise ValueError(
+                    f"windows: wanted a row for each of N windows in {name}, got {leaf.shape}"
+                )
+            _checks.finite(leaf, f"windows: {name}")
+
+
+def starts_of_windows(
+    windows: Windows, stretches: int
+) -> tuple[ReferenceStates, Float[Array, "windows m"] | None, Int[Array, " windows"]]:
+    """Return the starts of windows as a reference, their weights, and the stretch of each window.
+
+    The weight is one over the deviation of a start, in steps of order one; `None` for known starts.
+    """
+    count, scales = windows.count, np.asarray(windows.scales)
+    dtype = windows.wanted.omega.dtype
+    units = jnp.asarray(np.broadcast_to(scales, (count, scales.size)).astype(dtype))
+    rate = jnp.full(count, float(scales[-1]), dtype)
+    clusters = jnp.asarray(np.arange(count) * min(stretches, count) // count, jnp.int32)
+    weight = None
+    if windows.start_deviation is not None:
+        wide = np.repeat([windows.start_deviation[kind] for kind in names(windows.starts)], 3)
+        weight = jnp.asarray(np.broadcast_to(scales / wide, units.shape).astype(dtype))
+    return ReferenceStates(windows.starts, rate, units), weight, clusters

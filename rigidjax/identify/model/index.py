@@ -61,7 +61,7 @@ def index_of(
         return places.reshape(shape)
 
     shared = [None if s.each else take(max(len(s.labels), 1), *s.shape) for s in slots]
-    start = np.concatenate([take(count, 3) for _ in range(kinds)], axis=1)
+    start = np.concatenate([np.zeros((count, 0), int), *(take(count, 3) for _ in range(kinds))], 1)
     own = [take(count, *s.shape) if s.each or s.spread is not None else None for s in slots]
     blocks, twice, columns, column = [bodies], [], [], bodies.shape[1]
     placed = []

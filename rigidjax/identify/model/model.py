@@ -19,6 +19,7 @@ from rigidjax.identify.data import stacking
 from rigidjax.identify.data.full_scale import with_limits
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.data.reference_states import ReferenceStates, first_rates, reference_of
+from rigidjax.identify.data.windows import Windows, require_windows, starts_of_windows
 from rigidjax.identify.model.charts import (
     AbstractBodyChart,
     Bodies,
@@ -29,7 +30,7 @@ from rigidjax.identify.model.charts import (
 )
 from rigidjax.identify.model.free import Free, Slot, checked_labels, find_slots, group_of_each
 from rigidjax.identify.model.index import Index, index_of
-from rigidjax.identify.model.predict import AbstractIntegrator, integrator_for
+from rigidjax.identify.model.predict import AbstractIntegrator, HeldSteps, integrator_for
 from rigidjax.identify.model.priors import AbstractLoss, Entropic
 from rigidjax.identify.model.scene import Process, Scene
 from rigidjax.identify.model.terms import (
@@ -88,7 +89,8 @@ class Model(eqx.Module):
     **Arguments:**
 
     - `recording`: one `Recording`, or a sequence of them with the same sensors: each has its own
-      initial state, all share the body.
+      initial state, all share the body. Or `Windows` of a record of measured states: each is a
+      short recording whose start is known, or free about the measured one.
     - `chart`: the chart of the body: `Ratios()` (the full tensor up to scale), `PrincipalRatios()`
       (body axes known to be principal), `Tensor()`, `Principal()` (with the scale), `Mass(guess)`
       (all ten numbers), `Known(body)`. For several bodies give recordings and charts by the bodies'
@@ -107,6 +109,8 @@ class Model(eqx.Module):
       the sampling. `Adaptive()` is quicker if the torque is smooth and the body turns by 0.1 rad or
       more between readings, and slow if the torque reads a noisy log. A free body is followed by
       the closed form.
+    - `stretches` of windows in a row: deviations come from leaving out one after the other; a
+      stretch should be longer than the errors of the model last.
     - `noise_each`: an estimated noise is one figure for all recordings (`False`), for each
       (`True`), for each body (`"body"`), or for recordings with the same label (a sequence).
 
@@ -136,6 +140,8 @@ class Model(eqx.Module):
     loss: AbstractLoss | None
     prior: Entropic | None
     pull: AbstractPull | None
+    start_weight: Float[Array, "records n"] | None
+    clusters: Int[Array, " records"] | None
     integrator: AbstractIntegrator | None
     state_kind: type = eqx.field(static=True)
     filter_steps: int = eqx.field(static=True)
@@ -143,7 +149,10 @@ class Model(eqx.Module):
 
     def __init__(
         self,
-        recording: Recording | Sequence[Recording] | Mapping[str, Recording | Sequence[Recording]],
+        recording: Recording
+        | Sequence[Recording]
+        | Mapping[str, Recording | Sequence[Recording]]
+        | Windows,
         chart: AbstractBodyChart | Mapping[str, AbstractBodyChart],
         *,
         torque: Torque | None = None,
@@ -153,9 +162,15 @@ class Model(eqx.Module):
         prior: Entropic | None = None,
         integrator: AbstractIntegrator | None = None,
         noise_each: bool | str | Sequence[Any] = False,
+        stretches: int = 12,
     ):
-        recordings, charts, names = _by_body(recording, chart)
-        _are_recordings(recordings)
+        windows = recording if isinstance(recording, Windows) else None
+        if windows is None:
+            recordings, charts, names = _by_body(recording, chart)
+            _are_recordings(recordings)
+        else:
+            require_windows(windows)
+            recordings, charts, names = [], chart, ("",) * windows.count
         for one in charts_of(charts):
             known = isinstance(one, Inertia | MassProperties)
             hint = "give a known body as Known(body)" if known else ""
@@ -176,9 +191,14 @@ class Model(eqx.Module):
             require_law(torque)
         if process is not None:
             _require_process(process)
-        recordings = with_limits(recordings)
-        _require_inputs(torque, recordings)
-        self.records, self.counts = stacking.stack(recordings)
+        if windows is None:
+            recordings = with_limits(recordings)
+            _require_inputs(torque, [recording.inputs for recording in recordings])
+            self.records, self.counts = stacking.stack(recordings)
+        else:
+            _require_inputs(torque, [windows.inputs])
+            self.records = windows.records()
+            self.counts = np.full(windows.count, windows.length + 1, np.int32)
         self.chart, self.torque, self.process = charts, torque, process
         self.loss, self.prior = loss, prior
         self.body_names, self.which, self.pull = names, None, None
@@ -190,9 +210,17 @@ class Model(eqx.Module):
         if isinstance(apart, bool):
             apart = tuple(range(len(names))) if apart else ("",) * len(names)
         self.noise_groups, _ = group_of_each(apart, names, "noise_each")
-        self.state_kind = _state_kind(recordings[0], torque, charts)
-        self.reference = reference_of(recordings, self.state_kind)
-        slots = find_slots(free, Scene(None, torque, process, recordings[0].sensors, None), names)
+        sensors = self.records.sensors
+        self.state_kind = _state_kind(sensors, torque, charts)
+        self.start_weight, self.clusters = None, None
+        if windows is None:
+            sensors = recordings[0].sensors
+            self.reference = reference_of(recordings, self.state_kind)
+        else:
+            parts = starts_of_windows(windows, _checks.whole(stretches, "stretches", 2))
+            self.reference, self.start_weight, self.clusters = parts
+            _require_states(windows, self.state_kind)
+        slots = find_slots(free, Scene(None, torque, process, sensors, None), names)
         taken = {name for one in charts_of(charts) for name in (*one.log_names, *one.plain_names)}
         for slot in slots:
             if slot.name in taken | {"Ωx", "Ωy", "Ωz"}:
@@ -200,10 +228,14 @@ class Model(eqx.Module):
                 raise ValueError(f"Free {slot.name!r}: {wanted}")
         bodies = places_of(charts, self.which, len(names))
         kinds = dimension(stacking.one(self.reference.state, 0)) // 3
+        kinds = kinds if windows is None or self.start_weight is not None else 0
         self.index, self.slots = index_of(bodies, charts.size, slots, kinds)
-        widest = max(float(np.diff(r.t).max()) for r in recordings)
+        widest = max((float(np.diff(r.t).max()) for r in recordings), default=0.0)
         turn = 1.5 * widest * float(np.max(self.reference.rate))
-        if integrator is None and torque is not None:
+        sampled = any(eqx.is_array(rows) for rows in self.records.inputs.values())
+        if windows is not None or sampled:
+            integrator = HeldSteps()
+        elif integrator is None and torque is not None:
             integrator = integrator_for(turn)
         self.integrator = integrator
         self.filter_steps = max(1, math.ceil(turn / TURN_OF_A_FILTER_STEP))
@@ -264,6 +296,7 @@ class Model(eqx.Module):
         xp: Any = np if _checks.known((vector, rates, self.reference.rate)) else jnp
         spin = xp.asarray(rates) / xp.asarray(self.reference.rate)[:, None]
         spin = xp.broadcast_to(spin, (self.count, 3)).astype(kind)
+        spin = spin if self.index.start.size else spin[:, :0]
         rest = self.size - vector.size - spin.size
         own = sum(s.own.size for s in self.slots if s.own is not None)
         zeros = xp.zeros(rest - own, kind), xp.zeros(own, kind)
@@ -414,6 +447,15 @@ def with_parts(model: Model, **parts: Any) -> Model:
     return new
 
 
+def _require_states(windows: Windows, kind: type) -> None:
+    """Raise `TypeError` if the torque needs more than the measured states have."""
+    if not isinstance(windows.starts, kind):
+        raise TypeError(
+            f"windows: the torque acts on {kind.__name__}, and the measured states are "
+            f"{type(windows.starts).__name__}"
+        )
+
+
 def _require_process(process: Any) -> None:
     """Raise `TypeError` for anything but unknown torques."""
     for part in parts_of(process):
@@ -421,14 +463,14 @@ def _require_process(process: Any) -> None:
         _checks.instance(part, (RandomTorque, CorrelatedTorque), "process", wanted=wanted)
 
 
-def _require_inputs(torque: Torque | None, recordings: Sequence[Recording]) -> None:
+def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) -> None:
     """Raise `ValueError` if the torque reads an input that a recording lacks."""
-    for number, recording in enumerate(recordings):
-        missing = [name for name in inputs_of(torque) if name not in recording.inputs]
+    for number, some in enumerate(inputs):
+        missing = [name for name in inputs_of(torque) if name not in some]
         if missing:
             raise ValueError(
                 f"torque: it reads {', '.join(map(repr, missing))}, and recording {number} has "
-                f"{', '.join(map(repr, recording.inputs)) or 'no inputs'}; give "
+                f"{', '.join(map(repr, some)) or 'no inputs'}; give "
                 "Recording(…, inputs={name: samples or a function of time})"
             )
 
@@ -505,9 +547,9 @@ def _zeros(*shape: int) -> Array:
     return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
 
 
-def _state_kind(recording: Recording, torque: Any, body: AbstractBodyChart | Bodies) -> type:
+def _state_kind(sensors: Any, torque: Any, body: AbstractBodyChart | Bodies) -> type:
     """Return the smallest kind of state that sensors and torque need."""
-    felt = [reading.sensor.feels for reading in recording.readings]
+    felt = [sensor.feels for sensor in sensors]
     if torque is not None:
         felt.append(getattr(torque, "feels", HasAttitude))
     forced = any(isinstance(part, AbstractForce) for part in parts_of(torque))

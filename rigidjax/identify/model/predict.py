@@ -10,6 +10,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from rigidjax import _checks
@@ -20,10 +21,14 @@ from rigidjax.identify.sensors import AbstractSensor, SensorInput
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, CoupledEquations, started
 from rigidjax.motion.torques.base import Torque
+from rigidjax.motion.torques.inputs import bind
 from rigidjax.motion.torques.states import freeze
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
+from rigidjax.solve.components import split
 from rigidjax.solve.equal_steps import advance, in_a_loop
 from rigidjax.solve.explicit import AbstractExplicit
+from rigidjax.solve.fixed_loop import first_row, first_rows, step
+from rigidjax.solve.steppers import cheapest, stepper_of
 from rigidjax.solve.tableaus import KUTTA4
 
 # The turn in a step, rad: the error of a fifth-order method is then 1e-9 a radian. A method of
@@ -156,6 +161,56 @@ def states_at(
         assert integrator is not None
         return integrator.states(body, state0, ts, torque)
     return FreeMotion(body, state0)(ts - ts[0])
+
+
+class HeldSteps(AbstractIntegrator):
+    """One step of order 4 from one sample to the next, with the inputs held through it.
+
+    Samples are evenly spaced. A delayed input changes inside a step, which is split there. `last` is
+    the number of the last time that is needed, `None` for all.
+
+    >>> HeldSteps().last
+    """
+
+    last: Int[Array, ""] | None = eqx.field(default=None, repr=False)
+
+    def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
+        return self.driven(body, state0, ts, torque, {})
+
+    def driven(
+        self,
+        body: Any,
+        state0: Any,
+        ts: Float[Array, " times"],
+        torque: Torque,
+        inputs: dict[str, Array],
+    ) -> Any:
+        """Return the states at `ts` (T,); `inputs` by name (before + T − 1, *k).
+
+        Row before + i is held through the step from time i. A torque's own states follow the rows
+        before the first time, with the body held at its initial state.
+        """
+        count, size = ts.shape[0] - 1, (ts[1] - ts[0]).astype(state0.omega.dtype)
+        before = max((len(rows) - count for rows in inputs.values()), default=0)
+        start = started(body, state0, bind(torque, first_row(torque, size, inputs)), 0.0)
+        field = equations_of_motion(body, start, torque)
+        stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
+
+        def one(y: Any, i: Array) -> tuple[Any, Any]:
+            y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
+            return y, stepper.state(y)
+
+        def warm_up(y: Any, i: Array) -> tuple[Any, None]:
+            # The torque's own states follow the inputs; the body keeps its initial state.
+            y, _ = one(y, i)
+            return split(Coupled(start.motion, stepper.state(y).own)), None
+
+        y0 = stepper.start
+        if before and isinstance(start, Coupled):
+            y0, _ = lax.scan(warm_up, y0, jnp.arange(-before, 0, dtype=jnp.int32))
+        still = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *jnp.shape(a))), start)
+        later = first_rows(count if self.last is None else self.last, one, y0, still)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, later)
 
 
 def shifted(field: Callable[..., Any], t: Array, state: Any, offset: Array) -> Any:

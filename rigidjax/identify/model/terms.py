@@ -15,13 +15,14 @@ from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.model.charts import Bodies, body_of_recording
 from rigidjax.identify.model.free import put
 from rigidjax.identify.model.predict import (
+    HeldSteps,
     body_of_equations,
     errors_along,
     sensor_inputs,
     states_at,
 )
 from rigidjax.identify.model.scene import Scene
-from rigidjax.motion.torques.inputs import bind
+from rigidjax.motion.torques.inputs import Input, bind
 from rigidjax.rotation.barrier import batched_as
 
 if TYPE_CHECKING:
@@ -51,8 +52,15 @@ def scene_of(
 
 def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[Any, Any]:
     """Return the states at the times of a recording, and the torque with its inputs."""
-    torque = bind(scene.torque, record.inputs)
     body: Any = body_of_equations(scene.body, model.state_kind)
+    functions = {name: source for name, source in record.inputs.items() if callable(source)}
+    if isinstance(model.integrator, HeldSteps) and scene.torque is not None:
+        samples = {n: rows for n, rows in record.inputs.items() if n not in functions}
+        unbound = {name: Input(name) for name in samples}
+        torque = bind(scene.torque, functions | unbound)
+        states = model.integrator.driven(body, scene.start, record.t, torque, samples)
+        return states, torque
+    torque = bind(scene.torque, functions)
     return states_at(model.integrator, body, scene.start, record.t, torque), torque
 
 
@@ -270,6 +278,8 @@ def prior_weights(model: "Model") -> Float[Array, " n"]:
         for places, deviation in about:
             if places is not None and deviation is not None:
                 weights = weights.at[places].set((1.0 / deviation).astype(weights.dtype))
+    if model.start_weight is not None:
+        weights = weights.at[model.index.start].set(model.start_weight)
     return weights
 
 

@@ -14,7 +14,7 @@ from rigidjax.identify.data.recording import count_of
 from rigidjax.identify.model import terms
 from rigidjax.identify.model.charts import charts_of, numbers_of
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.predict import FixedSteps
+from rigidjax.identify.model.predict import FixedSteps, HeldSteps
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
 from rigidjax.identify.search.normal import Normal, normal_of
@@ -130,14 +130,13 @@ def _bends(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
 def _as_far_as(model: Model, weights: Float[Array, "records times"]) -> Model:
     """Return the model, with its motion followed to the last time with weight."""
     steps = model.integrator
-    if not isinstance(steps, FixedSteps):
+    if not isinstance(steps, FixedSteps | HeldSteps):
         return model
     counts = jnp.any(weights > 0, axis=0)
     place = jnp.arange(counts.size, dtype=jnp.int32)
     last = jnp.minimum(jnp.max(jnp.where(counts, place, 0)) + _BEYOND, counts.size - 1)
-    return eqx.tree_at(
-        lambda m: m.integrator, model, FixedSteps(steps.substeps, steps.solver, last)
-    )
+    shorter = eqx.tree_at(lambda s: s.last, steps, last, is_leaf=lambda node: node is None)
+    return eqx.tree_at(lambda m: m.integrator, model, shorter)
 
 
 def _nothing(model: Model, kind: Any) -> Any:
@@ -269,11 +268,16 @@ def fit_in_stages(
     return polish(Attempt(x), task, damping=CAREFUL, aim=aim, watch=watch)
 
 
+def nominal(reading: Any) -> bool:
+    """Return whether the noise of a reading is only the unit of its errors."""
+    return getattr(reading.sensor, "nominal", False)
+
+
 def enough(model: Model) -> float:
     """Return a misfit that only the true motion reaches: twice the mean of χ², or 1 % of the
     signal.
     """
     return sum(
-        (1.0 if reading.known_noise else 0.01) * count_of(reading)
+        (1.0 if reading.known_noise and not nominal(reading) else 0.01) * count_of(reading)
         for reading in model.records.readings
     )

@@ -25,7 +25,7 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
     """Return `count` starting points: the regression first, then scattered around it or over the whole
     chart, the rate by a tenth. A `Free` starts at its given value.
     """
-    recordings = stacking.on_host(model.records, model.counts)
+    recordings = stacking.on_host(model.records, model.counts) if model.index.bodies else ()
     if isinstance(model.chart, Bodies):
         rows = list(zip(recordings, model.body_names, strict=True))
         found = {
@@ -34,13 +34,14 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
         }
         regressed = {name: body for name, body in found.items() if body is not None} or None
     else:
-        regressed = regress_inertia(recordings, model.torque)
+        regressed = regress_inertia(recordings, model.torque) if recordings else None
     start = model.start(regressed)
     bodies, spins = slice(model.index.bodies), np.asarray(model.index.start)[:, -3:]
     # NumPy's generator: that of JAX takes seconds to compile.
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)
     out = []
-    for index in range(count):
+    # Without a free body and free initial rates there is nothing to scatter.
+    for index in range(count if model.index.bodies or spins.size else 1):
         wide = 0.0 if index == 0 else (0.5 if regressed is not None and index % 2 else 1.5)
         x = np.array(start)
         middle = x[bodies] if (index == 0 or wide < 1) else 0 * x[bodies]

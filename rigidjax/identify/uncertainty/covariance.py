@@ -262,7 +262,7 @@ def of_white(linear: Linearised) -> Spread:
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     covariance = root.covariance
     return Spread(
-        _blinded(covariance, directions),
+        blinded(covariance, directions),
         covariance,
         "Gauss–Newton",
         np.concatenate([singular, *values]),
@@ -309,11 +309,11 @@ def spread(linear: Linearised, times: "Times", white: Spread | None = None) -> S
         return white
     covariance = _sandwich(linear, white, times)
     kind = f"sandwich: the errors are autocorrelated over {times.longest:.0f} samples"
-    shown = _blinded(covariance, white.null_directions)
+    shown = blinded(covariance, white.null_directions)
     return dataclasses.replace(white, covariance=shown, seen=covariance, kind=kind)
 
 
-def _blinded(covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
+def blinded(covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
     """The covariance, infinite for a number that depends on an undetermined direction."""
     shown = covariance.copy()
     blind = np.abs(null).max(axis=0, initial=0.0) > 1e-6

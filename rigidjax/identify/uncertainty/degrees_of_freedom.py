@@ -80,6 +80,11 @@ def freedom_of(
     shifts of the numbers by considered errors.
     """
     groups, left, blocks = np.asarray(model.noise_groups), [], linear.information
+    if model.clusters is not None:
+        # Variances come from the scatter between stretches alone.
+        degrees = np.array([max(float(np.max(np.asarray(model.clusters))), 1.0)])
+        none = np.zeros_like(groups)
+        return Freedom(covariance, linear.places, none, blocks[:1], (degrees,), (), considered)
     taken = leverages(linear, blocks, covariance)
     for sensor, kept, spans, lost in zip(
         model.records.sensors, linear.kept, times.spans, taken, strict=True

@@ -73,7 +73,7 @@ def labels(model: Model) -> list[tuple[str, str, bool]]:
         out += [(f"{log}{name}", chart.unit, True) for log in chart.log_names]
         out += [(f"{plain}{name}", chart.unit, False) for plain in chart.plain_names]
     names = recording_names(model)
-    for where in names:
+    for where in names if reports_starts(model) else ():
         out += [(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]
     for slot in model.slots:
         shape = slot.shape
@@ -83,6 +83,11 @@ def labels(model: Model) -> list[tuple[str, str, bool]]:
         called = [f"{slot.name}{part}{end}" for end in ends for part in parts]
         out += [(name, slot.unit, slot.positive) for name in called]
     return out
+
+
+def reports_starts(model: Model) -> bool:
+    """Return whether initial states are reported: those of windows are measured, and many."""
+    return model.clusters is None
 
 
 def charts(model: Model) -> list[tuple[str, AbstractBodyChart]]:
@@ -109,17 +114,18 @@ def _place(index: tuple[int, ...]) -> str:
 
 def vector(model: Model, x: Float[Array, " n"]) -> Array:
     """Return the reported quantities, with logarithms of the positive ones."""
-    rates = x[model.index.start[:, -3:]] * model.reference.rate[:, None]
-    parts, bodies = [], as_list(model.bodies(x))
+    parts, bodies = [jnp.zeros(0, x.dtype)], as_list(model.bodies(x))
     for (_, chart), body in zip(charts(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
-    parts.append(rates.reshape(-1))
+    if reports_starts(model):
+        rates = x[model.index.start[:, -3:]] * model.reference.rate[:, None]
+        parts.append(rates.reshape(-1))
     values = values_of(model, x)
     for slot in model.slots:
         for name in (slot.name, f"{slot.name}, own")[: 1 + (slot.spread is not None)]:
             value = values[name].reshape(-1)
             parts.append(jnp.log(value) if slot.positive else value)
-    return jnp.concatenate([part.astype(rates.dtype) for part in parts])
+    return jnp.concatenate([part.astype(x.dtype) for part in parts])
 
 
 @eqx.filter_jit

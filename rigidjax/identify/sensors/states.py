@@ -1,0 +1,57 @@
+"""A sensor that reads the whole state: what a window of measured states is compared with."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax._types import HasAttitude, HasPose, HasSpin
+from rigidjax.identify.sensors.base import AbstractSensor, SensorInput
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.manifold import minus_small
+
+_FEELS = {Spin: HasSpin, Attitude: HasAttitude, Rigid: HasPose}
+_SIZES = {Spin: (3, 3), Attitude: (7, 6), Rigid: (13, 12)}
+# Where the numbers of one part of a state end.
+_CUTS = {Spin: (), Attitude: (4,), Rigid: (3, 6, 10)}
+
+
+class StateSensor(AbstractSensor):
+    """Reads a whole state: its numbers in a row, (3,) Ω, (7,) q and Ω, or (13,) x, v, q and Ω.
+
+    The error is the change from the predicted state to the one that was read, as
+    `motion.manifold` counts it: three numbers for each part, of q the rotation vector (body frame,
+    rad).
+
+    **Arguments:** `kind` the class of the state, `Spin`, `Attitude` or `Rigid`; `noise` (k,)
+    standard deviations of the k numbers of the error; `nominal` whether these are no measure of the
+    errors, but only their units.
+
+    >>> StateSensor(rj.Attitude, jnp.ones(6), False).reading_shape
+    (7,)
+    """
+
+    kind: type = eqx.field(static=True)
+    noise: Float[Array, "*records k"]
+    nominal: bool = eqx.field(static=True)
+    unit: ClassVar[str] = ""
+
+    @property
+    def reading_shape(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The shape of a reading."""
+        return (_SIZES[self.kind][0],)
+
+    @property
+    def components(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The number of numbers of an error."""
+        return _SIZES[self.kind][1]
+
+    @property
+    def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The smallest state that has what is read."""
+        return _FEELS[self.kind]
+
+    def error(self, now: SensorInput, reading: Array) -> Float[Array, " k"]:
+        leaves = jnp.split(reading, _CUTS[self.kind])
+        return minus_small(self.kind(*leaves), now.state)
