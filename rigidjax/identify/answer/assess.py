@@ -247,7 +247,7 @@ def assess(
         spread = uncertainty.spread(linear, times, white)
     else:
         spread = by_stretches(stretches, white)
-        remarks = (*remarks, *remarks_on(stretches, model, x, _names_of_places(model)))
+        remarks = (*remarks, *remarks_on(stretches, model, x))
     numbers, of = values_and_slopes(model, x, near), charts(model)
     parts = considered.considerations(model, linear, noise, white.seen)
     spread = _with_considered(spread, parts, model)
@@ -323,16 +323,6 @@ def _allowance(
     known = rows if np.isfinite(linear.dense).all() and np.isfinite(covariance).all() else []
     moves = considered.unit_moves(model, linear, noise, covariance, slopes[known]) if known else []
     return allowance(model, parts, moves, [quantities[i] for i in known])
-
-
-def _names_of_places(model: Model) -> dict[int, str]:
-    """Return the name of each shared number by its place among the free numbers."""
-    names = {}
-    for slot in model.slots:
-        for index, place in np.ndenumerate(np.asarray(slot.shared if slot.own is None else ())):
-            inner = "".join(f" {'xyz'[i] if i < 3 else i}" for i in index[1:])
-            names[int(place)] = f"{slot.name}{inner}"
-    return names
 
 
 def _with_considered(

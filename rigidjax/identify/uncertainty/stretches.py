@@ -10,9 +10,9 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
-from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.model import Model, values_of
 from rigidjax.identify.uncertainty.covariance import Linearised, Spread, blinded, inverted
 
 # A number hangs on one stretch, of so many at least, if that makes this part of its variance.
@@ -82,6 +82,8 @@ def by_stretches(stretches: Stretches, white: Spread) -> Spread:
     """Return the covariance of the shared numbers by the scatter of the steps."""
     count, places = len(stretches.steps), stretches.places
     covariance = np.array(white.seen)
+    # What the starts of windows have in common with the shared numbers is not known in this way.
+    covariance[places], covariance[:, places] = 0.0, 0.0
     square = (count - 1) / count * stretches.steps.T @ stretches.steps
     covariance[np.ix_(places, places)] = square
     shown = blinded(covariance, white.null_directions)
@@ -89,17 +91,32 @@ def by_stretches(stretches: Stretches, white: Spread) -> Spread:
     return dataclasses.replace(white, covariance=shown, seen=covariance, kind=kind)
 
 
-def remarks(stretches: Stretches, model: Model, x: Any, names: dict[int, str]) -> list[str]:
-    """Return a remark on each number that hangs on one stretch; `names` by the place of a number."""
-    count, windows = len(stretches.steps), model.count
-    edges = -(-np.arange(count + 1) * windows // count)
-    out = []
+def remarks(stretches: Stretches, model: Model, x: Float[Array, " n"]) -> list[str]:
+    """Return a remark on each number that hangs on one stretch, with its value without that one."""
+    count = len(stretches.steps)
+    edges = -(-np.arange(count + 1) * model.count // count)
+    names, out = _names_of_places(model), []
     for place, stretch in stretches.hanging:
         step = stretches.steps[stretch, list(stretches.places).index(place)]
-        name = names.get(place, f"free number {place}")
-        value = float(np.asarray(x)[place] + step)
+        name, index = names.get(place, (f"number {place} of the body", None))
+        without = x.at[place].add(step)
+        value = without[place] if index is None else values_of(model, without)[name[0]][index]
+        shown = name if index is None else name[0] + name[1]
+        first, last = edges[stretch], edges[stretch + 1] - 1
         out.append(
-            f"{name} hangs on one stretch (without windows {edges[stretch]} … "
-            f"{edges[stretch + 1] - 1} it moves by {step:.3g} to {value:.3g} of its scale)"
+            f"{shown} hangs on one stretch (without windows {first} … {last} it is "
+            f"{float(value):.3g})"
         )
     return out
+
+
+def _names_of_places(model: Model) -> dict[int, tuple[Any, Any]]:
+    """Return the name of each shared number, and its index in the value, by its place."""
+    names: dict[int, tuple[Any, Any]] = {}
+    for slot in model.slots:
+        if slot.shared is None:
+            continue
+        for index, place in np.ndenumerate(np.asarray(slot.shared)):
+            inner = "".join(f" {'xyz'[i] if i < 3 else i}" for i in index[1:])
+            names[int(place)] = (slot.name, inner), index if slot.labels else index[1:]
+    return names
