@@ -63,8 +63,9 @@ def test_d15_a_forced_recording_is_fitted(loss):
     ts, body = jnp.linspace(0.0, 4.0, 25), rj.Inertia.from_principal(1.0, 1.6, 2.1)
     law = rj.torques.ConstantTorque([0.3, -0.2, 0.5])
     truth = rj.simulate(body, rj.Spin([0.4, 1.2, -0.3]), ts, law).ys.omega
-    record = identify.Recording(ts, (identify.Gyro(1e-3), truth), torque=law)
+    record = identify.Recording(ts, (identify.Gyro(1e-3), truth))
     options = {} if loss is None else {"loss": loss}
-    found = identify.fit(identify.Model(record, identify.Principal(1.5), **options), starts=1)
+    model = identify.Model(record, identify.Principal(1.5), torque=law, **options)
+    found = identify.fit(model, starts=1)
     moments = np.asarray(found.body.moments)
     np.testing.assert_allclose(np.sort(moments), [1.0, 1.6, 2.1], rtol=1e-5)

@@ -35,8 +35,6 @@ def test_signs_and_turns_do_not_matter():
     again = np.asarray(jax.vmap(lambda a: rj.euler.to_quaternion(a, "zyx"))(unwrapped))
     plain, signs, wraps = (fitted(x) for x in (q, flipped, again))
     assert plain.ok and signs.ok and wraps.ok
-    for a, b in zip(
-        jax.tree.leaves(plain.x), jax.tree.leaves(signs.x), strict=True
-    ):
+    for a, b in zip(jax.tree.leaves(plain.x), jax.tree.leaves(signs.x), strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_allclose(wraps.body.moments, plain.body.moments, rtol=1e-6)

@@ -52,10 +52,10 @@ def widths(random, count, width):
         own = 0.3 + width * random.normal()
         rates = np.exp(-own * times)[:, None] * [1.0, 2.0, 0.0]
         gyro = identify.Gyro(0.01), rates + 0.01 * random.normal(size=(40, 3))
-        records.append(identify.Recording(times, gyro, torque=Fading(0.2)))
+        records.append(identify.Recording(times, gyro))
     free = [identify.Free(lambda s: s.torque.coefficient, "c", scale=0.1, spread="estimated")]
     sphere = identify.Known(rj.Inertia.from_principal(1.0, 1.0, 1.0))
-    found = identify.fit(identify.Model(records, sphere, free=free), starts=1)
+    found = identify.fit(identify.Model(records, sphere, torque=Fading(0.2), free=free), starts=1)
     return [(found.interval()["c"], 0.3)]
 
 

@@ -15,7 +15,7 @@ repeats in one process, other readings each time; compile apart.
 
 What is not installed is left out. `--joint` adds all throws of the data beside the checkout as one
 problem (see `bench_throws.py`), then 55: throws of the groups that have fewest are in it twice.
-`--many` adds a thousand starts at once, and up to a thousand recordings, six numbers each.
+`--many` adds up to a thousand recordings, six numbers each.
 `--steps` adds what one evaluation costs in equal and in adaptive steps. `--real` has only the first
 comparison, with the throws of an object beside the checkout in the place of simulated readings:
 their errors are not white, and the fit estimates its noise.
@@ -40,7 +40,7 @@ jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.model.terms import with_blocks
+from rigidjax.identify.model.terms import blocks
 
 COUNT, STEP, SIGMA, WHEEL = 700, 1e-3, 0.02, 1.7e-6
 T = np.arange(COUNT) * STEP
@@ -61,8 +61,8 @@ t = np.arange(200) * 1e-2
 motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1.0, 0.1, 1.0]), t, LAW)
 read = motion.ys.omega + 0.01 * np.random.default_rng(0).normal(size=(200, 3))
 def fitted(read):
-    record = identify.Recording(t, (identify.Gyro(0.01), read), torque=LAW)
-    return identify.fit(identify.Model(record, identify.CHART), starts=1)
+    record = identify.Recording(t, (identify.Gyro(0.01), read))
+    return identify.fit(identify.Model(record, identify.CHART, torque=LAW), starts=1)
 begun = time.process_time()
 fitted(read)
 first = time.process_time()
@@ -88,31 +88,31 @@ def real():
     out = []
     for path in throws.paths("object_empty"):
         record = throws.record(path)
-        momentum = record.torque.parts[0].momentum
-        h = np.asarray(jax.vmap(momentum.speed)(record.t)) * throws.WHEEL
+        h = np.asarray(jax.vmap(record.inputs["speed"])(record.t)) * throws.WHEEL
         scene = np.asarray(record.readings[0].values), h, np.gradient(h, STEP)
-        made = identify.Model(record, identify.Tensor(UNIT), free=free)
+        made = identify.Model(record, identify.Tensor(UNIT), torque=throws.LAW, free=free)
         out.append((scene, made, start(made, scene[0])))
     return out
 
 
 def problem(readings, integrator=None):
-    record = identify.Recording(T, (identify.Gyro(SIGMA), readings), torque=law([0.0, 0.0, 0.0]))
+    record = identify.Recording(T, (identify.Gyro(SIGMA), readings))
     free = [identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=1e-5)]
-    return identify.Model(record, identify.Tensor(UNIT), free=free, integrator=integrator)
+    torque = law([0.0, 0.0, 0.0])
+    return identify.Model(
+        record, identify.Tensor(UNIT), torque=torque, free=free, integrator=integrator
+    )
 
 
 def driven(readings):
     push = rj.torques.ConstantTorque(TORQUE)
-    record = identify.Recording(T, (identify.Gyro(SIGMA), readings), torque=push)
-    return identify.Model(record, identify.Tensor(UNIT))
+    record = identify.Recording(T, (identify.Gyro(SIGMA), readings))
+    return identify.Model(record, identify.Tensor(UNIT), torque=push)
 
 
 def start(of, readings):
-    """The parameters of the common start."""
-    here = of.start(rj.Inertia(GUESS))
-    spin = jnp.asarray(readings[0] / np.asarray(of.typical_rate))[None]
-    return eqx.tree_at(lambda p: p.own.spin, here, spin)
+    """The free numbers of the common start."""
+    return of.start(rj.Inertia(GUESS), readings[0])
 
 
 def with_numba():
@@ -270,16 +270,6 @@ def cold():
         print(f"{kind}: {shown}; from nothing to the first fit {parts[4]:.1f}")
 
 
-def many(readings):
-    print("\n1000 starts in one vmap, 70 samples, free motion")
-    short = identify.Recording(T[::10], (identify.Gyro(SIGMA), readings[::10]))
-    ratios = identify.Model(short, identify.PrincipalRatios())
-    for name in ("first call", "warm"):
-        begun = time.process_time()
-        identify.fit(ratios, starts=1000, together=1000)
-        print(f"{name}: {time.process_time() - begun:.1f} CPU s")
-
-
 def recordings(counts=(100, 500, 1000)):
     """Recordings of a free body by one gyro, each with a rate and a bias of its own."""
     body, ts, rng = rj.Inertia.from_principal(1.0, 2.0, 2.5), T[:600:10], np.random.default_rng(0)
@@ -333,21 +323,21 @@ def steps():
     for apart in (0.1, 0.4, 1.6):
         ts = np.arange(0.0, 100.0, apart / np.linalg.norm(rates))
         read = np.asarray(rj.simulate(body, rj.Spin(rates), ts, smooth).ys.omega)
-        record = identify.Recording(ts, (identify.Gyro(0.01), read), torque=smooth)
-        made = identify.Model(record, identify.Principal(1.2))
+        record = identify.Recording(ts, (identify.Gyro(0.01), read))
+        made = identify.Model(record, identify.Principal(1.2), torque=smooth)
         tasks[f"smooth, {apart} rad apart"] = made, made.start(body)
     places = Path(__file__).parent
     loaded = importlib.util.spec_from_file_location("bench_throws", places / "bench_throws.py")
     bench = importlib.util.module_from_spec(loaded)
     loaded.loader.exec_module(bench)
     record = bench.record(bench.throws.paths("object_empty")[0], 1, 0.53)
-    made = identify.Model(record, identify.Tensor(3e-4))
+    made = identify.Model(record, identify.Tensor(3e-4), torque=bench.LAW)
     tasks["a throw with its log"] = made, made.start(rj.Inertia(GUESS))
     print("\none evaluation of errors and derivatives, ms")
     for name, (made, at) in tasks.items():
         for way in (made.integrator, identify.Adaptive()):
             chosen = eqx.tree_at(lambda p: p.integrator, made, way)
-            run = eqx.filter_jit(lambda at, chosen: with_blocks(at, chosen))
+            run = eqx.filter_jit(lambda at, chosen: blocks(chosen, at))
             found, _ = compared(
                 {"it": lambda at, run=run, chosen=chosen: jax.block_until_ready(run(at, chosen))},
                 [at] * 9,
@@ -424,7 +414,6 @@ def main():
     table("a known torque, nine numbers", tasks, pushed, "mujoco.sysid")
     cold()
     if options.many:
-        many(draws[0])
         recordings()
     if options.joint:
         joint(0)

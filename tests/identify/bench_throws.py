@@ -56,16 +56,15 @@ TRUTH = {PROOF: throws.PROOF_MOMENTS} | {name: throws.OBJECTS[name][1] for name 
 OWN_BIAS = 0.02
 
 
+LAW = throws.law(tilt=[0.0, 0.0])
+
+
 def record(path, every, end):
-    wide = throws.columns(path, throws.WINDOW[0] - 0.02)
-    log = throws.columns(path, throws.WINDOW[0])
-    speed = rj.torques.Series(wide["t"], wide["flywheel"])
-    wheel = rj.torques.Wheel(throws.WHEEL, [0.0, 0.0, 1.0], speed, delay=0.0, tilt=[0.0, 0.0])
-    law = rj.torques.Sum(rj.torques.Flywheel(wheel), rj.torques.Damping([0.0, 0.0, 0.0]))
+    log, speed = throws.columns(path, throws.WINDOW[0]), throws.speed(path)
     gyro = identify.Gyro(bias=[0.0] * 3, scale=[1.0] * 3, skew=[0.0] * 3)
     rates = np.stack([log["wx"], log["wy"], log["wz"]], axis=1)
     kept = np.flatnonzero(log["t"] <= end + 1e-9)[::every]
-    return identify.Recording(log["t"][kept], (gyro, rates[kept]), torque=law)
+    return identify.Recording(log["t"][kept], (gyro, rates[kept]), inputs={"speed": speed})
 
 
 def free(own_bias, drag):
@@ -86,7 +85,7 @@ SENSOR = [
 def together(records):
     charts = {name: identify.Tensor(3e-4) for name in records}
     moves = [*free({"spread": OWN_BIAS}, {"each": "body"}), *SENSOR]
-    problem = identify.Model(records, charts, free=moves, noise_each="body")
+    problem = identify.Model(records, charts, torque=LAW, free=moves, noise_each="body")
     return identify.fit(problem, starts=1)
 
 
@@ -97,25 +96,23 @@ def alone(name, row, joint):
 
 def some(name, rows, joint):
     """Throws of one body; each has a bias and a delay of its own."""
-    first = joint.model.of.index(name)
-    scenes = joint.model.scenes(joint.x)
+    at = joint.model.body_names.index(name) + np.asarray(rows)
+    scenes = jax.tree.map(lambda a: a[at[0]] if eqx.is_array(a) else a, joint.model.scenes(joint.x))
+    gyro = eqx.tree_at(lambda g: g.bias, scenes.sensors[0], joint.values["bias"])
+    torque = eqx.tree_at(lambda law: law.parts[0].momentum.delay, scenes.torque, jnp.zeros(()))
     chosen = [
-        eqx.tree_at(
-            lambda s: s.sensors[0].bias,
-            jax.tree.map(lambda a, i=first + row: a[i] if eqx.is_array(a) else a, scenes),
-            joint.values["bias"],
-        )
-        for row in rows
+        eqx.tree_at(lambda r: r.readings[0].sensor, joint.model.recordings[row], gyro) for row in at
     ]
     # As sure as the joint fit is of the drag, of all axes the one that it is least sure of.
     drag = max(
         q.deviation for q in joint.quantities if q.name in [f"drag {a} [{name}]" for a in "xyz"]
     )
     moves = free({"prior": OWN_BIAS, "each": True}, {"prior": drag})
-    problem = identify.Model(chosen, identify.Tensor(3e-4), free=moves)
+    problem = identify.Model(chosen, identify.Tensor(3e-4), torque=torque, free=moves)
     start = problem.start(joint.body[name])
-    spin = joint.x.own.spin[jnp.asarray(rows) + first]
-    start = eqx.tree_at(lambda p: p.own.spin, start, spin)
+    pairs = [(m.index.start, m.slots[1].own) for m in (problem, joint.model)]
+    for mine, theirs in zip(*pairs, strict=True):
+        start = start.at[mine].set(joint.x[theirs[at]])
     return identify.fit(problem, starts=1, initial=start)
 
 
@@ -274,7 +271,7 @@ def of_all(name, joint, levers, rows=None):
 def copies(joint, levers, count):
     """Print how many intervals of the joint fit hold in simulated copies of the experiment."""
     rng = np.random.default_rng(0)
-    errors, of = np.asarray(joint.residuals[0]), np.array(joint.model.of)
+    errors, of = np.asarray(joint.residuals[0]), np.array(joint.model.body_names)
     clean = np.asarray(joint.model.records.readings[0].values) - errors
     rows = {name: throws.levers(name) for name in levers}
     truth = {n: log_moments(n, joint.body[n].tensor, joint.body, levers) for n in TRUTH}

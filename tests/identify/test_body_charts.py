@@ -66,9 +66,10 @@ def test_a_free_centre_is_found_from_where_a_body_turns_about():
         ts,
         (identify.Marker(place, 1e-3), np.asarray(seen) + 1e-3 * rng.normal(size=(41, 3))),
         (identify.AttitudeSensor(1e-3), states.q),
-        torque=rj.torques.UniformGravity([0.0, 0.0, 0.0]),
     )
-    found = identify.fit(identify.Model(record, identify.Mass(guess, ["com"])), starts=1)
+    law = rj.torques.UniformGravity([0.0, 0.0, 0.0])
+    model = identify.Model(record, identify.Mass(guess, ["com"]), torque=law)
+    found = identify.fit(model, starts=1)
     np.testing.assert_allclose(found.body.com, BOX.com, rtol=0, atol=3e-3)
     np.testing.assert_allclose(found.body.second_moment, BOX.second_moment, rtol=0, atol=1e-13)
     for axis, value in zip("xyz", BOX.com, strict=True):
@@ -94,16 +95,17 @@ def test_bodies_with_and_without_a_scale_in_one_problem():
     ts = jnp.linspace(0.0, 3.0, 12)
     law = rj.torques.Damping([0.1, 0.1, 0.1])
     omega = rj.simulate(rj.Inertia.from_principal(1.0, 1.6, 2.1), rj.Spin([1.0, 2, 0.3]), ts, law).ys.omega  # fmt: skip
-    record = identify.Recording(ts, (identify.Gyro(0.01), omega), torque=law)
+    record = identify.Recording(ts, (identify.Gyro(0.01), omega))
     known = rj.Inertia(jnp.diag(jnp.array([0.5, 0.7, 0.8])), "arbitrary")
     charts = {"a": identify.Ratios(), "b": identify.Tensor(1.0), "c": identify.PrincipalRatios()}
     steps = identify.Adaptive(1e-6, 1e-9)
-    problem = identify.Model({name: record for name in charts}, charts, integrator=steps)
+    records = {name: record for name in charts}
+    problem = identify.Model(records, charts, torque=law, integrator=steps)
     start = problem.start()
     assert np.isfinite(np.asarray(problem.errors(start)[0])).all()
-    bodies, _ = problem.unpack(start)
+    bodies = problem.unpack(start).body
     assert [bodies[name].scale for name in "abc"] == ["arbitrary", None, "arbitrary"]
     mixed = {"a": identify.Known(known), "b": identify.Tensor(1.0)}
-    problem = identify.Model({name: record for name in mixed}, mixed)
+    problem = identify.Model({name: record for name in mixed}, mixed, torque=law)
     assert np.isfinite(np.asarray(problem.errors(problem.start())[0])).all()
-    assert problem.unpack(problem.start())[0]["a"].scale == "arbitrary"
+    assert problem.bodies(problem.start())["a"].scale == "arbitrary"

@@ -24,13 +24,15 @@ def turned(q, rng, sigma):
 def gyro_alone(rng):
     ys = rj.simulate(BODY, rj.Spin(OMEGA), TS).ys
     read = ys.omega + 0.02 * rng.normal(size=(60, 3))
-    return identify.Recording(TS, (identify.Gyro(0.02), read)), identify.PrincipalRatios(), []
+    record = identify.Recording(TS, (identify.Gyro(0.02), read))
+    return identify.Model(record, identify.PrincipalRatios())
 
 
 def noise_unknown(rng):
     ys = rj.simulate(BODY, rj.Spin(OMEGA), TS).ys
     read = ys.omega + 0.02 * rng.normal(size=(60, 3))
-    return identify.Recording(TS, (identify.Gyro(), read)), identify.PrincipalRatios(), []
+    record = identify.Recording(TS, (identify.Gyro(), read))
+    return identify.Model(record, identify.PrincipalRatios())
 
 
 def attitude_and_biased_gyro(rng):
@@ -42,7 +44,7 @@ def attitude_and_biased_gyro(rng):
         (identify.Gyro(0.02, bias=[0.0, 0.0, 0.0]), read),
     )
     free = [identify.Free(lambda s: s.sensors[1].bias, "bias", scale=0.02)]
-    return record, identify.PrincipalRatios(), free
+    return identify.Model(record, identify.PrincipalRatios(), free=free)
 
 
 def wheel_and_drag(rng):
@@ -51,9 +53,9 @@ def wheel_and_drag(rng):
     law = rj.torques.Sum(wheel, rj.torques.Damping([0.05, 0.05, 0.05]))
     ys = rj.simulate(BODY, rj.Spin(OMEGA), TS, law).ys
     read = ys.omega + 0.02 * rng.normal(size=(60, 3))
-    record = identify.Recording(TS, (identify.Gyro(0.02), read), torque=law)
+    record = identify.Recording(TS, (identify.Gyro(0.02), read))
     free = [identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=0.05)]
-    return record, identify.Principal(1.5), free
+    return identify.Model(record, identify.Principal(1.5), torque=law, free=free)
 
 
 def two_directions_of_a_top(rng):
@@ -66,8 +68,8 @@ def two_directions_of_a_top(rng):
         sensors.append(
             (identify.Direction(world, 0.02), off / jnp.linalg.norm(off, axis=1)[:, None])
         )
-    record = identify.Recording(TS, *sensors, torque=top)
-    return record, identify.Principal(1.5), []
+    record = identify.Recording(TS, *sensors)
+    return identify.Model(record, identify.Principal(1.5), torque=top)
 
 
 SCENES = (
@@ -85,14 +87,12 @@ def test_intervals_hold_the_truth_as_often_as_they_say(scene):
     rng = np.random.default_rng(11)
     truth, held = None, []
     for _ in range(RECORDS):
-        record, chart, free = scene(rng)
-        problem = identify.Model(record, chart, free=free)
+        problem = scene(rng)
         omega = [0.4, 1.2, 1.5] if scene is two_directions_of_a_top else OMEGA
         plan = problem.start(BODY, omega)
         if truth is None:
-            n = sum(x.size for x in jax.tree.leaves(plan))
             found = values_and_slopes(problem, plan, None)
-            named = quantities(problem, found, np.eye(n), np.zeros((0, n)))
+            named = quantities(problem, found, np.eye(plan.size), np.zeros((0, plan.size)))
             truth = {q.name: q.value for q in named if not q.name.startswith(("drag", "bias"))}
         found = identify.fit(problem, starts=1, initial=plan)
         bounds = found.interval(0.95)

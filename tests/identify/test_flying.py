@@ -31,7 +31,7 @@ def seen(law, start=START):
 @pytest.mark.slow
 def test_a_known_body_in_flight():
     problem = identify.Model(
-        identify.Recording(TS, *seen(FREE_FALL), torque=FREE_FALL), identify.Known(TRUTH)
+        identify.Recording(TS, *seen(FREE_FALL)), identify.Known(TRUTH), torque=FREE_FALL
     )
     found = identify.fit(problem, starts=2)
     assert found.ok
@@ -48,7 +48,7 @@ def test_a_known_body_in_flight():
 def test_mass_centre_and_shape_where_a_known_drag_shows_the_scale():
     law = rj.torques.Sum(FREE_FALL, rj.torques.Drag(0.2, [0.05, 0.0, 0.02], [0.5, 0.0, 0.0]))
     guess = rj.shapes.box(1.7, [0.35, 0.2, 0.12])
-    problem = identify.Model(identify.Recording(TS, *seen(law), torque=law), identify.Mass(guess))
+    problem = identify.Model(identify.Recording(TS, *seen(law)), identify.Mass(guess), torque=law)
     found = identify.fit(problem, starts=3)
     assert found.ok
     bounds = found.interval(0.99)
@@ -62,8 +62,9 @@ def test_mass_centre_and_shape_where_a_known_drag_shows_the_scale():
 
 def test_without_a_force_that_feels_it_the_mass_is_said_to_be_unseen():
     problem = identify.Model(
-        identify.Recording(TS, *seen(FREE_FALL), torque=FREE_FALL),
+        identify.Recording(TS, *seen(FREE_FALL)),
         identify.Mass(rj.shapes.box(1.7, [0.35, 0.2, 0.12])),
+        torque=FREE_FALL,
     )
     found = identify.fit(problem, starts=2)
     low, high = found.interval(0.95)["mass"]

@@ -2,11 +2,9 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import rigidjax as rj
 from rigidjax import identify, torques
-from rigidjax.identify.search.multiple_shooting import pieces
 
 BODY = rj.Inertia.from_principal(1.0, 2.0, 2.5)
 TS = np.linspace(0.0, 4.0, 81)
@@ -25,25 +23,22 @@ class Push(torques.AbstractTorque):
         return jnp.stack([0.3, 0.2, 1.0]) * self.source(t)
 
 
-def recording(start):
+LAG = identify.Free(lambda s: s.torque.source.time, "lag", scale=0.1, positive=True)
+
+
+def model(start):
     law = Push(torques.Lagged(DRIVE, 0.15))
     omega = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), TS, law).ys.omega
     read = np.asarray(omega) + 1e-3 * np.random.default_rng(1).normal(size=omega.shape)
+    record = identify.Recording(TS, (identify.Gyro(1e-3), read))
     guess = Push(torques.Lagged(DRIVE, start))
-    return identify.Recording(TS, (identify.Gyro(1e-3), read), torque=guess)
+    return identify.Model(record, identify.Principal(1.5), torque=guess, free=[LAG])
 
 
 def test_moments_and_a_motors_lag_come_back():
-    lag = identify.Free(lambda s: s.torque.source.time, "lag", scale=0.1, positive=True)
-    problem = identify.Model(recording(0.1), identify.Principal(1.5), free=[lag])
-    found = identify.fit(problem, starts=1)
+    found = identify.fit(model(0.1), starts=1)
     assert found.ok
     for name, value in {"Ix": 1.0, "Iy": 2.0, "Iz": 2.5, "lag": 0.15}.items():
         low, high = found.interval(0.999)[name]
         assert low < value < high
         assert high - low < 0.02 * value
-
-
-def test_pieces_are_refused():
-    with pytest.raises(ValueError, match="the torque has states of its own"):
-        pieces(identify.Model(recording(0.1), identify.Principal(1.5)), 4)

@@ -1,4 +1,4 @@
-"""Several recordings, pieces, priors, profiles, comparison, design, checkpoints, reports."""
+"""Several recordings, priors, profiles, comparison, design, checkpoints, reports."""
 
 import json
 import os
@@ -7,24 +7,17 @@ import subprocess
 import sys
 import time
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
 
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.__main__ import main
 from rigidjax.identify import cli_spec
 from rigidjax.identify.csv_io import LogError
-from rigidjax.identify.data.stacking import one
-from rigidjax.identify.model.free import local, places
-from rigidjax.identify.model.terms import errors_of_one, with_blocks
 from rigidjax.identify.search import checkpoint
-from rigidjax.identify.search.multiple_shooting import pieces
-from rigidjax.identify.search.stages import Tried
+from rigidjax.identify.search.stages import Attempt, errors_and_slopes
 from rigidjax.identify.uncertainty import quantities
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -32,20 +25,24 @@ DRAG = [0.05, 0.08, 0.02]
 RATES = ([0.4, 1.2, -0.3], [1.0, 0.2, 0.5], [-0.3, 0.9, 1.1])
 
 
+def law_of(speed, drag):
+    wheel = rj.torques.Wheel(0.2, [0.0, 0.0, 1.0], speed)
+    return rj.torques.Sum(rj.torques.Flywheel(wheel), rj.torques.Damping(drag))
+
+
+LAW = law_of(rj.torques.Input("speed"), [0.0, 0.0, 0.0])
+
+
 def throw(omega, bias, count=60, seed=0, sigma=0.005):
     """A damped body with a wheel inside, read by a gyro with a bias."""
     ts = jnp.asarray(np.arange(count) * 0.05)
     speed = rj.torques.Series(np.arange(80) * 0.05, 3.0 * np.tanh(np.arange(80) * 0.05))
-    law = rj.torques.Sum(
-        rj.torques.Flywheel(rj.torques.Wheel(0.2, [0.0, 0.0, 1.0], speed)),
-        rj.torques.Damping(DRAG),
-    )
+    law = law_of(speed, DRAG)
     ys = rj.simulate(BODY, rj.Spin(omega), ts, law).ys.omega
     read = np.asarray(ys) + np.asarray(bias)
     read = read + sigma * np.random.default_rng(seed).normal(size=read.shape)
-    start = rj.torques.Sum(law.parts[0], rj.torques.Damping([0.0, 0.0, 0.0]))
     gyro = identify.Gyro(sigma, bias=[0.0, 0.0, 0.0])
-    return identify.Recording(ts, (gyro, read), torque=start)
+    return identify.Recording(ts, (gyro, read), inputs={"speed": speed})
 
 
 FREE = [
@@ -65,7 +62,7 @@ def records():
 
 @pytest.fixture(scope="module")
 def joint(records):
-    problem = identify.Model(records, identify.Tensor(1.5), free=FREE)
+    problem = identify.Model(records, identify.Tensor(1.5), torque=LAW, free=FREE)
     return identify.fit(problem, starts=1)
 
 
@@ -90,33 +87,26 @@ def test_three_throws_of_different_lengths_give_one_body_with_its_scale(joint):
 
 @pytest.mark.slow
 def test_the_blocks_are_the_derivative(joint):
-    problem, at = joint.model, joint.x
-    (errors, _), (blocks, _) = with_blocks(at, problem)
-    where = np.asarray(places(problem, at))
-    flat, restore = ravel_pytree(at)
+    model, x = joint.model, joint.x
+    errors, blocks = errors_and_slopes(model, x)
+    where = np.asarray(model.index.places)
     for index in range(3):
-        record, ref = (one(x, index) for x in (problem.records, problem.reference))
-
-        def moved(step, index=index, record=record, ref=ref):
-            mine = one(local(problem, restore(flat + step)), index)
-            return errors_of_one(problem, mine, record, ref, None)[0][0]
-
         for column in (0, 1, 6, 10, 13):
-            step = jnp.zeros(flat.size).at[where[index, column]].set(1e-5)
-            slope = (moved(step) - moved(-step)) / 2e-5
+            step = jnp.zeros(x.size).at[where[index, column]].set(1e-5)
+            ends = (model.errors(x + sign * step)[0][index] for sign in (1, -1))
+            slope = np.subtract(*ends) / 2e-5
             np.testing.assert_allclose(blocks[0][index, ..., column], slope, atol=1e-7)
     assert errors[0].shape == (3, 60, 3)
 
 
 @pytest.mark.slow
 def test_models_are_compared_and_the_right_one_wins(records, joint):
-    plain = identify.Model(records, identify.Tensor(1.5), free=FREE[1:])
+    plain = identify.Model(records, identify.Tensor(1.5), torque=LAW, free=FREE[1:])
     rows = identify.compare({"drag": joint, "no drag": identify.fit(plain, starts=1)})
     assert [row.name for row in rows] == ["drag", "no drag"]
     assert rows[0].information == 0 and rows[1].information > 10
-    short = identify.fit(
-        identify.Model(records[:1], identify.Tensor(1.5), free=FREE[1:]), starts=1
-    )
+    short = identify.Model(records[:1], identify.Tensor(1.5), torque=LAW, free=FREE[1:])
+    short = identify.fit(short, starts=1)
     with pytest.raises(ValueError, match="wanted fits of the same readings"):
         identify.compare({"all": joint, "one": short})
 
@@ -125,7 +115,7 @@ def test_models_are_compared_and_the_right_one_wins(records, joint):
 def test_the_left_out_throw_is_predicted_best_by_the_right_model(records):
     with_drag, without = (
         identify.cross_validate(
-            lambda r, free=free: identify.Model(r, identify.Tensor(1.5), free=free),
+            lambda r, free=free: identify.Model(r, identify.Tensor(1.5), torque=LAW, free=free),
             records,
             starts=1,
         )
@@ -147,7 +137,8 @@ def test_priors_hold_what_the_data_cannot_see(records):
         FREE[0],
         FREE[1],
     ]
-    found = identify.fit(identify.Model(records, identify.Tensor(1.5), free=free), starts=1)
+    model = identify.Model(records, identify.Tensor(1.5), torque=LAW, free=free)
+    found = identify.fit(model, starts=1)
     low, high = found.interval(0.95)["wheel"]
     # The scale of everything hangs on the wheel: its prior is all that is known of it.
     np.testing.assert_allclose(np.log(high / low) / (2 * 1.96), 0.1, rtol=0.1)
@@ -187,30 +178,6 @@ def short_record():
 
 
 @pytest.mark.slow
-def test_pieces_meet_and_give_the_start(free_record):
-    problem = identify.Model(free_record, identify.PrincipalRatios())
-    whole = identify.fit(problem, starts=1, pieces=6)
-    assert whole.ok
-    np.testing.assert_allclose(
-        np.exp(problem.body.logs(whole.body)), [1 / 2.1, 1.6 / 2.1], rtol=0.02
-    )
-    cut = identify.fit(pieces(problem, 6), starts=1)
-    # The joints hold while a quantity is pulled.
-    widths = [
-        np.subtract(*ends) for ends in (identify.profile(cut, "Ix/Iz"), cut.interval()["Ix/Iz"])
-    ]
-    np.testing.assert_allclose(*widths, rtol=0.03)
-    np.testing.assert_allclose(
-        problem.body.logs(cut.body), problem.body.logs(whole.body), atol=5e-3
-    )
-    states = cut.state0.omega
-    motion = rj.simulate(whole.body, whole.state0, free_record.t).ys.omega
-    np.testing.assert_allclose(states, motion[::20][:6], atol=0.02)
-    with pytest.raises(ValueError, match="at least two pieces of four samples"):
-        pieces(problem, 60)
-
-
-@pytest.mark.slow
 def test_profile_agrees_with_the_covariance_where_the_misfit_is_quadratic(free_record):
     problem = identify.Model(free_record, identify.PrincipalRatios())
     found = identify.fit(problem, starts=1)
@@ -243,52 +210,38 @@ def test_the_best_first_rate_shows_more(free_record):
     assert doubts[0] < 0.5 * doubts[1]
 
 
-@pytest.mark.slow
-def test_many_starts_in_one_vmap_end_where_they_do_one_by_one(free_record):
-    problem = identify.Model(free_record, identify.PrincipalRatios())
-    alone, at_once = (identify.fit(problem, starts=4, together=n) for n in (1, 4))
-    assert len(at_once.starts) == 4
-    np.testing.assert_allclose(at_once.x.body, alone.x.body, atol=1e-6)
-
-
-def test_a_fit_killed_after_any_stride_ends_at_the_same_bits(short_record, tmp_path, monkeypatch):
-    """The damping of the strides to come depends on those that were, not on the process."""
-    # Steps in strides of three, so that one start has many of them.
-    monkeypatch.setattr(stages, "STRIDE", 3)
+def test_a_fit_killed_after_any_start_ends_at_the_same_bits(short_record, tmp_path, monkeypatch):
+    """The starts to come depend on those that were, not on the process."""
     problem = identify.Model(short_record, identify.PrincipalRatios())
     path, save = tmp_path / "fit.npz", checkpoint.Checkpoint.save
-    places = []
+    saved = []
 
     class KillError(Exception):
         pass
 
     def fit(last=None):
-        def killed(self, done, position):
-            save(self, done, position)
-            places.append(position[:2])
-            if len(places) == last:
+        def killed(self, done):
+            save(self, done)
+            saved.append(len(done))
+            if len(saved) == last:
                 raise KillError
 
         monkeypatch.setattr(checkpoint.Checkpoint, "save", killed)
-        places.clear()
-        return identify.fit(problem, starts=2, max_steps=30, checkpoint=path)
+        saved.clear()
+        return identify.fit(problem, starts=4, max_steps=30, checkpoint=path)
 
-    def bits(found):
-        return np.concatenate([np.ravel(x) for x in jax.tree.leaves(found.x)])
-
-    whole, count = bits(fit()), len(places)
-    # The last horizon took several strides: there is something to be lost.
-    assert (2, 2) in places and count > 8
-    for last in range(1, count + 1):
+    whole = fit().x
+    assert saved == [1, 2, 3, 4]
+    for last in range(1, 5):
         path.unlink()
         with pytest.raises(KillError):
             fit(last)
-        np.testing.assert_array_equal(bits(fit()), whole, err_msg=f"killed after {last}")
+        np.testing.assert_array_equal(fit().x, whole, err_msg=f"killed after {last}")
         # Nothing is done twice.
-        assert len(places) == count - last
+        assert saved == list(range(last + 1, 5))
     other = identify.Model(short_record, identify.PrincipalRatios(), loss=identify.Huber(0.5))
-    with pytest.raises(ValueError, match="the checkpoint of another problem"):
-        identify.fit(other, starts=2, checkpoint=path)
+    with pytest.raises(ValueError, match="the checkpoint of another model"):
+        identify.fit(other, starts=4, checkpoint=path)
 
 
 def test_a_checkpoint_is_known_by_all_that_the_search_depends_on(short_record):
@@ -320,9 +273,9 @@ def test_a_checkpoint_of_other_options_is_refused(short_record, tmp_path):
     problem, path = identify.Model(short_record, identify.PrincipalRatios()), tmp_path / "fit.npz"
     found = identify.fit(problem, starts=1, max_steps=20, checkpoint=path)
     again = identify.fit(problem, starts=1, max_steps=20, checkpoint=path)
-    np.testing.assert_array_equal(found.x.body, again.x.body)
+    np.testing.assert_array_equal(found.x, again.x)
     for other in ({"max_steps": 21}, {"tolerance": 1e-3}):
-        with pytest.raises(ValueError, match="of another problem, or of other options"):
+        with pytest.raises(ValueError, match="of another model, or of other options"):
             identify.fit(problem, starts=1, checkpoint=path, **{"max_steps": 20, **other})
 
 
@@ -334,7 +287,7 @@ def test_sensors_and_wheels_of_one_kind_have_names_of_their_own(tmp_path):
     wheels = [cli_spec.wheel(text) for text in ("s:1e-6:x", "r:1e-6:y")]
     free = ("bias", "delay")
     record = cli_spec.read_log(path, channels, wheels=wheels, free=free)
-    slots = cli_spec.problem_of([record], "tensor", free=free).slots
+    slots = cli_spec.model_of([record], "tensor", wheels=wheels, free=free).slots
     names = ["gyro 1 bias", "gyro 2 bias", "wheel 1 delay", "wheel 2 delay"]
     assert [slot.name for slot in slots] == names
 
@@ -343,8 +296,8 @@ def test_sensors_and_wheels_of_one_kind_have_names_of_their_own(tmp_path):
 def test_a_damaged_checkpoint_is_told_in_words(short_record, tmp_path, kind):
     problem = identify.Model(short_record, identify.PrincipalRatios())
     path = tmp_path / "fit.npz"
-    like = Tried(problem.start(), jnp.asarray(1.0), jnp.asarray(True))
-    checkpoint.Checkpoint(path, like, "2").save([like], checkpoint.SearchState(1, 0, like))
+    like = Attempt(problem.start(), jnp.asarray(1.0), jnp.asarray(True))
+    checkpoint.Checkpoint(path, like, "2").save([like])
     whole = path.read_bytes()
     if kind == "empty":
         path.write_bytes(b"")
@@ -380,7 +333,7 @@ omega = rj.simulate(rj.Inertia.from_principal(1.0, 1.6, 2.1), rj.Spin([0.4, 1.2,
 read = np.asarray(omega) + 0.01 * np.random.default_rng(9).normal(size=omega.shape)
 problem = identify.Model(identify.Recording(ts, (identify.Gyro(0.01), read)), identify.Ratios())
 found = identify.fit(problem, starts=int(sys.argv[2]), checkpoint=sys.argv[1], progress=print)
-np.save(sys.argv[3], np.concatenate([np.ravel(x) for x in jax.tree.leaves(found.x)]))
+np.save(sys.argv[3], found.x)
 """
 
 
@@ -443,13 +396,13 @@ def _asks_for(asked, wanted):
     """What was written is read: readings, wheel speeds, the model, what is free."""
     ((problem, how),) = asked
     assert how["starts"] == 1 and how["checkpoint"] is None
-    assert isinstance(problem.body, identify.Tensor) and problem.body.typical == 1.5
+    assert isinstance(problem.chart, identify.Tensor) and problem.chart.typical == 1.5
     assert {slot.name: slot.each for slot in problem.slots} == {"drag": False, "gyro bias": True}
     for found, given in zip(problem.recordings, wanted.recordings, strict=True):
         np.testing.assert_array_equal(found.t, given.t)
         np.testing.assert_array_equal(found.readings[0].values, given.readings[0].values)
-        np.testing.assert_array_equal(found.torque.parts[1].coefficient, np.zeros(3))
-        momentum = found.torque.parts[0].momentum(jnp.asarray(1.0))
+        np.testing.assert_array_equal(problem.torque.parts[1].coefficient, np.zeros(3))
+        momentum = rj.torques.bind(problem.torque, found.inputs).parts[0].momentum(1.0)
         np.testing.assert_allclose(momentum, [0.0, 0.0, 0.6 * np.tanh(1.0)], rtol=1e-15)
 
 
@@ -492,10 +445,10 @@ def test_logs_of_other_kinds(tmp_path):
 
 
 MISTAKES = [
-    (lambda r: identify.Free(lambda x: x.readings[0].sensor.scale, "scale"), "None is there; give it a starting value"),
-    (lambda r: identify.Free(lambda x: x.readings[3].sensor, "x"), "nothing is there"),
-    (lambda r: identify.Free(lambda x: x.readings[0].sensor, "x"), "wanted one array, got Gyro"),
-    (lambda r: identify.Free(lambda x: x.readings[0].sensor.bias, "x", positive=True), "wanted a positive starting value"),
+    (lambda r: identify.Free(lambda s: s.sensors[0].scale, "scale"), "None is there; give it a starting value"),
+    (lambda r: identify.Free(lambda s: s.sensors[3], "x"), "nothing is there"),
+    (lambda r: identify.Free(lambda s: s.sensors[0], "x"), "wanted one array, got Gyro"),
+    (lambda r: identify.Free(lambda s: s.sensors[0].bias, "x", positive=True), "wanted a positive starting value"),
 ]  # fmt: skip
 
 
@@ -512,8 +465,8 @@ def test_other_mistakes_are_named(records, short_record):
         identify.Model([records[0], short_record], identify.Tensor(1.5))
     with pytest.raises(ValueError, match="at least one Recording, got an empty sequence"):
         identify.Model([], identify.Tensor(1.5))
-    with pytest.raises(ValueError, match="has a torque of its own; put both in it"):
-        identify.Model(records, identify.Tensor(1.5), torque=rj.torques.Damping([1.0, 1, 1]))
+    with pytest.raises(ValueError, match="it reads 'speed', and recording 0 has no inputs; give"):
+        identify.Model(short_record, identify.Tensor(1.5), torque=LAW)
     marker = identify.Recording([0.0, 1.0], (identify.Marker([0.0, 0, 0]), np.zeros((2, 3))))
     with pytest.raises(ValueError, match=r"wanted Mass\(guess\) or Known"):
         identify.Model(marker, identify.Tensor(1.0))
@@ -531,14 +484,14 @@ def test_free_numbers_are_reported_with_their_units():
     wheel = rj.torques.Wheel(1e-6, [0, 0, 1], speed, delay=0.0, tilt=[0.0, 0.0])
     law = rj.torques.Sum(rj.torques.Flywheel(wheel), rj.torques.Damping([1e-6, 1e-6, 1e-6]))
     gyro = rj.identify.Gyro(0.01, bias=[0, 0, 0], scale=[1, 1, 1], offset=0.0)
-    record = rj.identify.Recording(ts, (gyro, jnp.ones((20, 3))), torque=law)
-    sensor = lambda name: lambda r: getattr(r.readings[0].sensor, name)
+    record = rj.identify.Recording(ts, (gyro, jnp.ones((20, 3))))
+    sensor = lambda name: lambda s: getattr(s.sensors[0], name)
     free = [rj.identify.Free(sensor(name), name) for name in ("bias", "scale", "offset")]
     free += [
         rj.identify.Free(lambda s: s.torque.parts[0].momentum.tilt, "tilt"),
         rj.identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", unit="N m s"),
     ]
-    problem = rj.identify.Model(record, rj.identify.Principal(1e-3), free=free)
+    problem = rj.identify.Model(record, rj.identify.Principal(1e-3), torque=law, free=free)
     units = {name.split()[0]: unit for name, unit, _ in quantities.labels(problem)}
     wanted = {"bias": "rad/s", "scale": "", "offset": "s", "tilt": "rad", "drag": "N m s"}
     assert {name: units[name] for name in wanted} == wanted
@@ -548,10 +501,11 @@ def test_steps_that_were_asked_for_are_kept_where_they_do():
     body, ts = rj.Inertia.from_principal(1.0, 2.0, 2.5), jnp.linspace(0.0, 2.0, 6)
     law = rj.torques.Damping([0.1, 0.2, 0.1])
     omega = rj.simulate(body, rj.Spin([0.3, 1.0, 0.2]), ts, law).ys.omega
-    record = identify.Recording(ts, (identify.Gyro(0.01), omega), torque=law)
+    record = identify.Recording(ts, (identify.Gyro(0.01), omega))
     # More than a fit would take by itself before it goes on with steps as they are needed.
     steps = identify.FixedSteps(40)
-    found = identify.fit(identify.Model(record, identify.Known(body), integrator=steps), starts=1)
+    model = identify.Model(record, identify.Known(body), torque=law, integrator=steps)
+    found = identify.fit(model, starts=1)
     assert found.model.integrator == steps
     np.testing.assert_allclose(found.state0.omega, omega[0], atol=1e-6)
 
@@ -561,9 +515,9 @@ def test_steps_that_are_too_long_become_finer(steps):
     body, ts = rj.Inertia.from_principal(1.0, 2.0, 2.5), jnp.linspace(0.0, 8.0, 6)
     law, start = rj.torques.Damping([0.1, 0.2, 0.1]), rj.Spin([0.3, 2.0, 0.2])
     omega = rj.simulate(body, start, ts, law).ys.omega
-    record = identify.Recording(ts, (identify.Gyro(1e-4), omega), torque=law)
-    problem = identify.Model(record, identify.Known(body), integrator=steps)
-    there = eqx.tree_at(lambda p: p.own.spin, problem.start(), omega[:1] / problem.typical_rate)
+    record = identify.Recording(ts, (identify.Gyro(1e-4), omega))
+    problem = identify.Model(record, identify.Known(body), torque=law, integrator=steps)
+    there = problem.start(omega=omega[0])
     assert np.abs(problem.errors(there)[0]).max() > 1e-4
     found = identify.fit(problem, starts=1)
     assert found.model.integrator != steps
@@ -579,7 +533,7 @@ def test_a_motion_that_outlasts_its_digits_is_named():
     start = rj.Attitude(q / np.linalg.norm(q), [1.40904798, 2.72002574, -1.26857553])
     ys = rj.simulate(body, start, ts, top).ys
     sensors = ((identify.AttitudeSensor(0.01), ys.q), (identify.Gyro(0.01), ys.omega))
-    record = identify.Recording(ts, *sensors, torque=top)
-    problem = identify.Model(record, identify.Known(body), integrator=identify.Adaptive())
+    record, steps = identify.Recording(ts, *sensors), identify.Adaptive()
+    problem = identify.Model(record, identify.Known(body), torque=top, integrator=steps)
     found = identify.fit(problem, starts=1, max_steps=2)
     assert "the shortest steps still change readings by" in found.status

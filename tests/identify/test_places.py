@@ -84,8 +84,8 @@ def test_a_throw_is_found_by_distances():
     states = rj.simulate(BODY, THROWN, TS, LAW).ys
     rng = np.random.default_rng(5)
     rates = np.asarray(states.omega) + 0.01 * rng.normal(size=(40, 3))
-    record = identify.Recording(TS, *ranges(0.01), (identify.Gyro(0.01), rates), torque=LAW)
-    found = identify.fit(identify.Model(record, identify.Known(BODY)), starts=1)
+    record = identify.Recording(TS, *ranges(0.01), (identify.Gyro(0.01), rates))
+    found = identify.fit(identify.Model(record, identify.Known(BODY), torque=LAW), starts=1)
     np.testing.assert_allclose(found.state0.x, THROWN.x, rtol=0, atol=0.02)
     np.testing.assert_allclose(found.state0.v, THROWN.v, rtol=0, atol=0.05)
     np.testing.assert_allclose(found.chi2 / found.dof, 1.0, atol=4 * np.sqrt(2 / found.dof))

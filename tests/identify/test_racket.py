@@ -27,9 +27,8 @@ def recordings(round_):
     out = []
     for toss in rows.values():
         data = np.array(toss)
-        law = rj.torques.QuadraticDamping([0.0, 0.0, 0.0])
         gyro = identify.Gyro(bias=[0.0, 0.0, 0.0])
-        out.append(identify.Recording(data[:, 0], (gyro, data[:, 1:]), torque=law))
+        out.append(identify.Recording(data[:, 0], (gyro, data[:, 1:])))
     return out
 
 
@@ -38,7 +37,8 @@ def fitted(round_, starts):
         identify.Free(lambda s: s.torque.coefficient, "drag", scale=0.01),
         identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05),
     ]
-    problem = identify.Model(recordings(round_), identify.Ratios(), free=free)
+    law = rj.torques.QuadraticDamping([0.0, 0.0, 0.0])
+    problem = identify.Model(recordings(round_), identify.Ratios(), torque=law, free=free)
     return identify.fit(problem, starts=starts, progress=print)
 
 
@@ -55,7 +55,10 @@ def rounds():
 def test_both_rounds_fit_from_blind_starts(rounds):
     for found in rounds:
         print(found.status, found.rms, found.correlation, found.interval(), found.values)
-        assert found.search.word == "found" and found.explanation.word != "does not explain the readings"
+        assert (
+            found.search.word == "found"
+            and found.explanation.word != "does not explain the readings"
+        )
         good = [s for s in found.starts if s.converged and s.fits]
         assert len(good) >= 2
 

@@ -62,10 +62,12 @@ def test_a_fit_of_readings_that_no_body_makes(moments):
     found = solve_ivp(slope, (0.0, 3.0), [0.5, 0.3, -0.4], "DOP853", T, rtol=1e-11, atol=1e-12)
     read = found.y.T + 1e-3 * np.random.default_rng(0).normal(size=(T.size, 3))
     torque = rj.torques.ConstantTorque(TORQUE)
-    record = identify.Recording(T, (identify.Gyro(1e-3), read), torque=torque)
-    fit = identify.fit(identify.Model(record, Moments()), starts=1)
+    record = identify.Recording(T, (identify.Gyro(1e-3), read))
+    fit = identify.fit(identify.Model(record, Moments(), torque=torque), starts=1)
     np.testing.assert_allclose(jnp.diag(fit.body.tensor), moments, rtol=0.03)
     if moments[2] == 1.9:
         assert fit.ok
     else:
-        assert not fit.ok and fit.explanation.reasons[0].startswith("no real body has these numbers")
+        assert not fit.ok and fit.explanation.reasons[0].startswith(
+            "no real body has these numbers"
+        )

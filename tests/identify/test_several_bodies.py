@@ -1,15 +1,14 @@
 """Several bodies read by one sensor: what is shared, what a group or a recording has of its own."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import once
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.model.free import local, places
 from rigidjax.identify.search.noise import estimate_noise
-from rigidjax.identify.search.stages import evaluate
+from rigidjax.identify.search.stages import errors_and_slopes
 
 BODIES = {
     "box": rj.Inertia.from_principal(1.0, 1.6, 2.1),
@@ -25,19 +24,19 @@ SIGMA = 0.004
 TS = np.arange(60) * 0.05
 
 
+SPEED = rj.torques.Series(TS, 3.0 * np.tanh(TS))
+WHEEL = rj.torques.Flywheel(rj.torques.Wheel(0.2, [0.0, 0.0, 1.0], SPEED))
+LAW = rj.torques.Sum(WHEEL, rj.torques.Damping([0.0, 0.0, 0.0]))
+
+
 def throw(name, omega, own, seed):
     """A damped body with a wheel inside; the gyro's axes are not orthogonal."""
-    speed = rj.torques.Series(TS, 3.0 * np.tanh(TS))
-    wheel = rj.torques.Flywheel(rj.torques.Wheel(0.2, [0.0, 0.0, 1.0], speed))
-    law = rj.torques.Sum(wheel, rj.torques.Damping(DRAG[name]))
+    law = rj.torques.Sum(WHEEL, rj.torques.Damping(DRAG[name]))
     ys = np.asarray(rj.simulate(BODIES[name], rj.Spin(omega), jnp.asarray(TS), law).ys.omega)
     a, b, c = SKEW
     read = ys @ np.array([[1.0, a, b], [0.0, 1.0, c], [0.0, 0.0, 1.0]]).T + own
     read = read + SIGMA * np.random.default_rng(seed).normal(size=read.shape)
-    start = rj.torques.Sum(wheel, rj.torques.Damping([0.0, 0.0, 0.0]))
-    return identify.Recording(
-        TS, (identify.Gyro(SIGMA, bias=[0.0] * 3, skew=[0.0] * 3), read), torque=start
-    )
+    return identify.Recording(TS, (identify.Gyro(SIGMA, bias=[0.0] * 3, skew=[0.0] * 3), read))
 
 
 FREE = [
@@ -63,7 +62,7 @@ def records():
 @pytest.fixture(scope="module")
 def found(records):
     charts = {"box": identify.Tensor(1.5), "rod": identify.Known(BODIES["rod"])}
-    return identify.fit(identify.Model(records, charts, free=FREE), starts=1)
+    return identify.fit(identify.Model(records, charts, torque=LAW, free=FREE), starts=1)
 
 
 def test_one_sensor_is_found_from_two_bodies_of_which_one_is_known(found):
@@ -93,18 +92,31 @@ def test_the_shared_bias_is_as_sure_as_its_spread_allows(found):
 
 
 def test_each_recording_depends_on_its_own_body_and_group(found):
-    problem, at = found.model, found.x
-    mine = local(problem, at)
+    model, x = found.model, found.x
     # Of the known body no number is free: its columns are those of no number.
-    where = np.asarray(places(problem, at))
-    size = sum(x.size for x in (at.body, *at.shared, at.own.spin, *at.own.each))
+    where = np.asarray(model.index.places)
     np.testing.assert_array_equal(where[0, :6], np.arange(6))
-    assert (where[2:, :6] == size).all()
-    np.testing.assert_array_equal(mine.shared[0][0], at.shared[0][0])
-    np.testing.assert_array_equal(mine.shared[0][3], at.shared[0][1])
+    assert (where[2:, :6] == x.size).all()
+    drag = model.scenes(x).torque.parts[1].coefficient
+    np.testing.assert_array_equal(drag, found.values["drag"][np.array([0, 0, 1, 1])])
+    bias = model.scenes(x).sensors[0].bias
+    np.testing.assert_array_equal(bias, found.values["bias, own"])
     # A shared value and a deviation have the same derivative.
-    blocks = np.asarray(evaluate(at, problem)[1][0][0])
+    blocks = np.asarray(errors_and_slopes(model, x)[1][0])
     np.testing.assert_array_equal(blocks[..., 9:12], blocks[..., 18:21])
+
+
+def test_derivatives_of_one_recording_are_those_of_all_numbers_there(found):
+    """Against differences of errors by every free number, recording by recording."""
+    model, x, h = found.model, np.asarray(found.x), 1e-5
+    blocks, where = np.asarray(errors_and_slopes(model, found.x)[1][0]), model.index.places
+    errors = once(lambda x: model.errors(x)[0])
+    for place in range(x.size):
+        step = h * np.eye(x.size)[place]
+        wanted = (errors(x + step) - errors(x - step)) / (2 * h)
+        here = np.asarray(where == place)
+        found = np.einsum("rtkm,rm->rtk", blocks, here.astype(float))
+        np.testing.assert_allclose(found, wanted, atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -118,20 +130,17 @@ def test_each_recording_depends_on_its_own_body_and_group(found):
 )
 def test_noise_is_estimated_by_group(records, each, wanted):
     silent = {
-        name: [
-            identify.Recording(r.t, (identify.Gyro(), r.readings[0].values), torque=r.torque)
-            for r in rows
-        ]
+        name: [identify.Recording(r.t, (identify.Gyro(), r.readings[0].values)) for r in rows]
         for name, rows in records.items()
     }
     charts = {name: identify.Known(body) for name, body in BODIES.items()}
-    problem = identify.Model(silent, charts, noise_each=each)
+    model = identify.Model(silent, charts, torque=LAW, noise_each=each)
     rng = np.random.default_rng(3)
     errors = (np.array([0.02, 0.05, 0.1, 0.1])[:, None, None] * rng.normal(size=(4, 60, 3)),)
     first = (jnp.ones((4, 3)),)
-    (_, ends), blocks = evaluate(problem.start(), problem)
-    found = (jax.tree.map(jnp.asarray, errors), ends), blocks
-    _, (noise,) = estimate_noise(problem, found, first, problem.start())
+    _, slopes = errors_and_slopes(model, model.start())
+    blocks = tuple(map(jnp.asarray, errors)), slopes
+    _, (noise,) = estimate_noise(model, model.start(), blocks, first)
     np.testing.assert_allclose(noise[:, 0], wanted, rtol=0.15)
 
 
@@ -148,9 +157,9 @@ def test_the_skew_of_a_sensor_and_the_tilt_of_a_wheel():
 
 
 MISTAKES = [
-    (lambda r: dict(body=identify.Tensor(1.0)), TypeError, "both recordings and charts by name"),
-    (lambda r: dict(body={"box": identify.Tensor(1.0)}), ValueError, r"recordings of \['box', 'rod'\]"),
-    (lambda r: dict(free=[identify.Free(lambda x: x.readings[0].sensor.bias, "b", each=["a"])]), ValueError, "one label for each of 4 recordings, got 1"),
+    (lambda r: dict(chart=identify.Tensor(1.0)), TypeError, "both recordings and charts by name"),
+    (lambda r: dict(chart={"box": identify.Tensor(1.0)}), ValueError, r"recordings of \['box', 'rod'\]"),
+    (lambda r: dict(free=[identify.Free(lambda s: s.sensors[0].bias, "b", each=["a"])]), ValueError, "one label for each of 4 recordings, got 1"),
     (lambda r: dict(noise_each=3), TypeError, "noise_each: wanted True, False, .body., or a sequence of labels"),
     (lambda r: dict(recording=r | {"rod": []}), ValueError, "no recording of 'rod'"),
     (lambda r: dict(prior=identify.Entropic(BODIES["box"], 1.0)), ValueError, "a prior is about one body"),
@@ -161,9 +170,9 @@ MISTAKES = [
 @pytest.mark.usefixtures("unhooked")
 def test_mistakes_are_named(records, change, kind, words):
     charts = {"box": identify.Tensor(1.5), "rod": identify.Known(BODIES["rod"])}
-    given = {"recording": records, "body": charts} | change(records)
+    given = {"recording": records, "chart": charts} | change(records)
     with pytest.raises(kind, match=words):
-        identify.Model(given.pop("recording"), given.pop("body"), **given)
+        identify.Model(given.pop("recording"), given.pop("chart"), **given)
 
 
 @pytest.mark.usefixtures("unhooked")

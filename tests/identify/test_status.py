@@ -35,10 +35,9 @@ def law(inertia=0.6, axis=(0.0, 0.0, 1.0), drag=(0.06, 0.05, 0.04), late=0.0):
 
 def gyro(rates, noise=SIGMA, chart=None, ts=TS, starts=2, **options):
     """A gyro alone."""
-    record = identify.Recording(ts, (identify.Gyro(noise), rates), **options)
-    return identify.fit(
-        identify.Model(record, chart or identify.PrincipalRatios()), starts=starts
-    )
+    record = identify.Recording(ts, (identify.Gyro(noise), rates))
+    model = identify.Model(record, chart or identify.PrincipalRatios(), **options)
+    return identify.fit(model, starts=starts)
 
 
 def both(rates, turns, ts=TS, **sensor):
@@ -52,9 +51,10 @@ def both(rates, turns, ts=TS, **sensor):
 def wheel(rates, named, free=True):
     """A gyro on a body with a wheel and drag."""
     moves = [identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=0.05)]
-    record = identify.Recording(TS, (identify.Gyro(), rates), torque=named)
-    problem = identify.Model(record, identify.Principal(1.5), free=moves if free else [])
-    return identify.fit(problem, starts=2)
+    record = identify.Recording(TS, (identify.Gyro(), rates))
+    moves = moves if free else []
+    model = identify.Model(record, identify.Principal(1.5), torque=named, free=moves)
+    return identify.fit(model, starts=2)
 
 
 def together(*readings):

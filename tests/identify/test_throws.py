@@ -50,7 +50,9 @@ def test_no_throw_diverges_from_a_blind_start(found, model):
     for group in GROUPS:
         # Errors of tenths of a per cent are not white: the status says so.
         assert {f.search.word for f in found[group][model]} == {"found"}
-        assert "does not explain the readings" not in {f.explanation.word for f in found[group][model]}
+        assert "does not explain the readings" not in {
+            f.explanation.word for f in found[group][model]
+        }
 
 
 def test_a_right_throw_has_no_cause_of_its_errors_and_one_read_wrong_has_its_own(found, model):
@@ -61,20 +63,21 @@ def test_a_right_throw_has_no_cause_of_its_errors_and_one_read_wrong_has_its_own
     assert sum("drag" in name for name in names) >= 6
     right = throws.record(throws.FOLDER / "object_empty_log00179.csv")
 
-    def changed(where, change):
-        record = eqx.tree_at(where, right, replace_fn=lambda x: jnp.asarray(change(np.asarray(x))))
-        (cause,) = identify.fit(throws.problem([record], model), starts=1).causes
+    def words_of(record, torque=throws.LAW):
+        (cause,) = identify.fit(throws.problem([record], model, torque), starts=1).causes
         return cause.words
 
-    def rates(r):
-        return r.readings[0].values
+    def misread(change):
+        change_of = lambda x: jnp.asarray(change(np.asarray(x)))
+        return words_of(eqx.tree_at(lambda r: r.readings[0].values, right, replace_fn=change_of))
 
-    words = changed(lambda s: s.torque.parts[0].momentum.inertia, lambda x: -x)
-    assert words == "most likely the torque with the other sign"
-    assert changed(rates, np.degrees) == "most likely deg/s read as rad/s"
-    words = changed(rates, lambda w: w * np.array([1.0, -1.0, 1.0]))
+    inertia = lambda law: law.parts[0].momentum.inertia
+    other = eqx.tree_at(inertia, throws.LAW, replace_fn=lambda x: -x)
+    assert words_of(right, other) == "most likely the torque with the other sign"
+    assert misread(np.degrees) == "most likely deg/s read as rad/s"
+    words = misread(lambda w: w * np.array([1.0, -1.0, 1.0]))
     assert "the y axis mirrored" in words and "z" not in words
-    assert changed(rates, lambda w: w[:, [0, 2, 1]]) == "most likely y and z swapped"
+    assert misread(lambda w: w[:, [0, 2, 1]]) == "most likely y and z swapped"
 
 
 def test_the_calibration_reproduces_the_proof_body(found, model):
@@ -150,15 +153,18 @@ def test_the_recipe_of_four_bodies_with_one_sensor_meets_its_bars(bench):
 def test_a_drag_that_can_drive_does_not_lose_a_throw():
     # Fitted to a quarter of this throw, quadratic drag and bias run away beyond it.
     record = throws.record(throws.FOLDER / "object_empty_log00184.csv")
-    law = rj.torques.Sum(record.torque.parts[0], rj.torques.QuadraticDamping([0.0, 0.0, 0.0]))
-    record = eqx.tree_at(lambda s: s.torque, record, law)
+    law = throws.law(rj.torques.QuadraticDamping)
     free = [
         identify.Free(lambda s: s.torque.parts[0].momentum.delay, "delay", scale=1e-3, each=True),
         identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=1e-6),
         identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05),
     ]
-    found = identify.fit(identify.Model(record, identify.Tensor(3e-4), free=free), starts=1)
-    assert found.search.word == "found" and found.explanation.word != "does not explain the readings"
+    found = identify.fit(
+        identify.Model(record, identify.Tensor(3e-4), torque=law, free=free), starts=1
+    )
+    assert (
+        found.search.word == "found" and found.explanation.word != "does not explain the readings"
+    )
     # Linear drag explains the same throw with 0.05 rad/s.
     assert found.rms[0] < 0.1
 

@@ -10,6 +10,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import report
+from rigidjax.identify.search.stages import errors_and_slopes
 from rigidjax.identify.uncertainty.covariance import correlation_times, inverted, linearise, spread
 
 TOSSES = Path(__file__).parents[3] / "shared" / "data" / "tennis_racket" / "tosses.csv"
@@ -43,7 +44,8 @@ def test_a_real_flat_body_has_intervals_with_a_width(toss):
 def test_the_sandwich_is_that_of_its_definition(toss):
     # H⁻¹ M H⁻¹ from the slopes themselves where nothing is weakly seen, M's errors in time by hand.
     found = identify.fit(identify.Model(toss, identify.PrincipalRatios()))
-    linear = linearise(found.model, found.x, found.noises)
+    blocks = errors_and_slopes(found.model, found.x)
+    linear = linearise(found.model, found.x, found.noises, blocks)
     times = correlation_times(linear)
     got = spread(linear, times)
     slopes = linear.slopes[0][0] * np.sqrt(linear.weights[0][0])[:, None, None]
@@ -91,9 +93,10 @@ def test_what_a_prior_tells_is_as_sure_beside_errors_that_are_autocorrelated():
     errors = rng.normal(size=rates.shape)
     for k in range(1, len(errors)):
         errors[k] = 0.8 * errors[k - 1] + 0.6 * errors[k]
-    record = identify.Recording(ts, (identify.Gyro(0.01), rates + 0.01 * errors), torque=law)
+    record = identify.Recording(ts, (identify.Gyro(0.01), rates + 0.01 * errors))
     wheel = identify.Free(lambda s: s.torque.momentum.inertia, "wheel", positive=True, prior=0.05)
-    found = identify.fit(identify.Model(record, identify.Principal(3e-4), free=[wheel]), starts=1)
+    model = identify.Model(record, identify.Principal(3e-4), torque=law, free=[wheel])
+    found = identify.fit(model, starts=1)
     assert found.covariance_kind.startswith("sandwich")
 
     def half(power):

@@ -1,11 +1,8 @@
 """What data do not determine is named: made-up singular vectors whose meaning is known."""
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
 
 import rigidjax as rj
 from rigidjax import identify
@@ -19,7 +16,7 @@ BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
 def fit_with(chart, directions, search="found", model="explains the readings", mix=None):
     """A fit of which only the directions that its data do not determine matter.
 
-    **Arguments:** `directions` functions of zeroed `Parameters` to changed ones.
+    **Arguments:** `directions` functions of a model, to the change (n,) of its free numbers.
     """
     gyro = identify.Gyro(0.01, bias=[0.0, 0.0, 0.0])
     turned = np.tile([0.8, 0.0, 0.6, 0.0], (5, 1))
@@ -29,8 +26,7 @@ def fit_with(chart, directions, search="found", model="explains the readings", m
     bias = identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05)
     problem = identify.Model(record, chart, free=[bias])
     here = problem.start(BODY)
-    nothing = jax.tree.map(jnp.zeros_like, here)
-    null = np.stack([np.asarray(ravel_pytree(make(nothing))[0]) for make in directions])
+    null = np.stack([np.asarray(make(problem)) for make in directions])
     null = null if mix is None else mix @ null
     n = null.shape[1]
     like = jnp.eye(n)
@@ -41,29 +37,30 @@ def fit_with(chart, directions, search="found", model="explains the readings", m
     )  # fmt: skip
 
 
-def grown(step):
+def moved(model, places, value):
+    """No change but at these places."""
+    return jnp.zeros(model.size).at[jnp.asarray(places)].set(value)
+
+
+def grown(model):
     """The body by 1 %: half the logarithm of its size."""
-    return at(step, "body", step.body.at[0].set(0.005))
-
-
-def at(tree, name, value):
-    return eqx.tree_at(lambda p: getattr(p, name), tree, value)
+    return moved(model, 0, 0.005)
 
 
 def test_combinations_are_told_apart_and_named():
-    def heading(step):
+    def heading(model):
         # About the world's vertical, in the axes of the body.
         axis = rj.quaternion.rotate_inverse(first, jnp.array([0.0, 0.0, 1.0]))
-        return eqx.tree_at(lambda p: p.own.turn, step, axis[None])
+        return moved(model, model.index.start[0, :3], axis)
 
-    def spun(step):
+    def spun(model):
         # The rate up, the bias down: in units of the typical rate and of 0.05 rad/s.
-        rate = step_rate * jnp.array([[0.0, 0.0, 1.0]])
-        moved = eqx.tree_at(lambda p: p.own.spin, step, rate)
-        return eqx.tree_at(lambda p: p.shared, moved, (jnp.array([0.0, 0.0, -20.0]),))
+        rate, bias = jnp.array([0.0, 0.0, step_rate]), jnp.array([0.0, 0.0, -20.0])
+        (slot,) = model.slots
+        return moved(model, model.index.start[0, 3:], rate) + moved(model, slot.shared[0], bias)
 
     probe = fit_with(identify.Principal(1.5), [grown])
-    first, step_rate = probe.model.unpack(probe.x)[1].q, 1 / probe.model.typical_rate
+    first, step_rate = probe.state0.q, 1 / probe.model.typical_rate
     assert rj.quaternion.angle(first) > 0.1  # so that the world's axes are not the body's
     mix = np.random.default_rng(0).normal(size=(3, 3))
     found = fit_with(identify.Principal(1.5), [grown, heading, spun], mix=mix).undetermined
@@ -78,12 +75,12 @@ def test_combinations_are_told_apart_and_named():
 def test_axes_that_turn_are_named_by_the_tensor():
     chart = identify.Tensor(1.0)
 
-    def tilted(step):
+    def tilted(model):
         def vector(angle):
             turned = BODY.rotated(rj.quaternion.exp(angle * jnp.array([0.0, 0.0, 1.0])))
             return chart.vector(turned)
 
-        return at(step, "body", (vector(1e-6) - vector(0.0)) / 1e-6)
+        return moved(model, range(6), (vector(1e-6) - vector(0.0)) / 1e-6)
 
     (one,) = fit_with(chart, [tilted]).undetermined
     assert one.names == ("Ixy",)

@@ -85,8 +85,8 @@ def readings():
     return omega, late, force, speeds[: TS.size]
 
 
-def record(law, sensors, values):
-    return identify.Recording(TS, *zip(sensors, values, strict=True), torque=law)
+def record(sensors, values):
+    return identify.Recording(TS, *zip(sensors, values, strict=True))
 
 
 @pytest.mark.parametrize("integrator", [identify.FixedSteps(4), identify.Adaptive(1e-11, 1e-13)])
@@ -104,10 +104,9 @@ def test_what_sensors_feel_of_the_motors(integrator):
     values = (omega, late, omega + force @ SENSITIVITY.T, force, speeds)
     body = law.without_wheels(LOCKED)
     problem = identify.Model(
-        record(law, sensors, values), identify.Known(body), integrator=integrator
+        record(sensors, values), identify.Known(body), torque=law, integrator=integrator
     )
-    spin = jnp.asarray(OMEGA)[None] / problem.typical_rate
-    here = eqx.tree_at(lambda p: p.own.spin, problem.start(), spin)
+    here = problem.start(omega=OMEGA)
     errors, motion = filter_once(lambda p: (problem.errors(p), problem.motion(p)))(here)
     for error, value, within in zip(errors, values, (1e-8, 1e-8, 1e-8, 1e-8, 1e-6), strict=True):
         assert np.abs(value).max() > 0.5
@@ -127,7 +126,7 @@ def test_an_accelerometer_off_the_centre_finds_the_bearings_friction():
         identify.Free(lambda s: s.sensors[1].place, "place", scale=0.1),
     ]
     body = identify.Known(guess.without_wheels(LOCKED))
-    problem = identify.Model(record(guess, sensors, values), body, free=free)
+    problem = identify.Model(record(sensors, values), body, torque=guess, free=free)
     found = identify.fit(problem, starts=1)
     assert found.ok
     np.testing.assert_allclose(found.values["friction"], FRICTION, rtol=0, atol=1e-3)

@@ -38,19 +38,30 @@ def columns(path, first):
     return {name: values[inside] for name, values in table.items()}
 
 
-def record(path):
-    # The wheel's log begins a little earlier, so that its delay has room.
+def speed(path):
+    """The wheel's log: it begins a little earlier, so that its delay has room."""
     wide = columns(path, WINDOW[0] - 0.02)
+    return rj.torques.Series(wide["t"], wide["flywheel"])
+
+
+def law(drag=rj.torques.Damping, **options):
+    """The wheel with the logged speed, and a drag."""
+    source = rj.torques.Input("speed")
+    wheel = rj.torques.Wheel(WHEEL, [0.0, 0.0, 1.0], source, delay=0.0, **options)
+    return rj.torques.Sum(rj.torques.Flywheel(wheel), drag([0.0, 0.0, 0.0]))
+
+
+LAW = law()
+
+
+def record(path):
     log = columns(path, WINDOW[0])
-    speed = rj.torques.Series(wide["t"], wide["flywheel"])
-    wheel = rj.torques.Flywheel(rj.torques.Wheel(WHEEL, [0.0, 0.0, 1.0], speed, delay=0.0))
-    law = rj.torques.Sum(wheel, rj.torques.Damping([0.0, 0.0, 0.0]))
     gyro = identify.Gyro(bias=[0.0, 0.0, 0.0])
     rates = np.stack([log["wx"], log["wy"], log["wz"]], axis=1)
-    return identify.Recording(log["t"], (gyro, rates), torque=law)
+    return identify.Recording(log["t"], (gyro, rates), inputs={"speed": speed(path)})
 
 
-def problem(recordings, model):
+def problem(recordings, model, torque=LAW):
     free = [
         identify.Free(lambda s: s.torque.parts[0].momentum.delay, "delay", scale=1e-3, each=True)
     ]
@@ -58,7 +69,7 @@ def problem(recordings, model):
         free.append(identify.Free(lambda s: s.torque.parts[1].coefficient, "drag", scale=1e-5))
     if "bias" in model:
         free.append(identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05))
-    return identify.Model(recordings, identify.Tensor(3e-4), free=free)
+    return identify.Model(recordings, identify.Tensor(3e-4), torque=torque, free=free)
 
 
 def fits(group, model):

@@ -171,15 +171,15 @@ def stand_in():
     )
     shaped = lambda p: rj.Inertia.from_second_moment(jnp.diag(jnp.exp(p)))
     return SimpleNamespace(
-        problem=SimpleNamespace(
+        model=SimpleNamespace(
             recordings=(SimpleNamespace(t=TS, readings=(reading,)),),
             count=1,
-            unpack=lambda p: (shaped(p), None),
+            unpack=lambda x: SimpleNamespace(body=shaped(x), state0=None),
         ),
         residuals=(errors,),
         noise=(np.full(3, 0.01),),
-        parameters=jnp.zeros(3),
-        beside=jnp.zeros(3),
+        x=jnp.zeros(3),
+        derivative_point=jnp.zeros(3),
         seen=0.01 * np.eye(3),
         body=shaped(jnp.zeros(3)),
     )

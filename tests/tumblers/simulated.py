@@ -155,8 +155,8 @@ def tumbler(seed: int, mode: str, rough: float = 0.0, noise: float = NOISE) -> T
     return Tumbler(mode, semi_axes, moments, state, rotation, wanted, phase, amplitude, recording)
 
 
-def level(recording: Any) -> Any:
-    return recording.readings[0].sensor.level
+def level(scene: Any) -> Any:
+    return scene.sensors[0].level
 
 
 def problem(recording: identify.Recording) -> identify.Model:

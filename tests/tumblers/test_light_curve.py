@@ -178,9 +178,9 @@ def test_a_daily_alias_is_not_taken_for_the_rotation():
     assert simulated.off(one, found.aliases[0])[0] < 1e-3 and found.ok
 
 
-def problem(*readings, torque=None, count=1):
+def problem(*readings, count=1):
     t = np.linspace(0.0, 10.0, 60)
-    record = identify.Recording(t, *readings, torque=torque)
+    record = identify.Recording(t, *readings)
     rows: Any = record if count == 1 else [record] * count
     return identify.Model(rows, identify.PrincipalRatios())
 

@@ -78,8 +78,8 @@ def test_a_fit_and_a_design():
     values[60:80] = np.nan
     record = identify.Recording(TS, (sensor, values, clouds))
 
-    def level_of(r: Any) -> Any:
-        return r.readings[0].sensor.level
+    def level_of(scene: Any) -> Any:
+        return scene.sensors[0].level
 
     level = identify.Free(level_of, "level")
     problem = identify.Model(record, identify.PrincipalRatios(), free=[level])
