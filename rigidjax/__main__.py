@@ -236,7 +236,7 @@ def _demo(options: argparse.Namespace) -> int:
 
     print("4179 Toutatis, 17 radar observations, 2 to 18 December 1992")
     print(f"data: {toutatis.CITATION}\n")
-    found = _fit(toutatis.problem(), options, 16)
+    found = _fit(toutatis.model(), options, 16)
     if found is None:
         return 2
     more = toutatis.rows(found)
@@ -263,8 +263,8 @@ def _channels(options: argparse.Namespace, rates: Sequence[str], unit: str) -> l
     return [cli_spec.Channel("gyro", tuple(rates), unit, noise, options.limit)]
 
 
-def _read(options: argparse.Namespace) -> tuple[list[Any], list[Any], rj.identify.Problem]:
-    """The sensors, the recordings, and the problem that the options describe."""
+def _read(options: argparse.Namespace) -> tuple[list[Any], list[Any], rj.identify.Model]:
+    """Return the sensors, the recordings, and the model that the options describe."""
     layout = cli_spec.layout_of(options.logs[0]) if options.columns is None else cli_spec.USUAL
     time, *rates = options.columns or layout.columns
     channels = _channels(options, rates, options.unit or layout.unit)
@@ -277,15 +277,13 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], list[Any], rj.identif
     how: dict[str, Any] = dict(time=time, time_unit=options.time_unit or layout.time_unit)
     how |= dict(window=options.window, wheels=wheels, free=options.free)
     records = [cli_spec.read_log(path, channels, **how) for path in options.logs]
-    problem = cli_spec.problem_of(
-        records, options.model, typical=options.typical, free=options.free, loss=options.loss
-    )
-    return channels, records, problem
+    how = dict(typical=options.typical, wheels=wheels, free=options.free, loss=options.loss)
+    return channels, records, cli_spec.model_of(records, options.model, **how)
 
 
 def _logs(options: argparse.Namespace) -> int:
     try:
-        channels, records, problem = _read(options)
+        channels, records, model = _read(options)
     except ValueError as error:
         return _error(error)
     for path, record in zip(options.logs, records, strict=True):
@@ -294,13 +292,13 @@ def _logs(options: argparse.Namespace) -> int:
         count, span = record.t.shape[0] + record.dropped, record.t[-1] - record.t[0]
         _say(f"{path}: {count} samples over {span:.4g} s{told}")
     print()
-    found = _fit(problem, options, 8)
+    found = _fit(model, options, 8)
     if found is None:
         return 2
     rate_unit = next((c.unit for c in channels if c.kind == "gyro" and c.unit != "rpm"), "rad/s")
     print()
     print(rj.identify.report.table(rj.identify.report.rows(found, rate_unit)))
-    for sensor, rms in zip(problem.records.sensors, found.rms, strict=True):
+    for sensor, rms in zip(model.records.sensors, found.rms, strict=True):
         scale = 180 / 3.141592653589793 if sensor.unit == "rad/s" and rate_unit == "deg/s" else 1.0
         unit = rate_unit if sensor.unit == "rad/s" else sensor.unit
         print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
@@ -311,11 +309,11 @@ def _logs(options: argparse.Namespace) -> int:
     return _write(found, options, title, names, names, {"rate_unit": rate_unit})
 
 
-def _fit(problem: rj.identify.Problem, options: argparse.Namespace, starts: int) -> Any:
+def _fit(model: rj.identify.Model, options: argparse.Namespace, starts: int) -> Any:
     """The fit, or `None` after an error message."""
     try:
         return rj.identify.fit(
-            problem,
+            model,
             starts=starts if options.starts is None else options.starts,
             progress=_say,
             checkpoint=options.checkpoint,

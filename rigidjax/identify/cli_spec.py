@@ -1,10 +1,10 @@
-"""From a description in words, as the command line gives it, to recordings and a problem."""
+"""From a description in words, as the command line gives it, to recordings and a model."""
 
 import functools
 from collections.abc import Callable, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -16,10 +16,11 @@ from rigidjax.identify.csv_io import UNITS, USUAL as USUAL, LogError, layout_of 
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.model import charts
 from rigidjax.identify.model.free import Free
-from rigidjax.identify.model.model import Model as Problem
+from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.priors import Huber, SoftL1
+from rigidjax.identify.model.scene import Scene
 from rigidjax.identify.sensors import AbstractSensor, Accelerometer, AttitudeSensor, Gyro
-from rigidjax.motion.torques import Damping, Flywheel, Series, Sum, Wheel
+from rigidjax.motion.torques import Damping, Flywheel, Input, Series, Sum, Wheel
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation import euler
 
@@ -127,12 +128,12 @@ def read_log(
     wheels: Sequence[WheelColumn] = (),
     free: Sequence[str] = (),
 ) -> Recording:
-    """One recording from a file, with the described sensors and wheels.
+    """Return one recording from a file, with the described sensors; wheel speeds are its inputs.
 
     **Arguments:** `path`; `channels`; `time`, `time_unit` the time column; `window` (from, to), s,
-    or `None` for all; `wheels`; `free` some of `bias`, `drag`, `delay`: sensors and torque get
-    these numbers, so that a fit can move them. An empty cell is a gap. **Raises** `LogError` as
-    `read_table`.
+    or `None` for all; `wheels`, whose speeds become inputs, by the names of `input_names`; `free`
+    some of `bias`, `drag`, `delay`: for `bias` the sensors get one, so that a fit can move it. An
+    empty cell is a gap. **Raises** `LogError` as `read_table`.
     """
     # Two wheels may share a column of their speed.
     turning = dict.fromkeys(w.column for w in wheels)
@@ -153,11 +154,11 @@ def read_log(
         seen = np.isfinite(values).all(axis=1)
         sensor, values = _sensor(one, values, "bias" in free)
         readings.append((sensor, values[kept], seen[kept]))
-    torque = _torque(path, t, table, wheels, free)
+    inputs = _speeds(path, t, table, wheels)
     # A large log is not to be held twice.
     del table
     try:
-        return Recording(t[kept], *readings, torque=torque)
+        return Recording(t[kept], *readings, inputs=inputs)
     except ValueError as error:
         raise LogError(f"{path}: {error}") from None
 
@@ -179,55 +180,79 @@ def _sensor(one: Channel, values: np.ndarray, bias: bool) -> tuple[AbstractSenso
         raise LogError(f"sensor {one.kind}: {error}") from None
 
 
-def _torque(
-    path: str | Path,
-    t: np.ndarray,
-    table: dict[str, np.ndarray],
-    wheels: Sequence[WheelColumn],
-    free: Sequence[str],
-) -> Torque | None:
-    parts: list[Torque] = []
-    for one in wheels:
+def input_names(wheels: Sequence[WheelColumn]) -> list[str]:
+    """Return the name of the input that holds the speed of each wheel."""
+    return [f"wheel {i + 1}" if len(wheels) > 1 else "wheel" for i in range(len(wheels))]
+
+
+def _speeds(
+    path: str | Path, t: np.ndarray, table: dict[str, np.ndarray], wheels: Sequence[WheelColumn]
+) -> dict[str, Series]:
+    """Return the logged speed of each wheel by the name of its input, rad/s."""
+    speeds = {}
+    for name, one in zip(input_names(wheels), wheels, strict=True):
         try:
-            speed = Series(t, table[one.column] * UNITS[one.unit])
+            speeds[name] = Series(t, table[one.column] * UNITS[one.unit])
         except ValueError as error:
             raise LogError(f"{path}: column {one.column!r}: {error}") from None
-        delay = 0.0 if "delay" in free else None
-        parts.append(Flywheel(Wheel(one.inertia, one.axis, speed, delay=delay)))
+    return speeds
+
+
+def _torque(wheels: Sequence[WheelColumn], free: Sequence[str]) -> Torque | None:
+    """Return the torque of the wheels, and of a linear drag if that is free; `None` for neither."""
+    delay = 0.0 if "delay" in free else None
+    parts: list[Torque] = [
+        Flywheel(Wheel(one.inertia, one.axis, Input(name), delay=delay))
+        for name, one in zip(input_names(wheels), wheels, strict=True)
+    ]
     if "drag" in free:
         parts.append(Damping([0.0, 0.0, 0.0]))
     return Sum(*parts) if parts else None
 
 
-def problem_of(
+def model_of(
     recordings: Sequence[Recording],
-    model: str,
+    chart: str,
     *,
     typical: float = 1.0,
+    wheels: Sequence[WheelColumn] = (),
     free: Sequence[str] = (),
     loss: str = "soft-l1",
-) -> Problem:
-    """The problem of recordings of `read_log`: a drag for all, bias and delay for each."""
-    if model not in MODELS:
-        raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {model!r}")
+) -> Model:
+    """Return the model of recordings of `read_log`: a drag for all, bias and delay for each.
+
+    **Arguments:** `recordings`; `chart` one of `MODELS`, the word of the option `--model`;
+    `typical` the typical size of a moment, kg m²; `wheels`, `free` as `read_log` had them; `loss`
+    one of `LOSSES`. **Raises** `LogError` for another word.
+    """
+    if chart not in MODELS:
+        raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {chart!r}")
     if loss not in LOSSES:
         raise LogError(f"loss: wanted one of {', '.join(LOSSES)}, got {loss!r}")
-    chart, moving = MODELS[model](typical), _free(recordings[0], typical, free)
-    return Problem(list(recordings), chart, free=moving, loss=LOSSES[loss])
+    moving = _free(recordings[0].sensors, input_names(wheels), typical, free)
+    return Model(
+        list(recordings),
+        MODELS[chart](typical),
+        torque=_torque(wheels, free),
+        free=moving,
+        loss=LOSSES[loss],
+    )
 
 
-def _free(first: Recording, typical: float, free: Sequence[str]) -> list[Free]:
-    """The free numbers of the sensors and the torque, as `read_log` laid them out."""
+def _free(
+    sensors: Sequence[AbstractSensor], wheels: Sequence[str], typical: float, free: Sequence[str]
+) -> list[Free]:
+    """Return the `Free`s of the sensors and of the torque that `_torque` makes of these wheels."""
 
-    def of_sensor(index: int, name: str) -> Callable[[Any], Any]:
-        return lambda r: getattr(r.readings[index].sensor, name)
+    def of_sensor(index: int, name: str) -> Callable[[Scene], Any]:
+        return lambda scene: getattr(scene.sensors[index], name)
 
-    def of_torque(index: int, path: str) -> Callable[[Any], Any]:
-        return lambda r: attrgetter(path)(r.torque.parts[index])
+    def of_torque(index: int, path: str) -> Callable[[Scene], Any]:
+        return lambda scene: attrgetter(path)(cast(Sum, scene.torque).parts[index])
 
     items: list[Free] = []
-    kinds = [type(sensor).__name__.lower() for sensor in first.sensors]
-    for index, (sensor, kind) in enumerate(zip(first.sensors, kinds, strict=True)):
+    kinds = [type(sensor).__name__.lower() for sensor in sensors]
+    for index, (sensor, kind) in enumerate(zip(sensors, kinds, strict=True)):
         many = kinds.count(kind) > 1
         name = f"{kind} {kinds[: index + 1].count(kind)}" if many else kind
         if getattr(sensor, "bias", None) is not None:
@@ -238,9 +263,8 @@ def _free(first: Recording, typical: float, free: Sequence[str]) -> list[Free]:
     if "drag" in free:
         where = of_torque(-1, "coefficient")
         items.append(Free(where, "drag", scale=0.1 * typical, unit="N m s"))
-    if "delay" in free and isinstance(first.torque, Sum):
-        wheels = len(first.torque.parts) - ("drag" in free)
-        for i in range(wheels):
-            name = f"wheel {i + 1} delay" if wheels > 1 else "wheel delay"
-            items.append(Free(of_torque(i, "momentum.delay"), name, scale=1e-3, each=True))
+    if "delay" in free:
+        for index, wheel in enumerate(wheels):
+            where = of_torque(index, "momentum.delay")
+            items.append(Free(where, f"{wheel} delay", scale=1e-3, each=True))
     return items
