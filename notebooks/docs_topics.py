@@ -12,7 +12,7 @@ FIRST = {
     "A rotation": "rj.quaternion.rotate rj.quaternion.exp rj.so3.log",
     "Conserved quantities": "rj.energy rj.conserved rj.drift",
     "The time of an event": "rj.Event rj.crossings",
-    "A fit": "rj.identify.fit rj.identify.Problem rj.identify.Recording rj.identify.Gyro",
+    "A fit": "rj.identify.fit rj.identify.Model rj.identify.Recording rj.identify.Gyro",
     "Many bodies": "rj.batch.rollout rj.batch.simulate",
     "A picture": "rj.plot.motion rj.plot.polhode rj.plot.fit",
 }
@@ -80,12 +80,12 @@ TOPICS = {
         "Distance of two bodies": "divergence",
     },
     "rj.identify": {
-        "The problem": "Problem Recording Free",
+        "The model": "Model Recording Scene Free",
         "What is fitted of the body": "PrincipalRatios Ratios Principal Tensor Mass Known "
         "AbstractBodyChart",
         "Sensors": "Gyro Accelerometer AttitudeSensor Direction Magnetometer Marker Position "
         "Velocity Range LowPass AbstractSensor SensorInput",
-        "The fit and its result": "fit Fit Parameters Unpacked",
+        "The fit and its result": "fit Fit Unpacked",
         "How it searches": "SoftL1 Huber AbstractLoss FixedSteps Adaptive Descent Entropic",
         "Uncertainty, comparison": "profile compare cross_validate",
         "Before the experiment": "simulate_readings expected best_first_rate fisher",

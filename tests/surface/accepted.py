@@ -75,7 +75,7 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ("rotation.so3.determinant", "a: huge", "a silent NaN*", OVERFLOW),
     ("body.parameters.unpack_*", "vector: huge", "a silent NaN*", OVERFLOW),
     ("body.parameters.flat_bend", "shape: huge", "a silent NaN*", OVERFLOW),
-    ("identify.Model.unpack", "parameters: huge", "a silent NaN*", OVERFLOW),
+    ("identify.Model.unpack", "x: huge", "a silent NaN*", OVERFLOW),
     # Domains.
     (
         "body.matrix_function",
@@ -128,7 +128,7 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ("drift", "*: float32", "returned*", "drift is round-off itself, so that it has no digits"),
     ("frames.Force", "force: None", "taken*", "None is documented: the particle is left to itself"),
     ("identify.Recording", "mask: None", "taken*", "None is documented: nothing is masked"),
-    ("identify.Recording", "torque: None", "taken*", "None is documented: no torque at all"),
+    ("identify.Recording", "inputs: None", "taken*", "None is documented: no inputs at all"),
     ("simulate (options)", "max_steps: None", "taken*", "None is documented: as many as it takes"),
 ]
 

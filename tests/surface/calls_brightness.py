@@ -35,7 +35,7 @@ row(
 row(
     "tumblers.fit_light_curve",
     lambda: dict(
-        problem=identify.Model(
+        model=identify.Model(
             identify.Recording(TIMES, (tumblers.Brightness(W, Y, noise=0.1), LIGHT)),
             identify.PrincipalRatios(),
         )

@@ -41,10 +41,10 @@ row(
         sensor=rj.identify.Gyro(0.1),
         values=np.stack([V, W, Y, V]),
         mask=np.array([True, True, False, True]),
-        torque=s.damping(),
+        inputs={"speed": np.ones(4)},
     ),
-    run=lambda t, sensor, values, mask, torque: rj.identify.Recording(
-        t, (sensor, values, mask), torque=torque
+    run=lambda t, sensor, values, mask, inputs: rj.identify.Recording(
+        t, (sensor, values, mask), inputs=inputs
     ),
     says=("reading",),
     **HOST,
@@ -87,7 +87,7 @@ row(
     "identify.Model",
     lambda: dict(
         recording=s.recording(),
-        body=rj.identify.PrincipalRatios(),
+        chart=rj.identify.PrincipalRatios(),
         torque=s.damping(),
         loss=rj.identify.Huber(),
         prior=rj.identify.Entropic(s.inertia(), 1.0),
@@ -97,34 +97,34 @@ row(
 )
 row(
     "identify.Model.start",
-    lambda: dict(self=s.problem(), body=s.inertia(), omega=W),
+    lambda: dict(self=s.model(), body=s.inertia(), omega=W),
     arguments=("body", "omega"),
 )
-plan = lambda: s.problem().start(s.inertia())
+plan = lambda: s.model().start(s.inertia())
 for name in ("unpack", "values", "scenes", "motion", "errors"):
     row(
         f"identify.Model.{name}",
-        lambda: dict(self=s.problem(), parameters=plan()),
-        arguments=("parameters",),
-        traced=("parameters",),
+        lambda: dict(self=s.model(), x=plan()),
+        arguments=("x",),
+        traced=("x",),
         says=("inertia",),
     )
 row(
     "identify.fisher",
-    lambda: dict(problem=s.problem(), parameters=plan()),
-    traced=("parameters",),
+    lambda: dict(model=s.model(), x=plan()),
+    traced=("x",),
     groups=("stranger", "nan"),
     transforms=("jit", "grad"),
 )
 row(
     "identify.expected",
-    lambda: dict(problem=s.problem(), parameters=plan()),
+    lambda: dict(model=s.model(), x=plan()),
     groups=("stranger", "nan"),
     **HOST,
 )
 row(
     "identify.best_first_rate",
-    lambda: dict(problem=s.problem(), body=s.inertia(), omega=W, max_steps=2),
+    lambda: dict(model=s.model(), body=s.inertia(), omega=W, max_steps=2),
     groups=("stranger",),
     dear=True,
     **HOST,
@@ -132,8 +132,8 @@ row(
 row(
     "identify.fit",
     lambda: dict(
-        problem=s.problem(), starts=1, initial=plan(), key=jax.random.key(0), tolerance=1e-4,
-        max_steps=30, together=1, pieces=1,
+        model=s.model(), starts=1, initial=plan(), key=jax.random.key(0), tolerance=1e-4,
+        max_steps=30,
     ),
     groups=("stranger",),
     **HOST,
@@ -171,10 +171,8 @@ records = (
     "Start",
     "Quantity",
     "Comparison",
-    "Own",
     "Limit",
     "Freedom",
-    "Parameters",
     "Unpacked",
 )
 leave_out("a record that the library fills", *(f"identify.{name}" for name in records))
@@ -264,7 +262,7 @@ for name in ("write_html", "write_json"):
         groups=KINDS,
         transforms=(),
     )
-for name in ("problem", "recording"):
+for name in ("model", "recording"):
     row(f"datasets.toutatis.{name}", transforms=())
 leave_out(
     "reads an ephemeris that is no dependency: tests/datasets/test_moon.py", "datasets.moon.Moon"

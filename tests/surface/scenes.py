@@ -142,13 +142,13 @@ def recording() -> rj.identify.Recording:
 
 
 @functools.cache
-def problem() -> rj.identify.Model:
+def model() -> rj.identify.Model:
     return rj.identify.Model(recording(), rj.identify.PrincipalRatios())
 
 
 @functools.cache
 def found() -> rj.identify.Fit:
-    return rj.identify.fit(problem(), starts=1)
+    return rj.identify.fit(model(), starts=1)
 
 
 @functools.cache

@@ -57,7 +57,7 @@ def unnamed(thing):
     text = inspect.getdoc(thing).partition(">>>")[0]
     if re.search(r"\bas (for )?`\w+`", text):
         return []
-    named = [one for one in inspect.signature(thing).x if not one.startswith("_")]
+    named = [one for one in inspect.signature(thing).parameters if not one.startswith("_")]
     return [one for one in named if not re.search(rf"\b{one}\b", text)]
 
 

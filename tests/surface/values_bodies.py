@@ -269,7 +269,7 @@ def unpack_moments(x):
 LAMBDA = lambda i: (sum(i) - 2 * i) / 2
 way("body.parameters.pack", lambda m, c, s: parameters.pack(props(m, c, s)), BODY, pack, norm=True)
 way(
-    "body.parameters.pack_second_moment body.x.pack_shape",
+    "body.parameters.pack_second_moment body.parameters.pack_shape",
     lambda s: (parameters.pack_second_moment(s), parameters.pack_shape(s)),
     v.second_moment, lambda s: (pack_second(s), pack_second(s)[1:]), norm=True,
 )  # fmt: skip

@@ -465,16 +465,16 @@ def fitted(y, noise):
 
 def our_fit(y, noise):
     recording = identify.Recording(np.arange(float(len(y))), (identify.Gyro(float(noise)), y))
-    problem = identify.Model(recording, identify.Known(rj.Inertia(jnp.eye(3))))
-    fit = identify.fit(problem, starts=1)
+    model = identify.Model(recording, identify.Known(rj.Inertia(jnp.eye(3))))
+    fit = identify.fit(model, starts=1)
     low, high = zip(*fit.interval().values(), strict=True)
     ends = fit.interval_of(lambda point: point.state0.omega)
-    planned = identify.expected(problem, fit.x)
+    planned = identify.expected(model, fit.x)
     return [
         fit.state0.omega, np.array([q.deviation for q in fit.quantities[-3:]]), fit.chi2, fit.dof,
         fit.residuals[0], np.array(low[-3:]), np.array(high[-3:]), *ends,
-        np.array([q.deviation for q in planned[-3:]]), problem.motion(fit.x).omega,
-        problem.unpack(fit.x)[1].omega,
+        np.array([q.deviation for q in planned[-3:]]), model.motion(fit.x).omega,
+        model.unpack(fit.x).state0.omega,
     ]  # fmt: skip
 
 
@@ -488,7 +488,7 @@ way(
 )  # fmt: skip
 
 
-# A problem: a ball whose gyro has a bias that a `Free` moves.
+# A model: a ball whose gyro has a bias that a `Free` moves.
 def information(count):
     """Of rate and bias, per σ²: each reading shows their sum."""
     one = np.eye(3) * count
@@ -499,26 +499,25 @@ def our_plan(w, b, y):
     recording = identify.Recording(
         np.arange(float(len(y))), (identify.Gyro(1.0, bias=jnp.zeros(3)), np.zeros(np.shape(y)))
     )
-    problem = identify.Model(
+    model = identify.Model(
         recording, identify.Known(rj.Inertia(jnp.eye(3))),
         free=[identify.Free(lambda s: s.sensors[0].bias, "bias")],
     )  # fmt: skip
-    plan = problem.start(rj.Inertia(jnp.eye(3)), w)
-    plan = eqx.tree_at(lambda p: p.shared[0], plan, b)
-    unit = jnp.concatenate([jnp.ones(3), jnp.full(3, problem.typical_rate)])
+    plan = model.start(rj.Inertia(jnp.eye(3)), w).at[model.slots[0].shared[0]].set(b)
+    unit = jnp.concatenate([jnp.ones(3), jnp.full(3, model.typical_rate)])
     return [
-        problem.unpack(plan)[1].omega, problem.errors(plan)[0] + y, problem.values(plan)["bias"],
-        identify.fisher(problem, plan) / unit[:, None] / unit, problem.motion(plan).omega[0],
+        model.unpack(plan).state0.omega, model.errors(plan)[0] + y, model.values(plan)["bias"],
+        identify.fisher(model, plan) / unit[:, None] / unit, model.motion(plan).omega[0],
     ]  # fmt: skip
 
 
 way(
     "identify.Model.start identify.Model.errors identify.Model.values identify.fisher "
-    "identify.Free identify.Parameters identify.Own identify.Model.typical_rate",
+    "identify.Free identify.Model.typical_rate",
     our_plan, (v.ordinary, v.ordinary, v.normal(4, 3)),
     lambda w, b, y: [
         w, y - w - b, b,
-        # Parameters in order: what is shared, then the rate, which is in typical rates.
+        # The free numbers in order: what is shared, then the rate, which is in typical rates.
         information(4) + 0 * w[0], w],
     norm=True, batched=False, cost=4,
 )  # fmt: skip
@@ -673,7 +672,7 @@ leave_out(
     "holds what it was given, or numbers of a row above",
     "identify.Belief.torques", "identify.Belief.walks", "identify.Filtered.t",
     "identify.Smoothed.t", "estimate.Walk", "identify.Push", "identify.Extended", "identify.Start",
-    "identify.Model.recording", "identify.Model.recordings", "identify.Model.torque",
+    "identify.Model.recording", "identify.Model.recordings", "identify.Scene",
     "identify.Model.bodies", "identify.Model.scenes",
     "identify.Recording.sensors", "identify.Fit.values",
     "identify.Fit.spreads", "identify.Fit.noise", "identify.Fit.jitter", "identify.Fit.rms", "tumblers.Alias",
