@@ -12,7 +12,7 @@ from rigidjax import identify
 from rigidjax.identify.data import stacking
 from rigidjax.identify.model.free import columns_alone, local, places
 from rigidjax.identify.search.multiple_shooting import pieces
-from rigidjax.identify.search.normal import Alone, Normal, normal_of
+from rigidjax.identify.model.normal import Alone, Normal, normal_of
 from rigidjax.identify.uncertainty import covariance as uncertainty
 
 RNG = np.random.default_rng(0)

@@ -15,7 +15,7 @@ from rigidjax import identify
 from rigidjax.identify.model.terms import half_sum, residuals
 from rigidjax.identify.search import least_squares, stages
 from rigidjax.identify.search.least_squares import Search, Settings
-from rigidjax.identify.search.normal import Normal
+from rigidjax.identify.model.normal import Normal
 from rigidjax.identify.search.stages import (
     SearchState,
     Task,

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 import rigidjax as rj
 from rigidjax import identify, torques
 from rigidjax.identify.search import window_fit
-from rigidjax.identify.search.normal import Normal
+from rigidjax.identify.model.normal import Normal
 from rigidjax.identify.search.window_fit import open_loop_errors
 
 H, T = 0.02, 81

@@ -21,6 +21,8 @@ from rigidjax.identify.model.predict import (
     states_at,
 )
 from rigidjax.identify.model.scene import Scene
+from rigidjax.motion.torques import Held
+from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.rotation.barrier import batched_as
 
@@ -51,9 +53,18 @@ def scene_of(
 
 def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[Any, Any]:
     """Return the states at the times of a recording, and the torque with its inputs."""
-    torque = bind(scene.torque, record.inputs)
+    torque = torque_of_scene(scene, record)
     body: Any = body_of_equations(scene.body, model.state_kind)
     return states_at(model.integrator, body, scene.start, record.t, torque), torque
+
+
+def torque_of_scene(scene: Scene, record: Recording) -> Torque | None:
+    """Return the torque of a scene, which reads the inputs of a recording."""
+    inputs = {
+        name: source if callable(source) else Held(record.t, source)
+        for name, source in record.inputs.items()
+    }
+    return bind(scene.torque, inputs)
 
 
 def errors_of_one(

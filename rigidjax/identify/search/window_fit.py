@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax.identify.data.windows import Horizons, Windows, by_horizon, held_errors
+from rigidjax.identify.model.normal import Normal
 from rigidjax.identify.model.terms import with_jacobian
 from rigidjax.identify.search.least_squares import BOLD, LMState, Settings, minimise
-from rigidjax.identify.search.normal import Normal
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.covariance import inverted
 from rigidjax.identify.uncertainty.flat_limit import unreal
