@@ -175,7 +175,9 @@ def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recordi
                 "fit(model).x or model.start(body) makes them"
             )
         x = model.start()
-    return _scene_at(model, require_numbers(model, x)), stacking.one(model.records, 0)
+    scene = _scene_at(model, require_numbers(model, x))
+    steps.require_sensors(scene.sensors)
+    return scene, stacking.one(model.records, 0)
 
 
 @eqx.filter_jit
@@ -401,7 +403,6 @@ def step(
     Array(0.1, dtype=float64)
     """
     scene, _ = scene_at(model, x)
-    steps.require_sensors(scene.sensors)
     _checks.instance(belief, Belief, "belief", hint="identify.first_belief makes it")
     if belief.t.shape != ():
         raise ValueError(
@@ -507,7 +508,6 @@ def checked_input(
     """Return the checked arguments of `filter` and `smooth`."""
     scene, recording = scene_at(model, x)
     _checks.instance(first, Belief, "first", hint="identify.first_belief makes it")
-    steps.require_sensors(scene.sensors)
     for sensor in scene.sensors:
         if not isinstance(first.x.motion, sensor.feels):
             kind, got = sensor.feels.__name__, type(first.x.motion).__name__
