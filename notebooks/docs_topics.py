@@ -30,7 +30,6 @@ GROUPS = {
     "Identification": (
         "rj.identify",
         "rj.identify.report",
-        "rj.estimate",
         "rj.datasets",
         "rj.datasets.toutatis",
         "rj.datasets.moon",
@@ -90,13 +89,10 @@ TOPICS = {
         "Uncertainty, comparison": "profile compare cross_validate",
         "Before the experiment": "simulate_readings expected best_first_rate fisher",
         "Short windows of driven bodies": "windows Windows fit_windows WindowFit",
-        "Log files": "read_table",
-    },
-    "rj.estimate": {
-        "The model": "Model Walk start",
-        "Filter and smoother": "filter smooth step",
+        "Unknown torques: filter and smoother": "Walk first_belief filter smooth step",
         "Likelihood, simulated motions": "log_likelihood sample",
         "Posterior": "LogDensity refit Refit posterior Posterior Nuts",
         "Linear models": "LinearModel linear_filter linear_smooth",
+        "Log files": "read_table",
     },
 }

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
-from rigidjax import estimate
+from rigidjax import identify
 
 YEAR, STEP, SPARSE = 365.25, 5, 3
 # Chandler and what excites it, turns of the seasons, mean pole: two real numbers each.
@@ -86,7 +86,7 @@ def model_of(v, errors, step=float(STEP)):
             jnp.full(2, 500.0),
         ]
     )
-    return estimate.LinearModel(transition, noise, matrix, deviation), jnp.diag(first)
+    return identify.LinearModel(transition, noise, matrix, deviation), jnp.diag(first)
 
 
 def named(names, x):
@@ -105,7 +105,7 @@ def fit(names, readings, errors):
 
     def loss(x):
         model, root = model_of(named(names, x), errors, float(STEP * SPARSE))
-        found = estimate.linear_filter(model, readings, jnp.zeros(SIZE), root)
+        found = identify.linear_filter(model, readings, jnp.zeros(SIZE), root)
         return -found.log_likelihood + 0.5 * jnp.sum((x / WIDE) ** 2)
 
     slope = jax.jit(jax.jacfwd(loss))
@@ -127,7 +127,7 @@ def fit(names, readings, errors):
 def forecasts(v, t, readings, errors, ahead=(30, 90, 180, 365)):
     """From every 90th day of 1985–1994: errors (n, 2) and predicted deviations, by days ahead."""
     model, root = model_of(v, errors)
-    found = estimate.linear_filter(model, readings, jnp.zeros(SIZE), root)
+    found = identify.linear_filter(model, readings, jnp.zeros(SIZE), root)
     first, last = (np.searchsorted(t, mjd) for mjd in (46066, 49718))
     starts = np.arange(first, last, 90 // STEP)
     means, covs = np.asarray(found.mean), np.asarray(found.covariance)
@@ -193,7 +193,7 @@ def main(path):
     best = max(fits, key=lambda name: fits[name][2] - 0.5 * len(MODELS[name]) * np.log(count))
     print(f"preferred by Schwarz's criterion: {best}")
     model, root = model_of(fits[best][0], errors)
-    found = estimate.linear_smooth(model, readings, jnp.zeros(SIZE), root)
+    found = identify.linear_smooth(model, readings, jnp.zeros(SIZE), root)
     size = np.hypot(*np.asarray(found.mean)[:, :2].T)
     for begin in (41684, 44239, 47892):
         part = (t >= begin) & (t < begin + 3653)

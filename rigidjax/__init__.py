@@ -2,8 +2,8 @@
 
 From the ground up: `quaternion`, `so3`, `euler` and `body`, `motion` and `torques`, `frames`,
 `exact` and `solve` (the motion in closed form, or by a solver), and what uses them: `identify`,
-`estimate`, `batch`, `workprecision`, `plot`. `elliptic`, `lagrangian`, `orbits` and `tumblers` are
-loaded when they are asked for. Most programs begin with `simulate`.
+`batch`, `workprecision`, `plot`. `elliptic`, `lagrangian`, `orbits` and `tumblers` are loaded when
+they are asked for. Most programs begin with `simulate`.
 
 Every function raises `TypeError` for an argument of another type (also half precision) and
 `ValueError` for a wrong shape; docstrings list the other errors. Under `jit` they are errors of
@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 from rigidjax import (
     batch as batch,
     body as body,
-    estimate as estimate,
     exact as exact,
     frames as frames,
     identify as identify,

@@ -53,8 +53,8 @@ def test_every_public_name_is_there_once(written):
 def test_a_signature_is_the_sources(written):
     _, pages = written
     assert "{py:function} rj.so3.exp(v: Vec3Like) -> Mat3\n" in pages["rigidjax.rotation.so3"]
-    nuts = "rj.estimate.Nuts(samples: int = 1000, warmup: int = 500, acceptance: float = 0.8)\n"
-    assert "{py:class} " + nuts in pages["rigidjax.estimate"]
+    nuts = "rj.identify.Nuts(samples: int = 1000, warmup: int = 500, acceptance: float = 0.8)\n"
+    assert "{py:class} " + nuts in pages["rigidjax.identify"]
     # A name that is documented is a link, by its full name.
     assert "inertia: rj.Inertia" in pages["rigidjax.exact"]
 

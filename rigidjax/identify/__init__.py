@@ -1,4 +1,11 @@
-"""Identification: from recordings to a body, with its uncertainty."""
+"""Identification: from recordings to a body, with its uncertainty.
+
+`fit` finds the body and all other free numbers of a `Model`. `filter`, `step` and `smooth` follow a
+model with an unknown torque: states, torques and sensor errors with their standard deviations.
+`log_likelihood` is the density of the readings, unknown torques integrated out; `sample` draws a
+motion under random torques. `LogDensity` is the posterior density of a fit: `posterior` draws from
+it, `refit` finds its maximum.
+"""
 
 from rigidjax._names import show
 from rigidjax.identify import report as report
@@ -7,11 +14,32 @@ from rigidjax.identify.answer.result import Fit as Fit
 from rigidjax.identify.csv_io import read_table as read_table
 from rigidjax.identify.data.recording import Recording as Recording
 from rigidjax.identify.data.windows import Windows as Windows, windows as windows
+from rigidjax.identify.filtering.filter import (
+    filter as filter,
+    first_belief as first_belief,
+    log_likelihood as log_likelihood,
+    step as step,
+)
+from rigidjax.identify.filtering.linear import (
+    LinearModel as LinearModel,
+    linear_filter as linear_filter,
+    linear_smooth as linear_smooth,
+)
+from rigidjax.identify.filtering.smoother import smooth as smooth
+from rigidjax.identify.filtering.steps import sample as sample
 from rigidjax.identify.inference.compare import compare as compare, cross_validate as cross_validate
+from rigidjax.identify.inference.density import LogDensity as LogDensity
 from rigidjax.identify.inference.design import (
     best_first_rate as best_first_rate,
     expected as expected,
     fisher as fisher,
+)
+from rigidjax.identify.inference.draws import (
+    Nuts as Nuts,
+    Posterior as Posterior,
+    Refit as Refit,
+    posterior as posterior,
+    refit as refit,
 )
 from rigidjax.identify.inference.horizons import predict_windows as predict_windows
 from rigidjax.identify.inference.profile import profile as profile
@@ -38,6 +66,7 @@ from rigidjax.identify.model.priors import (
     SoftL1 as SoftL1,
 )
 from rigidjax.identify.model.scene import Scene as Scene
+from rigidjax.identify.model.walks import Walk as Walk
 from rigidjax.identify.search.stochastic_gradient import Descent as Descent
 from rigidjax.identify.sensors import (
     AbstractSensor as AbstractSensor,

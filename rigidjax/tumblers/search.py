@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify.model.free import leaf_at
 from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.normal import Normal
 from rigidjax.identify.model.terms import template
 from rigidjax.identify.search.least_squares import CAREFUL, Settings, minimise
-from rigidjax.identify.search.normal import Normal
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.rotation import quaternion
 from rigidjax.tumblers import starts

@@ -14,7 +14,7 @@ accelerometer) scatter from throw to throw. Notebook 15 does the same from the l
 EVERY keeps each so many samples (default 1: 1 kHz), END is the last time, s (default 0.53).
 
 --white and --correlated: then each throw alone also has an unknown torque of that kind, its numbers
-free (`estimate.refit`). Device, wheel and objects are then all of such fits: the device and the
+free (`identify.refit`). Device, wheel and objects are then all of such fits: the device and the
 proof body are the means of theirs. With --whole all throws of a body are one problem instead.
 
 --copies: simulated copies of the whole experiment instead, whose truth is the joint fit: each throw
@@ -36,7 +36,7 @@ from scipy.special import stdtrit
 jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
-from rigidjax import estimate, identify
+from rigidjax import identify
 
 _spec = importlib.util.spec_from_file_location("throws", Path(__file__).with_name("throws.py"))
 throws = importlib.util.module_from_spec(_spec)
@@ -129,7 +129,7 @@ def with_torque(found, law):
             density, found.correlation * (ts[1] - ts[0])
         ),
     }[law]()
-    return estimate.refit(estimate.LogDensity(found, process))
+    return identify.refit(identify.LogDensity(found, process))
 
 
 def drawn(best, key, count=1000):

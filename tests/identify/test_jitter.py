@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax import estimate, identify
-from rigidjax.identify.filtering.steps import sensors_of
+from rigidjax import identify
+from rigidjax.identify.filtering.steps import require_sensors
 from rigidjax.identify.model.terms import independent
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -126,9 +126,8 @@ def test_a_wrong_jitter_is_refused_in_words(wrong):
 
 
 def test_where_jitter_has_no_meaning_it_is_refused_in_words():
-    model = estimate.Model(BODY, rj.torques.RandomTorque(1e-3))
     with pytest.raises(ValueError, match="jitter"):
-        sensors_of([identify.Gyro(SIGMA, jitter=TAU)], model)
+        require_sensors([identify.Gyro(SIGMA, jitter=TAU)])
     gyro = identify.Gyro(SIGMA, jitter="estimated")
     with pytest.raises(ValueError, match="jitter in s"):
         identify.simulate_readings(gyro, BODY, rj.Spin([0, 0, 1.0]), TS, key=jax.random.key(0))
@@ -142,5 +141,5 @@ def test_the_log_density_is_that_of_the_full_covariance():
         covariance = SIGMA**2 * np.eye(3) + np.outer(v, v)
         wanted -= 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]
         wanted -= 0.5 * e @ np.linalg.solve(covariance, e)
-    density = estimate.LogDensity(found)
+    density = identify.LogDensity(found)
     np.testing.assert_allclose(density(density.x0), wanted, rtol=1e-10)

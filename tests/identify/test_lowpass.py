@@ -144,7 +144,7 @@ def test_mistakes_are_named():
     gyro = identify.Gyro(0.1, lowpass=identify.LowPass(5.0))
     record = identify.Recording(t, (gyro, jnp.ones((20, 3))))
     with pytest.raises(ValueError, match="a lowpass has states of its own"):
-        rj.estimate.start(rj.estimate.Model(BODY), record, rate=0.1)
+        identify.first_belief(identify.Model(record, identify.Known(BODY)), rate=0.1)
 
 
 @pytest.mark.parametrize("order", [1, 2])

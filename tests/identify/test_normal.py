@@ -9,7 +9,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.model.model import AbstractPull, with_parts
-from rigidjax.identify.search.normal import Alone, Normal, normal_of
+from rigidjax.identify.model.normal import Alone, Normal, normal_of
 from rigidjax.identify.search.stages import errors_and_slopes
 from rigidjax.identify.uncertainty import covariance as uncertainty
 

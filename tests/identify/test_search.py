@@ -11,10 +11,10 @@ from jaxtyping import Array
 
 import rigidjax as rj
 from rigidjax import identify
+from rigidjax.identify.model.normal import Normal
 from rigidjax.identify.model.terms import all_errors
 from rigidjax.identify.search import least_squares, stages
 from rigidjax.identify.search.least_squares import LMState, Settings
-from rigidjax.identify.search.normal import Normal
 from rigidjax.identify.search.stages import (
     Attempt,
     Task,

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from rigidjax.identify.search.window_fit import open_loop_errors
 
 import rigidjax as rj
 from rigidjax import identify, torques
+from rigidjax.identify.model.normal import Normal
 from rigidjax.identify.search import window_fit
-from rigidjax.identify.search.normal import Normal
-from rigidjax.identify.search.window_fit import open_loop_errors
 
 H, T = 0.02, 81
 BODY = rj.Inertia.from_principal(1.0, 2.0, 2.5)

@@ -48,7 +48,7 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ),
     # Estimates.
     *(
-        (f"estimate.{name}", "good call", "returned*", "lost_at is NaN where nothing was lost")
+        (f"identify.{name}", "good call", "returned*", "lost_at is NaN where nothing was lost")
         for name in ("filter", "smooth")
     ),
     # Polynomials of states and bodies.

@@ -29,7 +29,7 @@ from surface.values_numbers import nearest
 from surface.values_solve import TOP, TS as TIMES_OF_RUN, law_of, textbook, top_force
 
 import rigidjax as rj
-from rigidjax import estimate, identify, tumblers
+from rigidjax import identify, tumblers
 from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.uncertainty.quantities import Quantity
 from rigidjax.motion.equations import EulerEquations, NewtonEuler
@@ -380,9 +380,9 @@ def filtered(f, g, h, r, y, mean, root):
 
 
 def our_filtered(f, g, h, r, y, mean, root):
-    model = estimate.LinearModel(f, g, h, r)
-    forth = estimate.linear_filter(model, y, mean, root)
-    back = estimate.linear_smooth(model, y, mean, root)
+    model = identify.LinearModel(f, g, h, r)
+    forth = identify.linear_filter(model, y, mean, root)
+    back = identify.linear_smooth(model, y, mean, root)
     return [
         forth.mean, forth.covariance, forth.log_likelihood, back.mean, back.covariance,
         back.log_likelihood, forth.deviation,
@@ -390,7 +390,7 @@ def our_filtered(f, g, h, r, y, mean, root):
 
 
 way(
-    "estimate.LinearModel estimate.linear_filter estimate.linear_smooth identify.LinearEstimate "
+    "identify.LinearModel identify.linear_filter identify.linear_smooth identify.LinearEstimate "
     "identify.LinearEstimate.covariance identify.LinearEstimate.deviation",
     our_filtered,
     (v.normal(3, 3), v.normal(3, 2), v.normal(2, 3), between(0.1, 1.0, 2), v.normal(4, 2),
@@ -415,27 +415,28 @@ def ball(j, d, noise, y, w):
 
 
 def our_ball(j, d, noise, y, w):
-    model = estimate.Model(rj.Inertia(j * jnp.eye(3)), rj.torques.RandomTorque(d))
-    gyro = identify.Gyro(noise)
     # Made without the checks of known numbers: a recording is of the host.
     empty = identify.Recording(TS, (identify.Gyro(1.0), np.zeros((4, 3))))
-    reading = Reading(gyro, y, jnp.ones(4, bool))
-    recording = eqx.tree_at(lambda r: r.readings[0], empty, reading)
-    first = estimate.start(model, recording, rj.Spin(w), rate=0.4)
-    forth = estimate.filter(model, recording, first, throw=False, substeps=1)
-    back = estimate.smooth(model, recording, first, throw=False, substeps=1)
-    one = estimate.step(model, first, 0.0, (gyro, y[0]))
+    body = identify.Known(rj.Inertia(j * jnp.eye(3)))
+    model = identify.Model(empty, body, process=rj.torques.RandomTorque(d))
+    reading = Reading(identify.Gyro(noise), y, jnp.ones(4, bool))
+    rows = jax.tree.map(lambda leaf: leaf[None], reading)
+    model = eqx.tree_at(lambda m: m.records.readings[0], model, rows)
+    first = identify.first_belief(model, state=rj.Spin(w), rate=0.4)
+    forth = identify.filter(model, first, throw=False, substeps=1)
+    back = identify.smooth(model, first, throw=False, substeps=1)
+    one = identify.step(model, first, 0.0, y[0])
     return [
         forth.states.omega, forth.belief.covariance, forth.log_likelihood,
         back.states.omega, back.belief.covariance, back.log_likelihood, forth.belief.deviation,
-        estimate.log_likelihood(model, recording, first, substeps=1), first.state.omega,
+        identify.log_likelihood(model, first, substeps=1), first.state.omega,
         first.deviation, one.state.omega,
     ]  # fmt: skip
 
 
 way(
-    "estimate.Model estimate.start estimate.filter estimate.smooth estimate.step "
-    "estimate.log_likelihood identify.Belief identify.Belief.covariance identify.Belief.deviation "
+    "identify.first_belief identify.filter identify.smooth identify.step "
+    "identify.log_likelihood identify.Belief identify.Belief.covariance identify.Belief.deviation "
     "identify.Belief.state identify.Filtered identify.Filtered.states identify.Smoothed "
     "identify.Smoothed.states",
     our_ball, (scale(-1, 1), scale(-2, 0), between(0.1, 0.5), v.normal(4, 3), v.ordinary), ball,
@@ -633,9 +634,13 @@ way(
 
 # Without noise a sample is the motion: a ball that turns steadily.
 def our_sample(j, q, w):
-    model = estimate.Model(rj.Inertia(j * jnp.eye(3)), rj.torques.RandomTorque(0.0))
-    made = estimate.sample(
-        jax.random.key(0), model, rj.Attitude(q, w), jnp.asarray([0.0, 1.0]), substeps=200
+    made = identify.sample(
+        jax.random.key(0),
+        rj.Inertia(j * jnp.eye(3)),
+        rj.Attitude(q, w),
+        jnp.asarray([0.0, 1.0]),
+        process=rj.torques.RandomTorque(0.0),
+        substeps=200,
     )
     now = identify.SensorInput(
         jnp.asarray(0.0), rj.Spin(w), rj.Inertia(j * jnp.eye(3)),
@@ -645,7 +650,7 @@ def our_sample(j, q, w):
 
 
 way(
-    "estimate.sample identify.Sampled identify.SensorInput.rate", our_sample,
+    "identify.sample identify.Sampled identify.SensorInput.rate", our_sample,
     (between(0.5, 2.0), v.quaternion, v.ordinary),
     lambda j, q, w: (v.matrix_of(q) @ v.rotation(w), w, q[:3] / j), norm=True, rtol=1e-8, cost=2,
 )  # fmt: skip
@@ -660,8 +665,8 @@ way(
 )  # fmt: skip
 leave_out(
     "a truth value, a count, a kind, a name or words",
-    "identify.Filtered.words", "identify.Smoothed.words", "estimate.LinearModel.size",
-    "estimate.LogDensity.size", "identify.Accelerometer.feels", "identify.Marker.feels",
+    "identify.Filtered.words", "identify.Smoothed.words", "identify.LinearModel.size",
+    "identify.LogDensity.size", "identify.Accelerometer.feels", "identify.Marker.feels",
     "identify.Combination.in_words", "identify.Fit.ok", "tumblers.LightCurve.ok",
     "identify.Fit.status", "tumblers.LightCurve.status", "identify.Fit.advice", "identify.Fit.causes",
     "identify.Answer", "identify.Cause",
@@ -671,7 +676,7 @@ leave_out(
 leave_out(
     "holds what it was given, or numbers of a row above",
     "identify.Belief.torques", "identify.Belief.walks", "identify.Filtered.t",
-    "identify.Smoothed.t", "estimate.Walk", "identify.Push", "identify.Extended", "identify.Start",
+    "identify.Smoothed.t", "identify.Walk", "identify.Push", "identify.Extended", "identify.Start",
     "identify.Model.recording", "identify.Model.recordings", "identify.Scene",
     "identify.Model.bodies", "identify.Model.scenes",
     "identify.Recording.sensors", "identify.Fit.values",
@@ -701,12 +706,12 @@ leave_out(
         "as_dict", "as_html", "numbers", "rows", "table", "verdict", "write_html", "write_json")),
 )  # fmt: skip
 leave_out(
-    "draws, and statistics of draws: tests/estimate hold them against densities that are known",
-    "estimate.posterior", "estimate.Posterior", "estimate.Posterior.ess", "estimate.Posterior.of",
-    "estimate.Posterior.points", "estimate.Posterior.rhat", "estimate.Posterior.to_arviz",
-    "estimate.Nuts", "estimate.refit", "estimate.Refit", "estimate.Refit.effective",
-    "estimate.Refit.interval_of", "estimate.Refit.point", "estimate.LogDensity",
-    "estimate.LogDensity.grown", "estimate.LogDensity.unpack", "identify.Unpacked",
+    "draws, and statistics of draws: tests/identify hold them against densities that are known",
+    "identify.posterior", "identify.Posterior", "identify.Posterior.ess", "identify.Posterior.of",
+    "identify.Posterior.points", "identify.Posterior.rhat", "identify.Posterior.to_arviz",
+    "identify.Nuts", "identify.refit", "identify.Refit", "identify.Refit.effective",
+    "identify.Refit.interval_of", "identify.Refit.point", "identify.LogDensity",
+    "identify.LogDensity.grown", "identify.LogDensity.unpack", "identify.Unpacked",
     "identify.Filtered.nis", "identify.Read",
 )  # fmt: skip
 leave_out(

@@ -1,5 +1,7 @@
 """The extended Kalman filter on the manifold, in square-root form, and its first belief."""
 
+import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,12 +12,24 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rigidjax import _checks
-from rigidjax._types import HasSpin, Scalar, ScalarLike
+from rigidjax._types import HasAttitude, HasSpin, Scalar, ScalarLike
+from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording
-from rigidjax.identify.data.reference_states import attitudes, first_rate
+from rigidjax.identify.data.reference_states import attitudes
 from rigidjax.identify.filtering import roots, steps
-from rigidjax.identify.filtering.steps import Dynamics, Extended, NoiseModel, Read, Sensors, Stops
-from rigidjax.motion import Attitude, Spin
+from rigidjax.identify.filtering.steps import (
+    Dynamics,
+    Extended,
+    Read,
+    Stops,
+    coloured_parts,
+    dynamics_of,
+)
+from rigidjax.identify.model.model import Model, require_numbers, require_one
+from rigidjax.identify.model.scene import Process, Scene
+from rigidjax.identify.model.terms import scene_of, torque_of_scene
+from rigidjax.identify.model.walks import Drift, drifting_values, in_shape
+from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.manifold import names, plus
 
@@ -26,7 +40,7 @@ class Belief(eqx.Module):
     **Fields:** `t` s; `x` the `Extended` state, `root` (n, n), with the rows in its order: for a
     `Spin` the errors of Ω; for an `Attitude` δθ (body frame, rad) and Ω; for a `Rigid` x, v, δθ, Ω;
     then 3 for each `CorrelatedTorque`, then the walks. After `filter` all fields have a leading
-    time axis. `start` makes the first belief.
+    time axis. `first_belief` makes the first one.
     """
 
     t: Float[Array, "*times"]
@@ -59,81 +73,119 @@ class Belief(eqx.Module):
         return jnp.sqrt(jnp.sum(self.root**2, axis=-1))
 
 
-def start(
-    model: NoiseModel,
-    recording: Recording,
-    state: Any = None,
+def first_belief(
+    model: Model,
+    x: Float[Array, " n"] | None = None,
     *,
+    state: Spin | Attitude | Rigid | None = None,
     rate: Any,
     attitude: Any = None,
     position: Any = None,
     velocity: Any = None,
 ) -> Belief:
-    """The belief before the first reading.
+    """Return the belief before the first reading.
 
-    **Arguments:** `model`; `recording`, which gives the first time and the first values of the
-    walks; `state` a `Spin`, `Attitude` or `Rigid`, the kind that is followed; `None` takes the
-    initial attitude and rate from the recording (`Spin` if no sensor shows an attitude). Then
-    standard deviations, one number or three, zero for known values: `rate` of Ω, rad/s; `attitude`
-    rad; `position` m and `velocity` m/s of a `Rigid`. Torques start from their model's stationary
-    distribution. **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing
-    or below zero.
+    The walks begin at their values in the scene, and each `CorrelatedTorque` at its stationary
+    distribution.
+
+    **Arguments:**
+
+    - `model`: a `Model` of one recording.
+    - `x`: (n,) its free numbers, such as `fit(model).x`; for `None` the body must be known, and the
+      initial state is what the first readings show.
+    - `state`: the initial state, of the kind that is followed; `None` takes that of x.
+    - `rate`, `attitude`, `position`, `velocity`: standard deviations of the initial state, one
+      number or three, zero for known values: of Ω, rad/s, for each kind of state; rad for an
+      `Attitude` and a `Rigid`; m and m/s for a `Rigid`.
+
+    **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing or below zero,
+    and if neither x nor `state` is there and the readings show no initial attitude.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> model = NoiseModel(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
-    >>> start(model, record, rate=0.1).deviation.tolist()
+    >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 2.0, 2.5))
+    >>> model = rj.identify.Model(record, body, process=rj.torques.RandomTorque(1e-4))
+    >>> first_belief(model, rate=0.1).deviation.tolist()
     [0.1, 0.1, 0.1]
     """
-    _checks.instance(model, NoiseModel, "model")
-    _checks.instance(recording, Recording, "recording")
-    sensors = steps.sensors_of(recording.sensors, model)
+    scene, record = scene_at(model, x)
     if state is None:
-        state = _shown(recording)
+        if x is None:
+            _require_shown(record, scene.start)
+        state = scene.start
     _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
     state = on_the_group(state)
-    dtype = state.omega.dtype
-    given = {"attitude": attitude, "rate": rate, "position": position, "velocity": velocity}
+    deviations = {"attitude": attitude, "rate": rate, "position": position, "velocity": velocity}
     words = {"x": "position", "v": "velocity", "q": "attitude", "omega": "rate"}
     kind, wanted = type(state).__name__, [words[part] for part in names(state)]
-    for name, value in given.items():
+    for name, value in deviations.items():
         if name not in wanted and value is not None:
             raise ValueError(f"{name}: a {kind} has none; leave it out")
         if name in wanted and value is None:
             raise ValueError(
-                f"{name}: wanted the standard deviation of the first one, got None; a {kind} needs "
-                + ", ".join(wanted)
+                f"{name}: wanted the standard deviation of the initial one, got None; a {kind} "
+                "needs " + ", ".join(wanted)
             )
-    parts = [_spread(given[name], (3,), name, dtype) for name in wanted]
-    parts += [law.deviation.astype(dtype) for law in model.coloured]
-    walks = tuple(value.astype(dtype) for value in sensors.first_walks)
-    for walk, value in zip(model.walks, walks, strict=True):
-        parts.append(_spread(walk.deviation, value.shape, "deviation", dtype).reshape(-1))
-        _spread(walk.density, value.shape, "density", dtype)
-    x = Extended(state, tuple(jnp.zeros(3, dtype) for _ in model.coloured), walks)
-    return Belief(recording.t[0], x, jnp.diag(jnp.concatenate(parts)))
+    parts = [in_shape(deviations[name], (3,), name) for name in wanted]
+    return belief_at(record.t[0], state, jnp.concatenate(parts), scene, model.walks)
 
 
-def _spread(value: Any, shape: tuple[int, ...], name: str, dtype: Any) -> Array:
-    deviation = steps.not_negative(value, name)
-    if deviation.shape not in ((), shape):
-        raise ValueError(f"{name}: wanted one number or shape {shape}, got {deviation.shape}")
-    return jnp.broadcast_to(deviation, shape).astype(dtype)
+def belief_at(
+    t: Scalar,
+    state: HasSpin,
+    deviations: Float[Array, " k"],
+    scene: Scene,
+    drifts: Sequence[Drift],
+) -> Belief:
+    """Return the belief of a state with these standard deviations, in the dtype of the state."""
+    dtype = state.omega.dtype
+    coloured = coloured_parts(scene.process)
+    walks = tuple(value.astype(dtype) for value in drifting_values(scene, drifts))
+    parts = [deviations, *(law.deviation for law in coloured)]
+    parts += [drift.deviation.reshape(-1) for drift in drifts]
+    root = jnp.diag(jnp.concatenate([part.astype(dtype) for part in parts]))
+    return Belief(t, Extended(state, tuple(jnp.zeros(3, dtype) for _ in coloured), walks), root)
 
 
-def _shown(recording: Recording) -> Spin | Attitude:
-    """The initial attitude and rate that the readings show."""
-    if not _checks.known(recording.t):
+def _require_shown(recording: Recording, state: Any) -> None:
+    """Raise an error if the readings do not show the initial attitude of the state."""
+    if not _checks.known(recording):
         raise TypeError("state: wanted a state; a traced recording shows none")
-    omega = jnp.asarray(first_rate(recording), recording.t.dtype)
-    if all(sensor.feels is HasSpin for sensor in recording.sensors):
-        return Spin(omega)
-    _, q = attitudes(recording)
-    if not len(q):
+    if isinstance(state, HasAttitude) and not len(attitudes(recording)[1]):
         raise ValueError(
             "state: the readings alone show no initial attitude (an attitude sensor, two "
             "directions, or three markers do); give an Attitude"
         )
-    return Attitude(jnp.asarray(np.asarray(q[0]), recording.t.dtype), omega)
+
+
+def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recording]:
+    """Return the scene of the only recording of a model, and the recording.
+
+    The torque of the scene reads the inputs of the recording.
+    """
+    require_one(model)
+    if model.count != 1:
+        raise ValueError(
+            f"model: wanted one recording, got {model.count}; filter each by a model of its own, "
+            "or put other readings in a model of one by equinox.tree_at, under jax.vmap"
+        )
+    if x is None:
+        if model.index.bodies:
+            raise ValueError(
+                "x: wanted the free numbers of the model, since its body is not known, got None; "
+                "fit(model).x or model.start(body) makes them"
+            )
+        x = model.start()
+    scene = _scene_at(model, require_numbers(model, x))
+    steps.require_sensors(scene.sensors)
+    return scene, stacking.one(model.records, 0)
+
+
+@eqx.filter_jit
+def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
+    row = model.index.rows(x)[0]
+    record, reference, which = stacking.one((model.records, model.reference, model.which), 0)
+    scene = scene_of(model, row, record, reference, which)
+    return dataclasses.replace(scene, torque=torque_of_scene(scene, record))
 
 
 class Grid(NamedTuple):
@@ -150,8 +202,10 @@ class Grid(NamedTuple):
         return kept if same else jax.tree.map(lambda leaf: leaf[self.rows], kept)
 
 
-def grid_of(model: NoiseModel, recording: Recording, first: Belief, substeps: int | None) -> Grid:
-    """The times of the steps."""
+def grid_of(
+    process: Process | None, recording: Recording, first: Belief, substeps: int | None
+) -> Grid:
+    """Return the times of the steps."""
     xp = _checks.namespace((recording.t, first.t))
     t, t0 = xp.asarray(recording.t), xp.asarray(first.t)
     if xp is np:
@@ -161,13 +215,27 @@ def grid_of(model: NoiseModel, recording: Recording, first: Belief, substeps: in
         )
         _checks.refuse(t, t[0] < t0, words)
     ends = xp.concatenate([t0[None], t])
-    counts = steps.steps_of(model, ends, first.x.motion, substeps, recording)
+    counts = steps.steps_of(process, ends, first.x.motion, substeps, recording)
     index = np.repeat(np.arange(counts.size), counts)
     rows = np.cumsum(counts) - 1
     part = (np.arange(index.size) - np.repeat(rows - counts, counts)) / counts[index]
     times = ends[index] + (t - ends[:-1])[index] * xp.asarray(part, t.dtype)
     times = xp.where(part == 1, t[index], times)
     return Grid(*map(jnp.asarray, (times, index, part == 1, rows)))
+
+
+class FilterInput(NamedTuple):
+    """The checked arguments of a filter: `checked_input` makes them.
+
+    **Fields:** the `scene`; the `drifts` of the model; the `recording`; the `first` belief; the
+    `grid` of the steps.
+    """
+
+    scene: Scene
+    drifts: tuple[Drift, ...]
+    recording: Recording
+    first: Belief
+    grid: Grid
 
 
 # A filter is lost if no reading was within so many deviations for so long, s, and so many readings.
@@ -222,88 +290,120 @@ class Filtered(eqx.Module):
 
 
 def filter(
-    model: NoiseModel,
-    recording: Recording,
+    model: Model,
     first: Belief,
+    x: Float[Array, " n"] | None = None,
     *,
     substeps: int | None = None,
     throw: bool = True,
 ) -> Filtered:
-    """Attitude, rate, unknown torque and sensor errors from the readings so far, at each time.
+    """Return attitude, rate, unknown torque and sensor errors from the readings up to each time.
 
     The multiplicative extended Kalman filter: the estimate is a state on the group, its error a
     rotation vector and numbers (Lefferts, Markley and Shuster 1982, doi:10.2514/3.56190). Between
     readings both follow the equations of motion, by the classical method of order 4. The covariance
     is kept as a root, updated by Potter's formula for each number read.
 
-    **Arguments:** `model`; `recording` a `Recording` whose sensors have their noise, and whose
-    torque acts beside the model's; masked readings are gaps, channels at their full scale are left
-    out, a sensor's `offset` is a delay; `first` of `start`; `substeps` fixed steps from one time to
-    the next, `None` chooses them by the rate if the numbers are known, else one. `throw`: with
-    `False` no event of the run raises an error; see `status`. **Returns** `belief`, `readings`,
-    `log_likelihood`, `status` and `lost_at` (`Filtered`). It may be jitted, differentiated, and
-    batched over any argument.
+    **Arguments:**
 
-    **Raises:** `ValueError` for a sensor without noise, and readings before `first`; with `throw`
-    also for a lost filter: no reading was within 6 deviations of its prediction for a second and
-    three readings.
+    - `model`: a `Model` of one recording, whose sensors have their noise. Masked readings are gaps,
+      channels at their full scale are left out, a sensor's `offset` is a delay.
+    - `first`: the belief before the first reading, of `first_belief`.
+    - `x`: (n,) the free numbers of the model, such as `fit(model).x`: body, torques and sensors are
+      those of the scene at x. `None` for a model whose body is known.
+    - `substeps`: the number of fixed steps from one time to the next; `None` chooses them by the
+      rate if the numbers are known, else one.
+    - `throw`: with `False` no event of the run raises an error; see `status`.
+
+    **Returns** `belief`, `readings`, `log_likelihood`, `status` and `lost_at` (`Filtered`). It may
+    be jitted, differentiated, and batched over `first`, `x`, and readings that `equinox.tree_at`
+    puts in the model.
+
+    **Raises:** `ValueError` for several recordings, a sensor without noise, and readings before
+    `first`; with `throw` also for a lost filter: no reading was within 6 deviations of its
+    prediction for a second and three readings.
 
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
-    >>> found = rj.estimate.filter(model, record, rj.estimate.start(model, record, rate=1.0))
-    >>> found.states.omega.shape, found.readings[0].innovation.shape, found.words
+    >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 2.0, 2.5))
+    >>> model = rj.identify.Model(record, body, process=rj.torques.RandomTorque(1e-4))
+    >>> run = rj.identify.filter(model, rj.identify.first_belief(model, rate=1.0))
+    >>> run.states.omega.shape, run.readings[0].innovation.shape, run.words
     ((2, 3), (2, 3), 'followed')
     """
-    out = _filter(looked_at(model, recording, first, substeps))
-    return told(out) if throw else out
+    run = _filter(checked_input(model, first, x, substeps))
+    return raise_if_lost(run) if throw else run
 
 
-def told(out: Any) -> Any:
-    """Return `out`; raise an error in words if it is lost or stopped."""
-    status = out.status
-    at = f" (at {float(out.lost_at):g} s)" if _checks.known(out.lost_at) else ""
-    advice = "; is the noise or density too small, or the start far off? throw=False returns it"
-    out = _checks.refuse(out, status == 1, f"filter: {WORDS[1]}{at}{advice}")
-    return _checks.refuse(out, status == 2, f"filter: {WORDS[2]}{advice}")
+def raise_if_lost(run: Any) -> Any:
+    """Return a run of a filter; raise an error in words if it is lost or stopped."""
+    status = run.status
+    at = f" (at {float(run.lost_at):g} s)" if _checks.known(run.lost_at) else ""
+    advice = (
+        "; is the noise or density too small, or the initial state far off? throw=False returns it"
+    )
+    run = _checks.refuse(run, status == 1, f"filter: {WORDS[1]}{at}{advice}")
+    return _checks.refuse(run, status == 2, f"filter: {WORDS[2]}{advice}")
 
 
 def log_likelihood(
-    model: NoiseModel, recording: Recording, first: Belief, *, substeps: int | None = None
+    model: Model,
+    first: Belief,
+    x: Float[Array, " n"] | None = None,
+    *,
+    substeps: int | None = None,
 ) -> Scalar:
-    """The logarithm of the density of all readings, the unknown torques integrated out.
+    """Return the logarithm of the density of all readings, the unknown torques integrated out.
 
     `Σ log N(ν; 0, s)` over innovations (Schweppe 1965, doi:10.1109/TIT.1965.1053737): maximise it
-    over moments, a density, a noise, an initial state. Arguments and errors are as for `filter`;
-    differentiable in forward and reverse mode.
+    over moments, a density, a noise, an initial state. Arguments and errors are those of `filter`;
+    it is differentiable in forward and reverse mode.
 
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(1.0), [[1.0, 0, 0]] * 2))
-    >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 1.0, 1.0))
-    >>> first = rj.estimate.start(model, record, rj.Spin([1.0, 0, 0]), rate=0.0)
-    >>> log_likelihood(model, record, first).round(6)
+    >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 1.0, 1.0))
+    >>> model = rj.identify.Model(record, body)
+    >>> first = rj.identify.first_belief(model, state=rj.Spin([1.0, 0, 0]), rate=0.0)
+    >>> log_likelihood(model, first).round(6)
     Array(-5.513631, dtype=float64)
     """
-    return _log_likelihood(looked_at(model, recording, first, substeps))
+    return _log_likelihood(checked_input(model, first, x, substeps))
 
 
-def step(model: NoiseModel, belief: Belief, t: ScalarLike, *readings: tuple) -> Belief:
-    """The belief at `t`, after the readings at `t`: for use while the body moves.
+def step(
+    model: Model,
+    belief: Belief,
+    t: ScalarLike,
+    *readings: Any,
+    seen: Sequence[Any] | None = None,
+    x: Float[Array, " n"] | None = None,
+) -> Belief:
+    """Return the belief at the time t, after the readings then: for use while the body moves.
 
-    **Arguments:** `model`; `belief` of `start` or the last `step`; `t` s, not before it; `readings`
-    pairs `(sensor, value)` or triples `(sensor, value, seen)`, `seen` a truth value. The walks'
-    `where` finds the sensors as `s.sensors[i]`, in this order, so each call gives them all.
     This is one step of the classical method: the time between readings must be short against a
-    turn. **Returns** the `Belief` at `t`. **Raises:** `ValueError` for a `t` before the belief, or
-    a reading with NaN, if the numbers are known.
+    turn.
 
-    >>> gyro = rj.identify.Gyro(0.1)
-    >>> record = rj.identify.Recording([0.0, 0.1], (gyro, [[1.0, 0, 0]] * 2))
-    >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
-    >>> belief = rj.estimate.start(model, record, rate=1.0)
-    >>> rj.estimate.step(model, belief, 0.1, (gyro, jnp.array([1.0, 0.0, 0.0]))).t
+    **Arguments:**
+
+    - `model`: a `Model` of one recording, whose body, torque and sensors are used, and not its
+      readings.
+    - `belief`: of `first_belief` or the last `step`.
+    - `t`: s, not before the belief.
+    - `readings`: one of each sensor, in the order of the recording.
+    - `seen`: a truth value for each sensor, false where there is no reading and the number counts
+      for nothing; `None` for all true.
+    - `x`: (n,) the free numbers of the model; `None` for a model whose body is known.
+
+    **Returns** the `Belief` at t. **Raises:** `ValueError` for a t before the belief, another
+    number of readings, or a reading with NaN, if the numbers are known.
+
+    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
+    >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 2.0, 2.5))
+    >>> model = rj.identify.Model(record, body, process=rj.torques.RandomTorque(1e-4))
+    >>> belief = rj.identify.first_belief(model, rate=1.0)
+    >>> rj.identify.step(model, belief, 0.1, jnp.array([1.0, 0.0, 0.0])).t
     Array(0.1, dtype=float64)
     """
-    _checks.instance(model, NoiseModel, "model")
-    _checks.instance(belief, Belief, "belief")
+    scene, _ = scene_at(model, x)
+    _checks.instance(belief, Belief, "belief", hint="identify.first_belief makes it")
     if belief.t.shape != ():
         raise ValueError(
             f"belief: wanted one, got times of shape {belief.t.shape}; for many use jax.vmap"
@@ -312,29 +412,32 @@ def step(model: NoiseModel, belief: Belief, t: ScalarLike, *readings: tuple) -> 
     if _checks.known((when, belief.t)):
         words = f"t: readings are out of order: {float(when):g} s is before {float(belief.t):g} s"
         _checks.refuse(when, when < belief.t, words)
-    sensors = steps.sensors_of([reading[0] for reading in readings], model)
+    flags = (True,) * len(readings) if seen is None else tuple(seen)
+    for name, items in (("readings", readings), ("seen", flags)):
+        if len(items) != len(scene.sensors):
+            kinds = ", ".join(type(sensor).__name__ for sensor in scene.sensors)
+            raise ValueError(f"{name}: wanted one for each sensor ({kinds}), got {len(items)}")
     values, masks = [], []
-    for sensor, value, *seen in readings:
+    for sensor, reading, flag in zip(scene.sensors, readings, flags, strict=True):
         name = type(sensor).__name__
-        value = _checks.floating(value, sensor.reading_shape, f"{name}: reading")
-        mask = jnp.asarray(seen[0] if seen else True)
+        value = _checks.floating(reading, sensor.reading_shape, f"{name}: reading")
+        mask = jnp.asarray(flag)
         if _checks.known((value, mask)) and bool(mask):
-            words = f"{name}: the reading contains NaN; give (sensor, value, False) if it is a gap"
+            words = f"{name}: the reading contains NaN; give seen=(…, False, …) if it is a gap"
             _checks.refuse(value, not np.isfinite(np.asarray(value)).all(), words)
         values.append(value)
         masks.append(mask)
-    return _step(steps.bare(model), sensors, belief, when, tuple(values), tuple(masks))
+    return _step(scene, model.walks, belief, Stops(when, tuple(values), tuple(masks)))
 
 
 @eqx.filter_jit
-def _step(
-    model: NoiseModel, sensors: Sensors, belief: Belief, t: Array, values: tuple, masks: tuple
-) -> Belief:
+def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) -> Belief:
     # A unit vector in the place of a missing reading keeps derivatives finite.
-    units = (jnp.eye(1, value.size, dtype=value.dtype).reshape(value.shape) for value in values)
-    values = tuple(map(jnp.where, masks, values, units))
+    units = (jnp.eye(1, v.size, dtype=v.dtype).reshape(v.shape) for v in stop.values)
+    values = tuple(map(jnp.where, stop.masks, stop.values, units))
     values = tuple(value.astype(belief.root.dtype) for value in values)
-    return _one(Dynamics(model, belief.x, sensors), belief, Stops(t, values, masks))[0]
+    dynamics = dynamics_of(scene, drifts, belief.x)
+    return _one(dynamics, belief, stop._replace(values=values))[0]
 
 
 def _one(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, Read]:
@@ -349,15 +452,11 @@ def _one(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, Read]
     return Belief(stop.t, plus(x, e), steps.reset(x, e, root)), Read(innovation, variance, seen)
 
 
-# The checked arguments of a filter: see `looked_at`.
-Given = tuple[NoiseModel, Sensors, Recording, Belief, Grid]
-
-
-def scan_filter(given: Given, keep: Any) -> tuple[Dynamics, Stops, Any]:
-    """`lax.scan` of the filter over all stops, which keeps `keep(belief, read)`."""
-    model, sensors, recording, first, grid = given
+def scan_filter(run: FilterInput, keep: Any) -> tuple[Dynamics, Stops, Any]:
+    """Run the filter over all stops by `lax.scan`, and return what `keep(belief, read)` kept."""
+    scene, drifts, recording, first, grid = run
     dtype = first.root.dtype
-    dynamics = Dynamics(model, first.x, sensors)
+    dynamics = dynamics_of(scene, drifts, first.x)
     values = tuple(r.values.astype(dtype)[grid.source] for r in recording.readings)
     masks = tuple(r.mask[grid.source] & grid.real for r in recording.readings)
     stops = Stops(grid.t, values, masks)
@@ -372,16 +471,17 @@ def scan_filter(given: Given, keep: Any) -> tuple[Dynamics, Stops, Any]:
 
 
 @eqx.filter_jit
-def _filter(given: Given) -> Filtered:
-    _, sensors, _, first, grid = given
-    beliefs, read = grid.of_rows(scan_filter(given, lambda belief, read: (belief, read))[2])
-    reads, total = steps.by_sensor(sensors, read), roots.terms(*read).log_density
-    return Filtered(beliefs, reads, total, *status_of(beliefs, reads, first.t))
+def _filter(run: FilterInput) -> Filtered:
+    both = scan_filter(run, lambda belief, read: (belief, read))[2]
+    beliefs, read = run.grid.of_rows(both)
+    reads = steps.by_sensor(run.scene.sensors, read)
+    total = roots.terms(*read).log_density
+    return Filtered(beliefs, reads, total, *status_of(beliefs, reads, run.first.t))
 
 
 @eqx.filter_jit
-def _log_likelihood(given: Given) -> Scalar:
-    return roots.terms(*scan_filter(given, lambda _, read: read)[2]).log_density
+def _log_likelihood(run: FilterInput) -> Scalar:
+    return roots.terms(*scan_filter(run, lambda _, read: read)[2]).log_density
 
 
 def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Array, Array]:
@@ -402,16 +502,15 @@ def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Arra
     return status, jnp.where(lost.any(), t[jnp.argmax(lost)], jnp.nan)
 
 
-def looked_at(
-    model: NoiseModel, recording: Recording, first: Belief, substeps: int | None
-) -> Given:
-    """The checked arguments of `filter` and `smooth`: model, sensors, recording, belief, times."""
-    _checks.instance(model, NoiseModel, "model")
-    _checks.instance(recording, Recording, "recording")
-    _checks.instance(first, Belief, "first", hint="estimate.start makes it")
-    for sensor in recording.sensors:
+def checked_input(
+    model: Model, first: Belief, x: Float[Array, " n"] | None, substeps: int | None
+) -> FilterInput:
+    """Return the checked arguments of `filter` and `smooth`."""
+    scene, recording = scene_at(model, x)
+    _checks.instance(first, Belief, "first", hint="identify.first_belief makes it")
+    for sensor in scene.sensors:
         if not isinstance(first.x.motion, sensor.feels):
             kind, got = sensor.feels.__name__, type(first.x.motion).__name__
             raise TypeError(f"first: a sensor needs a state with {kind}, got a {got}")
-    sensors = steps.sensors_of(recording.sensors, model)
-    return steps.bare(model), sensors, recording, first, grid_of(model, recording, first, substeps)
+    grid = grid_of(scene.process, recording, first, substeps)
+    return FilterInput(scene, model.walks, recording, first, grid)

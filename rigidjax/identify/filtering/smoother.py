@@ -10,19 +10,19 @@ from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
-from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.filtering import roots, steps
 from rigidjax.identify.filtering.filter import (
     WORDS,
     Belief,
-    Given,
-    looked_at,
+    FilterInput,
+    checked_input,
+    raise_if_lost,
     scan_filter,
     status_of,
-    told,
 )
 from rigidjax.identify.filtering.linear import LinearEstimate, solved
-from rigidjax.identify.filtering.steps import Dynamics, Extended, NoiseModel, Read, Stops
+from rigidjax.identify.filtering.steps import Dynamics, Extended, Read, Stops
+from rigidjax.identify.model.model import Model
 from rigidjax.motion.manifold import minus, plus
 
 
@@ -75,53 +75,57 @@ class Smoothed(eqx.Module):
 
 
 def smooth(
-    model: NoiseModel,
-    recording: Recording,
+    model: Model,
     first: Belief,
+    x: Float[Array, " n"] | None = None,
     *,
     iterations: int = 10,
     tolerance: float = 1e-2,
     substeps: int | None = None,
     throw: bool = True,
 ) -> Smoothed:
-    """Attitude, rate, unknown torque and sensor errors from all readings, with their deviations.
+    """Return attitude, rate, unknown torque and sensor errors from all readings.
 
     The motion of largest posterior density, by Gauss and Newton's method: each iteration linearises
     dynamics and sensors about the last motion, at first that of `filter`, and solves the linear
     problem exactly by a Kalman filter and the pass of Rauch, Tung and Striebel (Bell 1994,
     doi:10.1137/0804035).
 
-    **Arguments:** as for `filter`; `iterations` at most; it ends when no number moved by more than
-    `tolerance` of its standard deviation (the error that remains is about the square of that).
+    **Arguments:** `model`, `first`, `x`, `substeps` and `throw` of `filter`, and
+
+    - `iterations`: the largest number of iterations.
+    - `tolerance`: the iteration ends when no number moved by more than this part of its standard
+      deviation (the error that remains is about the square of that).
+
     **Returns** `belief`, `rows`, `pushes`, `readings`, `log_likelihood`, `change`, `iterations`,
     `status` and `lost_at` (`Smoothed`). It may be jitted, differentiated in forward mode, and
-    batched. **Raises:** as `filter`; with `throw` also for a motion that still moves by a standard
-    deviation.
+    batched. **Raises:** the errors of `filter`; with `throw` also one for a motion that still moves
+    by a standard deviation.
 
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(1.0))
-    >>> found = rj.estimate.smooth(model, record, rj.estimate.start(model, record, rate=1.0))
-    >>> found.pushes[0].mean.shape, found.rows.tolist()  # of three stops two are readings
+    >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 2.0, 2.5))
+    >>> model = rj.identify.Model(record, body, process=rj.torques.RandomTorque(1.0))
+    >>> best = rj.identify.smooth(model, rj.identify.first_belief(model, rate=1.0))
+    >>> best.pushes[0].mean.shape, best.rows.tolist()  # of three stops two are readings
     ((3, 3), [0, 2])
     """
     _checks.whole(iterations, "iterations", 1)
     _checks.positive(tolerance, "tolerance")
-    out = _smooth(looked_at(model, recording, first, substeps), iterations, tolerance)
+    run = _smooth(checked_input(model, first, x, substeps), iterations, tolerance)
     if not throw:
-        return out
+        return run
     words = (
         "smooth: the motion still moves by a standard deviation after the last iteration; give "
         "more iterations, a better initial state, or a model that the readings fit; throw=False "
         "returns it"
     )
-    return _checks.refuse(told(out), out.change > 1, words)
+    return _checks.refuse(raise_if_lost(run), run.change > 1, words)
 
 
 @eqx.filter_jit
-def _smooth(given: Given, iterations: int, tolerance: float) -> Smoothed:
-    _, sensors, _, first, grid = given
-    dynamics, stops, kept = scan_filter(given, lambda belief, read: (belief, read))
+def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
+    sensors, first, grid = run.scene.sensors, run.first, run.grid
+    dynamics, stops, kept = scan_filter(run, lambda belief, read: (belief, read))
     beliefs, read = grid.of_rows(kept)
     status, lost_at = status_of(beliefs, steps.by_sensor(sensors, read), first.t)
     path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, kept[0].x)
@@ -177,10 +181,10 @@ def _iterate(
     x0, earlier, later = (
         jax.tree.map(lambda leaf, at=at: leaf[at], path) for at in (0, slice(-1), slice(1, None))
     )
-    steps, rows = lax.map(about, (before, stops, earlier, later, kicks))
+    moves, rows = lax.map(about, (before, stops, earlier, later, kicks))
     # Nothing is read at the first time.
     matrix, error, deviation, seen = (jnp.pad(a, [(1, 0)] + [(0, 0)] * (a.ndim - 1)) for a in rows)
-    parts = dict(zip(("transition", "noise", "push"), steps, strict=True))
+    parts = dict(zip(("transition", "noise", "push"), moves, strict=True))
     parts |= {"matrix": matrix, "deviation": deviation, "offset": None}
     off = minus(x0, first.x)
     found = solved(parts, error, -off, steps.reset(x0, off, first.root), seen, back=True)

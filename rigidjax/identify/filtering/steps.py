@@ -17,13 +17,20 @@ from rigidjax._types import HasAttitude, HasSpin, Mat3, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.filtering import roots
-from rigidjax.identify.model.free import leaf_at
+from rigidjax.identify.model.free import with_leaves
 from rigidjax.identify.model.model import TURN_OF_A_FILTER_STEP
 from rigidjax.identify.model.predict import body_of_equations, shifted
+from rigidjax.identify.model.scene import (
+    Process,
+    Scene,
+    require_known_torque,
+    require_process,
+)
+from rigidjax.identify.model.walks import Drift
 from rigidjax.identify.sensors import AbstractSensor, Gyro, SensorInput
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.manifold import coordinates, dimension, tangent, turns
-from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
+from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
 from rigidjax.motion.torques.base import Torque, in_precision, require_law, tensor_of
 from rigidjax.motion.torques.composite import parts_of
 from rigidjax.rotation.kernels import normalised
@@ -31,70 +38,6 @@ from rigidjax.rotation.linalg3 import cross
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.equal_steps import advance
 from rigidjax.solve.tableaus import KUTTA4
-
-
-class Walk(eqx.Module):
-    """An unknown sensor error that drifts: `dx = √density dW`, a random walk.
-
-    **Arguments:** `where` picks it as a `Free` does: `lambda s: s.sensors[0].bias`; its
-    value in the recording is the initial value; `deviation` of that value, one number or one for
-    each component, in its unit; `density` of the drift, unit² / s, ≥ 0: zero for a constant error.
-    **Raises** `ValueError` for a deviation or density below zero.
-
-    >>> Walk(lambda s: s.sensors[0].bias, 0.01).density.tolist()
-    0.0
-    """
-
-    where: Callable[[Any], Any] = eqx.field(static=True)
-    deviation: Array
-    density: Array
-
-    def __init__(self, where: Callable[[Any], Any], deviation: Any, density: Any = 0.0):
-        words = "of a scene, such as lambda s: s.sensors[0].bias"
-        self.where = _checks.function(where, "where", words)
-        self.deviation = not_negative(deviation, "deviation")
-        self.density = not_negative(density, "density")
-
-
-class NoiseModel(eqx.Module):
-    """A body, its known and unknown torques, and the errors of its sensors that drift.
-
-    **Arguments:** `body` an `Inertia`, or `MassProperties` for a `Rigid` state; `torque` any
-    torques, among them `RandomTorque` and `CorrelatedTorque`, several in a `Sum`; `None` for a free
-    body without noise; `walks` the `Walk`s.
-
-    >>> model = NoiseModel(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
-    >>> len(model.white), len(model.coloured), model.torque
-    (1, 0, None)
-    """
-
-    body: Inertia | MassProperties
-    torque: Torque | None
-    white: tuple[RandomTorque, ...]
-    coloured: tuple[CorrelatedTorque, ...]
-    walks: tuple[Walk, ...]
-
-    def __init__(
-        self, body: Inertia | MassProperties, torque: Torque | None = None, *, walks: Any = ()
-    ):
-        self.body = _checks.single(body, (Inertia, MassProperties), "body")
-        if torque is not None:
-            require_law(torque)
-        parts = parts_of(torque)
-        self.white = tuple(part for part in parts if isinstance(part, RandomTorque))
-        self.coloured = tuple(part for part in parts if isinstance(part, CorrelatedTorque))
-        noise = (RandomTorque, CorrelatedTorque)
-        known: list[Any] = [part for part in parts if not isinstance(part, noise)]
-        self.torque = Sum(*known) if len(known) > 1 else (known[0] if known else None)
-        walks = (walks,) if isinstance(walks, Walk) else tuple(walks)
-        for walk in walks:
-            _checks.instance(walk, Walk, "walks", wanted="a sequence of Walk(where, deviation)")
-        self.walks = walks
-
-
-def bare(model: NoiseModel) -> NoiseModel:
-    """The model without its walks, whose functions would have each new one compiled again."""
-    return eqx.tree_at(lambda m: m.walks, model, ())
 
 
 class Extended(eqx.Module):
@@ -108,32 +51,9 @@ class Extended(eqx.Module):
     walks: tuple[Array, ...]
 
 
-class Sensors(eqx.Module):
-    """The sensors, and the paths and densities of their numbers that drift. No function is kept: a
-    second model of the same form does not compile again.
-    """
-
-    sensors: tuple[AbstractSensor, ...]
-    paths: tuple[tuple[Any, ...], ...] = eqx.field(static=True)
-    densities: tuple[Array, ...]
-
-    @property
-    def first_walks(self) -> tuple[Array, ...]:
-        """The first value of each number that drifts."""
-        leaves = dict(jax.tree.leaves_with_path(self))
-        return tuple(jnp.asarray(leaves[path]) for path in self.paths)
-
-    def drifted(self, walks: Sequence[Array]) -> tuple[AbstractSensor, ...]:
-        """Return the sensors with the values of `walks` in them."""
-        pairs, structure = jax.tree.flatten_with_path(self)
-        leaves = dict(pairs) | dict(zip(self.paths, walks, strict=True))
-        return jax.tree.unflatten(structure, [leaves[path] for path, _ in pairs]).sensors
-
-
-def sensors_of(sensors: Sequence[AbstractSensor], model: NoiseModel) -> Sensors:
-    """Return the checked sensors: each has a noise, and each walk finds its numbers."""
+def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
+    """Raise `ValueError` for a sensor whose errors the filter cannot weigh."""
     for sensor in sensors:
-        _checks.instance(sensor, AbstractSensor, "sensor")
         name = type(sensor).__name__
         if sensor.noise is None:
             raise ValueError(
@@ -150,39 +70,28 @@ def sensors_of(sensors: Sequence[AbstractSensor], model: NoiseModel) -> Sensors:
                 f"{name}: jitter makes errors that depend on each other, which the filter takes as "
                 "independent; leave it out, and give more noise"
             )
-    tree = Sensors(tuple(sensors), (), ())
-    paths = tuple(leaf_at(walk.where, tree, "Walk", "the sensor")[0] for walk in model.walks)
-    return Sensors(tree.sensors, paths, tuple(walk.density for walk in model.walks))
-
-
-NO_SENSORS = Sensors((), (), ())
 
 
 class Dynamics(eqx.Module):
-    """A model and sensors for one dtype and kind of state: what does not change is made once."""
+    """The equations of a filter, for one dtype and kind of state: `dynamics_of` makes them.
 
-    body: Inertia | MassProperties
+    **Fields:** `scene`, whose body is that of the equations; `field` the equations of motion under
+    the known torque; `inverse` of the inertia; `white` the roots of the densities of each
+    `RandomTorque`; `coloured` those of each `CorrelatedTorque`, and its time; `drifts` the roots of
+    the densities of the walks, and `paths` to their numbers in the scene.
+    """
+
+    scene: Scene
     field: Callable[..., Any]
     inverse: Mat3
     white: tuple[Array, ...]
     coloured: tuple[tuple[Array, Scalar], ...]
-    walks: tuple[Array, ...]
-    sensors: Sensors
+    drifts: tuple[Array, ...]
+    paths: tuple[tuple[Any, ...], ...] = eqx.field(static=True)
 
-    def __init__(self, model: NoiseModel, x: Extended, sensors: Sensors = NO_SENSORS):
-        dtype = x.motion.omega.dtype
-        self.body = body_of_equations(in_precision(model.body, dtype), type(x.motion))
-        self.field = equations_of_motion(self.body, x.motion, in_precision(model.torque, dtype))
-        self.inverse = inverse(tensor_of(self.body))
-        self.white = tuple(jnp.sqrt(law.density.astype(dtype)) for law in model.white)
-        self.coloured = tuple(
-            (jnp.sqrt(law.density.astype(dtype)), law.time.astype(dtype)) for law in model.coloured
-        )
-        self.walks = tuple(
-            jnp.broadcast_to(jnp.sqrt(density.astype(dtype)), value.shape)
-            for density, value in zip(sensors.densities, x.walks, strict=True)
-        )
-        self.sensors = sensors
+    def sensors_at(self, walks: Sequence[Array]) -> tuple[AbstractSensor, ...]:
+        """Return the sensors with these values of the walks."""
+        return with_leaves(self.scene, self.paths, walks).sensors
 
     @property
     def kicks(self) -> int:
@@ -245,8 +154,39 @@ class Dynamics(eqx.Module):
         if not drifting:
             return after, grown, noise
         same = jnp.eye(drifting, dtype=kicks.dtype)
-        strewn = jnp.diag(jnp.concatenate([w.reshape(-1) for w in self.walks]) * jnp.sqrt(h))
+        strewn = jnp.diag(jnp.concatenate([d.reshape(-1) for d in self.drifts]) * jnp.sqrt(h))
         return after, block_diag(grown, same), block_diag(noise, strewn)
+
+
+def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: Extended) -> Dynamics:
+    """Return the equations of a filter from a scene whose torque reads no `Input`.
+
+    `x` has the kind and the dtype of the state.
+    """
+    dtype = x.motion.omega.dtype
+    body: Any = body_of_equations(in_precision(scene.body, dtype), type(x.motion))
+    return Dynamics(
+        eqx.tree_at(lambda s: s.body, scene, body),
+        equations_of_motion(body, x.motion, in_precision(scene.torque, dtype)),
+        inverse(tensor_of(body)),
+        tuple(jnp.sqrt(law.density.astype(dtype)) for law in white_parts(scene.process)),
+        tuple(
+            (jnp.sqrt(law.density.astype(dtype)), law.time.astype(dtype))
+            for law in coloured_parts(scene.process)
+        ),
+        tuple(jnp.sqrt(drift.density.astype(dtype)) for drift in drifts),
+        tuple(drift.path for drift in drifts),
+    )
+
+
+def white_parts(process: Process | None) -> tuple[RandomTorque, ...]:
+    """Return the parts of an unknown torque that are white."""
+    return tuple(part for part in parts_of(process) if isinstance(part, RandomTorque))
+
+
+def coloured_parts(process: Process | None) -> tuple[CorrelatedTorque, ...]:
+    """Return the parts of an unknown torque that are states of a filter."""
+    return tuple(part for part in parts_of(process) if isinstance(part, CorrelatedTorque))
 
 
 def reset(
@@ -268,14 +208,6 @@ def reset(
     return root
 
 
-def not_negative(value: Any, name: str) -> Array:
-    """Finite numbers, none below zero."""
-    array, wanted = _checks.numbers(value, name), "a finite number that is not below zero"
-    if not array.size:
-        raise ValueError(f"{name}: wanted {wanted}, got none")
-    return _checks.sign(array, name, wanted, zero=True)
-
-
 class Stops(NamedTuple):
     """The times of the filter's steps, and the readings then."""
 
@@ -295,10 +227,10 @@ def linearised(
     basis = jax.vmap(lambda e: tangent(x, e))(jnp.eye(dimension(x), dtype=dtype))
     out = []
     for index, (value, mask) in enumerate(zip(stop.values, stop.masks, strict=True)):
-        sensor = in_precision(dynamics.sensors.sensors[index], dtype)
+        sensor = in_precision(dynamics.scene.sensors[index], dtype)
 
         def error(y: Extended, index: int = index, value: Array = value) -> Array:
-            seeing = in_precision(dynamics.sensors.drifted(y.walks)[index], dtype)
+            seeing = in_precision(dynamics.sensors_at(y.walks)[index], dtype)
 
             def field(t: Any, state: Any, args: Any = None) -> Any:
                 return dynamics.pushed(dynamics.field(t, state, args), y.torques)
@@ -307,7 +239,7 @@ def linearised(
             offset = getattr(seeing, "offset", None)
             if offset is not None:
                 motion, when = shifted(field, t, motion, offset), t + offset
-            return seeing.error(SensorInput(when, motion, dynamics.body, field), value)
+            return seeing.error(SensorInput(when, motion, dynamics.scene.body, field), value)
 
         found, push = jax.linearize(error, x)
         matrix = -jax.vmap(push, out_axes=1)(basis)
@@ -331,9 +263,9 @@ class Read(NamedTuple):
     seen: Bool[Array, "*times k"]
 
 
-def by_sensor(sensors: Sensors, read: Read) -> tuple[Read, ...]:
-    """The `Read` of each sensor, from that of all numbers in a row."""
-    ends = np.cumsum([sensor.components for sensor in sensors.sensors])[:-1]
+def by_sensor(sensors: Sequence[AbstractSensor], read: Read) -> tuple[Read, ...]:
+    """Return the `Read` of each sensor, from that of all numbers in a row."""
+    ends = np.cumsum([sensor.components for sensor in sensors])[:-1]
     return tuple(Read(*own) for own in zip(*(jnp.split(a, ends, -1) for a in read), strict=True))
 
 
@@ -342,21 +274,28 @@ MEMORY_A_STEP = 0.25
 
 
 def steps_of(
-    model: NoiseModel, ts: Any, state: Any, substeps: int | None, recording: Recording | None = None
+    process: Process | None,
+    ts: Any,
+    state: Any,
+    substeps: int | None,
+    recording: Recording | None = None,
 ) -> np.ndarray:
-    """The number of fixed steps from each of the times `ts` to the next: `substeps`, or by the rate
-    of the `state` and of gyros, or one if numbers are not known.
+    """Return the number of fixed steps from each of the times `ts` to the next.
+
+    It is `substeps`, or for `None` chosen by the rate of the `state` and of gyros, and by the
+    correlation times of the process; one if these numbers are not known.
     """
     if substeps is not None:
         return np.full(ts.shape[0] - 1, _checks.whole(substeps, "substeps", 1))
-    if not _checks.known((ts, state.omega, model.coloured)):
+    coloured = coloured_parts(process)
+    if not _checks.known((ts, state.omega, coloured)):
         return np.ones(ts.shape[0] - 1, int)
     rate = float(np.linalg.norm(np.asarray(state.omega, float)))
     for reading in () if recording is None else recording.readings:
         if isinstance(reading.sensor, Gyro):
             values = np.asarray(reading.values, float)[reading.seen]
             rate = max(rate, float(np.quantile(np.linalg.norm(values, axis=1), 0.99)))
-    times = [MEMORY_A_STEP * float(law.time) for law in model.coloured]
+    times = [MEMORY_A_STEP * float(law.time) for law in coloured]
     longest = min([TURN_OF_A_FILTER_STEP / rate if rate > 0 else math.inf, *times])
     return np.maximum(1, np.ceil(np.diff(ts) / longest * (1 - 1e-9))).astype(int)
 
@@ -374,61 +313,83 @@ class Sampled(eqx.Module):
 
 
 def sample(
-    key: Any, model: NoiseModel, state0: Any, ts: Any, *, substeps: int | None = None
+    key: Any,
+    body: Inertia | MassProperties,
+    state0: Any,
+    ts: Any,
+    *,
+    process: Process,
+    torque: Torque | None = None,
+    substeps: int | None = None,
 ) -> Sampled:
-    """One motion that the model's random torques could have made.
+    """Draw one motion that a random torque could make.
 
     Each step draws the integral and the first moment of the white noise, and follows the equations
     of motion under the polynomial with these moments by the classical method of order 4: of order
     1.5, and exact for a body at rest (Foster, Lyons and Oberhauser 2020, doi:10.1137/19M1261912). A
     `CorrelatedTorque` starts from its stationary distribution.
 
-    **Arguments:** `key` of `jax.random`; `model`; `state0` a `Spin`, `Attitude` or `Rigid`; `ts`
-    (T,) increasing times, s, the first is of `state0`; `substeps` fixed steps between two times,
-    `None` chooses them by the rate if it is known, else one. **Returns** `t`, `states` and
-    `torques` at these times (`Sampled`). **Raises** `ValueError` for times that do not increase.
+    **Arguments:**
+
+    - `key`: of `jax.random`.
+    - `body`: an `Inertia`, or `MassProperties` for a `Rigid` state.
+    - `state0`: a `Spin`, `Attitude` or `Rigid`, the state at the first time.
+    - `ts`: (T,) increasing times, s.
+    - `process`: the random torque, a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of them.
+    - `torque`: the known torque, or `None`.
+    - `substeps`: the number of fixed steps between two times; `None` chooses them by the rate if it
+      is known, else one.
+
+    **Returns** `t`, `states` and `torques` at these times (`Sampled`). **Raises** `ValueError` for
+    times that do not increase.
 
     >>> import jax
-    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(0.01))
-    >>> drawn = sample(jax.random.key(0), model, rj.Spin([0.0, 0.0, 1.0]), [0.0, 0.5, 1.0])
+    >>> body, ts = rj.Inertia.from_principal(1.0, 2.0, 2.5), [0.0, 0.5, 1.0]
+    >>> process = rj.torques.RandomTorque(0.01)
+    >>> drawn = sample(jax.random.key(0), body, rj.Spin([0.0, 0.0, 1.0]), ts, process=process)
     >>> drawn.states.omega.shape, drawn.torques  # white noise has no value at a time
     ((3, 3), ())
     """
     _checks.key(key)
-    _checks.instance(model, NoiseModel, "model")
+    _checks.single(body, (Inertia, MassProperties), "body")
     _checks.single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
+    require_process(process)
+    if torque is not None:
+        require_law(torque)
+    require_known_torque(torque)
     times = _checks.rows(ts, (), "ts")
     if times.shape[0] < 2:
         raise ValueError(f"ts: wanted at least two times, got {times.shape[0]}")
     if _checks.known(times):
         words = "ts: wanted increasing times"
         _checks.refuse(times, not (np.diff(np.asarray(times)) > 0).all(), words)
-    pieces = int(steps_of(model, times, state0, substeps).max())
-    return _sample(key, model, on_the_group(state0), times, pieces)
+    pieces = int(steps_of(process, times, state0, substeps).max())
+    scene = Scene(body, torque, process, (), on_the_group(state0))
+    return _sample(key, scene, times, pieces)
 
 
 @eqx.filter_jit
-def _sample(key: PRNGKeyArray, model: NoiseModel, state0: Any, ts: Array, pieces: int) -> Sampled:
-    dtype = state0.omega.dtype
+def _sample(key: PRNGKeyArray, scene: Scene, ts: Array, pieces: int) -> Sampled:
+    state0: Any = scene.start
+    dtype, coloured = state0.omega.dtype, coloured_parts(scene.process)
     first, later = jax.random.split(key)
-    keys = jax.random.split(first, len(model.coloured))
+    keys = jax.random.split(first, len(coloured))
     torques = tuple(
         law.deviation.astype(dtype) * jax.random.normal(one, (3,), dtype)
-        for law, one in zip(model.coloured, keys, strict=True)
+        for law, one in zip(coloured, keys, strict=True)
     )
     x0 = Extended(state0, torques, ())
-    dynamics = Dynamics(model, x0)
+    dynamics = dynamics_of(scene, (), x0)
 
-    def span(x: Extended, given: tuple[Array, Array, Array]) -> tuple[Extended, Extended]:
-        left, right, one = given
+    def span(x: Extended, now: tuple[Array, Array, Array]) -> tuple[Extended, Extended]:
+        left, right, one = now
         # Times may have more digits than the state.
         h = ((right - left) / pieces).astype(dtype)
         left = left.astype(dtype)
         kicks = jax.random.normal(one, (pieces, dynamics.kicks), dtype)
 
-        def move(x: Extended, now: tuple[Array, Array]) -> tuple[Extended, None]:
-            return dynamics.advance(left + now[0] * h, h, x, now[1]), None
+        def move(x: Extended, piece: tuple[Array, Array]) -> tuple[Extended, None]:
+            return dynamics.advance(left + piece[0] * h, h, x, piece[1]), None
 
         x, _ = lax.scan(move, x, (jnp.arange(pieces, dtype=dtype), kicks))
         return x, x

@@ -1,5 +1,6 @@
 """The terms of a log-density: of every number read, given those before it."""
 
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -7,14 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rigidjax._types import HasSpin, Scalar
+from rigidjax._types import Scalar
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.filtering import roots
-from rigidjax.identify.filtering.filter import Belief, grid_of, scan_filter
+from rigidjax.identify.filtering.filter import FilterInput, belief_at, grid_of, scan_filter
 from rigidjax.identify.filtering.roots import Terms
-from rigidjax.identify.filtering.steps import Extended, NoiseModel, sensors_of
+from rigidjax.identify.filtering.steps import require_sensors
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.predict import body_of_equations
+from rigidjax.identify.model.normal import normal_of
 from rigidjax.identify.model.terms import (
     Which,
     blocks,
@@ -23,13 +24,10 @@ from rigidjax.identify.model.terms import (
     prior_residuals,
     scene_of,
     standardised,
+    torque_of_scene,
     with_jacobian,
 )
-from rigidjax.identify.search.normal import normal_of
 from rigidjax.motion.manifold import dimension
-from rigidjax.motion.torques import Sum
-from rigidjax.motion.torques.composite import parts_of
-from rigidjax.motion.torques.inputs import bind
 
 
 def terms_of_one(
@@ -37,24 +35,20 @@ def terms_of_one(
 ) -> Terms:
     """Return the terms of the readings of one recording.
 
-    They are normal about the motion; where the scene has an unknown torque, the filter integrates
-    it out, and they are normal about its predictions.
+    They are normal about the motion; if a torque or sensor errors are unknown, the filter
+    integrates them out, and the readings are normal about its predictions.
     """
     scene = scene_of(model, row, record, reference, which)
-    if scene.process is None:
+    if scene.process is None and not model.walks:
         return _terms_of_motion(model, scene, record)
+    require_sensors(scene.sensors)
+    scene = dataclasses.replace(scene, torque=torque_of_scene(scene, record))
     start: Any = scene.start
-    body = body_of_equations(scene.body, model.state_kind)
-    law = bind(scene.torque, record.inputs)
-    noise = NoiseModel(body, Sum(*parts_of(law), *parts_of(scene.process)))
-    sensors = sensors_of(scene.sensors, noise)
-    state: HasSpin = start
-    torques = tuple(jnp.zeros(3, state.omega.dtype) for _ in noise.coloured)
-    known = jnp.zeros(dimension(state), state.omega.dtype)
-    deviations = jnp.concatenate([known, *(law.deviation for law in noise.coloured)])
-    first = Belief(record.t[0], Extended(state, torques, ()), jnp.diag(deviations))
-    grid = grid_of(noise, record, first, model.filter_steps)
-    _, _, read = scan_filter((noise, sensors, record, first, grid), lambda _, read: read)
+    known = jnp.zeros(dimension(start), start.omega.dtype)
+    first = belief_at(record.t[0], start, known, scene, model.walks)
+    grid = grid_of(scene.process, record, first, model.filter_steps)
+    run = FilterInput(scene, model.walks, record, first, grid)
+    _, _, read = scan_filter(run, lambda _, read: read)
     return jax.tree.map(jnp.ravel, roots.terms(*read))
 
 

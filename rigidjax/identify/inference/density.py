@@ -20,10 +20,10 @@ from rigidjax.identify.model.charts import places_of
 from rigidjax.identify.model.free import Slot
 from rigidjax.identify.model.index import index_of
 from rigidjax.identify.model.model import Model, Unpacked, scenes_of, unpacked, with_parts
-from rigidjax.identify.model.scene import Scene
+from rigidjax.identify.model.scene import Process, Scene, require_process
 from rigidjax.identify.model.terms import template
 from rigidjax.identify.uncertainty.covariance import of_white
-from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
+from rigidjax.motion.torques.composite import parts_of
 
 # The advice if a fit without the torque ended far from the body.
 _GUESS = (
@@ -37,26 +37,32 @@ class LogDensity(eqx.Module):
 
     Call it with x (n,), real numbers without bounds: the free numbers of `model`, which is the
     fitted one with the logarithms of factors of the noises that the fit estimates, and of the
-    numbers of the process, as shared `Free`s. `unpack(x)` gives body, states and values, `x0` is the
-    fit. `covariance`
-    is Laplace's, for a sampler's start and mass matrix; it is smaller than the fit's if errors are
-    autocorrelated.
+    numbers of the process, as shared `Free`s. `unpack(x)` gives body, states and values; `x0` is
+    the fit. `covariance` is Laplace's, for a sampler's start and mass matrix; it is smaller than the
+    fit's if errors are autocorrelated.
 
-    With a `process` the filter integrates the unknown torque out. Without it the readings are
-    independent and normal about the motion: this is too narrow if errors are autocorrelated; keep
-    fewer readings then, or give a process. A sensor's jitter is that of the fit. Priors are the
-    model's: `Free`s with a prior, an `Entropic` one; the prior of all other numbers is flat in x.
+    With a process or `Walk`s the filter integrates the unknown torque and the drifts out. Without
+    them the readings are independent and normal about the motion: this is too narrow if errors are
+    autocorrelated; keep fewer readings then, or give a process. A sensor's jitter is that of the
+    fit. Priors are the model's: `Free`s with a prior, an `Entropic` one; the prior of all other
+    numbers is flat in x.
 
-    **Arguments:** `fit` of `identify.fit`; with a process a first guess is enough, `fit(model,
-    starts=1, max_steps=1)`; `process` a `RandomTorque` or `CorrelatedTorque` or `None`; `deviation`
-    of the normal prior of the logarithms of its density and time about the given values, `None` for
-    a known process. The density scales with the square of a moment if only ratios of moments are
-    determined, as by a gyro alone: compare `density / moment**2`, and give the prior in the fit's
-    own unit of inertia (`fit.body`). **Raises:** `ValueError` for a robust loss, which is no
-    density, and for directions that neither data nor a prior determine.
+    **Arguments:**
+
+    - `fit`: of `identify.fit`; with a process a first guess is enough, `fit(model, starts=1,
+      max_steps=1)`.
+    - `process`: a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of them; `None` takes that of the
+      model.
+    - `deviation`: the standard deviation of the normal prior of the logarithms of the densities and
+      times of the process about its values, `None` for a known process. The density scales with the
+      square of a moment if only ratios of moments are determined, as by a gyro alone: compare
+      `density / moment**2`, and give the prior in the fit's own unit of inertia (`fit.body`).
+
+    **Raises:** `ValueError` for a robust loss, which is no density, and for directions that neither
+    data nor a prior determine.
 
     For numpyro: `numpyro.infer.MCMC(NUTS(potential_fn=lambda x: -density(x)), …)`; for blackjax:
-    `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are computed recording by
+    `blackjax.nuts(density, …)`, or `identify.posterior`. Gradients are computed recording by
     recording in forward mode, also under `jax.grad`; compile it by `equinox.filter_jit(density)`.
 
     >>> record, chart = rj.datasets.toutatis.recording(), rj.identify.PrincipalRatios()
@@ -72,14 +78,15 @@ class LogDensity(eqx.Module):
     def __init__(
         self,
         fit: Fit,
-        process: RandomTorque | CorrelatedTorque | None = None,
+        process: Process | None = None,
         *,
         deviation: float | None = 2.0,
     ):
         _checks.instance(fit, Fit, "LogDensity: fit", wanted="what identify.fit returns")
         model = fit.model
+        process = model.process if process is None else process
         if process is not None:
-            _checks.instance(process, (RandomTorque, CorrelatedTorque), "process")
+            require_process(process)
         if model.loss is not None:
             raise ValueError("fit: its model has a robust loss, which is no density; fit without")
         if not np.isfinite(np.asarray(fit.covariance)).all():
@@ -97,7 +104,8 @@ class LogDensity(eqx.Module):
         variances += [np.full(1, 1 / math.sqrt(total)) for _ in process_slots]
         new_slots = [*noise_slots, *process_slots]
         self.model, places = _with_slots(model, fit.noises, process, new_slots)
-        covariance = _covariance_of_white_errors(fit, process)
+        follows_the_motion = process is None and not model.walks
+        covariance = _covariance_of_white_errors(fit, follows_the_motion)
         self.x0 = jnp.zeros(self.model.size, fit.x.dtype).at[places].set(fit.x)
         whole = np.zeros((self.model.size, self.model.size))
         whole[np.ix_(places, places)] = covariance
@@ -116,7 +124,7 @@ class LogDensity(eqx.Module):
         return log_density(self.model, _checks.floating(x, self.x0.shape, "x"))
 
     def unpack(self, x: Float[Array, " n"]) -> Unpacked:
-        """Return the meaning of x (n,): body, initial states, values of the `Free`s, noise, process.
+        """Return what x (n,) represents: body, initial states, values of the `Free`s, noise, process.
 
         `noise` (R, k) is that of each sensor.
         """
@@ -155,11 +163,14 @@ def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
 
 def _process_slots(process: Any, prior: Array) -> list[Slot]:
     """Return a factor for each number of a process, its logarithm with the deviation `prior`."""
-    scene = Scene(None, None, process, (), None)
-    return [
-        _factor(path, path[-1].name, (1,) * jnp.ndim(leaf), "", (), None, prior)
-        for path, leaf in jax.tree.leaves_with_path(scene)
-    ]
+    scene, slots = Scene(None, None, process, (), None), []
+    several, number = len(parts_of(process)) > 1, -1
+    for path, leaf in jax.tree.leaves_with_path(scene):
+        # Each part begins with its density.
+        number += path[-1].name == "density"
+        name = f"{path[-1].name} {number}" if several else path[-1].name
+        slots.append(_factor(path, name, (1,) * jnp.ndim(leaf), "", (), None, prior))
+    return slots
 
 
 def _factor(
@@ -213,7 +224,7 @@ def _with_slots(
     return new_model, places
 
 
-def _covariance_of_white_errors(fit: Fit, process: Any) -> np.ndarray:
+def _covariance_of_white_errors(fit: Fit, follows_the_motion: bool) -> np.ndarray:
     """Return the covariance of the fit, for white errors if these were not."""
     covariance = np.asarray(fit.covariance)
     if fit.considered and fit.linear is not None:
@@ -223,6 +234,6 @@ def _covariance_of_white_errors(fit: Fit, process: Any) -> np.ndarray:
         # covariance of many recordings may be singular: no scale for a search.
         size = np.sqrt(np.diagonal(covariance))
         definite = np.linalg.eigvalsh(covariance / np.outer(size, size)).min() > 1e-10
-        if (process is None or not definite) and fit.linear is not None:
+        if (follows_the_motion or not definite) and fit.linear is not None:
             covariance = of_white(fit.linear).covariance
     return covariance

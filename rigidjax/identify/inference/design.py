@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
 from rigidjax.identify.model.model import Model, require_numbers, require_one
+from rigidjax.identify.model.normal import normal_of
 from rigidjax.identify.model.terms import blocks, changes, in_deviations
-from rigidjax.identify.search.normal import normal_of
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.covariance import inverted
 from rigidjax.identify.uncertainty.quantities import Quantity, quantities, values_and_slopes

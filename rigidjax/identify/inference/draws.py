@@ -21,10 +21,11 @@ from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.filtering.terms import curvature
 from rigidjax.identify.inference.density import LogDensity, of_draws
 from rigidjax.identify.model.model import Unpacked
+from rigidjax.identify.model.normal import Normal
 from rigidjax.identify.search.least_squares import Settings, minimise
-from rigidjax.identify.search.normal import Normal
 from rigidjax.identify.search.stages import is_order_one
 from rigidjax.identify.uncertainty.quantities import around
+from rigidjax.motion.torques.composite import parts_of
 
 # A sampler: key, log-density of z, a first z (n,) → draws (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
@@ -156,8 +157,8 @@ class Posterior(eqx.Module):
         for name, body in bodies.items():
             word = f"inertia [{name}]" if several else "inertia"
             out[word] = tensor_of(body)
-        if points.process is not None:
-            out["density"] = points.process.density
+        for number, part in enumerate(parts := parts_of(points.process)):
+            out[f"density {number}" if len(parts) > 1 else "density"] = part.density
         return arviz.from_dict({"posterior": {k: jnp.asarray(v) for k, v in out.items()}})
 
 
@@ -178,14 +179,14 @@ def posterior(
 
     >>> import jax
     >>> record, chart = rj.datasets.toutatis.recording(), rj.identify.PrincipalRatios()
-    >>> density = rj.estimate.LogDensity(rj.identify.fit(rj.identify.Model(record, chart)))
+    >>> density = rj.identify.LogDensity(rj.identify.fit(rj.identify.Model(record, chart)))
     >>> # Instead of Nuts(), a sampler of one's own: normal draws, which is Laplace's method.
     >>> normal = lambda key, log_density, start: jax.random.normal(key, (200, start.size))
     >>> drawn = posterior(density, jax.random.key(0), sampler=normal)
     >>> drawn.x.shape, bool((drawn.rhat < 1.05).all())  # four chains that agree
     ((4, 200, 8), True)
     """
-    _checks.instance(density, LogDensity, "density", hint="estimate.LogDensity(fit) makes one")
+    _checks.instance(density, LogDensity, "density", hint="identify.LogDensity(fit) makes one")
     _checks.key(key)
     chains = _checks.whole(chains, "chains", 2)
     sampler = Nuts() if sampler is None else _checks.function(sampler, "sampler", "of a key")
@@ -264,7 +265,7 @@ class Refit(eqx.Module):
             raise ValueError(
                 "interval_of: the search did not reach the maximum of the density, and fewer than "
                 "100 draws are independent: give refit more max_steps, or its fit a better "
-                "start, or draw from the density (estimate.posterior)"
+                "start, or draw from the density (identify.posterior)"
             )
         if float(self.effective) >= _LEAST:
             each = np.asarray(of_draws(of, self.density, self.draws))
@@ -292,14 +293,14 @@ def refit(
 ) -> Refit:
     """The maximum of the posterior density, and weighted draws around it for intervals.
 
-    A fit that allows for an unknown torque: `refit(LogDensity(fit, RandomTorque(1e-4)))` finds
-    body, initial states, all `Free`s, and the torque's density, starting from `fit`, by Fisher's
-    scoring: Levenberg–Marquardt with the expected information of the innovations as the normal
+    A fit that allows for an unknown torque, the process of its model: `refit(LogDensity(fit))`
+    finds body, initial states, all `Free`s, and the torque's density, starting from `fit`, by
+    Fisher's scoring: Levenberg–Marquardt with the expected information of the innovations as the normal
     matrix (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714). The draws come from a wide
     Student's t about that point, weighted by the density over that of the t (importance sampling:
     Geweke 1989, doi:10.2307/1913710). Draws of more than some dozen numbers are worth little
     (`effective`); intervals then come from the information, which is enough if each recording is
-    long. `estimate.posterior` draws from any density.
+    long. `identify.posterior` draws from any density.
 
     **Arguments:** `density` a `LogDensity`; `max_steps` at most; `draws` how many; `key` of
     `jax.random` for them, by default always the same. **Returns** a `Refit`; `converged` is false
@@ -310,14 +311,14 @@ def refit(
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
     >>> found = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()))
-    >>> best = refit(rj.estimate.LogDensity(found))
+    >>> best = refit(rj.identify.LogDensity(found))
     >>> bool(jnp.allclose(best.point.state0.omega, jnp.array([1.0, 0.1, 1.0]), atol=1e-3))
     True
     >>> low, high = best.interval_of(lambda point: point.state0.omega)
     >>> bool((low < high).all())
     True
     """
-    _checks.instance(density, LogDensity, "density", hint="estimate.LogDensity(fit) makes one")
+    _checks.instance(density, LogDensity, "density", hint="identify.LogDensity(fit) makes one")
     steps, count = _checks.whole(max_steps, "max_steps", 1), _checks.whole(draws, "draws", 1)
     key = jax.random.key(0) if key is None else _checks.key(key)
     return _refit(density, Settings(_SMALL, _DAMPING, steps), key, count)

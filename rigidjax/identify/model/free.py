@@ -251,10 +251,22 @@ def _tolerance_at(scene: Scene, path: tuple[Any, ...]) -> Any:
 
 def put(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"]) -> Scene:
     """Return the scene with its free numbers moved by the steps in the row of a recording."""
-    pairs, structure = jax.tree.flatten_with_path(scene)
-    leaves = dict(pairs)
-    for slot in slots:
-        start = jnp.asarray(leaves[slot.path])
+    paths = [slot.path for slot in slots]
+    values = []
+    for slot, start in zip(slots, leaves_at(scene, paths), strict=True):
         value = slot.move(start, row[slot.columns].reshape(slot.shape))
-        leaves[slot.path] = value.astype(start.dtype)
+        values.append(value.astype(start.dtype))
+    return with_leaves(scene, paths, values)
+
+
+def leaves_at(scene: Scene, paths: Sequence[tuple[Any, ...]]) -> tuple[Array, ...]:
+    """Return the leaves of a scene at these paths."""
+    leaves = dict(jax.tree.leaves_with_path(scene))
+    return tuple(jnp.asarray(leaves[path]) for path in paths)
+
+
+def with_leaves(scene: Scene, paths: Sequence[tuple[Any, ...]], values: Sequence[Array]) -> Scene:
+    """Return the scene with other leaves at these paths."""
+    pairs, structure = jax.tree.flatten_with_path(scene)
+    leaves = dict(pairs) | dict(zip(paths, values, strict=True))
     return jax.tree.unflatten(structure, [leaves[path] for path, _ in pairs])

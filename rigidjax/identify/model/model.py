@@ -32,7 +32,7 @@ from rigidjax.identify.model.free import Free, Slot, checked_labels, find_slots,
 from rigidjax.identify.model.index import Index, index_of
 from rigidjax.identify.model.predict import AbstractIntegrator, HeldSteps, integrator_for
 from rigidjax.identify.model.priors import AbstractLoss, Entropic
-from rigidjax.identify.model.scene import Process, Scene
+from rigidjax.identify.model.scene import Process, Scene, require_known_torque, require_process
 from rigidjax.identify.model.terms import (
     all_errors,
     motion_of_scene,
@@ -40,10 +40,10 @@ from rigidjax.identify.model.terms import (
     scene_of,
     template,
 )
+from rigidjax.identify.model.walks import Drift, Walk, find_drifts
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.manifold import dimension
-from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
 from rigidjax.motion.torques.base import AbstractForce, Torque, require_law
 from rigidjax.motion.torques.composite import parts_of
 from rigidjax.motion.torques.inputs import inputs_of
@@ -99,8 +99,9 @@ class Model(eqx.Module):
     - `torque`: the torque on the body in every recording, or `None`. It reads the inputs of a
       recording by name: `rigidjax.torques.Input("speed")`.
     - `process`: an unknown torque as noise, a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of
-      them, for `filter`, `smooth` and `LogDensity`, which integrate it out; `None` follows the
-      motion.
+      them. `filter`, `smooth` and `LogDensity` integrate it out; `fit` follows its mean, zero.
+    - `walks`: errors of the sensors that drift, a sequence of `Walk(where, deviation, density)`,
+      for the same functions; `fit` takes them as constant.
     - `free`: what else is free, a sequence of `Free(where, name, …)`: one value for all, for each
       body, group or recording.
     - `loss`: the weight of an outlier: `SoftL1()`, `Huber()`, or `None` for plain least squares.
@@ -134,6 +135,7 @@ class Model(eqx.Module):
     which: Int[Array, " records"] | None
     torque: Torque | None
     process: Process | None
+    walks: tuple[Drift, ...]
     slots: tuple[Slot, ...]
     index: Index
     noise_groups: Int[Array, " records"]
@@ -157,6 +159,7 @@ class Model(eqx.Module):
         *,
         torque: Torque | None = None,
         process: Process | None = None,
+        walks: Walk | Sequence[Walk] = (),
         free: Sequence[Free] = (),
         loss: AbstractLoss | None = None,
         prior: Entropic | None = None,
@@ -189,8 +192,9 @@ class Model(eqx.Module):
                 _checks.instance(value, kind, name)
         if torque is not None:
             require_law(torque)
+            require_known_torque(torque)
         if process is not None:
-            _require_process(process)
+            require_process(process)
         if windows is None:
             recordings = with_limits(recordings)
             _require_inputs(torque, [recording.inputs for recording in recordings])
@@ -220,7 +224,9 @@ class Model(eqx.Module):
             parts = starts_of_windows(windows, _checks.whole(stretches, "stretches", 2))
             self.reference, self.start_weight, self.clusters = parts
             _require_states(windows, self.state_kind)
-        slots = find_slots(free, Scene(None, torque, process, sensors, None), names)
+        scene = Scene(None, torque, process, sensors, None)
+        self.walks = find_drifts(walks, scene)
+        slots = find_slots(free, scene, names)
         taken = {name for one in charts_of(charts) for name in (*one.log_names, *one.plain_names)}
         for slot in slots:
             if slot.name in taken | {"Ωx", "Ωy", "Ωz"}:
@@ -454,13 +460,6 @@ def _require_states(windows: Windows, kind: type) -> None:
             f"windows: the torque acts on {kind.__name__}, and the measured states are "
             f"{type(windows.starts).__name__}"
         )
-
-
-def _require_process(process: Any) -> None:
-    """Raise `TypeError` for anything but unknown torques."""
-    for part in parts_of(process):
-        wanted = "a RandomTorque, a CorrelatedTorque or a Sum of them"
-        _checks.instance(part, (RandomTorque, CorrelatedTorque), "process", wanted=wanted)
 
 
 def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) -> None:

@@ -1,12 +1,16 @@
 """The scene of a recording: all that its readings depend on."""
 
+from typing import Any
+
 import equinox as eqx
 
+from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
 from rigidjax.motion.torques.base import Torque
+from rigidjax.motion.torques.composite import parts_of
 
 # An unknown torque: white, correlated in time, or several of these.
 Process = RandomTorque | CorrelatedTorque | Sum
@@ -33,3 +37,19 @@ class Scene(eqx.Module):
     process: Process | None
     sensors: tuple[AbstractSensor, ...]
     start: Spin | Attitude | Rigid | None
+
+
+def require_process(process: Any) -> None:
+    """Raise `TypeError` for anything but unknown torques."""
+    wanted = "a RandomTorque, a CorrelatedTorque or a Sum of them"
+    for part in parts_of(process) or (process,):
+        _checks.instance(part, (RandomTorque, CorrelatedTorque), "process", wanted=wanted)
+
+
+def require_known_torque(torque: Torque | None) -> None:
+    """Raise `TypeError` for a torque with unknown parts."""
+    for part in parts_of(torque):
+        if isinstance(part, RandomTorque | CorrelatedTorque):
+            raise TypeError(
+                f"torque: wanted the known torque, got a {type(part).__name__}; give it as process="
+            )

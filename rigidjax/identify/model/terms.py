@@ -22,6 +22,8 @@ from rigidjax.identify.model.predict import (
     states_at,
 )
 from rigidjax.identify.model.scene import Scene
+from rigidjax.motion.torques import Held
+from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import Input, bind
 from rigidjax.rotation.barrier import batched_as
 
@@ -60,8 +62,17 @@ def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[An
         torque = bind(scene.torque, functions | unbound)
         states = model.integrator.driven(body, scene.start, record.t, torque, samples)
         return states, torque
-    torque = bind(scene.torque, functions)
+    torque = torque_of_scene(scene, record)
     return states_at(model.integrator, body, scene.start, record.t, torque), torque
+
+
+def torque_of_scene(scene: Scene, record: Recording) -> Torque | None:
+    """Return the torque of a scene, which reads the inputs of a recording."""
+    inputs = {
+        name: source if callable(source) else Held(record.t[:-1], source)
+        for name, source in record.inputs.items()
+    }
+    return bind(scene.torque, inputs)
 
 
 def errors_of_one(

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rigidjax.identify.search.normal import Normal
+from rigidjax.identify.model.normal import Normal
 
 # Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
 # long as Gauss and Newton's.

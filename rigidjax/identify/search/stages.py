@@ -14,10 +14,10 @@ from rigidjax.identify.data.recording import count_of
 from rigidjax.identify.model import terms
 from rigidjax.identify.model.charts import charts_of, numbers_of
 from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.normal import Normal, normal_of
 from rigidjax.identify.model.predict import FixedSteps, HeldSteps
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
-from rigidjax.identify.search.normal import Normal, normal_of
 
 # The beginning of the record is fitted first: a long record has many wrong minima (the phase slips
 # by whole turns), a short one has not.

@@ -16,9 +16,9 @@ class RandomTorque(AbstractTorque):
     **Arguments:** `density` N² m² s, one number or one for each body axis (3,), ≥ 0. In a time t
     the rate about an axis of moment I changes by about √(density · t)/I.
 
-    `simulate` and a fit of `rigidjax.identify` use its mean, zero. `rigidjax.estimate` uses the
-    noise: `sample` draws a motion, `filter`, `smooth` and `log_likelihood` allow for it. Add it to
-    other torques by `Sum`. Source: Gelb, Applied Optimal Estimation (1974), §3.6. **Raises:**
+    `simulate` and a fit of `rigidjax.identify` use its mean, zero. It is the `process` of a
+    `rigidjax.identify.Model`: `filter`, `smooth` and `log_likelihood` allow for it, and `sample`
+    draws a motion under it. Several are added by `Sum`. Source: Gelb, Applied Optimal Estimation (1974), §3.6. **Raises:**
     `ValueError` for a density below zero.
 
     >>> RandomTorque(1e-4).density

@@ -1,4 +1,4 @@
-"""What the filter and the smoother cost: `python tests/estimate/bench_filter.py [readings]`.
+"""What the filter and the smoother cost: `python tests/identify/filtering/bench_filter.py [readings]`.
 
 A tumbling body under a white torque, read by a gyro (3 numbers of state), and by a gyro and a
 direction (6). Beside them an extended Kalman filter for the gyro written by hand, its loops compiled
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import rigidjax as rj
-from rigidjax import estimate, identify
+from rigidjax import identify
 
 jax.config.update("jax_enable_x64", True)
 
@@ -24,19 +24,21 @@ SUN = np.array([0.0, 0.6, 0.8])
 
 
 def scene(count):
-    """A model, a recording of the gyro alone and one with the direction; the first rate."""
-    model = estimate.Model(rj.Inertia.from_principal(*MOMENTS), rj.torques.RandomTorque(DENSITY))
+    """The models of a recording of the gyro alone, and of one with the direction."""
+    body, process = rj.Inertia.from_principal(*MOMENTS), rj.torques.RandomTorque(DENSITY)
     keys = jax.random.split(jax.random.key(0), 3)
     ts = DT * jnp.arange(count, dtype=float)
-    real = estimate.sample(keys[0], model, START, ts)
+    real = identify.sample(keys[0], body, START, ts, process=process)
     rates = real.states.omega + NOISE * jax.random.normal(keys[1], (count, 3))
     seen = jax.vmap(lambda q: rj.quaternion.rotate_inverse(q, jnp.asarray(SUN)))(real.states.q)
     seen = seen + NOISE * jax.random.normal(keys[2], (count, 3))
     seen = seen / jnp.linalg.norm(seen, axis=-1, keepdims=True)
     gyro = (identify.Gyro(NOISE), rates)
-    alone = identify.Recording(ts, gyro)
-    both = identify.Recording(ts, gyro, (identify.Direction(SUN, NOISE), seen))
-    return model, alone, both
+    records = (
+        identify.Recording(ts, gyro),
+        identify.Recording(ts, gyro, (identify.Direction(SUN, NOISE), seen)),
+    )
+    return [identify.Model(one, identify.Known(body), process=process) for one in records]
 
 
 def by_hand():
@@ -127,19 +129,19 @@ def cost(calls):
 
 
 def main(count):
-    model, alone, both = scene(count)
-    spin = estimate.start(model, alone, rate=0.1)
-    pose = estimate.start(model, both, state=START, rate=0.1, attitude=0.1)
+    alone, both = scene(count)
+    spin = identify.first_belief(alone, rate=0.1)
+    pose = identify.first_belief(both, state=START, rate=0.1, attitude=0.1)
     calls = {
-        "filter, gyro": lambda: estimate.filter(model, alone, spin).states.omega,
-        "filter, gyro and direction": lambda: estimate.filter(model, both, pose).states.omega,
-        "log-likelihood, gyro": lambda: estimate.log_likelihood(model, alone, spin),
-        "smoother, gyro": lambda: estimate.smooth(model, alone, spin).states.omega,
-        "smoother, gyro and direction": lambda: estimate.smooth(model, both, pose).states.omega,
+        "filter, gyro": lambda: identify.filter(alone, spin).states.omega,
+        "filter, gyro and direction": lambda: identify.filter(both, pose).states.omega,
+        "log-likelihood, gyro": lambda: identify.log_likelihood(alone, spin),
+        "smoother, gyro": lambda: identify.smooth(alone, spin).states.omega,
+        "smoother, gyro and direction": lambda: identify.smooth(both, pose).states.omega,
     }
     hand = by_hand()
     if hand is not None:
-        readings = np.asarray(alone.readings[0].values)
+        readings = np.asarray(alone.recording.readings[0].values)
         first = np.asarray(spin.x.motion.omega), np.asarray(spin.root @ spin.root.T)
         calls["numba, gyro"] = lambda: hand(readings, DT, np.array(MOMENTS), DENSITY, NOISE, *first)
     found = cost(calls)
@@ -149,16 +151,14 @@ def main(count):
 
     if hand is not None:
         means, total = calls["numba, gyro"]()
-        ours = estimate.filter(model, alone, spin)
+        ours = identify.filter(alone, spin)
         apart = np.abs(np.asarray(ours.states.omega) - means).max()
         print(f"rates differ by {apart:.1e} at most, log-likelihoods by "
               f"{abs(float(ours.log_likelihood) - total):.1e} of {total:.0f}")  # fmt: skip
-    for name, record, first in (("gyro", alone, spin), ("gyro and direction", both, pose)):
-        print(
-            f"smoother, {name}: {int(estimate.smooth(model, record, first).iterations)} iterations"
-        )
-    belief, gyro, reading = spin, both.readings[0].sensor, both.readings[0].values[1]
-    step = jax.jit(lambda belief, t, value: estimate.step(model, belief, t, (gyro, value)))
+    for name, model, first in (("gyro", alone, spin), ("gyro and direction", both, pose)):
+        print(f"smoother, {name}: {int(identify.smooth(model, first).iterations)} iterations")
+    belief, reading = spin, alone.recording.readings[0].values[1]
+    step = jax.jit(lambda belief, t, value: identify.step(alone, belief, t, value))
     jax.block_until_ready(step(belief, DT, reading).root)
     times = []
     for _ in range(5):

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.stats
-from estimate import records
+from identify.filtering import records
 from once import filter_once, once
 
 import rigidjax as rj
-from rigidjax import estimate, identify
+from rigidjax import identify
 
 DT, COUNT = 0.1, 12
 
@@ -62,16 +62,17 @@ def test_a_sphere_with_a_torque_that_remembers_and_a_bias_that_drifts_is_a_linea
     rng = np.random.default_rng(0)
     readings = rng.normal(size=(COUNT, 3))
     matrix = np.array([[1.0, 0.0, 1.0]])
-    model = estimate.Model(
-        rj.Inertia.from_principal(moment, moment, moment),
-        rj.torques.CorrelatedTorque(density, memory),
-        walks=[estimate.Walk(lambda s: s.sensors[0].bias, 0.2, drift)],
-    )
     record = identify.Recording(
         DT * np.arange(COUNT), (identify.Gyro(noise, bias=[0.0, 0.0, 0.0]), readings)
     )
-    first = estimate.start(model, record, rj.Spin([0.1, 0.2, 0.3]), rate=0.5)
-    found = estimate.filter(model, record, first, substeps=8)
+    model = identify.Model(
+        record,
+        identify.Known(rj.Inertia.from_principal(moment, moment, moment)),
+        process=rj.torques.CorrelatedTorque(density, memory),
+        walks=[identify.Walk(lambda s: s.sensors[0].bias, 0.2, drift)],
+    )
+    first = identify.first_belief(model, state=rj.Spin([0.1, 0.2, 0.3]), rate=0.5)
+    found = identify.filter(model, first, substeps=8)
     total = 0.0
     for axis in range(3):
         mean0 = np.array([0.1 * (axis + 1), 0.0, 0.0])
@@ -101,17 +102,18 @@ def test_a_spin_near_an_axis_is_a_linear_model():
     b = np.zeros((4, 2))
     b[0, 0], b[1, 1] = np.sqrt(density) / i1, np.sqrt(density) / i2
     grown, strewn = van_loan(a, b, DT)
-    model = estimate.Model(rj.Inertia.from_principal(i1, i2, i3), rj.torques.RandomTorque(density))
     rng = np.random.default_rng(1)
     readings = small * rng.normal(size=(COUNT, 2))
     # Along the axis a rate and angle that are known; across it small ones.
     omega = np.column_stack([readings, np.full(COUNT, spin)])
     record = identify.Recording(DT * np.arange(COUNT), (identify.Gyro([small, small, 1e3]), omega))
     state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0.0, spin])
-    first = estimate.start(
-        model, record, state, rate=[small, small, 0.0], attitude=[small, small, 0.0]
+    body = identify.Known(rj.Inertia.from_principal(i1, i2, i3))
+    model = identify.Model(record, body, process=rj.torques.RandomTorque(density))
+    first = identify.first_belief(
+        model, state=state, rate=[small, small, 0.0], attitude=[small, small, 0.0]
     )
-    found = estimate.filter(model, record, first, substeps=8)
+    found = identify.filter(model, first, substeps=8)
     matrix = np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0]])
     mean, cov, _ = dense(
         grown, strewn, matrix, [small**2] * 2, small**2 * np.eye(4), np.zeros(4), readings
@@ -131,9 +133,9 @@ def test_a_spin_near_an_axis_is_a_linear_model():
 
 @pytest.fixture(scope="module")
 def tumbling():
-    model, record, real = records.tumble()
-    first = estimate.start(model, record, records.START, rate=0.3, attitude=0.3)
-    return model, record, real, first, estimate.filter(model, record, first)
+    model, real = records.tumble()
+    first = identify.first_belief(model, state=records.START, rate=0.3, attitude=0.3)
+    return model, model.recording, real, first, identify.filter(model, first)
 
 
 def test_errors_and_innovations_are_as_large_as_the_filter_says(tumbling):
@@ -158,9 +160,8 @@ def test_steps_one_by_one_are_the_filter(tumbling):
     model, record, _, first, found = tumbling
     belief = first
     for k in range(3):
-        belief = estimate.step(
-            model, belief, record.t[k], *((r.sensor, r.values[k]) for r in record.readings)
-        )
+        readings = (reading.values[k] for reading in record.readings)
+        belief = identify.step(model, belief, record.t[k], *readings)
     np.testing.assert_allclose(belief.state.q, found.states.q[2], rtol=0, atol=1e-13)
     np.testing.assert_allclose(belief.covariance, found.belief.covariance[2], rtol=0, atol=1e-13)
 
@@ -177,37 +178,66 @@ class Speed(identify.AbstractSensor):
 
 def test_steps_take_readings_of_one_number():
     record = identify.Recording([0.0, 0.1], (Speed(), [1.0, 1.0]))
-    model = estimate.Model(records.BODY)
-    first = estimate.start(model, record, rj.Spin([0.0, 0.0, 1.1]), rate=0.1)
-    seen, gap = (estimate.step(model, first, 0.0, (Speed(), 1.0, seen)) for seen in (True, False))
+    model = records.known(record)
+    first = identify.first_belief(model, state=rj.Spin([0.0, 0.0, 1.1]), rate=0.1)
+    seen, gap = (identify.step(model, first, 0.0, 1.0, seen=[seen]) for seen in (True, False))
     np.testing.assert_allclose(gap.state.omega, first.state.omega, rtol=1e-15)
     np.testing.assert_allclose(seen.state.omega, [0.0, 0.0, 1.05], rtol=1e-14)
     np.testing.assert_allclose(seen.deviation, [0.1, 0.1, 0.1 / 2**0.5], rtol=1e-14)
 
 
+def test_the_scene_at_the_free_numbers_is_what_is_filtered():
+    """Body, torque, bias, noise and initial state at x are those of a model that has them."""
+    short, process = records.spinning(), rj.torques.RandomTorque(1e-3)
+    read = short.readings[0].values
+
+    def model_of(chart, bias, coefficient, free=()):
+        record = identify.Recording(short.t, (identify.Gyro(0.02, bias=bias), read))
+        damping = rj.torques.Damping(coefficient)
+        return identify.Model(record, chart, torque=damping, process=process, free=free)
+
+    free = [
+        identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.1),
+        identify.Free(lambda s: s.torque.coefficient, "damping", positive=True),
+    ]
+    model = model_of(identify.Principal(), [0.0, 0.0, 0.0], [0.1, 0.2, 0.3], free)
+    x = model.start(records.BODY, omega=[0.3, 0.9, 0.1])
+    bias, damping = model.slots
+    x = x.at[bias.shared[0]].set(jnp.array([0.2, 0.0, -0.1]))
+    x = x.at[damping.shared[0]].set(jnp.log(2.0))
+    other = model_of(identify.Known(records.BODY), [0.02, 0.0, -0.01], [0.2, 0.4, 0.6])
+    first = identify.first_belief(model, x, rate=0.1)
+    np.testing.assert_allclose(first.state.omega, [0.3, 0.9, 0.1], rtol=1e-14)
+    ours = identify.filter(model, first, x, substeps=1)
+    wanted = identify.filter(other, first, substeps=1)
+    np.testing.assert_allclose(ours.states.omega, wanted.states.omega, rtol=1e-12)
+    np.testing.assert_allclose(ours.log_likelihood, wanted.log_likelihood, rtol=1e-12)
+    assert float(abs(ours.log_likelihood - identify.log_likelihood(model, first, 0 * x))) > 0.1
+
+
 @pytest.mark.slow
 def test_more_steps_between_readings_change_little(tumbling):
-    model, record, _, first, found = tumbling
-    finer = estimate.filter(model, record, first, substeps=3)
+    model, _, _, first, found = tumbling
+    finer = identify.filter(model, first, substeps=3)
     np.testing.assert_allclose(finer.states.q, found.states.q, atol=1e-7)
     assert abs(float(finer.log_likelihood - found.log_likelihood)) < 1e-4
 
 
 def test_a_gap_is_followed_in_steps_that_the_rate_asks_for():
-    model, record, _ = records.tumble()
+    model, _ = records.tumble()
+    record = model.recording
     seen = np.ones(len(record.t), bool)
     seen[20:90] = False
     gapped = identify.Recording(record.t, *((r.sensor, r.values, seen) for r in record.readings))
     assert gapped.t.shape == (130,)
-    first = estimate.start(model, record, records.START, rate=0.3, attitude=0.3)
-    found = estimate.filter(model, gapped, first)
+    first = identify.first_belief(model, state=records.START, rate=0.3, attitude=0.3)
+    found = identify.filter(records.known(gapped, model.process), first)
     # The same as steps through the times that were dropped.
-    masked = [(r.sensor, r.values, r.mask & seen) for r in record.readings]
     belief = first
     for k in range(0, 92):
-        belief = estimate.step(
-            model, belief, record.t[k], *((s, v[k], bool(m[k])) for s, v, m in masked)
-        )
+        readings = (reading.values[k] for reading in record.readings)
+        flags = [bool(reading.mask[k] & seen[k]) for reading in record.readings]
+        belief = identify.step(model, belief, record.t[k], *readings, seen=flags)
     np.testing.assert_allclose(found.states.q[21], belief.state.q, atol=1e-7)
     np.testing.assert_allclose(found.belief.deviation[21], belief.deviation, rtol=1e-5)
 
@@ -217,14 +247,10 @@ def test_what_a_masked_reading_holds_does_not_matter(tumbling):
     seen = np.arange(len(record.t)) % 3 != 1
     readings = [(r.sensor, np.array(r.values)) for r in record.readings]
     other = np.where(seen[:, None], readings[0][1], np.nan)
-    runs = [
-        estimate.filter(
-            model,
-            identify.Recording(record.t, (readings[0][0], values, seen), *readings[1:]),
-            first,
-        )
-        for values in (readings[0][1], other)
-    ]
+    runs = []
+    for values in (readings[0][1], other):
+        masked = identify.Recording(record.t, (readings[0][0], values, seen), *readings[1:])
+        runs.append(identify.filter(records.known(masked, model.process), first))
     np.testing.assert_array_equal(runs[0].belief.root, runs[1].belief.root)
     np.testing.assert_array_equal(runs[0].states.q, runs[1].states.q)
 
@@ -236,25 +262,26 @@ def test_a_channel_at_its_full_scale_is_left_out(tumbling):
     assert 0.05 < full.mean() < 0.9
     gyro = identify.Gyro(0.02, limit=0.9)
     rest = [(r.sensor, r.values) for r in record.readings[1:]]
-    found = estimate.filter(model, identify.Recording(record.t, (gyro, clipped), *rest), first)
+    limited = identify.Recording(record.t, (gyro, clipped), *rest)
+    found = identify.filter(records.known(limited, model.process), first)
     np.testing.assert_array_equal(found.readings[0].seen, ~full)
     assert found.words == "followed"
     told = identify.Recording(record.t, (identify.Gyro(1e-4), clipped), *rest)
     with pytest.raises(ValueError, match=r"lost|broken"):
-        estimate.filter(model, told, first)
+        identify.filter(records.known(told, model.process), first)
 
 
 @pytest.mark.slow
 def test_a_sensor_that_is_late_is_seen_where_it_was():
-    model = estimate.Model(records.BODY)
     ts = 0.05 * jnp.arange(40, dtype=float)
     late = 0.03
     real = rj.simulate(records.BODY, records.START, jnp.concatenate([ts, ts[-1:] + 1])).ys
     moved = jax.vmap(rj.exact.FreeBody(records.BODY, records.START))(ts - late)
     gyro = identify.Gyro(0.01, offset=-late)
     record = identify.Recording(ts, (gyro, moved.omega))
-    first = estimate.start(model, record, rj.Spin(records.START.omega), rate=0.0)
-    found = estimate.filter(model, record, first)
+    model = records.known(record)
+    first = identify.first_belief(model, state=rj.Spin(records.START.omega), rate=0.0)
+    found = identify.filter(model, first)
     assert float(jnp.abs(found.readings[0].innovation).max()) < 1e-7
     np.testing.assert_allclose(found.states.omega, real.omega[:-1], atol=1e-7)
 
@@ -263,29 +290,53 @@ RANDOM, CORRELATED = rj.torques.RandomTorque(1e-4), rj.torques.CorrelatedTorque(
 DRAG = rj.torques.Damping([0.1, 0.2, 0.3])
 
 
-@pytest.mark.parametrize("more", [(), (DRAG, RANDOM, CORRELATED)])
-def test_a_torque_of_the_recording_acts_beside_the_models(more):
-    short, push = records.spinning(), rj.torques.ConstantTorque([0.0, 0.3, 0.0])
+class Push(rj.torques.AbstractTorque):
+    """A torque, N m, that is an input."""
+
+    feels = rj.motion.HasSpin
+    source: rj.torques.Input
+
+    def __call__(self, t, state, body):
+        return self.source(t)
+
+
+@pytest.mark.parametrize("more", [(), (DRAG,)])
+@pytest.mark.parametrize("process", [None, rj.torques.Sum(RANDOM, CORRELATED)])
+def test_a_torque_of_the_recording_acts_beside_the_models(more, process):
+    short, push = records.spinning(), [0.0, 0.3, 0.0]
     readings = [(r.sensor, r.values) for r in short.readings]
-    pushed = identify.Recording(short.t, *readings, torque=push)
+    logs = {
+        "samples": np.tile(push, (len(short.t), 1)),
+        "function": rj.torques.Held([0.0], [push]),
+    }
+    law = Push(rj.torques.Input("push"))
     runs = []
-    for laws, record in (((*more, push), short), (more, pushed), (more, short)):
-        model = estimate.Model(records.BODY, rj.torques.Sum(*laws) if laws else None)
-        first = estimate.start(model, record, rj.Spin(records.START.omega), rate=0.3)
-        runs.append(estimate.filter(model, record, first, substeps=1, throw=False))
-    inside, beside, without = runs
-    for ours, wanted in zip(jax.tree.leaves(beside), jax.tree.leaves(inside), strict=True):
-        np.testing.assert_allclose(ours, wanted, rtol=1e-12, atol=1e-14)
-    assert float(jnp.abs(without.log_likelihood - beside.log_likelihood)) > 0.1
+    for record, acting in (
+        (short, rj.torques.ConstantTorque(push)),
+        *(
+            (identify.Recording(short.t, *readings, inputs={"push": log}), law)
+            for log in logs.values()
+        ),
+        (short, None),
+    ):
+        laws = [*more, *([] if acting is None else [acting])]
+        model = records.known(record, process, torque=rj.torques.Sum(*laws) if laws else None)
+        first = identify.first_belief(model, state=rj.Spin(records.START.omega), rate=0.3)
+        runs.append(identify.filter(model, first, substeps=1, throw=False))
+    constant, *logged, without = runs
+    for run in logged:
+        for ours, wanted in zip(jax.tree.leaves(run), jax.tree.leaves(constant), strict=True):
+            np.testing.assert_allclose(ours, wanted, rtol=1e-12, atol=1e-14)
+    assert float(jnp.abs(without.log_likelihood - constant.log_likelihood)) > 0.1
 
 
 def likelihood(x):
     """Of two moments and a density, on the smallest program."""
-    body = rj.Inertia.from_principal(x[0], x[1], 2.5)
-    model = estimate.Model(body, rj.torques.RandomTorque(jnp.exp(x[2])))
-    short = records.spinning()
-    first = estimate.start(model, short, rj.Spin(records.START.omega), rate=0.3)
-    return estimate.log_likelihood(model, short, first, substeps=1)
+    body = identify.Known(rj.Inertia.from_principal(x[0], x[1], 2.5))
+    process = rj.torques.RandomTorque(jnp.exp(x[2]))
+    model = identify.Model(records.spinning(), body, process=process)
+    first = identify.first_belief(model, state=rj.Spin(records.START.omega), rate=0.3)
+    return identify.log_likelihood(model, first, substeps=1)
 
 
 AT = jnp.array([1.0, 2.0, np.log(1e-2)])
@@ -317,21 +368,20 @@ def test_without_noise_it_is_the_likelihood_of_the_fit(density):
     state0 = rj.Spin(records.START.omega + 0.01)
     turned = jax.vmap(rj.exact.FreeBody(records.BODY, state0))(short.t - short.t[0])
     wanted = scipy.stats.norm.logpdf(short.readings[0].values - turned.omega, scale=0.02).sum()
-    model = estimate.Model(records.BODY, rj.torques.RandomTorque(density))
-    first = estimate.start(model, short, state0, rate=0.0)
-    got = estimate.log_likelihood(model, short, first, substeps=8)
+    model = records.known(short, rj.torques.RandomTorque(density))
+    first = identify.first_belief(model, state=state0, rate=0.0)
+    got = identify.log_likelihood(model, first, substeps=8)
     assert abs(float(got) / wanted - 1) < 1e-9
 
 
 @pytest.mark.slow
 def test_covariances_stay_positive_in_single_precision(tumbling):
-    _, record, _, _, found = tumbling
-    model = estimate.Model(records.BODY, rj.torques.RandomTorque(1e-4))
+    model, _, _, _, found = tumbling
     start = rj.Attitude(
         jnp.array([1.0, 0, 0, 0], jnp.float32), jnp.asarray(records.START.omega, jnp.float32)
     )
-    first = estimate.start(model, record, start, rate=0.3, attitude=0.3)
-    single = estimate.filter(model, record, first)
+    first = identify.first_belief(model, state=start, rate=0.3, attitude=0.3)
+    single = identify.filter(model, first)
     assert single.belief.root.dtype == jnp.float32
     np.testing.assert_allclose(single.states.q, found.states.q, atol=2e-5)
     np.testing.assert_allclose(single.belief.deviation, found.belief.deviation, rtol=2e-4)
@@ -339,13 +389,17 @@ def test_covariances_stay_positive_in_single_precision(tumbling):
 
 @pytest.mark.slow
 def test_a_batch_of_records_is_each_of_them():
-    made = [records.tumble(count=20, seed=seed) for seed in (0, 1)]
-    model = made[0][0]
-    first = estimate.start(model, made[0][1], records.START, rate=0.3, attitude=0.3)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(record for _, record, _ in made))
-    both = jax.vmap(lambda r: estimate.log_likelihood(model, r, first, substeps=1))(stacked)
-    each = [estimate.log_likelihood(model, record, first, substeps=1) for _, record, _ in made]
-    np.testing.assert_allclose(both, jnp.stack(each), rtol=1e-12)
+    models = [records.tumble(count=20, seed=seed)[0] for seed in (0, 1)]
+    first = identify.first_belief(models[0], state=records.START, rate=0.3, attitude=0.3)
+
+    def likelihood_of(readings):
+        where = lambda model: [reading.values for reading in model.records.readings]
+        return identify.log_likelihood(eqx.tree_at(where, models[0], readings), first, substeps=1)
+
+    each = [[reading.values for reading in model.records.readings] for model in models]
+    both = jax.vmap(likelihood_of)([jnp.stack(pair) for pair in zip(*each, strict=True)])
+    wanted = [identify.log_likelihood(model, first, substeps=1) for model in models]
+    np.testing.assert_allclose(both, jnp.stack(wanted), rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -356,18 +410,17 @@ def test_a_million_steps_in_single_precision_leave_a_positive_covariance():
     omega = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (count, 1)) + 0.01 * jax.random.normal(
         key, (count, 3)
     )
-    model = estimate.Model(records.BODY, rj.torques.RandomTorque(1e-8))
     record = identify.Recording(ts, (identify.Gyro(0.01), omega))
+    model = records.known(record, rj.torques.RandomTorque(1e-8))
     start = rj.Attitude(jnp.array([1.0, 0, 0, 0], jnp.float32), jnp.array([0.0, 0, 1], jnp.float32))
-    first = estimate.start(model, record, start, rate=1.0, attitude=1e-3)
-    found = estimate.filter(model, record, first)
+    first = identify.first_belief(model, state=start, rate=1.0, attitude=1e-3)
+    found = identify.filter(model, first)
     cov = np.asarray(found.belief.root[-1], float)
     values = np.linalg.eigvalsh(cov @ cov.T)
     assert values.min() > 0 and found.words == "followed"
     exact = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
-    double = estimate.filter(
-        model, record, estimate.start(model, record, exact, rate=1.0, attitude=1e-3)
-    )
+    precise = identify.first_belief(model, state=exact, rate=1.0, attitude=1e-3)
+    double = identify.filter(model, precise)
     np.testing.assert_allclose(
         found.belief.deviation[-1, 3:], double.belief.deviation[-1, 3:], rtol=1e-2
     )
@@ -375,10 +428,10 @@ def test_a_million_steps_in_single_precision_leave_a_positive_covariance():
 
 class TestBadInput:
     record = identify.Recording([0.0, 0.1], (identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    model = estimate.Model(records.BODY)
+    model = records.known(record)
 
     def start(self):
-        return estimate.start(self.model, self.record, rate=0.1)
+        return identify.first_belief(self.model, rate=0.1)
 
     def test_densities(self):
         with pytest.raises(ValueError, match="density: wanted a finite number that is not below"):
@@ -388,60 +441,113 @@ class TestBadInput:
         with pytest.raises(ValueError, match="time: wanted a positive correlation time"):
             rj.torques.CorrelatedTorque(1.0, 0.0)
         with pytest.raises(ValueError, match="density: wanted a finite"):
-            estimate.Walk(lambda s: s.sensors[0].bias, 1.0, -1.0)
+            identify.Walk(lambda s: s.sensors[0].bias, 1.0, -1.0)
 
     def test_readings_out_of_order(self):
-        with pytest.raises(ValueError, match="out of order"):
-            estimate.filter(
-                self.model, self.record, eqx.tree_at(lambda b: b.t, self.start(), jnp.array(1.0))
-            )
         later = eqx.tree_at(lambda b: b.t, self.start(), jnp.array(1.0))
         with pytest.raises(ValueError, match="out of order"):
-            estimate.step(self.model, later, 0.5, (identify.Gyro(0.1), jnp.zeros(3)))
+            identify.filter(self.model, later)
+        with pytest.raises(ValueError, match="out of order"):
+            identify.step(self.model, later, 0.5, jnp.zeros(3))
 
     def test_a_sensor_without_noise(self):
         record = identify.Recording([0.0, 0.1], (identify.Gyro(), [[1.0, 0, 0]] * 2))
-        with pytest.raises(ValueError, match=r"wanted its noise.*Gyro\(noise="):
-            estimate.filter(self.model, record, self.start())
+        for run in (
+            lambda model: identify.filter(model, self.start()),
+            lambda model: identify.smooth(model, self.start()),
+            lambda model: identify.log_likelihood(model, self.start()),
+            lambda model: identify.step(model, self.start(), 0.1, jnp.zeros(3)),
+        ):
+            with pytest.raises(ValueError, match=r"wanted its noise.*Gyro\(noise="):
+                run(records.known(record))
 
     def test_nan(self):
         with pytest.raises(ValueError, match=r"contains NaN; give .* if it is a gap"):
-            estimate.step(self.model, self.start(), 0.1, (identify.Gyro(0.1), jnp.full(3, jnp.nan)))
+            identify.step(self.model, self.start(), 0.1, jnp.full(3, jnp.nan))
+
+    def test_a_step_without_each_reading(self):
+        with pytest.raises(
+            ValueError, match=r"readings: wanted one for each sensor \(Gyro\), got 0"
+        ):
+            identify.step(self.model, self.start(), 0.1)
+        with pytest.raises(ValueError, match=r"seen: wanted one for each sensor \(Gyro\), got 2"):
+            identify.step(self.model, self.start(), 0.1, jnp.zeros(3), seen=[True, False])
+
+    def test_several_recordings(self):
+        model = records.known([self.record, self.record])
+        for run in (
+            lambda: identify.first_belief(model, rate=0.1),
+            lambda: identify.filter(model, self.start()),
+            lambda: identify.log_likelihood(model, self.start()),
+        ):
+            with pytest.raises(ValueError, match=r"model: wanted one recording, got 2.*jax\.vmap"):
+                run()
+
+    def test_a_body_that_is_not_known(self):
+        model = identify.Model(self.record, identify.Ratios())
+        with pytest.raises(ValueError, match=r"x: wanted the free numbers.*fit\(model\)\.x"):
+            identify.first_belief(model, rate=0.1)
+        with pytest.raises(ValueError, match="x: wanted the 8 free numbers of this model"):
+            identify.filter(model, self.start(), jnp.zeros(3))
 
     def test_a_walk_that_finds_nothing(self):
-        model = estimate.Model(
-            records.BODY, walks=[estimate.Walk(lambda s: s.sensors[0].bias, 1.0)]
-        )
-        with pytest.raises(ValueError, match="None is there; give the sensor a starting value"):
-            estimate.start(model, self.record, rate=0.1)
-        model = estimate.Model(
-            records.BODY, walks=[estimate.Walk(lambda s: s.sensors[3], 1.0)]
-        )
-        with pytest.raises(ValueError, match="nothing is there"):
-            estimate.start(model, self.record, rate=0.1)
+        for where, words in (
+            (lambda s: s.sensors[0].bias, "None is there; give the sensor a starting value"),
+            (lambda s: s.sensors[3], "nothing is there"),
+            (lambda s: s.process.density, "Walk: wanted a number of a sensor"),
+        ):
+            with pytest.raises(ValueError, match=words):
+                records.known(self.record, RANDOM, walks=[identify.Walk(where, 1.0)])
 
-    def test_a_start_without_a_deviation(self):
+    def test_walks_that_do_not_fit(self):
+        gyro = identify.Gyro(0.1, bias=[0.0, 0.0, 0.0])
+        record = identify.Recording([0.0, 0.1], (gyro, [[1.0, 0, 0]] * 2))
+        walk = identify.Walk(lambda s: s.sensors[0].bias, 1.0)
+        with pytest.raises(ValueError, match="another Walk moves the same numbers"):
+            records.known(record, walks=[walk, walk])
+        with pytest.raises(TypeError, match="walks: wanted a sequence of Walk"):
+            records.known(record, walks=[1.0])
+        wide = identify.Walk(lambda s: s.sensors[0].bias, [1.0, 2.0])
+        with pytest.raises(ValueError, match=r"deviation: wanted one number or shape \(3,\)"):
+            records.known(record, walks=wide)
+
+    def test_an_unknown_torque_that_is_given_as_known(self):
+        with pytest.raises(TypeError, match="torque: wanted the known torque, got a RandomTorque"):
+            records.known(self.record, torque=rj.torques.Sum(DRAG, RANDOM))
+        with pytest.raises(TypeError, match="process: wanted a RandomTorque, a CorrelatedTorque"):
+            records.known(self.record, DRAG)
+
+    def test_a_first_belief_without_a_deviation(self):
         with pytest.raises(ValueError, match="attitude: wanted the standard deviation"):
-            estimate.start(self.model, self.record, records.START, rate=0.1)
+            identify.first_belief(self.model, state=records.START, rate=0.1)
         with pytest.raises(ValueError, match="rate: wanted a finite"):
-            estimate.start(self.model, self.record, rate=-1.0)
+            identify.first_belief(self.model, rate=-1.0)
+        with pytest.raises(ValueError, match="attitude: a Spin has none"):
+            identify.first_belief(self.model, rate=0.1, attitude=0.1)
+
+    def test_readings_that_show_no_attitude(self):
+        record = identify.Recording(
+            [0.0, 0.1], (identify.Direction([0.0, 0, 1], 0.1), [[0.0, 0, 1]] * 2)
+        )
+        with pytest.raises(ValueError, match="state: the readings alone show no initial attitude"):
+            identify.first_belief(records.known(record), rate=0.1, attitude=0.1)
 
     def test_a_state_that_the_sensor_cannot_see(self):
         record = identify.Recording(
             [0.0, 0.1], (identify.Direction([0.0, 0, 1], 0.1), [[0.0, 0, 1]] * 2)
         )
         with pytest.raises(TypeError, match="needs a state with HasAttitude"):
-            estimate.filter(self.model, record, self.start())
+            identify.filter(records.known(record), self.start())
 
     def test_a_lost_filter(self):
         t = np.arange(0, 3, 0.1)
         omega = np.tile([0.0, 0.0, 1.0], (t.size, 1))
         omega[t > 1] = [0.0, 0.0, -1.0]
         record = identify.Recording(t, (identify.Gyro(0.01), omega))
-        model = estimate.Model(records.BODY, rj.torques.RandomTorque(1e-12))
-        first = estimate.start(model, record, rate=0.1)
+        model = records.known(record, rj.torques.RandomTorque(1e-12))
+        first = identify.first_belief(model, rate=0.1)
         with pytest.raises(ValueError, match=r"lost: no reading.*more than a second.*at 2 s"):
-            estimate.filter(model, record, first)
-        found = estimate.filter(model, record, first, throw=False)
+            identify.filter(model, first)
+        found = identify.filter(model, first, throw=False)
         assert int(found.status) == 1 and "lost" in found.words
         assert abs(float(found.lost_at) - 2.0) < 1e-9

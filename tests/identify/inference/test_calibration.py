@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from estimate import records
+from identify.filtering import records
 
 import rigidjax as rj
-from rigidjax import estimate, identify
+from rigidjax import identify
 
 DT, NOISE = 0.05, 0.02
 # A gyro shows only ratios: of the body as `PrincipalRatios` makes it, whose tensor has trace 2.
@@ -47,7 +47,7 @@ def made(key, law, directions, count):
     grown = jnp.exp(PRIOR * jax.random.normal(keys[3], (len(leaves),)))
     law = jax.tree.unflatten(structure, [a * b for a, b in zip(leaves, grown, strict=True)])
     ts = DT * jnp.arange(count, dtype=float)
-    states = records.truth(keys[1], estimate.Model(BODY, law), start, ts, 2).states
+    states = records.truth(keys[1], law, start, ts, 2, body=BODY).states
     read = [records.gyro(keys[2], states.omega, NOISE)]
     for world, one in zip(directions, keys[4:], strict=True):
         read.append(records.direction(one, states.q, world, NOISE))
@@ -58,10 +58,10 @@ def density(ts, read, law, directions):
     """The posterior density of one record."""
     sensors = [identify.Gyro(NOISE), *(identify.Direction(world, NOISE) for world in directions)]
     record = identify.Recording(ts, *zip(sensors, read, strict=True))
-    problem = identify.Model(record, identify.PrincipalRatios())
+    model = identify.Model(record, identify.PrincipalRatios(), process=law)
     # A first guess: without the torque no motion explains the longer records.
-    first = identify.fit(problem, starts=1, max_steps=1)
-    return estimate.LogDensity(first, law, deviation=PRIOR)
+    first = identify.fit(model, starts=1, max_steps=1)
+    return identify.LogDensity(first, deviation=PRIOR)
 
 
 def compared(point, start, law):
@@ -95,7 +95,7 @@ def test_the_truth_lies_anywhere_among_the_draws_and_in_as_many_intervals_as_sai
     ranks, effective = [], []
     for key in jax.random.split(jax.random.key(7), many):
         ts, read, start, real = made(key, law, directions, count)
-        found = estimate.refit(density(ts, read, law, directions))
+        found = identify.refit(density(ts, read, law, directions))
         ranks.append(rank(found, start, real))
         effective.append(float(found.effective))
     whole = np.asarray(effective) > 100

@@ -10,16 +10,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from estimate import records
+from identify.filtering import records
 
 import rigidjax as rj
-from rigidjax import estimate, identify
+from rigidjax import identify
 from rigidjax.identify.answer.answers import Answer
-from rigidjax.identify.inference.density import curvature
+from rigidjax.identify.filtering.terms import curvature
+from rigidjax.identify.model.terms import blocks
+from rigidjax.identify.uncertainty.covariance import linearise
+
+# The places of the initial rate among the free numbers of `model`.
+SPIN = slice(2, 5)
 
 
 @functools.cache
-def problem():
+def model():
     ts = jnp.linspace(0.0, 6.0, 60)
     real = jax.vmap(rj.exact.FreeBody(records.BODY, rj.Spin(records.START.omega)))(ts)
     omega = records.gyro(jax.random.key(3), real.omega, 0.02)
@@ -30,29 +35,28 @@ def problem():
 @pytest.fixture(scope="module")
 def fitted():
     """A fit as it might be, for a fit compiles long: the truth, and some covariance."""
-    at = problem().start(records.BODY)
-    spin = records.START.omega[None] / problem().typical_rate
-    at = eqx.tree_at(lambda p: p.own.spin, at, spin)
+    at = model().start(records.BODY, omega=records.START.omega)
     root = np.tril(np.random.default_rng(0).normal(size=(5, 5)))
     covariance = 1e-4 * (jnp.eye(5) + root @ root.T)
-    nothing = jnp.zeros((0, 5))
+    nothing, noises = jnp.zeros((0, 5)), (jnp.full((1, 3), 0.02),)
     return identify.Fit(
-        problem(), at, covariance, covariance, "", (jnp.full((1, 3), 0.02),), (), 0.0, 1, 1.0, 1.0,
+        model(), at, covariance, covariance, "", noises, (), 0.0, 1, 1.0, 1.0,
         jnp.ones(5), nothing, (), Answer("found"),
         Answer("explains the readings"), (),
+        linear=linearise(model(), at, noises, blocks(model(), at)),
     )  # fmt: skip
 
 
 @functools.cache
 def whole_fit():
-    return identify.fit(problem(), starts=1)
+    return identify.fit(model(), starts=1)
 
 
 def test_without_a_process_it_is_normal_about_the_motion(fitted):
-    density = estimate.LogDensity(fitted)
+    density = identify.LogDensity(fitted)
     assert density.size == 5
     x = density.x0 + 0.01
-    errors = fitted.model.errors(density.unpack(x).x)
+    errors = fitted.model.errors(x)
     wanted = sum(scipy.stats.norm.logpdf(e, scale=0.02).sum() for e in errors)
     assert abs(float(density(x)) / wanted - 1) < 1e-12
     np.testing.assert_allclose(density.covariance, fitted.covariance)
@@ -61,32 +65,32 @@ def test_without_a_process_it_is_normal_about_the_motion(fitted):
 
 def test_its_width_is_that_of_white_errors_whatever_the_intervals_allow_for(fitted):
     wide = dataclasses.replace(fitted, covariance_kind="sandwich: the errors are autocorrelated")
-    density = estimate.LogDensity(wide)
+    density = identify.LogDensity(wide)
     columns, h = [], 1e-5
     for step in h * np.eye(5):
         up, down = (density.unpack(density.x0 + s * step).x for s in (1, -1))
-        apart = problem().errors(up)[0] - problem().errors(down)[0]
+        apart = model().errors(up)[0] - model().errors(down)[0]
         columns.append(np.ravel(apart) / (2 * h * 0.02))
     wanted = np.linalg.inv(np.array(columns) @ np.array(columns).T)
     np.testing.assert_allclose(density.covariance, wanted, rtol=1e-4, atol=1e-4 * np.max(wanted))
     # A torque that is integrated out makes it wide again: there the sandwich is nearer.
-    integrated = estimate.LogDensity(wide, rj.torques.RandomTorque(1e-4), deviation=None)
+    integrated = identify.LogDensity(wide, rj.torques.RandomTorque(1e-4), deviation=None)
     np.testing.assert_allclose(integrated.covariance, fitted.covariance)
     # Unless it is singular, which has no root.
     flat = dataclasses.replace(wide, covariance=1e-4 * jnp.ones((5, 5)))
-    integrated = estimate.LogDensity(flat, rj.torques.RandomTorque(1e-4), deviation=None)
+    integrated = identify.LogDensity(flat, rj.torques.RandomTorque(1e-4), deviation=None)
     np.testing.assert_allclose(integrated.covariance, density.covariance)
 
 
 def test_a_noise_that_is_unknown_is_one_number_as_in_the_fit(fitted):
-    record = problem().recordings[0]
+    record = model().recordings[0]
     unknown = (identify.Gyro(), record.readings[0].values)
     other = identify.Model(identify.Recording(record.t, unknown), identify.PrincipalRatios())
-    density = estimate.LogDensity(dataclasses.replace(fitted, problem=other))
+    density = identify.LogDensity(dataclasses.replace(fitted, model=other))
     assert density.size == 6
     np.testing.assert_allclose(density.covariance[-1, -1], 1 / (2 * 180))
     x = density.x0.at[-1].set(np.log(2.0))
-    wanted = scipy.stats.norm.logpdf(problem().errors(fitted.x)[0], scale=0.04).sum()
+    wanted = scipy.stats.norm.logpdf(model().errors(fitted.x)[0], scale=0.04).sum()
     np.testing.assert_allclose(density(x), wanted, rtol=1e-12)
     np.testing.assert_allclose(density.unpack(x).noise[0], 0.04)
 
@@ -94,7 +98,7 @@ def test_a_noise_that_is_unknown_is_one_number_as_in_the_fit(fitted):
 @pytest.mark.oldest
 def test_its_gradient_is_right(fitted):
     """Through its own rule and that of the errors, recording by recording: central differences."""
-    density = estimate.LogDensity(fitted)
+    density = identify.LogDensity(fitted)
     x, h = np.asarray(density.x0) + 0.01, 1e-5
     value = jax.jit(lambda x: density(x))
     slope = jax.jit(jax.grad(lambda x: density(x)))(x)
@@ -104,7 +108,7 @@ def test_its_gradient_is_right(fitted):
 
 def test_its_gradient_over_a_batch_of_draws_is_that_of_each(fitted):
     """The noises do not move with x: in the batch they are shared, in the derivative they are not."""
-    density = estimate.LogDensity(fitted)
+    density = identify.LogDensity(fitted)
     x = density.x0[None] + 0.01 * jnp.arange(3.0)[:, None]
     each = jax.jit(lambda x: density(x))
     found, wanted = jax.jit(
@@ -122,8 +126,8 @@ def test_its_gradient_over_a_batch_of_draws_is_that_of_each(fitted):
 
 @pytest.mark.slow
 def test_a_process_of_no_density_changes_nothing(fitted):
-    plain = estimate.LogDensity(fitted)
-    with_one = estimate.LogDensity(fitted, rj.torques.RandomTorque(0.0), deviation=None)
+    plain = identify.LogDensity(fitted)
+    with_one = identify.LogDensity(fitted, rj.torques.RandomTorque(0.0), deviation=None)
     x = plain.x0 + 0.01
     # Equal steps of the classical method against the closed form.
     assert abs(float(with_one(x) / plain(x)) - 1) < 1e-6
@@ -134,33 +138,77 @@ def test_a_process_of_no_density_changes_nothing(fitted):
 
 
 def test_a_density_that_is_unknown_is_one_number_more(fitted):
-    density = estimate.LogDensity(fitted, rj.torques.RandomTorque(1e-4), deviation=2.0)
+    density = identify.LogDensity(fitted, rj.torques.RandomTorque(1e-4), deviation=2.0)
     assert density.size == 6
     x = density.x0.at[-1].set(jnp.log(3.0))
     np.testing.assert_allclose(density.unpack(x).process.density, 3e-4)
-    known = estimate.LogDensity(fitted, rj.torques.RandomTorque(3e-4), deviation=None)
+    known = identify.LogDensity(fitted, rj.torques.RandomTorque(3e-4), deviation=None)
     prior = -0.5 * (np.log(3.0) / 2.0) ** 2
     np.testing.assert_allclose(density(x), known(x[:-1]) + prior, rtol=1e-12)
 
 
+def test_the_process_of_the_model_is_that_of_the_density(fitted):
+    record, chart = model().recording, identify.PrincipalRatios()
+    process = rj.torques.RandomTorque(1e-4)
+    other = dataclasses.replace(fitted, model=identify.Model(record, chart, process=process))
+    ours, wanted = identify.LogDensity(other), identify.LogDensity(fitted, process)
+    assert ours.size == 6
+    x = wanted.x0 + 0.01
+    np.testing.assert_allclose(ours(x), wanted(x), rtol=1e-14)
+    # The filter at x is that of the density.
+    scene = ours.model
+    known = identify.first_belief(scene, x, rate=0.0)
+    of_filter = identify.log_likelihood(scene, known, x, substeps=scene.filter_steps)
+    prior = -0.5 * float(0.01 / 2.0) ** 2
+    np.testing.assert_allclose(of_filter + prior, ours(x), rtol=1e-12)
+
+
+def test_a_process_of_two_parts_has_the_numbers_of_both(fitted):
+    white, coloured = rj.torques.RandomTorque(1e-4), rj.torques.CorrelatedTorque(1e-3, 0.5)
+    density = identify.LogDensity(fitted, rj.torques.Sum(white, coloured))
+    assert density.size == 8
+    point = density.unpack(density.x0.at[5:].set(jnp.log(jnp.array([2.0, 3.0, 4.0]))))
+    parts = point.process.parts
+    np.testing.assert_allclose(parts[0].density, 2e-4)
+    np.testing.assert_allclose(parts[1].density, 3e-3)
+    np.testing.assert_allclose(parts[1].time, 2.0)
+    assert {"density 0", "density 1", "time 1"} <= set(point.values)
+
+
+def test_a_walk_without_drift_is_a_bias_that_is_integrated_out(fitted):
+    """The covariance of the readings has one more part, the same at all times: dense algebra."""
+    record, deviation = model().recording, 0.05
+    gyro = identify.Gyro(0.02, bias=[0.0, 0.0, 0.0])
+    seen = identify.Recording(record.t, (gyro, record.readings[0].values))
+    walk = identify.Walk(lambda s: s.sensors[0].bias, deviation)
+    other = identify.Model(seen, identify.PrincipalRatios(), walks=[walk])
+    density = identify.LogDensity(dataclasses.replace(fitted, model=other))
+    x = density.x0 + 0.01
+    errors = np.asarray(model().errors(x)[0])
+    times = len(errors)
+    covariance = 0.02**2 * np.eye(times) + deviation**2 * np.ones((times, times))
+    logs = scipy.stats.multivariate_normal(np.zeros(times), covariance).logpdf(errors.T)
+    # Fixed steps of the filter against the closed form.
+    assert abs(float(density(x)) / logs.sum() - 1) < 1e-6
+
+
 def test_a_noise_that_is_unknown_moves_no_other_number(fitted):
     # Inside the filter the sensor has a noise, and with it one leaf more than in the problem.
-    record = problem().recordings[0]
+    record = model().recordings[0]
     bias = identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.1, prior=0.1)
     values = []
     for noise in (None, 0.02):
         gyro = identify.Gyro(noise, bias=[0.01, -0.02, 0.03])
         seen = identify.Recording(record.t, (gyro, record.readings[0].values))
         other = identify.Model(seen, identify.PrincipalRatios(), free=[bias])
-        at = other.start(records.BODY)
-        at = eqx.tree_at(lambda p: p.own.spin, at, fitted.x.own.spin)
-        at = eqx.tree_at(lambda p: p.shared[0], at, jnp.array([1.0, -1.0, 0.5]))
+        at = other.start(records.BODY, omega=records.START.omega)
+        at = at.at[other.slots[0].shared[0]].set(jnp.array([1.0, -1.0, 0.5]))
         covariance = 1e-4 * jnp.eye(8)
         found = dataclasses.replace(
-            fitted, problem=other, parameters=at, covariance=covariance, seen=covariance,
+            fitted, model=other, x=at, covariance=covariance, seen=covariance,
             singular_values=jnp.ones(8), null_directions=jnp.zeros((0, 8)),
         )  # fmt: skip
-        with_one = estimate.LogDensity(found, rj.torques.RandomTorque(1e-4), deviation=None)
+        with_one = identify.LogDensity(found, rj.torques.RandomTorque(1e-4), deviation=None)
         values.append(float(with_one(with_one.x0)))
     np.testing.assert_allclose(values[0], values[1], rtol=1e-12)
 
@@ -168,7 +216,7 @@ def test_a_noise_that_is_unknown_moves_no_other_number(fitted):
 @pytest.mark.oldest
 def test_the_gradient_with_a_process_is_right_recording_by_recording(fitted):
     """Noise, a shared bias with deviations and the process: central differences."""
-    record = problem().recordings[0]
+    record = model().recordings[0]
     reading = identify.Gyro(bias=[0.0, 0.0, 0.0]), record.readings[0].values
     cut = [
         identify.Recording(record.t[k : k + 12], (reading[0], reading[1][k : k + 12]))
@@ -177,14 +225,14 @@ def test_the_gradient_with_a_process_is_right_recording_by_recording(fitted):
     bias = identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.1, spread=0.1)
     both = identify.Model(cut, identify.PrincipalRatios(), free=[bias], noise_each=True)
     at = both.start(records.BODY)
-    size = sum(leaf.size for leaf in jax.tree.leaves(at))
+    size = at.size
     covariance = 1e-4 * jnp.eye(size)
     found = dataclasses.replace(
-        fitted, problem=both, parameters=at, covariance=covariance, seen=covariance,
+        fitted, model=both, x=at, covariance=covariance, seen=covariance,
         noises=(jnp.full((2, 3), 0.02),), singular_values=jnp.ones(size),
         null_directions=jnp.zeros((0, size)),
     )  # fmt: skip
-    density = estimate.LogDensity(found, rj.torques.RandomTorque(1e-3))
+    density = identify.LogDensity(found, rj.torques.RandomTorque(1e-3))
     assert density.size == size + 2 + 1
     x, h = np.asarray(density.x0) + 0.01, 1e-5
     slope, ahead = jax.jit(lambda x: (jax.grad(density)(x), jax.jacfwd(density)(x)))(x)
@@ -201,8 +249,8 @@ def test_any_sampler_will_do(fitted):
         assert np.isfinite(jax.eval_shape(density, start).size)
         return jax.random.normal(key, (500, start.size))
 
-    density = estimate.LogDensity(fitted)
-    drawn = estimate.posterior(density, jax.random.key(0), sampler=laplace)
+    density = identify.LogDensity(fitted)
+    drawn = identify.posterior(density, jax.random.key(0), sampler=laplace)
     assert drawn.x.shape == (4, 500, 5)
     np.testing.assert_allclose(drawn.x.mean((0, 1)), density.x0, atol=5e-3)
     spread = np.cov(np.asarray(drawn.x).reshape(-1, 5).T)
@@ -217,11 +265,11 @@ def test_any_sampler_will_do(fitted):
 
 
 def test_chains_of_many_recordings_are_those_of_their_keys_too(fitted):
-    many = identify.Model([problem().recordings[0]] * 8, identify.PrincipalRatios())
+    many = identify.Model([model().recordings[0]] * 8, identify.PrincipalRatios())
     at = many.start(records.BODY)
     covariance = jnp.diag(jnp.linspace(1e-4, 1e-2, 26))
     found = dataclasses.replace(
-        fitted, problem=many, parameters=at, covariance=covariance, seen=covariance,
+        fitted, model=many, x=at, covariance=covariance, seen=covariance,
         noises=(jnp.full((8, 3), 0.02),), singular_values=jnp.ones(26),
         null_directions=jnp.zeros((0, 26)),
     )  # fmt: skip
@@ -229,7 +277,7 @@ def test_chains_of_many_recordings_are_those_of_their_keys_too(fitted):
     def laplace(key, density, start):
         return jax.random.normal(key, (500, start.size))
 
-    drawn = estimate.posterior(estimate.LogDensity(found), jax.random.key(0), sampler=laplace)
+    drawn = identify.posterior(identify.LogDensity(found), jax.random.key(0), sampler=laplace)
     assert drawn.x.shape == (4, 500, 26)
     np.testing.assert_allclose(drawn.x.var((0, 1)), np.diagonal(covariance), rtol=0.2)
     assert len(np.unique(np.asarray(drawn.x[:, 0, 0]))) == 4
@@ -245,7 +293,7 @@ def test_draws_that_depend_on_the_last_are_worth_less(fitted):
 
         return jax.lax.scan(step, start, jax.random.split(key, 4000))[1]
 
-    drawn = estimate.posterior(estimate.LogDensity(fitted), jax.random.key(1), sampler=slow)
+    drawn = identify.posterior(identify.LogDensity(fitted), jax.random.key(1), sampler=slow)
     wanted = 16000 * (1 - rho) / (1 + rho)
     assert (np.abs(drawn.ess / wanted - 1) < 0.3).all()
 
@@ -254,7 +302,7 @@ def test_draws_that_depend_on_the_last_are_worth_less(fitted):
 def test_nuts_draws_from_a_normal_distribution(acceptance):
     root = np.array([[1.0, 0.0], [1.5, 0.5]])
     inverse = np.linalg.inv(root @ root.T)
-    sampler = estimate.Nuts(samples=2000, warmup=300, acceptance=acceptance)
+    sampler = identify.Nuts(samples=2000, warmup=300, acceptance=acceptance)
     draw = jax.jit(lambda key: sampler(key, lambda z: -0.5 * z @ inverse @ z, jnp.zeros(2)))
     # blackjax leans on the promotions that our tests forbid.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
@@ -267,9 +315,9 @@ def test_nuts_draws_from_a_normal_distribution(acceptance):
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # entries that are constant
 def test_draws_go_to_arviz(fitted):
     arviz = pytest.importorskip("arviz")
-    density = estimate.LogDensity(fitted, rj.torques.RandomTorque(1e-4), deviation=2.0)
+    density = identify.LogDensity(fitted, rj.torques.RandomTorque(1e-4), deviation=2.0)
     x = density.x0[None, None] + 0.01 * jax.random.normal(jax.random.key(0), (4, 50, density.size))
-    drawn = estimate.Posterior(density, x)
+    drawn = identify.Posterior(density, x)
     table = drawn.to_arviz()
     assert {"inertia[0, 0]", "density[0]"} <= set(arviz.summary(table).index)
     assert table["posterior"]["omega0"].shape[:2] == (4, 50)
@@ -279,20 +327,20 @@ def test_draws_go_to_arviz(fitted):
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
 def test_several_bodies_go_to_arviz_by_name(fitted):
     arviz = pytest.importorskip("arviz")
-    record = problem().recordings[0]
+    record = model().recordings[0]
     chart = identify.PrincipalRatios()
     both = identify.Model({"a": record, "b": record}, {"a": chart, "b": chart})
     at = both.start({"a": records.BODY, "b": records.BODY})
-    size = sum(leaf.size for leaf in jax.tree.leaves(at))
+    size = at.size
     covariance = 1e-4 * jnp.eye(size)
     noises = (jnp.full((2, 3), 0.02),)
     found = dataclasses.replace(
-        fitted, problem=both, parameters=at, covariance=covariance, seen=covariance, noises=noises,
+        fitted, model=both, x=at, covariance=covariance, seen=covariance, noises=noises,
         singular_values=jnp.ones(size), null_directions=jnp.zeros((0, size)),
     )  # fmt: skip
-    density = estimate.LogDensity(found)
+    density = identify.LogDensity(found)
     x = density.x0[None, None] + 0.01 * jax.random.normal(jax.random.key(0), (2, 8, size))
-    table = estimate.Posterior(density, x).to_arviz()
+    table = identify.Posterior(density, x).to_arviz()
     assert {"inertia [a]", "inertia [b]"} <= set(table["posterior"].data_vars)
     assert "inertia [a][0, 0]" in arviz.summary(table).index
 
@@ -300,24 +348,24 @@ def test_several_bodies_go_to_arviz_by_name(fitted):
 @pytest.mark.usefixtures("unhooked")
 def test_what_is_refused(fitted):
     with pytest.raises(TypeError, match="density: wanted LogDensity"):
-        estimate.posterior(fitted, jax.random.key(0))
+        identify.posterior(fitted, jax.random.key(0))
     for wrong in (0.0, 1.0, -0.5):
         with pytest.raises(ValueError, match="acceptance: wanted"):
-            estimate.Nuts(acceptance=wrong)
-    with pytest.raises(TypeError, match="process: wanted RandomTorque or CorrelatedTorque"):
-        estimate.LogDensity(fitted, records.BODY)
+            identify.Nuts(acceptance=wrong)
+    with pytest.raises(TypeError, match="process: wanted a RandomTorque, a CorrelatedTorque"):
+        identify.LogDensity(fitted, records.BODY)
 
 
 def test_without_blackjax_it_says_what_is_missing(fitted, monkeypatch):
     monkeypatch.setitem(sys.modules, "blackjax", None)
     with pytest.raises(ImportError, match="blackjax is missing"):
-        estimate.posterior(estimate.LogDensity(fitted), jax.random.key(0))
+        identify.posterior(identify.LogDensity(fitted), jax.random.key(0))
 
 
 @pytest.mark.slow
 def test_a_fit_of_what_is_well_determined_is_found_again():
     fitted = whole_fit()
-    found = estimate.refit(estimate.LogDensity(fitted))
+    found = identify.refit(identify.LogDensity(fitted))
     assert found.converged
     deviation = np.sqrt(np.diagonal(fitted.covariance))
     np.testing.assert_allclose(found.x, found.density.x0, atol=1e-2 * deviation.min())
@@ -337,18 +385,18 @@ def shape(point):
 @pytest.mark.slow
 def test_a_torque_that_the_fit_knows_nothing_of():
     # Nine tenths of the misfit is the torque's: the plain fit is refused, this one holds the truth.
-    model = estimate.Model(records.BODY, rj.torques.RandomTorque(1e-3))
+    process = rj.torques.RandomTorque(1e-3)
     ts = jnp.linspace(0.0, 4.0, 80)
     made = []
     for k in range(3):
         keys = jax.random.split(jax.random.key(k), 2)
         spin = rj.Spin(records.START.omega + 0.3 * k)
-        real = records.truth(keys[0], model, spin, ts, 2)
+        real = records.truth(keys[0], process, spin, ts, 2)
         omega = records.gyro(keys[1], real.states.omega, 0.02)
         made.append(identify.Recording(ts, (identify.Gyro(0.02), omega)))
     plain = identify.fit(identify.Model(made, identify.PrincipalRatios()), starts=2)
     assert not plain.ok
-    found = estimate.refit(estimate.LogDensity(plain, rj.torques.RandomTorque(1e-4)))
+    found = identify.refit(identify.LogDensity(plain, rj.torques.RandomTorque(1e-4)))
     assert found.converged
 
     low, high = found.interval_of(shape, 0.999)
@@ -361,10 +409,10 @@ def test_a_torque_that_the_fit_knows_nothing_of():
 def test_nuts_agrees_with_the_fit_where_it_is_well_determined():
     fitted = whole_fit()
     pytest.importorskip("blackjax")
-    density = estimate.LogDensity(fitted)
+    density = identify.LogDensity(fitted)
     # blackjax leans on the promotions that our tests forbid.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        drawn = estimate.posterior(density, jax.random.key(0), sampler=estimate.Nuts(500, 300))
+        drawn = identify.posterior(density, jax.random.key(0), sampler=identify.Nuts(500, 300))
     assert (drawn.rhat < 1.01).all() and (drawn.ess > 500).all()
     x = np.asarray(drawn.x).reshape(-1, density.size)
     deviation = np.sqrt(np.diagonal(fitted.covariance))
@@ -374,8 +422,8 @@ def test_nuts_agrees_with_the_fit_where_it_is_well_determined():
 
 def test_weighted_draws_stand_for_the_density(fitted):
     # Nearly normal here: the draws have the mean and the covariance of the curvature.
-    density = estimate.LogDensity(fitted)
-    found = estimate.refit(density, draws=4000, key=jax.random.key(1))
+    density = identify.LogDensity(fitted)
+    found = identify.refit(density, draws=4000, key=jax.random.key(1))
     assert found.draws.shape == (4000, density.size) and found.effective > 1500
     np.testing.assert_allclose(found.weights.sum(), 1.0)
     # Each weight is as large as the density over that of the t, whose logarithm is written out.
@@ -397,16 +445,16 @@ def test_weighted_draws_stand_for_the_density(fitted):
     # Where the draws are worth nothing the curvature is taken: what is linear in x is normal.
     one = jnp.zeros_like(found.weights).at[0].set(1.0)
     poor = eqx.tree_at(lambda f: f.weights, found, one)
-    low, high = poor.interval_of(lambda point: point.x.own.spin)
-    at = poor.point.x.own.spin
+    low, high = poor.interval_of(lambda point: point.x[SPIN])
+    at = poor.point.x[SPIN]
     np.testing.assert_allclose(0.5 * (low + high), at, atol=1e-12)
-    low2, high2 = found.interval_of(lambda point: point.x.own.spin)
+    low2, high2 = found.interval_of(lambda point: point.x[SPIN])
     np.testing.assert_allclose(high2 - low2, high - low, rtol=0.15)
     early = eqx.tree_at(lambda f: f.converged, poor, jnp.asarray(False))
     with pytest.raises(ValueError, match="the search did not reach the maximum"):
-        early.interval_of(lambda point: point.x.own.spin)
+        early.interval_of(lambda point: point.x[SPIN])
     with pytest.raises(ValueError, match="draws: wanted"):
-        estimate.refit(density, draws=0)
+        identify.refit(density, draws=0)
 
 
 @pytest.mark.parametrize("process", [None, rj.torques.RandomTorque(0.03 / 11)])
@@ -418,18 +466,17 @@ def test_the_information_is_the_covariance_of_the_gradient(fitted, process):
 
     seen = identify.Recording(ts, (identify.Gyro(), jnp.ones((25, 3))))
     other = identify.Model(seen, identify.PrincipalRatios())
-    at = other.start(records.BODY)
-    at = eqx.tree_at(lambda p: p.own.spin, at, records.START.omega[None] / other.typical_rate)
-    found = dataclasses.replace(fitted, problem=other, parameters=at)
-    density = estimate.LogDensity(found, process, deviation=50.0)
+    at = other.start(records.BODY, omega=records.START.omega)
+    found = dataclasses.replace(fitted, model=other, x=at)
+    density = identify.LogDensity(found, process, deviation=50.0)
 
     def one(key):
         keys = jax.random.split(key, 2)
-        model = estimate.Model(body, process)
-        real = records.truth(keys[0], model, rj.Spin(records.START.omega), ts, 2)
+        torque = rj.torques.RandomTorque(0.0) if process is None else process
+        real = records.truth(keys[0], torque, rj.Spin(records.START.omega), ts, 2, body=body)
         omega = records.gyro(keys[1], real.states.omega, 0.02)
         where = lambda d: d.model.records.readings[0].values
-        return curvature(eqx.tree_at(where, density, omega[None]), density.x0)
+        return curvature(eqx.tree_at(where, density, omega[None]).model, density.x0)
 
     keys = jax.random.split(jax.random.key(5), many)
     found = jax.jit(lambda keys: jax.lax.map(one, keys))(keys)
@@ -445,6 +492,6 @@ def test_the_information_is_the_covariance_of_the_gradient(fitted, process):
 def test_a_fit_that_failed_without_the_torque_is_refused_with_the_way_out(fitted):
     lost = dataclasses.replace(fitted, covariance=jnp.full((5, 5), jnp.inf))
     with pytest.raises(ValueError, match=r"fewer free numbers\. *"):
-        estimate.LogDensity(lost)
+        identify.LogDensity(lost)
     with pytest.raises(ValueError, match="begin from a first guess"):
-        estimate.LogDensity(lost, rj.torques.RandomTorque(1e-4))
+        identify.LogDensity(lost, rj.torques.RandomTorque(1e-4))

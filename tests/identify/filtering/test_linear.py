@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from rigidjax.estimate import LinearModel, linear_filter, linear_smooth
+from rigidjax.identify import LinearModel, linear_filter, linear_smooth
 from rigidjax.identify.filtering import roots
 
 N, M, K, T = 3, 2, 2, 6

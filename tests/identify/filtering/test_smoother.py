@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
-from estimate import records
+from identify.filtering import records
 from once import once
 
 import rigidjax as rj
-from rigidjax import estimate, identify
-from rigidjax.identify.filtering.steps import Dynamics, Extended
+from rigidjax import identify
+from rigidjax.identify.filtering.steps import Extended, dynamics_of
 from rigidjax.motion.manifold import minus, plus
 
 COUNT = 5
@@ -19,10 +19,10 @@ COUNT = 5
 @pytest.fixture(scope="module")
 def short():
     """A few readings far apart of a body pushed hard: the motion is far from linear."""
-    model = estimate.Model(records.BODY, rj.torques.RandomTorque(0.05))
+    process = rj.torques.RandomTorque(0.05)
     keys = jax.random.split(jax.random.key(5), 3)
     ts = 0.25 * jnp.arange(COUNT, dtype=float)
-    real = records.truth(keys[0], model, records.START, ts, 5)
+    real = records.truth(keys[0], process, records.START, ts, 5)
     record = identify.Recording(
         ts,
         (identify.Gyro(0.1), records.gyro(keys[1], real.states.omega, 0.1)),
@@ -31,14 +31,16 @@ def short():
             records.direction(keys[2], real.states.q, records.SUN, 0.1),
         ),
     )
-    first = estimate.start(model, record, records.START, rate=0.3, attitude=0.3)
-    found = estimate.smooth(model, record, first, substeps=1, tolerance=1e-9, iterations=30)
+    model = records.known(record, process)
+    first = identify.first_belief(model, state=records.START, rate=0.3, attitude=0.3)
+    found = identify.smooth(model, first, substeps=1, tolerance=1e-9, iterations=30)
     return model, record, first, found
 
 
 def test_it_is_the_most_probable_motion(short):
     model, record, first, found = short
-    dynamics = Dynamics(model, first.x)
+    scene = identify.Scene(records.BODY, None, model.process, record.sensors, None)
+    dynamics = dynamics_of(scene, (), first.x)
 
     def residuals(z):
         """Of the first error and all kicks, in unit normal numbers."""
@@ -77,8 +79,8 @@ def test_it_is_the_most_probable_motion(short):
 
 
 def test_it_knows_more_than_the_filter(short):
-    model, record, first, found = short
-    passed = estimate.filter(model, record, first, substeps=1)
+    model, _, first, found = short
+    passed = identify.filter(model, first, substeps=1)
     sizes = [np.linalg.slogdet(run.belief.root[0])[1] for run in (found, passed)]
     assert sizes[0] < sizes[1] - 1
     assert found.change < 1e-9 and found.words == "followed"
@@ -92,10 +94,10 @@ def test_a_torque_that_is_not_in_the_equations_is_seen():
     law = rj.torques.Tabulated(ts, np.stack([0 * push, push, 0 * push], axis=1))
     real = rj.simulate(records.BODY, rj.Spin(records.START.omega), ts, law).ys
     noisy = records.gyro(jax.random.key(0), real.omega, 0.01)
-    model = estimate.Model(records.BODY, rj.torques.CorrelatedTorque(0.05, 0.5))
     record = identify.Recording(ts, (identify.Gyro(0.01), noisy))
-    first = estimate.start(model, record, rj.Spin(records.START.omega), rate=0.1)
-    found = estimate.smooth(model, record, first)
+    model = records.known(record, rj.torques.CorrelatedTorque(0.05, 0.5))
+    first = identify.first_belief(model, state=rj.Spin(records.START.omega), rate=0.1)
+    found = identify.smooth(model, first)
     torque = np.asarray(found.belief.torques[0])[found.rows]
     band = 2 * np.asarray(found.belief.deviation)[found.rows, 3:]
     inside = (ts > 1.2) & (ts < 1.8)
@@ -107,8 +109,8 @@ def test_a_torque_that_is_not_in_the_equations_is_seen():
 
 
 def test_a_motion_that_does_not_settle_is_told(short):
-    model, record, _, _ = short
+    model, _, _, _ = short
     wrong = rj.Attitude(rj.quaternion.exp(jnp.array([2.5, 0.0, 0.0])), records.START.omega)
-    first = estimate.start(model, record, wrong, rate=0.3, attitude=0.3)
+    first = identify.first_belief(model, state=wrong, rate=0.3, attitude=0.3)
     with pytest.raises(ValueError, match=r"smooth: the motion still moves|lost"):
-        estimate.smooth(model, record, first, substeps=1, iterations=1)
+        identify.smooth(model, first, substeps=1, iterations=1)

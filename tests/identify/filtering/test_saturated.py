@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from estimate import records
+from identify.filtering import records
 
 import rigidjax as rj
-from rigidjax import estimate, identify
+from rigidjax import identify
 
 COUNT, RATE = 1000, 2000 * np.pi / 180
 
@@ -23,9 +23,9 @@ def test_the_equations_of_motion_see_through_saturation():
     ts = 0.002 * jnp.arange(COUNT + 1, dtype=float)
     axis = np.array([0.4, 0.8, 0.5])
     start = rj.Attitude([1.0, 0, 0, 0], RATE * axis / np.linalg.norm(axis))
-    model = estimate.Model(records.BODY, rj.torques.RandomTorque(1e-3))
+    process = rj.torques.RandomTorque(1e-3)
     keys = jax.random.split(jax.random.key(0), 3)
-    real = records.truth(keys[0], model, start, ts, 4).states
+    real = records.truth(keys[0], process, start, ts, 4).states
     # 0.1 rad/s on each reading: a cheap gyro at such a rate.
     read = np.asarray(records.gyro(keys[1], real.omega, 0.1))
     limit = 25.0
@@ -35,8 +35,9 @@ def test_the_equations_of_motion_see_through_saturation():
     assert lost.mean() > 0.3
     record = identify.Recording(ts, (identify.Gyro(0.1, limit=limit), clipped, seen))
     guess = rj.Attitude([1.0, 0, 0, 0], start.omega * 1.01)
-    first = estimate.start(model, record, guess, rate=1.0, attitude=0.005)
-    found = estimate.filter(model, record, first)
+    model = records.known(record, process)
+    first = identify.first_belief(model, state=guess, rate=1.0, attitude=0.005)
+    found = identify.filter(model, first)
     end = jax.tree.map(lambda leaf: leaf[-1], found.states)
     off = angle(end.q, real.q[-1])
     # What integrating the readings gives, the last one held where one is missing.

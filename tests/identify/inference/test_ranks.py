@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from estimate import records
+from identify.filtering import records
 
 import rigidjax as rj
-from rigidjax import estimate, identify
+from rigidjax import identify
 
 TS = 0.03 * jnp.arange(40, dtype=float)
 NOISE = 0.02
@@ -28,7 +28,7 @@ PRIOR = identify.Entropic(rj.Inertia.from_principal(4.0 / 11, 8.0 / 11, 10.0 / 1
 # Of the logarithm of the torque's density.
 LAW, LAW_SPREAD = rj.torques.RandomTorque(0.05 / 11), 0.5
 RECORDS, BINS = 200, 10
-SAMPLER = estimate.Nuts(samples=150, warmup=60)
+SAMPLER = identify.Nuts(samples=150, warmup=60)
 # Every third draw of two chains.
 THIN = 3
 
@@ -38,7 +38,7 @@ def drawn_body(key):
     cell = 0.02
     line = cell * jnp.arange(-150.0, 150.0)
     centre = identify.Model(record(np.ones((TS.size, 3))), CHART).start(PRIOR.guess)
-    points = centre.body[None] + jnp.stack(jnp.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    points = centre[:2][None] + jnp.stack(jnp.meshgrid(line, line), axis=-1).reshape(-1, 2)
     log = jax.vmap(lambda x: -0.5 * jnp.sum(PRIOR.residuals(CHART.body(x), scaled=False) ** 2))
     # Of the numbers of a body those whose root has no negative eigenvalue: a flat body, which the
     # prior forbids, is between these and the others.
@@ -64,32 +64,30 @@ def made(key, body, process):
     omega = RATE + RATE_SPREAD * jax.random.normal(keys[0], (3,))
     bias = jnp.zeros(3) if process else BIAS_SPREAD * jax.random.normal(keys[1], (3,))
     truth = {"body": body, "rate": omega}
-    law = None
+    law = rj.torques.RandomTorque(0.0)
     if not process:
         truth["bias"] = bias
     else:
         log = LAW_SPREAD * jax.random.normal(keys[2])
         law = rj.torques.RandomTorque(LAW.density * jnp.exp(log))
         truth["process"] = log[None]
-    model = estimate.Model(CHART.body(body), law)
-    states = records.truth(keys[3], model, rj.Spin(omega), TS, 2).states
+    states = records.truth(keys[3], law, rj.Spin(omega), TS, 2, body=CHART.body(body)).states
     return records.gyro(keys[4], states.omega + bias[None], NOISE), truth
 
 
 def density_of(read, process):
-    bias = identify.Free(
-        lambda s: s.sensors[0].bias, "bias", scale=BIAS_SPREAD, prior=BIAS_SPREAD
-    )
+    bias = identify.Free(lambda s: s.sensors[0].bias, "bias", scale=BIAS_SPREAD, prior=BIAS_SPREAD)
     free = [] if process else [bias]
-    problem = identify.Model(record(read), CHART, free=free, prior=PRIOR)
+    law = LAW if process else None
+    model = identify.Model(record(read), CHART, process=law, free=free, prior=PRIOR)
     if not process:
-        return estimate.LogDensity(identify.fit(problem, starts=1))
-    first = identify.fit(problem, starts=1, max_steps=1)
-    return estimate.LogDensity(first, LAW, deviation=LAW_SPREAD)
+        return identify.LogDensity(identify.fit(model, starts=1))
+    first = identify.fit(model, starts=1, max_steps=1)
+    return identify.LogDensity(first, deviation=LAW_SPREAD)
 
 
 def numbers(point):
-    out = {"body": point.x.body, "rate": point.state0.omega, **point.values}
+    out = {"body": point.x[:2], "rate": point.state0.omega, **point.values}
     if point.process is not None:
         out["process"] = jnp.log(point.process.density / LAW.density)[:1]
     return out
@@ -107,7 +105,7 @@ def test_the_truth_has_any_rank_among_draws_by_nuts(process):
         density = density_of(read, process)
         # blackjax leans on the promotions that our tests forbid.
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-            found = estimate.posterior(density, mine[2], sampler=SAMPLER, chains=2)
+            found = identify.posterior(density, mine[2], sampler=SAMPLER, chains=2)
         effective.append(float(jnp.min(found.ess)))
         draws = found.of(numbers)
         # 99 draws: 100 ranks.

@@ -9,7 +9,7 @@ from surface.calls import leave_out, row
 from surface.scenes import TS, V
 
 import rigidjax as rj
-from rigidjax import estimate, identify
+from rigidjax import identify
 
 HOST = dict(host=True, transforms=())
 FEW = dict(groups=("stranger", "kind", "function"), transforms=())
@@ -17,71 +17,61 @@ FEW = dict(groups=("stranger", "kind", "function"), transforms=())
 
 @functools.cache
 def model():
-    return estimate.Model(s.inertia(), rj.torques.RandomTorque(0.1))
-
-
-@functools.cache
-def recording():
-    return identify.Recording(TS, (identify.Gyro(0.1), np.tile(V, (len(TS), 1))))
+    record = identify.Recording(TS, (identify.Gyro(0.1), np.tile(V, (len(TS), 1))))
+    return identify.Model(record, identify.Known(s.inertia()), process=rj.torques.RandomTorque(0.1))
 
 
 @functools.cache
 def belief():
-    return estimate.start(model(), recording(), rj.Spin(V), rate=0.1)
+    return identify.first_belief(model(), state=rj.Spin(V), rate=0.1)
 
 
 @functools.cache
 def linear():
-    return estimate.LinearModel(np.eye(2), 0.1 * np.eye(2), np.eye(2), np.ones(2))
+    return identify.LinearModel(np.eye(2), 0.1 * np.eye(2), np.eye(2), np.ones(2))
 
 
 row("motion.torques.RandomTorque", dict(density=np.abs(V)))
 row("motion.torques.CorrelatedTorque", dict(density=np.abs(V), time=0.5))
 row(
-    "estimate.Model",
-    lambda: dict(body=s.inertia(), torque=s.damping()),
-    groups=("stranger",),
-    transforms=(),
-)
-row(
-    "estimate.Walk",
+    "identify.Walk",
     dict(where=lambda s: s.sensors[0].bias, deviation=0.1, density=0.2),
     arguments=("deviation", "density"),
     groups=("stranger", "nan", "inf"),
     transforms=(),
 )
 row(
-    "estimate.start",
-    lambda: dict(model=model(), recording=recording(), state=s.attitude(), rate=0.1, attitude=0.2),
+    "identify.first_belief",
+    lambda: dict(model=model(), x=model().start(), state=s.attitude(), rate=0.1, attitude=0.2),
     groups=("stranger", "nan"),
-    arguments=("model", "recording", "state", "rate", "attitude"),
+    arguments=("model", "x", "state", "rate", "attitude"),
     transforms=(),
 )
 for name in ("filter", "smooth", "log_likelihood"):
     row(
-        f"estimate.{name}",
-        lambda: dict(model=model(), recording=recording(), first=belief()),
+        f"identify.{name}",
+        lambda: dict(model=model(), first=belief(), x=model().start()),
         groups=("stranger",),
         transforms=(),
     )
 row(
-    "estimate.step",
-    lambda: dict(model=model(), belief=belief(), t=0.3, value=V),
-    run=lambda model, belief, t, value: estimate.step(
-        model, belief, t, (identify.Gyro(0.1), value)
-    ),
+    "identify.step",
+    lambda: dict(model=model(), belief=belief(), t=0.3, reading=V, x=model().start()),
+    run=lambda model, belief, t, reading, x: identify.step(model, belief, t, reading, x=x),
     groups=("stranger", "shape"),
-    says=("reading",),
     transforms=(),
 )
 row(
-    "estimate.sample",
-    lambda: dict(key=jax.random.key(0), model=model(), state0=s.spin(), ts=TS, substeps=2),
+    "identify.sample",
+    lambda: dict(
+        key=jax.random.key(0), body=s.inertia(), state0=s.spin(), ts=TS, substeps=2,
+        process=rj.torques.RandomTorque(0.1), torque=s.damping(),
+    ),
     groups=("stranger",),
     transforms=(),
-)
+)  # fmt: skip
 row(
-    "estimate.LinearModel",
+    "identify.LinearModel",
     dict(
         transition=np.eye(2), noise=np.eye(2), matrix=np.eye(2), deviation=np.ones(2),
         push=np.ones(2), offset=np.ones(2),
@@ -92,18 +82,18 @@ row(
 )  # fmt: skip
 for name in ("linear_filter", "linear_smooth"):
     row(
-        f"estimate.{name}",
+        f"identify.{name}",
         lambda: dict(model=linear(), readings=np.ones((4, 2)), mean=np.zeros(2), root=np.eye(2)),
         groups=("stranger", "shape"),
         transforms=("jit", "grad"),
     )
 row(
-    "estimate.Nuts",
+    "identify.Nuts",
     dict(samples=10, warmup=10, acceptance=0.8),
     groups=("stranger",),
     transforms=(),
 )
-leave_out("made by start and by each filter", "identify.Belief")
+leave_out("made by first_belief and by each filter", "identify.Belief")
 leave_out(
     "what a function returns",
     *(
@@ -112,8 +102,8 @@ leave_out(
     ),
     "identify.LinearEstimate",
 )
-leave_out("made of a fit, which takes long; see tests/estimate", "estimate.LogDensity")
+leave_out("made of a fit, which takes long; see tests/identify/inference", "identify.LogDensity")
 leave_out(
-    "takes a LogDensity, and long; see tests/estimate",
-    *(f"estimate.{name}" for name in ("posterior", "Posterior", "refit", "Refit")),
+    "takes a LogDensity, and long; see tests/identify/inference",
+    *(f"identify.{name}" for name in ("posterior", "Posterior", "refit", "Refit")),
 )

@@ -1,0 +1,98 @@
+"""Errors of the sensors that drift while a recording is made, and that the filter follows."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax.identify.model.free import leaf_at, leaves_at
+from rigidjax.identify.model.scene import Scene
+
+
+class Walk(eqx.Module):
+    """An unknown sensor error that drifts: `dx = √density dW`, a random walk.
+
+    **Arguments:**
+
+    - `where`: picks it from a `Scene`, as a `Free` does: `lambda s: s.sensors[0].bias`. Its value
+      there is the initial value.
+    - `deviation`: the standard deviation of the initial value, one number or one for each
+      component, in its unit.
+    - `density`: the density of the drift, unit²/s, one number or one for each component: zero for a
+      constant error.
+
+    **Raises** `ValueError` for a deviation or density below zero.
+
+    >>> Walk(lambda s: s.sensors[0].bias, 0.01).density.tolist()
+    0.0
+    """
+
+    where: Callable[[Scene], Any] = eqx.field(static=True)
+    deviation: Array
+    density: Array
+
+    def __init__(self, where: Callable[[Scene], Any], deviation: Any, density: Any = 0.0):
+        words = "of a scene, such as lambda s: s.sensors[0].bias"
+        self.where = _checks.function(where, "where", words)
+        self.deviation = not_negative(deviation, "deviation")
+        self.density = not_negative(density, "density")
+
+
+class Drift(eqx.Module):
+    """A `Walk` whose leaf in the scene is known.
+
+    `path` is the way to the leaf in the scene; `deviation` and `density` have the shape of the
+    leaf. No function is kept: a second model does not compile again.
+    """
+
+    path: tuple[Any, ...] = eqx.field(static=True)
+    deviation: Float[Array, "*shape"]
+    density: Float[Array, "*shape"]
+
+
+def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]:
+    """Return the drift of each `Walk` in a scene."""
+    wanted = "a sequence of Walk(where, deviation)"
+    _checks.instance(walks, (Walk, Sequence), "walks", wanted=wanted)
+    drifts: list[Drift] = []
+    for walk in (walks,) if isinstance(walks, Walk) else tuple(walks):
+        _checks.instance(walk, Walk, "walks", wanted=wanted)
+        path, value = leaf_at(walk.where, scene, "Walk", "the sensor")
+        if path[0].name != "sensors":
+            raise ValueError(
+                f"Walk: wanted a number of a sensor, such as s.sensors[0].bias, got one of the "
+                f"{path[0].name}; a torque that is not known is a process"
+            )
+        if any(drift.path == path for drift in drifts):
+            raise ValueError("Walk: another Walk moves the same numbers")
+        value = jnp.asarray(value)
+        parts = (
+            in_shape(number, value.shape, name).astype(value.dtype)
+            for number, name in ((walk.deviation, "deviation"), (walk.density, "density"))
+        )
+        drifts.append(Drift(path, *parts))
+    return tuple(drifts)
+
+
+def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
+    """Return the numbers of a scene that drift."""
+    return leaves_at(scene, [drift.path for drift in drifts])
+
+
+def not_negative(value: Any, name: str) -> Array:
+    """Return finite numbers, if none is below zero; else raise `ValueError`."""
+    array, wanted = _checks.numbers(value, name), "a finite number that is not below zero"
+    if not array.size:
+        raise ValueError(f"{name}: wanted {wanted}, got none")
+    return _checks.sign(array, name, wanted, zero=True)
+
+
+def in_shape(value: Any, shape: tuple[int, ...], name: str) -> Array:
+    """Return one number, or numbers of this shape, in this shape; none is below zero."""
+    numbers = not_negative(value, name)
+    if numbers.shape not in ((), shape):
+        raise ValueError(f"{name}: wanted one number or shape {shape}, got {numbers.shape}")
+    return jnp.broadcast_to(numbers, shape)
