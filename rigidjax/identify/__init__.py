@@ -1,6 +1,7 @@
 """Identification: from recordings to a body, with its uncertainty."""
 
 from rigidjax._names import show
+from rigidjax.cli.logs.table import read_table as read_table
 from rigidjax.identify import report as report
 from rigidjax.identify.body_charts import (
     AbstractBodyChart as AbstractBodyChart,
@@ -12,7 +13,6 @@ from rigidjax.identify.body_charts import (
     Tensor as Tensor,
 )
 from rigidjax.identify.compare import compare as compare, cross_validate as cross_validate
-from rigidjax.identify.csv_io import read_table as read_table
 from rigidjax.identify.design import (
     best_first_rate as best_first_rate,
     expected as expected,

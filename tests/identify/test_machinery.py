@@ -16,9 +16,10 @@ from jax.flatten_util import ravel_pytree
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.__main__ import main
-from rigidjax.identify import checkpoint, cli_spec, quantities, search
-from rigidjax.identify.csv_io import LogError
+from rigidjax.cli import spec
+from rigidjax.cli.command import main
+from rigidjax.cli.logs.errors import LogError
+from rigidjax.identify import checkpoint, quantities, search
 from rigidjax.identify.multiple_shooting import pieces
 from rigidjax.identify.padding import one
 from rigidjax.identify.parameters import local, places
@@ -328,11 +329,11 @@ def test_sensors_and_wheels_of_one_kind_have_names_of_their_own(tmp_path):
     path, rng = tmp_path / "log.csv", np.random.default_rng(0)
     table = np.column_stack([np.arange(20.0), rng.normal(size=(20, 8))])
     np.savetxt(path, table, delimiter=",", header="t,a,b,c,d,e,f,s,r")
-    channels = [cli_spec.channel(text) for text in ("gyro=a,b,c", "gyro=d,e,f")]
-    wheels = [cli_spec.wheel(text) for text in ("s:1e-6:x", "r:1e-6:y")]
+    channels = [spec.channel(text) for text in ("gyro=a,b,c", "gyro=d,e,f")]
+    wheels = [spec.wheel(text) for text in ("s:1e-6:x", "r:1e-6:y")]
     free = ("bias", "delay")
-    record = cli_spec.read_log(path, channels, wheels=wheels, free=free)
-    slots = cli_spec.problem_of([record], "tensor", free=free).slots
+    record = spec.read_log(path, channels, wheels=wheels, free=free)
+    slots = spec.problem_of([record], "tensor", free=free).slots
     names = ["gyro 1 bias", "gyro 2 bias", "wheel 1 delay", "wheel 2 delay"]
     assert [slot.name for slot in slots] == names
 

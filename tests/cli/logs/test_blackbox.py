@@ -6,9 +6,10 @@ import sys
 import numpy as np
 import pytest
 
-from rigidjax.__main__ import main
+from rigidjax.cli.command import main
+from rigidjax.cli.logs.errors import LogError
+from rigidjax.cli.logs.layouts import USUAL, layout_of
 from rigidjax.identify import read_table
-from rigidjax.identify.csv_io import USUAL, LogError, layout_of
 
 PHYPHOX = '"Time (s)","{0} x (rad/s)","{0} y (rad/s)","{0} z (rad/s)","{1} (rad/s)"\n'
 

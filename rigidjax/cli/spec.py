@@ -11,8 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax.identify import body_charts, csv_io
-from rigidjax.identify.csv_io import UNITS, USUAL as USUAL, LogError, layout_of as layout_of
+from rigidjax.cli.logs.errors import LogError
+from rigidjax.cli.logs.table import read_table
+from rigidjax.cli.logs.times import increasing
+from rigidjax.cli.logs.units import UNITS
+from rigidjax.identify import body_charts
 from rigidjax.identify.loss import Huber, SoftL1
 from rigidjax.identify.parameters import Free
 from rigidjax.identify.problem import Problem
@@ -136,9 +139,9 @@ def read_log(
     # Two wheels may share a column of their speed.
     turning = dict.fromkeys(w.column for w in wheels)
     names = [time, *(c for one in channels for c in one.columns), *turning]
-    table = csv_io.read_table(path, names)
+    table = read_table(path, names)
     t = table[time] * UNITS[time_unit]
-    csv_io.increasing(path, t, time)
+    increasing(path, t, time)
     inside = np.ones(t.shape, bool)
     if window is not None:
         inside = (t >= window[0] - 1e-12) & (t <= window[1] + 1e-12)

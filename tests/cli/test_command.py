@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax import __main__ as command
-from rigidjax.__main__ import main
+from rigidjax.cli import command
+from rigidjax.cli.command import main
 from rigidjax.identify.answers import Answer
 
 GOOD = "t,wx,wy,wz\n" + "\n".join(f"{k},{np.cos(k):.6f},{np.sin(k):.6f},1.0" for k in range(12))
@@ -224,7 +224,7 @@ def test_ctrl_c_is_not_lost_in_the_garbage_collector(monkeypatch):
 
 
 def test_a_reader_that_stops_reading_does_not_stop_what_is_written_after():
-    says = "import sys; from rigidjax.__main__ import _say; sys.stdin.read(); _say('1'); _say('2'); print('on', file=sys.stderr)"
+    says = "import sys; from rigidjax.cli.command import _say; sys.stdin.read(); _say('1'); _say('2'); print('on', file=sys.stderr)"
     pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     run = subprocess.Popen([sys.executable, "-c", says], text=True, **pipes)
     assert run.stdout is not None
@@ -268,7 +268,7 @@ def test_mistakes_are_told_before_the_fit(options, words, folder, capsys):
 
 
 def test_the_charts_of_other_commands_are_named_as_they_are_written(folder, capsys):
-    stored = Path(__file__).parent / "workprecision" / "record.csv"
+    stored = Path(__file__).parents[1] / "workprecision" / "record.csv"
     rows = stored.read_text().replace("simulate", r"s$\badcmd{$")
     Path("stored.csv").write_text("\n".join(rows.splitlines()[:20]))
     assert main(["workprecision", "--from", "stored.csv", "--figure", "chart"]) == 0

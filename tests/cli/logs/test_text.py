@@ -8,8 +8,9 @@ import pytest
 from scipy.io import savemat
 
 import rigidjax as rj
-from rigidjax.__main__ import main
-from rigidjax.identify.csv_io import LogError, layout_of
+from rigidjax.cli.command import main
+from rigidjax.cli.logs.errors import LogError
+from rigidjax.cli.logs.layouts import layout_of
 
 GOOD = "t,wx,wy,wz\n" + "\n".join(
     f"{0.1 * k:.1f},{np.cos(k):.6f},{np.sin(k):.6f},1.0" for k in range(12)

@@ -1,0 +1,1 @@
+"""The command line: `command` runs it, `spec` makes a problem of its options, `logs` reads."""

@@ -1,0 +1,22 @@
+"""NumPy's and MATLAB's files of arrays."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rigidjax.cli.logs.columns import Columns
+
+
+def npz(path: Path, columns: Sequence[str]) -> Columns:
+    # NumPy does not close a file that it opened itself and cannot read.
+    with path.open("rb") as raw, np.load(raw) as file:
+        return file.files, {name: file[name] for name in columns if name in file.files}
+
+
+def mat(path: Path, columns: Sequence[str]) -> Columns:
+    from scipy.io import loadmat, whosmat
+
+    with path.open("rb") as raw:
+        names = [name for name, *_ in whosmat(raw)]
+        return names, loadmat(raw, variable_names=list(columns))

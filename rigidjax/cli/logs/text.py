@@ -1,0 +1,105 @@
+"""Logs in text: a header line, then numbers. Errors name file, line and column."""
+
+import csv
+import itertools
+import math
+import re
+from array import array
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple, TextIO
+
+import numpy as np
+
+from rigidjax.cli.logs.errors import LogError
+
+SEPARATORS = ",;\t"
+
+
+class Header(NamedTuple):
+    """Column names; their separator; the number of their line; the lines read after it."""
+
+    names: list[str]
+    separator: str
+    line: int
+    after: list[str]
+
+
+def read_header(file: TextIO) -> Header:
+    """The header of a text, read from its beginning: the first line, below comments (`#`).
+
+    It may be the last comment, as `numpy.savetxt` writes it: then numbers follow.
+    """
+    comments, first, line = "", file.readline(_LONGEST), 1
+    while first.startswith("#") or (first and not first.strip()):
+        comments = first if first.startswith("#") else comments
+        first, line = file.readline(_LONGEST), line + 1
+    names, separator = _split(first)
+    if comments and (not first or any(map(_NUMBER.fullmatch, names))):
+        return Header(*_split(comments.lstrip("#")), line - 1, [first])
+    return Header(names, separator, line, [])
+
+
+# A file of one endless line is not read for its header; what `csv` takes as one cell.
+_LONGEST = 131_072
+_NUMBER = re.compile(r"[-+.\d][-+.\deE]*")
+
+
+def _split(first: str) -> tuple[list[str], str]:
+    """The names in a line, and what separates them: whichever gives most of them."""
+    separator = max(SEPARATORS, key=first.count)
+    return [name.strip() for name in next(csv.reader([first], delimiter=separator), [])], separator
+
+
+def rows(path: Path, file: TextIO, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    header, separator, top, after = read_header(file)
+    if not any(header):
+        raise LogError(f"{path}: line 1: wanted a header with the columns {', '.join(columns)}")
+    for name in columns:
+        if name not in header:
+            advice = (
+                "names and numbers are separated by commas, semicolons or tabs"
+                if len(header) == 1
+                else "name yours with --columns or --sensor"
+            )
+            raise LogError(
+                f"{path}: line {top}: no column {name!r}; the columns are {', '.join(header)} "
+                f"({advice})"
+            )
+        if header.count(name) > 1:
+            raise LogError(
+                f"{path}: line {top}: {header.count(name)} columns are called {name!r}: which one?"
+            )
+    wanted = [(name, header.index(name), array("d")) for name in columns]
+    reader = csv.reader(itertools.chain(after, file), delimiter=separator)
+    for cells in reader:
+        line = reader.line_num + top
+        if len(cells) > len(header) and any(cell.strip() for cell in cells[len(header) :]):
+            raise LogError(
+                f"{path}: line {line}: {len(cells)} cells, but the header names {len(header)} "
+                "columns"
+            )
+        if any(cell.strip() for cell in cells):
+            for name, place, numbers in wanted:
+                if place >= len(cells):
+                    raise LogError(f"{path}: line {line}: column {name!r}: the line ends before it")
+                try:
+                    numbers.append(_number(cells[place].strip()))
+                except ValueError as error:
+                    raise LogError(f"{path}: line {line}: column {name!r}: {error}") from None
+    return {name: np.frombuffer(numbers, float) for name, _, numbers in wanted}
+
+
+def _number(cell: str) -> float:
+    if not cell:
+        return math.nan
+    # Python's own spelling of numbers is wider than that of logs: 1_000, other alphabets' digits.
+    plain = cell.isascii() and "_" not in cell
+    try:
+        value = float(cell if plain else "")
+    except ValueError:
+        comma = "; a decimal comma? wanted a point" if "," in cell else ""
+        raise ValueError(f"{cell!r} is not a number{comma}") from None
+    if not math.isfinite(value):
+        raise ValueError(f"{cell} is not a finite number; leave the cell empty for a gap")
+    return value
