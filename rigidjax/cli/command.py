@@ -2,11 +2,14 @@
 
 import _thread
 import argparse
+import contextlib
+import dataclasses
 import functools
 import os
 import sys
 import threading
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -16,8 +19,9 @@ import numpy as np
 import rigidjax as rj
 from rigidjax import _checks
 from rigidjax.cli import spec
-from rigidjax.cli.logs.errors import LogError
-from rigidjax.cli.logs.layouts import USUAL, layout_of
+from rigidjax.cli.logs.errors import LogError, LogWarning
+from rigidjax.cli.logs.layouts import layout_of
+from rigidjax.cli.logs.units import TIME_UNITS, unit_in
 from rigidjax.workprecision import command as workprecision
 
 # The options that the demo uses as well; the others describe how to read logs.
@@ -164,27 +168,37 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--columns": dict(
         nargs=4, metavar=("T", "WX", "WY", "WZ"), help="names of the time column and of the three "
         "body rates (default: t wx wy wz; those of phyphox and of binary logs are known)"),
+    "--time": dict(
+        metavar="COLUMN", help="name of the time column alone, beside --sensor (default: t)"),
     "--unit": dict(
         choices=("rad/s", "deg/s"),
-        help="of the rates (default: rad/s; Blackbox and Crazyflie deg/s)"),
+        help="of the rates (default: as the names of the columns say, such as 'x (deg/s)', else "
+        "rad/s; Blackbox and Crazyflie deg/s)"),
     "--noise": dict(
-        nargs="+", type=float, help="standard deviation of a rate, in --unit, one number or one "
-        "for each axis (default: estimated)"),
+        nargs="+", type=float, help="standard deviation of a rate, in the unit of the rates, one "
+        "number or one for each axis (default: estimated)"),
     "--limit": dict(
-        type=float, help="full scale of the rates, in --unit: a reading at it counts as at least "
-        "that much (default: found where the log shows a plateau)"),
+        type=float, help="full scale of the rates, in their unit: a reading at it counts as at "
+        "least that much (default: found where the log shows a plateau)"),
     "--loss": dict(
         choices=tuple(spec.LOSSES), default="soft-l1",
         help="how an outlier counts: linearly, or squared (none; default: soft-l1)"),
     "--sensor": dict(
         action="append", metavar="KIND=COLUMNS[:UNIT[:NOISE]]",
         help="instead of --columns: gyro=wx,wy,wz:deg/s:0.1, accelerometer=ax,ay,az:m/s2, "
-        "quaternion=qw,qx,qy,qz, euler-ZYX=yaw,pitch,roll:deg (body to world); may be repeated"),
+        "quaternion=qw,qx,qy,qz, euler-ZYX=yaw,pitch,roll:deg (body to world); may be repeated; "
+        "without UNIT as the names of the columns say"),
     "--time-unit": dict(
-        choices=("s", "ms", "us"),
-        help="of the time column (default: s; Blackbox, PX4 and Crazyflie us)"),
+        choices=TIME_UNITS,
+        help="of the time column (default: as its name says, such as 't [ms]', else s; Blackbox, "
+        "PX4 and Crazyflie us)"),
     "--window": dict(
-        nargs=2, type=float, metavar=("FROM", "TO"), help="use these seconds only"),
+        nargs=2, type=float, metavar=("FROM", "TO"),
+        help="use these seconds only, from the first time in the log"),
+    "--flight": dict(
+        type=int, metavar="N", help="which flight of a Blackbox log that holds several, from 1"),
+    "--strict": _FLAG | dict(
+        help="refuse a log of which rows or frames would be left out, or whose units are doubtful"),
     "--wheel": dict(
         action="append", default=[], metavar="COLUMN:INERTIA[:AXIS[:UNIT]]",
         help="a wheel whose speed was logged: its inertia in kg m², axis x, y or z, rad/s or rpm"),
@@ -218,10 +232,10 @@ def _parser() -> argparse.ArgumentParser:
     identify = commands.add_parser(
         "identify",
         help="fit a body and its motion to recordings",
-        description="Fit a body's inertia and motion to logs (.csv with a header line, .npz, "
-        ".mat, Blackbox's .bbl and .bfl, PX4's .ulg, .mcap, a Crazyflie's), several together if "
-        "several are given; or, with --demo, "
-        "to the radar observations of asteroid 4179 Toutatis.",
+        description="Fit a body's inertia and motion to logs (.csv or .csv.gz with a header line, "
+        ".npz, .mat, Blackbox's .bbl and .bfl, PX4's .ulg, .mcap, a Crazyflie's), several together "
+        "if several are given; or, with --demo, to the radar observations of asteroid "
+        "4179 Toutatis.",
         epilog="A throw with a gyro and a flywheel whose inertia is known: identify throw1.csv "
         "throw2.csv --wheel flywheel:1.2e-6:z --model tensor --typical 3e-4 --free drag bias "
         "--report throws.html",
@@ -251,8 +265,8 @@ def _demo(options: argparse.Namespace) -> int:
     return _write(found, options, title, [toutatis.CITATION], [title], units, more)
 
 
-def _channels(options: argparse.Namespace, rates: Sequence[str], unit: str) -> list[Any]:
-    """The sensors that are described."""
+def _channels(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Channel]:
+    """Return the sensors that the options describe."""
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
         if alone:
@@ -261,34 +275,72 @@ def _channels(options: argparse.Namespace, rates: Sequence[str], unit: str) -> l
     noise = None if options.noise is None else spec.noises(options.noise, "--noise")
     if options.limit is not None and not options.limit > 0:
         raise LogError(f"--limit: wanted a positive number, got {options.limit}")
-    return [spec.Channel("gyro", tuple(rates), unit, noise, options.limit)]
+    return [spec.Channel("gyro", tuple(rates), options.unit, noise, options.limit)]
 
 
 def _read(options: argparse.Namespace) -> tuple[list[Any], list[Any], rj.identify.Problem]:
     """The sensors, the recordings, and the problem that the options describe."""
-    layout = layout_of(options.logs[0]) if options.columns is None else USUAL
-    time, *rates = options.columns or layout.columns
-    channels = _channels(options, rates, options.unit or layout.unit)
+    if options.columns and options.time:
+        raise LogError("--time: the first of --columns is it already")
     wheels = [spec.wheel(text) for text in options.wheel]
     if options.model in ("tensor", "principal") and not wheels:
         words = "free motion shows ratios only; a scale needs a --wheel"
         raise LogError(f"--model {options.model}: {words}")
     if "delay" in options.free and not wheels:
         raise LogError("--free delay: that of a --wheel, and there is none")
-    how: dict[str, Any] = dict(time=time, time_unit=options.time_unit or layout.time_unit)
-    how |= dict(window=options.window, wheels=wheels, free=options.free)
-    records = [spec.read_log(path, channels, **how) for path in options.logs]
+    how: dict[str, Any] = dict(window=options.window, wheels=wheels, free=options.free)
+    records, of_first = [], None
+    for path in options.logs:
+        time, *rates = options.columns or layout_of(path).columns
+        time = options.time or time
+        time_unit = spec.unit_of_time(path, time, options.time_unit)
+        channels = [
+            dataclasses.replace(one, unit=spec.unit_of_channel(path, one))
+            for one in _channels(options, rates)
+        ]
+        _say_units(path, time, time_unit, channels)
+        how |= dict(time=time, time_unit=time_unit, flight=options.flight)
+        records.append(spec.read_log(path, channels, **how))
+        of_first = of_first or channels
     problem = spec.problem_of(
         records, options.model, typical=options.typical, free=options.free, loss=options.loss
     )
-    return channels, records, problem
+    return of_first or [], records, problem
+
+
+def _say_units(path: str, time: str, time_unit: str, channels: Sequence[spec.Channel]) -> None:
+    """Say which units were read from the names of columns."""
+    units = [("time", (time,), time_unit)] + [(one.kind, one.columns, one.unit) for one in channels]
+    words = [f"{what} in {unit}" for what, names, unit in units if unit_in(names[0], [unit or ""])]
+    if words:
+        _say(f"{path}: {', '.join(words)}, as the names of its columns say")
+
+
+@contextlib.contextmanager
+def _log_warnings(strict: bool) -> Iterator[None]:
+    """Say warnings of logs in one line each, or raise the first of them where that is wanted."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error" if strict else "always", LogWarning)
+        usual = warnings.showwarning
+
+        def show(message: Any, category: type[Warning], *where: Any, **how: Any) -> None:
+            if issubclass(category, LogWarning):
+                _say(str(message))
+            else:
+                usual(message, category, *where, **how)
+
+        warnings.showwarning = show
+        yield
 
 
 def _logs(options: argparse.Namespace) -> int:
     try:
-        channels, records, problem = _read(options)
+        with _log_warnings(options.strict):
+            channels, records, problem = _read(options)
     except ValueError as error:
         return _error(error)
+    except LogWarning as warning:
+        return _error(f"{warning} (--strict)")
     for path, record in zip(options.logs, records, strict=True):
         gaps = sum(int((~reading.seen).sum()) for reading in record.readings) + record.dropped
         told = f", {gaps} gap{'s' if gaps > 1 else ''}" if gaps else ""

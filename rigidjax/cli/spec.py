@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from rigidjax.cli.logs.errors import LogError
+from rigidjax.cli.logs.layouts import usual_unit
 from rigidjax.cli.logs.table import read_table
-from rigidjax.cli.logs.times import increasing
-from rigidjax.cli.logs.units import UNITS
+from rigidjax.cli.logs.times import increasing, kept_rows, remark_on_step
+from rigidjax.cli.logs.units import TIME_UNITS, UNITS, unit_of
 from rigidjax.identify import body_charts
 from rigidjax.identify.loss import Huber, SoftL1
 from rigidjax.identify.parameters import Free
@@ -41,22 +42,27 @@ SENSOR_UNITS = {
     "euler": ("rad", "deg"),
 }
 
+_WHEEL_UNITS = ("rad/s", "rpm")
+
 
 class Channel(eqx.Module):
-    """One sensor of a log; noise (of each axis) and full scale in its unit."""
+    """One sensor of a log; noise (of each axis) and full scale in its unit.
+
+    `unit` is `None` where the names of the columns, or else what is usual, shall decide.
+    """
 
     kind: str
     columns: tuple[str, ...]
-    unit: str
+    unit: str | None
     noise: tuple[float, ...] | None
     limit: float | None = None
 
 
 class WheelColumn(eqx.Module):
-    """A wheel whose speed was logged: column, unit, inertia (kg m²), axis."""
+    """A wheel whose speed was logged: column, unit (as in `Channel`), inertia (kg m²), axis."""
 
     column: str
-    unit: str
+    unit: str | None
     inertia: float
     axis: tuple[float, float, float]
 
@@ -71,8 +77,8 @@ def channel(text: str) -> Channel:
     kind, _, rest = text.partition("=")
     names, *more = rest.split(":")
     columns = tuple(name.strip() for name in names.split(","))
-    allowed = SENSOR_UNITS.get("euler" if kind.startswith("euler-") else kind)
-    if allowed is None or kind == "euler":
+    allowed = None if kind == "euler" else SENSOR_UNITS.get(kind.partition("-")[0])
+    if allowed is None:
         raise LogError(
             f"sensor {text!r}: wanted gyro, accelerometer, quaternion or euler-SEQUENCE, as in "
             "gyro=wx,wy,wz:deg/s"
@@ -80,8 +86,8 @@ def channel(text: str) -> Channel:
     wanted = 4 if kind == "quaternion" else 3
     if len(columns) != wanted or not all(columns):
         raise LogError(f"sensor {text!r}: wanted {wanted} columns, got {names!r}")
-    unit = more[0] if more and more[0] else allowed[0]
-    if unit not in allowed:
+    unit = more[0] if more and more[0] else None
+    if unit not in (None, *allowed):
         raise LogError(f"sensor {text!r}: wanted the unit {' or '.join(allowed)}, got {unit!r}")
     if len(more) < 2:
         return Channel(kind, columns, unit, None)
@@ -93,7 +99,7 @@ def channel(text: str) -> Channel:
 
 
 def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
-    """The noise of three axes, from one positive number or three; `LogError` for others."""
+    """Return the noise of three axes, from one positive number or three; `LogError` for others."""
     if len(noise) not in (1, 3):
         raise LogError(f"{where}: wanted one noise or three, got {len(noise)}")
     if not all(0 < part < np.inf for part in noise):
@@ -108,12 +114,12 @@ def wheel(text: str) -> WheelColumn:
     """
     name, *more = text.split(":")
     axis = more[1] if len(more) > 1 else "z"
-    unit = more[2] if len(more) > 2 else "rad/s"
+    unit = more[2] if len(more) > 2 else None
     try:
         inertia = float(more[0])
     except (IndexError, ValueError):
         raise LogError(f"wheel {text!r}: wanted COLUMN:INERTIA, as in flywheel:5.2e-7:z") from None
-    if axis not in ("x", "y", "z") or unit not in ("rad/s", "rpm"):
+    if axis not in ("x", "y", "z") or unit not in (None, *_WHEEL_UNITS):
         raise LogError(f"wheel {text!r}: wanted an axis x, y or z and a unit rad/s or rpm")
     x, y, z = (float(axis == one) for one in "xyz")
     return WheelColumn(name, unit, inertia, (x, y, z))
@@ -124,37 +130,50 @@ def read_log(
     channels: Sequence[Channel],
     *,
     time: str = "t",
-    time_unit: str = "s",
+    time_unit: str | None = None,
     window: tuple[float, float] | None = None,
     wheels: Sequence[WheelColumn] = (),
     free: Sequence[str] = (),
+    flight: int | None = None,
 ) -> Recording:
-    """One recording from a file, with the described sensors and wheels.
+    """Return one recording from a file, with the described sensors and wheels.
 
-    **Arguments:** `path`; `channels`; `time`, `time_unit` the time column; `window` (from, to), s,
-    or `None` for all; `wheels`; `free` some of `bias`, `drag`, `delay`: sensors and torque get
-    these numbers, so that a fit can move them. An empty cell is a gap. **Raises** `LogError` as
-    `read_table`.
+    Its times are counted from the first stamp of the log. An empty cell is a gap.
+
+    **Arguments:**
+
+    - `path`: the file; `flight` as in `read_table`;
+    - `channels`, `wheels`: what to read;
+    - `time`, `time_unit`: the time column; its name says the unit if that is `None`, else it is s;
+    - `window`: (from, to), s from the first stamp, or `None` for all;
+    - `free`: some of `bias`, `drag`, `delay`: sensors and torque get these numbers, so that a fit
+      can move them.
+
+    It **warns** as `read_table`, of rows that are left out because their times do not increase, and
+    of times that are plainly in another unit. **Raises** `LogError` as `read_table`, and for rates
+    that are all zero.
     """
+    unit = unit_of_time(path, time, time_unit)
     # Two wheels may share a column of their speed.
     turning = dict.fromkeys(w.column for w in wheels)
     names = [time, *(c for one in channels for c in one.columns), *turning]
-    table = read_table(path, names)
-    t = table[time] * UNITS[time_unit]
-    increasing(path, t, time)
-    inside = np.ones(t.shape, bool)
-    if window is not None:
-        inside = (t >= window[0] - 1e-12) & (t <= window[1] + 1e-12)
-        if inside.sum() < 4:
-            raise LogError(f"{path}: fewer than 4 samples between {window[0]} and {window[1]} s")
-    kept = slice(None) if inside.all() else inside
-    readings = []
+    table = read_table(path, names, flight=flight)
+    # Seconds since 1970, or nanoseconds, leave few digits for a step.
+    t = (table[time] - _first(table[time])) * UNITS[unit]
+    kept = kept_rows(path, t, time, window)
+    # A large log is not to be copied.
+    kept = slice(None) if kept.size == t.size else kept
+    readings, rate = [], 0.0
     for one in channels:
         values = np.stack([table[name] for name in one.columns], axis=1)
-        values *= UNITS[one.unit]
+        factor = UNITS[unit_of_channel(path, one)]
+        values *= factor
         seen = np.isfinite(values).all(axis=1)
-        sensor, values = _sensor(one, values, "bias" in free)
+        if one.kind == "gyro":
+            rate = _typical_rate(path, one, values[kept][seen[kept]])
+        sensor, values = _sensor(one, values, factor, "bias" in free)
         readings.append((sensor, values[kept], seen[kept]))
+    remark_on_step(path, t[kept], unit, rate)
     torque = _torque(path, t, table, wheels, free)
     # A large log is not to be held twice.
     del table
@@ -164,10 +183,45 @@ def read_log(
         raise LogError(f"{path}: {error}") from None
 
 
-def _sensor(one: Channel, values: np.ndarray, bias: bool) -> tuple[AbstractSensor, np.ndarray]:
+def _first(t: np.ndarray) -> float:
+    """Return the first time that there is, or zero."""
+    finite = np.isfinite(t)
+    return float(t[np.argmax(finite)]) if finite.any() else 0.0
+
+
+def unit_of_channel(path: str | Path, one: Channel) -> str:
+    """Return the unit that a channel states, its columns name, or that is usual in such a log."""
+    allowed = SENSOR_UNITS[one.kind.partition("-")[0]]
+    usual = usual_unit(path, one.columns[0]) or allowed[0]
+    return unit_of(one.columns, one.unit, usual, allowed, str(path))
+
+
+def unit_of_time(path: str | Path, column: str, stated: str | None) -> str:
+    """Return the unit of times that is stated, that their column names, or that is usual."""
+    usual = usual_unit(path, column) or "s"
+    return unit_of([column], stated, usual, TIME_UNITS, str(path))
+
+
+def _typical_rate(path: str | Path, one: Channel, rates: np.ndarray) -> float:
+    """Return the median magnitude of rates (n, 3), rad/s; `LogError` if there is none but zero."""
+    names = ", ".join(one.columns)
+    if not rates.size:
+        raise LogError(f"{path}: no row has a rate in each of the columns {names}")
+    if not rates.any():
+        raise LogError(
+            f"{path}: the rates ({names}) are all zero: a body at rest shows nothing of its "
+            "inertia, or the sensor was off"
+        )
+    return float(np.median(np.linalg.norm(rates, axis=1)))
+
+
+def _sensor(
+    one: Channel, values: np.ndarray, factor: float, bias: bool
+) -> tuple[AbstractSensor, np.ndarray]:
+    """Return the sensor of a channel, whose unit has this factor to SI, and its readings."""
     zero = [0.0, 0.0, 0.0] if bias else None
-    noise = None if one.noise is None else UNITS[one.unit] * np.array(one.noise)
-    limit = None if one.limit is None else one.limit * UNITS[one.unit]
+    noise = None if one.noise is None else factor * np.array(one.noise)
+    limit = None if one.limit is None else one.limit * factor
     if one.kind == "gyro":
         return Gyro(noise, bias=zero, limit=limit), values
     if one.kind == "accelerometer":
@@ -189,9 +243,12 @@ def _torque(
     free: Sequence[str],
 ) -> Torque | None:
     parts: list[Torque] = []
+    # A speed counts outside the window, too: before a reading and after it.
+    kept = increasing(t) if wheels else slice(None)
     for one in wheels:
+        unit = unit_of([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
         try:
-            speed = Series(t, table[one.column] * UNITS[one.unit])
+            speed = Series(t[kept], table[one.column][kept] * UNITS[unit])
         except ValueError as error:
             raise LogError(f"{path}: column {one.column!r}: {error}") from None
         delay = 0.0 if "delay" in free else None

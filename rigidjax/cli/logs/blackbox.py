@@ -1,9 +1,13 @@
-"""Blackbox logs of flight controllers, read by orangebox (an extra)."""
+"""Blackbox logs of flight controllers, whose fields are decoded by orangebox (an extra).
+
+The library hands on frames that stand on no I frame (a P frame holds differences), so that the
+order of frames is followed here, as the flight controllers' own decoder does.
+"""
 
 import math
 import struct
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,41 +15,215 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.cli.logs.columns import Columns
+from rigidjax.cli.logs.errors import LogError, warn
+
+# The bounds of the flight controllers' own decoder; times in µs, both counters have 32 bits.
+_LONGEST_FRAME, _ITERATION_JUMP, _TIME_JUMP, _WRAP = 256, 5_000, 10_000_000, 2**32
+# How many numbers of variable length follow each kind of event.
+_EVENT_NUMBERS = {0: 1, 14: 2, 15: 1, 30: 2}
+_RESUME, _ADJUSTMENT, _LOG_END = 14, 13, 255
+_END_MARK = b"End of log\0"
 
 
-def blackbox(path: Path, columns: Sequence[str]) -> Columns:
-    """The names of all fields, and the wanted ones, of the first flight in a Blackbox log.
+def blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
+    """Return the names of all fields, and the wanted ones, of one flight in a Blackbox log.
 
     Rates come in deg/s and accelerations in g by the scales in the header, as in the flight
     controllers' own viewer; other fields as logged. A log without its last mark is read to its end.
+    P frames before the first I frame, and frames from a hurt one to the next I frame, are left out
+    with a warning. **Raises** `LogError` where there are several flights and none is chosen.
     """
-    parser = _checks.library("orangebox", "blackbox", str(path)).Parser.load(str(path))
-    names = parser.field_names
-    wanted = {name: (names.index(name), array("d")) for name in columns if name in names}
-    try:
-        for frame in parser.frames():
-            for place, numbers in wanted.values():
-                numbers.append(float(frame.data[place]))
-    except (RuntimeError, IndexError, TypeError):
-        # At the end of a log without a last mark the parser raises one of these.
-        if parser.reader.tell() < len(parser.reader):
-            raise
-    scales = _scales(parser.headers)
-    return names, {
-        name: np.frombuffer(numbers, float) * scales.get(name.partition("[")[0], 1.0)
-        for name, (_, numbers) in wanted.items()
+    library = _checks.library("orangebox.reader", "blackbox", str(path))
+    pointers = library.Reader(str(path)).log_pointers
+    if flight is None and len(pointers) > 1 and columns:
+        ends = [*pointers[1:], path.stat().st_size]
+        sizes = ", ".join(f"{(b - a) / 1e3:.3g}" for a, b in zip(pointers, ends, strict=True))
+        raise LogError(
+            f"{path}: {len(pointers)} flights are in this log, of {sizes} kB; choose one: "
+            f"--flight 1 to {len(pointers)} (flight= in Python)"
+        )
+    if flight is not None and not 1 <= flight <= len(pointers):
+        raise LogError(f"{path}: no flight {flight}; it holds {len(pointers)}")
+    index = flight or 1
+    data = path.read_bytes()[pointers[index - 1] : (*pointers, None)[index]]
+    log = _Flight(library.Reader(str(path), index), data)
+    scales, wanted = _scales(log.headers), [name for name in columns if name in log.names]
+    rows = {name: array("d") for name in wanted}
+    for frame in log.frames():
+        for name, numbers in rows.items():
+            numbers.append(frame[name])
+    if log.left_out:
+        warn(
+            f"{path}: {log.left_out} of {log.count} frames are left out: they stand on no whole I "
+            "frame (the first one is missing, or a frame is hurt)"
+        )
+    return log.names, {
+        name: log.wrapped(name, np.frombuffer(numbers, float))
+        * scales.get(name.partition("[")[0], 1.0)
+        for name, numbers in rows.items()
     }
 
 
-def _scales(headers: dict[str, Any]) -> dict[str, float]:
-    """The factors of the raw numbers of some fields."""
-    found = {}
+class _Bytes:
+    """Iterate over bytes, as the library's decoders read them; `place` is that of the next one."""
+
+    def __init__(self, data: bytes, place: int):
+        self.data, self.place = data, place
+
+    def __next__(self) -> int:
+        self.place += 1
+        # An `IndexError` says that the data end within a frame.
+        return self.data[self.place - 1]
+
+
+class _Flight:
+    """One flight: its header, and its frames in the order of the log.
+
+    `count` is the number of I and P frames met so far, `left_out` that of those not handed on.
+    """
+
+    def __init__(self, reader: Any, data: bytes):
+        types = _checks.library("orangebox.types", "blackbox", "a Blackbox log")
+        context = _checks.library("orangebox.context", "blackbox", "a Blackbox log").Context
+        self.headers: Mapping[str, Any] = reader.headers
+        self.fields: Mapping[Any, Sequence[Any]] = reader.field_defs
+        self.context = context(self.headers, self.fields)
+        self.kinds = {ord(kind.value): kind for kind in types.FrameType}
+        self.kind, self.frame = types.FrameType, types.Frame
+        self.data, self.count, self.left_out = data, 0, 0
+        self.main = [field.name for field in self.fields[self.kind.INTRA]]
+        others = [self.fields.get(kind, ()) for kind in (self.kind.SLOW, self.kind.GPS)]
+        self.others = [field.name for kind in others for field in kind]
+        self.names = list(dict.fromkeys([*self.main, *self.others]))
+
+    def wrapped(self, name: str, values: np.ndarray) -> np.ndarray:
+        """Return the values of a field as the 32-bit numbers that the flight controller had."""
+        if name not in self.main or name == "time":
+            return values
+        if self.fields[self.kind.INTRA][self.main.index(name)].signed:
+            return (values + _WRAP / 2) % _WRAP - _WRAP / 2
+        return values % _WRAP
+
+    def frames(self) -> Iterator[Mapping[str, float]]:
+        """Yield the fields of each frame that stands on a whole I frame, by name.
+
+        Fields of slow and GPS frames have the values of the last such frame, NaN before the first.
+        """
+        stream, others = _Bytes(self.data, self._header_size()), dict.fromkeys(self.others, np.nan)
+        last, clock, valid, lost = None, None, False, 0
+        while stream.place < len(self.data):
+            kind = self.kinds.get(next(stream))
+            begin = stream.place
+            if kind is None or (kind != self.kind.EVENT and kind not in self.fields):
+                # A frame without its letter; erased memory at the end of a log is none.
+                lost, valid = lost + valid, False
+                continue
+            is_main = kind in (self.kind.INTRA, self.kind.INTER)
+            if is_main:
+                self.count, self.left_out = self.count + 1 + lost, self.left_out + lost
+                lost = 0
+            try:
+                if kind == self.kind.EVENT:
+                    event, numbers = self._event(stream)
+                    if event == _LOG_END:
+                        return
+                    last = tuple(numbers) if event == _RESUME else last
+                    continue
+                values = self._values(stream, kind)
+            except IndexError:
+                values = ()
+            if not values or stream.place - begin > _LONGEST_FRAME:
+                # The next frame may begin anywhere after the letter of this one.
+                stream.place, valid = begin, False
+                self.left_out += is_main
+                continue
+            if not is_main:
+                others |= zip((field.name for field in self.fields[kind]), values, strict=True)
+                if kind != self.kind.SLOW:
+                    self.context.add_frame(self.frame(kind, values))
+                continue
+            continues = last is None or _continues(last, values[:2])
+            if kind == self.kind.INTRA:
+                # What only looks like an I frame is seldom followed by the letter of another.
+                after = self.data[stream.place : stream.place + 1]
+                is_followed = not after or after[0] in self.kinds
+                valid = continues and (valid or is_followed)
+            else:
+                valid = valid and continues
+            if valid or kind == self.kind.INTRA:
+                # If an I frame does not continue the last one, either may be the hurt one: the next
+                # I frame is compared with the later.
+                last = values[:2]
+            if not valid:
+                self.left_out += 1
+                continue
+            self.context.last_iter = values[0]
+            self.context.add_frame(self.frame(kind, values))
+            clock = values[1] if clock is None else clock + (values[1] - clock) % _WRAP
+            yield others | dict(zip(self.main, values, strict=True)) | {"time": clock}
+
+    def _header_size(self) -> int:
+        """Return where the lines of the header end."""
+        place = 0
+        while self.data.startswith(b"H ", place):
+            place = self.data.index(b"\n", place) + 1
+        return place
+
+    def _values(self, stream: _Bytes, kind: Any) -> tuple[Any, ...]:
+        """Decode the fields of one frame."""
+        context, fields, values = self.context, self.fields[kind], ()
+        context.frame_type, context.field_index = kind, 0
+        while context.field_index < len(fields):
+            context.current_frame = values
+            raw = fields[context.field_index].decoderfun(stream, context)
+            for one in raw if isinstance(raw, tuple) else (raw,):
+                values += (fields[context.field_index].predictorfun(one, context),)
+                context.field_index += 1
+        return values
+
+    def _event(self, stream: _Bytes) -> tuple[int, list[int]]:
+        """Pass one event; return its kind (-1 for an unknown one) and its numbers."""
+        event = next(stream)
+        if event == _LOG_END:
+            is_last = self.data.startswith(_END_MARK, stream.place)
+            return (_LOG_END if is_last else -1), []
+        if event == _ADJUSTMENT:
+            if next(stream) > 127:
+                stream.place += 4
+                return event, []
+            return event, [_unsigned(stream)]
+        if event not in _EVENT_NUMBERS:
+            return -1, []
+        return event, [_unsigned(stream) for _ in range(_EVENT_NUMBERS[event])]
+
+
+def _unsigned(stream: _Bytes) -> int:
+    """Read a number of variable length: seven bits a byte, the eighth says that more follow."""
+    number, shift = 0, 0
+    while shift < 35:
+        byte = next(stream)
+        number |= (byte & 127) << shift
+        shift += 7
+        if byte < 128:
+            return number
+    return 0
+
+
+def _continues(last: Sequence[int], values: Sequence[int]) -> bool:
+    """Whether iteration and time of a frame go on from the last one, and not too far."""
+    iteration, time = ((new - old) % _WRAP for old, new in zip(last, values, strict=True))
+    return iteration < _ITERATION_JUMP and time < _TIME_JUMP
+
+
+def _scales(headers: Mapping[str, Any]) -> dict[str, float]:
+    """Return the factors of the raw numbers of some fields."""
+    factors = {}
     if "gyro_scale" in headers:
         value = headers["gyro_scale"]
         # Written as the bits of a float, which the parser takes for a whole number.
         scale = struct.unpack("f", struct.pack("I", value))[0] if isinstance(value, int) else value
         baseflight = "baseflight" in str(headers.get("Firmware type", "")).lower()
-        found["gyroADC"] = scale * (1e6 * 180 / math.pi if baseflight else 1.0)
+        factors["gyroADC"] = scale * (1e6 * 180 / math.pi if baseflight else 1.0)
     if "acc_1G" in headers:
-        found["accSmooth"] = 1.0 / float(headers["acc_1G"])
-    return found
+        factors["accSmooth"] = 1.0 / float(headers["acc_1G"])
+    return factors

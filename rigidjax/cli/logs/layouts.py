@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rigidjax.cli.logs.table import BINARY, kind_of
-from rigidjax.cli.logs.text import read_header
+from rigidjax.cli.logs.text import opened, read_header
+from rigidjax.cli.logs.units import TIME_UNITS, unit_in
 
 
 class Layout(NamedTuple):
@@ -20,34 +21,64 @@ class Layout(NamedTuple):
 USUAL = Layout(("t", "wx", "wy", "wz"), "rad/s", "s")
 
 
+# The units of fields in logs that have no units in their names.
+_UNITS = {
+    ".bbl": {"time": "us", "gyroADC": "deg/s", "accSmooth": "g"},
+    ".ulg": {"timestamp": "us"},
+    ".usd": {"timestamp": "us", "gyro": "deg/s", "acc": "g"},
+}
+_UNITS[".bfl"] = _UNITS[".bbl"]
+
+
+def usual_unit(path: str | Path, name: str) -> str | None:
+    """Return the unit that a column of a binary log is known to have, or `None`."""
+    units = _UNITS.get(kind_of(Path(path)), {})
+    return next((units[part] for part in re.split(r"[.\[]", name) if part in units), None)
+
+
 def layout_of(path: str | Path) -> Layout:
-    """The layout of a log: phyphox (any language) or a binary one if it has rates, else `USUAL`."""
+    """Return the layout of a log, else `USUAL`.
+
+    That of a text is read from the units in its names, as phyphox writes them in any language.
+    """
     path = Path(path)
-    if kind_of(path) in BINARY:
-        # Whoever reads it says what is wrong.
-        with contextlib.suppress(Exception):
+    # Whoever reads the log says what is wrong with it.
+    with contextlib.suppress(Exception):
+        if kind_of(path) in BINARY:
             return _of_binary(path) or USUAL
-        return USUAL
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            names = read_header(file).names
-    except (OSError, UnicodeDecodeError):
-        return USUAL
-    times = [name for name in names if re.search(r"\(s\)$", name)]
-    rates = [name for axis in "xyz" for name in names if re.search(rf"\b{axis} \(rad/s\)$", name)]
-    if len(times) == 1 and len(rates) == 3:
-        x, y, z = rates
-        return Layout((times[0], x, y, z), "rad/s", "s")
+        with opened(path) as file:
+            return _of_names(read_header(file).names) or USUAL
     return USUAL
 
 
+def _of_names(names: list[str]) -> Layout | None:
+    """Return the one time and the three rates, about x, y and z, that have units in their names."""
+    times = {name: unit for name in names if (unit := unit_in(name, ())) in TIME_UNITS}
+    rates = {name: unit for name in names if (unit := unit_in(name, ())) in ("rad/s", "deg/s")}
+    axes = [[n for n in rates if re.search(rf"\b{axis}\W*[(\[]", n)] for axis in "xyz"]
+    if len(times) != 1 or any(len(one) != 1 for one in axes):
+        return None
+    (x,), (y,), (z,) = axes
+    ((time, time_unit),) = times.items()
+    return Layout((time, x, y, z), str(rates[x]), str(time_unit))
+
+
 def _of_binary(path: Path) -> Layout | None:
-    """The time and the rates that such a log has; `None` if it has no rates."""
+    """Return the layout of a binary log, or `None` if it has no rates."""
+    columns = _columns_of_binary(path)
+    if columns is None:
+        return None
+    time, x, *_ = columns
+    return Layout(columns, usual_unit(path, x) or "rad/s", usual_unit(path, time) or "s")
+
+
+def _columns_of_binary(path: Path) -> tuple[str, str, str, str] | None:
+    """Return the names of the time and the rates in a binary log."""
     kind = kind_of(path)
     if kind in (".bbl", ".bfl"):
-        return Layout(("time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]"), "deg/s", "us")
+        return "time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]"
     if kind == ".usd":
-        return Layout(("timestamp", "gyro.x", "gyro.y", "gyro.z"), "deg/s", "us")
+        return "timestamp", "gyro.x", "gyro.y", "gyro.z"
     names, _ = BINARY[kind](path, [])
     for stem, parts in (
         ("gyro_rad", ("[0]", "[1]", "[2]")),
@@ -60,5 +91,5 @@ def _of_binary(path: Path) -> Layout | None:
                 times = ("timestamp",) if kind == ".ulg" else ("stamp", "log_time")
                 time = next(f"{topic}.{t}" for t in times if f"{topic}.{t}" in names)
                 x, y, z = (f"{topic}.{stem}{part}" for part in parts)
-                return Layout((time, x, y, z), "rad/s", "us" if kind == ".ulg" else "s")
+                return time, x, y, z
     return None

@@ -1,8 +1,11 @@
 """Columns of a log by name, whatever its format."""
 
 import csv
+import functools
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +14,7 @@ from rigidjax.cli.logs import text
 from rigidjax.cli.logs.arrays import mat, npz
 from rigidjax.cli.logs.blackbox import blackbox
 from rigidjax.cli.logs.crazyflie import FIRST_BYTE, crazyflie
-from rigidjax.cli.logs.errors import LogError
+from rigidjax.cli.logs.errors import LogError, LogWarning
 from rigidjax.cli.logs.mcap import mcap
 from rigidjax.cli.logs.ulog import ulog
 
@@ -19,20 +22,33 @@ BINARY = {".bbl": blackbox, ".bfl": blackbox, ".ulg": ulog, ".mcap": mcap, ".usd
 _READERS = {".npz": npz, ".mat": mat} | BINARY
 
 
-def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Columns of a log by name: text with a header, `.npz`, `.mat` (MATLAB up to v7), a Crazyflie's
-    µSD log (without ending, or `.usd`), and with the extra of that name `blackbox` (`.bbl`,
-    `.bfl`), `ulog` of PX4 (`.ulg`), `mcap` (JSON and ROS 2).
+def read_table(
+    path: str | Path, columns: Sequence[str], *, flight: int | None = None
+) -> dict[str, np.ndarray]:
+    """Return columns of a log by name.
 
-    **Arguments:** `path`; `columns` the names that are wanted, others are ignored. Text is
-    separated by commas, semicolons or tabs, whichever splits the header line into most names; its
-    decimals have a point. Lines that begin with `#` may stand above the header, which may be the
-    last of them, as `numpy.savetxt` writes it. **Returns** name → (T,) numbers, NaN for an empty
-    cell. A text is read line by line; the memory needed is up to three times its numbers.
+    A log is text with a header, `.npz`, `.mat` (MATLAB up to v7), a Crazyflie's µSD log (without
+    ending, or `.usd`), or with the extra of that name `blackbox` (`.bbl`, `.bfl`), `ulog` of PX4
+    (`.ulg`), `mcap` (JSON and ROS 2). Text is in UTF-8, UTF-16 or Windows's code page 1252, and may
+    be packed (`.gz`). It is separated by commas, semicolons or tabs, whichever splits the header
+    line into most names. Decimals have a point, or between semicolons and tabs a comma. Lines that
+    begin with `#` may stand above the header, which may be the last of them, as `numpy.savetxt`
+    writes it. A text is read line by line; the memory needed is up to three times its numbers.
+
+    **Arguments:**
+
+    - `path`: the file;
+    - `columns`: the names that are wanted, others are ignored;
+    - `flight`: which flight of a Blackbox log is read, from 1; `None` for the only one.
+
+    **Returns** name → (T,) numbers in the units of the log, NaN for an empty cell. It **warns** how
+    many frames of a Blackbox log are left out: those before the first I frame, and those from a
+    hurt one to the next I frame.
 
     **Raises:** `ValueError`, one line naming file, line and column, for a file that is missing, cut
     or not of its kind, a missing column or two of its name, a name that is wanted twice, a cell
-    that is not a number, a line with more cells than the header, columns of different lengths.
+    that is not a number, a line with more cells than the header, columns of different lengths, a
+    log of several flights of which none is chosen.
 
     >>> read_table("missing.csv", ["t"])
     Traceback (most recent call last):
@@ -50,28 +66,45 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
     if path.is_dir():
         raise LogError(f"{path}: is a folder, not a log")
     if kind_of(path) in _READERS:
-        return _arrays(path, columns)
+        return _arrays(path, columns, flight)
+    _require_one_flight(path, flight)
+    if path.suffix.lower() == ".gz" and kind_of(path.with_suffix("")) in _READERS:
+        raise LogError(f"{path}: only text is read while it is packed; unpack it first: gunzip")
     try:
         # Line by line: only the numbers of a large file stay in memory.
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with text.opened(path) as file:
             return text.rows(path, file, columns)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, EOFError, UnicodeError, zlib.error, csv.Error) as error:
         why = f"{type(error).__name__}: {error}".splitlines()[0]
         raise LogError(f"{path}: cannot be read as text ({why})") from None
 
 
 def kind_of(path: Path) -> str:
-    """The ending of a log, in small letters; `.usd` for a Crazyflie's, which has none."""
+    """Return the ending of a log, in small letters; `.usd` for a Crazyflie's, which has none."""
     if path.suffix or not path.is_file():
         return path.suffix.lower()
     with path.open("rb") as file:
         return ".usd" if file.read(1) == bytes([FIRST_BYTE]) else ""
 
 
-def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
+def _require_one_flight(path: Path, flight: int | None) -> None:
+    """Raise `LogError` if a flight is chosen in a log that is none of Blackbox."""
+    if flight is not None:
+        raise LogError(f"{path}: flight {flight}: only a Blackbox log (.bbl, .bfl) has flights")
+
+
+def _arrays(path: Path, columns: Sequence[str], flight: int | None) -> dict[str, np.ndarray]:
+    """Read columns of a log that is no text."""
+    read: Any = _READERS[kind_of(path)]
+    if read is blackbox:
+        read = functools.partial(blackbox, flight=flight)
+    else:
+        _require_one_flight(path, flight)
     # The readers raise many kinds of errors for an empty or a cut file.
     try:
-        names, held = _READERS[kind_of(path)](path, columns)
+        names, held = read(path, columns)
+    except (LogError, LogWarning):
+        raise
     except ModuleNotFoundError as error:
         raise LogError(str(error)) from None
     except Exception as error:

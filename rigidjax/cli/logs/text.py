@@ -1,19 +1,47 @@
 """Logs in text: a header line, then numbers. Errors name file, line and column."""
 
+import codecs
 import csv
+import gzip
+import io
 import itertools
 import math
 import re
 from array import array
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, TextIO
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidjax.cli.logs.errors import LogError
 
 SEPARATORS = ",;\t"
+
+
+def opened(path: Path) -> io.TextIOWrapper:
+    """Open a log in text, packed (`.gz`) or not, by the encoding that its first bytes show."""
+    packed = path.suffix.lower() == ".gz"
+    raw: Any = gzip.open(path, "rb") if packed else path.open("rb")
+    try:
+        return io.TextIOWrapper(raw, encoding=_encoding(raw.peek(8192)), newline="")
+    except BaseException:
+        raw.close()
+        raise
+
+
+def _encoding(begin: bytes) -> str:
+    """Return UTF-16 if its mark or zeros between the letters show it, else UTF-8 or Windows's."""
+    if begin[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return "utf-16"
+    if len(begin) > 1 and 0 in begin[:2]:
+        return "utf-16-be" if begin[0] == 0 else "utf-16-le"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(begin)
+    except UnicodeDecodeError:
+        # Which bytes stand for no letter there, the reading says.
+        return "cp1252"
+    return "utf-8-sig"
 
 
 class Header(NamedTuple):
@@ -25,7 +53,7 @@ class Header(NamedTuple):
     after: list[str]
 
 
-def read_header(file: TextIO) -> Header:
+def read_header(file: io.TextIOBase) -> Header:
     """The header of a text, read from its beginning: the first line, below comments (`#`).
 
     It may be the last comment, as `numpy.savetxt` writes it: then numbers follow.
@@ -51,7 +79,8 @@ def _split(first: str) -> tuple[list[str], str]:
     return [name.strip() for name in next(csv.reader([first], delimiter=separator), [])], separator
 
 
-def rows(path: Path, file: TextIO, columns: Sequence[str]) -> dict[str, np.ndarray]:
+def rows(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    """Read the wanted columns of a text, line by line."""
     header, separator, top, after = read_header(file)
     if not any(header):
         raise LogError(f"{path}: line 1: wanted a header with the columns {', '.join(columns)}")
@@ -71,6 +100,7 @@ def rows(path: Path, file: TextIO, columns: Sequence[str]) -> dict[str, np.ndarr
                 f"{path}: line {top}: {header.count(name)} columns are called {name!r}: which one?"
             )
     wanted = [(name, header.index(name), array("d")) for name in columns]
+    number_of = _Numbers(separator)
     reader = csv.reader(itertools.chain(after, file), delimiter=separator)
     for cells in reader:
         line = reader.line_num + top
@@ -84,22 +114,47 @@ def rows(path: Path, file: TextIO, columns: Sequence[str]) -> dict[str, np.ndarr
                 if place >= len(cells):
                     raise LogError(f"{path}: line {line}: column {name!r}: the line ends before it")
                 try:
-                    numbers.append(_number(cells[place].strip()))
+                    numbers.append(number_of(cells[place].strip()))
                 except ValueError as error:
                     raise LogError(f"{path}: line {line}: column {name!r}: {error}") from None
     return {name: np.frombuffer(numbers, float) for name, _, numbers in wanted}
 
 
-def _number(cell: str) -> float:
-    if not cell:
-        return math.nan
-    # Python's own spelling of numbers is wider than that of logs: 1_000, other alphabets' digits.
-    plain = cell.isascii() and "_" not in cell
-    try:
-        value = float(cell if plain else "")
-    except ValueError:
-        comma = "; a decimal comma? wanted a point" if "," in cell else ""
-        raise ValueError(f"{cell!r} is not a number{comma}") from None
-    if not math.isfinite(value):
-        raise ValueError(f"{cell} is not a finite number; leave the cell empty for a gap")
-    return value
+class _Numbers:
+    """Read cells as numbers; the first decimal of a file decides between a point and a comma."""
+
+    def __init__(self, separator: str):
+        self.separator = separator
+        self.decimal: str | None = None
+
+    def __call__(self, cell: str) -> float:
+        if not cell:
+            return math.nan
+        plain = cell
+        if self.separator != "," and (self.decimal == "," or "," in cell):
+            plain = self._with_point(cell)
+        elif "." in cell:
+            self.decimal = "."
+        # Python's own spelling is wider than that of logs: 1_000, other alphabets' digits.
+        try:
+            value = float(plain if plain.isascii() and "_" not in plain else "")
+        except ValueError:
+            comma = "; a decimal comma? wanted a point" if "," in cell else ""
+            raise ValueError(f"{cell!r} is not a number{comma}") from None
+        if not math.isfinite(value):
+            raise ValueError(f"{cell} is not a finite number; leave the cell empty for a gap")
+        return value
+
+    def _with_point(self, cell: str) -> str:
+        """Return the cell with a point for its decimal comma."""
+        if "." in cell or self.decimal == ".":
+            raise ValueError(f"{cell!r} is not a number; the decimals above have the other sign")
+        # Between tabs, 1,200 may be a thousand.
+        if self.decimal is None and self.separator == "\t" and _THOUSANDS.fullmatch(cell):
+            raise ValueError(f"{cell!r} is not a number; does its comma mark thousands?")
+        if "," in cell:
+            self.decimal = ","
+        return cell.replace(",", ".")
+
+
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")

@@ -1,39 +1,17 @@
-"""Logs of phyphox and of flight controllers: known columns, units, scales."""
+"""Blackbox logs: scales and units, frames that stand on no I frame, several flights."""
 
+import logging
 import struct
 import sys
+import warnings
 
 import numpy as np
 import pytest
 
 from rigidjax.cli.command import main
-from rigidjax.cli.logs.errors import LogError
-from rigidjax.cli.logs.layouts import USUAL, layout_of
+from rigidjax.cli.logs.errors import LogError, LogWarning
+from rigidjax.cli.logs.layouts import layout_of, usual_unit
 from rigidjax.identify import read_table
-
-PHYPHOX = '"Time (s)","{0} x (rad/s)","{0} y (rad/s)","{0} z (rad/s)","{1} (rad/s)"\n'
-
-
-@pytest.mark.parametrize("words", [("Gyroscope", "Absolute"), ("Gyroskop", "Absolutwert")])
-@pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_phyphox_is_known_by_its_header(tmp_path, words, separator):
-    path = tmp_path / "Raw Data.csv"
-    header = PHYPHOX.format(*words).replace(",", separator)
-    rows = "\n".join(separator.join(map(str, row)) for row in np.arange(20.0).reshape(4, 5))
-    path.write_text(header + rows)
-    layout = layout_of(path)
-    assert (layout.unit, layout.time_unit) == ("rad/s", "s")
-    table = read_table(path, layout.columns)
-    np.testing.assert_array_equal(table[layout.columns[0]], [0, 5, 10, 15])
-    np.testing.assert_array_equal(table[f"{words[0]} z (rad/s)"], [3, 8, 13, 18])
-
-
-@pytest.mark.parametrize("text", ["t,wx,wy,wz\n", "", '"unclosed (s),x (rad/s)'])
-def test_other_texts_have_the_usual_columns(tmp_path, text):
-    path = tmp_path / "log.csv"
-    path.write_text(text)
-    assert layout_of(path) == USUAL
-    assert layout_of(tmp_path / "none.csv") == layout_of(tmp_path) == USUAL
 
 
 def unsigned(value):
@@ -69,6 +47,8 @@ def blackbox_log(rows, scale="0x3f800000", end=True):
     return "".join(f"H {line}\n" for line in header).encode() + frames + mark
 
 
+# What a log of the right frames has to say.
+logging.getLogger("orangebox").setLevel(logging.ERROR)
 ROWS = [(1000 * i, 100 - i, -7 * i, 3000, 2048) for i in range(50)]
 
 
@@ -112,6 +92,191 @@ def test_a_field_that_is_not_there_is_named(tmp_path):
 def test_without_the_parser_the_extra_is_named(tmp_path, monkeypatch):
     path = tmp_path / "flight.bbl"
     path.write_bytes(blackbox_log(ROWS))
-    monkeypatch.setitem(sys.modules, "orangebox", None)
+    monkeypatch.setitem(sys.modules, "orangebox.reader", None)
     with pytest.raises(LogError, match=r"pip install 'rigidjax\[blackbox\]'"):
         read_table(path, ["time"])
+
+
+INTERVAL, STEP = 6, 500
+END = b"E\xffEnd of log\x00"
+
+
+def signed(value):
+    return unsigned(2 * value if value >= 0 else -2 * value - 1)
+
+
+def value_of(n):
+    """The readings of frame n."""
+    return [7 * n * n % 501 - 250, 31 * n % 97, -n, 2048 + n % 5]
+
+
+def time_of(n):
+    return 40_000_000 + STEP * n + 3 * (n % 4)
+
+
+def frames(first, last, start=0, iteration=0):
+    """Frames `first` … `last` - 1 of a log with an I frame at each multiple of `INTERVAL`.
+
+    The differences of P frames are those of the previous frame, or of both before (time).
+    """
+    out = []
+    for n in range(first, last):
+        time = start + time_of(n)
+        if n % INTERVAL == 0:
+            numbers = unsigned((iteration + n) % 2**32) + unsigned(time % 2**32)
+            out.append(b"I" + numbers + b"".join(map(signed, value_of(n))))
+        else:
+            before = time_of(n - 1)
+            earlier = before if n % INTERVAL == 1 else time_of(n - 2)
+            steps = [new - old for new, old in zip(value_of(n), value_of(n - 1), strict=True)]
+            moved = signed(time_of(n) - 2 * before + earlier)
+            out.append(b"P" + moved + b"".join(map(signed, steps)))
+    return out
+
+
+HEADER = "".join(f"H {line}\n" for line in [
+    "Product:Blackbox flight data recorder by Nicholas Sherlock", "Data version:2",
+    f"I interval:{INTERVAL}", "P interval:1/1",
+    "Field I name:loopIteration,time,gyroADC[0],gyroADC[1],gyroADC[2],accSmooth[0]",
+    "Field I signed:0,0,1,1,1,1", "Field I predictor:0,0,0,0,0,0", "Field I encoding:1,1,0,0,0,0",
+    "Field P predictor:6,2,1,1,1,1", "Field P encoding:9,0,0,0,0,0",
+    "Field S name:flightModeFlags,stateFlags", "Field S signed:0,0", "Field S predictor:0,0",
+    "Field S encoding:1,1",
+    "Firmware type:Cleanflight", "gyro_scale:0x3f800000", "acc_1G:2048",
+]).encode()  # fmt: skip
+COLUMNS = ["loopIteration", "time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]"]
+
+
+def content(numbers):
+    return np.array([[n, time_of(n), *value_of(n)[:3]] for n in numbers], float)
+
+
+def read(tmp_path, data, **how):
+    path = tmp_path / "flight.bbl"
+    path.write_bytes(data)
+    return np.stack(list(read_table(path, COLUMNS, **how).values()), axis=1)
+
+
+def test_differences_are_summed(tmp_path):
+    data = HEADER + b"".join(frames(0, 50)) + END
+    np.testing.assert_array_equal(read(tmp_path, data), content(range(50)))
+
+
+@pytest.mark.parametrize("first", [1, 2, 5, 11])
+def test_nothing_before_the_first_i_frame(first, tmp_path):
+    begin = -(-first // INTERVAL) * INTERVAL
+    words = rf"flight.bbl: {begin - first} of {50 - first} frames are left out: they stand on no"
+    with pytest.warns(LogWarning, match=words):
+        table = read(tmp_path, HEADER + b"".join(frames(first, 50)) + END)
+    np.testing.assert_array_equal(table, content(range(begin, 50)))
+
+
+@pytest.mark.parametrize("hurt", [7, 11, 12, 31, 36])
+@pytest.mark.parametrize("damage", [b"\0", b"\xff\xfe\0", b""])
+def test_nothing_from_a_hurt_frame_to_the_next_i_frame(hurt, damage, tmp_path):
+    """The letter of a frame is lost, and another byte or none stands there."""
+    parts = frames(0, 50)
+    parts[hurt] = damage + (parts[hurt][1:] if damage else b"\x07" + parts[hurt][2:])
+    with pytest.warns(LogWarning, match="frames are left out"):
+        table = read(tmp_path, HEADER + b"".join(parts) + END)
+    again = (hurt // INTERVAL + 1) * INTERVAL
+    np.testing.assert_array_equal(table, content([*range(hurt), *range(again, 50)]))
+
+
+def test_a_frame_that_does_not_go_on_in_time_is_hurt(tmp_path):
+    parts = frames(0, 50)
+    parts[20] = b"P" + signed(20_000_000) + parts[20][2:]
+    with pytest.warns(LogWarning, match="4 of 50 frames are left out"):
+        table = read(tmp_path, HEADER + b"".join(parts) + END)
+    np.testing.assert_array_equal(table, content([*range(20), *range(24, 50)]))
+
+
+@pytest.mark.parametrize("cut", range(1, 9))
+def test_a_log_that_ends_within_a_frame_keeps_the_whole_ones(cut, tmp_path):
+    """Cut by an I frame, whose bytes are counted."""
+    parts = frames(0, 49)
+    assert len(parts[-1]) > 8
+    with pytest.warns(LogWarning, match="1 of 49 frames are left out"):
+        table = read(tmp_path, HEADER + b"".join(parts)[:-cut])
+    np.testing.assert_array_equal(table, content(range(48)))
+
+
+def test_erased_memory_behind_the_last_frame_is_no_fault(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        table = read(tmp_path, HEADER + b"".join(frames(0, 20)) + 300 * b"\xff")
+    np.testing.assert_array_equal(table, content(range(20)))
+
+
+def test_events_and_slow_frames_do_not_break_the_order(tmp_path):
+    parts = frames(0, 40)
+    parts[3] += b"S" + unsigned(9) + unsigned(1)
+    parts[8] += b"E\0" + unsigned(123_456)
+    parts[9] += b"E\x1e" + unsigned(3) + unsigned(300)
+    parts[15] += b"E\x0d\x05" + signed(-300)
+    parts[16] += b"E\x0d\x85" + struct.pack("<f", 1.5)
+    parts[20] += b"S" + unsigned(300) + unsigned(2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        table = read(tmp_path, HEADER + b"".join(parts) + END)
+    np.testing.assert_array_equal(table, content(range(40)))
+    flags = read_table(tmp_path / "flight.bbl", ["flightModeFlags"])["flightModeFlags"]
+    np.testing.assert_array_equal(flags, 4 * [np.nan] + 17 * [9.0] + 19 * [300.0])
+
+
+def test_a_pause_that_is_announced_loses_nothing(tmp_path):
+    """By the event of resumed logging: 90 s later, 180 000 iterations on."""
+    later, skipped = 90_000_000, 180_000
+    resume = b"E\x0e" + unsigned(skipped + 12) + unsigned(later + time_of(12))
+    data = b"".join(frames(0, 12)) + resume + b"".join(frames(12, 30, later, skipped))
+    table = read(tmp_path, HEADER + data + END)
+    wanted = content(range(30))
+    wanted[12:, :2] += [skipped, later]
+    np.testing.assert_array_equal(table, wanted)
+
+
+def test_a_pause_that_is_not_announced_costs_one_group(tmp_path):
+    later = 90_000_000
+    data = b"".join(frames(0, 12)) + b"".join(frames(12, 30, later))
+    with pytest.warns(LogWarning, match="6 of 30 frames are left out"):
+        table = read(tmp_path, HEADER + data + END)
+    wanted = content([*range(12), *range(18, 30)])
+    wanted[12:, 1] += later
+    np.testing.assert_array_equal(table, wanted)
+
+
+def test_the_clock_goes_on_after_32_bits(tmp_path):
+    """71.6 minutes in µs; differences go over the end, the next I frame begins at zero."""
+    begin = 2**32 - time_of(9)
+    table = read(tmp_path, HEADER + b"".join(frames(0, 30, begin)) + END)
+    wanted = content(range(30))
+    wanted[:, 1] += begin
+    np.testing.assert_array_equal(table, wanted)
+
+
+def two_flights():
+    return HEADER + b"".join(frames(0, 24)) + END + HEADER + b"".join(frames(12, 48)) + END
+
+
+def test_of_several_flights_one_is_chosen(tmp_path):
+    np.testing.assert_array_equal(read(tmp_path, two_flights(), flight=1), content(range(24)))
+    np.testing.assert_array_equal(read(tmp_path, two_flights(), flight=2), content(range(12, 48)))
+    words = r"flight.bbl: 2 flights are in this log, of .* kB; choose one: --flight 1 to 2"
+    with pytest.raises(LogError, match=words):
+        read(tmp_path, two_flights())
+    for flight in (0, 3, -1):
+        with pytest.raises(LogError, match=f"no flight {flight}; it holds 2"):
+            read(tmp_path, two_flights(), flight=flight)
+
+
+def test_only_blackbox_has_flights(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,wx\n0,1\n")
+    with pytest.raises(LogError, match="flight 1: only a Blackbox log"):
+        read_table(path, ["t"], flight=1)
+
+
+def test_fields_have_their_units(tmp_path):
+    path = tmp_path / "flight.bbl"
+    units = {"time": "us", "gyroADC[1]": "deg/s", "accSmooth[2]": "g", "motor[0]": None}
+    assert {name: usual_unit(path, name) for name in units} == units
