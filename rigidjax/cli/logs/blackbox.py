@@ -48,17 +48,20 @@ def blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> C
     data = path.read_bytes()[pointers[index - 1] : (*pointers, None)[index]]
     log = _Flight(library.Reader(str(path), index), data)
     scales, wanted = _scales(log.headers), [name for name in columns if name in log.names]
-    rows = {name: array("d") for name in wanted}
-    for frame in log.frames():
+    rows, groups = {name: array("d") for name in wanted}, array("q")
+    for group, frame in log.frames():
+        groups.append(group)
         for name, numbers in rows.items():
             numbers.append(frame[name])
+    keep = ~np.isin(np.frombuffer(groups, np.int64), log.incomplete_groups())
+    log.left_out += int((~keep).sum())
     if log.left_out:
         warn(
             f"{path}: {log.left_out} of {log.count} frames are left out: they stand on no whole I "
             "frame (the first one is missing, or a frame is hurt)"
         )
     return log.names, {
-        name: log.wrapped(name, np.frombuffer(numbers, float))
+        name: log.wrapped(name, np.frombuffer(numbers, float)[keep])
         * scales.get(name.partition("[")[0], 1.0)
         for name, numbers in rows.items()
     }
@@ -79,7 +82,8 @@ class _Bytes:
 class _Flight:
     """One flight: its header, and its frames in the order of the log.
 
-    `count` is the number of I and P frames met so far, `left_out` that of those not handed on.
+    `count` is the number of I and P frames met so far, `left_out` that of those not handed on. A
+    group is an I frame and the P frames after it; `incomplete` are those with too few.
     """
 
     def __init__(self, reader: Any, data: bytes):
@@ -91,6 +95,7 @@ class _Flight:
         self.kinds = {ord(kind.value): kind for kind in types.FrameType}
         self.kind, self.frame = types.FrameType, types.Frame
         self.data, self.count, self.left_out = data, 0, 0
+        self.groups, self.incomplete = 0, list[int]()
         self.main = [field.name for field in self.fields[self.kind.INTRA]]
         others = [self.fields.get(kind, ()) for kind in (self.kind.SLOW, self.kind.GPS)]
         self.others = [field.name for kind in others for field in kind]
@@ -104,13 +109,22 @@ class _Flight:
             return (values + _WRAP / 2) % _WRAP - _WRAP / 2
         return values % _WRAP
 
-    def frames(self) -> Iterator[Mapping[str, float]]:
-        """Yield the fields of each frame that stands on a whole I frame, by name.
+    def incomplete_groups(self) -> list[int]:
+        """Return the groups that lost frames unseen; none if that is so of half the groups.
 
-        Fields of slow and GPS frames have the values of the last such frame, NaN before the first.
+        Then it is the header's interval of frames that is not what the log has.
+        """
+        return self.incomplete if 2 * len(self.incomplete) < self.groups else []
+
+    def frames(self) -> Iterator[tuple[int, Mapping[str, float]]]:
+        """Yield the group and the fields, by name, of each frame that stands on a whole I frame.
+
+        The group is that of a P frame, and -1 for an I frame, which stands alone. Fields of slow
+        and GPS frames have the values of the last such frame, NaN before the first.
         """
         stream, others = _Bytes(self.data, self._header_size()), dict.fromkeys(self.others, np.nan)
-        last, clock, valid, lost = None, None, False, 0
+        last, last_key, clock, raw_clock = None, None, None, 0
+        valid, lost, resumed = False, 0, False
         while stream.place < len(self.data):
             kind = self.kinds.get(next(stream))
             begin = stream.place
@@ -127,7 +141,9 @@ class _Flight:
                     event, numbers = self._event(stream)
                     if event == _LOG_END:
                         return
-                    last = tuple(numbers) if event == _RESUME else last
+                    if event == _RESUME:
+                        last = last_key = tuple(numbers)
+                        resumed = True
                     continue
                 values = self._values(stream, kind)
             except IndexError:
@@ -142,25 +158,58 @@ class _Flight:
                 if kind != self.kind.SLOW:
                     self.context.add_frame(self.frame(kind, values))
                 continue
-            continues = last is None or _continues(last, values[:2])
             if kind == self.kind.INTRA:
-                # What only looks like an I frame is seldom followed by the letter of another.
-                after = self.data[stream.place : stream.place + 1]
-                is_followed = not after or after[0] in self.kinds
-                valid = continues and (valid or is_followed)
+                if valid and not resumed and self._lacks_frames(last, values[:2]):
+                    self.incomplete.append(self.groups)
+                valid = last_key is None or _continues(last_key, values[:2])
+                resumed = False
+                # If it does not continue the last I frame, either may be the hurt one: the next I
+                # frame is compared with the later.
+                last_key = values[:2]
             else:
-                valid = valid and continues
-            if valid or kind == self.kind.INTRA:
-                # If an I frame does not continue the last one, either may be the hurt one: the next
-                # I frame is compared with the later.
-                last = values[:2]
+                valid = valid and _continues(last, values[:2])
+            if not self._is_frame_next(stream.place):
+                # It may have swallowed the letter of the next frame.
+                stream.place, valid = begin, False
             if not valid:
                 self.left_out += 1
                 continue
+            last = values[:2]
             self.context.last_iter = values[0]
             self.context.add_frame(self.frame(kind, values))
-            clock = values[1] if clock is None else clock + (values[1] - clock) % _WRAP
-            yield others | dict(zip(self.main, values, strict=True)) | {"time": clock}
+            group = self.groups
+            if kind == self.kind.INTRA:
+                # A time that is wrong in a P frame must not move those of later groups.
+                clock = values[1] if clock is None else clock + (values[1] - raw_clock) % _WRAP
+                raw_clock, group, self.groups = values[1], -1, self.groups + 1
+            time = clock + (values[1] - raw_clock) % _WRAP
+            yield group, others | dict(zip(self.main, values, strict=True)) | {"time": time}
+
+    def _lacks_frames(self, last: Sequence[int], key: Sequence[int]) -> bool:
+        """Whether an I frame is not the one after the last frame, by the header's intervals.
+
+        A greater jump is a pause.
+        """
+        expected = last[0] + 1 + self.context.count_skipped_frames()
+        is_earlier = (key[1] - last[1]) % _WRAP >= _WRAP // 2
+        return is_earlier or 0 < (key[0] - expected) % _WRAP < _ITERATION_JUMP
+
+    def _is_frame_next(self, place: int) -> bool:
+        """Whether the bytes from here on are a frame, a P frame without its letter, or the end.
+
+        Where they are none, the frame before is probably hurt itself: it has too few bytes or too
+        many. Erased memory is an end.
+        """
+        if place == len(self.data) or self.data[place] in self.kinds:
+            return True
+        if not self.data[place:].strip(b"\xff\0"):
+            return True
+        stream = _Bytes(self.data, place + 1)
+        try:
+            self._values(stream, self.kind.INTER)
+        except IndexError:
+            return False
+        return stream.place == len(self.data) or self.data[stream.place] in self.kinds
 
     def _header_size(self) -> int:
         """Return where the lines of the header end."""

@@ -171,16 +171,53 @@ def test_nothing_before_the_first_i_frame(first, tmp_path):
     np.testing.assert_array_equal(table, content(range(begin, 50)))
 
 
-@pytest.mark.parametrize("hurt", [7, 11, 12, 31, 36])
-@pytest.mark.parametrize("damage", [b"\0", b"\xff\xfe\0", b""])
-def test_nothing_from_a_hurt_frame_to_the_next_i_frame(hurt, damage, tmp_path):
-    """The letter of a frame is lost, and another byte or none stands there."""
+@pytest.mark.parametrize("hurt", [7, 11, 20, 31])
+def test_nothing_from_a_frame_without_its_letter_to_the_next_i_frame(hurt, tmp_path):
     parts = frames(0, 50)
-    parts[hurt] = damage + (parts[hurt][1:] if damage else b"\x07" + parts[hurt][2:])
-    with pytest.warns(LogWarning, match="frames are left out"):
+    parts[hurt] = b"\0" + parts[hurt][1:]
+    with pytest.warns(LogWarning, match="of 50 frames are left out"):
         table = read(tmp_path, HEADER + b"".join(parts) + END)
     again = (hurt // INTERVAL + 1) * INTERVAL
     np.testing.assert_array_equal(table, content([*range(hurt), *range(again, 50)]))
+
+
+@pytest.mark.parametrize("hurt", [7, 11, 31, 40])
+@pytest.mark.parametrize("lost", [slice(1, 2), slice(-1, None)])
+def test_a_frame_of_too_few_bytes_is_not_handed_on(hurt, lost, tmp_path):
+    """It takes the letter of the next frame for one of its numbers."""
+    # The iteration of an I frame has two bytes from 128 on.
+    parts = frames(240, 290)
+    numbers = bytearray(parts[hurt])
+    del numbers[lost]
+    parts[hurt] = bytes(numbers)
+    with pytest.warns(LogWarning, match="frames are left out"):
+        table = read(tmp_path, HEADER + b"".join(parts) + END)
+    again = (hurt // INTERVAL + 1) * INTERVAL
+    numbers = [*range(240, 240 + hurt), *range(240 + again, 290)]
+    np.testing.assert_array_equal(table, content(numbers))
+
+
+@pytest.mark.parametrize("lost", [[20], [20, 21], [19, 20, 21, 22]])
+def test_whole_frames_that_are_missing_are_seen_at_the_next_i_frame(lost, tmp_path):
+    """The differences after them are added to the wrong frame: which, nobody knows."""
+    data = b"".join(frame for n, frame in enumerate(frames(0, 50)) if n not in lost)
+    with pytest.warns(LogWarning, match=f"{5 - len(lost)} of {50 - len(lost)} frames are left"):
+        table = read(tmp_path, HEADER + data + END)
+    np.testing.assert_array_equal(table, content([*range(19), *range(24, 50)]))
+
+
+def test_an_interval_that_the_header_does_not_have_leaves_nothing_out(tmp_path):
+    data = HEADER.replace(b"P interval:1/1", b"P interval:1/2") + b"".join(frames(0, 50)) + END
+    np.testing.assert_array_equal(read(tmp_path, data)[:, 2:], content(range(50))[:, 2:])
+
+
+def test_a_wrong_time_stays_in_its_group(tmp_path):
+    """One that goes on, but by too much: the differences of the I frames say so."""
+    parts = frames(0, 50)
+    parts[20] = b"P" + signed(5_000_000) + parts[20][2:]
+    with pytest.warns(LogWarning, match="5 of 50 frames are left out"):
+        table = read(tmp_path, HEADER + b"".join(parts) + END)
+    np.testing.assert_array_equal(table, content([*range(19), *range(24, 50)]))
 
 
 def test_a_frame_that_does_not_go_on_in_time_is_hurt(tmp_path):
