@@ -5,6 +5,7 @@ order of frames is followed here, as the flight controllers' own decoder does.
 """
 
 import math
+import re
 import struct
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,6 +24,7 @@ _LONGEST_FRAME, _ITERATION_JUMP, _TIME_JUMP, _WRAP = 256, 5_000, 10_000_000, 2**
 _EVENT_NUMBERS = {0: 1, 14: 2, 15: 1, 30: 2}
 _RESUME, _ADJUSTMENT, _LOG_END = 14, 13, 255
 _END_MARK = b"End of log\0"
+_ERASED = re.compile(rb"[\xff\0]*\Z")
 
 
 def blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
@@ -123,7 +125,8 @@ class _Flight:
         and GPS frames have the values of the last such frame, NaN before the first.
         """
         stream, others = _Bytes(self.data, self._header_size()), dict.fromkeys(self.others, np.nan)
-        last, last_key, clock, raw_clock = None, None, None, 0
+        last: Sequence[int] = ()
+        last_key, clock, raw_clock = last, None, 0
         valid, lost, resumed = False, 0, False
         while stream.place < len(self.data):
             kind = self.kinds.get(next(stream))
@@ -148,8 +151,9 @@ class _Flight:
                 values = self._values(stream, kind)
             except IndexError:
                 values = ()
-            if not values or stream.place - begin > _LONGEST_FRAME:
-                # The next frame may begin anywhere after the letter of this one.
+            size = stream.place - begin
+            if not values or size > _LONGEST_FRAME or not self._is_frame_next(stream.place):
+                # It may have swallowed the letter of the next frame.
                 stream.place, valid = begin, False
                 self.left_out += is_main
                 continue
@@ -161,16 +165,13 @@ class _Flight:
             if kind == self.kind.INTRA:
                 if valid and not resumed and self._lacks_frames(last, values[:2]):
                     self.incomplete.append(self.groups)
-                valid = last_key is None or _continues(last_key, values[:2])
+                valid = not last_key or _continues(last_key, values[:2])
                 resumed = False
                 # If it does not continue the last I frame, either may be the hurt one: the next I
                 # frame is compared with the later.
                 last_key = values[:2]
             else:
                 valid = valid and _continues(last, values[:2])
-            if not self._is_frame_next(stream.place):
-                # It may have swallowed the letter of the next frame.
-                stream.place, valid = begin, False
             if not valid:
                 self.left_out += 1
                 continue
@@ -202,7 +203,7 @@ class _Flight:
         """
         if place == len(self.data) or self.data[place] in self.kinds:
             return True
-        if not self.data[place:].strip(b"\xff\0"):
+        if _ERASED.match(self.data, place):
             return True
         stream = _Bytes(self.data, place + 1)
         try:
