@@ -235,6 +235,25 @@ def _sensor(
         raise LogError(f"sensor {one.kind}: {error}") from None
 
 
+def _evenly_spaced(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return samples (n,) at even times, with those interpolated whose rows are left out.
+
+    Times that are not those of an even series, rounded to a thousandth of a step, are returned as
+    they are.
+    """
+    step = np.median(np.diff(t)) if t.size > 1 else np.nan
+    place = (t - t[:1]) / step
+    if not np.isfinite(step) or place[-1] > 10 * t.size:
+        return t, values
+    # A better step than that of two rounded times.
+    step *= place[-1] / np.round(place[-1])
+    place = (t - t[0]) / step
+    if np.abs(place - np.round(place)).max() > 1e-3:
+        return t, values
+    places = np.arange(np.round(place[-1]) + 1)
+    return t[0] + step * places, np.interp(places, np.round(place), values)
+
+
 def _torque(
     path: str | Path,
     t: np.ndarray,
@@ -248,7 +267,7 @@ def _torque(
     for one in wheels:
         unit = unit_of([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
         try:
-            speed = Series(t[kept], table[one.column][kept] * UNITS[unit])
+            speed = Series(*_evenly_spaced(t[kept], table[one.column][kept] * UNITS[unit]))
         except ValueError as error:
             raise LogError(f"{path}: column {one.column!r}: {error}") from None
         delay = 0.0 if "delay" in free else None
