@@ -210,7 +210,7 @@ def _typical_rate(path: str | Path, one: Channel, rates: np.ndarray) -> float:
     if not rates.any():
         raise LogError(
             f"{path}: the rates ({names}) are all zero: a body at rest shows nothing of its "
-            "inertia, or the sensor was off"
+            "inertia, or the sensor was off; other columns by --columns, another part by --window"
         )
     return float(np.median(np.linalg.norm(rates, axis=1)))
 

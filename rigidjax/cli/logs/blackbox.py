@@ -55,7 +55,7 @@ def blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> C
         groups.append(group)
         for name, numbers in rows.items():
             numbers.append(frame[name])
-    keep = ~np.isin(np.frombuffer(groups, np.int64), log.incomplete_groups())
+    keep = ~np.isin(np.frombuffer(groups, np.int64), log.order.incomplete_groups())
     log.left_out += int((~keep).sum())
     if log.left_out:
         warn(
@@ -84,8 +84,7 @@ class _Bytes:
 class _Flight:
     """One flight: its header, and its frames in the order of the log.
 
-    `count` is the number of I and P frames met so far, `left_out` that of those not handed on. A
-    group is an I frame and the P frames after it; `incomplete` are those with too few.
+    `count` is the number of I and P frames met so far, `left_out` that of those not handed on.
     """
 
     def __init__(self, reader: Any, data: bytes):
@@ -97,7 +96,7 @@ class _Flight:
         self.kinds = {ord(kind.value): kind for kind in types.FrameType}
         self.kind, self.frame = types.FrameType, types.Frame
         self.data, self.count, self.left_out = data, 0, 0
-        self.groups, self.incomplete = 0, list[int]()
+        self.order = _Order()
         self.main = [field.name for field in self.fields[self.kind.INTRA]]
         others = [self.fields.get(kind, ()) for kind in (self.kind.SLOW, self.kind.GPS)]
         self.others = [field.name for kind in others for field in kind]
@@ -111,29 +110,20 @@ class _Flight:
             return (values + _WRAP / 2) % _WRAP - _WRAP / 2
         return values % _WRAP
 
-    def incomplete_groups(self) -> list[int]:
-        """Return the groups that lost frames unseen; none if that is so of half the groups.
-
-        Then it is the header's interval of frames that is not what the log has.
-        """
-        return self.incomplete if 2 * len(self.incomplete) < self.groups else []
-
     def frames(self) -> Iterator[tuple[int, Mapping[str, float]]]:
         """Yield the group and the fields, by name, of each frame that stands on a whole I frame.
 
         The group is that of a P frame, and -1 for an I frame, which stands alone. Fields of slow
         and GPS frames have the values of the last such frame, NaN before the first.
         """
+        order, lost = self.order, 0
         stream, others = _Bytes(self.data, self._header_size()), dict.fromkeys(self.others, np.nan)
-        last: Sequence[int] = ()
-        last_key, clock, raw_clock = last, None, 0
-        valid, lost, resumed = False, 0, False
         while stream.place < len(self.data):
             kind = self.kinds.get(next(stream))
             begin = stream.place
             if kind is None or (kind != self.kind.EVENT and kind not in self.fields):
                 # A frame without its letter; erased memory at the end of a log is none.
-                lost, valid = lost + valid, False
+                lost, order.is_valid = lost + order.is_valid, False
                 continue
             is_main = kind in (self.kind.INTRA, self.kind.INTER)
             if is_main:
@@ -145,8 +135,7 @@ class _Flight:
                     if event == _LOG_END:
                         return
                     if event == _RESUME:
-                        last = last_key = tuple(numbers)
-                        resumed = True
+                        order.resume(numbers)
                     continue
                 values = self._values(stream, kind)
             except IndexError:
@@ -154,46 +143,23 @@ class _Flight:
             size = stream.place - begin
             if not values or size > _LONGEST_FRAME or not self._is_frame_next(stream.place):
                 # It may have swallowed the letter of the next frame.
-                stream.place, valid = begin, False
+                stream.place, order.is_valid = begin, False
                 self.left_out += is_main
-                continue
-            if not is_main:
+            elif not is_main:
                 others |= zip((field.name for field in self.fields[kind]), values, strict=True)
                 if kind != self.kind.SLOW:
                     self.context.add_frame(self.frame(kind, values))
-                continue
-            if kind == self.kind.INTRA:
-                if valid and not resumed and self._lacks_frames(last, values[:2]):
-                    self.incomplete.append(self.groups)
-                valid = not last_key or _continues(last_key, values[:2])
-                resumed = False
-                # If it does not continue the last I frame, either may be the hurt one: the next I
-                # frame is compared with the later.
-                last_key = values[:2]
-            else:
-                valid = valid and _continues(last, values[:2])
-            if not valid:
+            elif not order.accepts(values[:2], kind == self.kind.INTRA, self._next_iteration()):
                 self.left_out += 1
-                continue
-            last = values[:2]
-            self.context.last_iter = values[0]
-            self.context.add_frame(self.frame(kind, values))
-            group = self.groups
-            if kind == self.kind.INTRA:
-                # A time that is wrong in a P frame must not move those of later groups.
-                clock = values[1] if clock is None else clock + (values[1] - raw_clock) % _WRAP
-                raw_clock, group, self.groups = values[1], -1, self.groups + 1
-            time = clock + (values[1] - raw_clock) % _WRAP
-            yield group, others | dict(zip(self.main, values, strict=True)) | {"time": time}
+            else:
+                self.context.last_iter = values[0]
+                self.context.add_frame(self.frame(kind, values))
+                fields = dict(zip(self.main, values, strict=True)) | {"time": order.time}
+                yield -1 if kind == self.kind.INTRA else order.groups, others | fields
 
-    def _lacks_frames(self, last: Sequence[int], key: Sequence[int]) -> bool:
-        """Whether an I frame is not the one after the last frame, by the header's intervals.
-
-        A greater jump is a pause.
-        """
-        expected = last[0] + 1 + self.context.count_skipped_frames()
-        is_earlier = (key[1] - last[1]) % _WRAP >= _WRAP // 2
-        return is_earlier or 0 < (key[0] - expected) % _WRAP < _ITERATION_JUMP
+    def _next_iteration(self) -> int:
+        """Return the iteration after that of the last frame, by the header's intervals."""
+        return self.context.last_iter + 1 + self.context.count_skipped_frames()
 
     def _is_frame_next(self, place: int) -> bool:
         """Whether the bytes from here on are a frame, a P frame without its letter, or the end.
@@ -245,6 +211,61 @@ class _Flight:
         if event not in _EVENT_NUMBERS:
             return -1, []
         return event, [_unsigned(stream) for _ in range(_EVENT_NUMBERS[event])]
+
+
+class _Order:
+    """Follow the iterations and times of I and P frames.
+
+    A group is an I frame and the P frames after it; `groups` counts them, `incomplete` are those
+    with too few frames. `time` is that of the last frame, µs, without the jumps of a clock of 32
+    bits. `is_valid` says whether all frames since the last I frame were whole.
+    """
+
+    def __init__(self):
+        self.is_valid, self.is_resumed = False, False
+        self.last: Sequence[int] = ()
+        self.last_key: Sequence[int] = ()
+        self.time, self.key_time = 0, 0
+        self.groups, self.incomplete = 0, list[int]()
+
+    def resume(self, numbers: Sequence[int]) -> None:
+        """Go on at the iteration and the time of an event after a pause."""
+        self.last = self.last_key = tuple(numbers)
+        self.is_resumed = True
+
+    def accepts(self, values: Sequence[int], is_key: bool, expected: int) -> bool:
+        """Whether a frame of this iteration and time follows the last one; it is the last then."""
+        if is_key:
+            if self.is_valid and not self.is_resumed and self._lacks_frames(values, expected):
+                self.incomplete.append(self.groups)
+            self.is_valid = not self.last_key or _continues(self.last_key, values)
+        else:
+            self.is_valid = self.is_valid and _continues(self.last, values)
+        if self.is_valid:
+            if is_key:
+                # A time that is wrong in a P frame must not move those of later groups.
+                ahead = (values[1] - self.key_time) % _WRAP
+                self.key_time = self.key_time + ahead if self.groups else values[1]
+                self.groups += 1
+            self.time = self.key_time + (values[1] - self.key_time) % _WRAP
+            self.last = values
+        if is_key:
+            # If it does not continue the last I frame, either may be the hurt one: the next I frame
+            # is compared with the later.
+            self.last_key, self.is_resumed = values, False
+        return self.is_valid
+
+    def _lacks_frames(self, key: Sequence[int], expected: int) -> bool:
+        """Whether an I frame is not the one after the last frame; a greater jump is a pause."""
+        is_earlier = (key[1] - self.last[1]) % _WRAP >= _WRAP // 2
+        return is_earlier or 0 < (key[0] - expected) % _WRAP < _ITERATION_JUMP
+
+    def incomplete_groups(self) -> list[int]:
+        """Return the groups that lost frames unseen; none if that is so of half the groups.
+
+        Then it is the header's interval of frames that is not what the log has.
+        """
+        return self.incomplete if 2 * len(self.incomplete) < self.groups else []
 
 
 def _unsigned(stream: _Bytes) -> int:
