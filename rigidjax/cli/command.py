@@ -63,7 +63,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _once_more(lost: Any) -> None:
-    """Ctrl-C where Python drops it, as in JAX's callback of the garbage collector: once more."""
+    """Raise Ctrl-C once more where Python drops it, as in JAX's callback of the collector."""
     if lost.exc_type is KeyboardInterrupt:
         # From another thread, and later: here it would be dropped again.
         threading.Timer(0.05, _thread.interrupt_main).start()
@@ -145,7 +145,7 @@ def _keep_compiled() -> None:
 
 
 def _cache_folder() -> Path:
-    """Where this platform has a user's caches: XDG, macOS, Windows."""
+    """Return where this platform has a user's caches: XDG, macOS, Windows."""
     given = os.environ.get("XDG_CACHE_HOME")
     if given:
         return Path(given) / "rigidjax"
@@ -279,7 +279,7 @@ def _channels(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Ch
 
 
 def _read(options: argparse.Namespace) -> tuple[list[Any], list[Any], rj.identify.Problem]:
-    """The sensors, the recordings, and the problem that the options describe."""
+    """Return the sensors, the recordings, and the problem that the options describe."""
     if options.columns and options.time:
         raise LogError("--time: the first of --columns is it already")
     wheels = [spec.wheel(text) for text in options.wheel]
@@ -365,7 +365,7 @@ def _logs(options: argparse.Namespace) -> int:
 
 
 def _fit(problem: rj.identify.Problem, options: argparse.Namespace, starts: int) -> Any:
-    """The fit, or `None` after an error message."""
+    """Return the fit, or `None` after an error message."""
     try:
         return rj.identify.fit(
             problem,
@@ -387,7 +387,7 @@ def _write(
     units: dict[str, str],
     more: Sequence[tuple[str, float, float, float, str]] = (),
 ) -> int:
-    """The outputs that the options ask for, each separately; the exit code."""
+    """Write the outputs that the options ask for, each separately; return the exit code."""
     report, figure = rj.identify.report, options.figure
     if options.demo and figure is None and _matplotlib():
         figure = Path("toutatis.png")

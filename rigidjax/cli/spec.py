@@ -68,17 +68,17 @@ class WheelColumn(eqx.Module):
 
 
 def channel(text: str) -> Channel:
-    """A sensor written `KIND=COLUMNS[:UNIT[:NOISE]]`, such as `gyro=wx,wy,wz:deg/s:0.1`.
+    """Return the sensor that is written `KIND=COLUMNS[:UNIT[:NOISE]]`.
 
-    KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y, z) or `euler-ZXZ` (any sequence; body →
-    world); NOISE one number or three, one for each axis, as in `0.1,0.1,0.2`. **Raises**
-    `LogError` in words.
+    An example is `gyro=wx,wy,wz:deg/s:0.1`. KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y,
+    z) or `euler-ZXZ` (any sequence; body → world); NOISE is one number or three, one for each axis,
+    as in `0.1,0.1,0.2`. **Raises** `LogError` in words.
     """
     kind, _, rest = text.partition("=")
     names, *more = rest.split(":")
     columns = tuple(name.strip() for name in names.split(","))
-    allowed = None if kind == "euler" else SENSOR_UNITS.get(kind.partition("-")[0])
-    if allowed is None:
+    allowed = _units_of_kind(kind)
+    if not allowed:
         raise LogError(
             f"sensor {text!r}: wanted gyro, accelerometer, quaternion or euler-SEQUENCE, as in "
             "gyro=wx,wy,wz:deg/s"
@@ -98,6 +98,12 @@ def channel(text: str) -> Channel:
     return Channel(kind, columns, unit, noises(noise, f"sensor {text!r}"))
 
 
+def _units_of_kind(kind: str) -> tuple[str, ...]:
+    """Return the units of a kind of sensor, none for what is no kind."""
+    key = "euler" if kind.startswith("euler-") else kind
+    return () if kind == "euler" else SENSOR_UNITS.get(key, ())
+
+
 def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
     """Return the noise of three axes, from one positive number or three; `LogError` for others."""
     if len(noise) not in (1, 3):
@@ -108,9 +114,10 @@ def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
 
 
 def wheel(text: str) -> WheelColumn:
-    """A wheel written `COLUMN:INERTIA[:AXIS[:UNIT]]`, such as `flywheel:5.2e-7:z:rad/s`.
+    """Return the wheel that is written `COLUMN:INERTIA[:AXIS[:UNIT]]`.
 
-    INERTIA in kg m² about its axis, AXIS `x`, `y` or `z` of the body. **Raises** `LogError`.
+    An example is `flywheel:5.2e-7:z:rad/s`. INERTIA is in kg m² about its axis, AXIS `x`, `y` or
+    `z` of the body. **Raises** `LogError`.
     """
     name, *more = text.split(":")
     axis = more[1] if len(more) > 1 else "z"
@@ -191,7 +198,7 @@ def _first(t: np.ndarray) -> float:
 
 def unit_of_channel(path: str | Path, one: Channel) -> str:
     """Return the unit that a channel states, its columns name, or that is usual in such a log."""
-    allowed = SENSOR_UNITS[one.kind.partition("-")[0]]
+    allowed = _units_of_kind(one.kind)
     usual = usual_unit(path, one.columns[0]) or allowed[0]
     return unit_of(one.columns, one.unit, usual, allowed, str(path))
 
@@ -285,7 +292,7 @@ def problem_of(
     free: Sequence[str] = (),
     loss: str = "soft-l1",
 ) -> Problem:
-    """The problem of recordings of `read_log`: a drag for all, bias and delay for each."""
+    """Return the problem of recordings of `read_log`: a drag for all, bias and delay for each."""
     if model not in MODELS:
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {model!r}")
     if loss not in LOSSES:
@@ -295,7 +302,7 @@ def problem_of(
 
 
 def _free(first: Recording, typical: float, free: Sequence[str]) -> list[Free]:
-    """The free numbers of the sensors and the torque, as `read_log` laid them out."""
+    """Return the free numbers of the sensors and the torque, as `read_log` laid them out."""
 
     def of_sensor(index: int, name: str) -> Callable[[Any], Any]:
         return lambda r: getattr(r.readings[index].sensor, name)

@@ -139,6 +139,12 @@ def test_times_in_another_unit_are_remarked_upon(tmp_path):
         spec.read_log(path, GYRO)
 
 
+@pytest.mark.parametrize("kind", ["gyro-x", "euler", "eulerZYX", "accelerometer-1", ""])
+def test_a_kind_of_sensor_that_is_none_is_refused(kind):
+    with pytest.raises(LogError, match="wanted gyro, accelerometer, quaternion or euler-SEQUENCE"):
+        spec.channel(f"{kind}=a,b,c")
+
+
 @pytest.mark.parametrize("window", [None, (0.5, 1.0)])
 def test_rates_that_are_all_zero_are_refused_in_words(window, tmp_path):
     values = RATES.copy()

@@ -463,7 +463,10 @@ WRONG = [
     (["--wheel", "s"], "wanted COLUMN:INERTIA"),
     (["--wheel", "s:1:w"], "wanted an axis x, y or z"),
     (["--model", "tensor"], "free motion shows ratios only; a scale needs a --wheel"),
-    (["--window", "5", "6"], "fewer than 4 samples between 5 and 6 s from the first stamp; the log goes from 0 to 1.1 s"),
+    (
+        ["--window", "5", "6"],
+        "fewer than 4 samples between 5 and 6 s from the first stamp; the log goes from 0 to 1.1 s",
+    ),
 ]
 
 

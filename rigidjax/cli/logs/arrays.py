@@ -9,12 +9,14 @@ from rigidjax.cli.logs.columns import Columns
 
 
 def npz(path: Path, columns: Sequence[str]) -> Columns:
+    """Return the names of the arrays in a `.npz` file, and the wanted ones."""
     # NumPy does not close a file that it opened itself and cannot read.
     with path.open("rb") as raw, np.load(raw) as file:
         return file.files, {name: file[name] for name in columns if name in file.files}
 
 
 def mat(path: Path, columns: Sequence[str]) -> Columns:
+    """Return the names of the arrays in a `.mat` file, and the wanted ones."""
     from scipy.io import loadmat, whosmat
 
     with path.open("rb") as raw:

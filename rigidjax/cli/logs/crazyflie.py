@@ -13,7 +13,7 @@ FIRST_BYTE = 0xBC
 
 
 def crazyflie(path: Path, columns: Sequence[str]) -> Columns:
-    """The variables of a Crazyflie's µSD log by name, as `gyro.x`, and their `timestamp`, µs.
+    """Return the variables of a Crazyflie's µSD log by name (`gyro.x`), and their `timestamp`, µs.
 
     They are those of the event with most of the wanted names. Source: the format's description in
     the firmware's documentation, "µSD card deck", versions 1 and 2.

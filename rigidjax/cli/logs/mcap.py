@@ -13,9 +13,10 @@ from rigidjax.cli.logs.columns import Columns
 
 
 def mcap(path: Path, columns: Sequence[str]) -> Columns:
-    """`topic.field.part` of the JSON and ROS 2 messages in an MCAP file, as
-    `/imu.angular_velocity.x`; `topic.log_time` and `topic.stamp` (of its header), s from the first
-    message of the file.
+    """Return the fields of JSON and ROS 2 messages, such as `/imu.angular_velocity.x`.
+
+    `topic.log_time` and `topic.stamp` (of the message's header) are in s from the first message of
+    the file.
     """
     make_reader = _checks.library("mcap.reader", "mcap", str(path)).make_reader
     ros = _checks.library("mcap_ros2.decoder", "mcap", str(path)).DecoderFactory
@@ -53,7 +54,7 @@ class _Json:
 
 
 def _numbers_in(content: Any, name: str = "") -> Iterator[tuple[str, float]]:
-    """The numbers in a message, with the names of their places."""
+    """Yield the numbers in a message, with the names of their places."""
     if isinstance(content, bool | int | float | np.number):
         yield name, float(content)
     elif isinstance(content, list | tuple | np.ndarray):

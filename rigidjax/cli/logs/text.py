@@ -54,7 +54,7 @@ class Header(NamedTuple):
 
 
 def read_header(file: io.TextIOBase) -> Header:
-    """The header of a text, read from its beginning: the first line, below comments (`#`).
+    """Return the header of a text, read from its beginning: the first line, below comments (`#`).
 
     It may be the last comment, as `numpy.savetxt` writes it: then numbers follow.
     """
@@ -74,7 +74,7 @@ _NUMBER = re.compile(r"[-+.\d][-+.\deE]*")
 
 
 def _split(first: str) -> tuple[list[str], str]:
-    """The names in a line, and what separates them: whichever gives most of them."""
+    """Return the names in a line, and what separates them: whichever gives most of them."""
     separator = max(SEPARATORS, key=first.count)
     return [name.strip() for name in next(csv.reader([first], delimiter=separator), [])], separator
 

@@ -8,8 +8,9 @@ from rigidjax.cli.logs.columns import Columns
 
 
 def ulog(path: Path, columns: Sequence[str]) -> Columns:
-    """`topic.field` of a ULog of PX4, as `sensor_combined.gyro_rad[0]`, `topic#1.field` of a second
-    instance; times in µs.
+    """Return the fields of a ULog of PX4 as `topic.field`, such as `sensor_combined.gyro_rad[0]`.
+
+    Those of a second instance are `topic#1.field`; times are in µs.
     """
     reader, held = _checks.library("pyulog", "ulog", str(path)).ULog, {}
     # The library does not close a file that it opened itself and cannot read.

@@ -295,12 +295,14 @@ def two_flights():
     return HEADER + b"".join(frames(0, 24)) + END + HEADER + b"".join(frames(12, 48)) + END
 
 
-def test_of_several_flights_one_is_chosen(tmp_path):
+def test_of_several_flights_one_is_chosen(tmp_path, capsys):
     np.testing.assert_array_equal(read(tmp_path, two_flights(), flight=1), content(range(24)))
     np.testing.assert_array_equal(read(tmp_path, two_flights(), flight=2), content(range(12, 48)))
     words = r"flight.bbl: 2 flights are in this log, of .* kB; choose one: --flight 1 to 2"
     with pytest.raises(LogError, match=words):
         read(tmp_path, two_flights())
+    assert main(["identify", str(tmp_path / "flight.bbl")]) == 2
+    assert "choose one: --flight 1 to 2 (flight= in Python)\n" in capsys.readouterr().err
     for flight in (0, 3, -1):
         with pytest.raises(LogError, match=f"no flight {flight}; it holds 2"):
             read(tmp_path, two_flights(), flight=flight)
