@@ -97,7 +97,7 @@ def test_what_is_like_nothing_gets_no_answer_and_hidden_names_no_search():
             getattr(rj, name)
         assert "did you mean" not in str(caught.value)
     # A module that is not loaded yet: the import system asks the package first.
-    assert importlib.import_module("rigidjax.identify.csv_io")
+    assert importlib.import_module("rigidjax.cli.spec")
 
 
 def test_readme_and_guide_use_what_is_shown():

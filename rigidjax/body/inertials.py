@@ -1,7 +1,8 @@
 """Mass, centre of mass and inertia from and to robot descriptions: URDF and MuJoCo's XML."""
 
+import warnings
 import xml.etree.ElementTree as Tree
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,18 @@ _KEYS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
 def read_inertials(path: str | Path) -> dict[str, MassProperties]:
-    """The bodies with inertia in a URDF or MuJoCo XML file, by name, in their own frames.
+    """Return the bodies with inertia in a URDF or MuJoCo XML file, by name, in their own frames.
 
     URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`, `inertia`. MuJoCo: `<inertial>` with
     `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`; an inertia that MuJoCo would compute from
-    geometry is not read.
+    geometry is not read, nor are files that are included.
 
-    **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in order. **Raises:**
-    `ValueError`, with file and body, for a file that is missing or of another format, an invalid
-    number, an orientation in another form, an inertia of no real body.
+    **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in order.
+
+    It **warns** of each body that is left out: one without mass, with an invalid number, with an
+    orientation in another form, with an inertia of no real body. It also warns of settings by which
+    MuJoCo changes the masses that are written in the file. **Raises** `ValueError`, with file and
+    body, where no body is left, and for a file that is missing or of another format.
 
     >>> read_inertials("missing.urdf")
     Traceback (most recent call last):
@@ -35,15 +39,59 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     path = _checks.path(path)
     root, nodes = _opened(path)
     read = _from_urdf if root.tag == "robot" else _from_mujoco
-    out: dict[str, MassProperties] = {}
+    bodies: dict[str, MassProperties] = {}
+    faults = []
     for name, node in nodes.items():
         inertial = node.find("inertial")
         if inertial is not None:
             try:
-                out[name] = read(inertial)
+                bodies[name] = read(inertial)
             except ValueError as error:
-                raise ValueError(f"{path}: body {name!r}: {error}") from None
-    return out
+                faults.append(f"{path}: body {name!r}: {error}")
+    if faults and not bodies:
+        raise ValueError(faults[0])
+    for words in [f"{fault}; this body is left out" for fault in faults]:
+        warnings.warn(words, stacklevel=2)
+    for words in _settings(root):
+        warnings.warn(f"{path}: {words}", stacklevel=2)
+    return bodies
+
+
+# What MuJoCo does with the masses in a file by an attribute of `<compiler>` with another value than
+# these.
+_UNCHANGED = {
+    "inertiafromgeom": ("false", "auto"), "settotalmass": ("-1", "0"), "balanceinertia": ("false",),
+    "boundmass": ("0",), "boundinertia": ("0",), "coordinate": ("local",),
+}  # fmt: skip
+_CHANGES = {
+    "inertiafromgeom": "takes all masses and inertias from the geometry instead",
+    "settotalmass": "scales all masses and inertias to this total mass",
+    "balanceinertia": "replaces the moments of what is no real body by their mean",
+    "boundmass": "raises smaller masses to this one",
+    "boundinertia": "raises smaller moments to this one",
+    "coordinate": "reads places and orientations in the frame of the world",
+}
+
+
+def _settings(root: Tree.Element) -> list[str]:
+    """Return the settings by which MuJoCo has other masses than the file's inertials."""
+    words = []
+    for compiler in root.iter("compiler"):
+        for key, unchanged in _UNCHANGED.items():
+            value = compiler.get(key)
+            if value is not None and not _is_one_of(value, unchanged):
+                words.append(f'{key}="{value}": MuJoCo {_CHANGES[key]}; read as written')
+    if next(root.iter("include"), None) is not None:
+        words.append("<include>: bodies in other files are not read")
+    return words
+
+
+def _is_one_of(value: str, words: Sequence[str]) -> bool:
+    """Whether an attribute has one of these values, as a word or as a number."""
+    try:
+        return float(value) in map(float, words)
+    except ValueError:
+        return value.strip() in words
 
 
 def write_inertials(

@@ -8,10 +8,10 @@ it, `refit` finds its maximum.
 """
 
 from rigidjax._names import show
+from rigidjax.cli.logs.table import read_table as read_table
 from rigidjax.identify import report as report
 from rigidjax.identify.answer.fit import fit as fit
 from rigidjax.identify.answer.result import Fit as Fit
-from rigidjax.identify.csv_io import read_table as read_table
 from rigidjax.identify.data.recording import Recording as Recording
 from rigidjax.identify.data.windows import Windows as Windows, windows as windows
 from rigidjax.identify.filtering.filter import (

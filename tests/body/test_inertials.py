@@ -76,7 +76,10 @@ MISTAKES = [
     (URDF.replace('"2.5"', '"two"'), "body 'upper': iyy: 'two' are no numbers"),
     (URDF.replace("0.1 -0.2 0.3", "0.1 -0.2"), "xyz: wanted 3 finite numbers, got '0.1 -0.2'"),
     (URDF.replace("base", "upper"), "two bodies are called 'upper'"),
-    (MUJOCO.replace("quat", "euler"), "body 'upper': its inertial is turned by euler; wanted quat"),
+    (
+        MUJOCO.replace("quat", "euler").replace('mass="1.0"', 'mass="-1"'),
+        "body 'upper': its inertial is turned by euler; wanted quat",
+    ),
     ("<world/>", "wanted a URDF .robot. or MuJoCo file, got <world>"),
     ("<robot", "cannot be read as XML"),
 ]
@@ -92,3 +95,72 @@ def test_a_name_that_is_not_there(tmp_path):
     source = written(tmp_path, URDF)
     with pytest.raises(ValueError, match="no body 'hand'; there are base, upper"):
         rj.body.write_inertials(tmp_path / "x", {"hand": rj.shapes.box(1.0, [1.0, 1, 1])}, source)
+
+
+ROBOT = """<robot name="arm">
+  <link name="world"/>
+  {links}
+</robot>
+"""
+LINK = """<link name="{name}"><inertial>
+  <origin xyz="0 0 0.2"/><mass value="{mass}"/>
+  <inertia ixx="{moment}" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.02"/>
+</inertial></link>"""
+BAD = {
+    "tool": (dict(mass="0", moment="0.01"), "wanted a positive mass, got 0"),
+    "camera": (dict(mass="0.1", moment="0.09"), "no body has the moments 0.02, 0.02, 0.09"),
+    "cover": (dict(mass="1e-3 kg", moment="0.01"), "value: '1e-3 kg' are no numbers"),
+    "plate": (dict(mass="0.1", moment="nan"), "ixx: wanted 1 finite numbers, got 'nan'"),
+}
+
+
+def test_the_links_of_a_whole_robot_are_read_and_bad_ones_named(tmp_path):
+    good = {f"link {k}": dict(mass=f"{k}.5", moment="0.03") for k in range(1, 4)}
+    links = list(good.items()) + [(name, how) for name, (how, _) in BAD.items()]
+    links.insert(1, links.pop())
+    text = ROBOT.format(links="\n".join(LINK.format(name=name, **how) for name, how in links))
+    path = written(tmp_path, text)
+    with pytest.warns(UserWarning, match="left out") as said:
+        found = rj.body.read_inertials(path)
+    assert list(found) == list(good)
+    np.testing.assert_allclose([body.mass for body in found.values()], [1.5, 2.5, 3.5])
+    words = {str(one.message) for one in said}
+    assert len(words) == len(said) == len(BAD)
+    for name, (_, why) in BAD.items():
+        (line,) = (line for line in words if line.startswith(f"{path}: body {name!r}: {why}"))
+        assert line.endswith("; this body is left out")
+
+
+SETTINGS = {
+    'inertiafromgeom="true"': "takes all masses and inertias from the geometry instead",
+    'settotalmass="12"': "scales all masses and inertias to this total mass",
+    'balanceinertia="true"': "replaces the moments of what is no real body by their mean",
+    'boundmass="0.5"': "raises smaller masses to this one",
+    'boundinertia="1e-3"': "raises smaller moments to this one",
+    'coordinate="global"': "reads places and orientations in the frame of the world",
+}
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_settings_by_which_mujoco_has_other_masses_are_told(setting, tmp_path):
+    path = written(tmp_path, MUJOCO.replace("<mujoco>", f"<mujoco><compiler {setting}/>"))
+    with pytest.warns(UserWarning, match="MuJoCo") as said:
+        found = rj.body.read_inertials(path)
+    assert list(found) == ["upper", "lower"]
+    assert [str(one.message) for one in said] == [
+        f"{path}: {setting}: MuJoCo {SETTINGS[setting]}; read as written"
+    ]
+
+
+def test_settings_that_change_nothing_are_not_told(tmp_path):
+    usual = 'inertiafromgeom="auto" settotalmass="-1.0" balanceinertia="false" boundmass="0"'
+    path = written(
+        tmp_path, MUJOCO.replace("<mujoco>", f'<mujoco><compiler {usual} angle="radian"/>')
+    )
+    assert list(rj.body.read_inertials(path)) == ["upper", "lower"]
+
+
+def test_files_that_are_included_are_told(tmp_path):
+    path = written(tmp_path, MUJOCO.replace("<mujoco>", '<mujoco><include file="arm.xml"/>'))
+    with pytest.warns(UserWarning, match="<include>: bodies in other files are not read"):
+        rj.body.read_inertials(path)

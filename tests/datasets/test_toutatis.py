@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax.__main__ import main
+from rigidjax.cli.command import main
 from rigidjax.datasets import toutatis
 
 

@@ -13,9 +13,9 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.__main__ import main
-from rigidjax.identify import cli_spec
-from rigidjax.identify.csv_io import LogError
+from rigidjax.cli import spec
+from rigidjax.cli.command import main
+from rigidjax.cli.logs.errors import LogError
 from rigidjax.identify.search import checkpoint
 from rigidjax.identify.search.stages import Attempt, errors_and_slopes
 from rigidjax.identify.uncertainty import quantities
@@ -283,11 +283,11 @@ def test_sensors_and_wheels_of_one_kind_have_names_of_their_own(tmp_path):
     path, rng = tmp_path / "log.csv", np.random.default_rng(0)
     table = np.column_stack([np.arange(20.0), rng.normal(size=(20, 8))])
     np.savetxt(path, table, delimiter=",", header="t,a,b,c,d,e,f,s,r")
-    channels = [cli_spec.channel(text) for text in ("gyro=a,b,c", "gyro=d,e,f")]
-    wheels = [cli_spec.wheel(text) for text in ("s:1e-6:x", "r:1e-6:y")]
+    channels = [spec.channel(text) for text in ("gyro=a,b,c", "gyro=d,e,f")]
+    wheels = [spec.wheel(text) for text in ("s:1e-6:x", "r:1e-6:y")]
     free = ("bias", "delay")
-    record = cli_spec.read_log(path, channels, wheels=wheels, free=free)
-    slots = cli_spec.model_of([record], "tensor", wheels=wheels, free=free).slots
+    record = spec.read_log(path, channels, wheels=wheels, free=free)
+    slots = spec.model_of([record], "tensor", wheels=wheels, free=free).slots
     names = ["gyro 1 bias", "gyro 2 bias", "wheel 1 delay", "wheel 2 delay"]
     assert [slot.name for slot in slots] == names
 
@@ -417,7 +417,10 @@ WRONG = [
     (["--wheel", "s"], "wanted COLUMN:INERTIA"),
     (["--wheel", "s:1:w"], "wanted an axis x, y or z"),
     (["--model", "tensor"], "free motion shows ratios only; a scale needs a --wheel"),
-    (["--window", "5", "6"], "fewer than 4 samples between 5.0 and 6.0 s"),
+    (
+        ["--window", "5", "6"],
+        "fewer than 4 samples between 5 and 6 s from the first stamp; the log goes from 0 to 1.1 s",
+    ),
 ]
 
 

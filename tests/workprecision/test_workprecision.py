@@ -13,7 +13,7 @@ from orbits.three_body_series import solve
 from systems import free_body_mp, tops_mp
 
 import rigidjax as rj
-from rigidjax.__main__ import main
+from rigidjax.cli.command import main
 from rigidjax.workprecision import (
     Scene,
     choose,

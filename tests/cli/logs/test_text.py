@@ -1,5 +1,8 @@
 """What a user reads when a log is wrong: one line with file, line and column, exit code 2."""
 
+import codecs
+import gzip
+import re
 import subprocess
 import sys
 
@@ -8,8 +11,9 @@ import pytest
 from scipy.io import savemat
 
 import rigidjax as rj
-from rigidjax.__main__ import main
-from rigidjax.identify.csv_io import LogError, layout_of
+from rigidjax.cli.command import main
+from rigidjax.cli.logs.errors import LogError
+from rigidjax.cli.logs.layouts import layout_of
 
 GOOD = "t,wx,wy,wz\n" + "\n".join(
     f"{0.1 * k:.1f},{np.cos(k):.6f},{np.sin(k):.6f},1.0" for k in range(12)
@@ -26,10 +30,12 @@ WRONG = {
     "no column": (GOOD.replace("wy", "gyro_y"), "line 1: no column 'wy'; the columns are t, wx, gyro_y, wz"),
     "nan": (_swap(4, "0.2,nan,1,1"), "line 4: column 'wx': nan is not a finite number"),
     "text": (_swap(5, "0.3,1,fast,1"), "line 5: column 'wy': 'fast' is not a number"),
-    "no time": (_swap(5, ",1,1,1"), "column 't': row 4 is empty"),
     "short line": (_swap(6, "0.4,1"), "line 6: column 'wy': the line ends before it"),
-    "time stands": (_swap(6, "0.3,1,1,1"), "column 't': row 5: time 0.3 is not above the 0.3"),
-    "a time that stands, below a comment": ("# by hand\n\n" + _swap(6, "0.3,1,1,1"), "column 't': row 5: time 0.3 is not above the 0.3"),
+    "no times": (re.sub(r"\n\d\.\d", "\n", GOOD), "column 't': the times of 12 of 12 rows are repeated, backward or missing (row 1 is the first)"),
+    "two clocks": (GOOD + GOOD.removeprefix("t,wx,wy,wz"), "column 't': the clock was set back at row 13, from 1.1 to 0 s; make two logs of it"),
+    "a time that stands": (re.sub(r"\n\d\.\d", "\n0.3", GOOD), "column 't': the times of 11 of 12 rows are repeated, backward or missing (row 2 is the first)"),
+    "rates of zero": ("t,wx,wy,wz\n" + "\n".join(f"{k},0,0.0,-0" for k in range(9)), "the rates (wx, wy, wz) are all zero"),
+    "no rates": ("t,wx,wy,wz\n" + "\n".join(f"{k},1,,1" for k in range(9)), "no row has a rate in each of the columns wx, wy, wz"),
     "a comment, no column": ("# by hand\n" + GOOD.replace("wy", "gyro"), "line 2: no column 'wy'; the columns are t, wx, gyro, wz"),
     "a cell below comments": ("# by hand\n\n# twice\n" + _swap(5, "0.3,1,fast,1"), "line 8: column 'wy': 'fast' is not a number"),
     "a cell below a header that is a comment": ("# by hand\n# " + _swap(5, "0.3,1,fast,1"), "line 6: column 'wy': 'fast' is not a number"),
@@ -87,6 +93,103 @@ def test_comments_above_the_header_and_the_header_of_savetxt(comments, mark, sep
     table = rj.identify.read_table(path, ["wz", "t", "wy"])
     for place, name in ((0, "t"), (2, "wy"), (3, "wz")):
         np.testing.assert_array_equal(table[name], values[:, place])
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize(
+    ("encoding", "mark"),
+    [
+        ("utf-8", b""), ("utf-8", codecs.BOM_UTF8), ("utf-16-le", codecs.BOM_UTF16_LE),
+        ("utf-16-be", codecs.BOM_UTF16_BE), ("utf-16-le", b""), ("utf-16-be", b""), ("cp1252", b""),
+    ],
+)  # fmt: skip
+def test_texts_of_other_systems_packed_or_not(encoding, mark, packed, tmp_path):
+    text = "t;Drehrate (°/s)\r\n" + "".join(f"{0.5 * k};{k * k}\r\n" for k in range(2000))
+    path = tmp_path / ("log.csv.gz" if packed else "log.csv")
+    data = mark + text.encode(encoding)
+    path.write_bytes(gzip.compress(data) if packed else data)
+    table = rj.identify.read_table(path, ["t", "Drehrate (°/s)"])
+    np.testing.assert_array_equal(table["t"], 0.5 * np.arange(2000))
+    np.testing.assert_array_equal(table["Drehrate (°/s)"], np.arange(2000.0) ** 2)
+
+
+def test_a_damaged_packed_file_gets_one_line(tmp_path):
+    whole = gzip.compress((GOOD + "\n" + 900 * "9,1,1,1\n").encode())
+    for data in (b"", b"t,wx\n1,2\n", whole[:40], whole[:-12] + bytes(12)):
+        (tmp_path / "log.csv.gz").write_bytes(data)
+        with pytest.raises(
+            LogError, match=r"log.csv.gz: (cannot be read as text|line 1: wanted a)"
+        ):
+            rj.identify.read_table(tmp_path / "log.csv.gz", ["t", "wx"])
+    (tmp_path / "log.npz.gz").write_bytes(whole)
+    with pytest.raises(LogError, match="only text is read while it is packed; unpack it first"):
+        rj.identify.read_table(tmp_path / "log.npz.gz", ["t", "wx"])
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+@pytest.mark.parametrize("style", ["%.9E", "%.6f", "%.2f"])
+def test_decimal_commas_between_semicolons_and_tabs(separator, style, tmp_path):
+    values = np.random.default_rng(3).normal(scale=700.0, size=(40, 3))
+    values[4] = [0.0, -1.0, 1234.0]
+    path = tmp_path / "log.csv"
+    np.savetxt(
+        path,
+        values,
+        fmt=style,
+        delimiter=separator,
+        header="a\tb\tc".replace("\t", separator),
+        comments="",
+    )
+    points = rj.identify.read_table(path, ["a", "b", "c"])
+    path.write_text(path.read_text().replace(".", ","))
+    commas = rj.identify.read_table(path, ["a", "b", "c"])
+    for name in "abc":
+        np.testing.assert_array_equal(points[name], commas[name])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "a;b\n1,5;2\n1;2.5\n",
+            "line 3: column 'b': '2.5' is not a number; the decimals above have",
+        ),
+        (
+            "a;b\n1.5;2\n1;2,5\n",
+            "line 3: column 'b': '2,5' is not a number; the decimals above have",
+        ),
+        ("a;b\n1.234,5;2\n", "line 2: column 'a': '1.234,5' is not a number"),
+        ("a;b\n1,234,5;2\n", "line 2: column 'a': '1,234,5' is not a number"),
+        (
+            "a\tb\n1,234\t2\n",
+            "line 2: column 'a': '1,234' is not a number; does its comma mark thou",
+        ),
+        ('a,b\n"1,5",2\n', "line 2: column 'a': '1,5' is not a number; a decimal comma?"),
+    ],
+)
+def test_commas_that_may_mean_two_things_are_refused(text, words, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(LogError) as caught:
+        rj.identify.read_table(path, ["a", "b"])
+    assert words in str(caught.value)
+
+
+def test_a_thousand_between_tabs_is_a_decimal_once_another_cell_shows_it(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("a\tb\n0,5\t1,234\n")
+    assert rj.identify.read_table(path, ["a", "b"])["b"].tolist() == [1.234]
+
+
+@pytest.mark.parametrize("unit", ["rad/s", "deg/s", "°/s"])
+@pytest.mark.parametrize("time_unit", ["s", "ms"])
+def test_a_layout_has_the_units_in_its_names(unit, time_unit, tmp_path):
+    path = tmp_path / "log.csv"
+    names = [f"Zeit ({time_unit})", "Betrag", *(f"Gyroskop {axis} ({unit})" for axis in "zyx")]
+    path.write_text(";".join(names) + "\n")
+    layout = layout_of(path)
+    assert layout.columns == (names[0], names[4], names[3], names[2])
+    assert layout.unit == unit.replace("°", "deg") and layout.time_unit == time_unit
 
 
 def test_a_header_that_is_a_comment_is_known_as_that_of_phyphox(tmp_path):

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax import __main__ as command
-from rigidjax.__main__ import main
+from rigidjax.cli import command
+from rigidjax.cli.command import main
 from rigidjax.identify.answer.answers import Answer
 
 GOOD = "t,wx,wy,wz\n" + "\n".join(f"{k},{np.cos(k):.6f},{np.sin(k):.6f},1.0" for k in range(12))
@@ -224,13 +224,68 @@ def test_ctrl_c_is_not_lost_in_the_garbage_collector(monkeypatch):
 
 
 def test_a_reader_that_stops_reading_does_not_stop_what_is_written_after():
-    says = "import sys; from rigidjax.__main__ import _say; sys.stdin.read(); _say('1'); _say('2'); print('on', file=sys.stderr)"
+    says = "import sys; from rigidjax.cli.command import _say; sys.stdin.read(); _say('1'); _say('2'); print('on', file=sys.stderr)"
     pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     run = subprocess.Popen([sys.executable, "-c", says], text=True, **pipes)
     assert run.stdout is not None
     run.stdout.close()
     run.stdout = None
     assert run.communicate()[1] == "on\n" and run.returncode == 0
+
+
+TIMES = 0.05 * np.arange(40)
+
+
+def rows_of(t, names="t,wx,wy,wz", scale=1.0):
+    """A log of a body that turns about a moving axis."""
+    rates = scale * np.stack([np.cos(TIMES), np.sin(TIMES), 1.0 + 0 * TIMES], axis=1)
+    rows = np.column_stack([t, rates])
+    return names + "\n" + "\n".join(",".join(f"{x:.9g}" for x in row) for row in rows)
+
+
+def repeated():
+    t = TIMES.copy()
+    t[7] = t[6]
+    return rows_of(t)
+
+
+def test_what_is_left_out_of_a_log_is_said_and_refused_if_that_is_wanted(folder, fitted, capsys):
+    Path("log.csv").write_text(repeated())
+    line = (
+        "log.csv: column 't': 1 of 40 rows are left out: their times are repeated, backward or "
+        "missing (row 8)\n"
+    )
+    assert main(["identify", "log.csv"]) == 0 and len(fitted) == 1
+    out = capsys.readouterr()
+    assert out.out.startswith(line + "log.csv: 39 samples over 1.95 s\n") and out.err == ""
+    assert main(["identify", "log.csv", "--strict"]) == 2 and len(fitted) == 1
+    assert capsys.readouterr().err == f"error: {line[:-1]} (--strict)\n"
+    assert main(["identify", "log.csv", "--strict", "--window", "1", "1.9"]) == 0
+    assert "log.csv: 19 samples over 0.9 s\n" in capsys.readouterr().out
+
+
+def test_units_in_the_names_of_columns_are_read_and_said(folder, fitted, capsys):
+    names = ["Time [ms]", *(f"Gyroscope {axis} (deg/s)" for axis in "xyz")]
+    Path("log.csv").write_text(rows_of(1e3 * TIMES, ",".join(names), 180 / np.pi))
+    said = "log.csv: time in ms, gyro in deg/s, as the names of its columns say\n"
+    samples = "log.csv: 40 samples over 1.95 s\n"
+    for options in ([], ["--columns", *names], ["--columns", *names, "--unit", "deg/s"]):
+        assert main(["identify", "log.csv", *options]) == 0
+        out = capsys.readouterr().out
+        assert out.startswith(said + samples) and "deg/s" in out.split(samples)[1]
+    assert main(["identify", "log.csv", "--unit", "rad/s"]) == 2
+    words = "'Gyroscope x (deg/s)' is in deg/s by its name, and rad/s is stated: which one?"
+    assert words in capsys.readouterr().err
+
+
+def test_the_time_column_alone_is_named_beside_a_sensor(folder, fitted, capsys):
+    Path("log.csv").write_text(rows_of(1e9 * TIMES, "stamp,p,q,r"))
+    options = ["--sensor", "gyro=p,q,r", "--time", "stamp", "--time-unit", "ns"]
+    assert main(["identify", "log.csv", *options]) == 0
+    assert "log.csv: 40 samples over 1.95 s\n" in capsys.readouterr().out
+    options += ["--columns", "stamp", "p", "q", "r"]
+    assert main(["identify", "log.csv", *options]) == 2
+    assert "--time: the first of --columns is it already" in capsys.readouterr().err
 
 
 REFUSED = [
@@ -248,6 +303,9 @@ REFUSED = [
     (["log.csv", "--starts", "0"], "starts: wanted a whole number of at least 1, got 0"),
     (["log.csv", "--sensor", "gyro=wx,wy,wz", "--unit", "deg/s"], "--unit: with --sensor"),
     (["log.csv", "--sensor", "gyro=wx,wy,wz", "--noise", "1"], "--noise: with --sensor"),
+    (["log.csv", "--flight", "2"], "log.csv: flight 2: only a Blackbox log (.bbl, .bfl) has flights"),
+    (["log.csv", "--window", "20", "30"], "between 20 and 30 s from the first stamp; the log goes from 0 to 11 s"),
+    (["log.csv", "--window", "3", "2"], "window: wanted FROM below TO, got 3 2"),
     (["log.csv", "--free", "delay"], "--free delay: that of a --wheel, and there is none"),
     (["a\x1b[31m.csv"], r"a\x1b[31m.csv: no such file"),
     (["log.csv", "--json", "a\x1b[31m/b"], r"there is no folder a\x1b[31m"),
@@ -268,7 +326,7 @@ def test_mistakes_are_told_before_the_fit(options, words, folder, capsys):
 
 
 def test_the_charts_of_other_commands_are_named_as_they_are_written(folder, capsys):
-    stored = Path(__file__).parent / "workprecision" / "record.csv"
+    stored = Path(__file__).parents[1] / "workprecision" / "record.csv"
     rows = stored.read_text().replace("simulate", r"s$\badcmd{$")
     Path("stored.csv").write_text("\n".join(rows.splitlines()[:20]))
     assert main(["workprecision", "--from", "stored.csv", "--figure", "chart"]) == 0

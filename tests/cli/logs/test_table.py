@@ -11,9 +11,11 @@ from mcap.writer import Writer
 from mcap_ros2.writer import Writer as RosWriter
 
 import rigidjax as rj
-from rigidjax.__main__ import main
-from rigidjax.identify import cli_spec, read_table
-from rigidjax.identify.csv_io import USUAL, LogError, layout_of
+from rigidjax.cli import spec
+from rigidjax.cli.command import main
+from rigidjax.cli.logs.errors import LogError
+from rigidjax.cli.logs.layouts import USUAL, layout_of
+from rigidjax.identify import read_table
 
 T = np.arange(40) * 0.01
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -119,8 +121,8 @@ def test_time_and_rates_are_found_in_si(tmp_path, kind):
     name, write, exact = FILES[kind]
     write(tmp_path / name)
     layout = layout_of(tmp_path / name)
-    rates = cli_spec.channel(f"gyro={','.join(layout.columns[1:])}:{layout.unit}")
-    record = cli_spec.read_log(
+    rates = spec.channel(f"gyro={','.join(layout.columns[1:])}:{layout.unit}")
+    record = spec.read_log(
         tmp_path / name, [rates], time=layout.columns[0], time_unit=layout.time_unit
     )
     np.testing.assert_allclose(record.t - record.t[0], T, rtol=0, atol=1e-6)

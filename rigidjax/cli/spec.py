@@ -11,8 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax.identify import csv_io
-from rigidjax.identify.csv_io import UNITS, USUAL as USUAL, LogError, layout_of as layout_of
+from rigidjax.cli.logs.errors import LogError
+from rigidjax.cli.logs.layouts import usual_unit
+from rigidjax.cli.logs.table import read_table
+from rigidjax.cli.logs.times import increasing, kept_rows, remark_on_step
+from rigidjax.cli.logs.units import TIME_UNITS, UNITS, unit_of
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.model import charts
 from rigidjax.identify.model.free import Free
@@ -40,38 +43,43 @@ SENSOR_UNITS = {
     "euler": ("rad", "deg"),
 }
 
+_WHEEL_UNITS = ("rad/s", "rpm")
+
 
 class Channel(eqx.Module):
-    """One sensor of a log; noise (of each axis) and full scale in its unit."""
+    """One sensor of a log; noise (of each axis) and full scale in its unit.
+
+    `unit` is `None` where the names of the columns, or else what is usual, shall decide.
+    """
 
     kind: str
     columns: tuple[str, ...]
-    unit: str
+    unit: str | None
     noise: tuple[float, ...] | None
     limit: float | None = None
 
 
 class WheelColumn(eqx.Module):
-    """A wheel whose speed was logged: column, unit, inertia (kg m²), axis."""
+    """A wheel whose speed was logged: column, unit (as in `Channel`), inertia (kg m²), axis."""
 
     column: str
-    unit: str
+    unit: str | None
     inertia: float
     axis: tuple[float, float, float]
 
 
 def channel(text: str) -> Channel:
-    """A sensor written `KIND=COLUMNS[:UNIT[:NOISE]]`, such as `gyro=wx,wy,wz:deg/s:0.1`.
+    """Return the sensor that is written `KIND=COLUMNS[:UNIT[:NOISE]]`.
 
-    KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y, z) or `euler-ZXZ` (any sequence; body →
-    world); NOISE one number or three, one for each axis, as in `0.1,0.1,0.2`. **Raises**
-    `LogError` in words.
+    An example is `gyro=wx,wy,wz:deg/s:0.1`. KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y,
+    z) or `euler-ZXZ` (any sequence; body → world); NOISE is one number or three, one for each axis,
+    as in `0.1,0.1,0.2`. **Raises** `LogError` in words.
     """
     kind, _, rest = text.partition("=")
     names, *more = rest.split(":")
     columns = tuple(name.strip() for name in names.split(","))
-    allowed = SENSOR_UNITS.get("euler" if kind.startswith("euler-") else kind)
-    if allowed is None or kind == "euler":
+    allowed = _units_of_kind(kind)
+    if not allowed:
         raise LogError(
             f"sensor {text!r}: wanted gyro, accelerometer, quaternion or euler-SEQUENCE, as in "
             "gyro=wx,wy,wz:deg/s"
@@ -79,8 +87,8 @@ def channel(text: str) -> Channel:
     wanted = 4 if kind == "quaternion" else 3
     if len(columns) != wanted or not all(columns):
         raise LogError(f"sensor {text!r}: wanted {wanted} columns, got {names!r}")
-    unit = more[0] if more and more[0] else allowed[0]
-    if unit not in allowed:
+    unit = more[0] if more and more[0] else None
+    if unit not in (None, *allowed):
         raise LogError(f"sensor {text!r}: wanted the unit {' or '.join(allowed)}, got {unit!r}")
     if len(more) < 2:
         return Channel(kind, columns, unit, None)
@@ -91,8 +99,14 @@ def channel(text: str) -> Channel:
     return Channel(kind, columns, unit, noises(noise, f"sensor {text!r}"))
 
 
+def _units_of_kind(kind: str) -> tuple[str, ...]:
+    """Return the units of a kind of sensor, none for what is no kind."""
+    key = "euler" if kind.startswith("euler-") else kind
+    return () if kind == "euler" else SENSOR_UNITS.get(key, ())
+
+
 def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
-    """The noise of three axes, from one positive number or three; `LogError` for others."""
+    """Return the noise of three axes, from one positive number or three; `LogError` for others."""
     if len(noise) not in (1, 3):
         raise LogError(f"{where}: wanted one noise or three, got {len(noise)}")
     if not all(0 < part < np.inf for part in noise):
@@ -101,18 +115,19 @@ def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
 
 
 def wheel(text: str) -> WheelColumn:
-    """A wheel written `COLUMN:INERTIA[:AXIS[:UNIT]]`, such as `flywheel:5.2e-7:z:rad/s`.
+    """Return the wheel that is written `COLUMN:INERTIA[:AXIS[:UNIT]]`.
 
-    INERTIA in kg m² about its axis, AXIS `x`, `y` or `z` of the body. **Raises** `LogError`.
+    An example is `flywheel:5.2e-7:z:rad/s`. INERTIA is in kg m² about its axis, AXIS `x`, `y` or
+    `z` of the body. **Raises** `LogError`.
     """
     name, *more = text.split(":")
     axis = more[1] if len(more) > 1 else "z"
-    unit = more[2] if len(more) > 2 else "rad/s"
+    unit = more[2] if len(more) > 2 else None
     try:
         inertia = float(more[0])
     except (IndexError, ValueError):
         raise LogError(f"wheel {text!r}: wanted COLUMN:INERTIA, as in flywheel:5.2e-7:z") from None
-    if axis not in ("x", "y", "z") or unit not in ("rad/s", "rpm"):
+    if axis not in ("x", "y", "z") or unit not in (None, *_WHEEL_UNITS):
         raise LogError(f"wheel {text!r}: wanted an axis x, y or z and a unit rad/s or rpm")
     x, y, z = (float(axis == one) for one in "xyz")
     return WheelColumn(name, unit, inertia, (x, y, z))
@@ -123,37 +138,50 @@ def read_log(
     channels: Sequence[Channel],
     *,
     time: str = "t",
-    time_unit: str = "s",
+    time_unit: str | None = None,
     window: tuple[float, float] | None = None,
     wheels: Sequence[WheelColumn] = (),
     free: Sequence[str] = (),
+    flight: int | None = None,
 ) -> Recording:
     """Return one recording from a file, with the described sensors; wheel speeds are its inputs.
 
-    **Arguments:** `path`; `channels`; `time`, `time_unit` the time column; `window` (from, to), s,
-    or `None` for all; `wheels`, whose speeds become inputs, by the names of `input_names`; `free`
-    some of `bias`, `drag`, `delay`: for `bias` the sensors get one, so that a fit can move it. An
-    empty cell is a gap. **Raises** `LogError` as `read_table`.
+    Its times are counted from the first stamp of the log. An empty cell is a gap.
+
+    **Arguments:**
+
+    - `path`: the file; `flight` as in `read_table`;
+    - `channels`, `wheels`: what to read; speeds become inputs, by the names of `input_names`;
+    - `time`, `time_unit`: the time column; its name says the unit if that is `None`, else it is s;
+    - `window`: (from, to), s from the first stamp, or `None` for all;
+    - `free`: some of `bias`, `drag`, `delay`: for `bias` the sensors get one, so that a fit can move
+      it.
+
+    It **warns** as `read_table`, of rows that are left out because their times do not increase, and
+    of times that are plainly in another unit. **Raises** `LogError` as `read_table`, and for rates
+    that are all zero.
     """
+    unit = unit_of_time(path, time, time_unit)
     # Two wheels may share a column of their speed.
     turning = dict.fromkeys(w.column for w in wheels)
     names = [time, *(c for one in channels for c in one.columns), *turning]
-    table = csv_io.read_table(path, names)
-    t = table[time] * UNITS[time_unit]
-    csv_io.increasing(path, t, time)
-    inside = np.ones(t.shape, bool)
-    if window is not None:
-        inside = (t >= window[0] - 1e-12) & (t <= window[1] + 1e-12)
-        if inside.sum() < 4:
-            raise LogError(f"{path}: fewer than 4 samples between {window[0]} and {window[1]} s")
-    kept = slice(None) if inside.all() else inside
-    readings = []
+    table = read_table(path, names, flight=flight)
+    # Seconds since 1970, or nanoseconds, leave few digits for a step.
+    t = (table[time] - _first(table[time])) * UNITS[unit]
+    kept = kept_rows(path, t, time, window)
+    # A large log is not to be copied.
+    kept = slice(None) if kept.size == t.size else kept
+    readings, rate = [], 0.0
     for one in channels:
         values = np.stack([table[name] for name in one.columns], axis=1)
-        values *= UNITS[one.unit]
+        factor = UNITS[unit_of_channel(path, one)]
+        values *= factor
         seen = np.isfinite(values).all(axis=1)
-        sensor, values = _sensor(one, values, "bias" in free)
+        if one.kind == "gyro":
+            rate = _typical_rate(path, one, values[kept][seen[kept]])
+        sensor, values = _sensor(one, values, factor, "bias" in free)
         readings.append((sensor, values[kept], seen[kept]))
+    remark_on_step(path, t[kept], unit, rate)
     inputs = _speeds(path, t, table, wheels)
     # A large log is not to be held twice.
     del table
@@ -163,10 +191,45 @@ def read_log(
         raise LogError(f"{path}: {error}") from None
 
 
-def _sensor(one: Channel, values: np.ndarray, bias: bool) -> tuple[AbstractSensor, np.ndarray]:
+def _first(t: np.ndarray) -> float:
+    """Return the first time that there is, or zero."""
+    finite = np.isfinite(t)
+    return float(t[np.argmax(finite)]) if finite.any() else 0.0
+
+
+def unit_of_channel(path: str | Path, one: Channel) -> str:
+    """Return the unit that a channel states, its columns name, or that is usual in such a log."""
+    allowed = _units_of_kind(one.kind)
+    usual = usual_unit(path, one.columns[0]) or allowed[0]
+    return unit_of(one.columns, one.unit, usual, allowed, str(path))
+
+
+def unit_of_time(path: str | Path, column: str, stated: str | None) -> str:
+    """Return the unit of times that is stated, that their column names, or that is usual."""
+    usual = usual_unit(path, column) or "s"
+    return unit_of([column], stated, usual, TIME_UNITS, str(path))
+
+
+def _typical_rate(path: str | Path, one: Channel, rates: np.ndarray) -> float:
+    """Return the median magnitude of rates (n, 3), rad/s; `LogError` if there is none but zero."""
+    names = ", ".join(one.columns)
+    if not rates.size:
+        raise LogError(f"{path}: no row has a rate in each of the columns {names}")
+    if not rates.any():
+        raise LogError(
+            f"{path}: the rates ({names}) are all zero: a body at rest shows nothing of its "
+            "inertia, or the sensor was off; other columns by --columns, another part by --window"
+        )
+    return float(np.median(np.linalg.norm(rates, axis=1)))
+
+
+def _sensor(
+    one: Channel, values: np.ndarray, factor: float, bias: bool
+) -> tuple[AbstractSensor, np.ndarray]:
+    """Return the sensor of a channel, whose unit has this factor to SI, and its readings."""
     zero = [0.0, 0.0, 0.0] if bias else None
-    noise = None if one.noise is None else UNITS[one.unit] * np.array(one.noise)
-    limit = None if one.limit is None else one.limit * UNITS[one.unit]
+    noise = None if one.noise is None else factor * np.array(one.noise)
+    limit = None if one.limit is None else one.limit * factor
     if one.kind == "gyro":
         return Gyro(noise, bias=zero, limit=limit), values
     if one.kind == "accelerometer":
@@ -185,14 +248,37 @@ def input_names(wheels: Sequence[WheelColumn]) -> list[str]:
     return [f"wheel {i + 1}" if len(wheels) > 1 else "wheel" for i in range(len(wheels))]
 
 
+def _evenly_spaced(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return samples (n,) at even times, with those interpolated whose rows are left out.
+
+    Times that are not those of an even series, rounded to a thousandth of a step, are returned as
+    they are.
+    """
+    step = np.median(np.diff(t)) if t.size > 1 else np.nan
+    place = (t - t[:1]) / step
+    if not np.isfinite(step) or place[-1] > 10 * t.size:
+        return t, values
+    # A better step than that of two rounded times.
+    step *= place[-1] / np.round(place[-1])
+    place = (t - t[0]) / step
+    if np.abs(place - np.round(place)).max() > 1e-3:
+        return t, values
+    places = np.arange(np.round(place[-1]) + 1)
+    return t[0] + step * places, np.interp(places, np.round(place), values)
+
+
 def _speeds(
     path: str | Path, t: np.ndarray, table: dict[str, np.ndarray], wheels: Sequence[WheelColumn]
 ) -> dict[str, Series]:
     """Return the logged speed of each wheel by the name of its input, rad/s."""
     speeds = {}
+    # A speed counts outside the window, too: before a reading and after it.
+    kept = increasing(t) if wheels else slice(None)
     for name, one in zip(input_names(wheels), wheels, strict=True):
+        unit = unit_of([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
         try:
-            speeds[name] = Series(t, table[one.column] * UNITS[one.unit])
+            samples = table[one.column][kept] * UNITS[unit]
+            speeds[name] = Series(*_evenly_spaced(t[kept], samples))
         except ValueError as error:
             raise LogError(f"{path}: column {one.column!r}: {error}") from None
     return speeds

@@ -1,0 +1,1 @@
+"""Readers of logs, one format in each module; `table.read_table` chooses among them."""

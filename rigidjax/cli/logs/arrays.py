@@ -1,0 +1,24 @@
+"""NumPy's and MATLAB's files of arrays."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rigidjax.cli.logs.columns import Columns
+
+
+def npz(path: Path, columns: Sequence[str]) -> Columns:
+    """Return the names of the arrays in a `.npz` file, and the wanted ones."""
+    # NumPy does not close a file that it opened itself and cannot read.
+    with path.open("rb") as raw, np.load(raw) as file:
+        return file.files, {name: file[name] for name in columns if name in file.files}
+
+
+def mat(path: Path, columns: Sequence[str]) -> Columns:
+    """Return the names of the arrays in a `.mat` file, and the wanted ones."""
+    from scipy.io import loadmat, whosmat
+
+    with path.open("rb") as raw:
+        names = [name for name, *_ in whosmat(raw)]
+        return names, loadmat(raw, variable_names=list(columns))

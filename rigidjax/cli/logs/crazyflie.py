@@ -1,0 +1,51 @@
+"""The binary log of the Crazyflie's µSD card, which has no library, by its own header."""
+
+import struct
+from array import array
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rigidjax.cli.logs.columns import Columns
+
+FIRST_BYTE = 0xBC
+
+
+def crazyflie(path: Path, columns: Sequence[str]) -> Columns:
+    """Return the variables of a Crazyflie's µSD log by name (`gyro.x`), and their `timestamp`, µs.
+
+    They are those of the event with most of the wanted names. Source: the format's description in
+    the firmware's documentation, "µSD card deck", versions 1 and 2.
+    """
+    data = path.read_bytes()
+    version, count = struct.unpack_from("<HH", data, 1)
+    if data[0] != FIRST_BYTE or version not in (1, 2):
+        raise ValueError(f"wanted a µSD log of version 1 or 2, got {data[0]:#x}, {version}")
+    at, events = 5, {}
+
+    def text(at: int) -> tuple[str, int]:
+        end = data.index(b"\0", at)
+        return data[at:end].decode(), end + 1
+
+    for _ in range(count):
+        key = struct.unpack_from("<H", data, at)[0]
+        _, at = text(at + 2)
+        size, at = struct.unpack_from("<H", data, at)[0], at + 2
+        names, kinds = ["timestamp"], "I" if version == 1 else "Q"
+        for _ in range(size):
+            # A name and the kind of its number, as `gyro.x(f)`.
+            word, at = text(at)
+            names, kinds = [*names, word[:-3]], kinds + word[-2]
+        events[key] = names, struct.Struct("<" + kinds), array("d")
+    # The last four bytes are a check sum.
+    while at < len(data) - 4:
+        _, form, rows = events[struct.unpack_from("<H", data, at)[0]]
+        rows.extend(form.unpack_from(data, at + 2))
+        at += 2 + form.size
+    names, _, rows = max(events.values(), key=lambda e: (len({*columns} & {*e[0]}), len(e[2])))
+    table = np.frombuffer(rows, float).reshape(-1, len(names)).T
+    held = dict(zip(names, table, strict=True))
+    held["timestamp"] = held["timestamp"] * (1e3 if version == 1 else 1.0)
+    every = [name for names, *_ in events.values() for name in names]
+    return list(dict.fromkeys(every)), {name: held[name] for name in columns if name in held}

@@ -1,0 +1,95 @@
+"""The columns of time and rates that a log is known to have."""
+
+import contextlib
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+from rigidjax.cli.logs.table import BINARY, kind_of
+from rigidjax.cli.logs.text import opened, read_header
+from rigidjax.cli.logs.units import TIME_UNITS, unit_in
+
+
+class Layout(NamedTuple):
+    """Names of the time and the three rate columns, the unit of the rates, that of the time."""
+
+    columns: tuple[str, str, str, str]
+    unit: str
+    time_unit: str
+
+
+USUAL = Layout(("t", "wx", "wy", "wz"), "rad/s", "s")
+
+
+# The units of fields in logs that have no units in their names.
+_UNITS = {
+    ".bbl": {"time": "us", "gyroADC": "deg/s", "accSmooth": "g"},
+    ".ulg": {"timestamp": "us"},
+    ".usd": {"timestamp": "us", "gyro": "deg/s", "acc": "g"},
+}
+_UNITS[".bfl"] = _UNITS[".bbl"]
+
+
+def usual_unit(path: str | Path, name: str) -> str | None:
+    """Return the unit that a column of a binary log is known to have, or `None`."""
+    units = _UNITS.get(kind_of(Path(path)), {})
+    return next((units[part] for part in re.split(r"[.\[]", name) if part in units), None)
+
+
+def layout_of(path: str | Path) -> Layout:
+    """Return the layout of a log, else `USUAL`.
+
+    That of a text is read from the units in its names, as phyphox writes them in any language.
+    """
+    path = Path(path)
+    # Whoever reads the log says what is wrong with it.
+    with contextlib.suppress(Exception):
+        if kind_of(path) in BINARY:
+            return _of_binary(path) or USUAL
+        with opened(path) as file:
+            return _of_names(read_header(file).names) or USUAL
+    return USUAL
+
+
+def _of_names(names: list[str]) -> Layout | None:
+    """Return the one time and the three rates, about x, y and z, that have units in their names."""
+    times = {name: unit for name in names if (unit := unit_in(name, ())) in TIME_UNITS}
+    rates = {name: unit for name in names if (unit := unit_in(name, ())) in ("rad/s", "deg/s")}
+    axes = [[n for n in rates if re.search(rf"\b{axis}\W*[(\[]", n)] for axis in "xyz"]
+    if len(times) != 1 or any(len(one) != 1 for one in axes):
+        return None
+    (x,), (y,), (z,) = axes
+    ((time, time_unit),) = times.items()
+    return Layout((time, x, y, z), str(rates[x]), str(time_unit))
+
+
+def _of_binary(path: Path) -> Layout | None:
+    """Return the layout of a binary log, or `None` if it has no rates."""
+    columns = _columns_of_binary(path)
+    if columns is None:
+        return None
+    time, x, *_ = columns
+    return Layout(columns, usual_unit(path, x) or "rad/s", usual_unit(path, time) or "s")
+
+
+def _columns_of_binary(path: Path) -> tuple[str, str, str, str] | None:
+    """Return the names of the time and the rates in a binary log."""
+    kind = kind_of(path)
+    if kind in (".bbl", ".bfl"):
+        return "time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]"
+    if kind == ".usd":
+        return "timestamp", "gyro.x", "gyro.y", "gyro.z"
+    names, _ = BINARY[kind](path, [])
+    for stem, parts in (
+        ("gyro_rad", ("[0]", "[1]", "[2]")),
+        ("xyz", ("[0]", "[1]", "[2]")),
+        ("angular_velocity", (".x", ".y", ".z")),
+    ):
+        for name in names:
+            topic, _, field = name.rpartition(f".{stem}{parts[0]}")
+            if topic and not field and (stem != "xyz" or topic == "vehicle_angular_velocity"):
+                times = ("timestamp",) if kind == ".ulg" else ("stamp", "log_time")
+                time = next(f"{topic}.{t}" for t in times if f"{topic}.{t}" in names)
+                x, y, z = (f"{topic}.{stem}{part}" for part in parts)
+                return time, x, y, z
+    return None

@@ -1,0 +1,67 @@
+"""MCAP files of JSON and ROS 2 messages, read by mcap (an extra)."""
+
+import json
+from array import array
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigidjax import _checks
+from rigidjax.cli.logs.columns import Columns
+
+
+def mcap(path: Path, columns: Sequence[str]) -> Columns:
+    """Return the fields of JSON and ROS 2 messages, such as `/imu.angular_velocity.x`.
+
+    `topic.log_time` and `topic.stamp` (of the message's header) are in s from the first message of
+    the file.
+    """
+    make_reader = _checks.library("mcap.reader", "mcap", str(path)).make_reader
+    ros = _checks.library("mcap_ros2.decoder", "mcap", str(path)).DecoderFactory
+    names: dict[str, None] = {}
+    held: dict[str, array] = {name: array("d") for name in columns}
+    first = None
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[_Json(), ros()])
+        for number, (_, channel, message, content) in enumerate(reader.iter_decoded_messages()):
+            if not columns and number == _ENOUGH:
+                # Only names are asked for.
+                break
+            first = message.log_time if first is None else first
+            fields = {"log_time": 1e-9 * (message.log_time - first)} | dict(_numbers_in(content))
+            if {"header.stamp.sec", "header.stamp.nanosec"} <= set(fields):
+                whole = 10**9 * int(fields["header.stamp.sec"]) - first
+                fields["stamp"] = 1e-9 * (whole + int(fields["header.stamp.nanosec"]))
+            for field, number in fields.items():
+                name = f"{channel.topic}.{field}"
+                names[name] = None
+                if name in held:
+                    held[name].append(number)
+    return list(names), {name: np.frombuffer(a, float) for name, a in held.items() if len(a)}
+
+
+# Messages in which each topic is seen once.
+_ENOUGH = 2000
+
+
+class _Json:
+    """mcap's interface of a decoder, for messages in JSON."""
+
+    def decoder_for(self, encoding: str, schema: Any) -> Callable[[bytes], Any] | None:
+        return json.loads if encoding == "json" else None
+
+
+def _numbers_in(content: Any, name: str = "") -> Iterator[tuple[str, float]]:
+    """Yield the numbers in a message, with the names of their places."""
+    if isinstance(content, bool | int | float | np.number):
+        yield name, float(content)
+    elif isinstance(content, list | tuple | np.ndarray):
+        for index, one in enumerate(content):
+            yield from _numbers_in(one, f"{name}[{index}]")
+    elif not isinstance(content, str | bytes):
+        named = isinstance(content, Mapping)
+        for part in content if named else getattr(content, "__slots__", ()):
+            inside = content[part] if named else getattr(content, part)
+            yield from _numbers_in(inside, f"{name}.{part}" if name else str(part))

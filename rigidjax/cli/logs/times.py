@@ -1,0 +1,135 @@
+"""The time column: the rows in a window, and those whose times increase."""
+
+import bisect
+from pathlib import Path
+
+import numpy as np
+
+from rigidjax.cli.logs.errors import LogError, warn
+from rigidjax.cli.logs.units import TIME_UNITS, UNITS
+
+# So many rows in a row are no bad stamps, but a clock that was set.
+_RESTART = 5
+_FEWEST = 4
+# Steps, s, within which loggers of moving bodies read.
+_USUAL_STEPS = (1e-5, 1.0)
+_ODD_STEPS = (1e-7, 1e3)
+# A longer gap, in steps, is where a clock was set, or the logger was off.
+_GAP = 1e5
+
+
+def increasing(t: np.ndarray) -> np.ndarray:
+    """Return which times (T,) to keep, so that they increase and as few as possible are left out.
+
+    They are a longest increasing subsequence (by patience sorting), so that a repeated, a backward,
+    a far too large and a missing (NaN) time costs its own row only.
+
+    >>> increasing(np.array([0.0, 1.0, 1.0, 90.0, 2.0, np.nan, 3.0])).tolist()
+    [True, True, False, False, True, False, True]
+    """
+    if (np.diff(t) > 0).all() and np.isfinite(t).all():
+        return np.ones(t.shape, bool)
+    # The least last time of an increasing subsequence of each length, and its row.
+    ends: list[float] = []
+    rows: list[int] = []
+    before = np.full(t.shape, -1)
+    for row in np.flatnonzero(np.isfinite(t)).tolist():
+        length = bisect.bisect_left(ends, t[row])
+        before[row] = rows[length - 1] if length else -1
+        if length == len(ends):
+            ends.append(t[row])
+            rows.append(row)
+        elif t[row] < ends[length]:
+            ends[length], rows[length] = t[row], row
+    keep = np.zeros(t.shape, bool)
+    row = rows[-1] if rows else -1
+    while row >= 0:
+        keep[row] = True
+        row = before[row]
+    return keep
+
+
+def kept_rows(
+    path: str | Path, t: np.ndarray, name: str, window: tuple[float, float] | None
+) -> np.ndarray:
+    """Return which rows to use: those in the window whose times increase.
+
+    **Arguments:** `path` and `name` of the time column, for messages; `t` (T,) s, from the first
+    stamp; `window` (from, to), s from the first stamp, or `None` for all rows. It **warns** which
+    rows in the window are left out because their time is repeated, backward or missing. **Raises**
+    `LogError` for fewer than four rows, for times of which half do not increase, and where a
+    clock starts again.
+    """
+    if window is not None and not window[0] < window[1]:
+        raise LogError(f"{path}: window: wanted FROM below TO, got {window[0]:g} {window[1]:g}")
+    finite = np.isfinite(t)
+    # A row without a time is where the one before it is.
+    place = np.maximum.accumulate(np.where(finite, np.arange(t.size), 0))
+    near = t[place] if t.size else t
+    inside = np.ones(t.shape, bool)
+    if window is not None:
+        inside = (near >= window[0] - 1e-12) & (near <= window[1] + 1e-12)
+        if inside.sum() < _FEWEST:
+            least, most = (np.nanmin(t), np.nanmax(t)) if finite.any() else (np.nan, np.nan)
+            raise LogError(
+                f"{path}: fewer than {_FEWEST} samples between {window[0]:g} and {window[1]:g} s "
+                f"from the first stamp; the log goes from {least:g} to {most:g} s"
+            )
+    rows = np.flatnonzero(inside)
+    keep = increasing(t[rows])
+    if rows.size < _FEWEST:
+        raise LogError(f"{path}: wanted at least {_FEWEST} samples, got {rows.size}")
+    bad = rows[~keep]
+    _require_one_clock(path, t, name, rows, keep)
+    if 2 * bad.size >= rows.size or keep.sum() < _FEWEST:
+        raise LogError(
+            f"{path}: column {name!r}: the times of {bad.size} of {rows.size} rows are repeated, "
+            f"backward or missing (row {bad[0] + 1} is the first)"
+        )
+    if bad.size:
+        shown = ", ".join(str(row + 1) for row in bad[:5]) + (", …" if bad.size > 5 else "")
+        warn(
+            f"{path}: column {name!r}: {bad.size} of {rows.size} rows are left out: their times "
+            f"are repeated, backward or missing (row{'s' if bad.size > 1 else ''} {shown})"
+        )
+    return rows[keep]
+
+
+def _require_one_clock(
+    path: str | Path, t: np.ndarray, name: str, rows: np.ndarray, keep: np.ndarray
+) -> None:
+    """Raise `LogError` where times that do not go on are a second series that increases."""
+    bad = np.flatnonzero(~keep)
+    for run in np.split(bad, np.flatnonzero(np.diff(bad) > 1) + 1):
+        if run.size >= _RESTART and (np.diff(t[rows[run]]) > 0).all():
+            # Left out is the end of the first series or the begin of the second.
+            first, after = run[0], run[-1] + 1
+            row = rows[first if first and t[rows[first]] <= t[rows[first - 1]] else after]
+            raise LogError(
+                f"{path}: column {name!r}: the clock was set back at row {row + 1}, from "
+                f"{t[row - 1]:g} to {t[row]:g} s; make two logs of it, or choose a part by --window"
+            )
+
+
+def remark_on_step(path: str | Path, t: np.ndarray, unit: str, rate: float) -> None:
+    """Warn of a time column that is plainly not in its unit.
+
+    **Arguments:** `path` for the message; `t` (T,) s; `unit` in which it was read; `rate` a typical
+    angular rate, rad/s, or zero if there is no gyro.
+    """
+    steps = np.diff(t)
+    step = float(np.median(steps))
+    if steps.max() > _GAP * step:
+        row = int(np.argmax(steps))
+        warn(
+            f"{path}: no time between {t[row]:.6g} and {t[row + 1]:.6g} s, other steps are "
+            f"{step:.3g} s; --window chooses a part"
+        )
+    turns = step * rate / (2 * np.pi)
+    if _ODD_STEPS[0] <= step <= _ODD_STEPS[1] and turns < 1:
+        return
+    low, high = _USUAL_STEPS
+    others = [u for u in TIME_UNITS if low <= step * UNITS[u] / UNITS[unit] <= high and u != unit]
+    turned = f", in which the body turns {turns:.3g} times" if turns >= 1 else ""
+    advice = f"; is it in {' or '.join(others)}? say --time-unit" if others else ""
+    warn(f"{path}: the step between two times is {step:.3g} s{turned}{advice}")

@@ -1,0 +1,94 @@
+"""Units of columns: their factors to SI, and how loggers write them in names of columns."""
+
+import math
+import re
+from collections.abc import Sequence
+
+from rigidjax.cli.logs.errors import LogError, warn
+
+# All units become SI.
+UNITS = {
+    "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "mm": 1e-3, "m/s2": 1.0, "g": 9.80665,
+    "1": 1.0, "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180,
+    "rpm": math.pi / 30,
+}  # fmt: skip
+TIME_UNITS = ("s", "ms", "us", "ns")
+# How each unit is written, in small letters; powers without `^`, `**` or raised digits.
+_SPELLINGS = {
+    "s": "s sec secs second seconds",
+    "ms": "ms msec millisecond milliseconds",
+    "us": "us usec microsecond microseconds",
+    "ns": "ns nsec nanosecond nanoseconds",
+    "rad/s": "rad/s rad/sec rads/s radian/s radians/s rads-1 rad_s",
+    "deg/s": "deg/s deg/sec degs/s degree/s degrees/s °/s °/sec dps degs-1 °s-1 deg_s",
+    "rpm": "rpm rev/min r/min 1/min u/min min-1",
+    "m/s2": "m/s2 m/sec2 m/s/s ms-2 m_s2",
+    "g": "g g0",
+    "rad": "rad rads radian radians",
+    "deg": "deg degs degree degrees °",
+}
+_UNIT_OF = {word: unit for unit, words in _SPELLINGS.items() for word in words.split()}
+_IN_BRACKETS = re.compile(r"[(\[]([^()\[\]]*)[)\]]\s*$")
+# What is meant as a unit: brackets may as well hold an axis or an index.
+_UNKNOWN = re.compile(r"[/°]|dps|lsb|count|raw", re.IGNORECASE)
+# Signs that are written in several ways.
+_SIGNS = str.maketrans({
+    "²": "2", "⁻": "-", "−": "-", "¹": "1", "µ": "u", "μ": "u", "º": "°", "^": None, "*": None,
+    "·": None, "⋅": None, ".": None, " ": None,
+})  # fmt: skip
+
+
+def unit_in(name: str, allowed: Sequence[str]) -> str | None:
+    """Return the unit that ends the name of a column, or `None`.
+
+    In brackets it may be any of `UNITS`; without brackets, after a blank, a comma or an underscore,
+    one of `allowed`. A power may be written with `^`, `**` or raised digits.
+
+    >>> unit_in("Gyroscope x (°/s)", ["rad/s"]), unit_in("wx_deg/s", ["deg/s"]), unit_in("wx", [])
+    ('deg/s', 'deg/s', None)
+    """
+    brackets = _IN_BRACKETS.search(name)
+    if brackets:
+        return _UNIT_OF.get(_plain(brackets[1]))
+    endings = (name[match.end() :] for match in re.finditer(r"[\s,_]+", name))
+    units = (_UNIT_OF.get(_plain(ending)) for ending in endings)
+    return next((unit for unit in units if unit in allowed), None)
+
+
+def _plain(word: str) -> str:
+    """Return a unit in the spelling of `_SPELLINGS`: a capital G is no gram, but gauss."""
+    return word.translate(_SIGNS).lower() if word.strip() != "G" else word
+
+
+def unit_of(
+    names: Sequence[str], stated: str | None, usual: str, allowed: Sequence[str], where: str
+) -> str:
+    """Return the unit of columns: the one that their names or the user state, else the usual one.
+
+    **Arguments:** `names` of the columns; `stated` the unit that the user states, or `None`;
+    `usual` the unit where neither states one; `allowed` the units that such a column may have;
+    `where` what the error messages begin with. **Raises** `LogError` where names and user, or two
+    names, state different units, or a name states a unit that is not allowed. It **warns** of a
+    unit in brackets that it does not know.
+    """
+    in_names = {name: unit for name in names if (unit := unit_in(name, allowed))}
+    for name, unit in in_names.items():
+        if unit not in allowed:
+            wanted = " or ".join(allowed)
+            raise LogError(f"{where}: column {name!r} is in {unit}; wanted {wanted}")
+        if stated is not None and unit != stated:
+            raise LogError(
+                f"{where}: column {name!r} is in {unit} by its name, and {stated} is stated: "
+                "which one? state the same unit, or none"
+            )
+    # One column for each unit.
+    columns = {unit: name for name, unit in in_names.items()}
+    if len(columns) > 1:
+        (one, first), (other, second) = list(columns.items())[:2]
+        raise LogError(f"{where}: column {first!r} is in {one}, column {second!r} in {other}")
+    unit = stated or next(iter(in_names.values()), usual)
+    for name in names:
+        brackets = _IN_BRACKETS.search(name)
+        if stated is None and brackets and name not in in_names and _UNKNOWN.search(brackets[1]):
+            warn(f"{where}: column {name!r}: no unit that is known; it is read in {unit}")
+    return unit
