@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin, Mat3, Scalar
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.estimate import roots
 from rigidjax.identify.parameters import leaf_at
@@ -76,7 +77,7 @@ class Model(eqx.Module):
     def __init__(
         self, body: Inertia | MassProperties, torque: Torque | None = None, *, walks: Any = ()
     ):
-        self.body = _checks.single(body, (Inertia, MassProperties), "body")
+        self.body = validation.single(body, (Inertia, MassProperties), "body")
         if torque is not None:
             require_law(torque)
         parts = parts_of(torque)
