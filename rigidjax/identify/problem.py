@@ -265,7 +265,7 @@ class Problem(eqx.Module):
 
 def _scenes(problem: Problem, parameters: Parameters) -> Recording:
     mine = local(problem, parameters)
-    return jax.vmap(lambda one, record: filled(problem, one, record))(mine, problem.records)
+    return eqx.filter_vmap(lambda one, record: filled(problem, one, record))(mine, problem.records)
 
 
 def values_of(problem: Problem, parameters: Parameters) -> dict[str, Array]:

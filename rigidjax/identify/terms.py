@@ -79,9 +79,11 @@ def over_records(function: Any, problem: "Problem", mine: Any) -> Any:
         # Without the outer loop it compiles to a smaller program.
         out = function(*(padding.one(tree, 0) for tree in trees))
         return jax.tree.map(lambda leaf: leaf[None], out)
+    arrays, rest = eqx.partition(trees, eqx.is_array)
+    of_one = lambda each: function(*eqx.combine(each, rest))  # noqa: E731
     if jax.default_backend() == "cpu":
-        return lax.map(lambda each: function(*each), trees, batch_size=1)
-    return jax.vmap(function)(*trees)
+        return lax.map(of_one, arrays, batch_size=1)
+    return jax.vmap(of_one)(arrays)
 
 
 @eqx.filter_custom_jvp

@@ -168,7 +168,11 @@ class WindowFit(eqx.Module, Generic[Value]):
         level = _checks.fraction(level, "level")
         reach = float(stdtrit(max(self.stretches - 1, 1), 0.5 + 0.5 * level))
         low, high = (
-            jax.tree.map(lambda x, d, s=s: x + s * reach * d, self.value, self.deviation)
+            jax.tree.map(
+                lambda x, d, s=s: x + s * reach * d if eqx.is_array(x) else x,
+                self.value,
+                self.deviation,
+            )
             for s in (-1.0, 1.0)
         )
         return low, high
@@ -191,13 +195,13 @@ def fit_windows(
     """The free numbers with the least errors of open-loop runs over all windows.
 
     **Arguments:** `windows`; `scene` a function of the free numbers → (body, torque), whose torque
-    reads the inputs of the windows; `guess` the initial free numbers, any tree of arrays; `noise`
-    by kind (`x`, `v`, `q`, `omega`) the unit of an error: by default the rms of a prediction that
-    holds the state at the start; `starts` by kind the standard deviation of the measured starts
-    (the `noise` of the readings must be given with it; `np.inf`: the start is free); `None` takes
-    the starts as measured; `stretches` of windows in a row for the deviations: a stretch should be
-    longer than the errors of the model last; `max_steps` of the search. The motion is computed by
-    `RungeKutta4`, one step a sample.
+    reads the inputs of the windows; `guess` the initial free numbers, any tree of arrays (or a
+    network, whose functions are left alone); `noise` by kind (`x`, `v`, `q`, `omega`) the unit of
+    an error: by default the rms of a prediction that holds the state at the start; `starts` by kind
+    the standard deviation of the measured starts (the `noise` of the readings must be given with
+    it; `np.inf`: the start is free); `None` takes the starts as measured; `stretches` of windows in
+    a row for the deviations: a stretch should be longer than the errors of the model last;
+    `max_steps` of the search. The motion is computed by `RungeKutta4`, one step a sample.
 
     Levenberg–Marquardt on normal equations that are summed window by window. Uncertain starts are
     found window by window, and eliminated (variable projection). The search first uses a ninth and
@@ -347,12 +351,24 @@ def _require_scene(scene: Any, guess: Any, windows: Windows) -> None:
 
 def _numbers(guess: Any, kind: Any) -> tuple[Float[Array, " n"], Callable[[Array], Any]]:
     """The free numbers in one vector, and a function that puts them back."""
-    leaves, tree = jax.tree.flatten(guess)
-    leaves = [_checks.finite(_checks.numbers(leaf, "guess"), "guess") for leaf in leaves]
-    x, back = ravel_pytree(jax.tree.unflatten(tree, [leaf.astype(kind) for leaf in leaves]))
+
+    def number(leaf: Any) -> Any:
+        # The weights of a network stand beside its functions.
+        if callable(leaf):
+            return leaf
+        return _checks.finite(_checks.numbers(leaf, "guess"), "guess").astype(kind)
+
+    x, back = _in_a_row(jax.tree.map(number, guess))
     if not x.size:
         raise ValueError("guess: wanted a tree of floating numbers, at least one")
     return x, back
+
+
+def _in_a_row(guess: Any) -> tuple[Float[Array, " n"], Callable[[Array], Any]]:
+    """The arrays of a tree in one vector, and a function that puts them back."""
+    arrays, rest = eqx.partition(guess, eqx.is_array)
+    x, back = ravel_pytree(arrays)
+    return x, lambda x: eqx.combine(back(x), rest)
 
 
 def _too_late(windows: Windows, law: Any) -> str | None:
@@ -403,7 +419,7 @@ def _searched(
     """The search from `guess` over the first `steps` of the first `count` windows; it keeps normal
     matrix and gradient of each stretch of them, (C, n, n) and (C, n).
     """
-    x, back = ravel_pytree(guess)
+    x, back = _in_a_row(guess)
 
     def of_one(x: Array, window: Windows) -> tuple[Array, Array, Array]:
         def errors(x: Array, start: Any) -> Array:
