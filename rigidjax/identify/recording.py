@@ -72,11 +72,11 @@ class Recording(eqx.Module):
     **Arguments:** `t` (T,) increasing times, s; then, for each sensor, a pair `(sensor, values)` or
     a triple `(sensor, values, mask)`: `values` (T, 3) for a `Gyro`, (T, 4) or
     (T, 3, 3) for an `AttitudeSensor`, as the sensor's `reading_shape` says; `mask` (T,) true where
-    there is a reading (what it masks may be NaN). A time at which no sensor read anything is
-    dropped: a masked reading and an absent one are the same. Sensors with their own times share
-    the union of these.
-    `torque`, by keyword, is what turned this body besides its own spin: a wheel whose speed was
-    logged, a law with coefficients that a `Free` may move; `None` for none.
+    there is a reading (what it masks may be NaN). A row of `values` or `mask` with a masked entry
+    of a NumPy masked array is not read; `t` may have none. A time at which no sensor read anything
+    is dropped: a masked reading and an absent one are the same. Sensors with their own times share
+    the union of these. `torque`, by keyword, is what turned this body besides its own spin: a wheel
+    whose speed was logged, a law with coefficients that a `Free` may move; `None` for none.
 
     **Raises** `TypeError` for traced numbers (the times that are kept depend on them) and for
     anything but a sensor; `ValueError` for times that do not increase, also after rounding to
@@ -197,7 +197,11 @@ def _reading(
             f"{name}: noise: wanted an array of shape ({sensor.components},), a standard deviation "
             f"for each component of the error, or None, got shape {np.shape(sensor.noise)}"
         )
+    values, hidden = _checks.unmasked(values)
     values = _checks.on_host(values, f"{name}: readings")
+    rows_hidden = None if hidden is None else hidden.reshape(len(hidden), -1).any(axis=1)
+    if rows_hidden is not None:
+        values[rows_hidden] = np.nan
     # Matrices of an attitude, for one, become quaternions.
     values = getattr(sensor, "readings", lambda values: values)(values)
     wanted = (t.size, *sensor.reading_shape)
@@ -205,6 +209,7 @@ def _reading(
         turned = "; transposed?" if values.shape == wanted[::-1] else ""
         many = f"; t has {t.size} times" if values.shape[1:] == wanted[1:] else turned
         raise ValueError(f"{name}: wanted readings of shape {wanted}, got {values.shape}{many}")
+    mask, no_flag = _checks.unmasked(mask)
     try:
         flags = np.ones(t.size, bool) if mask is None else np.asarray(mask)
     except ValueError as error:
@@ -214,6 +219,8 @@ def _reading(
     mask = flags.astype(bool)
     if mask.shape != t.shape:
         raise ValueError(f"{name}: wanted a mask of shape {t.shape}, got {mask.shape}")
+    for absent in (rows_hidden, no_flag):
+        mask = mask if absent is None else mask & ~absent
     across = tuple(range(1, values.ndim))
     bad = mask & ~np.isfinite(values).all(axis=across)
     if bad.any():

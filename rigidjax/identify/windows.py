@@ -142,7 +142,8 @@ def windows(
         )
     if not isinstance(inputs, Mapping | None):
         raise TypeError(f"inputs: wanted arrays by name, got {type(inputs).__name__}")
-    _require_rows(times, states, inputs or {})
+    inputs = {k: _checks.without_mask(v, f"inputs[{k!r}]") for k, v in (inputs or {}).items()}
+    _require_rows(times, states, inputs)
     h, even = _step_of(times)
     broken = np.concatenate([[0], np.cumsum(~even)])
     begin = np.arange(before, times.size - length, stride)
@@ -157,7 +158,7 @@ def windows(
     follow = begin[:, None] + 1 + np.arange(length)
     kind = jnp.result_type(float)
     arrays = jax.tree.map(lambda a: np.asarray(a, kind), states)
-    samples = {k: np.asarray(v, kind) for k, v in (inputs or {}).items()}
+    samples = {k: np.asarray(v, kind) for k, v in inputs.items()}
     return Windows(
         round(h, 12),
         jax.tree.map(lambda a: jnp.asarray(a[begin]), arrays),
