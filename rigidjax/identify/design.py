@@ -25,9 +25,9 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
 
     **Arguments:** `problem` whose recordings give times, sensors with known noise, and torques (the
     readings themselves do not matter); `parameters` the motion that is planned. **Returns** the
-    quantities of `Fit.quantities` (`name`, `value`, `deviation`, `unit`) with the standard
-    deviations of the Cramér–Rao bound, infinite where the motion would show nothing. **Raises:**
-    `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
+    quantities of `Fit.quantities` (`name`, `value`, `deviation` in the same `unit`) with the
+    standard deviations of the Cramér–Rao bound, infinite where the motion would show nothing.
+    **Raises:** `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
 
     >>> problem = rj.datasets.toutatis.problem()
     >>> plan = problem.start(rj.Inertia.from_principal(3.1, 3.2, 1.0))

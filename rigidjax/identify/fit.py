@@ -15,7 +15,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax.identify import padding, search
 from rigidjax.identify.assessment import assess
-from rigidjax.identify.checkpoint import Checkpoint, bare, fingerprint, require_folder
+from rigidjax.identify.checkpoint import (
+    Checkpoint,
+    bare,
+    fingerprint,
+    report_progress,
+    require_folder,
+)
 from rigidjax.identify.initial_guess import starting_points
 from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces
 from rigidjax.identify.noise import estimate_noise
@@ -274,9 +280,8 @@ def _together(
 
 
 def _say(progress: Any, number: int, total: int, tried: list[Tried]) -> None:
-    if progress is not None:
-        best = min(float(item.cost) for item in tried)
-        progress(f"start {number}/{total}: misfit {float(tried[-1].cost):.6g}, best {best:.6g}")
+    best, last = min(float(item.cost) for item in tried), float(tried[-1].cost)
+    report_progress(progress, f"start {number}/{total}: misfit {last:.6g}, best {best:.6g}")
 
 
 def _evaluated(best: Tried, problem: Problem) -> Tried:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
 from rigidjax.identify import padding
+from rigidjax.identify.checkpoint import report_progress
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.terms import Noise, half_sum, residuals
@@ -75,9 +76,9 @@ def descend(
             if not np.isfinite(np.asarray(costs)).all():
                 break
             point = after
-            if progress is not None:
-                done = first + keys.shape[0]
-                progress(f"descent {done}/{how.steps}: misfit {float(costs.mean()):.6g}")
+            done = first + keys.shape[0]
+            line = f"descent {done}/{how.steps}: misfit {float(costs.mean()):.6g}"
+            report_progress(progress, line)
     except KeyboardInterrupt:
         return point, False
     return point, True
