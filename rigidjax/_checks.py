@@ -108,7 +108,8 @@ def unmasked(value: Any) -> tuple[Any, np.ndarray | None]:
     mask = getattr(value, "mask", None) if isinstance(value, np.ndarray) else None
     if mask is None:
         return value, None
-    data = np.ma.getdata(value) if isinstance(value, np.ma.MaskedArray) else value.unmasked
+    data: Any = value
+    data = np.ma.getdata(value) if isinstance(value, np.ma.MaskedArray) else data.unmasked
     return data, np.broadcast_to(mask, data.shape) if np.any(mask) else None
 
 

@@ -242,7 +242,7 @@ class _AlongEphemeris(eqx.Module):
     moon: Moon
 
     def __call__(self, t: ScalarLike, own: Array, args: object = None) -> Array:
-        return self.core.rate(t, own, self.moon.attitude(t), None)
+        return self.core.rate(t, own, self.moon.attitude(t), self.moon.body(core=True))
 
 
 def _carried(core: _Core, year: float) -> Float[Array, "3"]:
