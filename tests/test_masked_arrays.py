@@ -120,8 +120,13 @@ def test_a_masked_reading_is_not_read(values, mask, unhooked):
     assert float(jnp.abs(read.values).max()) < 2.0
 
 
-def test_a_time_of_masked_readings_alone_is_dropped(unhooked):
-    assert identify.Recording(TS, (GYRO, hidden(RATES, 23))).t.shape == (40,)
+def test_a_masked_row_keeps_its_time_between_readings(unhooked):
+    record = identify.Recording(TS, (GYRO, hidden(RATES, 23)))
+    assert record.t.shape == (41,) and not bool(record.readings[0].mask[7])
+    assert record.size == 3 * 40
+    # The motion starts at a reading.
+    late = identify.Recording(TS, (GYRO, hidden(RATES, 1)))
+    np.testing.assert_array_equal(late.t, TS[1:])
 
 
 def test_a_masked_attitude_is_not_read(unhooked):
