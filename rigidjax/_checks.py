@@ -100,8 +100,37 @@ def numbers(value: Any, name: str, unit: str = "") -> Array:
     return array
 
 
+def unmasked(value: Any) -> tuple[Any, np.ndarray | None]:
+    """Return the data of a masked array and its mask, true where an entry has no value.
+
+    The mask is `None` if no entry is masked, and for other values, which are returned as they are.
+    """
+    mask = getattr(value, "mask", None) if isinstance(value, np.ndarray) else None
+    if mask is None:
+        return value, None
+    data: Any = value
+    data = np.ma.getdata(value) if isinstance(value, np.ma.MaskedArray) else data.unmasked
+    return data, np.broadcast_to(mask, data.shape) if np.any(mask) else None
+
+
+def without_mask(value: Any, name: str) -> Any:
+    """Return `value`, of a masked array its data; refuse masked entries.
+
+    What lies under a mask is often a wild reading.
+    """
+    value, mask = unmasked(value)
+    if mask is not None:
+        raise ValueError(
+            f"{name}: wanted numbers, got a masked array with {int(mask.sum())} of {mask.size} "
+            f"entries masked, the first at index {tuple(int(i) for i in np.argwhere(mask)[0])}; "
+            "they have no value: leave them out"
+        )
+    return value
+
+
 def _in_si(value: Any, name: str, wanted: str = "") -> Any:
     """Quantities of astropy or pint as numbers in SI; other values as they are."""
+    value = without_mask(value, name)
     if isinstance(value, (list, tuple)):
         items = [_in_si(item, name, wanted) for item in value]
         same = all(a is b for a, b in zip(items, value, strict=True))
@@ -344,8 +373,9 @@ def on_host(value: Any, name: str) -> np.ndarray:
             f"{name}: wanted numbers that are known, got a traced array; this works on the host: "
             "call it outside of jax.jit, jax.grad and jax.vmap"
         )
+    value = _in_si(value, name)
     try:
-        array = np.asarray(_in_si(value, name))
+        array = np.asarray(value)
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name}: wanted numbers, got {type(value).__name__}") from error
     if array.dtype.kind not in "iuf" and array.dtype != jnp.bfloat16:

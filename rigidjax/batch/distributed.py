@@ -5,6 +5,7 @@ The results of a share are the same bits as on one process alone.
 
 import os
 import tempfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -122,9 +123,13 @@ def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"share-{jax.process_index()}.npz"
     handle, name = tempfile.mkstemp(dir=folder, suffix=".part")
-    with os.fdopen(handle, "wb") as file:
-        np.savez(file, **leaves)
-    os.replace(name, path)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, **leaves)
+        os.replace(name, path)
+    except OSError:
+        os.unlink(name)
+        raise
     return path
 
 
@@ -174,7 +179,13 @@ def _known(tree: Any, name: str) -> Any:
 def _together(send: Callable[[Any], Any], tree: Any, checkpoint: Any) -> Any:
     """`send` of every array, after the tree has been written to the `checkpoint`."""
     if checkpoint is not None:
-        save(tree, checkpoint)
+        try:
+            save(tree, checkpoint)
+        except OSError as error:
+            # The rows are still to be sent.
+            words = f"this process's share is not in {checkpoint} ({error.strerror or error})"
+            warnings.warn(f"gather, total: {words}; it is sent all the same", stacklevel=3)
+            checkpoint = None
     if jax.process_count() == 1:
         return tree
     try:

@@ -131,8 +131,9 @@ def rollout(
 
     **Raises:** `TypeError` if bodies, states, torque and solver do not fit together; `ValueError`
     for shapes that do not agree, an input that is missing or that no torque reads, a step that is
-    not positive, a `save_every` that does not divide `num_steps`, and, for known numbers, moments
-    that are not positive or quaternions that are not unit.
+    not positive, a `save_every` that does not divide `num_steps`, and, for known numbers, an
+    inertia that no mass has or a moment of zero (a traced one, and a NaN, make that body alone NaN)
+    or quaternions that are not unit.
 
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))

@@ -10,7 +10,8 @@ from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
+from rigidjax.body.validation import first_impossible
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
@@ -29,9 +30,9 @@ class BodyBatch(NamedTuple):
 
 
 def one_of(shared: Any, each: Any, rest: Any) -> tuple[Any, Any, Any]:
-    """A single body, its state and its torque; NaN, for that body alone, if it is invalid."""
+    """A single body, its state and its torque; a state that is invalid becomes NaN."""
     body, state0, torque = eqx.combine(shared, each, rest)
-    return validation.real_or_nan(body), on_the_group(validation.start(state0, False)), torque
+    return body, on_the_group(validation.start(state0, False)), torque
 
 
 def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyBatch:
@@ -59,16 +60,16 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
         raise TypeError(
             f"bodies: wanted Inertia, or MassProperties for Rigid, got {type(bodies).__name__}"
         )
-    tensor = bodies.inertia.tensor if isinstance(bodies, MassProperties) else bodies.tensor
+    tensor = tensor_of(bodies)
     if tensor.ndim not in (2, 3) or (tensor.ndim == 3 and tensor.shape[0] not in (1, count)):
         raise ValueError(
             f"bodies: wanted one body, or {count} as the states, of shape ({count}, 3, 3), got "
             f"{tensor.shape}"
         )
-    _positive(tensor)
+    # Before the states' precision: in a finer one, the rounding of a plate looks like a fault.
+    bodies = _real(bodies)
     if isinstance(states0, HasAttitude):
         _unit(states0.q)
-    # In the precision of the states.
     bodies = jax.tree.map(lambda a: a if a.dtype == dtype else a.astype(dtype), bodies)
     own = tensor.ndim == 3
     if own and tensor.shape[0] == 1 and count > 1:
@@ -150,24 +151,18 @@ def _selected(torque: Any, pick: Any) -> Any:
     return jax.tree.unflatten(structure, [i in found for i in range(len(leaves))])
 
 
-def _positive(tensor: Array) -> None:
+def _real(bodies: Inertia | MassProperties) -> Any:
+    """The bodies; an error names the first known one that no mass has, traced ones become NaN."""
+    tensor = tensor_of(bodies)
     if not _checks.known(tensor):
-        return
-    a = np.asarray(tensor, np.float64).reshape(-1, 3, 3)
-    with np.errstate(invalid="ignore", over="ignore"):
-        minor = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
-        whole = (
-            a[:, 0, 2] * (a[:, 1, 0] * a[:, 2, 1] - a[:, 1, 1] * a[:, 2, 0])
-            - a[:, 1, 2] * (a[:, 0, 0] * a[:, 2, 1] - a[:, 0, 1] * a[:, 2, 0])
-            + a[:, 2, 2] * minor
-        )
-        # A body with NaN gets its own status.
-        bad = (a[:, 0, 0] <= 0) | (minor <= 0) | (whole <= 0)
-    if bad.any():
-        i = int(np.argmax(bad))
-        # With a NaN beside the bad number there are no moments to show.
-        found = f"{np.linalg.eigvalsh(a[i])} kg m²" if np.isfinite(a[i]).all() else f"{a[i]}"
-        raise ValueError(f"bodies: wanted positive moments, got {found} of body {i}")
+        return validation.real_or_nan(bodies)
+    index = first_impossible(tensor.reshape(-1, 3, 3))
+    if index is not None:
+        try:
+            Inertia(tensor.reshape(-1, 3, 3)[index]).invertible()
+        except ValueError as error:
+            raise ValueError(f"bodies: {error}; this is body {index}") from None
+    return bodies
 
 
 def _unit(q: Array) -> None:

@@ -23,11 +23,13 @@ from rigidjax._types import (
     Vec3,
     Vector,
 )
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
 from rigidjax.body.principal_axes import principal
-from rigidjax.body.validation import unit_quaternion
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross, dot, product
+
+_HINT = "Inertia.from_tensor takes a matrix"
 
 
 def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> Scalar:
@@ -63,11 +65,11 @@ def kinetic_energy_about(
     >>> kinetic_energy_about(ball, [1.0, 0, 0, 0], [0.0, 1, 0], [0.0, 0, 1])
     Array(2., dtype=float64)
     """
-    _checks.single(body, MassProperties, "body")
+    body = validation.single(body, MassProperties, "body")
     velocity = _checks.floating(velocity, (3,), "velocity")
     omega = _checks.floating(omega, (3,), "omega")
     about_origin = body.inertia_about(jnp.zeros_like(body.com)).tensor
-    swing = quaternion.rotate(unit_quaternion(q), cross(omega, body.com))
+    swing = quaternion.rotate(validation.unit_quaternion(q), cross(omega, body.com))
     return (
         0.5 * body.mass * dot(velocity, velocity)
         + body.mass * dot(velocity, swing)
@@ -85,6 +87,7 @@ def kinetic_energy_of_matrix_rate(second_moment: Matrix, matrix_rate: Matrix) ->
     Array(1., dtype=float64)
     """
     s = _checks.floating(second_moment, (3, 3), "second_moment")
+    s = validation.symmetric(s, "second_moment")
     rate = _checks.floating(matrix_rate, (3, 3), "matrix_rate")
     return 0.5 * jnp.sum(product(rate, s) * rate)
 
@@ -150,10 +153,11 @@ def ellipsoid(
         words = {"mass": "no size", "energy": "the energy, J", "momentum": "the momentum, kg m²/s"}
         raise TypeError(f"size: wanted {words[kind]} for the ellipsoid of {kind}, got {size!r}")
     if kind == "mass":
-        solid = _checks.single(body, MassProperties, "body")
+        solid = validation.single(body, MassProperties, "body")
         second_moments, q = principal(solid.second_moment)
         return jnp.sqrt(5.0 * second_moments / solid.mass), q
-    moments, q = Inertia(_tensor(body)).invertible().principal()
+    one = _checks.single(body, (Inertia, MassProperties), "body", hint=_HINT)
+    moments, q = Inertia(tensor_of(one)).invertible().principal()
     wanted = "a number ≥ 0, J" if kind == "energy" else "a number ≥ 0, kg m²/s"
     size = _checks.sign(_checks.floating(size, (), "size"), "size", wanted, zero=True)
     return (jnp.sqrt(2.0 * size / moments) if kind == "energy" else size / moments), q
@@ -164,5 +168,4 @@ def _omega(state):
 
 
 def _tensor(body: Inertia | MassProperties) -> Mat3:
-    hint = "Inertia.from_tensor takes a matrix"
-    return tensor_of(_checks.single(body, (Inertia, MassProperties), "body", hint=hint))
+    return tensor_of(validation.single(body, (Inertia, MassProperties), "body", hint=_HINT))

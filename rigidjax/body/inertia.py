@@ -41,7 +41,8 @@ class Inertia(eqx.Module):
     """The inertia tensor I of a body about the point it turns about.
 
     **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor checks shape and dtype only;
-    `from_tensor`, `from_principal` and `from_second_moment` also check that the body is real.
+    `from_tensor`, `from_principal`, `from_second_moment`, and all that takes a body, check that it
+    is real.
     `scale` "arbitrary" if only the ratios of the components are known, as after a fit of free
     motion: `simulate` then warns of torques, and `shifted` raises `ValueError`.
 
@@ -111,7 +112,7 @@ class Inertia(eqx.Module):
     @property
     def moments(self) -> Vec3:
         """Principal moments I1 ≤ I2 ≤ I3, (3,), kg m²."""
-        return eigensystem(self.tensor)[0]
+        return eigensystem(validation.symmetric(self.tensor, "inertia tensor"))[0]
 
     def principal(self) -> tuple[Vec3, Quat]:
         """Principal moments, ascending, and the rotation principal axes → body axes.
@@ -290,7 +291,7 @@ class MassProperties(eqx.Module):
         return _joined(self, -other.mass, other.com, -other.second_moment)
 
 
-def tensor_of(body: Inertia | MassProperties) -> Mat3:
+def tensor_of(body: Inertia | MassProperties) -> Float[Array, "*batch 3 3"]:
     """The inertia tensor (3, 3), kg m²: of an `Inertia`, or about the centre of mass."""
     return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
 

@@ -119,6 +119,7 @@ def faces_of(faces: Any, n: int) -> Array:
     """The faces as an array (m, 3) of vertex numbers below n, checked if they are known."""
     if not _checks.known(faces):
         return faces
+    faces = _checks.without_mask(faces, "faces")
     try:
         table = np.asarray(faces)
     except ValueError as error:

@@ -13,6 +13,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3
+from rigidjax.body import validation
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.body.symmetric3 import product
 
@@ -51,7 +52,9 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
     >>> moments, q
     (Array([1., 2., 3.], dtype=float64), Array([1., 0., 0., 0.], dtype=float64))
     """
-    moments, axes = eigensystem(_checks.floating(tensor, (3, 3), "tensor"))
+    moments, axes = eigensystem(
+        validation.symmetric(_checks.floating(tensor, (3, 3), "tensor"), "tensor")
+    )
     return moments, _quaternion_near_identity(axes)
 
 
@@ -150,7 +153,7 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     >>> matrix_function(jnp.sqrt, 4.0 * jnp.eye(3))[0]
     Array([2., 0., 0.], dtype=float64)
     """
-    a = _checks.floating(tensor, (3, 3), "tensor")
+    a = validation.symmetric(_checks.floating(tensor, (3, 3), "tensor"), "tensor")
     _checks.function(function, "function", "number → number, written in jax.numpy")
     # In units of the largest entry (a power of two), so that no product leaves the dtype's range.
     # One power less, so that it is a number for the largest of the dtype, too.

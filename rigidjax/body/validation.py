@@ -5,6 +5,7 @@ and the numbers, traced ones with `equinox.error_if`, without them. A few units 
 tolerated: plates, rods and points lie on the boundary and pass.
 """
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -16,7 +17,6 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Quat, Quaternion
-from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.validation import near_unit, tolerance
 
@@ -59,22 +59,51 @@ def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 
     )
 
 
-def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bool) -> Any:
-    """Return `body` if some mass has these numbers and no moment is zero; `mass` may be `None`.
+def single(
+    value: Any, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
+) -> Any:
+    """Return `value` if it is one body of one of `kinds`, and some mass has its numbers.
 
-    Other numbers are refused if they are known, or if `throw`; else the traced body becomes NaN.
+    Known numbers of no real body are refused; a traced body of such numbers becomes NaN. A moment
+    may be zero: what divides by the moments calls `possible`.
+    """
+    _checks.single(value, kinds, name, wanted=wanted, hint=hint)
+    has_mass = hasattr(value, "mass")
+    tensor = value.inertia.tensor if has_mass else value.tensor
+    return possible(value, tensor, value.mass if has_mass else None, throw=False, thin=True)
+
+
+def symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
+    """Return a symmetric matrix; refuse a known one that is not, make a traced one NaN."""
+    if _checks.known(a):
+        return _symmetric(a, name)
+    return jnp.where(_asymmetry(a)[1], jnp.nan, a)
+
+
+def possible(
+    body: Any,
+    tensor: Float[Array, "*batch 3 3"],
+    mass: Any,
+    throw: bool,
+    *,
+    thin: bool = False,
+) -> Any:
+    """Return `body` if some mass has these numbers and, unless `thin`, no moment is zero.
+
+    `mass` may be `None`. Other numbers are refused if they are known, or if `throw`; else the
+    traced body becomes NaN.
     """
     tensor = _checks.numbers(tensor, "inertia tensor")
     is_known = _checks.known((tensor, mass))
     if not is_known and _checks.known(plain := lax.stop_gradient((tensor, mass))):
         # Only differentiated: one look at the numbers, in the place of thirty programs.
-        flat, broken = _impossible(np, np.asarray(plain[0]), _slack(tensor))
-        if not (flat | broken).any() and (mass is None or (np.asarray(plain[1]) > 0).all()):
+        faults = _faults(np, plain[0], thin)
+        if not any(f.any() for f in faults) and (mass is None or (np.asarray(plain[1]) > 0).all()):
             return body
     xp = np if is_known else jnp
     light = xp.asarray(False) if mass is None else ~(_values(mass) > 0)
-    flat, broken = _impossible(xp, _values(tensor), _slack(tensor))
-    bad = light | flat | broken
+    flat, broken, skew = _faults(xp, tensor if is_known else lax.stop_gradient(tensor), thin)
+    bad = light | flat | broken | skew
     if is_known:
         if bad.any():
             if mass is not None:
@@ -85,12 +114,38 @@ def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bo
     if not throw:
         nan = lambda a: jnp.where(bad.reshape(bad.shape + (1,) * (a.ndim - bad.ndim)), jnp.nan, a)  # noqa: E731
         return jax.tree.map(nan, body)
-    which = jnp.where(light.any(), 0, jnp.where(broken.any(), 1, 2))
-    words = [_MASS, _BROKEN, f"{_FLAT}, or not a number{_THIN}"]
-    return eqx.branched_error_if(body, bad.any(), which, words)
+    which = jnp.where(skew.any(), 1, jnp.where(broken.any(), 2, 3))
+    words = [_MASS, f"inertia tensor{_SKEW}{_CAUSE}", _BROKEN, f"{_FLAT}, or not a number{_THIN}"]
+    return eqx.branched_error_if(body, bad.any(), jnp.where(light.any(), 0, which), words)
+
+
+def first_impossible(tensors: Float[Array, "n 3 3"]) -> int | None:
+    """Return the index of the first of these known tensors that no body has, or `None`.
+
+    A tensor with a NaN is passed over: among many bodies it gets a status of its own.
+    """
+    many = tensors.shape[0] > _MANY
+    with np.errstate(invalid="ignore", over="ignore"):
+        bad, index = (_compiled_first if many else functools.partial(_first, np))(tensors)
+    return int(index) if bad else None
+
+
+# With more bodies one compiled pass is quicker than NumPy, and they stay on their device.
+_MANY = 4096
+
+
+def _first(xp: Any, tensors: Any) -> tuple[Any, Any]:
+    flat, broken, skew = _faults(xp, tensors, thin=False)
+    bad = (flat | broken | skew) & ~xp.isnan(xp.asarray(tensors)).any(axis=(-1, -2))
+    return bad.any(), xp.argmax(bad)
+
+
+_compiled_first = jax.jit(functools.partial(_first, jnp))
 
 
 _MASS = "mass: wanted a positive mass (kg), got zero, a negative one or NaN"
+_SKEW = ": wanted a symmetric matrix, got A ≠ Aᵀ"
+_CAUSE = "; a product of inertia is missing or mistyped; if it is noise, give 0.5 * (A + A.T)"
 _BROKEN = (
     "inertia: wanted moments that are not negative and keep the triangle inequality I1 + I2 ≥ I3, "
     "got others: no distribution of mass has such moments. Is this a second moment 𝔖? then use "
@@ -103,26 +158,38 @@ _THIN = (
 )
 
 
-def _impossible(xp: Any, tensor: Any, slack: float) -> tuple[Any, Any]:
-    """Whether a moment is zero or NaN, and whether no mass has these moments, by minors of 𝔖."""
+def _faults(xp: Any, tensor: Any, thin: bool) -> tuple[Any, Any, Any]:
+    """Whether a moment is zero or NaN (never if `thin`), no mass has these moments, I ≠ Iᵀ.
 
-    def minors(a: Any) -> tuple[Any, ...]:
-        xx, yy, zz, xy, xz, yz = (a[..., i, j] for i, j in PAIRS)
-        two = xx * yy - xy * xy, xx * zz - xz * xz, yy * zz - yz * yz
-        whole = xx * two[2] - xy * (xy * zz - xz * yz) + xz * (xy * yz - xz * yy)
-        return xx, yy, zz, *two, whole
-
-    trace = tensor[..., 0, 0] + tensor[..., 1, 1] + tensor[..., 2, 2]
-    safe = xp.where(trace > 0, trace, 1)
-    a = tensor / safe[..., None, None]
-    second = 0.5 * xp.eye(3, dtype=a.dtype) - a
+    The moments of a mass are judged by the minors of its second moment 𝔖, in units of the trace.
+    """
+    slack = _slack(tensor)
+    # Nine numbers by NumPy cost a tenth of nine arrays.
+    nine = xp.moveaxis(xp.asarray(tensor).reshape(*tensor.shape[:-2], 9), -1, 0)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = np.ascontiguousarray(nine) if xp is np else nine
+    trace = xx + yy + zz
+    some = trace > 0
+    scale = 1 / xp.where(some, trace, 1)
+    xx, yy, zz, xy, xz, yz = (a * scale for a in (xx, yy, zz, xy, xz, yz))
+    skew = (
+        (abs(xy - yx * scale) > slack)
+        | (abs(xz - zx * scale) > slack)
+        | (abs(yz - zy * scale) > slack)
+    )
+    sx, sy, sz = 0.5 - xx, 0.5 - yy, 0.5 - zz
+    squares = xy * xy, xz * xz, yz * yz
+    product = 2 * xy * xz * yz
+    minors = (sx * sy - squares[0], sx * sz - squares[1], sy * sz - squares[2])
+    whole = sx * minors[2] - sy * squares[1] - sz * squares[0] - product
     broken = trace < 0
-    for minor in minors(second):
+    for minor in (sx, sy, sz, *minors, whole):
         # With a NaN the other entries are not scaled, and say nothing.
-        broken = broken | ((trace > 0) & (minor < -slack))
+        broken = broken | (some & (minor < -slack))
+    if thin:
+        return broken & False, broken, skew
     # The product of the two larger moments is 1/9 to 1/4 of the squared trace.
-    determinant = minors(a)[-1]
-    return ~(trace > 0) | ~(determinant > 0.125 * slack), broken
+    determinant = xx * (yy * zz - squares[2]) - yy * squares[1] - zz * squares[0] + product
+    return ~some | ~(determinant > 0.125 * slack), broken, skew
 
 
 def unit_quaternion(q: Quaternion) -> Quat:
@@ -151,15 +218,19 @@ def _moments_of_a_body(value, moments):
     )
 
 
-def _symmetric(a, name):
+def _asymmetry(a):
+    """The largest difference A − Aᵀ, and whether it is more than round-off."""
     difference = abs(_values(a) - _values(a).swapaxes(-1, -2)).max(axis=(-1, -2))
-    largest = abs(_values(a)).max(axis=(-1, -2))
+    return difference, (difference > _slack(a) * abs(_values(a)).max(axis=(-1, -2))).any()
+
+
+def _symmetric(a, name):
+    difference, bad = _asymmetry(a)
     found = f" (largest difference {float(difference.max()):.3g})" if _checks.known(a) else ""
     return _checks.refuse(
         a,
-        (difference > _slack(a) * largest).any(),
-        f"{name}: wanted a symmetric matrix, got A ≠ Aᵀ{found}; a product of inertia is missing "
-        "or mistyped; if it is noise, give 0.5 * (A + A.T)",
+        bad,
+        f"{name}{_SKEW}{found}{_CAUSE}",
     )
 
 

@@ -447,8 +447,8 @@ def _matplotlib() -> bool:
 def _say(line: str) -> None:
     try:
         print(_checks.printable(line), flush=True)
-    except BrokenPipeError:
-        # The reader has stopped, as `head` does: files are still to be written.
+    except OSError:
+        # The reader has stopped, as `head` does, or a disk is full: files are still to be written.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -9,11 +9,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._names import show
@@ -121,9 +122,11 @@ class Moon(eqx.Module):
         """The torque of Earth and Sun.
 
         **Arguments:** `degree` of the Moon's gravity in the Earth's field, 2 to 4; `tide` whether
-        the Earth and the spin deform the Moon; `core` whether a liquid core turns in the mantle,
-        with DE421's own initial rate: then `first` is `EPOCH`, otherwise it **raises**
-        `ValueError`; `figure` whether the Earth is oblate.
+        the Earth and the spin deform the Moon; `core` whether a liquid core turns in the mantle;
+        `figure` whether the Earth is oblate. DE421 gives the core's rate at `EPOCH`; the initial
+        one, at `first`, is that of a core carried from there by the mantle of the ephemeris.
+        **Raises:** `ValueError` for a core in float32 (unless `first` is `EPOCH`): decades in s
+        have no digit within a minute.
         """
         c = self.constants
         rows = []
@@ -141,13 +144,11 @@ class Moon(eqx.Module):
             GravityGradient(c["GMS"] * self._in_si, self.sun),
         )
         if core:
-            if self.first != EPOCH:
-                raise ValueError(
-                    "torque: the core's rate is known at the year EPOCH: Moon(EPOCH, …)"
-                )
             rate = jnp.array([c["OMGCX"], c["OMGCY"], c["OMGCZ"]]) / DAY
             friction = c["KVC"] / DAY * self.body().tensor[2, 2]
             law = _Core(rate, self._core.tensor, friction, law)
+            if self.first != EPOCH:
+                law = eqx.tree_at(lambda core: core.state0, law, _carried(law, self.first))
         if tide:
             response, turn = c["K2M"] * self._radius**5 / _G, 2 * np.pi / (27.321661 * DAY)
             bulge = Tide(response, c["TAUM"] * DAY, self._mu_earth, self.earth, turn)
@@ -232,6 +233,39 @@ class _Core(eqx.Module):
     def __call__(self, t: ScalarLike, state: Any, body: Inertia, own: Array) -> Array:
         whole = Inertia(body.tensor + self.tensor)
         return evaluate(self.gravity, t, state, whole) + self.on_mantle(state, own)
+
+
+class _AlongEphemeris(eqx.Module):
+    """The equation of a core's angular velocity in the mantle of the ephemeris."""
+
+    core: _Core
+    moon: Moon
+
+    def __call__(self, t: ScalarLike, own: Array, args: object = None) -> Array:
+        return self.core.rate(t, own, self.moon.attitude(t), self.moon.body(core=True))
+
+
+def _carried(core: _Core, year: float) -> Float[Array, "3"]:
+    """The core's angular velocity at a `year`, rad/s, mantle frame; `core.state0` is at `EPOCH`."""
+    if core.state0.dtype != jnp.float64:
+        raise ValueError(
+            f"torque: a core from EPOCH to {year} needs float64: set "
+            "jax.config.update('jax_enable_x64', True)"
+        )
+    between = Moon(min(year, EPOCH), max(year, EPOCH))
+    begin, end = (365.25 * DAY * (at - between.first) for at in (EPOCH, year))
+    return _followed(_AlongEphemeris(core, between), core.state0, jnp.array([begin, end]))
+
+
+@eqx.filter_jit
+def _followed(field: _AlongEphemeris, own: Array, ends: Float[Array, "2"]) -> Float[Array, "3"]:
+    steps = dfx.PIDController(rtol=1e-12, atol=1e-12 * jnp.max(jnp.abs(own)))
+    first = jnp.sign(ends[1] - ends[0]) * jnp.minimum(DAY, jnp.abs(ends[1] - ends[0]))
+    found = dfx.diffeqsolve(
+        dfx.ODETerm(field), dfx.Dopri8(), ends[0], ends[1], first, own,
+        stepsize_controller=steps, max_steps=1_000_000,
+    )  # fmt: skip
+    return found.ys[0]  # pyright: ignore[reportOptionalSubscript]
 
 
 def _raised(table: Chebyshev, z: float) -> Chebyshev:

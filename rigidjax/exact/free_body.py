@@ -40,7 +40,7 @@ class FreeBody(eqx.Module):
     setting: Setting
 
     def __init__(self, inertia: Inertia, state0: HasSpin):
-        _check(inertia, state0)
+        inertia = _checked(inertia, state0)
         # Powers of two, so that scaling loses no digit and no body is too large or small.
         self.exponent = exponent_of(state0.omega)
         self.tensor = times_power_of_two(inertia.tensor, -exponent_of(inertia.tensor))
@@ -123,15 +123,14 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     (float32: 40).
 
     **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, a `Rigid`;
-    for known values also for NaN, a moment that is not positive, a quaternion that is not unit, and
-    a time in which the body turns by more than 1/eps rad.
+    for known values also for NaN, a tensor that no mass has (a traced one gives NaN), a moment of
+    zero, a quaternion that is not unit, and a time in which the body turns by more than 1/eps rad.
 
     >>> state0 = rj.Attitude([1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1e-4])
     >>> free_body(rj.Inertia.from_principal(1.0, 2.0, 3.0), state0, 20.0).omega
     Array([-0.42522037, -0.90508985,  0.24550111], dtype=float64)
     """
-    _check(inertia, state0)
-    inertia = validation.possible(inertia, inertia.tensor, None, throw=False)
+    _checked(inertia, state0)
     return _jitted(inertia, state0, _time(t, state0.omega))
 
 
@@ -153,7 +152,7 @@ def _time(t: ScalarLike, omega: Array) -> Scalar:
     return t
 
 
-def _check(inertia: Inertia, state0: HasSpin) -> None:
+def _checked(inertia: Inertia, state0: HasSpin) -> Inertia:
     if isinstance(state0, HasPose) or not isinstance(state0, HasSpin):
         raise TypeError(
             f"state0: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
@@ -167,16 +166,14 @@ def _check(inertia: Inertia, state0: HasSpin) -> None:
     for name, array in arrays.items():
         if array.dtype != tensor.dtype:
             raise TypeError(f"{name} is {array.dtype}, but the inertia tensor is {tensor.dtype}")
+    inertia = validation.possible(inertia, tensor, None, throw=False)
     if not _checks.known((tensor, arrays)):
-        return
-    tensor = np.asarray(_checks.finite(tensor, "inertia tensor"), dtype=np.float64)
-    least = np.linalg.eigvalsh(tensor).min()
-    if not least > 0:
-        raise ValueError(f"inertia tensor: wanted positive principal moments, got {least:.3g}")
+        return inertia
     for name, array in arrays.items():
         _checks.finite(array, name)
     if "q" in arrays:
-        near_unit(arrays["q"], "q", tolerance(inertia.tensor.dtype))
+        near_unit(arrays["q"], "q", tolerance(tensor.dtype))
+    return inertia
 
 
 @functools.partial(jnp.vectorize, signature="(n),(n)->(n)")

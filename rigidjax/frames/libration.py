@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
-from rigidjax.body import inertia as _inertia
+from rigidjax.body import inertia as _inertia, validation
 from rigidjax.frames.frame_dynamics import BodyInFrame
 from rigidjax.frames.moving import MovingFrame
 from rigidjax.frames.rotation_models import Uniform
@@ -58,7 +58,7 @@ def libration_integral(state: Any, body: Any, rate: ScalarLike) -> Scalar:
     1.0
     """
     _checks.single(state, HasAttitude, "state", wanted="an Attitude in the orbital frame")
-    _checks.single(body, _inertia.Inertia, "body")
+    body = validation.single(body, _inertia.Inertia, "body")
     axes = jnp.eye(3, dtype=state.q.dtype)
     n = _checks.floating(rate, (), "rate").astype(state.q.dtype)
     up, normal = (quaternion.rotate_inverse(state.q, axes[i]) for i in (0, 2))

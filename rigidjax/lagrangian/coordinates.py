@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion import Attitude
 from rigidjax.motion.torques.base import Torque, require_law
@@ -113,7 +114,7 @@ class EulerAngleTop(eqx.Module):
     torque: Torque | None
 
     def __init__(self, inertia: Inertia, torque: Torque | None = None):
-        _checks.single(inertia, Inertia, "inertia")
+        inertia = validation.single(inertia, Inertia, "inertia")
         if torque is not None:
             require_law(torque)
         if torque is not None and not hasattr(torque, "energy"):

@@ -14,6 +14,7 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.principal_axes import principal
 from rigidjax.plot.style import COLOURS, attitudes, cube, matrices, plain, pyplot, times
@@ -110,7 +111,7 @@ def tumble(
     b'GIF89a'
     """
     seconds, pictures = _length(ts, seconds, fps)
-    _checks.single(body, (Inertia, MassProperties), "body")
+    body = validation.single(body, (Inertia, MassProperties), "body")
     moments, q = evenly(ts, states, pictures)
     size = _checks.whole(size, "size", 64)
     corners, tip, reach = _box(body)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rigidjax import _checks
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.plot.style import AXES, COLOURS, plain, several_axes
 
@@ -61,7 +62,7 @@ def inertia_ellipsoid(
 def _given(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
     """The body, and bodies drawn from the Gaussian of a fit (a leading axis), `None` without."""
     if isinstance(body, Inertia | MassProperties):
-        return _checks.single(body, (Inertia, MassProperties), "body"), None
+        return validation.single(body, (Inertia, MassProperties), "body"), None
     if not hasattr(body, "x") or not hasattr(body, "model"):
         words = "inertia_ellipsoid: wanted an Inertia, a MassProperties or a Fit, got "
         raise TypeError(words + _checks.kind(body))

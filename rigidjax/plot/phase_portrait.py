@@ -8,6 +8,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude
+from rigidjax.body import validation
 from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion.torques import HeavyTop
@@ -41,7 +42,7 @@ def phase_portrait(
     >>> phase_portrait(body, top, rj.simulate(body, start, [0.0, 0.1, 0.2], top).ys).get_xlabel()
     'tilt θ, deg'
     """
-    _checks.single(inertia, Inertia, "inertia")
+    inertia = validation.single(inertia, Inertia, "inertia")
     for name, size in (("mass", ()), ("com", (3,)), ("gravity", (3,))):
         _checks.floating(getattr(_checks.instance(top, HeavyTop, "top"), name), size, f"top.{name}")
     levels = _checks.whole(levels, "levels", 1)

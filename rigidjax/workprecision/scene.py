@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
 from rigidjax.body.symmetric3 import PAIRS, from_components
 from rigidjax.frames import Point
@@ -94,7 +95,7 @@ class Scene(eqx.Module):
         wanted = "an Attitude or a Point"
         _checks.instance(self.state0, (Attitude, Point), "state0", wanted=wanted, hint=hint)
         if self.body is not None:
-            _checks.single(self.body, Inertia, "body", hint="or None with a Point")
+            validation.single(self.body, Inertia, "body", hint="or None with a Point")
         _checks.positive(self.end, "end", "an end > 0, s")
 
     @property

@@ -1,5 +1,7 @@
 """What one process alone can go wrong with: traced arrays, files that are no shares."""
 
+import resource
+
 import jax
 import numpy as np
 import pytest
@@ -28,3 +30,23 @@ def test_a_share_of_another_tree_is_named(tmp_path):
         distributed.recover((np.zeros(3), np.zeros(3)), tmp_path)
     with pytest.raises(FileNotFoundError, match="no share"):
         distributed.recover(np.zeros(3), tmp_path / "none")
+
+
+@pytest.mark.parametrize("name", ["gather", "total"])
+def test_a_share_that_cannot_be_written_is_sent_all_the_same(tmp_path, name):
+    taken = tmp_path / "file"
+    taken.write_text("no folder")
+    with pytest.warns(UserWarning, match=f"this process's share is not in {taken}"):
+        found = getattr(distributed, name)(np.arange(3.0), taken)
+    assert found.tolist() == [0.0, 1.0, 2.0]
+
+
+def test_a_full_disk_leaves_no_part_of_a_share(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+        with pytest.raises(OSError, match="File too large"):
+            distributed.save(np.arange(3.0), tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())

@@ -281,7 +281,7 @@ def test_words(unhooked):
         run(bodies, states, 0.1, 4.0)
     with pytest.raises(ValueError, match=r"whole part of num_steps = 10"):
         run(bodies, states, 0.1, 10, save_every=3)
-    with pytest.raises(ValueError, match=r"positive moments.* of body 1"):
+    with pytest.raises(ValueError, match=r"moments that are not negative.*this is body 1"):
         run(rj.Inertia(bodies.tensor.at[1, 0, 0].set(-1.0)), states, 0.1, 4)
     with pytest.raises(ValueError, match="of body 2"):
         run(bodies, rj.Attitude(states.q.at[2].mul(2.0), states.omega), 0.1, 4)

@@ -2,10 +2,12 @@
 
 from importlib.util import find_spec
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 
 import rigidjax as rj
 from rigidjax.datasets import moon
@@ -102,6 +104,51 @@ def test_the_moon_turns_as_in_the_ephemeris(years, parts, most):
     off = jax.vmap(lambda p, q: rj.quaternion.log(rj.quaternion.multiply(p, q)))(back, ys.q)
     rms = np.degrees(np.sqrt(np.mean(off**2, axis=0))) * 3600
     assert (rms <= most).all(), rms
+
+
+@there
+@pytest.mark.parametrize("first", [1969.2, 1969.8])
+def test_the_core_is_carried_to_another_year_as_by_scipy(first):
+    read = moon.Moon(first, first + 1)
+    core = read.torque(core=True)
+    c = read.constants
+    between = moon.Moon(min(first, moon.EPOCH), max(first, moon.EPOCH))
+    rate = jax.jit(lambda t: between.attitude(t).omega)
+    share = c["IFAC"] * float(read.body().tensor[2, 2])
+    moments = share * np.array([1 - c["COBLAT"], 1 - c["COBLAT"], 1.0])
+
+    def slope(t, own):
+        # d(I ω)/dt + Ω × (I ω) = −(friction on the mantle), in mantle axes.
+        omega = np.asarray(rate(t))
+        flat = moments[2] - moments[0]
+        pushed = flat * own[2] * np.array([-own[1], own[0], 0.0])
+        drag = c["KVC"] / moon.DAY * float(read.body().tensor[2, 2]) * (own - omega)
+        return (np.cross(moments * own, omega) - drag - pushed) / moments
+
+    begin = np.array([c["OMGCX"], c["OMGCY"], c["OMGCZ"]]) / moon.DAY
+    ends = [365.25 * moon.DAY * (year - between.first) for year in (moon.EPOCH, first)]
+    found = scipy.integrate.solve_ivp(slope, ends, begin, "DOP853", rtol=1e-10, atol=1e-17)
+    np.testing.assert_allclose(core.state0, found.y[:, -1], rtol=1e-7, atol=1e-14)
+
+
+@there
+@pytest.mark.parametrize("first", [1931.0, 2044.0])
+def test_the_mantle_follows_a_core_carried_over_decades(first):
+    read = moon.Moon(first, first + 2)
+    body, law = read.body(core=True), read.torque(core=True, tide=True, figure=True)
+    ts = jnp.arange(0.0, 2 * 365.25, 10.0) * moon.DAY
+    back = jax.vmap(lambda t: rj.quaternion.conjugate(read.attitude(t).q))(ts)
+
+    @eqx.filter_jit
+    def rms(law):
+        ys = rj.simulate(body, read.attitude(0.0), ts, law, rtol=1e-10, atol=1e-16).ys
+        off = jax.vmap(lambda p, q: rj.quaternion.log(rj.quaternion.multiply(p, q)))(back, ys.q)
+        return jnp.rad2deg(jnp.sqrt(jnp.mean(off**2, axis=0))) * 3600
+
+    assert float(rms(law).max()) < 1e-3
+    # A core that turns with the mantle does not do.
+    core = lambda law: law.torque.state0
+    assert float(rms(eqx.tree_at(core, law, read.attitude(0.0).omega)).max()) > 0.02
 
 
 @there

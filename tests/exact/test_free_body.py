@@ -523,7 +523,7 @@ def test_one_free_motion_for_every_state():
     [
         (
             lambda: exact.free_body(Inertia(jnp.diag(jnp.array([1.0, 2, -3]))), START, 1.0),
-            "positive",
+            "moments that are not negative",
         ),
         (
             lambda: exact.free_body(BODY, Attitude([2.0, 0, 0, 0], [0.0, 1, 0]), 1.0),

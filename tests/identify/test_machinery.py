@@ -206,7 +206,7 @@ def test_the_best_first_rate_shows_more(free_record):
     rate, promise = identify.best_first_rate(problem, BODY, start)
     poor = identify.expected(problem, problem.start(BODY, start))
     np.testing.assert_allclose(jnp.linalg.norm(rate), np.linalg.norm(start), rtol=1e-9)
-    doubts = [np.prod([q.deviation for q in qs[:2]]) for qs in (promise, poor)]
+    doubts = [np.prod([q.deviation / q.value for q in qs[:2]]) for qs in (promise, poor)]
     assert doubts[0] < 0.5 * doubts[1]
 
 

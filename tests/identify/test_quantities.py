@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 import rigidjax as rj
 from rigidjax import identify
@@ -131,3 +132,40 @@ def test_no_number_is_long():
         gaps = (min(below, above), below, above)
         for text, number, gap in zip(shown, (value, low, high), gaps, strict=True):
             assert abs(float(text) - number) <= 0.05 * gap + 1e-12 * max(abs(low), high)
+
+
+@pytest.mark.parametrize("size", [1e-3, 40.0])
+def test_the_deviation_of_a_positive_number_is_in_its_unit(size):
+    # The same number, once free itself and once by its logarithm: what is known of it is the same.
+    law = rj.torques.Damping([size, size, size])
+    body, start = rj.Inertia.from_principal(9 * size, 13 * size, 16 * size), [1.0, 0.2, 0.4]
+    motion = rj.simulate(body, rj.Spin(start), TIMES, law).ys
+    record = identify.Recording(TIMES, (identify.Gyro(0.01), motion.omega), torque=law)
+    planned = []
+    for positive in (False, True):
+        scale = 1.0 if positive else size
+        where = lambda r: r.torque.coefficient
+        free = identify.Free(where, "damping", scale=scale, positive=positive)
+        problem = identify.Problem(record, identify.Known(body), free=[free])
+        planned.append(identify.expected(problem, problem.start(None, start))[3:])
+    for plain, positive in zip(*planned, strict=True):
+        assert plain.value == pytest.approx(size) == positive.value and positive.positive
+        assert 1e-3 < positive.deviation / size < 0.2
+        assert positive.deviation == pytest.approx(plain.deviation, rel=1e-9)
+        # The interval of the logarithm: its ends are a factor away.
+        low, high = positive.interval(0.95)
+        reach = 1.959963984540054 * positive.deviation / size
+        np.testing.assert_allclose(np.log([high / size, size / low]), reach, rtol=1e-9)
+
+
+def test_the_deviation_of_a_ratio_is_that_of_its_interval_as_a_function():
+    found = fitted()
+    ratio = lambda point: point.body.moments[0] / point.body.moments[2]
+    low, high = found.interval_of(ratio, level=0.5)
+    quantity = found.quantities[0]
+    ends = quantity.interval(0.5)
+    width = 0.5 * (high - low)
+    assert quantity.name == "Ix/Iz" and quantity.value == pytest.approx(0.4, rel=1e-3)
+    assert np.log(ends[1] / ends[0]) / 2 * quantity.value == pytest.approx(width, rel=1e-6)
+    student = scipy.stats.t.ppf(0.75, quantity.freedom)
+    assert quantity.deviation == pytest.approx(width / student, rel=1e-6)

@@ -157,4 +157,4 @@ def object_moments(group, tensor, device, factor):
 def relative_deviation(found):
     """Standard deviations of the log of the three moments of one fit, ascending moments."""
     order = np.argsort([q.value for q in found.quantities[:3]])
-    return np.array([found.quantities[i].deviation for i in order])
+    return np.array([found.quantities[i].deviation / found.quantities[i].value for i in order])

@@ -657,7 +657,7 @@ way(
 way(
     "identify.Quantity.interval",
     lambda x, d, r: [
-        *Quantity("x", x, d, "m", True).interval(math.erf(r / 2**0.5)),
+        *Quantity("x", x, x * d, "m", True).interval(math.erf(r / 2**0.5)),
         *Quantity("x", x, d, "m", False).interval(math.erf(r / 2**0.5)),
     ],
     (scale(), between(0, 1), between(0.1, 3)),

@@ -129,7 +129,8 @@ def test_intervals_hold_the_truth_of_a_body_that_is_no_ellipsoid():
     assert found.ok and error[2] > 0.02 and (error[:2] < 5e-3).all()
     assert (error < 1.96 * found.deviations).all()
     # They are those of the fit itself, and no wider than the ratios can be known.
-    assert abs(found.fit.quantities[0].deviation / found.deviations[2] - 1) < 1e-6
+    ratio = found.fit.quantities[0]
+    assert abs(ratio.deviation / ratio.value / found.deviations[2] - 1) < 1e-6
     assert (found.deviations[2:] < 0.1).all()
 
 
@@ -157,7 +158,7 @@ def test_the_allowance_for_shape_is_what_such_shapes_do_to_a_fit():
             # Off the diagonal there are two of each.
             total += (1 + (i != j)) * np.square(shift) * (0.04 / size) ** 2
     for a, b, wanted in zip(found.fit.quantities[:2], plain, total, strict=True):
-        added = a.deviation**2 - b.deviation**2
+        added = (a.deviation / a.value) ** 2 - (b.deviation / b.value) ** 2
         np.testing.assert_allclose(added, wanted, rtol=0.1)
 
 

@@ -54,7 +54,7 @@ def _listed(named: Sequence[Quantity], sizes: Float[np.ndarray, " quantities"]) 
     words = []
     for quantity, size in list(zip(named, sizes, strict=True))[:MOST]:
         unit = quantity.value if quantity.positive else 1.0
-        half = float(quantile(0.95, quantity.freedom)) * quantity.deviation * abs(unit)
+        half = float(quantile(0.95, quantity.freedom)) * quantity.deviation
         shown = f"{quantity.name} by {abs(unit) * size:.2g}"
         words.append(f"{shown} (interval ±{half:.2g})" if np.isfinite(half) else shown)
     return ", ".join(words)

@@ -22,6 +22,7 @@ from rigidjax.identify.model.terms import Noise, all_errors
 from rigidjax.identify.search.checkpoint import (
     Checkpoint,
     fingerprint,
+    report_progress,
     require_folder,
     without_arrays,
 )
@@ -228,9 +229,8 @@ def _from_each(
             best = min(attempts, key=_cost)
             attempts[:] = [one if one is best else without_arrays(one) for one in attempts]
             keep.save(attempts)
-            if progress is not None:
-                words = f"misfit {float(attempts[-1].cost):.6g}, best {_cost(best):.6g}"
-                progress(f"start {number}/{len(points)}: {words}")
+            words = f"misfit {float(attempts[-1].cost):.6g}, best {_cost(best):.6g}"
+            report_progress(progress, f"start {number}/{len(points)}: {words}")
     except KeyboardInterrupt:
         interrupts.append(f"interrupted after {len(attempts)} of {len(points)} starts")
         if np.isfinite(float(latest.cost)):

@@ -22,6 +22,7 @@ from rigidjax.identify.uncertainty.quantities import (
     charts,
     labels,
     recording_names,
+    reported_deviation,
     reports_starts,
     value_and_slope,
     vector,
@@ -287,7 +288,7 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
 
 def _half(quantity: Quantity) -> float:
     """Half of the 95 % interval, of the logarithm if positive."""
-    return float(quantile(0.95, quantity.freedom)) * quantity.deviation
+    return float(quantile(0.95, quantity.freedom)) * reported_deviation(quantity)
 
 
 def _rate(rates: Sequence[Quantity], count: int) -> str:
@@ -335,7 +336,7 @@ def correlations(fit: "Fit") -> list[str]:
     """Pairs of reported quantities (moments, not components) whose errors have |ρ| > 0.95."""
     slope = np.asarray(value_and_slope(fit.model, fit.derivative_point)[1])[: len(fit.quantities)]
     covariance = slope @ np.asarray(fit.seen) @ slope.T
-    deviation = np.array([quantity.deviation for quantity in fit.quantities])
+    deviation = np.array([reported_deviation(quantity) for quantity in fit.quantities])
     good = np.isfinite(deviation) & (deviation > 0)
     follow = {f"{plain}{name}" for name, c in charts(fit.model) for plain in c.plain_names}
     names = [quantity.name for quantity in fit.quantities]

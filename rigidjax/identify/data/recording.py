@@ -68,15 +68,16 @@ class Recording(eqx.Module):
     """Times and readings of one motion.
 
     **Arguments:** `t` (T,) increasing times, s; then, for each sensor, a pair `(sensor, values)` or
-    a triple `(sensor, values, mask)`: `values` (T, 3) for a `Gyro`, (T, 4) or
-    (T, 3, 3) for an `AttitudeSensor`, as the sensor's `reading_shape` says; `mask` (T,) true where
-    there is a reading (what it masks may be NaN). A time at which no sensor read anything is
-    dropped: a masked reading and an absent one are the same. Sensors with their own times share
-    the union of these.
-    `inputs`, by keyword, are what was logged beside the readings, by name: the speed of a wheel, the
-    commands of motors. Each is a function of time such as `rigidjax.torques.Series(times, speeds)`,
-    or samples (T, …) at `t`, each held until the next one. The torque of a `Model` reads an input
-    by its name, `rigidjax.torques.Input("speed")`.
+    a triple `(sensor, values, mask)`: `values` (T, 3) for a `Gyro`, (T, 4) or (T, 3, 3) for an
+    `AttitudeSensor`, as the sensor's `reading_shape` says; `mask` (T,) true where there is a
+    reading (what it masks may be NaN). A row of `values` or `mask` with a masked entry of a NumPy
+    masked array is not read, and keeps its time; `t` may have none. Otherwise a time at which no
+    sensor read anything is dropped: a reading that `mask` excludes and an absent one are the same.
+    Sensors with their own times share the union of these.
+    `inputs`, by keyword, are what was logged beside the readings, by name: the speed of a wheel,
+    the commands of motors. Each is a function of time such as `rigidjax.torques.Series(times,
+    speeds)`, or samples (T, …) at `t`, each held until the next one. The torque of a `Model` reads
+    an input by its name, `rigidjax.torques.Input("speed")`.
 
     **Raises** `TypeError` for traced numbers (the times that are kept depend on them) and for
     anything but a sensor; `ValueError` for times that do not increase, also after rounding to
@@ -117,9 +118,12 @@ class Recording(eqx.Module):
             raise ValueError("Recording: wanted at least one pair (sensor, values)")
         rows = [_reading(t, *reading) for reading in readings]
         self.inputs = _checked_inputs(t, {} if inputs is None else inputs)
-        used = np.any([mask for _, _, mask in rows], axis=0)
-        if used.sum() < 2:
+        read = np.any([mask for _, _, mask, _ in rows], axis=0)
+        if read.sum() < 2:
             raise ValueError("Recording: wanted readings at two times at least; the rest is masked")
+        # The motion starts at the first reading, whatever is hidden before it.
+        within = np.maximum.accumulate(read) & np.maximum.accumulate(read[::-1])[::-1]
+        used = read | (within & np.any([hidden for *_, hidden in rows], axis=0))
         if any(not callable(source) for source in self.inputs.values()):
             # A sample is held until the next one, whether or not a sensor read anything then.
             used = np.ones(t.size, bool)
@@ -131,7 +135,7 @@ class Recording(eqx.Module):
         _require_digits(t[kept], self.t.dtype)
         self.readings = tuple(
             Reading(sensor, jnp.asarray(values[kept]), jnp.asarray(mask[kept]))
-            for sensor, values, mask in rows
+            for sensor, values, mask, _ in rows
         )
 
     def __repr__(self) -> str:
@@ -216,7 +220,8 @@ def _require_digits(given: np.ndarray, dtype: Any) -> None:
 
 def _reading(
     t: np.ndarray, sensor: AbstractSensor, values: Any, mask: Any = None
-) -> tuple[AbstractSensor, np.ndarray, np.ndarray]:
+) -> tuple[AbstractSensor, np.ndarray, np.ndarray, np.ndarray]:
+    """The sensor, its checked values and mask, and the rows that a masked array hides."""
     name = type(sensor).__name__
     if not isinstance(sensor, AbstractSensor):
         raise TypeError(f"Recording: wanted pairs (sensor, values), got {name} for a sensor")
@@ -225,7 +230,11 @@ def _reading(
             f"{name}: noise: wanted an array of shape ({sensor.components},), a standard deviation "
             f"for each component of the error, or None, got shape {np.shape(sensor.noise)}"
         )
+    values, no_value = _checks.unmasked(values)
     values = _checks.on_host(values, f"{name}: readings")
+    rows_hidden = None if no_value is None else no_value.reshape(len(no_value), -1).any(axis=1)
+    if rows_hidden is not None:
+        values[rows_hidden] = np.nan
     # Matrices of an attitude, for one, become quaternions.
     values = getattr(sensor, "readings", lambda values: values)(values)
     wanted = (t.size, *sensor.reading_shape)
@@ -233,6 +242,7 @@ def _reading(
         turned = "; transposed?" if values.shape == wanted[::-1] else ""
         many = f"; t has {t.size} times" if values.shape[1:] == wanted[1:] else turned
         raise ValueError(f"{name}: wanted readings of shape {wanted}, got {values.shape}{many}")
+    mask, no_flag = _checks.unmasked(mask)
     try:
         flags = np.ones(t.size, bool) if mask is None else np.asarray(mask)
     except ValueError as error:
@@ -242,6 +252,10 @@ def _reading(
     mask = flags.astype(bool)
     if mask.shape != t.shape:
         raise ValueError(f"{name}: wanted a mask of shape {t.shape}, got {mask.shape}")
+    hidden = np.zeros(t.shape, bool)
+    for absent in (rows_hidden, no_flag):
+        hidden = hidden if absent is None else hidden | absent
+    mask = mask & ~hidden
     across = tuple(range(1, values.ndim))
     bad = mask & ~np.isfinite(values).all(axis=across)
     if bad.any():
@@ -260,4 +274,4 @@ def _reading(
         wrong, why = refusal(values)
         if wrong.any():
             raise ValueError(f"{name}: {why.format(index=int(np.argmax(wrong)))}")
-    return sensor, values, mask
+    return sensor, values, mask, hidden

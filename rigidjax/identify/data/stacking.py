@@ -20,15 +20,22 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
     counts = np.array([r.t.shape[0] for r in recordings], np.int32)
     rows = max(_rows(recording, 0) for recording in recordings)
     alike = [lengthened(r, int(counts.max()), rows) for r in recordings]
-    forms = [(jax.tree.structure(r), [np.shape(x) for x in jax.tree.leaves(r)]) for r in alike]
-    for index, form in enumerate(forms):
-        if form != forms[0]:
+    # A law may hold what is no number: a function, a word.
+    numbers, others = zip(*(eqx.partition(r, _is_number) for r in alike), strict=True)
+    shapes = [[np.shape(x) for x in jax.tree.leaves(r)] for r in numbers]
+    for index, other in enumerate(others):
+        if not (eqx.tree_equal(other, others[0]) is True and shapes[index] == shapes[0]):
             raise ValueError(
                 f"recordings: the one at index {index} differs from the first in its sensors or "
                 "its inputs; give all recordings the same kinds in the same order, with the same "
                 "options"
             )
-    return jax.tree.map(_stacked, *alike), counts
+    return eqx.combine(jax.tree.map(_stacked, *numbers), others[0]), counts
+
+
+def _is_number(leaf: Any) -> bool:
+    """Whether a leaf is an array or a real number of Python, which recordings need not share."""
+    return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | complex)
 
 
 def of_few_lengths(model: Any) -> Any:
@@ -55,15 +62,6 @@ def _length(count: int) -> int:
 
 
 def _stacked(*leaves: Any) -> Any:
-    if not eqx.is_array_like(leaves[0]):
-        if any(leaf is not leaves[0] for leaf in leaves):
-            raise ValueError(
-                "recordings: their inputs or sensors hold different functions "
-                f"({', '.join(dict.fromkeys(getattr(f, '__name__', str(f)) for f in leaves))}), "
-                "and one program serves all recordings; give all the same function, and what "
-                "differs as numbers"
-            )
-        return leaves[0]
     # By NumPy if the numbers are known: JAX compiles a program for each shape.
     if _checks.known(leaves):
         return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))

@@ -192,7 +192,8 @@ def windows(
         )
     if not isinstance(inputs, Mapping | None):
         raise TypeError(f"inputs: wanted arrays by name, got {type(inputs).__name__}")
-    _require_rows(times, states, inputs or {})
+    inputs = {k: _checks.without_mask(v, f"inputs[{k!r}]") for k, v in (inputs or {}).items()}
+    _require_rows(times, states, inputs)
     h, even = _step_of(times)
     broken = np.concatenate([[0], np.cumsum(~even)])
     begin = np.arange(before, times.size - length, stride)
@@ -207,7 +208,7 @@ def windows(
     follow = begin[:, None] + 1 + np.arange(length)
     kind = jnp.result_type(float)
     arrays = jax.tree.map(lambda a: np.asarray(a, kind), states)
-    samples = {k: np.asarray(v, kind) for k, v in (inputs or {}).items()}
+    samples = {k: np.asarray(v, kind) for k, v in inputs.items()}
     kinds = names(states)
     if noise is not None:
         noise = _by_kind(noise, kinds, "noise", _checks.positive)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
-from rigidjax.body import parameters as charts
+from rigidjax.body import parameters as charts, validation
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of as tensor_of
 from rigidjax.body.symmetric3 import swap_trace
 
@@ -300,7 +300,7 @@ class Known(AbstractBodyChart):
     log_names: ClassVar[tuple[str, ...]] = ()
 
     def __check_init__(self) -> None:
-        _checks.single(self.known, (Inertia, MassProperties), "known")
+        validation.single(self.known, (Inertia, MassProperties), "known")
 
     def body(self, vector: Numbers) -> Inertia | MassProperties:
         return self.known

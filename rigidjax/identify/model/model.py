@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.full_scale import with_limits
@@ -527,7 +528,7 @@ def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
     """Return the chart's numbers of a guess, or its default start."""
     if body is None:
         return _zeros(chart.size)
-    _checks.single(body, (Inertia, MassProperties), "body")
+    body = validation.single(body, (Inertia, MassProperties), "body")
     if _checks.known(body):
         jax.tree.map(lambda leaf: _checks.finite(leaf, "body"), body)
     vector = eqx.filter_jit(chart.vector)(body)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
 
 
@@ -106,7 +107,7 @@ class Entropic(eqx.Module):
     weight: Scalar = eqx.field(converter=_weight)
 
     def __check_init__(self) -> None:
-        _checks.single(self.guess, (Inertia, MassProperties), "guess")
+        validation.single(self.guess, (Inertia, MassProperties), "guess")
 
     def residuals(self, body: Inertia | MassProperties, scaled: bool = True) -> Float[Array, " n"]:
         """Numbers whose squares add up to `2 w D`; `scaled` false compares shapes alone."""

@@ -1,10 +1,13 @@
 """The state of a search in a file, so that a killed search can continue."""
 
+import contextlib
 import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+import uuid
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,19 @@ from rigidjax.identify.search.stages import Attempt
 def without_arrays(attempt: Attempt) -> Attempt:
     """Return an attempt without its errors and derivatives, which need memory."""
     return attempt if attempt.blocks is None else dataclasses.replace(attempt, blocks=None)
+
+
+def report_progress(progress: Callable[[str], Any] | None, line: str) -> None:
+    """Call `progress`, if there is one; an output that cannot be written does not end a fit."""
+    if progress is None:
+        return
+    try:
+        progress(line)
+    except OSError as error:
+        reason = error.strerror or error
+        warnings.warn(
+            f"fit: progress could not be written ({reason}); the search goes on", stacklevel=3
+        )
 
 
 def require_folder(path: str | Path) -> None:
@@ -34,6 +50,9 @@ def fingerprint(*trees: Any) -> str:
     leaves, structure = jax.tree.flatten(trees)
     words, found = [repr(structure)], hashlib.sha256()
     for leaf in leaves:
+        if not eqx.is_array_like(leaf):
+            words.append(repr(leaf))
+            continue
         array = np.asarray(leaf)
         words.append(f"{array.dtype} {array.shape}")
         found.update(array.tobytes())
@@ -45,8 +64,9 @@ def fingerprint(*trees: Any) -> str:
 class Checkpoint:
     """The ends of the starts of a long search so far, on disk after every start.
 
-    `like` is an `Attempt` of the right shapes, `print_of` the `fingerprint` of all that the search
-    depends on. A file of another model raises `ValueError`, and is not overwritten.
+    `like` is a `Attempt` of the right shapes, `print_of` the `fingerprint` of all that the search
+    depends on. A file of another model raises `ValueError`, and is not overwritten. What cannot
+    be written is said by a warning.
     """
 
     def __init__(self, path: str | Path | None, like: Attempt, print_of: str):
@@ -61,11 +81,22 @@ class Checkpoint:
         if self.path is None:
             return
         head = dict(print_of=self.print_of, done=len(done))
-        new = self.path.with_name(self.path.name + ".new")
-        with new.open("wb") as file:
-            file.write(json.dumps(head).encode() + b"\n")
-            eqx.tree_serialise_leaves(file, [without_arrays(item) for item in done])
-        new.replace(self.path)
+        # A name of its own: another program may write to the same checkpoint.
+        part = self.path.with_name(f"{self.path.name}.{uuid.uuid4().hex}.part")
+        try:
+            with part.open("xb") as file:
+                file.write(json.dumps(head).encode() + b"\n")
+                eqx.tree_serialise_leaves(file, [without_arrays(item) for item in done])
+            part.replace(self.path)
+        except OSError as error:
+            warnings.warn(
+                f"fit: the checkpoint {self.path} is not up to date ({error.strerror or error}); "
+                "the search goes on",
+                stacklevel=2,
+            )
+        finally:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
 
     def _read(self, path: Path) -> None:
         try:

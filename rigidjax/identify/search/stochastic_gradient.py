@@ -19,6 +19,7 @@ from rigidjax.identify.model.terms import (
     prior_residuals,
     reading_residuals,
 )
+from rigidjax.identify.search.checkpoint import report_progress
 
 if TYPE_CHECKING:
     import optax
@@ -78,9 +79,9 @@ def descend(
             if not np.isfinite(np.asarray(costs)).all():
                 break
             x = after
-            if progress is not None:
-                done = first + keys.shape[0]
-                progress(f"descent {done}/{how.steps}: misfit {float(costs.mean()):.6g}")
+            done = first + keys.shape[0]
+            line = f"descent {done}/{how.steps}: misfit {float(costs.mean()):.6g}"
+            report_progress(progress, line)
     except KeyboardInterrupt:
         return x, False
     return x, True

@@ -19,13 +19,15 @@ FARTHEST = 1e3
 
 
 class Quantity(eqx.Module):
-    """A number with a name: its value, standard deviation (of the logarithm if positive), unit.
+    """A number with a name: its value, and its standard deviation in the same `unit`.
 
-    `cuts` are its correlation with the flatness of each body, and the flatness in standard
-    deviations (`rigidjax.identify.flat_limit`); `most` is an upper limit for all bodies; `freedom`
-    the degrees of freedom of its variance, infinite if all noise is given.
+    The errors of a `positive` one are those of its logarithm: `deviation` is the value times the
+    standard deviation of the logarithm, and an interval reaches farther up than down. `cuts` are
+    its correlation with the flatness of each body, and the flatness in standard deviations
+    (`rigidjax.identify.flat_limit`); `most` is an upper limit for all bodies; `freedom` the degrees
+    of freedom of its variance, infinite if all noise is given.
 
-    >>> mass = Quantity("mass", 2.0, 0.01, "kg", True)
+    >>> mass = Quantity("mass", 2.0, 0.02, "kg", True)
     >>> low, high = mass.interval(0.95)
     >>> round(low, 3), round(high, 3)
     (1.961, 2.04)
@@ -48,12 +50,20 @@ class Quantity(eqx.Module):
         that it holds the true value. **Raises** `ValueError` outside (0, 1).
         """
         reach = float(quantile(level, self.freedom))
-        low, high = (float(side) * self.deviation for side in cut_ends(reach, self.cuts))
+        wide = reported_deviation(self)
+        low, high = (float(side) * wide for side in cut_ends(reach, self.cuts))
         if not self.positive:
             return self.value + low, self.value + high
         if max(-low, high) > np.log(FARTHEST):
             return 0.0, self.most
         return float(self.value * np.exp(low)), min(float(self.value * np.exp(high)), self.most)
+
+
+def reported_deviation(quantity: Quantity) -> float:
+    """The standard deviation of what `vector` holds: of the logarithm if positive."""
+    if not quantity.positive:
+        return quantity.deviation
+    return quantity.deviation / quantity.value if quantity.value else np.inf
 
 
 def cut_ends(reach: np.ndarray | float, cuts: Sequence[tuple[Any, float]]) -> tuple[Any, Any]:
@@ -178,7 +188,7 @@ def quantities(
         least = np.finfo(float).eps * (1.0 if positive else abs(shown))
         most = 1.0 if name.startswith(Ratios.log_names) else np.inf
         mine = tuple((float(rho[index]), away) for rho, away in cuts)
-        deviation = float(np.maximum(deviation, least))
+        deviation = float(np.maximum(deviation, least)) * (shown if positive else 1.0)
         own = float(freedom[index])
         out.append(Quantity(name, shown, deviation, unit, positive, mine, most, own))
     return tuple(out)

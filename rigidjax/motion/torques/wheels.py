@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
+from rigidjax.body import validation
 from rigidjax.body.inertia import Body, Inertia, MassProperties, tensor_of, with_tensor
 from rigidjax.body.symmetric3 import outer
 from rigidjax.motion.torques import base
@@ -161,7 +162,7 @@ class ReactionWheels(base.AbstractTorque):
 
     def without_wheels(self, body: Body) -> Body:
         """The `body`, an `Inertia` or `MassProperties` with locked wheels, less `Σ J a aᵀ`."""
-        _checks.single(body, (Inertia, MassProperties), "body")
+        body = validation.single(body, (Inertia, MassProperties), "body")
         rows = (j * outer(a, a) for j, a in zip(self.inertia, self.axes, strict=True))
         taken = sum(rows, jnp.zeros((3, 3), self.axes.dtype))
         return with_tensor(body, tensor_of(body) - taken)

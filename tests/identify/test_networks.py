@@ -1,0 +1,83 @@
+"""A network as a torque: its weights are fitted to recordings, and to windows."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import rigidjax as rj
+from rigidjax import identify
+from rigidjax._types import HasSpin
+
+BODY = rj.Inertia.from_principal(1.0, 1.7, 2.3)
+TS = np.linspace(0.0, 3.0, 21)
+STARTS = ([1.2, 0.4, -0.9], [-0.5, 1.1, 0.8])
+
+
+class Cubic(eqx.Module):
+    """The true law, −0.1 Ω − 0.2 Ω³."""
+
+    feels: ClassVar[type] = HasSpin
+
+    def __call__(self, t, state, body):
+        return -0.1 * state.omega - 0.2 * state.omega**3
+
+
+class Network(eqx.Module):
+    """A torque of the body rate by a network."""
+
+    net: eqx.nn.MLP
+    feels: ClassVar[type] = HasSpin
+
+    def __call__(self, t, state, body):
+        return self.net(state.omega)
+
+
+def network():
+    key = jax.random.key(3)
+    net = eqx.nn.MLP(3, 3, width_size=3, depth=1, activation=jnp.tanh, key=key)
+    return Network(jax.tree.map(lambda x: x.astype(float) if eqx.is_array(x) else x, net))
+
+
+def rates(start):
+    return rj.simulate(BODY, rj.Spin(start), TS, Cubic()).ys
+
+
+def distance(law):
+    """The error of a law at the rates of all motions over the size of the true one, rms."""
+    omega = jnp.concatenate([rates(start).omega for start in STARTS])
+    of = lambda law: jax.vmap(lambda w: law(0.0, rj.Spin(w), BODY))(omega)
+    true = of(Cubic())
+    return float(jnp.sqrt(jnp.mean((of(law) - true) ** 2) / jnp.mean(true**2)))
+
+
+def test_the_weights_of_a_network_are_fitted_to_recordings():
+    records = [
+        identify.Recording(TS, (identify.Gyro(1e-3), rates(start).omega), torque=network())
+        for start in STARTS
+    ]
+    free = [
+        identify.Free(
+            lambda r, i=i, part=part: getattr(r.torque.net.layers[i], part), f"{part} {i}"
+        )
+        for i in (0, 1)
+        for part in ("weight", "bias")
+    ]
+    problem = identify.Problem(records, identify.Known(BODY), free=free)
+    fit = identify.fit(problem, initial=problem.start(), max_steps=40)
+    law = problem.scenes(fit.parameters).torque
+    fitted = jax.tree.map(lambda leaf: leaf[0] if eqx.is_array(leaf) else leaf, law)
+    assert fitted.net.activation is jnp.tanh
+    assert distance(network()) > 0.5 and distance(fitted) < 0.1
+
+
+def test_the_weights_of_a_network_are_fitted_to_windows():
+    cut = [identify.windows(TS, rates(start), length=5, stride=3) for start in STARTS]
+    fit = identify.fit_windows(
+        identify.Windows.joined(*cut), lambda law: (BODY, law), network(), max_steps=60
+    )
+    assert fit.value.net.activation is jnp.tanh and distance(fit.value) < 0.1
+    low, high = fit.interval()
+    assert bool((low.net.layers[0].weight <= high.net.layers[0].weight).all())
