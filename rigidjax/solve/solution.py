@@ -49,7 +49,8 @@ class Solution(eqx.Module, Generic[State]):
     stats: dict[str, Any]
     result: dfx.RESULTS
     _arrays: Any
-    _rest: tuple[tuple[Any, ...], Any] = eqx.field(static=True)
+    # A tree, no `PyTreeDef`: what Equinox leaves out of one is not itself after `pickle`.
+    _rest: Any = eqx.field(static=True)
     event_time: Float[Array, ""] | None = None
     event_state: Any = None
     own: Any = None
@@ -166,8 +167,7 @@ class Solution(eqx.Module, Generic[State]):
 
     @property
     def _setup(self) -> Any:
-        leaves, structure = self._rest
-        return eqx.combine(self._arrays, jax.tree.unflatten(structure, leaves))
+        return eqx.combine(self._arrays, self._rest)
 
     @property
     def _states(self) -> Any:
