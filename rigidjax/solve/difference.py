@@ -60,7 +60,7 @@ def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple
     way = jax.tree.map(random_way, x)
     rise = jnp.max(jnp.abs(_change(derivative, way)))
     size = jnp.maximum(jnp.max(jnp.abs(value)), _SLOW * rise)
-    unsure = jnp.maximum(jnp.max(value_error), jnp.finfo(value.dtype).eps * size)
+    unsure = jnp.maximum(jnp.max(value_error), float(jnp.finfo(value.dtype).eps) * size)
     # Values that change fast change by the root of what they are unsure of.
     step = jnp.sqrt(unsure * size) / jnp.where(rise > 0, rise, 1)
     longest = _STEP[value.dtype.itemsize]
@@ -104,7 +104,7 @@ def slopes_of(x: Any, middle: Array, step: Array, sides: Any, values: Array, err
     bend = jnp.abs(values[0] + values[1] - 2 * middle)
     size, rise = jnp.max(jnp.abs(error.value)), jnp.max(jnp.abs(derivative))
     eps = jnp.finfo(error.value.dtype).eps
-    unsure = jnp.max(bend + _CLOSER * error.value_error) + 8 * eps * size
+    unsure = jnp.max(bend + _CLOSER * error.value_error) + 8 * float(eps) * size
     ways = jax.tree.map(lambda side: jnp.abs(side[1] - side[0]) / (2 * step), sides)
     of_derivative = _change(error.derivative_error, ways)
     curved = rise * rise * step / jnp.maximum(size, _SLOW * rise)
@@ -120,7 +120,8 @@ def errors_of_numbers(slopes: Slopes) -> Any:
     slope = jnp.where(slopes.differ, jnp.abs(slopes.difference - slopes.derivative), 0)
 
     def of_leaf(way: Array) -> Array:
-        return slope.reshape(*slope.shape, *[1] * way.ndim) / jnp.where(way > 0, way, 1)
+        inverse = 1 / jnp.where(way > 0, way, 1)
+        return jnp.tensordot(slope, inverse.astype(slope.dtype), axes=0)
 
     return jax.tree.map(of_leaf, slopes.ways)
 
@@ -145,7 +146,8 @@ def _change(derivative: Any, way: Any) -> Array:
     """A derivative times a change of x: the change of the value."""
 
     def of_leaf(derivative: Array, way: Array) -> Array:
-        axes = tuple(range(derivative.ndim - way.ndim, derivative.ndim))
-        return jnp.sum(derivative * way, axes)
+        many = derivative.ndim - way.ndim
+        way = way.reshape(*[1] * many, *way.shape)
+        return jnp.sum(derivative * way, tuple(range(many, derivative.ndim)))
 
     return jnp.sum(jnp.stack(jax.tree.leaves(jax.tree.map(of_leaf, derivative, way))), 0)

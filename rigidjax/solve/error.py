@@ -297,9 +297,9 @@ def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
         left, here, right = t[:-2, None], t[1:-1, None], t[2:, None]
         chord = (f[:-2] * (right - here) + f[2:] * (here - left)) / (right - left)
         size = jnp.max(jnp.abs(f), 0)
-        missed = jnp.abs(f[1:-1] - chord) / jnp.where(size > 0, size, 1)
+        missed = jnp.abs(f[1:-1] - chord) / jnp.where(size > 0, size, 1)[None]
         missed = jnp.max(jnp.where(jnp.isfinite(missed), missed, 0), 1)
-        usual = _SUDDEN * jnp.median(missed) + _ROUGH * jnp.finfo(t.dtype).eps
+        usual = _SUDDEN * jnp.median(missed) + _ROUGH * float(jnp.finfo(t.dtype).eps)
         most = jnp.argmax(missed)
         return jnp.where(missed[most] > usual, t[1 + most], ts[0])
 
