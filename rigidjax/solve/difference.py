@@ -22,7 +22,7 @@ _STEP = {8: 5e-7, 4: 5e-4}
 # The least size of values, relative to their rise along x: a value may be zero just there.
 _SLOW = 1e-3
 # What a second run is unsure of, relative to the error of the first.
-_CLOSER = 0.04
+_CLOSER = 0.01
 # The slopes differ where their distance is so many times what is known of it.
 _UNSURE = 10.0
 
