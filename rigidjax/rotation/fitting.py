@@ -32,7 +32,6 @@ from rigidjax.rotation.linalg3 import (
 )
 from rigidjax.rotation.validation import direction, rotation_matrix, unit_quaternion
 
-
 # The least weight, relative to the largest, of the first estimate in Wahba's problem.
 _LIGHT = 1e-3
 
