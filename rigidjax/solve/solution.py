@@ -121,6 +121,11 @@ class Solution(eqx.Module, Generic[State]):
         digits of body, torque and start (in closed form, of the times). A `UserWarning` names the
         time after which nothing is known, as in chaos.
 
+        A torque that depends on the time is also sampled at 16 384 times, each part of the run at
+        one saved state: adaptive steps of the second run end at a pulse that both runs would pass
+        over. Not seen is a pulse between two samples, one that the torque has at other states only,
+        and under fixed steps one that falls between their stages.
+
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.5, 1.0])
         >>> law = rj.torques.Damping([0.1, 0.1, 0.1])
         >>> rj.simulate(body, start, [0.0, 5.0], law).error.total["omega"] < 1e-9
