@@ -90,13 +90,13 @@ def wahba(
     closer = jnp.where(heavy > 0, jnp.maximum(heavy, _LIGHT * jnp.max(heavy)), 0)
     try:
         best = nearest(_weighted_sum(closer, those, these))
+        for _ in range(4):
+            best = _newton_step(best, heavy, those, these)
+        # Each Newton step from the solution doubles the order to which derivatives are right.
+        for _ in range(2):
+            best = _newton_step(best, w, world, body)
     except ValueError:
         raise ValueError(words) from None
-    for _ in range(4):
-        best = _newton_step(best, heavy, those, these)
-    # Each Newton step from the solution doubles the order to which derivatives are right.
-    for _ in range(2):
-        best = _newton_step(best, w, world, body)
     # (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det b: 0 where a turn is free.
     eps = float(jnp.finfo(w.dtype).eps)
     loose = jnp.zeros((), bool)

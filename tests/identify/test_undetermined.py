@@ -111,3 +111,35 @@ def test_a_fit_that_explains_nothing_calls_nothing_determined():
 def test_words(changes, relative, words):
     units = tuple("" if ratio else "m" for ratio in relative)
     assert Combination(("A", "B"), changes, units, relative).in_words == words
+
+
+def test_a_number_that_switches_a_torque_is_named():
+    class Until(eqx.Module):
+        end: jax.Array
+        unused: jax.Array
+
+        def __call__(self, t, state, body):
+            return jnp.array([0.2, 0.1, 0.5]) * jnp.where(t < self.end, 1.0, 0.0)
+
+    law = Until(jnp.asarray(0.55), jnp.asarray(1.0))
+    record = identify.Recording(TS, (identify.Gyro(0.01), np.ones((5, 3))), torque=law)
+    free = [
+        identify.Free(lambda r: r.torque.end, "end", scale=1.0),
+        identify.Free(lambda r: r.torque.unused, "gain", scale=1.0),
+    ]
+    problem = identify.Problem(record, identify.Known(BODY), free=free)
+    here = problem.start()
+    null = np.zeros((2, len(ravel_pytree(here)[0])))
+    nothing = jax.tree.map(jnp.zeros_like, here)
+    for row in range(2):
+        one = eqx.tree_at(lambda p: p.shared[row], nothing, jnp.ones_like(nothing.shared[row]))
+        null[row] = np.asarray(ravel_pytree(one)[0])
+    like = jnp.eye(null.shape[1])
+    fit = identify.Fit(
+        problem, here, like, like, "none", (jnp.full((1, 3), 1e-3),), (), 1.0, 1, 1.0, 1.0,
+        jnp.ones(null.shape[1]), jnp.asarray(null), (), Answer("found"),
+        Answer("explains the readings"), (),
+    )  # fmt: skip
+    words = [one.in_words for one in fit.undetermined]
+    assert words[0].startswith("Readings change with end, but derivatives do not see it: a torque")
+    assert words[1] == "Gain is not determined: no reading changes with it."
