@@ -82,7 +82,7 @@ def simulate(
       the smallest number that matters. The closed form uses neither.
     - `accuracy`: in the place of tolerances, how far the states may be from the exact motion: rad,
       and relative to the largest value in the run. Two or more cheap runs find the tolerance.
-      `sol.error` is then known without more runs, and has the same look at pulses. Where it exceeds the accuracy (chaos, round-off),
+      `sol.error` is then known without more runs. Where it exceeds the accuracy (chaos, round-off),
       a `UserWarning` says from which time on; under `jit` look at `sol.error.relative`.
     - `dt0`, `stepsize_controller`: first step and controller where the tolerances are not enough,
       such as `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.

@@ -108,18 +108,6 @@ def test_a_derivative_that_misses_a_switch_is_not_known(name):
     assert abs(float(error.derivative) - right) <= 2 * float(error.derivative_error)
 
 
-def test_a_small_lost_part_is_its_error():
-    def f(x, **how):
-        law = lambda t, s, b: Z * jnp.where(t < x[0], 0.02, 0.0) - x[1] * s.omega
-        return rj.simulate(BODY, rj.Spin([0.0, 0.0, 1.0]), [0.0, 2.0], law, **how).ys.omega[-1, 2]
-
-    with pytest.warns(UserWarning, match="the likely cause|The likely cause"):
-        error = rj.error_of(f, jnp.array([1.2, 0.2]))
-    # exp(−0.1 (2 − 1.2))·0.02/2 is the derivative by the time of the switch.
-    missed = 0.01 * np.exp(-0.1 * 0.8)
-    assert missed < float(error.derivative_error[0]) < 4 * missed and bool(error.known)
-
-
 def test_the_last_digits_of_zeros_count():
     body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
 
