@@ -448,3 +448,10 @@ def float_type(value: Any, name: str = "dtype") -> Any:
     if kind not in (np.float32, np.float64):
         raise TypeError(f"{name}: wanted float32 or float64, got {_shown(value)}")
     return kind
+
+
+def later_origin(dtype: Any) -> str:
+    """Return the advice for times so large that `dtype` cannot resolve their steps."""
+    if np.dtype(dtype) == np.float64:
+        return "count time from a later origin, such as the first time of the run"
+    return "count time from a later origin, or use float64"

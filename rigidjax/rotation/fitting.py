@@ -32,6 +32,9 @@ from rigidjax.rotation.linalg3 import (
 )
 from rigidjax.rotation.validation import direction, rotation_matrix, unit_quaternion
 
+# The least weight, relative to the largest, of the first estimate in Wahba's problem.
+_LIGHT = 1e-3
+
 
 def project(matrix: Mat3Like) -> Mat3:
     """The rotation nearest to a matrix (Frobenius norm), with the correct derivative also on SO(3).
@@ -64,8 +67,9 @@ def wahba(
     """The rotation M, body → world, least in Σ w_i |world_i − M body_i|² (Wahba 1965).
 
     **Arguments:** `body`, `world` (n, 3), n ≥ 2: the same directions in both frames, any units;
-    `weights` (n,), not negative, 1 if not given. It solves the quartic of Markley 1993 (FOAM, J.
-    Astronaut. Sci. 41, 261), then takes Newton steps on the group.
+    `weights` (n,), not negative, 1 if not given; they may differ by 1e13 (1e5 in float32). It
+    solves the quartic of Markley 1993 (FOAM, J. Astronaut. Sci. 41, 261), then takes Newton steps
+    on the group.
 
     **Raises:** an error, also under `jit`, if the directions do not determine the rotation: fewer
     than two, or all parallel (to 5e-4 rad in float64, 4° in float32, where half the digits would be
@@ -80,15 +84,50 @@ def wahba(
     for name, rows in (("body", body), ("world", world)):
         direction(rows.reshape(-1), name)
     w, world, body = (of_order_one(x) for x in (w, world, body))
-    b = (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
     words = "wahba: these directions do not fix the attitude; two that are not parallel are needed"
+    heavy, those, these = lax.stop_gradient((w, world, body))
+    # In one sum a light direction would lose its digits beside a heavy one.
+    closer = jnp.where(heavy > 0, jnp.maximum(heavy, _LIGHT * jnp.max(heavy)), 0)
     try:
-        best = nearest(b)
+        best = nearest(_weighted_sum(closer, those, these))
+        for _ in range(4):
+            best = _newton_step(best, heavy, those, these)
+        # Each Newton step from the solution doubles the order to which derivatives are right.
+        for _ in range(2):
+            best = _newton_step(best, w, world, body)
     except ValueError:
         raise ValueError(words) from None
     # (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det b: 0 where a turn is free.
-    firmness = determinant(_curvature(best, b / jnp.sqrt((b * b).sum())))
-    return _checks.refuse(best, ~(firmness > 4 * np.sqrt(jnp.finfo(b.dtype).eps)), words)
+    eps = float(jnp.finfo(w.dtype).eps)
+    loose = jnp.zeros((), bool)
+    for weights, least in ((jnp.sign(heavy), 4 * np.sqrt(eps)), (heavy, 64 * eps)):
+        b = _weighted_sum(weights, those, these)
+        firmness = determinant(_curvature(lax.stop_gradient(best), b / jnp.sqrt((b * b).sum())))
+        loose = loose | ~(firmness > least)
+    return _checks.refuse(best, loose, words)
+
+
+def _weighted_sum(
+    w: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
+) -> Mat3:
+    """Σ w_i world_i body_iᵀ."""
+    return (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
+
+
+def _newton_step(
+    best: Mat3, w: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
+) -> Mat3:
+    """A Newton step from `best` towards the largest Σ w_i world_i · M body_i.
+
+    The moment of each direction is taken of the small difference of both vectors: the rounding of a
+    heavy one does not turn the body about it.
+    """
+    moved = (best[None] * body[:, None, :]).sum(-1)
+    lengths = [jnp.sqrt((x * x).sum(-1)) for x in lax.stop_gradient((moved, world))]
+    ratio = lengths[0] / jnp.where(lengths[1] > 0, lengths[1], 1)
+    moment = (w[:, None] * jax.vmap(cross)(moved - ratio[:, None] * world, world)).sum(0)
+    turn = solve(_curvature(jnp.eye(3, dtype=w.dtype), _weighted_sum(w, moved, world)), moment)
+    return product(quaternion.to_matrix(quaternion.exp(turn)), best)
 
 
 def align(a: Vec3Like, b: Vec3Like) -> Mat3:

@@ -47,6 +47,7 @@ class Located(NamedTuple):
 
     times: Array  # (K, *bodies), NaN beyond the last
     states: Array  # (K, n, *bodies)
+    jumps: Array  # (K, *bodies), whether g jumps over zero there
     number: Array
     t: Array  # at the end
     h: Array  # the next step, NaN where one was met
@@ -78,6 +79,7 @@ class _Body(NamedTuple):
     tries: Array
     steps: Array
     found: Array
+    jumped: Array  # whether g jumped over the zero found last
 
 
 def locate(motion: Motion, search: Search, run: Run) -> Located:
@@ -94,7 +96,7 @@ def locate(motion: Motion, search: Search, run: Run) -> Located:
     h, x = jnp.where(sound, run.h0, jnp.nan), jnp.zeros_like(t0)
     end = _End(x, none, none)
     g = jnp.where(there, none, g)
-    body = _Body(t0, y0, h, side, g, rate, zero, no, x, end, end, zero, zero, no)
+    body = _Body(t0, y0, h, side, g, rate, zero, no, x, end, end, zero, zero, no, no)
     on = lambda body: jnp.any(_going(search, run, body))  # noqa: E731
 
     def next_zero(body: _Body) -> _Body:
@@ -102,22 +104,24 @@ def locate(motion: Motion, search: Search, run: Run) -> Located:
         return body._replace(found=body.found & motion.counts(body.t, body.y, body.steps))
 
     def row(state: Any) -> Any:
-        body, times, states, k, count = state
+        body, times, states, jumps, k, count = state
         body = lax.while_loop(on, next_zero, body._replace(found=no))
         t = jnp.where(body.found, body.t, jnp.nan)
         y = jnp.where(lift(body.found, body.y), body.y, jnp.nan)
         times = lax.dynamic_update_index_in_dim(times, t, k, 0)
         states = lax.dynamic_update_index_in_dim(states, y, k, 0)
-        return body, times, states, k + 1, count + body.found.astype(jnp.int32)
+        jumps = lax.dynamic_update_index_in_dim(jumps, body.found & body.jumped, k, 0)
+        return body, times, states, jumps, k + 1, count + body.found.astype(jnp.int32)
 
     times = jnp.full((search.many, *t0.shape), jnp.nan, t0.dtype)
     states = jnp.full((search.many, *y0.shape), jnp.nan, y0.dtype)
-    body, times, states, _, count = lax.while_loop(
-        lambda state: (state[3] < search.many) & on(state[0]._replace(found=no)),
+    jumps = jnp.zeros(times.shape, bool)
+    body, times, states, jumps, _, count = lax.while_loop(
+        lambda state: (state[4] < search.many) & on(state[0]._replace(found=no)),
         row,
-        (body, times, states, jnp.zeros((), jnp.int32), zero),
+        (body, times, states, jumps, jnp.zeros((), jnp.int32), zero),
     )
-    return Located(times, states, count, body.t, body.h, body.steps)
+    return Located(times, states, jumps, count, body.t, body.h, body.steps)
 
 
 def _going(search: Search, run: Run, body: _Body) -> Array:
@@ -162,8 +166,8 @@ def _pass(motion: Motion, search: Search, run: Run, body: _Body) -> _Body:
     refine = on & body.refining
     low = _choose(refine & ~other, here, body.low)
     high = _choose(refine & other, here, body.high)
-    near, move, guess = _newton(body, low, high, here)
-    done = refine & near
+    near, pinned, move, guess = _newton(body, low, high, here)
+    done = refine & (near | pinned)
     move = jnp.where(done, move, jnp.zeros_like(move))
     low, high = _choose(crossed, start, low), _choose(crossed, here, high)
 
@@ -186,11 +190,14 @@ def _pass(motion: Motion, search: Search, run: Run, body: _Body) -> _Body:
         tries=jnp.where(shorter | (refine & ~done), body.tries + 1, 0).astype(jnp.int32),
         steps=body.steps + on.astype(jnp.int32),
         found=body.found | done,
+        jumped=jnp.where(done, ~near, body.jumped),
     )
 
 
-def _newton(body: _Body, low: _End, high: _End, here: _End) -> tuple[Array, Array, Array]:
-    """Whether the zero is found, how far it is from `here` then, and else where to look next."""
+def _newton(body: _Body, low: _End, high: _End, here: _End) -> tuple[Array, Array, Array, Array]:
+    """Whether the zero is near, or between ends that nothing is between; how far it is from `here`
+    if it is near; and else where to look next.
+    """
     rate, eps = here.rate, jnp.finfo(body.h.dtype).eps
     move = (-here.g / jnp.where(rate == 0, jnp.ones_like(rate), rate)).astype(here.x.dtype)
     goal = here.x + move
@@ -202,7 +209,7 @@ def _newton(body: _Body, low: _End, high: _End, here: _End) -> tuple[Array, Arra
     pinned = (width <= unit) | (body.tries >= _MOST)
     inside = (goal > low.x) & (goal < high.x) & (body.tries < _GUESSES)
     guess = jnp.where(inside, goal, low.x + 0.5 * width)
-    return near | pinned, jnp.where(near, move, jnp.zeros_like(move)), guess
+    return near, pinned, jnp.where(near, move, jnp.zeros_like(move)), guess
 
 
 def _choose(which: Array, a: _End, b: _End) -> _End:

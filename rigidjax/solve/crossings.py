@@ -6,6 +6,8 @@ one step of Chebyshev's method, whose first and second derivatives are those of 
 
     τ = −(g/ġ)(1 + ½ g g̈/ġ²),   y = y* + f τ + ½ (df/dt) τ².
 
+Where g jumps over zero, halving finds the time; nothing tells how it changes: derivatives are NaN.
+
 A zero of round-off, of what the motion conserves or of a component that stays at zero, does not
 count. Its ġ is at most some ε (|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ), times the root of the number of steps. The
 size rᵢ of the terms of ẏᵢ is the length of the array of the state that i belongs to, taken of ẏ and
@@ -59,7 +61,8 @@ class Event(eqx.Module):
     **Arguments:**
 
     - `condition`: a Module or function `(t, state, body) → scalar`, smooth along the motion; it may
-      hold traced numbers. Under a law with states of its own the state is a `Coupled`:
+      hold traced numbers. One that jumps over zero (`jnp.sign(…)`) is met where it jumps; its time
+      has NaN derivatives. Under a law with states of its own the state is a `Coupled`:
       `state.motion.omega`, `state.own`.
     - `direction`: 1 for a zero on the way up, −1 on the way down, 0 for both (as in SciPy), in the
       order in which the run meets them.
@@ -237,7 +240,8 @@ def solve_until(
     short = jnp.concatenate([jnp.where(before, ts, end), jnp.where(met, end, ts[-1])[None]])
     ys, stats, result = solve(setup, state0, short)
     y = ravel_pytree(jax.tree.map(lambda leaf: leaf[-1], ys))[0]
-    s, y = correction(crossed, numbers[0], crossed.time(end), y, met)
+    jumps = found.jumps[0]
+    s, y = correction(crossed, numbers[0], crossed.time(end), y, met & ~jumps)
     met = met & (result == dfx.RESULTS.successful)
 
     def rows(leaf: Array) -> Array:
@@ -246,9 +250,21 @@ def solve_until(
 
     time, y = (jnp.where(met, leaf, jnp.nan) for leaf in (crossed.time(s), y))
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
-    out = (jax.tree.map(rows, ys), time, crossed.tree(y))
-    ys, time, state = nan_derivatives(out, inputs)
+    ys = nan_derivatives(jax.tree.map(rows, ys), inputs)
+    time, state = _with_derivatives((time, crossed.tree(y)), jumps, inputs)
     return ys, stats, dfx.RESULTS.where(met, dfx.RESULTS.event_occurred, result), time, state
+
+
+def _with_derivatives(crossing: Any, jumps: Array, inputs: Any) -> Any:
+    """The same numbers with NaN derivatives by `inputs` where they are NaN or the section jumps."""
+
+    def lost(leaf: Array) -> Array:
+        return jnp.where(
+            jumps.reshape(*jumps.shape, *[1] * (leaf.ndim - jumps.ndim)), jnp.nan, leaf
+        )
+
+    moved = nan_derivatives(jax.tree.map(lost, crossing), inputs)
+    return as_known(lax.stop_gradient(crossing), moved)
 
 
 @eqx.filter_jit
@@ -258,30 +274,30 @@ def _solved(
     state0 = on_the_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
     found = located(crossed, Search(event.direction, many, max_steps), numbers)
-    times, states = _as_found(found.times, found.states, setup, event, state0, ts)
+    times, states = _as_found(found.times, found.states, found.jumps, setup, event, state0, ts)
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
     out = crossed.time(times), jax.vmap(crossed.tree)(states)
-    times, states = nan_derivatives(out, inputs)
+    times, states = _with_derivatives(out, found.jumps, inputs)
     result = outcome(found.h, found.t, crossed.time(ts[-1]), found.number >= many)
     result = of_body(result, setup.body)
     return Crossings(times, states, found.number, result, found.steps)
 
 
 @eqx.filter_custom_jvp
-def _as_found(times: Array, states: Array, *scene: Any) -> tuple[Array, Array]:
+def _as_found(times: Array, states: Array, jumps: Array, *scene: Any) -> tuple[Array, Array]:
     """The crossings of a `scene`: only derivatives run it once more."""
     return times, states
 
 
 @_as_found.def_jvp
 def _(primals: Any, tangents: Any) -> Any:
-    found, scene = primals[:2], primals[2:]
-    moved, along = eqx.filter_jvp(partial(_corrected, found[0]), scene, tangents[2:])
+    found, jumps, scene = primals[:2], primals[2], primals[3:]
+    moved, along = eqx.filter_jvp(partial(_corrected, found[0], jumps), scene, tangents[3:])
     return as_known(found, moved), along
 
 
 def _corrected(
-    times: Array, setup: Free | Loop, event: Event, state0: Any, ts: Array
+    times: Array, jumps: Array, setup: Free | Loop, event: Event, state0: Any, ts: Array
 ) -> tuple[Array, Array]:
     """Times, in s, and states of the crossings found as functions of all numbers of the scene."""
     crossed, (constants, *_) = section(setup, event, state0, ts)
@@ -290,7 +306,7 @@ def _corrected(
     s = jnp.where(there, times, last)
     ys, *_ = solve(setup, state0, jnp.concatenate([ts[:1], crossed.time(s)]))
     ys = jax.vmap(lambda y: ravel_pytree(y)[0])(ys)[1:]
-    times, states = jax.vmap(partial(correction, crossed, constants))(s, ys, there)
+    times, states = jax.vmap(partial(correction, crossed, constants))(s, ys, there & ~jumps)
     return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
 
 

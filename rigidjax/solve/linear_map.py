@@ -11,7 +11,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jax.core import ShapedArray
 from jax.custom_derivatives import zero_from_primal
 from jax.extend.core import Primitive
@@ -40,8 +39,21 @@ def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) 
 
 
 def as_known(known: Any, moved: Any) -> Any:
-    """The numbers `known` with the derivatives, of every order, of the same computed anew."""
-    return jax.tree.map(lambda a, b: a + (b - lax.stop_gradient(b)), known, moved)
+    """The numbers `known` with the derivatives, of every order, of the same computed anew.
+
+    These may be NaN, and their derivatives, too.
+    """
+    return jax.tree.map(_known, known, moved)
+
+
+@jax.custom_jvp
+def _known(known: Array, moved: Array) -> Array:
+    return batched_as(known, (known, moved))
+
+
+@_known.defjvp
+def _known_jvp(primals: Any, tangents: Any) -> Any:
+    return _known(*primals), tangents[1]
 
 
 def nan_derivatives(tree: Any, inputs: Any) -> Any:

@@ -209,26 +209,30 @@ def _loop(
     return out.ys, dict(zip(_COUNTS, taken, strict=True)), out.result, (last_time, out.last)
 
 
-_WORDS = (
-    (
-        NONFINITE,
-        "simulate: the motion became NaN or infinite. Is the torque finite at every time and state "
-        "of the run? With fixed steps: are they short enough for this spin? throw=False keeps "
-        "what came before",
-    ),
-    (
-        dfx.RESULTS.dt_min_reached,
-        "simulate: no step is short enough: the minimum step size, some units of round-off of the "
-        "time, was reached. Does the torque jump or grow without bound? In float32 the times near "
-        "1e9 s are 100 s apart: count time from a later origin, or use float64",
-    ),
+_NONFINITE_WORDS = (
+    "simulate: the motion became NaN or infinite. Is the torque finite at every time and state of "
+    "the run? With fixed steps: are they short enough for this spin? throw=False keeps what came "
+    "before"
 )
+
+
+def _shortest_step_words(dtype: Any) -> str:
+    gap = np.spacing(np.asarray(1e9, dtype))
+    return (
+        "simulate: no step is short enough: the minimum step size, some units of round-off of the "
+        f"time, was reached. Does the torque jump or grow without bound? In {np.dtype(dtype)} the "
+        f"times near 1e9 s are {gap:.2g} s apart: {_checks.later_origin(dtype)}"
+    )
 
 
 def refuse(ys: Any, result: dfx.RESULTS) -> Any:
     """The states `ys`, or an error in words where the run did not get to its end."""
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
-    for why, words in _WORDS:
+    shortest = _shortest_step_words(jax.tree.leaves(ys)[0].dtype)
+    for why, words in (
+        (NONFINITE, _NONFINITE_WORDS),
+        (dfx.RESULTS.dt_min_reached, shortest),
+    ):
         ys = eqx.error_if(ys, result == why, words)
         ill = ill & (result != why)
     return result.error_if(ys, ill)

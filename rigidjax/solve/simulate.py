@@ -6,7 +6,6 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -211,6 +210,4 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
     motion, own = (ys.motion, ys.own) if isinstance(ys, Coupled) else (ys, None)
     # The set-up as arrays and the rest, so that `jax.jit` and `jax.vmap` can return it.
     arrays, rest = eqx.partition(setup, eqx.is_array)
-    leaves, structure = jax.tree.flatten(rest)
-    rest = tuple(leaves), structure
     return Solution(times, motion, stats, result, arrays, rest, event_time, event_state, own)

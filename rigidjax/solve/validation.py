@@ -175,8 +175,8 @@ def times(ts: Any, throw: bool) -> Array:
         where = f"; ts[{i}] is not {'below' if back else 'above'} the one before"
         if _checks.known(ts) and (float(ts[i]) - float(ts[i - 1])) * (-1 if back else 1) > 0:
             where += (
-                f" in {found.dtype}, which cannot tell {ts[i - 1]!r} from {ts[i]!r}: count time "
-                "from a later origin, or use float64"
+                f" in {found.dtype}, which cannot tell {ts[i - 1]!r} from {ts[i]!r}: "
+                + _checks.later_origin(found.dtype)
             )
     kind = "decreasing" if back else "increasing"
     return _guard(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
@@ -199,8 +199,7 @@ def first_step(dt0: Any, times: Array) -> Array:
         if abs(float(step)) < 8 * gap:
             raise ValueError(
                 f"dt0: steps of {dt0} s are too short for {times.dtype}, whose times near "
-                f"{float(far):g} s are {gap:.2g} s apart; count time from a later origin, or use "
-                "float64"
+                f"{float(far):g} s are {gap:.2g} s apart; " + _checks.later_origin(times.dtype)
             )
     return abs(step)
 

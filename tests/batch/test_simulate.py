@@ -135,3 +135,28 @@ def test_words(unhooked):
         rj.batch.simulate(bodies, states.omega, TS)
     with pytest.raises(TypeError, match="wanted Inertia"):
         rj.batch.simulate(bodies.tensor, states, TS)
+
+
+@pytest.mark.parametrize("count", [40, 200])
+def test_no_bit_of_a_body_depends_on_the_others(count):
+    # More than one chunk, or a part of one; under a law whose last digits show the order of bodies.
+    rng = np.random.default_rng(3)
+    q = rng.normal(size=(count, 4))
+    q = jnp.asarray(q / np.linalg.norm(q, axis=1)[:, None])
+    omega, law = (
+        rng.normal(size=(count, 3)),
+        rj.torques.HeavyTop(1.0, [0.1, 0.2, 0.9], [0, 0, -9.0]),
+    )
+    bodies = rj.Inertia(jax.vmap(jnp.diag)(jnp.asarray(1 + rng.uniform(0, 0.5, (count, 3)))))
+
+    def rates(omega):
+        states = rj.Attitude(q, jnp.asarray(omega))
+        return np.asarray(rj.batch.simulate(bodies, states, [0.0, 3.0], law).ys.omega)
+
+    right = rates(omega)
+    for index, wild in ((3, np.nan), (17, 30.0), (0, np.nan)):
+        other = np.array(omega)
+        other[index] *= wild
+        one = rates(other)
+        same = [np.array_equal(a, b) for a, b in zip(one, right, strict=True)]
+        assert [i for i in range(count) if not same[i]] == [index]

@@ -108,3 +108,33 @@ def test_a_fit_that_explains_nothing_calls_nothing_determined():
 def test_words(changes, relative, words):
     units = tuple("" if ratio else "m" for ratio in relative)
     assert Combination(("A", "B"), changes, units, relative).in_words == words
+
+
+def test_a_number_that_switches_a_torque_is_named():
+    class Until(eqx.Module):
+        end: jax.Array
+        unused: jax.Array
+
+        def __call__(self, t, state, body):
+            return jnp.array([0.2, 0.1, 0.5]) * jnp.where(t < self.end, 1.0, 0.0)
+
+    law = Until(jnp.asarray(0.55), jnp.asarray(1.0))
+    record = identify.Recording(TS, (identify.Gyro(0.01), np.ones((5, 3))))
+    free = [
+        identify.Free(lambda s: s.torque.end, "end", scale=1.0),
+        identify.Free(lambda s: s.torque.unused, "gain", scale=1.0),
+    ]
+    problem = identify.Model(record, identify.Known(BODY), torque=law, free=free)
+    here = problem.start()
+    null = np.zeros((2, problem.size))
+    for row, slot in enumerate(problem.slots):
+        null[row, np.ravel(slot.shared)] = 1.0
+    like = jnp.eye(null.shape[1])
+    fit = identify.Fit(
+        problem, here, like, like, "none", (jnp.full((1, 3), 1e-3),), (), 1.0, 1, 1.0, 1.0,
+        jnp.ones(null.shape[1]), jnp.asarray(null), (), Answer("found"),
+        Answer("explains the readings"), (),
+    )  # fmt: skip
+    words = [one.in_words for one in fit.undetermined]
+    assert words[0].startswith("Readings change with end, but derivatives do not see it: a torque")
+    assert words[1] == "Gain is not determined: no reading changes with it."

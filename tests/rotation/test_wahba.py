@@ -178,3 +178,23 @@ def test_derivatives_of_the_karcher_mean():
     np.testing.assert_allclose(first(v), (f(v + h * e) - f(v - h * e)) / (2 * h), atol=1e-9)
     _, second = jax.jvp(first, (v,), (e,))
     np.testing.assert_allclose(second, (first(v + h * e) - first(v - h * e)) / (2 * h), atol=1e-8)
+
+
+@pytest.mark.parametrize("ratio", [1e5, 1e8, 1e11])
+def test_a_heavy_direction_beside_a_light_one(ratio):
+    # SciPy's infinite weight is the limit: off by the residual over the ratio.
+    rng = np.random.default_rng(9)
+    body = rng.normal(size=(3, 3))
+    right = Rotation.random(random_state=4).as_matrix()
+    world = body @ right.T + 0.02 * rng.normal(size=(3, 3))
+    weights = np.array([1.0, ratio, 0.7])
+    found = so3.wahba(body, world, weights)
+    limit = Rotation.align_vectors(world, body, weights=[1.0, np.inf, 0.7])[0].as_matrix()
+    assert np.abs(found - limit).max() < 1e-13 + 1.0 / ratio
+    change, h = rng.normal(size=(3, 3)), 1e-5
+    ends = [so3.wahba(body, world + step * change, weights) for step in (h, -h)]
+    f = lambda world: so3.wahba(body, world, weights)
+    _, slope = jax.jvp(f, (jnp.asarray(world),), (jnp.asarray(change),))
+    np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2 * h), atol=1e-8 + 1e-18 * ratio)
+    with pytest.raises(ValueError, match="do not fix the attitude"):
+        so3.wahba(body[[0, 0, 0]], world, weights)

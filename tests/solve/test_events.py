@@ -401,3 +401,31 @@ def test_back_in_time_with_wheels():
     back = rj.simulate(body, rj.Spin(omega), [2.0, 0.0], wheels(speed))
     np.testing.assert_allclose(back.ys.omega[-1], start.omega, atol=1e-8)
     np.testing.assert_allclose(back.own[0][-1, 0], 0.1 * (30.0 + 0.1), rtol=1e-8)
+
+
+# The rates of a flip pass zero at 9.4255 s: conditions that jump there, with and without slopes.
+JUMPS = {
+    "sign": lambda t, state, body: jnp.sign(state.omega[1]),
+    "level": lambda t, state, body: jnp.where(state.omega[1] > 0, 2.0, -0.5),
+    "slope before": lambda t, state, body: jnp.where(state.omega[1] > 0, state.omega[1] + 1, -1.0),
+    "slope after": lambda t, state, body: jnp.where(state.omega[1] > 0, 1.0, state.omega[1] - 1),
+}
+
+
+@pytest.mark.parametrize("law", [None, Nothing()], ids=["free", "forced"])
+@pytest.mark.parametrize("name", JUMPS)
+def test_a_condition_that_jumps_is_met_where_it_jumps(name, law):
+    def meet(scale, condition):
+        start = rj.Spin(scale * jnp.array([0.0, 1.0, 0.01]))
+        sol = rj.simulate(BODY, start, [0.0, 5.0, 12.0], law, event=condition, **TIGHT)
+        return sol.event_time, sol.event_state.omega
+
+    right, rates = meet(1.0, middle)
+    time, omega = meet(1.0, JUMPS[name])
+    np.testing.assert_allclose(time, right, rtol=1e-12)
+    np.testing.assert_allclose(omega, rates, atol=1e-9)
+    along = jax.jvp(lambda scale: meet(scale, JUMPS[name]), (1.0,), (1.0,))[1]
+    assert np.isnan(along[0]) and np.all(np.isnan(along[1]))
+    start = rj.Spin([0.0, 1.0, 0.01])
+    passed = rj.crossings(BODY, start, 0.0, 12.0, JUMPS[name], law, max_crossings=2, **TIGHT)
+    np.testing.assert_allclose(passed.times[0], right, rtol=1e-12)

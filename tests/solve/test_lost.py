@@ -215,3 +215,16 @@ def test_times_that_float32_cannot_tell_apart_are_named():
     law = jax.tree.map(lambda a: a.astype(jnp.float32), DAMPING)
     with pytest.raises(RuntimeError, match="count time from a later origin, or use float64"):
         rj.simulate(body, start, ts, law)
+
+
+def test_float64_is_not_advised_to_a_run_in_float64():
+    law = lambda t, state, body: jnp.cos(40 * t) * jnp.ones(3)
+    epoch = 1.6e9
+    with pytest.raises(
+        RuntimeError, match=r"float64 the times near 1e9 s are 1\.2e-07 s apart: count"
+    ) as told:
+        rj.simulate(BODY, rj.Spin(OMEGA), [epoch, epoch + 5.0], law, rtol=1e-11)
+    assert "use float64" not in str(told.value) and "float32" not in str(told.value)
+    assert "such as the first time of the run" in str(told.value)
+    with pytest.raises(ValueError, match="such as the first time of the run"):
+        rj.simulate(BODY, rj.Spin(OMEGA), [epoch, epoch + 5.0], law, dt0=1e-7)

@@ -1,5 +1,8 @@
 """What `simulate` returns is a pytree of arrays: it goes through every transformation of JAX."""
 
+import copy
+import pickle
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -77,3 +80,15 @@ def test_simulate_itself_may_be_transformed():
     many = jax.vmap(rj.simulate, in_axes=(0, None, None, None))(bodies, rj.Spin(OMEGA), TS, DRAG)
     np.testing.assert_allclose(many.ys.omega[1], found.ys.omega, rtol=1e-9)
     assert repr(found) == "Solution(Spin at 5 times 0 … 1 s, 4 steps, 0 rejected; successful)"
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda sol: pickle.loads(pickle.dumps(sol))])
+@pytest.mark.parametrize("name", ["free", "forced", "solver", "event"])
+def test_a_copied_solution_evaluates_as_the_original(name, duplicate):
+    sol = run(name, 1.0)
+    copied = duplicate(sol)
+    pairs = [(copied, sol), (copied.evaluate(0.2), sol.evaluate(0.2)), (copied.drift, sol.drift)]
+    if name == "forced":
+        pairs.append((copied.error, sol.error))
+    for one, other in pairs:
+        jax.tree.map(np.testing.assert_array_equal, one, other)

@@ -15,6 +15,7 @@ from rigidjax.identify.data.full_scale import in_words
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, as_list
 from rigidjax.identify.model.model import Model
+from rigidjax.identify.search.stages import errors_and_slopes
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 from rigidjax.identify.uncertainty.quantities import (
@@ -40,6 +41,8 @@ PART = 1e-3
 ROUND_OFF = 1e-5
 # Two changes count as the same factor if they differ by less than this share.
 EVEN = 0.01
+# So many standard deviations of all readings: less for a hundredth of a number tells nothing of it.
+CHANGED = 0.01
 # The largest number of names written for a combination, and of combinations.
 MOST, SEVERAL = 6, 5
 
@@ -48,7 +51,8 @@ class Combination(eqx.Module):
     """Numbers that may change together without changing a reading.
 
     **Fields:** `names`; small `changes` of each: relative if `relative` is true, else in its
-    `units`.
+    `units`; `unseen_switch` whether readings change all the same, and only their derivatives do
+    not, as with a time or a state at which a torque switches.
 
     >>> Combination(("I1", "I2"), (0.01, 0.01), ("", ""), (True, True)).in_words
     'I1 and I2 rise together: only I1/I2 is determined.'
@@ -60,11 +64,18 @@ class Combination(eqx.Module):
     changes: tuple[float, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
     relative: tuple[bool, ...] = eqx.field(static=True)
+    unseen_switch: bool = eqx.field(static=True, default=False)
 
     @property
     def in_words(self) -> str:
-        """One sentence."""
+        """One sentence, or two."""
         names, sizes = self.names, np.array(self.changes)
+        if self.unseen_switch:
+            return (
+                f"Readings change with {' and '.join(names)}, but derivatives do not see it: a "
+                "torque most likely switches there (jnp.where, jnp.sign), and no search moves it. "
+                "For a time take torques.Pulses or jump_times of the law; for a state, an Event."
+            )
         if len(names) == 1:
             name = names[0][0].upper() + names[0][1:]
             return f"{name} is not determined: no reading changes with it."
@@ -97,7 +108,7 @@ def undetermined(fit: "Fit") -> tuple[Combination, ...]:
     null = np.asarray(fit.null_directions)
     if not null.size:
         return ()
-    best = None
+    best = basis = None
     slopes, values = map(np.asarray, _slopes(fit.model, fit.derivative_point))
     names, many = _names(fit.model), len(charts(fit.model))
     first, turns = len(labels(fit.model)), 3 * fit.model.count
@@ -114,17 +125,41 @@ def undetermined(fit: "Fit") -> tuple[Combination, ...]:
         size = np.where(relative | (size == 0), 1.0, size)
         changes = null @ slope.T / size
         kept = _kept(fit, [one[0] for one in here], changes)
-        found = _reduced(np.where(kept, changes, 0.0))
+        changes = np.where(kept, changes, 0.0)
+        found = _reduced(changes)
         if best is None or np.count_nonzero(found) < np.count_nonzero(best[0]):
-            best = found, here, size, values[rows]
-    assert best is not None
+            best, basis = (found, here, size, values[rows]), changes
+    assert best is not None and basis is not None
     # In the order of their first numbers: the order of the directions depends on round-off.
     found = sorted((row for row in best[0] if row.any()), key=lambda row: np.flatnonzero(row)[0])
-    return tuple(_combination(row, *best[1:]) for row in found)
+    switches = [_readings_change(fit, np.linalg.lstsq(basis.T, row)[0] @ null) for row in found]
+    both = zip(found, switches, strict=True)
+    return tuple(_combination(row, *best[1:], switch) for row, switch in both)
+
+
+def _readings_change(fit: "Fit", direction: np.ndarray) -> bool:
+    """Return whether readings change along a `direction` (n,) in which no derivative sees it.
+
+    A torque may switch at what moves. The change of even order in the step is left out: derivatives
+    do not see it either, where a number counts by its square.
+    """
+    if fit.model.torque is None:
+        return False
+    x = fit.derivative_point
+    step = 0.01 * jnp.asarray(direction / np.abs(direction).max(), x.dtype)
+    after, before = (errors_and_slopes(fit.model, x + h)[0] for h in (step, -step))
+    total = 0.0
+    for one, other, noise in zip(after, before, fit.noises, strict=True):
+        total += float(np.sum((0.5 * np.asarray(one - other) / np.asarray(noise)[:, None]) ** 2))
+    return total > CHANGED**2
 
 
 def _combination(
-    row: np.ndarray, names: list[tuple[str, str, bool]], size: np.ndarray, values: np.ndarray
+    row: np.ndarray,
+    names: list[tuple[str, str, bool]],
+    size: np.ndarray,
+    values: np.ndarray,
+    switch: bool,
 ) -> Combination:
     order = np.flatnonzero(row)
     # The largest change: a hundredth of the number, or of its size; the first number goes up.
@@ -140,6 +175,7 @@ def _combination(
         tuple(float(changes[i]) for i in order),
         tuple("" if relative[i] else names[i][1] for i in order),
         tuple(bool(relative[i]) for i in order),
+        switch,
     )
 
 

@@ -210,7 +210,7 @@ def _require_digits(given: np.ndarray, dtype: Any) -> None:
     index = int(np.argmax(off))
     words = (
         f"t: {dtype} changes the step of {steps[index]:.3g} s after {given[index]} s to "
-        f"{held[index]:.3g} s; count time from a later origin, or use float64"
+        f"{held[index]:.3g} s; {_checks.later_origin(dtype)}"
     )
     if off[index] >= 1:
         raise ValueError(words)

@@ -1,0 +1,159 @@
+"""What a run, a derivative and a fit cannot have seen they do not confirm: pulses, switches, zeros."""
+
+import warnings
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rigidjax as rj
+
+BODY = rj.Inertia.from_principal(1.0, 1.4, 2.0)
+Z = jnp.array([0.0, 0.0, 1.0])
+FIXED = dict(solver=rj.solvers.Tsitouras5())
+
+
+def gaussian(t, state, body):
+    return 50.0 * Z * jnp.exp(-0.5 * ((t - 7.3131) / 2e-3) ** 2)
+
+
+GAIN = 50.0 * 2e-3 * np.sqrt(2 * np.pi) / 2.0
+
+
+def gain(sol):
+    return float(sol.ys.omega[-1, 2] - sol.ys.omega[0, 2])
+
+
+@pytest.mark.parametrize(
+    "how", [{}, FIXED, dict(solver=dfx.Tsit5())], ids=["own", "five", "diffrax"]
+)
+@pytest.mark.parametrize("ts", [[0.0, 20.0], [20.0, 0.0]], ids=["forward", "back"])
+def test_a_pulse_between_steps_is_no_known_motion(how, ts):
+    sol = rj.simulate(BODY, rj.Spin([0.0, 0.0, 0.3]), ts, gaussian, **how)
+    miss = abs(abs(gain(sol)) - GAIN)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert miss <= 3 * float(sol.error.total["omega"][-1])
+
+
+def test_an_accuracy_holds_for_a_pulse_between_steps():
+    ts = [0.0, 20.0]
+    for width, accuracy in ((2e-3, 1e-6), (5e-4, 1e-8)):
+
+        def law(t, state, body, width=width):
+            return 50.0 * Z * jnp.exp(-0.5 * ((t - 3.777) / width) ** 2) / width * 1e-3
+
+        sol = rj.simulate(BODY, rj.Spin([0.0, 0.0, 0.3]), ts, law, accuracy=accuracy)
+        right = 0.05 * np.sqrt(2 * np.pi) / 2.0
+        assert abs(gain(sol) - right) <= accuracy
+        assert float(sol.error.relative[-1]) <= accuracy
+
+
+def test_smooth_laws_of_time_have_no_sudden_times():
+    from rigidjax.solve.error import _sudden_times
+
+    ts = jnp.linspace(0.0, 30.0, 7)
+    smooth = {
+        "swing": lambda t, state, body: jnp.cos(3.0 * t + 1.0) * state.omega,
+        "fast": lambda t, state, body: jnp.sin(40.0 * t) * Z,
+        "decay": lambda t, state, body: jnp.exp(-0.1 * t) * Z,
+        "line": lambda t, state, body: (1.0 + 0.3 * t) * Z,
+    }
+    for name, law in smooth.items():
+        sol = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), ts, law)
+        times = _sudden_times(sol._setup, sol.ts, sol._states)
+        assert not np.any(times), name
+    still = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), ts, rj.torques.Damping([0.1, 0.1, 0.1]))
+    assert _sudden_times(still._setup, still.ts, still._states).size == 0
+
+
+class Until(eqx.Module):
+    end: jax.Array
+    size: jax.Array
+
+    def __call__(self, t, state, body):
+        return Z * self.size * jnp.where(t < self.end, 1.0, 0.0)
+
+
+class Burn(eqx.Module):
+    stop: jax.Array
+
+    def __call__(self, t, state, body):
+        return Z * jnp.where(state.omega[2] < self.stop, 1.0, 0.25)
+
+
+def last_rate(law, **tolerances):
+    return rj.simulate(BODY, rj.Spin([0.0, 0.0, 0.0]), [0.0, 3.0], law, **tolerances).ys.omega[
+        -1, 2
+    ]
+
+
+# The rate is size·end/2, of which a half is lost; or stop + (3 − 2 stop)/8, of which all is lost.
+LOST = {
+    "half": (lambda x, **how: last_rate(Until(x, x), **how), 1.1, 1.1),
+    "time": (lambda x, **how: last_rate(Until(x, jnp.ones(())), **how), 1.7, 0.5),
+    "state": (lambda x, **how: last_rate(Burn(x), **how), 0.6, 0.75),
+}
+
+
+@pytest.mark.parametrize("name", LOST)
+def test_a_derivative_that_misses_a_switch_is_not_known(name):
+    f, x, right = LOST[name]
+    with pytest.warns(UserWarning, match="a torque that switches at a time or a state"):
+        error = rj.error_of(f, jnp.asarray(x))
+    assert not bool(error.known)
+    assert abs(float(error.derivative) - right) <= 2 * float(error.derivative_error)
+
+
+def test_the_last_digits_of_zeros_count():
+    body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+
+    def f(change, **how):
+        omega = jnp.stack([0.4 + change, jnp.ones_like(change), 0.2 + 0.0 * change])
+        return rj.simulate(body, rj.Spin(omega), [0.0, 3e3], **how).ys.omega[-1, 0]
+
+    error = rj.error_of(f, 0.0)
+    other = rj.error_of(lambda x, **how: f(x - 0.4, **how), 0.4)
+    for part in ("value_error", "derivative_error"):
+        here, there = (float(np.asarray(getattr(e, part))) for e in (error, other))
+        assert 0.1 * there < here < 30 * there, part
+
+
+@pytest.mark.parametrize("moments", [[1.0, 1.0, 2.0], [0.8, 1.2, 2.0]])
+def test_a_flat_body_has_a_difference_on_one_side(moments):
+    def f(moments, **how):
+        body = rj.Inertia.from_principal(*moments)
+        law = rj.torques.Damping([0.1, 0.1, 0.1])
+        return rj.simulate(body, rj.Spin([0.4, 1.1, 3.0]), [0.0, 1.0], law, **how).ys.omega[-1]
+
+    error = rj.error_of(f, jnp.array(moments))
+    assert bool(error.known) and float(error.derivative_error.max()) < 1e-6
+
+
+def test_smooth_functions_agree_with_their_differences():
+    from rigidjax.solve.difference import sides_of, slopes_of, values_at
+
+    rng = np.random.default_rng(5)
+    functions = (
+        lambda x: jnp.sin(1e4 * x[0]) * x[1],
+        lambda x: jnp.exp(-x[0]) - x[1] ** 3,
+        lambda x: (x[0] - x[1]) ** 2,
+        lambda x: jnp.stack([x[0] * x[1], 1e6 * x[1], 0.0 * x[0]]),
+    )
+    for f in functions:
+        for _ in range(20):
+            x = jnp.asarray(rng.normal(size=2))
+            value, slope = f(x), jax.jacfwd(f)(x)
+            error = rj.solve.FunctionError(
+                value, 1e-10 * jnp.abs(value), slope, 1e-9 * jnp.abs(slope)
+            )
+            step, sides = sides_of(x, value, error.value_error, slope)
+            values = values_at(lambda x, _: f(x), sides, jnp.zeros(2))
+            assert not np.any(slopes_of(x, value, step, sides, values, error).differ)
+            wrong = eqx.tree_at(lambda e: e.derivative, error, 0.9 * slope)
+            slopes = slopes_of(x, value, step, sides, values, wrong)
+            missed = np.abs(slopes.difference - slopes.derivative)
+            assert np.any(slopes.differ) or missed.max() < 0.02 * np.abs(slopes.difference).max()
