@@ -16,6 +16,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
+from rigidjax.identify.data import stacking
 
 BRICK = Path(__file__).parents[3] / "shared" / "data" / "nesc_brick" / "tumbling_brick.csv"
 MOMENTS = np.array([1.0, 1.6, 2.1])
