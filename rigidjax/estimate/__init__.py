@@ -18,7 +18,11 @@ from rigidjax.identify.filtering.linear import (
     linear_smooth as linear_smooth,
 )
 from rigidjax.identify.filtering.smoother import smooth as smooth
-from rigidjax.identify.filtering.steps import NoiseModel as NoiseModel, Walk as Walk, sample as sample
+from rigidjax.identify.filtering.steps import (
+    NoiseModel as NoiseModel,
+    Walk as Walk,
+    sample as sample,
+)
 from rigidjax.identify.inference.density import LogDensity as LogDensity
 from rigidjax.identify.inference.draws import (
     Nuts as Nuts,

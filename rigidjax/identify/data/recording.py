@@ -72,11 +72,10 @@ class Recording(eqx.Module):
     (T, 3, 3) for an `AttitudeSensor`, as the sensor's `reading_shape` says; `mask` (T,) true where
     there is a reading (what it masks may be NaN). A time at which no sensor read anything is
     dropped: a masked reading and an absent one are the same. Sensors with their own times share
-    the union of these.
-    `inputs`, by keyword, are what was logged beside the readings, by name: the speed of a wheel, the
-    commands of motors. Each is a function of time such as `rigidjax.torques.Series(times, speeds)`,
-    or samples (T, …) at `t`, each held until the next one. The torque of a `Model` reads an input
-    by its name, `rigidjax.torques.Input("speed")`.
+    the union of these. `inputs`, by keyword, are what was logged beside the readings, by name: the
+    speed of a wheel, the commands of motors. Each is a function of time such as
+    `rigidjax.torques.Series(times, speeds)`, or samples (T, …) at `t`, each held until the next
+    one. The torque of a `Model` reads an input by its name, `rigidjax.torques.Input("speed")`.
 
     **Raises** `TypeError` for traced numbers (the times that are kept depend on them) and for
     anything but a sensor; `ValueError` for times that do not increase, also after rounding to
