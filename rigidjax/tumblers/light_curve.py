@@ -45,10 +45,10 @@ LEAST, ABOVE = 12, 40.0
 class Alias(eqx.Module):
     """A motion found by a search.
 
-    **Fields:** `x` (n,) the free numbers; `cost` half of χ²; `rotation` the body period, s, `precession` the
-    mean precession period, s (`rigidjax.exact.body_period`, `precession_period`); `mode` `"long"`
-    or `"short"`: the circulated axis; `ratios` (2,) the two smaller moments over the largest;
-    `explains` whether it explains the data nearly as well as the best.
+    **Fields:** `x` (n,) the free numbers; `cost` half of χ²; `rotation` the body period, s,
+    `precession` the mean precession period, s (`rigidjax.exact.body_period`, `precession_period`);
+    `mode` `"long"` or `"short"`: the circulated axis; `ratios` (2,) the two smaller moments over
+    the largest; `explains` whether it explains the data nearly as well as the best.
     """
 
     x: Float[Array, " n"]
@@ -73,9 +73,9 @@ class LightCurve(eqx.Module):
     **Fields:** `fit` of the best motion, whose covariance allows for a body that is no ellipsoid;
     `aliases` all motions found, in the order of their misfits; `deviations` (4,) relative standard
     deviations of the best one's rotation, precession and two ratios; `pairs` their frequencies;
-    `search` and `explanation` the two answers as of a `Fit`. The search is also `not alone` if another
-    alias explains the data nearly as well; the model `leaves a part` also if χ² is three deviations
-    above its mean for the given noise.
+    `search` and `explanation` the two answers as of a `Fit`. The search is also `not alone` if
+    another alias explains the data nearly as well; the model also `leaves a part` if χ² is three
+    deviations above its mean for the given noise.
     """
 
     fit: Fit
@@ -113,7 +113,7 @@ def fit_light_curve(
     tolerance: float = 1e-4,
     progress: Callable[[str], Any] | None = None,
 ) -> LightCurve:
-    """The motion of a free tumbler from one light curve, without a guess.
+    """Fit the motion of a free tumbler to one light curve, without a guess.
 
     `two_frequencies` finds pairs of frequencies in the squared flux. Each pair is precession and
     twice the rotation, in long- and short-axis mode (Kaasalainen 2001), over a grid of bodies and

@@ -133,9 +133,9 @@ def descended(model: Model, starts: list[Array], noise: Any, tolerance: float) -
 
 @eqx.filter_jit
 def _many(starts: Array, model: Model, noise: Any, settings: Settings, count: Any) -> Attempt:
-    """Return the end of the search from the first `count` starts, one after another, with slopes by differences.
+    """Return the ends of the searches from the first `count` starts, one after another.
 
-    The closed form without derivatives takes a hundredth of the time.
+    The slopes are differences of the closed form: derivatives take a hundred times as long.
     """
 
     def one(given: tuple[Array, Array]) -> Attempt:

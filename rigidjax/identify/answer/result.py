@@ -27,8 +27,9 @@ from rigidjax.identify.uncertainty.quantities import Quantity, around
 class Start(eqx.Module):
     """The result of one start: the end of the search, and whether it explains the data.
 
-    **Fields:** `x` (n,) the free numbers at its end; `cost` half of the sum of squares there; `converged`
-    whether the search did; `fits` whether it explains the data as well as the best point does.
+    **Fields:** `x` (n,) the free numbers at its end; `cost` half of the sum of squares at x;
+    `converged` whether the search converged; `fits` whether it explains the data as well as the
+    best point does.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> model = rj.identify.Model(record, rj.identify.PrincipalRatios())
@@ -53,10 +54,10 @@ class Fit(eqx.Module):
     for white ones, and `independent` the number of independent errors; `singular_values` (n,) of
     the whitened Jacobian, its columns of length one, with the numbers of one recording alone apart;
     `null_directions` (k, n) that the data do not determine; `quantities` all reported quantities,
-    by name; `search` the first answer, whose `word` is `found`, `not alone` or `not ended`; `explanation`
-    the second one: `explains the readings`, `leaves a part`, `does not explain the readings`;
-    `left` the indices of the sensors whose errors it does not explain; `limits` the distance of
-    each body from a flat one; `near` the point of the derivatives beside a flat body, else `None`;
+    by name; `search` the first answer, whose `word` is `found`, `not alone` or `not ended`;
+    `explanation` the second one: `explains the readings`, `leaves a part`, `does not explain the
+    readings`; `left` the indices of the sensors whose errors it does not explain; `limits` the
+    distance of each body from a flat one; `near` the point of the derivatives beside a flat body, else `None`;
     `freedom` what the degrees of freedom of variances follow from;
     `linear` errors and derivatives there, which all of these come from; `considered` the errors of
     sensors that the covariance allows for by their `Tolerance`; `allowance` says so in words, or

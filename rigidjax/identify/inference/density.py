@@ -37,9 +37,9 @@ class LogDensity(eqx.Module):
 
     Call it with x (n,), real numbers without bounds: the free numbers of `model`, which is the
     fitted one with the logarithms of factors of the noises that the fit estimates, and of the
-    numbers of the process, as shared `Free`s. `unpack(x)` gives body, states and values; `x0` is
-    the fit. `covariance` is Laplace's, for a sampler's start and mass matrix; it is smaller than the
-    fit's if errors are autocorrelated.
+    numbers of the process, as shared `Free`s. `unpack(x)` gives body, states and values, `x0` is
+    the fit. `covariance` is Laplace's, for a sampler's start and mass matrix; it is smaller than
+    the fit's if errors are autocorrelated.
 
     With a process or `Walk`s the filter integrates the unknown torque and the drifts out. Without
     them the readings are independent and normal about the motion: this is too narrow if errors are
@@ -124,9 +124,10 @@ class LogDensity(eqx.Module):
         return log_density(self.model, _checks.floating(x, self.x0.shape, "x"))
 
     def unpack(self, x: Float[Array, " n"]) -> Unpacked:
-        """Return what x (n,) represents: body, initial states, values of the `Free`s, noise, process.
+        """Return the quantities that x (n,) represents.
 
-        `noise` (R, k) is that of each sensor.
+        These are the body, the initial states, the values of the `Free`s, the noise (R, k) of each
+        sensor, and the process.
         """
         x = _checks.floating(x, self.x0.shape, "x")
         scenes, point = scenes_of(self.model, x), unpacked(self.model, x)

@@ -19,7 +19,7 @@ from rigidjax.identify.uncertainty.quantities import Quantity, quantities, value
 
 
 def expected(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, ...]:
-    """The expected report of a fit of such a recording, with its standard deviations.
+    """Return the report to expect of a fit of such recordings, with its standard deviations.
 
     **Arguments:** `model` whose recordings give times and sensors with known noise (the readings
     themselves do not matter); `x` (n,) the free numbers of the motion that is planned, as
@@ -48,10 +48,11 @@ def expected(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, ...]:
 
 
 def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """Fisher's information (n, n) of the free numbers: `Jᵀ Σ⁻¹ J` of the predictions.
+    """Return Fisher's information (n, n) of the free numbers: `Jᵀ Σ⁻¹ J` of the predictions.
 
     **Arguments:** `model` with known noises; `x` (n,) the free numbers of the motion. It is
-    differentiable in x, for a design by gradients. **Raises** `ValueError` for a sensor without noise.
+    differentiable in x, for a design by gradients. **Raises** `ValueError` for a sensor without
+    noise.
 
     >>> model = rj.datasets.toutatis.model()
     >>> fisher(model, model.start()).shape

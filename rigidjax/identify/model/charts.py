@@ -138,7 +138,7 @@ def _typical(value: Any) -> Array:
         raise TypeError(
             "typical: wanted the rough size of the moments, one number, kg m², got "
             f"{type(value).__name__}; give a known body as Known(body), an initial guess by "
-            "fit(initial=problem.start(body))"
+            "fit(initial=model.start(body))"
         )
     size = _checks.positive(value, "typical", "a positive moment of inertia, kg m²")
     return jnp.asarray(size, jnp.result_type(float))
@@ -413,12 +413,12 @@ def body_of_recording(
 
 
 def charts_of(body: Any) -> tuple[Any, ...]:
-    """The charts of a problem's body or bodies."""
+    """Return the charts of a model's body or bodies."""
     return body.charts if isinstance(body, Bodies) else (body,)
 
 
 def numbers_of(body: Any, vector: Any) -> list[Any]:
-    """The numbers of each chart of a problem's body or bodies."""
+    """Return the numbers of each chart of a model's body or bodies."""
     sizes = [chart.size for chart in charts_of(body)]
     return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
 

@@ -445,8 +445,8 @@ def require_numbers(model: Model, x: Any) -> Float[Array, " n"]:
 def with_parts(model: Model, **parts: Any) -> Model:
     """Return the model with these fields in the place of its own, as they are.
 
-    `dataclasses.replace` would call `Model(…)`, and `equinox.tree_at` cannot replace a tuple without
-    leaves.
+    `dataclasses.replace` would call `Model(…)`, and `equinox.tree_at` cannot replace a tuple
+    without leaves.
     """
     new = object.__new__(Model)
     for field in dataclasses.fields(Model):
@@ -476,7 +476,7 @@ def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) 
 
 
 def _by_body(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
-    """Return the recordings in a row, the chart or charts, and the name of each recording's body."""
+    """Return the recordings in a row, the chart or charts, and the body's name for each one."""
     if isinstance(recording, Mapping) or isinstance(body, Mapping):
         if not (isinstance(recording, Mapping) and isinstance(body, Mapping)):
             raise TypeError(

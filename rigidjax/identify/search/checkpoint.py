@@ -46,7 +46,10 @@ def require_folder(path: str | Path) -> None:
 
 
 def fingerprint(*trees: Any) -> str:
-    """Return a hash of numbers and structure, the same in every process; a function counts by its name."""
+    """Return a hash of numbers and structure, the same in every process.
+
+    A function counts by its name.
+    """
     leaves, structure = jax.tree.flatten(trees)
     words, found = [repr(structure)], hashlib.sha256()
     for leaf in leaves:

@@ -22,8 +22,10 @@ from rigidjax.motion.torques.states import has_states
 
 
 def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[Float[Array, " n"]]:
-    """Return `count` starting points: the regression first, then scattered around it or over the whole
-    chart, the rate by a tenth. A `Free` starts at its given value.
+    """Return `count` starting points: the regression first, then scattered ones.
+
+    These scatter around the regression or over the whole chart, their rates by a tenth. A `Free`
+    starts at its given value.
     """
     recordings = stacking.on_host(model.records, model.counts) if model.index.bodies else ()
     if isinstance(model.chart, Bodies):

@@ -32,7 +32,7 @@ class Descent(eqx.Module):
     """The first descent of a fit, on a few recordings at a time.
 
     Each step draws `batch` recordings without replacement, differentiates their misfit and hands
-    the gradient of all parameters to `optimiser`. The parameters are unconstrained and of order
+    its gradient by all free numbers to `optimiser`. The free numbers are unconstrained and of order
     one: a learning rate is a share of order one. **Arguments:** `optimiser` any
     `optax.GradientTransformation`; `steps` their number; `batch`. **Raises:** `TypeError` for
     anything but an optimiser, `ValueError` for counts below one. Source: Robbins and Monro 1951,
@@ -64,7 +64,10 @@ def descend(
     key: PRNGKeyArray,
     progress: Callable[[str], Any] | None = None,
 ) -> tuple[Float[Array, " n"], bool]:
-    """Return the end of the steps, or the last point before a NaN; and whether it was not interrupted."""
+    """Return the end of the steps, or the last point before a NaN, and whether all steps were made.
+
+    An interrupt (Ctrl-C) ends the steps early.
+    """
     if how.batch > model.count:
         raise ValueError(
             f"Descent: wanted a batch of at most {model.count} recordings, got {how.batch}"

@@ -17,7 +17,7 @@ from rigidjax.body.inertia import MassProperties
 class SensorInput(eqx.Module):
     """The input of a sensor: a motion at one time.
 
-    **Fields:** `t` s; `state` of the kind that the problem needs; `body` the `Inertia` or
+    **Fields:** `t` s; `state` of the kind that the model needs; `body` the `Inertia` or
     `MassProperties`; `field` the equations of motion `f(t, state, args)`, with the states of its
     laws put in as they are at `t`; `own` those states, as `Solution.own` orders them: for
     a sensor of one's own that reads a wheel or a motor.

@@ -27,11 +27,18 @@ WEAKEST = 1e-6
 
 
 class Linearised(eqx.Module):
-    """A model about its best point. For each sensor `raw` errors (R, T, k) in its unit, whitened
-    `errors`, `raw_slopes` and `slopes` (R, T, k, m) of both in a recording's numbers, `weights` (R, T), `kept` (R, T, k) if
-    they have weight and are below full scale; the `places` (R, m) of a recording's numbers among
-    all n; `pulls` (n,) of these to zero by priors, `firm` (n,) one over their deviations; `extra`
-    (j,), `extra_slopes` (j, n) of the prior of a body and of joints.
+    """The errors of a model at one point, and their derivatives by its free numbers.
+
+    **Fields:** for each sensor `raw` errors (R, T, k) in its unit, whitened `errors`, and
+    `raw_slopes` and `slopes` (R, T, k, m), the derivatives of both by the m numbers of a recording;
+    `weights` (R, T) of the loss; `kept` (R, T, k) true if an error has weight and its reading is
+    below full scale. `places` (R, m) of a recording's numbers among all n; `pulls` (n,) of these to
+    zero by priors, `firm` (n,) one over the deviations of the priors; `extra` (j,) and
+    `extra_slopes` (j, n) the residuals beside those of readings, and their derivatives.
+
+    >>> found = rj.identify.fit(rj.datasets.toutatis.model(), starts=1, max_steps=2)
+    >>> [slopes.shape for slopes in found.linear.slopes]  # 17 times, 3 components, 8 free numbers
+    [(1, 17, 3, 8), (1, 17, 3, 8)]
     """
 
     raw: tuple[np.ndarray, ...]
@@ -78,7 +85,7 @@ class Linearised(eqx.Module):
 
     @property
     def information(self) -> tuple[np.ndarray, ...]:
-        """That of the readings of each sensor, (R, m, m) of each recording's numbers."""
+        """The information (R, m, m) in the readings of each sensor on each recording's numbers."""
         return tuple(rows.swapaxes(1, 2) @ rows for rows in self.rows)
 
     def along(self, step: np.ndarray) -> float:
@@ -205,7 +212,7 @@ def _found(wanted: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 class Spread(eqx.Module):
-    """Covariance of the parameters, infinite along undetermined directions, `seen` within the
+    """Covariance of the free numbers, infinite along undetermined directions, `seen` within the
     determined ones, and its method; `singular_values` of the weighted Jacobian with columns of
     length one; `null_directions` (k, n); `root` of the covariance of white errors.
     """
