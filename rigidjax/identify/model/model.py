@@ -195,7 +195,9 @@ class Model(eqx.Module):
             apart = tuple(range(len(names))) if apart else ("",) * len(names)
         self.noise_groups, _ = group_of_each(apart, names, "noise_each")
         self.state_kind = _state_kind(recordings[0], torque, charts)
-        self.reference = reference_of(recordings, self.state_kind)
+        # The readings are known: so are these numbers, within a trace of the body or torque, too.
+        with jax.ensure_compile_time_eval():
+            self.reference = reference_of(recordings, self.state_kind)
         scene = Scene(None, torque, process, recordings[0].sensors, None)
         self.walks = find_drifts(walks, scene)
         slots = find_slots(free, scene, names)
@@ -208,7 +210,7 @@ class Model(eqx.Module):
         kinds = dimension(stacking.one(self.reference.state, 0)) // 3
         self.index, self.slots = index_of(bodies, charts.size, slots, kinds)
         widest = max(float(np.diff(r.t).max()) for r in recordings)
-        turn = 1.5 * widest * float(np.max(self.reference.rate))
+        turn = 1.5 * widest * float(np.max(np.asarray(self.reference.rate)))
         if integrator is None and torque is not None:
             integrator = integrator_for(turn)
         self.integrator = integrator
