@@ -80,6 +80,7 @@ from rigidjax.identify.sensors import (
     Position as Position,
     Range as Range,
     SensorInput as SensorInput,
+    Tolerance as Tolerance,
     Velocity as Velocity,
 )
 

@@ -54,9 +54,18 @@ def status(search: Answer, model: Answer) -> str:
 
 
 def advice(
-    search: Answer, model: Answer, causes: tuple[Cause, ...], kind: str, above: float
+    search: Answer,
+    model: Answer,
+    causes: tuple[Cause, ...],
+    kind: str,
+    above: float,
+    allowed: str,
 ) -> str:
-    """Whether the intervals can be trusted, what to try; `above`: errors over the given noise."""
+    """Return whether the intervals can be trusted, and what to try.
+
+    `above` is the size of the errors over the given noise; `allowed` says what the intervals allow
+    for beside random errors, or what a sensor that is off would do.
+    """
     remedies = list(dict.fromkeys(cause.remedy for cause in causes))
     tries = f" Try: {'; '.join(remedies)}." if remedies else ""
     if model.word == FAILS:
@@ -81,11 +90,8 @@ def advice(
     if above > FAR:
         return f"The intervals cannot be trusted: the sensors make no errors of this size.{tries}"
     if model.word == LEAVES:
-        allowed = "allow" if kind.startswith("sandwich") else "do not allow"
-        return (
-            f"The intervals {allowed} for autocorrelated errors of this size, whatever their "
-            f"cause; they do not show a constant shift of a number.{tries}"
-        )
+        lasting = "allow" if kind.startswith("sandwich") else "do not allow"
+        return f"The intervals {lasting} for autocorrelated errors of this size. {allowed}{tries}"
     if search.reasons or model.reasons:
-        return f"The intervals can be trusted; read the remarks, too.{tries}"
-    return "The intervals can be trusted."
+        return f"The intervals allow for the noise; read the remarks, too. {allowed}{tries}"
+    return f"The intervals allow for the noise. {allowed}"

@@ -1,5 +1,6 @@
 """The quality of a fit: covariance, status, and whether other starts explain the data as well."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rigidjax import _show
+from rigidjax.identify.answer.allowance import allowance
 from rigidjax.identify.answer.answers import (
     EXPLAINS,
     FAILS,
@@ -23,11 +25,12 @@ from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.search.noise import median_of_chi2
 from rigidjax.identify.search.stages import Attempt, errors_and_slopes
-from rigidjax.identify.uncertainty import covariance as uncertainty, flat_limit
+from rigidjax.identify.uncertainty import considered, covariance as uncertainty, flat_limit
 from rigidjax.identify.uncertainty.covariance import Linearised, Times, scatter
 from rigidjax.identify.uncertainty.degrees_of_freedom import freedom_of
 from rigidjax.identify.uncertainty.flat_limit import of_charts
 from rigidjax.identify.uncertainty.quantities import (
+    Quantity,
     charts,
     quantities as quantities_of,
     values_and_slopes,
@@ -236,7 +239,10 @@ def assess(
     white = uncertainty.of_white(linear)
     spread = uncertainty.spread(linear, times, white)
     numbers, of = values_and_slopes(model, x, near), charts(model)
-    freedom = freedom_of(model, linear, times, white.seen)
+    parts = considered.considerations(model, linear, noise, white.seen)
+    spread = _with_considered(spread, parts, model)
+    shifts = considered.stacked_shifts(parts, linear.size)
+    freedom = freedom_of(model, linear, times, white.seen, shifts)
     limits = flat_limit.limits(model, numbers, -white.seen @ linear.slope, [n for n, _ in of])
     # Steps stay short in a long curved valley, although hardly anything is left to gain.
     held = [limit.slope for limit in limits if limit.free < 0]
@@ -258,6 +264,10 @@ def assess(
     unreal = of_charts(of, flat_limit.bodies_of(model, x))
     reasons = (*unreal, *explanation.reasons)
     explanation = Answer(explanation.word, reasons) if best_cost < np.inf else Answer(FAILS)
+    quantities = quantities_of(
+        model, numbers, spread.seen, spread.null_directions, limits, freedom.of(numbers[1])
+    )
+    words = _allowance(model, linear, noise, white.seen, parts, quantities, numbers[1])
     return Fit(
         shown,
         x,
@@ -272,9 +282,7 @@ def assess(
         times.independent,
         jnp.asarray(spread.singular_values),
         jnp.asarray(spread.null_directions),
-        quantities_of(
-            model, numbers, spread.seen, spread.null_directions, limits, freedom.of(numbers[1])
-        ),
+        quantities,
         _search(best_cost, done, rival, interrupted, remarks),
         explanation,
         left,
@@ -282,4 +290,42 @@ def assess(
         near,
         freedom,
         linear.first_times(shown.records.t.shape[1]),
+        parts,
+        words,
+    )
+
+
+def _allowance(
+    model: Model,
+    linear: Linearised,
+    noise: Noise,
+    covariance: np.ndarray,
+    parts: tuple[considered.Consideration, ...],
+    quantities: Sequence[Quantity],
+    slopes: np.ndarray,
+) -> str:
+    """Return what the intervals allow for, of moments and ratios, else of the `Free`s."""
+    bodies = {log + name for name, chart in charts(model) for log in chart.log_names}
+    free = {slot.name for slot in model.slots}
+    rows = [i for i, one in enumerate(quantities) if one.name in bodies and one.name != "mass"]
+    rows = rows or [i for i, one in enumerate(quantities) if one.name.split(" ")[0] in free]
+    rows = [i for i in rows if np.isfinite(quantities[i].deviation)]
+    known = rows if np.isfinite(linear.dense).all() and np.isfinite(covariance).all() else []
+    moves = considered.unit_moves(model, linear, noise, covariance, slopes[known]) if known else []
+    return allowance(model, parts, moves, [quantities[i] for i in known])
+
+
+def _with_considered(
+    spread: uncertainty.Spread, parts: tuple[considered.Consideration, ...], model: Model
+) -> uncertainty.Spread:
+    """Return the covariance with that of considered errors added."""
+    if not parts:
+        return spread
+    root = considered.stacked_shifts(parts, len(spread.seen))
+    added, words = root @ root.T, considered.in_words(parts, model.records.sensors)
+    return dataclasses.replace(
+        spread,
+        covariance=spread.covariance + added,
+        seen=spread.seen + added,
+        kind=f"{spread.kind}; considered: {words}",
     )

@@ -21,6 +21,7 @@ from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, in_deviations
 from rigidjax.identify.search.starts import balance, of_rates, tensor_and_margin
 from rigidjax.identify.sensors import Gyro
+from rigidjax.identify.uncertainty.considered import slope_in_time
 from rigidjax.identify.uncertainty.covariance import Linearised
 
 # Corrected rates must leave less than this share of the error as read, and of the whole signal.
@@ -159,7 +160,7 @@ def clock(model: Model, noise: Noise, linear: Linearised, index: int) -> Cause |
     kept = linear.kept[index].all(axis=-1)
     if not (_of_three(sensor) and error[kept].any()):
         return None
-    slope = _slope(model, np.asarray(model.records.readings[index].values) - error)
+    slope = slope_in_time(model, np.asarray(model.records.readings[index].values) - error)
     late = model.records.readings[index].late
     both = np.asarray(in_deviations(np.stack([error, slope], -1), noise[index], late))
     error, slope = both[..., 0], both[..., 1]
@@ -210,15 +211,6 @@ def _of_three(sensor: Any) -> bool:
     return sensor.reading_shape == (3,) and sensor.components == 3
 
 
-def _slope(model: Model, shown: np.ndarray) -> np.ndarray:
-    """The time derivative of a sensor's prediction (R, T, k), zero for a masked reading."""
-    t, out = np.asarray(model.records.t), np.zeros_like(shown)
-    for row, count in enumerate(model.counts):
-        if count > 2:
-            out[row, :count] = np.gradient(shown[row, :count], t[row, :count], axis=0)
-    return out
-
-
 def _table(
     model: Model, x: Any, noise: Noise, linear: Linearised, index: int
 ) -> tuple[tuple[str, np.ndarray, str, str], ...]:
@@ -230,7 +222,7 @@ def _table(
     unit, itself = reading.sensor.unit, shown[..., None] * axes
     response = _response(model, x, noise, linear, index)
     return (
-        ("lag", _slope(model, shown)[..., None], "a clock offset of {size} s",
+        ("lag", slope_in_time(model, shown)[..., None], "a clock offset of {size} s",
          "let a Free move the sensor's offset, or the delay of the torque's log"),
         ("bias", axes, f"a bias left out, ({{size}}) {unit}", "let a Free move the sensor's bias"),
         ("scale", itself,

@@ -17,6 +17,7 @@ from rigidjax.identify.answer.causes import causes
 from rigidjax.identify.answer.undetermined import Combination, undetermined
 from rigidjax.identify.model.model import Model, Unpacked, unpacked
 from rigidjax.identify.model.terms import Noise
+from rigidjax.identify.uncertainty.considered import Consideration
 from rigidjax.identify.uncertainty.covariance import Linearised
 from rigidjax.identify.uncertainty.degrees_of_freedom import Freedom, quantile
 from rigidjax.identify.uncertainty.flat_limit import Limit
@@ -57,7 +58,9 @@ class Fit(eqx.Module):
     `left` the indices of the sensors whose errors it does not explain; `limits` the distance of
     each body from a flat one; `near` the point of the derivatives beside a flat body, else `None`;
     `freedom` what the degrees of freedom of variances follow from;
-    `linear` errors and derivatives there, which all of these come from.
+    `linear` errors and derivatives there, which all of these come from; `considered` the errors of
+    sensors that the covariance allows for by their `Tolerance`; `allowance` says so in words, or
+    what a sensor that is off would do to the result.
 
     >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> [quantity.name for quantity in found.quantities[:2]], found.covariance.shape
@@ -85,6 +88,8 @@ class Fit(eqx.Module):
     near: Float[Array, " n"] | None = None
     freedom: Freedom | None = None
     linear: Linearised | None = None
+    considered: tuple[Consideration, ...] = ()
+    allowance: str = ""
 
     @property
     def status(self) -> str:
@@ -117,7 +122,12 @@ class Fit(eqx.Module):
         # Outliers dominate χ² under a robust loss.
         above = np.sqrt(self.chi2 / self.dof) if self.model.loss is None else 1.0
         return answers.advice(
-            self.search, self.explanation, self.causes, self.covariance_kind, above
+            self.search,
+            self.explanation,
+            self.causes,
+            self.covariance_kind,
+            above,
+            self.allowance,
         )
 
     def __str__(self) -> str:

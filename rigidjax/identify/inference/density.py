@@ -227,7 +227,9 @@ def _with_slots(
 def _covariance_of_white_errors(fit: Fit, follows_the_motion: bool) -> np.ndarray:
     """Return the covariance of the fit, for white errors if these were not."""
     covariance = np.asarray(fit.covariance)
-    if fit.covariance_kind.startswith("sandwich"):
+    if fit.considered and fit.linear is not None:
+        covariance = of_white(fit.linear).covariance
+    elif fit.covariance_kind.startswith("sandwich"):
         # The density assumes white errors: it is narrower than the fit's intervals. The sandwich
         # covariance of many recordings may be singular: no scale for a search.
         size = np.sqrt(np.diagonal(covariance))

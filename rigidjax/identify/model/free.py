@@ -172,8 +172,9 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
             wanted = "a spread is estimated from three recordings or more"
             raise ValueError(f"{here}: {wanted}, got {len(bodies)}; give it")
         spread = item.scale if isinstance(item.spread, str) else item.spread
+        prior = _tolerance_at(scene, path) if item.prior is None else item.prior
         prior, spread = (
-            None if x is None else jnp.asarray(x / item.scale) for x in (item.prior, spread)
+            None if x is None else jnp.asarray(x / item.scale) for x in (prior, spread)
         )
         groups, labels = None, ()
         if not isinstance(item.each, bool):
@@ -234,6 +235,18 @@ def _unit_of(scene: Scene, path: tuple[Any, ...]) -> str:
     for key in way:
         holder = getattr(holder, key.name) if hasattr(key, "name") else holder[key.idx]
     return getattr(holder, "unit", "")
+
+
+# The tolerance of a sensor that is about one of its members.
+TOLERANCES = {"scale": "scale", "skew": "cross_axis", "bias": "bias", "offset": "clock"}
+
+
+def _tolerance_at(scene: Scene, path: tuple[Any, ...]) -> Any:
+    """Return the tolerance of the sensor for the member at `path`, `None` if it has none."""
+    if len(path) != 3 or getattr(path[0], "name", "") != "sensors":
+        return None
+    tolerance = getattr(scene.sensors[path[1].idx], "tolerance", None)
+    return getattr(tolerance, TOLERANCES.get(path[2].name, ""), None)
 
 
 def put(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"]) -> Scene:

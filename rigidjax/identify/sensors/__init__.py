@@ -14,6 +14,7 @@ from rigidjax.identify.sensors.base import (
     SensorInput as SensorInput,
 )
 from rigidjax.identify.sensors.lowpass import LowPass as LowPass
+from rigidjax.identify.sensors.tolerance import Tolerance as Tolerance
 from rigidjax.identify.sensors.vectors import (
     Accelerometer as Accelerometer,
     Gyro as Gyro,

@@ -11,11 +11,12 @@ from rigidjax._types import HasAttitude, HasPose, HasSpin, Vec3
 from rigidjax.identify.sensors import base
 from rigidjax.identify.sensors.base import ClockedSensor, SensorInput
 from rigidjax.identify.sensors.lowpass import LowPass, lowpass_of
+from rigidjax.identify.sensors.tolerance import Tolerance
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross
 
 
-class _Vector(ClockedSensor):
+class VectorSensor(ClockedSensor):
     """A sensor that reads a vector in its own axes: `scale · S exp(−mounting) v + bias`."""
 
     noise: Vec3 | None = eqx.field(converter=base.deviations(), default=None)
@@ -29,6 +30,7 @@ class _Vector(ClockedSensor):
         default=None,
     )
     lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
+    tolerance: Tolerance | None = None
 
     def _shown(self, truth: Vec3) -> Vec3:
         """The prediction of `truth` v (3,), body frame, with
@@ -45,7 +47,7 @@ class _Vector(ClockedSensor):
         return seen if self.bias is None else seen + self.bias
 
 
-class Gyro(_Vector):
+class Gyro(VectorSensor):
     """Reads the body rate: `scale · S exp(−mounting) Ω + bias + G f`, rad/s.
 
     **Arguments:** `noise` standard deviation of a reading, rad/s, one number or (3,); `None`
@@ -56,8 +58,8 @@ class Gyro(_Vector):
     `S = [[1, a, b], [0, 1, c], [0, 0, 1]]`; `limit` full scale, rad/s, one number or (3,): a
     reading at it counts as "at least that much", `None` finds it from the readings; `offset` s: the
     reading at t belongs to t + offset; `jitter` s the standard deviation of the time stamps, each a
-    number of its own, or `"estimated"`; `lowpass` the `LowPass` of the readings; `g_sensitivity` G
-    (3, 3), rad/s per m/s²: the effect on each channel of the specific force f, in the body's axes,
+    number of its own, or `"estimated"`; `lowpass` the `LowPass` of the readings; `tolerance` a
+    `Tolerance`, how far scale, axes, bias and clock may be off; `g_sensitivity` G (3, 3), rad/s per m/s²: the effect on each channel of the specific force f, in the body's axes,
     at the gyro's place: `place` (3,) m and `gravity` (3,) m/s² as for `Accelerometer`, the centre
     of mass and `None` unless given.
 
@@ -108,7 +110,7 @@ def specific_force(now: SensorInput, place: Vec3, gravity: Vec3 | None) -> Vec3:
     return force + quaternion.rotate(quaternion.conjugate(state.q), carried - gravity)
 
 
-class Accelerometer(_Vector):
+class Accelerometer(VectorSensor):
     """Reads the specific force at its place: `scale · S exp(−mounting) f + bias`, m/s².
 
     `f = Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)` in the body frame (notes, eq 88, seen from the body),
@@ -119,7 +121,8 @@ class Accelerometer(_Vector):
     sensor's place, m, body frame: from the reference point of the `Inertia`, or in the frame of the
     `MassProperties`; `gravity` (3,) m/s², world frame: `None` for a body in free fall (`Spin`,
     `Attitude`), needed by a body on a pivot and by a `Rigid`; `bias`, `scale`, `mounting`, `skew`,
-    `limit`, `offset`, `jitter`, `lowpass` as for `Gyro`. **Raises** `ValueError` as `Gyro`.
+    `limit`, `offset`, `jitter`, `lowpass`, `tolerance` as for `Gyro`. **Raises** `ValueError` as
+    `Gyro`.
 
     >>> Accelerometer(noise=0.1, place=[0.01, 0.0, 0.0]).unit
     'm/s²'
@@ -136,12 +139,12 @@ class Accelerometer(_Vector):
         return reading - self._shown(specific_force(now, self.place, self.gravity))
 
 
-class Magnetometer(_Vector):
+class Magnetometer(VectorSensor):
     """Reads a known field of the world: `scale · S exp(−mounting) Rᵀ b + bias`.
 
     **Arguments:** `noise` in the field's unit, one number or (3,), `None` to estimate it; `field`
     (3,) b, world frame, any unit; `bias` (the body's own magnetism), `scale`, `mounting`, `skew`,
-    `limit`, `offset`, `jitter`, `lowpass` as for `Gyro`. For a direction without a strength use
+    `limit`, `offset`, `jitter`, `lowpass`, `tolerance` as for `Gyro`. For a direction without a strength use
     `Direction`. **Raises** `ValueError` as `Gyro`.
 
     >>> Magnetometer(noise=1e-7, field=[2e-5, 0.0, 4e-5]).reading_shape

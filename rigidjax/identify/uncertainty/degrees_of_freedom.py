@@ -20,7 +20,8 @@ class Freedom(eqx.Module):
     `groups` (R,) of recordings with a common noise; of each sensor `blocks` (R, m, m), the
     information of its readings, and `left` (G,), its independent errors less what the fit takes,
     infinite for a given noise; `widths` of each width that is estimated the places of its
-    deviations, its square, and its degrees.
+    deviations, its square, and its degrees; `considered` (n, c) the shifts of the numbers by
+    considered errors, whose variances are known.
     """
 
     covariance: np.ndarray
@@ -29,9 +30,21 @@ class Freedom(eqx.Module):
     blocks: tuple[np.ndarray, ...]
     left: tuple[np.ndarray, ...]
     widths: tuple[tuple[np.ndarray, float, float], ...]
+    considered: np.ndarray
 
     def of(self, slope: np.ndarray) -> np.ndarray:
-        """Degrees of freedom of the variance of functions with this derivative (…, n).
+        """Return the degrees of freedom of the variance of functions with derivative `slope` (…, n).
+
+        The variance of considered errors is known: of a sum of both the degrees grow with the
+        square of the whole over the estimated part.
+        """
+        estimated = np.sum((slope @ self.covariance) * slope, axis=-1)
+        known = np.sum((slope @ self.considered) ** 2, axis=-1)
+        grown = (1.0 + known / np.maximum(estimated, 1e-300)) ** 2
+        return np.asarray(self.of_estimated(slope) * grown)
+
+    def of_estimated(self, slope: np.ndarray) -> np.ndarray:
+        """Return the degrees of freedom of the part of a variance that noise and widths make.
 
         Each noise and each width counts by its share of the variance; where all noises have
         `PLENTY`, the least counts for all. Source: Satterthwaite 1946, doi:10.2307/3002019.
@@ -61,8 +74,11 @@ def freedom_of(
     linear: Linearised,
     times: Times,
     covariance: np.ndarray,
+    considered: np.ndarray,
 ) -> Freedom:
-    """The `Freedom` of a fit; `covariance` that for white errors."""
+    """Return the `Freedom` of a fit; `covariance` is that of white errors, `considered` (n, c) the
+    shifts of the numbers by considered errors.
+    """
     groups, left, blocks = np.asarray(model.noise_groups), [], linear.information
     taken = leverages(linear, blocks, covariance)
     for sensor, kept, spans, lost in zip(
@@ -77,7 +93,9 @@ def freedom_of(
             mine, size = np.ravel(slot.own).astype(int), float(cast(Any, slot.spread)) ** 2
             shown = np.eye(mine.size) - covariance[np.ix_(mine, mine)] / size
             widths.append((mine, size, max(float(np.sum(shown**2)), 1e-12)))
-    return Freedom(covariance, linear.places, groups, blocks, tuple(left), tuple(widths))
+    return Freedom(
+        covariance, linear.places, groups, blocks, tuple(left), tuple(widths), considered
+    )
 
 
 def leverages(

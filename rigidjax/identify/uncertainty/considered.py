@@ -1,0 +1,169 @@
+"""Considered numbers: what a sensor may be off, in the covariance but not in the search.
+
+Schmidt 1966, Application of state-space methods to navigation problems; Bierman 1977,
+Factorization Methods for Discrete Sequential Estimation, ch. VIII; Tapley, Schutz and Born 2004,
+Statistical Orbit Determination, ch. 6.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from rigidjax.identify.model.free import TOLERANCES
+from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.terms import Noise, in_deviations
+from rigidjax.identify.sensors.vectors import VectorSensor
+from rigidjax.identify.uncertainty.covariance import Linearised
+
+# What a sensor of unknown tolerance is asked for in a report: 1 % of scale, 1° between axes.
+USUAL = {"scale": 0.01, "cross_axis": float(np.radians(1.0))}
+# The member of the sensor that each tolerance is about.
+MEMBERS = {tolerance: member for member, tolerance in TOLERANCES.items()}
+_OFF_DIAGONAL = [(i, j) for i in range(3) for j in range(3) if i != j]
+
+
+class Consideration(eqx.Module):
+    """An error that a sensor may have, and its effect on a fit.
+
+    `sensor` is the number of the sensor, `kind` a field of `Tolerance`, `deviation` its standard
+    deviation. `shifts` (n, c) are the changes of the n free numbers by an error of one standard
+    deviation in each of its c ways, which are independent: three channels of a scale, six pairs of
+    axes, three biases, one clock.
+    """
+
+    sensor: int = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+    deviation: float
+    shifts: np.ndarray
+
+
+def considerations(
+    model: Model, linear: Linearised, noise: Noise, covariance: np.ndarray
+) -> tuple[Consideration, ...]:
+    """Return the effect of the tolerances of all sensors, but of what a `Free` moves.
+
+    `covariance` (n, n) is that of white errors within the determined directions.
+    """
+    out = []
+    for index, sensor in enumerate(model.records.sensors):
+        tolerance = getattr(sensor, "tolerance", None)
+        for kind, member in MEMBERS.items():
+            width = getattr(tolerance, kind, None)
+            if width is None or is_free(model, index, member):
+                continue
+            # Recordings of one sensor have one tolerance: the largest.
+            deviation = float(np.max(np.asarray(width)))
+            shifts = deviation * shifts_of(model, linear, noise, covariance, index, kind)
+            out.append(Consideration(index, kind, deviation, shifts))
+    return tuple(out)
+
+
+def is_free(model: Model, index: int, member: str) -> bool:
+    """Return whether a `Free` moves this member of the sensor number `index`."""
+    ways = [tuple(getattr(key, "name", getattr(key, "idx", None)) for key in slot.path)
+            for slot in model.slots]  # fmt: skip
+    return ("sensors", index, member) in ways
+
+
+def shifts_of(
+    model: Model,
+    linear: Linearised,
+    noise: Noise,
+    covariance: np.ndarray,
+    index: int,
+    kind: str,
+) -> Float[np.ndarray, "n ways"]:
+    """Return the change of the free numbers by a unit error of a sensor, in each of its ways.
+
+    Readings that are off by D c move the least squares by `−H⁻¹ Jᵀ W D c`.
+    """
+    direction = _directions(model, linear, index, kind)
+    late = model.records.readings[index].late
+    scaled = np.asarray(in_deviations(direction, noise[index], late))
+    pulls = np.einsum(
+        "rtkm,rt,rtkc->rmc", linear.slopes[index], linear.weights[index], scaled, optimize=True
+    )
+    rows = np.zeros((linear.size + 1, direction.shape[-1]))
+    np.add.at(rows, linear.places, pulls)
+    return -covariance @ rows[:-1]
+
+
+def _directions(
+    model: Model, linear: Linearised, index: int, kind: str
+) -> Float[np.ndarray, "records times 3 ways"]:
+    """Return the changes of the readings of a sensor by a unit error, in each of its ways."""
+    reading = model.records.readings[index]
+    shown = np.asarray(reading.values) - linear.raw[index]
+    eye = np.eye(3)
+    if kind == "scale":
+        return shown[..., None] * eye
+    if kind == "bias":
+        return np.broadcast_to(eye, (*shown.shape, 3))
+    if kind == "clock":
+        return slope_in_time(model, shown)[..., None]
+    columns = [eye[i] * shown[..., j, None] for i, j in _OFF_DIAGONAL]
+    return np.stack(columns, axis=-1)
+
+
+def slope_in_time(
+    model: Model, shown: Float[np.ndarray, "records times k"]
+) -> Float[np.ndarray, "records times k"]:
+    """Return the time derivative of the predictions of a sensor, zero beyond each recording."""
+    t, out = np.asarray(model.records.t), np.zeros_like(shown)
+    for row, count in enumerate(model.counts):
+        if count > 2:
+            out[row, :count] = np.gradient(shown[row, :count], t[row, :count], axis=0)
+    return out
+
+
+def stacked_shifts(parts: tuple[Consideration, ...], size: int) -> Float[np.ndarray, "n ways"]:
+    """Return the shifts of n = `size` free numbers by all considered errors: a root of the
+    covariance that these add.
+    """
+    return np.concatenate([np.zeros((size, 0)), *(part.shifts for part in parts)], axis=1)
+
+
+def in_words(parts: tuple[Consideration, ...], sensors: Any) -> str:
+    """Return what is considered, for a report: "a Gyro off by 1 % of scale, 0.5° between axes"."""
+    units = {"scale": "{:.3g} % of scale", "cross_axis": "{:.3g}° between axes",
+             "bias": "a bias of {:.3g} {unit}", "clock": "a clock offset of {:.3g} s"}  # fmt: skip
+    sizes = {"scale": 100.0, "cross_axis": float(np.degrees(1.0)), "bias": 1.0, "clock": 1.0}
+    by_sensor: dict[int, list[str]] = {}
+    for part in parts:
+        words = units[part.kind].format(
+            sizes[part.kind] * part.deviation, unit=sensors[part.sensor].unit
+        )
+        by_sensor.setdefault(part.sensor, []).append(words)
+    named = [
+        f"a {type(sensors[index]).__name__} off by {', '.join(words)}"
+        for index, words in by_sensor.items()
+    ]
+    return "; ".join(named)
+
+
+def unit_moves(
+    model: Model,
+    linear: Linearised,
+    noise: Noise,
+    covariance: np.ndarray,
+    slopes: Float[np.ndarray, "quantities n"],
+) -> list[tuple[int, dict[str, Float[np.ndarray, " quantities"]]]]:
+    """Return how far usual errors of each sensor without a tolerance would move some quantities.
+
+    For each such sensor its number, and by kind (`USUAL`) the largest change of each quantity, of
+    derivative `slopes`, by an error in one of its ways.
+    """
+    out = []
+    for index, sensor in enumerate(model.records.sensors):
+        if not isinstance(sensor, VectorSensor) or sensor.tolerance is not None:
+            continue
+        moves = {}
+        for kind, size in USUAL.items():
+            if not is_free(model, index, MEMBERS[kind]):
+                shifts = size * shifts_of(model, linear, noise, covariance, index, kind)
+                moves[kind] = np.abs(slopes @ shifts).max(axis=1)
+        if moves:
+            out.append((index, moves))
+    return out
