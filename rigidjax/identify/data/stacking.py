@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax.identify.data.recording import Reading, Recording
@@ -64,7 +65,7 @@ def _length(count: int) -> int:
 def _stacked(*leaves: Any) -> Any:
     # By NumPy if the numbers are known: JAX compiles a program for each shape.
     if _checks.known(leaves):
-        return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))
+        return _constant(np.stack([np.asarray(leaf) for leaf in leaves]))
     return jnp.stack(leaves)
 
 
@@ -75,9 +76,15 @@ def one(records: Any, index: Any) -> Any:
         if not eqx.is_array(leaf):
             return leaf
         known = _checks.known((leaf, index))
-        return jnp.asarray(np.asarray(leaf)[index]) if known else leaf[index]
+        return _constant(np.asarray(leaf)[index]) if known else leaf[index]
 
     return jax.tree.map(pick, records)
+
+
+def _constant(array: np.ndarray) -> Array:
+    """Return an array of JAX that is known, also within a trace."""
+    with jax.ensure_compile_time_eval():
+        return jnp.asarray(array)
 
 
 def on_host(records: Recording, counts: Any) -> tuple[Recording, ...]:

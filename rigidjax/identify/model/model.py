@@ -220,7 +220,9 @@ class Model(eqx.Module):
         self.start_weight, self.clusters = None, None
         if windows is None:
             sensors = recordings[0].sensors
-            self.reference = reference_of(recordings, self.state_kind)
+            # The readings are known: so are these numbers, within a trace of the torque, too.
+            with jax.ensure_compile_time_eval():
+                self.reference = reference_of(recordings, self.state_kind)
         else:
             parts = starts_of_windows(windows, _checks.whole(stretches, "stretches", 2))
             self.reference, self.start_weight, self.clusters = parts
@@ -238,7 +240,7 @@ class Model(eqx.Module):
         kinds = kinds if windows is None or self.start_weight is not None else 0
         self.index, self.slots = index_of(bodies, charts.size, slots, kinds)
         widest = max((float(np.diff(r.t).max()) for r in recordings), default=0.0)
-        turn = 1.5 * widest * float(np.max(self.reference.rate))
+        turn = 1.5 * widest * float(np.max(np.asarray(self.reference.rate)))
         sampled = any(eqx.is_array(rows) for rows in self.records.inputs.values())
         if windows is not None or sampled:
             integrator = HeldSteps()

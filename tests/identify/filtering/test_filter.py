@@ -307,7 +307,7 @@ def test_a_torque_of_the_recording_acts_beside_the_models(more, process):
     readings = [(r.sensor, r.values) for r in short.readings]
     logs = {
         "samples": np.tile(push, (len(short.t), 1)),
-        "function": rj.torques.Held([0.0], [push]),
+        "function": rj.torques.Held([0.0, 1.0], [push, push]),
     }
     law = Push(rj.torques.Input("push"))
     runs = []
@@ -499,6 +499,7 @@ class TestBadInput:
             with pytest.raises(ValueError, match=words):
                 records.known(self.record, RANDOM, walks=[identify.Walk(where, 1.0)])
 
+    @pytest.mark.usefixtures("unhooked")
     def test_walks_that_do_not_fit(self):
         gyro = identify.Gyro(0.1, bias=[0.0, 0.0, 0.0])
         record = identify.Recording([0.0, 0.1], (gyro, [[1.0, 0, 0]] * 2))
@@ -511,6 +512,7 @@ class TestBadInput:
         with pytest.raises(ValueError, match=r"deviation: wanted one number or shape \(3,\)"):
             records.known(record, walks=wide)
 
+    @pytest.mark.usefixtures("unhooked")
     def test_an_unknown_torque_that_is_given_as_known(self):
         with pytest.raises(TypeError, match="torque: wanted the known torque, got a RandomTorque"):
             records.known(self.record, torque=rj.torques.Sum(DRAG, RANDOM))
