@@ -33,7 +33,7 @@ from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.equations import on_the_group
-from rigidjax.motion.torques.base import jumps_of, lacking
+from rigidjax.motion.torques.base import lacking
 from rigidjax.solve import crossing_loop, validation
 from rigidjax.solve.adaptive import taken_out
 from rigidjax.solve.adaptive_loop import Method, Run, first_step, of_body, outcome, tried
@@ -49,6 +49,7 @@ from rigidjax.solve.run import (
     equations_of_motion,
     solve,
 )
+from rigidjax.solve.switching import stopped
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 
@@ -328,15 +329,18 @@ def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[S
     (y0, tree), dtype = ravel_pytree(state0), ts.dtype
     sign = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
     way = setup.sign if isinstance(setup, Loop) else sign
-    jumps = jumps_of(setup.torque).astype(dtype)
     field: Any = equations_of_motion(setup.body, state0, setup.torque)
-    field, condition, along, jumps = ahead(way, field, condition, ts[jnp.array([0, -1])], jumps)
-    longest = whole = lax.stop_gradient(along[1] - along[0])
+    field, condition, along, jumps = ahead(way, field, condition, ts[jnp.array([0, -1])])
+    whole: Any = lambda s, y, *sides: ravel_pytree(field(s, tree(y), sides or None))[0]  # noqa: E731
+    ready = stopped(whole, jumps, along[0], along[1], y0)
+    longest = length = lax.stop_gradient(along[1] - along[0])
     if event.max_step is not None:
         longest = lax.stop_gradient(jnp.asarray(event.max_step, dtype))
+    if isinstance(setup, Loop) and setup.max_step is not None:
+        longest = jnp.minimum(longest, setup.max_step)
 
     def slope(s: Array, y: Array) -> Array:
-        return ravel_pytree(field(s, tree(y), None))[0]
+        return ready.field(ready.constants, s, y)
 
     def rates(s: Array, y: Array) -> tuple[Array, Array, Array]:
         there = slope(s, y)
@@ -350,13 +354,13 @@ def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[S
     else:
         solver, free = None, FreeMotion(setup.body, state0)
         motion = lambda s, _: ravel_pytree(free(sign.astype(s.dtype) * s - ts[0]))[0]  # noqa: E731
-        longest = jnp.minimum(longest, _spacing(setup.body, state0, whole))
+        longest = jnp.minimum(longest, _spacing(setup.body, state0, length))
         rtol, atol, h0 = jnp.zeros((), y0.dtype), jnp.zeros((), y0.dtype), longest
-    (of_motion, of_rates), constants, _ = taken_out([motion, rates], along[0], y0)
-    stops = jnp.concatenate([jnp.clip(jnp.sort(jumps), along[0], along[1]), along[1:]])
+    (of_motion, of_rates), constants = taken_out([motion, rates], along[0], y0)
+    stops = jnp.concatenate([ready.stops, along[1:]])
     sizes = [leaf.size for leaf in jax.tree.leaves(state0)]
     crossed = Section(solver, of_motion, of_rates, tree, sizes, sign)
-    run = Run(along[0], stops, stops[:0], y0, rtol, atol, h0)
+    run = Run(along[0], stops, stops[:0], y0, rtol, atol, h0, longest)
     return crossed, (constants, run, longest)
 
 

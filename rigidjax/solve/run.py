@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from rigidjax import _checks
@@ -25,12 +24,13 @@ from rigidjax.motion.equations import (
     NewtonEuler,
     on_the_group,
 )  # fmt: skip
-from rigidjax.motion.torques.base import Torque, jumps_of
+from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.adaptive_loop import NONFINITE, finite, of_body
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
+from rigidjax.solve.sides import declared_jumps, on_sides
 
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
@@ -70,6 +70,7 @@ class Loop(eqx.Module):
     max_steps: int = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
     cuts: Array | None = None  # where a step has to end, beside the jumps of the torque
+    max_step: Any = None
 
 
 class Ends(eqx.Module):
@@ -119,25 +120,23 @@ def direction(times: Array) -> Int[Array, ""] | None:
 
 
 def ahead(
-    sign: Array | None, field: Callable[..., Any], condition: Any, ts: Array, jumps: Array
-) -> tuple[Callable[..., Any], Any, Array, Array]:
-    """A vector field, a condition, times and jump times in s = σt; `sign` σ is `None` for s = t."""
-    if sign is None:
-        return field, condition, ts, jumps
-    time = lambda s: sign.astype(s.dtype) * s  # noqa: E731
+    sign: Array | None, field: Callable[..., Any], condition: Any, ts: Array
+) -> tuple[Callable[..., Any], Any, Array, list[Array]]:
+    """A vector field, a condition, times and jump times in s = σt; `sign` σ is `None` for s = t.
 
-    def directed(s: Array, y: Any, args: Any = None) -> Any:
-        t = time(s)
-        if jumps.size:
-            # A law has its new value from the jump on; a step back that begins there wants the old
-            # one. The oldest JAX has no derivative of `nextafter`, not even one to be stopped.
-            still = lax.stop_gradient(t)
-            before = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
-            t = t + jnp.where(sign < 0, before - still, jnp.zeros_like(still))
-        return jax.tree.map(lambda leaf: sign.astype(leaf.dtype) * leaf, field(t, y, args))
+    The field takes the stops of its parts that jump, in s, as its third argument (see `adaptive`).
+    """
+    time = lambda s: s if sign is None else sign.astype(s.dtype) * s  # noqa: E731
+
+    def directed(s: Array, y: Any, sides: Any = None) -> Any:
+        sided = on_sides(field, sign, None if sides is None else [time(side) for side in sides])
+        slope = sided(time(s), y, None)
+        if sign is None:
+            return slope
+        return jax.tree.map(lambda leaf: sign.astype(leaf.dtype) * leaf, slope)
 
     asked = None if condition is None else lambda s, y: condition(time(s), y)
-    return directed, asked, time(ts), time(jumps)
+    return directed, asked, time(ts), [time(jumps) for jumps in declared_jumps(field)]
 
 
 @eqx.filter_jit
@@ -197,16 +196,21 @@ def _by_diffrax(
 def _loop(
     setup: Loop, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
-    field, jumps = equations_of_motion(setup.body, state0, setup.torque), jumps_of(setup.torque)
+    field = equations_of_motion(setup.body, state0, setup.torque)
+    field, watch, along, jumps = ahead(setup.sign, field, watch, ts)
     if setup.cuts is not None:
-        jumps = jnp.concatenate([jumps.astype(ts.dtype), setup.cuts])
-    field, watch, along, jumps = ahead(setup.sign, field, watch, ts, jumps)
+        cuts = setup.cuts if setup.sign is None else setup.sign.astype(ts.dtype) * setup.cuts
+        jumps = [*jumps, cuts]
     how = dict(rtol=setup.rtol, atol=setup.atol, dt0=setup.dt0, max_steps=setup.max_steps)
+    how |= dict(max_step=setup.max_step)
     out = adaptive(setup.solver, field, along, state0, jumps=jumps, halt=watch, **how)
     taken = (out.num_steps, out.num_steps - out.num_rejected, out.num_rejected)
     sign = setup.sign
     last_time = out.last_time if sign is None else sign.astype(ts.dtype) * out.last_time
-    return out.ys, dict(zip(_COUNTS, taken, strict=True)), out.result, (last_time, out.last)
+    stats: dict[str, Any] = dict(zip(_COUNTS, taken, strict=True))
+    if out.over is not None:
+        stats["switches_missed"] = out.over
+    return out.ys, stats, out.result, (last_time, out.last)
 
 
 _WORDS = (
