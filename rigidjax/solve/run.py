@@ -24,12 +24,15 @@ from rigidjax.motion.equations import (
     NewtonEuler,
     on_the_group,
 )  # fmt: skip
+from rigidjax.motion.torques import ChangingInertia
 from rigidjax.motion.torques.base import Torque
+from rigidjax.motion.torques.composite import parts_of
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.adaptive_loop import NONFINITE, finite, of_body
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
+from rigidjax.solve.momentum import by_momentum, left
 from rigidjax.solve.sides import declared_jumps, on_sides
 
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
@@ -155,7 +158,7 @@ def solve(
         run: Any = _loop if isinstance(setup, Loop) else _by_diffrax
         ys, stats, result, end = run(setup, watch, state0, ts)
         if setup.throw:
-            ys = refuse(ys, result)
+            ys = refuse(ys, result, setup.torque)
         if watch is not None:
             ended = result == dfx.RESULTS.event_occurred
             stats |= {"ended": ended, "end_time": end[0], "end_state": end[1]}
@@ -169,7 +172,10 @@ def _by_diffrax(
     setup: Setup, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
     subs = [dfx.SubSaveAt(ts=ts)] + [dfx.SubSaveAt(t1=True)] * (watch is not None)
-    term = dfx.ODETerm(equations_of_motion(setup.body, state0, setup.torque))
+    form = by_momentum(setup.body, state0, setup.torque)
+    field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
+    state0 = state0 if form is None else form.enter(ts[0], state0)
+    term = dfx.ODETerm(field)
     out = dfx.diffeqsolve(
         term, setup.solver, ts[0], ts[-1], setup.dt0, state0,
         saveat=dfx.SaveAt(subs=subs), stepsize_controller=setup.controller, adjoint=setup.adjoint,
@@ -184,7 +190,7 @@ def _by_diffrax(
         there = jnp.isfinite(times).reshape(-1, *[1] * (leaf.ndim - 1))
         return jnp.where(there, leaf, jnp.full_like(leaf, jnp.nan))
 
-    ys, result = jax.tree.map(reached, ys), out.result
+    ys, result = left(form, ts, jax.tree.map(reached, ys)), out.result
     if not isinstance(setup.controller, dfx.AbstractAdaptiveStepSizeController):
         # Equal steps look at no error, and would go on with NaN.
         ill = (result == dfx.RESULTS.successful) & ~finite(ys)
@@ -196,7 +202,9 @@ def _by_diffrax(
 def _loop(
     setup: Loop, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
-    field = equations_of_motion(setup.body, state0, setup.torque)
+    form = by_momentum(setup.body, state0, setup.torque)
+    field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
+    state0 = state0 if form is None else form.enter(ts[0], state0)
     field, watch, along, jumps = ahead(setup.sign, field, watch, ts)
     if setup.cuts is not None:
         cuts = setup.cuts if setup.sign is None else setup.sign.astype(ts.dtype) * setup.cuts
@@ -210,9 +218,14 @@ def _loop(
     stats: dict[str, Any] = dict(zip(_COUNTS, taken, strict=True))
     if out.over is not None:
         stats["switches_missed"] = out.over
-    return out.ys, stats, out.result, (last_time, out.last)
+    return left(form, ts, out.ys), stats, out.result, (last_time, out.last)
 
 
+_INERTIA = (
+    "simulate: the motion under ChangingInertia became NaN or infinite. Is inertia(t) the tensor of "
+    "a body at every time of the run: symmetric, with positive moments of which none exceeds the "
+    "sum of the other two? throw=False keeps what came before"
+)
 _WORDS = (
     (
         NONFINITE,
@@ -229,8 +242,10 @@ _WORDS = (
 )
 
 
-def refuse(ys: Any, result: dfx.RESULTS) -> Any:
+def refuse(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
     """The states `ys`, or an error in words where the run did not get to its end."""
+    if any(isinstance(part, ChangingInertia) for part in parts_of(torque)):
+        ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
     for why, words in _WORDS:
         ys = eqx.error_if(ys, result == why, words)

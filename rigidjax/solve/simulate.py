@@ -197,7 +197,7 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
     try:
         if run is not None:
             ys, stats, result = run
-            ys = refuse(ys, result) if setup.throw else ys
+            ys = refuse(ys, result, setup.torque) if setup.throw else ys
         elif event is None:
             ys, stats, result = solve(setup, state0, times)
         else:

@@ -12,6 +12,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin, Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import Inertia, tensor_of, with_tensor
 from rigidjax.body.symmetric3 import from_components
+from rigidjax.body.validation import is_real
 from rigidjax.motion.torques import base
 from rigidjax.motion.torques.inputs import require_no_jumps
 from rigidjax.rotation import quaternion
@@ -139,7 +140,7 @@ class ChangingInertia(eqx.Module):
         def momentum(t: Any, q: Any, omega: Any) -> tuple[Vec3, Mat3]:
             here = eqx.tree_at(lambda s: s.omega, state, omega)
             here = here if q is None else eqx.tree_at(lambda s: s.q, here, q)
-            now = self.tensor(t, here, body).astype(omega.dtype)
+            now = real_or_nan(self.tensor(t, here, body).astype(omega.dtype))
             return apply(now, omega), now
 
         # Ω̇ is not known yet: I(Ω) Ω is linear in it. One program along four ways: t and q, e_i.
@@ -158,6 +159,11 @@ class ChangingInertia(eqx.Module):
         slope = solve(slopes[1:].T, turning)
         torque = apply(fixed, slope) - cross(apply(fixed, omega), omega)
         return torque if force is None else base.Wrench(force, torque)
+
+
+def real_or_nan(tensor: Mat3) -> Mat3:
+    """The inertia tensor (3, 3) of a body, kg m²; NaN for any other numbers, which end a run."""
+    return jnp.where(is_real(tensor), tensor, jnp.full_like(tensor, jnp.nan))
 
 
 class Tide(eqx.Module):
