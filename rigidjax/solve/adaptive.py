@@ -27,7 +27,8 @@ class Found(NamedTuple):
     """The result of `adaptive`.
 
     **Fields:** `ys` the states at `ts`; `num_steps` accepted and rejected, `num_rejected` of these;
-    `result` a `diffrax.RESULTS`; `last` the state at the end, `last_time`; `over` whether a part
+    `result` a `diffrax.RESULTS`; `last` the state at the end, `last_time`, and
+    `next_step`, the length of the step that would follow; `over` whether a part
     switches by the time more often than is looked for (`None`: nothing does).
     """
 
@@ -37,6 +38,7 @@ class Found(NamedTuple):
     result: dfx.RESULTS
     last_time: Array
     last: Any
+    next_step: Array
     over: Array | None
 
 
@@ -100,7 +102,7 @@ def adaptive(
     last = jnp.where(end.t >= ts[-1], end.y, jnp.nan)
     ys = jax.vmap(tree)(jnp.concatenate([numbers[None], between, last[None]]))
     state = tree(lax.stop_gradient(end.y))
-    return Found(ys, end.steps, end.rejected, result, end.t, state, ready.over)
+    return Found(ys, end.steps, end.rejected, result, end.t, state, end.h, ready.over)
 
 
 def taken_out(

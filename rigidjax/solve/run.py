@@ -1,5 +1,6 @@
 """A run in one compiled piece: by the closed form, by diffrax, or by our own loop."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -17,7 +18,7 @@ from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.coupled import Coupled, CoupledEquations, started
+from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of, started
 from rigidjax.motion.equations import (
     AttitudeEquations,
     EulerEquations,
@@ -218,7 +219,8 @@ def _loop(
     stats: dict[str, Any] = dict(zip(_COUNTS, taken, strict=True))
     if out.over is not None:
         stats["switches_missed"] = out.over
-    return left(form, ts, out.ys), stats, out.result, (last_time, out.last)
+    last = out.last if form is None else form.leave(last_time, out.last)
+    return left(form, ts, out.ys), stats, out.result, (last_time, last, out.next_step)
 
 
 _INERTIA = (
@@ -226,7 +228,13 @@ _INERTIA = (
     "a body at every time of the run: symmetric, with positive moments of which none exceeds the "
     "sum of the other two? throw=False keeps what came before"
 )
+_MANY_STEPS = (
+    "simulate: the maximum number of solver steps, max_steps, did not reach the last time. Has the "
+    "motion many turns? then give a larger one. Does a law switch by the state (sign, where) and hold it there? then no "
+    "number of steps is enough: smooth the switch, or end the run there by an Event"
+)
 _WORDS = (
+    (dfx.RESULTS.max_steps_reached, _MANY_STEPS),
     (
         NONFINITE,
         "simulate: the motion became NaN or infinite. Is the torque finite at every time and state "
@@ -251,6 +259,45 @@ def refuse(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
         ys = eqx.error_if(ys, result == why, words)
         ill = ill & (result != why)
     return result.error_if(ys, ill)
+
+
+@eqx.filter_jit
+def _end_of(loop: Loop, state0: Any, ts: Array) -> Any:
+    """Where a run ends: time, next step, number of steps, and state."""
+    state0 = started(loop.body, on_the_group(state0), loop.torque, ts[0])
+    *_, stats, _, end = _loop(loop, None, state0, ts)
+    return *end, stats["num_steps"]
+
+
+# Steps so much shorter than their mean that the motion stands still at one place.
+_STUCK = 1e-2
+
+
+def words_of_steps(loop: Loop, state0: Any, ts: Array, error: RuntimeError) -> RuntimeError:
+    """The same error; if a run has taken all its steps, with what they were spent on."""
+    numbers = (loop, state0, ts)
+    if _MANY_STEPS not in str(error) or not isinstance(loop, Loop) or not _checks.known(numbers):
+        return error
+    t, state, step, count = _end_of(dataclasses.replace(loop, throw=False), state0, ts)
+    begun, end, t = float(ts[0]), float(ts[-1]), float(t)
+    gone, step = abs(t - begun), float(step)
+    words = f"simulate: the maximum number of solver steps, {int(count)}, "
+    words += f"led to t = {t:.9g} s, and not to {end:.9g} s"
+    if step * int(count) < _STUCK * gone:
+        return type(error)(
+            f"{words}; the last are {step:.1e} s long, all at one place: does a law switch there "
+            "by the state (sign, where) and hold it at the switch, as Coulomb friction does at "
+            "rest? No number of steps is enough: smooth the switch (tanh(x / width) for sign(x)), "
+            "or end the run there by an Event and go on with the law that holds then"
+        )
+    if hasattr(motion_of(state), "omega"):
+        rates = (motion_of(y).omega for y in (state0, state))
+        rate = max(float(np.linalg.norm(np.asarray(w))) for w in rates)
+        turns, share = rate * gone / (2 * np.pi), abs(end - begun) / max(gone, 1e-300)
+        if turns > 1:
+            words += f": {int(count) / turns:.3g} steps a turn for {turns * share:.3g} turns"
+    needed = 1.2 * int(count) * abs(end - begun) / max(gone, 1e-300)
+    return type(error)(f"{words}; give max_steps={int(float(f'{needed:.1g}')):_} or more")
 
 
 def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:

@@ -21,7 +21,7 @@ from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.error import error_of_run, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected, Watched
-from rigidjax.solve.run import Free, Loop, Setup, direction, refuse, refuse_ended, solve
+from rigidjax.solve.run import Free, Loop, Setup, direction, refuse, refuse_ended, solve, words_of_steps
 from rigidjax.solve.solution import Solution, State, told
 from rigidjax.solve.splitting import AbstractSplitting
 
@@ -50,6 +50,7 @@ def simulate(
     atol: ScalarLike | None = None,
     accuracy: ScalarLike | None = None,
     dt0: ScalarLike | None = None,
+    max_step: ScalarLike | None = None,
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
     event: Event | Callable[..., Any] | None = None,
@@ -87,6 +88,9 @@ def simulate(
       a `UserWarning` says from which time on; under `jit` look at `sol.error.relative`.
     - `dt0`, `stepsize_controller`: first step and controller where the tolerances are not enough,
       such as `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
+    - `max_step`: the longest step, s, such as half of the shortest event in a law that steps could
+      pass over (a smooth bump, a switch by the state). The closed form takes no steps; a
+      `stepsize_controller` has its own limit.
     - `adjoint`: how derivatives through a solver of diffrax are taken, as there. `None` is
       `diffrax.RecursiveCheckpointAdjoint()` for `jax.grad`, with 4096 checkpoints where `rtol` is
       known to be below 1e-10; `diffrax.ForwardMode()` is for `jax.jacfwd`. Our loop and the closed
@@ -126,6 +130,15 @@ def simulate(
         raise ValueError("simulate: give either an accuracy or rtol and atol, not both")
     if accuracy is not None and _checks.known(accuracy):
         _checks.positive(accuracy, "accuracy")
+    if max_step is not None:
+        if stepsize_controller is not None:
+            raise ValueError(
+                "simulate: give max_step without a stepsize_controller, which has its own limit "
+                "(dtmax of diffrax.PIDController)"
+            )
+        if _checks.known(max_step):
+            _checks.positive(max_step, "max_step")
+        max_step = jnp.asarray(max_step, times.dtype)
     if stepsize_controller is None:
         rtol, atol = validation.tolerances(rtol, atol, times.dtype)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
@@ -141,7 +154,7 @@ def simulate(
         way = direction(times)
         # As arrays: another tolerance does not compile again.
         rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
-        loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw)  # pyright: ignore
+        loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw, None, max_step)  # pyright: ignore
         if accuracy is None:
             return _solution(loop, event, state0, times)
         return _accurate(loop, event, state0, times, accuracy)
@@ -158,14 +171,14 @@ def simulate(
         )
     meter, control = progress_meter or NO_METER, stepsize_controller
     setup = Setup(body, torque, solver, control, first, adjoint, meter, max_steps, throw)
-    return _solution(_completed(setup, rtol, atol, times), None, state0, times)
+    return _solution(_completed(setup, rtol, atol, times, max_step), None, state0, times)
 
 
-def _completed(setup: Setup, rtol: Any, atol: Any, times: Array) -> Setup:
+def _completed(setup: Setup, rtol: Any, atol: Any, times: Array, max_step: Any) -> Setup:
     """A run by diffrax with what was left to its defaults."""
     solver, control, adjoint, dt0 = setup.solver, setup.controller, setup.adjoint, setup.dt0
     if control is None:
-        control = Watched(dfx.PIDController(rtol=rtol, atol=atol))
+        control = Watched(dfx.PIDController(rtol=rtol, atol=atol, dtmax=max_step))
         if hasattr(setup.torque, "jump_times") and (jumps := jumps_of(setup.torque)).size:
             # An adaptive step may pass over a short pulse.
             jumps = jnp.sort(jumps.astype(times.dtype))
@@ -205,7 +218,7 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
             state0 = ready(event, setup.body, state0, setup.torque, times[0])
             ys, stats, result, event_time, event_state = solve_until(setup, event, state0, times)
     except RuntimeError as error:
-        raise _checks.bare(error) from None
+        raise words_of_steps(setup, state0, times, _checks.bare(error)) from None
     if setup.throw and "ended" in stats:
         ys = refuse_ended(setup.torque, ys, stats, times)
     motion, own = (ys.motion, ys.own) if isinstance(ys, Coupled) else (ys, None)
