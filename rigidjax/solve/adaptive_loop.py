@@ -283,7 +283,7 @@ def start(method: Method, constants: Arrays, run: Run) -> LoopState:
         h = jnp.where(method.halt(t0, y0), HALTED, h)
     zero = jnp.zeros(t0.shape, jnp.int32)
     # Stops at the start or behind it need no step.
-    behind = jnp.sum(run.stops[:-1] <= t0, 0, dtype=jnp.int32)
+    behind = jnp.sum(run.stops[:-1] <= t0[None], 0, dtype=jnp.int32)
     return LoopState(y0, t0, lax.stop_gradient(h), behind, zero, zero)
 
 

@@ -12,7 +12,7 @@ of a switching time is that of the implicit function `gap(p, t) = 0`.
 import os
 import warnings
 from collections.abc import Callable, Iterator
-from itertools import count
+from itertools import count, pairwise
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -64,6 +64,8 @@ _MOST = 64  # times of one rounding
 _FEW = 32  # a comparison of more elements is a table
 _FEW_KINKS = 3  # more kinks in one operation cost more steps than they save
 _HALVINGS = {"float64": 62, "float32": 36}
+_GRID = 4096  # points of the search for a switch that is bent in time
+_NEAR = 16  # places at which it is looked for between them
 
 
 class Node(NamedTuple):
@@ -81,8 +83,7 @@ class Node(NamedTuple):
     @property
     def name(self) -> str:
         """The primitive's name; that of the function for a call of `searchsorted`."""
-        called = self.params.get("name")
-        return "searchsorted" if called == "searchsorted" else self.primitive.name
+        return _name(self)
 
 
 class Program(NamedTuple):
@@ -105,8 +106,18 @@ class Switch(NamedTuple):
 
     @property
     def most(self) -> int:
-        """The number of times at which one element may change."""
+        """The number of times at which one element may change, if it only rises or falls."""
         return _MOST if self.node.name in _LEVELS else 1
+
+    @property
+    def places(self) -> int:
+        """The number of changes that are looked for."""
+        return _MOST + 2 * _NEAR if self.degree == BENT else self.size * self.most
+
+    @property
+    def exact(self) -> bool:
+        """Whether no element can change more often than is looked for."""
+        return self.degree < BENT and self.most == 1
 
     @property
     def line(self) -> str:
@@ -115,10 +126,14 @@ class Switch(NamedTuple):
 
 
 class Analysis(NamedTuple):
-    """The `switches` of a program, the lines that switch by the state, and those not understood."""
+    """The `switches` of a program, the lines that switch by the state, and those not understood.
+
+    `kinks` are too many for steps to end at each, and serve the search for bent switches.
+    """
 
     program: Program
     switches: list[Switch]
+    kinks: list[Switch]
     by_state: list[str]
     unseen: list[str]
 
@@ -131,6 +146,11 @@ def _bodies(params: dict[str, Any]) -> Iterator[tuple[Any, Any]]:
                 yield part.jaxpr, part.consts
             elif isinstance(part, Jaxpr):
                 yield part, ()
+
+
+def _name(eqn: Any) -> str:
+    called = eqn.params.get("name")
+    return "searchsorted" if called == "searchsorted" else eqn.primitive.name
 
 
 def _kinds(eqn: Any) -> list[Any]:
@@ -158,7 +178,7 @@ def _bends(name: str, kinds: list[Any]) -> bool:
 def _any_switch(jaxpr: Any, bent: bool = False) -> bool:
     """Return whether a program, or one within it, holds a jump, or if `bent` a kink."""
     for eqn in jaxpr.eqns:
-        name, kinds = eqn.primitive.name, _kinds(eqn)
+        name, kinds = _name(eqn), _kinds(eqn)
         if _jumps(name, eqn.params, kinds) or (bent and _bends(name, kinds)) or name in _OPAQUE:
             return True
         if any(_any_switch(body, bent) for body, _ in _bodies(eqn.params)):
@@ -175,9 +195,9 @@ def flatten(closed: ClosedJaxpr) -> Program:
         scope |= dict(zip(jaxpr.constvars, consts, strict=True))
         read = lambda atom: atom if isinstance(atom, Literal) else scope[atom]  # noqa: E731
         for eqn in jaxpr.eqns:
-            args, name = [read(atom) for atom in eqn.invars], eqn.primitive.name
+            args, name = [read(atom) for atom in eqn.invars], _name(eqn)
             own = declared or DECLARED in str(eqn.source_info.name_stack)
-            if name in _CALLS and eqn.params.get("name") != "searchsorted":
+            if name in _CALLS:
                 ((body, held),) = _bodies(eqn.params)
                 outputs = enter(body, kept(held), args, own)
             else:
@@ -236,7 +256,7 @@ def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
         return None
     program = flatten(closed)
     degrees, of_state = {program.inputs[0]: STRAIGHT}, {program.inputs[1]}
-    switches, by_state, unseen = [], [], []
+    switches, kinks, by_state, unseen = [], [], [], []
     for node in program.nodes:
         inputs = [i for i in node.inputs if not isinstance(i, Literal)]
         look = lambda i: CONSTANT if isinstance(i, Literal) else degrees.get(i, CONSTANT)  # noqa: E731
@@ -257,12 +277,12 @@ def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
             unseen += [where] * timed
         elif timed and not stateful:
             switch = _switch_of(program, node, operands, jumps)
-            many = switch.size > (_FEW if jumps else _FEW_KINKS)
-            if switch.degree <= MONOTONE and not many:
+            if switch.size <= (_FEW if jumps else _FEW_KINKS):
                 switches.append(switch)
-            elif jumps and not many:
-                unseen.append(where)
-    return Analysis(program, switches, by_state, unseen)
+            elif switch.size <= _FEW:
+                kinks.append(switch)
+    bent = any(switch.degree == BENT for switch in switches)
+    return Analysis(program, switches, kinks if bent else [], by_state, unseen)
 
 
 def _is_ours(node: Node) -> bool:
@@ -367,68 +387,185 @@ class Times(NamedTuple):
     """
 
     times: Array  # (k,) with derivatives; the end of the run where nothing changes
-    there: Array  # (k,) whether something changes
+    element: Array  # (k,) of the switch
     change: Array  # (k,) of the element's value
-    first: Array  # (n,) the values of all elements at the start
+    first: Arrays  # the values of the elements of each switch at the start
     outputs: Arrays  # of the equations at the start
     over: Array  # whether an element changes more often than it has places
 
 
+class _Watched(NamedTuple):
+    """Some switches of a program as functions of the time, all their elements in one array."""
+
+    analysis: Analysis
+    switches: list[Switch]
+    constants: Arrays
+
+    def operands(self, t: Any) -> list[list[Any]]:
+        """Return the operands and the result of each equation."""
+        wanted = [i for s in self.switches for i in (*s.node.inputs, s.node.outputs[0])]
+        found = evaluator(self.analysis.program, wanted)(self.constants, t)
+        ends = np.cumsum([0, *(len(s.node.inputs) + 1 for s in self.switches)])
+        return [found[i:j] for i, j in pairwise(ends)]
+
+    def _each(self, of: Callable[..., Any], t: Array) -> list[Array]:
+        both = zip(self.switches, self.operands(t), strict=True)
+        return [of(switch, *operands).astype(t.dtype) for switch, operands in both]
+
+    def values(self, t: Array) -> list[Array]:
+        return self._each(_value, t)
+
+    def value(self, t: Array) -> Array:
+        return jnp.concatenate(self.values(t))
+
+    def gap(self, t: Array) -> Array:
+        return jnp.concatenate(self._each(_gap, t))
+
+
 def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times:
     """Find the times in a < t ≤ b at which the switches of a field change."""
-    program, switches = analysis.program, analysis.switches
-    dtype, number = a.dtype, len(switches)
-    operands = [i for s in switches for i in (*s.node.inputs, s.node.outputs[0])]
-    values = evaluator(program, operands)
-    spans = np.cumsum([0, *(len(s.node.inputs) + 1 for s in switches)])
-
-    def each(of: Callable[..., Any], t: Any) -> Any:
-        found = values(constants, t)
-        parts = [
-            of(switches[i], *found[spans[i] : spans[i + 1]]).astype(dtype) for i in range(number)
-        ]
-        return jnp.concatenate(parts)
-
-    element, level = _places(switches)
     start, end = lax.stop_gradient((a, b))
     # What changes within some round-off of the start has changed.
-    start = start + 8 * jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end - start))
-    first, last = each(_value, start), each(_value, end)
-    changed = lambda t, i, k: jnp.abs(each(_value, t)[i] - first[i]) >= k  # noqa: E731
-    there = jnp.abs(last - first)[element] >= level
+    start = start + 8 * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end - start))
+    steady = [s for s in analysis.switches + analysis.kinks if s.degree <= MONOTONE]
+    parts, over, known = {}, jnp.asarray(False), jnp.zeros(0, a.dtype)
+    if steady:
+        watched = _Watched(analysis, steady, constants)
+        *places, over = _of_steady(watched, start, end)
+        known = places[0]
+        ends = np.cumsum([0, *(s.places for s in steady)])
+        for switch, i, j in zip(steady, ends[:-1], ends[1:], strict=True):
+            parts[id(switch)] = [place[i:j] for place in places]
+    for switch in analysis.switches:
+        if switch.degree == BENT:
+            *places, more = _of_bent(_Watched(analysis, [switch], constants), start, end, known)
+            parts[id(switch)], over = places, over | more
+            known = jnp.concatenate([known, places[0]])
+    columns = zip(*(parts[id(switch)] for switch in analysis.switches), strict=True)
+    t, element, change = (jnp.concatenate(column) for column in columns)
+    whole = _Watched(analysis, analysis.switches, constants)
+    outputs = [operands[-1] for operands in whole.operands(start)]
+    return Times(jnp.where(t < end, t, b), element, change, whole.values(start), outputs, over)
+
+
+def _of_steady(watched: _Watched, start: Array, end: Array) -> tuple[Array, ...]:
+    """Return times, elements, changes and whether there are more, of what only rises or falls."""
+    whole, element, level = _levels(watched.switches)
+    first, last = watched.value(start), watched.value(end)
+    rise = (last - first)[whole]
+    there = jnp.abs(rise) >= level
+    low, high = (jnp.full(whole.shape, edge) for edge in (start, end))
+    t, _ = _halved(watched, low, high, whole, first[whole], level)
+    t, _ = _moving(watched, jnp.where(there, t, end), whole, there)
+    once = np.concatenate([np.full(s.places, s.most == 1) for s in watched.switches])
+    most = np.concatenate([np.full(s.size, s.most) for s in watched.switches])
+    over = jnp.any((jnp.abs(last - first) > most) & (most > 1))
+    change = jnp.where(there, jnp.where(once, rise, jnp.sign(rise)), 0)
+    return t, jnp.asarray(element), change, over
+
+
+def _levels(switches: list[Switch]) -> tuple[np.ndarray, ...]:
+    """Return the element of each place, through all switches and in its own, and which change."""
+    parts, before = [], 0
+    for switch in switches:
+        element, level = (np.ravel(a) for a in np.mgrid[: switch.size, 1 : switch.most + 1])
+        parts.append((before + element, element, level))
+        before += switch.size
+    whole, element, level = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return whole, element, level
+
+
+def _of_bent(watched: _Watched, start: Array, end: Array, known: Array) -> tuple[Array, ...]:
+    """Return what `_of_steady` does of one switch, by a grid with the `known` times of others."""
+    (switch,) = watched.switches
+    low, high, element, over = _cells(watched, start, end, lax.stop_gradient(known))
+    base = jax.vmap(lambda t, i: watched.value(t)[i])(low, element)
+    t, value = _halved(watched, low, high, element, base, np.full(low.shape, 0.5))
+    there = value != base
+    t, moves = _moving(watched, jnp.where(there, t, end), element, there)
+    if known.shape[0]:
+        # Where an operand jumps, the switch moves as that jump does.
+        near = jnp.argmin(jnp.abs(known[None] - t[:, None]), 1)
+        still = lax.stop_gradient(t)
+        there_too = jnp.abs(known[near] - still) <= 8 * jnp.finfo(t.dtype).eps * jnp.abs(still)
+        t = jnp.where(there & ~moves & there_too, known[near], t)
+    return t, element, jnp.where(there, value - base, 0), over
+
+
+def _cells(watched: _Watched, start: Array, end: Array, known: Array) -> tuple[Array, ...]:
+    """Return intervals (k,) in which an element changes once, the element, and whether all fit."""
+    size, dtype = watched.switches[0].size, start.dtype
+    grid = start + (end - start) * jnp.linspace(0.0, 1.0, max(256, _GRID // size), dtype=dtype)
+    if known.shape[0]:
+        beside = jnp.nextafter(known, jnp.full_like(known, -jnp.inf))
+        grid = jnp.sort(jnp.concatenate([grid, jnp.clip(jnp.stack([known, beside]), start, end).ravel()]))
+    value, gap = jax.vmap(watched.value)(grid), jax.vmap(watched.gap)(grid)
+    changes = jnp.ravel(value[1:] != value[:-1])
+    many = jnp.sum(changes)
+    # The first of them: `nonzero` takes five times as long to compile.
+    _, cell = lax.top_k(changes.astype(jnp.int32), _MOST)
+    row, element = cell // size, cell % size
+    low = grid[row]
+    high = jnp.where(jnp.arange(_MOST) < many, grid[row + 1], low)
+    # Between two points it may be met twice, near where the gap comes closest to zero.
+    middle, sides = jnp.abs(gap[1:-1]), jnp.stack([jnp.abs(gap[:-2]), jnp.abs(gap[2:])])
+    calm = (value[1:-1] == value[:-2]) & (value[1:-1] == value[2:]) & jnp.all(middle <= sides, 0)
+    depth = jnp.max(sides, 0) - middle + jnp.finfo(dtype).tiny
+    nearness, cell = lax.top_k(-jnp.ravel(jnp.where(calm, middle / depth, jnp.inf)), _NEAR)
+    row, which = cell // size, cell % size
+    left = grid[row]
+    right = jnp.where(jnp.isfinite(nearness), grid[row + 2], left)
+    sign = jnp.sign(gap[row + 1, which])
+    distance = jax.vmap(lambda t, i, sign: sign * watched.gap(t)[i])
+
+    def shorter(_: Any, ends: Any) -> Any:
+        left, right = ends
+        third = (right - left) / 3
+        falls = distance(left + third, which, sign) > distance(right - third, which, sign)
+        return jnp.where(falls, left + third, left), jnp.where(falls, right, right - third)
+
+    a, b = lax.fori_loop(0, _HALVINGS[dtype.name], shorter, (left, right))
+    lowest = 0.5 * (a + b)
+    low, high = jnp.concatenate([low, left, lowest]), jnp.concatenate([high, lowest, right])
+    return low, high, jnp.concatenate([element, which, which]), many > _MOST
+
+
+def _halved(
+    watched: _Watched, low: Array, high: Array, element: Any, base: Array, level: Any
+) -> tuple[Array, Array]:
+    """Return the first times (k,) at which an element is so far from its `base`; its value then."""
+    at = jax.vmap(lambda t, i: watched.value(t)[i])
 
     def half(_: Any, ends: Any) -> Any:
         low, high = ends
         middle = low + 0.5 * (high - low)
-        new = jax.vmap(changed)(middle, element, level)
+        new = jnp.abs(at(middle, element) - base) >= level
         return jnp.where(new, low, middle), jnp.where(new, middle, high)
 
-    ends = (jnp.full(element.shape, start), jnp.full(element.shape, end))
-    ends = lax.stop_gradient(ends)
-    t = lax.fori_loop(0, _HALVINGS[dtype.name], half, ends)[1]
-    gap = jax.vmap(lambda t, i: each(_gap, t)[i])
+    given = lax.stop_gradient((low, high))
+    t = lax.fori_loop(0, _HALVINGS[low.dtype.name], half, given)[1]
+    return t, at(t, element)
+
+
+def _moving(watched: _Watched, t: Array, element: Any, there: Array) -> tuple[Array, Array]:
+    """Return the times with the derivatives of implicit functions, and whether they have some."""
+    gap = jax.vmap(lambda t, i: watched.gap(t)[i])
+    bent = any(s.degree == BENT for s in watched.switches)
+    t, moves, slope = lax.stop_gradient(t), there, jnp.zeros_like(t)
+    still, here = t, jnp.zeros_like(t)
     # Each step of Newton's method of value zero adds an order of derivatives.
-    for _ in range(1 if all(s.degree == STRAIGHT for s in switches) else 2):
+    for _ in range(1 if all(s.degree == STRAIGHT for s in watched.switches) else 2):
         here, slope = jax.jvp(lambda t: gap(t, element), (t,), (jnp.ones_like(t),))
-        moves = there & jnp.isfinite(slope) & (slope != 0)
+        moves = moves & jnp.isfinite(slope) & (slope != 0)
         rise = here - lax.stop_gradient(here)
         t = t - jnp.where(moves, rise / jnp.where(moves, slope, 1), 0)
-    most = np.concatenate([np.full(s.size, s.most) for s in switches])
-    once = np.concatenate([np.full(s.size, s.most == 1) for s in switches])[element]
-    change = jnp.where(once, (last - first)[element], jnp.sign(last - first)[element])
-    over = jnp.any((jnp.abs(last - first) > most) & (most > 1))
-    outputs = [values(constants, start)[spans[i + 1] - 1] for i in range(number)]
-    return Times(jnp.where(there, t, b), there, change, first, outputs, over)
-
-
-def _places(switches: list[Switch]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the element of each place, counted through all switches, and which change it is."""
-    elements, levels, before = [], [], 0
-    for switch in switches:
-        element, level = np.mgrid[before : before + switch.size, 1 : switch.most + 1]
-        elements, levels = [*elements, np.ravel(element)], [*levels, np.ravel(level)]
-        before += switch.size
-    return np.concatenate(elements), np.concatenate(levels)
+    if bent:
+        # A jump of the operand itself is no zero of its gap.
+        beside = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
+        step, eps = jnp.abs(slope) * (still - beside), jnp.finfo(t.dtype).eps
+        jump = jnp.abs(here - gap(beside, element))
+        moves = moves & (jump <= 64 * (step + eps * (1 + jnp.abs(here))))
+    return t, moves
 
 
 class _Side(NamedTuple):
@@ -436,44 +573,47 @@ class _Side(NamedTuple):
 
     switch: Switch
     number: int
-    elements: slice
     places: slice
 
     @property
     def reads(self) -> list[Any]:
         """The inputs of the equation that are still needed."""
-        return self.switch.node.inputs if self.switch.most > 1 else []
+        return [] if self.switch.exact else self.switch.node.inputs
 
     def value(self, read: Callable[[Any], Any], inputs: tuple[Any, ...]) -> Any:
         """Return the result at the time `inputs[0]`, from the stops and values `inputs[-1]`."""
         node, (stops, found) = self.switch.node, inputs[-1]
         past = inputs[0] >= stops[self.places]
-        steps = jnp.where(past, found.change[self.places], 0).reshape(self.switch.size, -1).sum(1)
-        here, out = found.first[self.elements] + steps, node.shapes[0]
+        steps = jnp.where(past, found.change[self.places], 0)
+        if self.switch.size > 1:
+            own = found.element[self.places][None] == np.arange(self.switch.size)[:, None]
+            steps = jnp.sum(jnp.where(own, steps[None], 0), 1)
+        else:
+            steps = jnp.sum(steps)
+        here, out = found.first[self.number] + steps, node.shapes[0]
         if node.name == "searchsorted":
             return found.outputs[self.number] - jnp.sum(steps).astype(out.dtype)
+        operands = [read(i) for i in self.reads]
         if node.name in _COMPARISONS:
-            return (here > 0.5).reshape(out.shape)
-        if self.switch.most == 1:
-            return here.reshape(out.shape).astype(out.dtype)
-        operands = [read(i) for i in node.inputs]
+            here = here > 0.5
         if node.name == "rem":
             x, y = operands
             here = x - y * here.reshape(out.shape).astype(x.dtype)
         here = here.reshape(out.shape).astype(out.dtype)
+        if self.switch.exact:
+            return here
         params = node.primitive.get_bind_params(node.params)
         return jnp.where(found.over, node.primitive.bind(*operands, **params), here)
 
 
 def by_sides(analysis: Analysis) -> Callable[..., Array]:
     """Return the field f(constants, t, y, …, (stops, `Times`)) with its switches at the stops."""
-    replaced, elements, places = {}, 0, 0
+    replaced, begin = {}, 0
     for number, switch in enumerate(analysis.switches):
-        more = elements + switch.size, places + switch.size * switch.most
-        side = _Side(switch, number, slice(elements, more[0]), slice(places, more[1]))
-        elements, places = more
         if switch.jumps:
-            replaced[switch.node.outputs[0]] = side
+            places = slice(begin, begin + switch.places)
+            replaced[switch.node.outputs[0]] = _Side(switch, number, places)
+        begin += switch.places
     evaluate = evaluator(analysis.program, [analysis.program.output], replaced)
     return lambda constants, *inputs: evaluate(constants, *inputs)[0]
 
@@ -569,6 +709,9 @@ def stopped(
     found = times_of(analysis, program.closed.consts, a, b)
     stops, each = separated(jnp.concatenate([*declared, found.times]), a, b)
     *sides, own = _split(lax.stop_gradient(each), [*declared, found.times])
+    over, most = found.over, _MOST + sum(times.shape[0] for times in declared)
+    if stops.shape[0] > most:
+        stops, over = stops[:most], over | (stops[most] < b)
     more, tree = jax.tree.flatten((sides if likes else [], (own, lax.stop_gradient(found))))
     field = by_sides(analysis)
 
@@ -576,7 +719,7 @@ def stopped(
         sides, places = tree.unflatten(given[number:])
         return field(program.consts(given[:number]), t, y, *sides, places)
 
-    return Stopped(call, [*program.constants, *more], number, stops, found.over)
+    return Stopped(call, [*program.constants, *more], number, stops, over)
 
 
 def _split(whole: Array, like: list[Array]) -> list[Array]:
