@@ -17,7 +17,7 @@ from rigidjax.body.inertia import MassProperties, tensor_of, with_tensor
 from rigidjax.motion import Attitude
 from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of
 from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
-from rigidjax.motion.torques import ChangingInertia
+from rigidjax.motion.torques import ChangingInertia, Sum
 from rigidjax.motion.torques.base import in_precision
 from rigidjax.motion.torques.composite import parts_of, real_or_nan
 from rigidjax.motion.torques.states import freeze
@@ -77,7 +77,8 @@ def by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
 
 def changing(torque: Any) -> ChangingInertia | None:
     """Return the `ChangingInertia` that a torque is, or `None`."""
-    parts = parts_of(torque)
+    # Scenes of particles, and none, are no torques.
+    parts = parts_of(torque) if isinstance(torque, ChangingInertia | Sum) else ()
     return parts[0] if len(parts) == 1 and isinstance(parts[0], ChangingInertia) else None
 
 

@@ -1,6 +1,7 @@
 """A run in one compiled piece: by the closed form, by diffrax, or by our own loop."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -25,16 +26,15 @@ from rigidjax.motion.equations import (
     NewtonEuler,
     on_the_group,
 )  # fmt: skip
-from rigidjax.motion.torques import ChangingInertia
 from rigidjax.motion.torques.base import Torque
-from rigidjax.motion.torques.composite import parts_of
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.adaptive_loop import NONFINITE, finite, of_body
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
-from rigidjax.solve.momentum import by_momentum, left
+from rigidjax.solve.momentum import by_momentum, changing, left
 from rigidjax.solve.sides import declared_jumps, on_sides
+from rigidjax.solve.switching import MOST, analysis_of, traced
 
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
@@ -252,13 +252,31 @@ _WORDS = (
 
 def refuse(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
     """The states `ys`, or an error in words where the run did not get to its end."""
-    if any(isinstance(part, ChangingInertia) for part in parts_of(torque)):
+    if changing(torque) is not None:
         ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
     for why, words in _WORDS:
         ys = eqx.error_if(ys, result == why, words)
         ill = ill & (result != why)
     return result.error_if(ys, ill)
+
+
+def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) -> None:
+    """Warn if a law switches by the time more often than steps can end at its switches."""
+    missed = stats.get("switches_missed", False)
+    if not _checks.known((missed, state0, ts)) or not np.any(np.asarray(missed)):
+        return
+    state0 = started(setup.body, state0, setup.torque, ts[0])
+    form = by_momentum(setup.body, state0, setup.torque)
+    field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
+    analysis = analysis_of(traced(lambda t, y: field(t, y, None), ts[0], state0).closed)
+    lines = [] if analysis is None else list(dict.fromkeys(s.line for s in analysis.switches))
+    warnings.warn(
+        f"simulate: a law switches by the time more than {MOST} times ({'; '.join(lines)}): steps "
+        "end at the first of them, and the derivative by the others is lost. Give the law "
+        "`jump_times`, all its jumps in s, or take torques.Held or Pulses for a table",
+        stacklevel=4,
+    )
 
 
 @eqx.filter_jit

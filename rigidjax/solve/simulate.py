@@ -21,7 +21,17 @@ from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.error import error_of_run, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected, Watched
-from rigidjax.solve.run import Free, Loop, Setup, direction, refuse, refuse_ended, solve, words_of_steps
+from rigidjax.solve.run import (
+    Free,
+    Loop,
+    Setup,
+    direction,
+    refuse,
+    refuse_ended,
+    solve,
+    warn_of_missed,
+    words_of_steps,
+)
 from rigidjax.solve.solution import Solution, State, told
 from rigidjax.solve.splitting import AbstractSplitting
 
@@ -219,6 +229,7 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
             ys, stats, result, event_time, event_state = solve_until(setup, event, state0, times)
     except RuntimeError as error:
         raise words_of_steps(setup, state0, times, _checks.bare(error)) from None
+    warn_of_missed(setup, state0, times, stats)
     if setup.throw and "ended" in stats:
         ys = refuse_ended(setup.torque, ys, stats, times)
     motion, own = (ys.motion, ys.own) if isinstance(ys, Coupled) else (ys, None)

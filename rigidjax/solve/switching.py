@@ -60,7 +60,7 @@ _MONOTONE = {
 # does; in a straight line; by rising or falling only; otherwise.
 CONSTANT, PIECES, STRAIGHT, MONOTONE, BENT = range(5)
 
-_MOST = 64  # times of one rounding
+MOST = 64  # times of one law, and of one rounding
 _FEW = 32  # a comparison of more elements is a table
 _FEW_KINKS = 3  # more kinks in one operation cost more steps than they save
 _HALVINGS = {"float64": 62, "float32": 36}
@@ -107,12 +107,12 @@ class Switch(NamedTuple):
     @property
     def most(self) -> int:
         """The number of times at which one element may change, if it only rises or falls."""
-        return _MOST if self.node.name in _LEVELS else 1
+        return MOST if self.node.name in _LEVELS else 1
 
     @property
     def places(self) -> int:
         """The number of changes that are looked for."""
-        return _MOST + 2 * _NEAR if self.degree == BENT else self.size * self.most
+        return MOST + 2 * _NEAR if self.degree == BENT else self.size * self.most
 
     @property
     def exact(self) -> bool:
@@ -221,8 +221,8 @@ def flatten(closed: ClosedJaxpr) -> Program:
 
     inputs = [next(numbers) for _ in closed.jaxpr.invars]
     constants = [next(numbers) for _ in closed.consts]
-    (output,) = enter(closed.jaxpr, constants, inputs, False)
-    return Program(nodes, constants, inner, inputs, output)
+    outputs = enter(closed.jaxpr, constants, inputs, False)
+    return Program(nodes, constants, inner, inputs, outputs[0])
 
 
 def degree_of(node: Node, operands: list[int]) -> int:
@@ -255,7 +255,7 @@ def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
     if not _any_switch(closed.jaxpr, bent=True):
         return None
     program = flatten(closed)
-    degrees, of_state = {program.inputs[0]: STRAIGHT}, {program.inputs[1]}
+    degrees, of_state = {program.inputs[0]: STRAIGHT}, set(program.inputs[1:])
     switches, kinks, by_state, unseen = [], [], [], []
     for node in program.nodes:
         inputs = [i for i in node.inputs if not isinstance(i, Literal)]
@@ -498,15 +498,17 @@ def _cells(watched: _Watched, start: Array, end: Array, known: Array) -> tuple[A
     grid = start + (end - start) * jnp.linspace(0.0, 1.0, max(256, _GRID // size), dtype=dtype)
     if known.shape[0]:
         beside = jnp.nextafter(known, jnp.full_like(known, -jnp.inf))
-        grid = jnp.sort(jnp.concatenate([grid, jnp.clip(jnp.stack([known, beside]), start, end).ravel()]))
+        grid = jnp.sort(
+            jnp.concatenate([grid, jnp.clip(jnp.stack([known, beside]), start, end).ravel()])
+        )
     value, gap = jax.vmap(watched.value)(grid), jax.vmap(watched.gap)(grid)
     changes = jnp.ravel(value[1:] != value[:-1])
     many = jnp.sum(changes)
     # The first of them: `nonzero` takes five times as long to compile.
-    _, cell = lax.top_k(changes.astype(jnp.int32), _MOST)
+    _, cell = lax.top_k(changes.astype(jnp.int32), MOST)
     row, element = cell // size, cell % size
     low = grid[row]
-    high = jnp.where(jnp.arange(_MOST) < many, grid[row + 1], low)
+    high = jnp.where(jnp.arange(MOST) < many, grid[row + 1], low)
     # Between two points it may be met twice, near where the gap comes closest to zero.
     middle, sides = jnp.abs(gap[1:-1]), jnp.stack([jnp.abs(gap[:-2]), jnp.abs(gap[2:])])
     calm = (value[1:-1] == value[:-2]) & (value[1:-1] == value[2:]) & jnp.all(middle <= sides, 0)
@@ -527,7 +529,7 @@ def _cells(watched: _Watched, start: Array, end: Array, known: Array) -> tuple[A
     a, b = lax.fori_loop(0, _HALVINGS[dtype.name], shorter, (left, right))
     lowest = 0.5 * (a + b)
     low, high = jnp.concatenate([low, left, lowest]), jnp.concatenate([high, lowest, right])
-    return low, high, jnp.concatenate([element, which, which]), many > _MOST
+    return low, high, jnp.concatenate([element, which, which]), many > MOST
 
 
 def _halved(
@@ -709,7 +711,7 @@ def stopped(
     found = times_of(analysis, program.closed.consts, a, b)
     stops, each = separated(jnp.concatenate([*declared, found.times]), a, b)
     *sides, own = _split(lax.stop_gradient(each), [*declared, found.times])
-    over, most = found.over, _MOST + sum(times.shape[0] for times in declared)
+    over, most = found.over, MOST + sum(times.shape[0] for times in declared)
     if stops.shape[0] > most:
         stops, over = stops[:most], over | (stops[most] < b)
     more, tree = jax.tree.flatten((sides if likes else [], (own, lax.stop_gradient(found))))
