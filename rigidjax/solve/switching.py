@@ -453,13 +453,13 @@ def _of_steady(watched: _Watched, start: Array, end: Array) -> tuple[Array, ...]
     whole, element, level = _levels(watched.switches)
     first, last = watched.value(start), watched.value(end)
     rise = (last - first)[whole]
-    there = jnp.abs(rise) >= level
+    there = jnp.abs(rise) >= np.asarray(level, rise.dtype)
     low, high = (jnp.full(whole.shape, edge) for edge in (start, end))
     t, _ = _halved(watched, low, high, whole, first[whole], level)
     t, _ = _moving(watched, jnp.where(there, t, end), whole, there)
     once = np.concatenate([np.full(s.places, s.most == 1) for s in watched.switches])
     most = np.concatenate([np.full(s.size, s.most) for s in watched.switches])
-    over = jnp.any((jnp.abs(last - first) > most) & (most > 1))
+    over = jnp.any((jnp.abs(last - first) > most.astype(rise.dtype)) & (most > 1))
     change = jnp.where(there, jnp.where(once, rise, jnp.sign(rise)), 0)
     return t, jnp.asarray(element), change, over
 
@@ -477,7 +477,6 @@ def _levels(switches: list[Switch]) -> tuple[np.ndarray, ...]:
 
 def _of_bent(watched: _Watched, start: Array, end: Array, known: Array) -> tuple[Array, ...]:
     """Return what `_of_steady` does of one switch, by a grid with the `known` times of others."""
-    (switch,) = watched.switches
     low, high, element, over = _cells(watched, start, end, lax.stop_gradient(known))
     base = jax.vmap(lambda t, i: watched.value(t)[i])(low, element)
     t, value = _halved(watched, low, high, element, base, np.full(low.shape, 0.5))
@@ -511,7 +510,7 @@ def _cells(watched: _Watched, start: Array, end: Array, known: Array) -> tuple[A
     high = jnp.where(jnp.arange(MOST) < many, grid[row + 1], low)
     # Between two points it may be met twice, near where the gap comes closest to zero.
     middle, sides = jnp.abs(gap[1:-1]), jnp.stack([jnp.abs(gap[:-2]), jnp.abs(gap[2:])])
-    calm = (value[1:-1] == value[:-2]) & (value[1:-1] == value[2:]) & jnp.all(middle <= sides, 0)
+    calm = (value[1:-1] == value[:-2]) & (value[1:-1] == value[2:]) & jnp.all(middle[None] <= sides, 0)
     depth = jnp.max(sides, 0) - middle + jnp.finfo(dtype).tiny
     nearness, cell = lax.top_k(-jnp.ravel(jnp.where(calm, middle / depth, jnp.inf)), _NEAR)
     row, which = cell // size, cell % size
@@ -541,7 +540,7 @@ def _halved(
     def half(_: Any, ends: Any) -> Any:
         low, high = ends
         middle = low + 0.5 * (high - low)
-        new = jnp.abs(at(middle, element) - base) >= level
+        new = jnp.abs(at(middle, element) - base) >= np.asarray(level, low.dtype)
         return jnp.where(new, low, middle), jnp.where(new, middle, high)
 
     given = lax.stop_gradient((low, high))
