@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Int
 
 from rigidjax import _checks
@@ -34,7 +35,7 @@ from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.momentum import by_momentum, changing, left
 from rigidjax.solve.sides import declared_jumps, on_sides
-from rigidjax.solve.switching import MOST, analysis_of, traced
+from rigidjax.solve.switching import MOST, analysis_of, stopped, traced
 
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
@@ -59,6 +60,8 @@ class Setup(eqx.Module):
     progress_meter: dfx.AbstractProgressMeter
     max_steps: int | None = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
+    # Whether steps end where the law switches: times that increase, and no controller of one's own.
+    stops: bool = eqx.field(static=True, default=False)
 
 
 class Loop(eqx.Module):
@@ -169,6 +172,17 @@ def solve(
     return nan_derivatives(ys, inputs), stats, of_body(result, setup.body)
 
 
+class _OfNumbers(eqx.Module):
+    """A field of the numbers of a state as one of states, for diffrax."""
+
+    constants: Any
+    field: Any = eqx.field(static=True)
+    tree: Any = eqx.field(static=True)
+
+    def __call__(self, t: Any, y: Any, args: object = None) -> Any:
+        return self.tree(self.field(self.constants, t, ravel_pytree(y)[0]))
+
+
 def _by_diffrax(
     setup: Setup, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
@@ -176,14 +190,27 @@ def _by_diffrax(
     form = by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
     state0 = state0 if form is None else form.enter(ts[0], state0)
+    controller, over = setup.controller, None
+    if setup.stops:
+        numbers, tree = ravel_pytree(state0)
+        directed, _, _, jumps = ahead(None, field, None, ts)
+        of_one = lambda t, y, *sides: ravel_pytree(directed(t, tree(y), sides or None))[0]  # noqa: E731
+        ready = stopped(of_one, jumps, ts[0], ts[-1], numbers)
+        over = ready.over
+        if len(ready.constants) > ready.smooth:
+            field = _OfNumbers(ready.constants, ready.field, tree)
+        if ready.stops.size:
+            controller = dfx.ClipStepSizeController(controller, jump_ts=ready.stops)
     term = dfx.ODETerm(field)
     out = dfx.diffeqsolve(
         term, setup.solver, ts[0], ts[-1], setup.dt0, state0,
-        saveat=dfx.SaveAt(subs=subs), stepsize_controller=setup.controller, adjoint=setup.adjoint,
+        saveat=dfx.SaveAt(subs=subs), stepsize_controller=controller, adjoint=setup.adjoint,
         max_steps=setup.max_steps, throw=False, progress_meter=setup.progress_meter,
         event=None if watch is None else dfx.Event(watch),
     )  # fmt: skip
     stats: dict[str, Any] = {k: value for k, value in out.stats.items() if k != "max_steps"}
+    if over is not None:
+        stats["switches_missed"] = over
     (times, *last_time), (ys, *last) = out.ts, out.ys  # pyright: ignore
 
     def reached(leaf: Array) -> Array:

@@ -189,7 +189,11 @@ def _completed(setup: Setup, rtol: Any, atol: Any, times: Array, max_step: Any) 
     solver, control, adjoint, dt0 = setup.solver, setup.controller, setup.adjoint, setup.dt0
     if control is None:
         control = Watched(dfx.PIDController(rtol=rtol, atol=atol, dtmax=max_step))
-        if hasattr(setup.torque, "jump_times") and (jumps := jumps_of(setup.torque)).size:
+        # A splitting looks into the field of a known class.
+        forward = direction(times) is None and not isinstance(solver, AbstractSplitting)
+        setup = dataclasses.replace(setup, stops=forward)
+        declares = not forward and hasattr(setup.torque, "jump_times")
+        if declares and (jumps := jumps_of(setup.torque)).size:
             # An adaptive step may pass over a short pulse.
             jumps = jnp.sort(jumps.astype(times.dtype))
             control = dfx.ClipStepSizeController(control, jump_ts=jumps)

@@ -12,7 +12,7 @@ of a switching time is that of the implicit function `gap(p, t) = 0`.
 import os
 import warnings
 from collections.abc import Callable, Iterator
-from itertools import count, pairwise
+from itertools import count
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,6 +22,7 @@ import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.extend.source_info_util import summarize
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax.solve.batching import Arrays
@@ -390,36 +391,49 @@ class Times(NamedTuple):
     element: Array  # (k,) of the switch
     change: Array  # (k,) of the element's value
     first: Arrays  # the values of the elements of each switch at the start
-    outputs: Arrays  # of the equations at the start
+    outputs: Arrays  # of a search among edges at the start; empty for other switches
     over: Array  # whether an element changes more often than it has places
 
 
 class _Watched(NamedTuple):
-    """Some switches of a program as functions of the time, all their elements in one array."""
+    """A switch of a program with its constants: its `size` elements as functions of the time."""
 
-    analysis: Analysis
-    switches: list[Switch]
+    program: Program
+    switch: Switch
     constants: Arrays
 
-    def operands(self, t: Any) -> list[list[Any]]:
-        """Return the operands and the result of each equation."""
-        wanted = [i for s in self.switches for i in (*s.node.inputs, s.node.outputs[0])]
-        found = evaluator(self.analysis.program, wanted)(self.constants, t)
-        ends = np.cumsum([0, *(len(s.node.inputs) + 1 for s in self.switches)])
-        return [found[i:j] for i, j in pairwise(ends)]
+    @property
+    def still(self) -> "_Watched":
+        """The same switch without derivatives."""
+        return self._replace(constants=lax.stop_gradient(self.constants))
 
-    def _each(self, of: Callable[..., Any], t: Array) -> list[Array]:
-        both = zip(self.switches, self.operands(t), strict=True)
-        return [of(switch, *operands).astype(t.dtype) for switch, operands in both]
-
-    def values(self, t: Array) -> list[Array]:
-        return self._each(_value, t)
+    def operands(self, t: Array) -> list[Any]:
+        """Return the operands and the result of the equation."""
+        node = self.switch.node
+        wanted = [*node.inputs, node.outputs[0]]
+        return evaluator(self.program, wanted)(self.constants, t)
 
     def value(self, t: Array) -> Array:
-        return jnp.concatenate(self.values(t))
+        return _value(self.switch, *self.operands(t)).astype(t.dtype)
 
     def gap(self, t: Array) -> Array:
-        return jnp.concatenate(self._each(_gap, t))
+        return _gap(self.switch, *self.operands(t)).astype(t.dtype)
+
+    def values(self, t: Array, element: Any) -> Array:
+        """Return the value of one element at each of the times t (k,)."""
+        return self._of_each(self.value, t, element)
+
+    def gaps(self, t: Array, element: Any) -> Array:
+        return self._of_each(self.gap, t, element)
+
+    def _of_each(self, of: Callable[[Array], Array], t: Array, element: Any) -> Array:
+        if self.switch.size == 1:
+            return jax.vmap(lambda t: of(t).reshape(()))(t)
+        return jax.vmap(lambda t, i: of(t)[i])(t, element)
+
+
+# Times, elements and changes at the places of a switch, and whether there are more.
+_Places = tuple[Array, Array, Array, Array]
 
 
 def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times:
@@ -427,80 +441,77 @@ def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times
     start, end = lax.stop_gradient((a, b))
     # What changes within some round-off of the start has changed.
     start = start + 8 * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end - start))
-    steady = [s for s in analysis.switches + analysis.kinks if s.degree <= MONOTONE]
-    parts, over, known = {}, jnp.asarray(False), jnp.zeros(0, a.dtype)
-    if steady:
-        watched = _Watched(analysis, steady, constants)
-        *places, over = _of_steady(watched, start, end)
-        known = places[0]
-        ends = np.cumsum([0, *(s.places for s in steady)])
-        for switch, i, j in zip(steady, ends[:-1], ends[1:], strict=True):
-            parts[id(switch)] = [place[i:j] for place in places]
-    for switch in analysis.switches:
-        if switch.degree == BENT:
-            *places, more = _of_bent(_Watched(analysis, [switch], constants), start, end, known)
-            parts[id(switch)], over = places, over | more
-            known = jnp.concatenate([known, places[0]])
-    columns = zip(*(parts[id(switch)] for switch in analysis.switches), strict=True)
-    t, element, change = (jnp.concatenate(column) for column in columns)
-    whole = _Watched(analysis, analysis.switches, constants)
-    outputs = [operands[-1] for operands in whole.operands(start)]
-    return Times(jnp.where(t < end, t, b), element, change, whole.values(start), outputs, over)
+    watched = [_Watched(analysis.program, s, constants) for s in analysis.switches]
+    others = [_Watched(analysis.program, s, constants) for s in analysis.kinks]
+    steady = [one for one in watched + others if one.switch.degree <= MONOTONE]
+    found = _of_steady(steady, start, end)
+    known = [places[0] for places in found]
+    parts: list[_Places] = []
+    for one in watched:
+        if one.switch.degree == BENT:
+            parts.append(_of_bent(one, start, end, known))
+            known.append(parts[-1][0])
+        else:
+            parts.append(found.pop(0))
+    t, element, change = (jnp.concatenate([part[i] for part in parts]) for i in range(3))
+    over = jnp.any(jnp.stack([part[3] for part in parts]))
+    first = [one.still.value(start) for one in watched]
+    outputs = [
+        one.still.operands(start)[-1] if one.switch.node.name == "searchsorted" else start[None][:0]
+        for one in watched
+    ]
+    return Times(jnp.where(t < end, t, b), element, change, first, outputs, over)
 
 
-def _of_steady(watched: _Watched, start: Array, end: Array) -> tuple[Array, ...]:
-    """Return times, elements, changes and whether there are more, of what only rises or falls."""
-    whole, element, level = _levels(watched.switches)
-    first, last = watched.value(start), watched.value(end)
-    rise = (last - first)[whole]
-    there = jnp.abs(rise) >= np.asarray(level, rise.dtype)
-    low, high = (jnp.full(whole.shape, edge) for edge in (start, end))
-    t, _ = _halved(watched, low, high, whole, first[whole], level)
-    t, _ = _moving(watched, jnp.where(there, t, end), whole, there)
-    once = np.concatenate([np.full(s.places, s.most == 1) for s in watched.switches])
-    most = np.concatenate([np.full(s.size, s.most) for s in watched.switches])
-    over = jnp.any((jnp.abs(last - first) > most.astype(rise.dtype)) & (most > 1))
-    change = jnp.where(there, jnp.where(once, rise, jnp.sign(rise)), 0)
-    return t, jnp.asarray(element), change, over
+def _of_steady(watched: list[_Watched], start: Array, end: Array) -> list[_Places]:
+    """Find the changes of what only rises or only falls."""
+    starts, rises, elements, levels = [], [], [], []
+    for one in watched:
+        element, level = (np.ravel(a) for a in np.mgrid[: one.switch.size, 1 : one.switch.most + 1])
+        first, last = one.still.value(start), one.still.value(end)
+        starts, rises = [*starts, first[element]], [*rises, last - first]
+        elements, levels = [*elements, element], [*levels, level.astype(start.dtype)]
+    edges = [(jnp.full(a.shape, start), jnp.full(a.shape, end)) for a in elements]
+    found = _halved(watched, edges, elements, starts, levels)
+    parts = []
+    for one, t, element, level, change in zip(watched, found, elements, levels, rises, strict=True):
+        rise, most = change[element], one.switch.most
+        there = jnp.abs(rise) >= level
+        t, _ = _moving(one, jnp.where(there, t, end), element, there)
+        over = jnp.any(jnp.abs(change) > most) & (most > 1)
+        change = jnp.where(there, rise if most == 1 else jnp.sign(rise), 0)
+        parts.append((t, jnp.asarray(element), change, over))
+    return parts
 
 
-def _levels(switches: list[Switch]) -> tuple[np.ndarray, ...]:
-    """Return the element of each place, through all switches and in its own, and which change."""
-    parts, before = [], 0
-    for switch in switches:
-        element, level = (np.ravel(a) for a in np.mgrid[: switch.size, 1 : switch.most + 1])
-        parts.append((before + element, element, level))
-        before += switch.size
-    whole, element, level = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return whole, element, level
-
-
-def _of_bent(watched: _Watched, start: Array, end: Array, known: Array) -> tuple[Array, ...]:
-    """Return what `_of_steady` does of one switch, by a grid with the `known` times of others."""
-    low, high, element, over = _cells(watched, start, end, lax.stop_gradient(known))
-    base = jax.vmap(lambda t, i: watched.value(t)[i])(low, element)
-    t, value = _halved(watched, low, high, element, base, np.full(low.shape, 0.5))
+def _of_bent(one: _Watched, start: Array, end: Array, known: list[Array]) -> _Places:
+    """Find the changes of a switch by a grid, to which the `known` times of others are added."""
+    before = jnp.concatenate(known) if known else jnp.zeros(0, start.dtype)
+    low, high, element, over = _cells(one.still, start, end, lax.stop_gradient(before))
+    base = one.still.values(low, element)
+    level = np.full(low.shape, 0.5, start.dtype)
+    (t,) = _halved([one], [(low, high)], [element], [base], [level])
+    value = one.still.values(t, element)
     there = value != base
-    t, moves = _moving(watched, jnp.where(there, t, end), element, there)
-    if known.shape[0]:
+    t, moves = _moving(one, jnp.where(there, t, end), element, there)
+    if known:
         # Where an operand jumps, the switch moves as that jump does.
-        near = jnp.argmin(jnp.abs(known[None] - t[:, None]), 1)
-        still = lax.stop_gradient(t)
-        there_too = jnp.abs(known[near] - still) <= 8 * jnp.finfo(t.dtype).eps * jnp.abs(still)
-        t = jnp.where(there & ~moves & there_too, known[near], t)
+        near, still = jnp.argmin(jnp.abs(before[None] - t[:, None]), 1), lax.stop_gradient(t)
+        same = jnp.abs(before[near] - still) <= 8 * jnp.finfo(t.dtype).eps * jnp.abs(still)
+        t = jnp.where(there & ~moves & same, before[near], t)
     return t, element, jnp.where(there, value - base, 0), over
 
 
-def _cells(watched: _Watched, start: Array, end: Array, known: Array) -> tuple[Array, ...]:
+def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array, ...]:
     """Return intervals (k,) in which an element changes once, the element, and whether all fit."""
-    size, dtype = watched.switches[0].size, start.dtype
+    size, dtype = one.switch.size, start.dtype
     grid = start + (end - start) * jnp.linspace(0.0, 1.0, max(256, _GRID // size), dtype=dtype)
     if known.shape[0]:
         beside = jnp.nextafter(known, jnp.full_like(known, -jnp.inf))
         grid = jnp.sort(
             jnp.concatenate([grid, jnp.clip(jnp.stack([known, beside]), start, end).ravel()])
         )
-    value, gap = jax.vmap(watched.value)(grid), jax.vmap(watched.gap)(grid)
+    value, gap = jax.vmap(one.value)(grid), jax.vmap(one.gap)(grid)
     changes = jnp.ravel(value[1:] != value[:-1])
     many = jnp.sum(changes)
     # The first of them: `nonzero` takes five times as long to compile.
@@ -510,19 +521,21 @@ def _cells(watched: _Watched, start: Array, end: Array, known: Array) -> tuple[A
     high = jnp.where(jnp.arange(MOST) < many, grid[row + 1], low)
     # Between two points it may be met twice, near where the gap comes closest to zero.
     middle, sides = jnp.abs(gap[1:-1]), jnp.stack([jnp.abs(gap[:-2]), jnp.abs(gap[2:])])
-    calm = (value[1:-1] == value[:-2]) & (value[1:-1] == value[2:]) & jnp.all(middle[None] <= sides, 0)
+    calm = (
+        (value[1:-1] == value[:-2]) & (value[1:-1] == value[2:]) & jnp.all(middle[None] <= sides, 0)
+    )
     depth = jnp.max(sides, 0) - middle + jnp.finfo(dtype).tiny
     nearness, cell = lax.top_k(-jnp.ravel(jnp.where(calm, middle / depth, jnp.inf)), _NEAR)
     row, which = cell // size, cell % size
     left = grid[row]
     right = jnp.where(jnp.isfinite(nearness), grid[row + 2], left)
     sign = jnp.sign(gap[row + 1, which])
-    distance = jax.vmap(lambda t, i, sign: sign * watched.gap(t)[i])
 
     def shorter(_: Any, ends: Any) -> Any:
         left, right = ends
         third = (right - left) / 3
-        falls = distance(left + third, which, sign) > distance(right - third, which, sign)
+        ends = (one.gaps(t, which) for t in (left + third, right - third))
+        falls = sign * next(ends) > sign * next(ends)
         return jnp.where(falls, left + third, left), jnp.where(falls, right, right - third)
 
     a, b = lax.fori_loop(0, _HALVINGS[dtype.name], shorter, (left, right))
@@ -532,39 +545,44 @@ def _cells(watched: _Watched, start: Array, end: Array, known: Array) -> tuple[A
 
 
 def _halved(
-    watched: _Watched, low: Array, high: Array, element: Any, base: Array, level: Any
-) -> tuple[Array, Array]:
-    """Return the first times (k,) at which an element is so far from its `base`; its value then."""
-    at = jax.vmap(lambda t, i: watched.value(t)[i])
+    watched: list[_Watched], edges: Any, elements: Any, bases: list[Array], levels: Any
+) -> list[Array]:
+    """Return the first times (k,) at which elements are so far from their bases, of each switch."""
 
-    def half(_: Any, ends: Any) -> Any:
-        low, high = ends
-        middle = low + 0.5 * (high - low)
-        new = jnp.abs(at(middle, element) - base) >= np.asarray(level, low.dtype)
-        return jnp.where(new, low, middle), jnp.where(new, middle, high)
+    def half(_: Any, edges: Any) -> Any:
+        halves = []
+        for one, (low, high), element, base, level in zip(
+            watched, edges, elements, bases, levels, strict=True
+        ):
+            middle = low + 0.5 * (high - low)
+            new = jnp.abs(one.still.values(middle, element) - base) >= level
+            halves.append((jnp.where(new, low, middle), jnp.where(new, middle, high)))
+        return halves
 
-    given = lax.stop_gradient((low, high))
-    t = lax.fori_loop(0, _HALVINGS[low.dtype.name], half, given)[1]
-    return t, at(t, element)
+    if not watched:
+        return []
+    edges = lax.stop_gradient(edges)
+    count = _HALVINGS[edges[0][0].dtype.name]
+    return [high for _, high in lax.fori_loop(0, count, half, edges)]
 
 
-def _moving(watched: _Watched, t: Array, element: Any, there: Array) -> tuple[Array, Array]:
+def _moving(one: _Watched, t: Array, element: Any, there: Array) -> tuple[Array, Array]:
     """Return the times with the derivatives of implicit functions, and whether they have some."""
-    gap = jax.vmap(lambda t, i: watched.gap(t)[i])
-    bent = any(s.degree == BENT for s in watched.switches)
-    t, moves, slope = lax.stop_gradient(t), there, jnp.zeros_like(t)
-    still, here = t, jnp.zeros_like(t)
+    degree = one.switch.degree
+    still, moves, slope, here = lax.stop_gradient(t), there, jnp.zeros_like(t), jnp.zeros_like(t)
+    t = still
     # Each step of Newton's method of value zero adds an order of derivatives.
-    for _ in range(1 if all(s.degree == STRAIGHT for s in watched.switches) else 2):
-        here, slope = jax.jvp(lambda t: gap(t, element), (t,), (jnp.ones_like(t),))
+    for _ in range(1 if degree == STRAIGHT else 2):
+        gaps = lambda t: one.gaps(t, element)  # noqa: E731
+        here, slope = jax.jvp(gaps, (t,), (jnp.ones_like(t),))
         moves = moves & jnp.isfinite(slope) & (slope != 0)
         rise = here - lax.stop_gradient(here)
         t = t - jnp.where(moves, rise / jnp.where(moves, slope, 1), 0)
-    if bent:
+    if degree == BENT:
         # A jump of the operand itself is no zero of its gap.
         beside = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
         step, eps = jnp.abs(slope) * (still - beside), jnp.finfo(t.dtype).eps
-        jump = jnp.abs(here - gap(beside, element))
+        jump = jnp.abs(here - one.gaps(beside, element))
         moves = moves & (jump <= 64 * (step + eps * (1 + jnp.abs(here))))
     return t, moves
 
@@ -585,15 +603,17 @@ class _Side(NamedTuple):
         """Return the result at the time `inputs[0]`, from the stops and values `inputs[-1]`."""
         node, (stops, found) = self.switch.node, inputs[-1]
         past = inputs[0] >= stops[self.places]
-        steps = jnp.where(past, found.change[self.places], 0)
-        if self.switch.size > 1:
-            own = found.element[self.places][None] == np.arange(self.switch.size)[:, None]
-            steps = jnp.sum(jnp.where(own, steps[None], 0), 1)
+        steps, size = jnp.where(past, found.change[self.places], 0), self.switch.size
+        if self.switch.degree < BENT:
+            steps = steps.reshape(size, -1)
         else:
-            steps = jnp.sum(steps)
+            element = found.element[self.places][None]
+            own = element == np.arange(size, dtype=element.dtype)[:, None]
+            steps = jnp.where(own, steps[None], 0)
+        steps = jnp.sum(steps, 1)
         here, out = found.first[self.number] + steps, node.shapes[0]
         if node.name == "searchsorted":
-            return found.outputs[self.number] - jnp.sum(steps).astype(out.dtype)
+            return (found.outputs[self.number] - jnp.sum(steps)).astype(out.dtype)
         operands = [read(i) for i in self.reads]
         if node.name in _COMPARISONS:
             here = here > 0.5
@@ -604,7 +624,7 @@ class _Side(NamedTuple):
         if self.switch.exact:
             return here
         params = node.primitive.get_bind_params(node.params)
-        return jnp.where(found.over, node.primitive.bind(*operands, **params), here)
+        return jnp.where(found.over > 0, node.primitive.bind(*operands, **params), here)
 
 
 def by_sides(analysis: Analysis) -> Callable[..., Array]:
@@ -626,15 +646,22 @@ def separated(times: Array, a: Array, b: Array) -> tuple[Array, Array]:
     """
     inside = (times > a) & (times < b)
     t = jnp.where(inside, times, jnp.where(times <= a, a, b))
-    order = jnp.argsort(lax.stop_gradient(t), stable=True)
-    t, inside = t[order], inside[order]
     still, last = lax.stop_gradient((t, b))
+    count = np.arange(t.shape[0])
+    # Comparisons of few with each other are quicker than a sort.
+    earlier = still[None] < still[:, None]
+    earlier = earlier | ((still[None] == still[:, None]) & (count[None] < count[:, None]))
+    rank = jnp.sum(earlier, 1)
+    here = rank[None] == count[:, None]
+    ordered = lambda a: jnp.sum(jnp.where(here, a[None], 0), 1)  # noqa: E731
+    t = ordered(t)
+    still, inside = lax.stop_gradient(t), ordered(inside) > 0
     gap = 4 * jnp.finfo(t.dtype).eps * lax.stop_gradient(jnp.maximum(jnp.abs(a), jnp.abs(b)))
-    shift = gap * jnp.arange(t.shape[0]).astype(t.dtype)
+    shift = gap * count.astype(t.dtype)
     pushed = lax.cummax(jnp.where(inside, still - shift, -jnp.inf)) + shift
     apart = jnp.where(inside, jnp.maximum(still, jnp.minimum(pushed, last)), still)
     t = t + (apart - still)
-    return t, t[jnp.argsort(order)]
+    return t, t[rank]
 
 
 def say_unseen(analysis: Analysis) -> None:
@@ -713,12 +740,14 @@ def stopped(
     over, most = found.over, MOST + sum(times.shape[0] for times in declared)
     if stops.shape[0] > most:
         stops, over = stops[:most], over | (stops[most] < b)
-    more, tree = jax.tree.flatten((sides if likes else [], (own, lax.stop_gradient(found))))
-    field = by_sides(analysis)
+    # As one array: a loop that carries many is slower.
+    places = lax.stop_gradient((own, found._replace(times=own[:0])))
+    one, unpacked = ravel_pytree(jax.tree.map(lambda leaf: leaf.astype(a.dtype), places))
+    more, field = [*(sides if likes else []), one], by_sides(analysis)
 
     def call(given: Arrays, t: Array, y: Array) -> Array:
-        sides, places = tree.unflatten(given[number:])
-        return field(program.consts(given[:number]), t, y, *sides, places)
+        *sides, one = given[number:]
+        return field(program.consts(given[:number]), t, y, *sides, unpacked(one))
 
     return Stopped(call, [*program.constants, *more], number, stops, over)
 
