@@ -60,8 +60,9 @@ class Setup(eqx.Module):
     progress_meter: dfx.AbstractProgressMeter
     max_steps: int | None = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
-    # Whether steps end where the law switches: times that increase, and no controller of one's own.
+    # Whether steps end where the law switches, in s = σt: under no controller of one's own.
     stops: bool = eqx.field(static=True, default=False)
+    sign: Array | None = None  # σ as of `Loop`
 
 
 class Loop(eqx.Module):
@@ -186,27 +187,28 @@ class _OfNumbers(eqx.Module):
 def _by_diffrax(
     setup: Setup, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
-    subs = [dfx.SubSaveAt(ts=ts)] + [dfx.SubSaveAt(t1=True)] * (watch is not None)
     form = by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
     state0 = state0 if form is None else form.enter(ts[0], state0)
-    controller, over = setup.controller, None
+    controller, over, along, ends = setup.controller, None, ts, watch
     if setup.stops:
         numbers, tree = ravel_pytree(state0)
-        directed, _, _, jumps = ahead(None, field, None, ts)
-        of_one = lambda t, y, *sides: ravel_pytree(directed(t, tree(y), sides or None))[0]  # noqa: E731
-        ready = stopped(of_one, jumps, ts[0], ts[-1], numbers)
+        directed, ends, along, jumps = ahead(setup.sign, field, watch, ts)
+        of_one = lambda s, y, *sides: ravel_pytree(directed(s, tree(y), sides or None))[0]  # noqa: E731
+        ready = stopped(of_one, jumps, along[0], along[-1], numbers)
         over = ready.over
-        if len(ready.constants) > ready.smooth:
+        if setup.sign is not None or len(ready.constants) > ready.smooth:
             field = _OfNumbers(ready.constants, ready.field, tree)
         if ready.stops.size:
             controller = dfx.ClipStepSizeController(controller, jump_ts=ready.stops)
+    subs = [dfx.SubSaveAt(ts=along)] + [dfx.SubSaveAt(t1=True)] * (watch is not None)
+    event = None if ends is None else dfx.Event(lambda t, y, args, **_: ends(t, y))
     term = dfx.ODETerm(field)
     out = dfx.diffeqsolve(
-        term, setup.solver, ts[0], ts[-1], setup.dt0, state0,
+        term, setup.solver, along[0], along[-1], setup.dt0, state0,
         saveat=dfx.SaveAt(subs=subs), stepsize_controller=controller, adjoint=setup.adjoint,
         max_steps=setup.max_steps, throw=False, progress_meter=setup.progress_meter,
-        event=None if watch is None else dfx.Event(watch),
+        event=event,
     )  # fmt: skip
     stats: dict[str, Any] = {k: value for k, value in out.stats.items() if k != "max_steps"}
     if over is not None:
@@ -223,6 +225,8 @@ def _by_diffrax(
         # Equal steps look at no error, and would go on with NaN.
         ill = (result == dfx.RESULTS.successful) & ~finite(ys)
         result = dfx.RESULTS.where(ill, NONFINITE, result)
+    if setup.stops and setup.sign is not None:
+        last_time = [setup.sign.astype(ts.dtype) * t for t in last_time]
     end = jax.tree.map(lambda leaf: leaf[0], (*last_time, *last))
     return ys, stats, result, end
 

@@ -15,7 +15,6 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame
 from rigidjax.motion.coupled import Coupled
-from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import validation
 from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.error import error_of_run, solve_to
@@ -189,14 +188,9 @@ def _completed(setup: Setup, rtol: Any, atol: Any, times: Array, max_step: Any) 
     solver, control, adjoint, dt0 = setup.solver, setup.controller, setup.adjoint, setup.dt0
     if control is None:
         control = Watched(dfx.PIDController(rtol=rtol, atol=atol, dtmax=max_step))
-        # A splitting looks into the field of a known class.
-        forward = direction(times) is None and not isinstance(solver, AbstractSplitting)
-        setup = dataclasses.replace(setup, stops=forward)
-        declares = not forward and hasattr(setup.torque, "jump_times")
-        if declares and (jumps := jumps_of(setup.torque)).size:
-            # An adaptive step may pass over a short pulse.
-            jumps = jnp.sort(jumps.astype(times.dtype))
-            control = dfx.ClipStepSizeController(control, jump_ts=jumps)
+        # A splitting looks into the field, of a known class.
+        stops = not isinstance(solver, AbstractSplitting)
+        setup = dataclasses.replace(setup, stops=stops, sign=direction(times))
     elif isinstance(control, dfx.AbstractAdaptiveStepSizeController):
         control = Watched(control)
     # Ours project inside their one kernel; a second time outside of it breaks the kernel up.
@@ -206,7 +200,8 @@ def _completed(setup: Setup, rtol: Any, atol: Any, times: Array, max_step: Any) 
         rtol = getattr(control, "rtol", None)
         tight = rtol is not None and _checks.known(rtol) and float(rtol) < _TIGHT
         adjoint = _EVERY_STEP if tight else ADJOINT
-    dt0 = None if dt0 is None else dt0 * jnp.sign(times[-1] - times[0])
+    if dt0 is not None and not setup.stops:
+        dt0 = dt0 * jnp.sign(times[-1] - times[0])
     new = dict(solver=solver, controller=control, adjoint=adjoint, dt0=dt0)
     return dataclasses.replace(setup, **new)
 
