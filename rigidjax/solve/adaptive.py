@@ -20,7 +20,7 @@ from rigidjax.solve.adaptive_loop import HALTED, LoopState, Method, Record, Run,
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import linear_map, refuse
-from rigidjax.solve.switching import stopped, traced
+from rigidjax.solve.stops import stopped, traced
 
 
 class Found(NamedTuple):
@@ -60,10 +60,11 @@ def adaptive(
 
     **Arguments:** `solver` an explicit method of this package; `field` a vector field
     `f(t, y, args)` as of `equations_of_motion`; `ts` (T,) s; `y0` the state at `ts[0]`; `rtol`,
-    `atol` scalars; `dt0` the first step and `max_step` the longest, s, or `None`; `jumps` times, s, in any order, at which the
-    field jumps: steps end there (several arrays: one of each part, whose stops it then gets as its
-    `args`); what the field compares with the time itself is found; `halt(t, y)` a condition, tested after each step, that ends the
-    run. Derivatives are by all numbers of the field, `ts`, `jumps` and `y0`, lengths of steps held.
+    `atol` scalars; `dt0` the first step and `max_step` the longest, s, or `None`; `jumps` times,
+    s, in any order, at which the field jumps: steps end there (several arrays: one of each part of
+    the field, which gets the stops of each as its `args`); times with which the field compares the
+    time itself are found; `halt(t, y)` a condition, tested after each step, that ends the run.
+    Derivatives are by all numbers of the field, `ts`, `jumps` and `y0`, lengths of steps held.
 
     **Returns** a `Found`. A run that needs more than `max_steps`, is halted, or meets a NaN that no
     shorter step avoids, ends early: its `result` says so, and the states not reached are NaN.
@@ -79,7 +80,8 @@ def adaptive(
     validation.one_dtype((ts, y0), "ts, y0")
     numbers, tree = ravel_pytree(y0)
     of_one = lambda t, y, *sides: ravel_pytree(field(t, tree(y), sides or None))[0]  # noqa: E731
-    declared = [] if jumps is None else list(jumps) if isinstance(jumps, list | tuple) else [jumps]
+    declared: Any = [] if jumps is None else jumps
+    declared = list(declared) if isinstance(declared, list | tuple) else [declared]
     ready = stopped(of_one, declared, ts[0], ts[-1], numbers)
     constants, ends, count = ready.constants, None, len(ready.constants)
     if halt is not None:

@@ -50,7 +50,7 @@ from rigidjax.solve.run import (
     equations_of_motion,
     solve,
 )
-from rigidjax.solve.switching import stopped
+from rigidjax.solve.stops import stopped
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 

@@ -60,7 +60,7 @@ class ByMomentum(eqx.Module):
     def _with_rate(self, y: Any, rate: Any, t: Any) -> Any:
         motion, own = motion_of(y), y.own if isinstance(y, Coupled) else ()
         dtype = motion.omega.dtype
-        inner = self.field.field if isinstance(self.field, CoupledEquations) else self.field
+        inner: Any = self.field.field if isinstance(self.field, CoupledEquations) else self.field
         now = freeze(inner.law, own).tensor(jnp.asarray(t, dtype)) if own else inner.law.tensor(t)
         fixed = tensor_of(inner.body).astype(dtype)
         omega = rate(now.astype(dtype), fixed, motion.omega)

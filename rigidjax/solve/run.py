@@ -35,7 +35,8 @@ from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.momentum import by_momentum, changing, left
 from rigidjax.solve.sides import declared_jumps, on_sides
-from rigidjax.solve.switching import MOST, analysis_of, stopped, traced
+from rigidjax.solve.stops import stopped, traced
+from rigidjax.solve.switching import MOST, analysis_of
 
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
@@ -134,7 +135,9 @@ def ahead(
 
     The field takes the stops of its parts that jump, in s, as its third argument (see `adaptive`).
     """
-    time = lambda s: s if sign is None else sign.astype(s.dtype) * s  # noqa: E731
+
+    def time(s: Array) -> Array:
+        return s if sign is None else sign.astype(s.dtype) * s
 
     def directed(s: Array, y: Any, sides: Any = None) -> Any:
         sided = on_sides(field, sign, None if sides is None else [time(side) for side in sides])
@@ -255,14 +258,15 @@ def _loop(
 
 
 _INERTIA = (
-    "simulate: the motion under ChangingInertia became NaN or infinite. Is inertia(t) the tensor of "
-    "a body at every time of the run: symmetric, with positive moments of which none exceeds the "
-    "sum of the other two? throw=False keeps what came before"
+    "simulate: the motion under ChangingInertia became NaN or infinite. Is inertia(t) the tensor "
+    "of a body at every time of the run: symmetric, with positive moments of which none exceeds "
+    "the sum of the other two? throw=False keeps what came before"
 )
 _MANY_STEPS = (
     "simulate: the maximum number of solver steps, max_steps, did not reach the last time. Has the "
-    "motion many turns? then give a larger one. Does a law switch by the state (sign, where) and hold it there? then no "
-    "number of steps is enough: smooth the switch, or end the run there by an Event"
+    "motion many turns? then give a larger one. Does a law switch by the state (sign, where) and "
+    "hold it there? then no number of steps is enough: smooth the switch, or end the run there by "
+    "an Event"
 )
 _WORDS = (
     (dfx.RESULTS.max_steps_reached, _MANY_STEPS),

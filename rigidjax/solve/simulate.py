@@ -77,8 +77,11 @@ def simulate(
       body. For many, `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`; with
       `throw=False` return `.result`, too: one for each body.
     - `ts`: (T,) increasing times, s, or decreasing ones, backwards in time. The first is the start.
-    - `torque`: a torque of `rigidjax.torques` (the stepper gets the jumps of a schedule), or any
-      callable Module `(t, state, body) → (3,)`, N m, body frame; `None` for a free body. A torque's
+    - `torque`: a torque of `rigidjax.torques`, or any callable Module `(t, state, body) → (3,)`,
+      N m, body frame; `None` for a free body. Steps end where it declares jumps (`jump_times`), and
+      where it compares the time with what no state changes (`jnp.where(t < te, …)`): such times are
+      found before the run, and have derivatives. Steps do not end at switches by the state, and
+      their derivatives are lost: end a run there by an `event`, and begin another. A torque's
       own states (`rigidjax.torques.AbstractTorque`) are in `own`. For a `Point` it is a scene of
       `rigidjax.scenes`, a `MovingFrame`, or a force per mass `(t, state, None) → (3,)`, m/s².
     - `solver`: `None` is the cheapest accurate choice: the closed form (`rigidjax.exact`) for a

@@ -16,7 +16,8 @@ from once import once
 
 import rigidjax as rj
 from rigidjax import torques
-from rigidjax.solve.switching import analysis_of, traced
+from rigidjax.solve.stops import traced
+from rigidjax.solve.switching import analysis_of
 
 AXIS = np.array([0.0, 0.0, 1.0])
 BODY = rj.Inertia.from_principal(1.0, 1.0, 2.0)

@@ -84,8 +84,11 @@ class ChangingInertia(eqx.Module):
 
     **Arguments:** `inertia` kg m², body frame, about the point that the body turns about (the
     centre of mass of a `Rigid`): a function of time, t → (3, 3), such as `Linear(times, tensors)`,
-    or a Module with `feels` (as torques have) of `(t, state, body)`, such as `Tide`. Its derivative
-    along the motion is taken: it must not jump (`Held`). `torque` all other torques, or `None`:
+    or a Module with `feels` (as torques have) of `(t, state, body)`, such as `Tide`. `simulate`
+    integrates the momentum under a function of time: where it jumps, `jnp.where(t < t1, I0, I1)`,
+    the momentum stays. Elsewhere (`rigidjax.batch.rollout`), and of a Module with `feels`, the
+    derivative along the motion is taken, which has no jumps. A tensor of no body (not symmetric,
+    moments that are not positive or break the triangle inequality) is NaN, and ends the run. `torque` all other torques, or `None`:
     give them here, not beside it in a `Sum`, because their τ acts on I, and they get the body with
     I.
 
