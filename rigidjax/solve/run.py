@@ -141,10 +141,7 @@ def ahead(
 
     def directed(s: Array, y: Any, sides: Any = None) -> Any:
         sided = on_sides(field, sign, None if sides is None else [time(side) for side in sides])
-        slope = sided(time(s), y, None)
-        if sign is None:
-            return slope
-        return jax.tree.map(lambda leaf: sign.astype(leaf.dtype) * leaf, slope)
+        return jax.tree.map(time, sided(time(s), y, None))
 
     asked = None if condition is None else lambda s, y: condition(time(s), y)
     return directed, asked, time(ts), [time(jumps) for jumps in declared_jumps(field)]

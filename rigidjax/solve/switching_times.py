@@ -153,7 +153,7 @@ def _of_steady(watched: list[_Watched], start: Array, end: Array) -> list[_Place
         t, _ = _moving(one, jnp.where(there, t, end), element, there)
         over = jnp.any(jnp.abs(change) > most) & (most > 1)
         change = jnp.where(there, rise if most == 1 else jnp.sign(rise), 0)
-        parts.append((t, jnp.asarray(element), change, over))
+        parts.append((t, jnp.asarray(element, jnp.int32), change, over))
     return parts
 
 
@@ -328,7 +328,7 @@ def separated(times: Array, a: Array, b: Array) -> tuple[Array, Array]:
     here = rank[None] == count[:, None]
     ordered = lambda a: jnp.sum(jnp.where(here, a[None], 0), 1)  # noqa: E731
     t = ordered(t)
-    still, inside = lax.stop_gradient(t), ordered(inside) > 0
+    still, inside = lax.stop_gradient(t), ordered(inside.astype(t.dtype)) > 0
     gap = 4 * jnp.finfo(t.dtype).eps * lax.stop_gradient(jnp.maximum(jnp.abs(a), jnp.abs(b)))
     shift = gap * count.astype(t.dtype)
     pushed = lax.cummax(jnp.where(inside, still - shift, -jnp.inf)) + shift
