@@ -88,9 +88,9 @@ class ChangingInertia(eqx.Module):
     integrates the momentum under a function of time: where it jumps, `jnp.where(t < t1, I0, I1)`,
     the momentum stays. Elsewhere (`rigidjax.batch.rollout`), and of a Module with `feels`, the
     derivative along the motion is taken, which has no jumps. A tensor of no body (not symmetric,
-    moments that are not positive or break the triangle inequality) is NaN, and ends the run. `torque`
-    all other torques, or `None`: give them here, not beside it in a `Sum`, because their τ acts on
-    I, and they get the body with I.
+    moments that are not positive or break the triangle inequality) is NaN, and ends the run.
+    `torque` all other torques, or `None`: give them here, not beside it in a `Sum`, because their
+    τ acts on I, and they get the body with I.
 
     A function of time replaces the inertia of the body given to `simulate`. Parts that move inside
     must have no momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend
