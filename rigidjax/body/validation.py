@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
 from rigidjax._types import Quat, Quaternion
@@ -190,6 +190,14 @@ def _faults(xp: Any, tensor: Any, thin: bool) -> tuple[Any, Any, Any]:
     # The product of the two larger moments is 1/9 to 1/4 of the squared trace.
     determinant = xx * (yy * zz - squares[2]) - yy * squares[1] - zz * squares[0] + product
     return ~some | ~(determinant > 0.125 * slack), broken, skew
+
+
+def is_real(tensor: Float[Array, "*batch 3 3"]) -> Bool[Array, "*batch"]:
+    """Return whether some mass has this inertia tensor, kg m², with no moment of zero."""
+    a = lax.stop_gradient(tensor)
+    flat, broken = _impossible(jnp, a, _slack(a))
+    skew = jnp.abs(a - a.swapaxes(-1, -2)).max(axis=(-1, -2))
+    return ~(flat | broken) & (skew <= _slack(a) * jnp.abs(a).max(axis=(-1, -2)))
 
 
 def unit_quaternion(q: Quaternion) -> Quat:

@@ -1,6 +1,6 @@
 """A run with adaptive steps as one function of numbers, differentiable in both modes, batched."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -8,6 +8,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jax.flatten_util import ravel_pytree
@@ -19,13 +20,16 @@ from rigidjax.solve.adaptive_loop import HALTED, LoopState, Method, Record, Run,
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import linear_map, refuse
+from rigidjax.solve.stops import stopped, traced
 
 
 class Found(NamedTuple):
     """The result of `adaptive`.
 
     **Fields:** `ys` the states at `ts`; `num_steps` accepted and rejected, `num_rejected` of these;
-    `result` a `diffrax.RESULTS`; `last` the state at the end, `last_time`.
+    `result` a `diffrax.RESULTS`; `last` the state at the end, `last_time`, and
+    `next_step`, the length of the step that would follow; `over` whether a part
+    switches by the time more often than is looked for (`None`: nothing does).
     """
 
     ys: Any
@@ -34,6 +38,8 @@ class Found(NamedTuple):
     result: dfx.RESULTS
     last_time: Array
     last: Any
+    next_step: Array
+    over: Array | None
 
 
 def adaptive(
@@ -45,17 +51,20 @@ def adaptive(
     rtol: Any,
     atol: Any,
     dt0: Any = None,
+    max_step: Any = None,
     max_steps: int = 100_000,
-    jumps: Array | None = None,
+    jumps: Array | Sequence[Array] | None = None,
     halt: Callable[..., Any] | None = None,
 ) -> Found:
     """The states at `ts`, with adaptive steps, controlled as by `diffrax.PIDController`.
 
     **Arguments:** `solver` an explicit method of this package; `field` a vector field
     `f(t, y, args)` as of `equations_of_motion`; `ts` (T,) s; `y0` the state at `ts[0]`; `rtol`,
-    `atol` scalars; `dt0` the first step, s, or `None`; `jumps` times, s, in any order, at which the
-    field jumps: steps end there; `halt(t, y)` a condition, tested after each step, that ends the
-    run. Derivatives are by all numbers of the field, `ts`, `jumps` and `y0`, lengths of steps held.
+    `atol` scalars; `dt0` the first step and `max_step` the longest, s, or `None`; `jumps` times,
+    s, in any order, at which the field jumps: steps end there (several arrays: one of each part of
+    the field, which gets the stops of each as its `args`); times with which the field compares the
+    time itself are found; `halt(t, y)` a condition, tested after each step, that ends the run.
+    Derivatives are by all numbers of the field, `ts`, `jumps` and `y0`, lengths of steps held.
 
     **Returns** a `Found`. A run that needs more than `max_steps`, is halted, or meets a NaN that no
     shorter step avoids, ends early: its `result` says so, and the states not reached are NaN.
@@ -70,40 +79,46 @@ def adaptive(
     """
     validation.one_dtype((ts, y0), "ts, y0")
     numbers, tree = ravel_pytree(y0)
-    functions: list[Any] = [lambda t, y: ravel_pytree(field(t, tree(y), None))[0]]
+    of_one = lambda t, y, *sides: ravel_pytree(field(t, tree(y), sides or None))[0]  # noqa: E731
+    declared: Any = [] if jumps is None else jumps
+    declared = list(declared) if isinstance(declared, list | tuple) else [declared]
+    ready = stopped(of_one, declared, ts[0], ts[-1], numbers)
+    constants, ends, count = ready.constants, None, len(ready.constants)
     if halt is not None:
-        functions.append(lambda t, y: halt(t, tree(y)))
-    (of_one, *ended), constants, count = taken_out(functions, ts[0], numbers)
-    # The condition that ends a run has no derivative.
-    smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
+        condition = traced(lambda t, y: halt(t, tree(y)), ts[0], numbers)
+        constants = constants + condition.constants
+        ends = lambda given, t, y: condition.call(given[count:], t, y)  # noqa: E731
+    # Neither the condition that ends a run nor the side of a switch has a derivative.
+    smooth = [i < ready.smooth and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
     project = lambda y: ravel_pytree(on_the_group(tree(y)))[0]  # noqa: E731
     sizes = [leaf.size for leaf in jax.tree.leaves(y0)]
-    ends = ended[0] if ended else None
-    method = Method(solver.tableau, of_one, project, ends, sizes, max_steps)
-    stops = ts[-1:]
-    if jumps is not None and jumps.size:
-        inside = jnp.clip(jnp.sort(jumps.astype(ts.dtype)), ts[0], ts[-1])
-        stops = jnp.concatenate([inside, stops])
+    of_field = lambda given, t, y: ready.field(given[:count], t, y)  # noqa: E731
+    method = Method(solver.tableau, of_field, project, ends, sizes, max_steps)
+    stops = jnp.concatenate([ready.stops, ts[-1:]]) if ready.stops.size else ts[-1:]
     rtol, atol = (jnp.asarray(a, ts.dtype) for a in (rtol, atol))
     h0 = jnp.asarray(jnp.nan if dt0 is None else dt0, ts.dtype)
-    run = Run(ts[0], stops, ts[1:-1], numbers, rtol, atol, h0)
+    longest = lax.stop_gradient(jnp.asarray(jnp.inf if max_step is None else max_step, ts.dtype))
+    run = Run(ts[0], stops, ts[1:-1], numbers, rtol, atol, h0, longest)
     between, end = _solved(method, smooth, constants, run)
     result = outcome(end.h, end.t, ts[-1], end.h == HALTED)
     last = jnp.where(end.t >= ts[-1], end.y, jnp.nan)
     ys = jax.vmap(tree)(jnp.concatenate([numbers[None], between, last[None]]))
-    return Found(ys, end.steps, end.rejected, result, end.t, tree(lax.stop_gradient(end.y)))
+    state = tree(lax.stop_gradient(end.y))
+    return Found(ys, end.steps, end.rejected, result, end.t, state, end.h, ready.over)
 
 
 def taken_out(
     functions: list[Callable[..., Any]], *like: Any
-) -> tuple[list[Callable[..., Any]], Arrays, int]:
-    """Each function as `f(constants, *args)`; the constants of all, and how many the first has."""
-    closed = [eqx.filter_closure_convert(function, *like) for function in functions]
-    arrays, rest = eqx.partition(closed, eqx.is_array)
-    constants, tree = jax.tree.flatten(arrays)
-    call = lambda i, constants, *args: eqx.combine(tree.unflatten(constants), rest)[i](*args)  # noqa: E731
-    calls = [partial(call, i) for i in range(len(closed))]
-    return calls, constants, len(jax.tree.leaves(arrays[0]))
+) -> tuple[list[Callable[..., Any]], Arrays]:
+    """Each function as `f(constants, *args)`, and the constants of all."""
+    programs = [traced(function, *like) for function in functions]
+    ends = np.cumsum([0, *(len(program.constants) for program in programs)])
+
+    def call(i: int, constants: Arrays, *args: Any) -> Any:
+        return programs[i].call(constants[ends[i] : ends[i + 1]], *args)
+
+    calls = [partial(call, i) for i in range(len(programs))]
+    return calls, [c for program in programs for c in program.constants]
 
 
 def _solved(

@@ -58,6 +58,7 @@ class Run(NamedTuple):
     rtol: Array
     atol: Array
     h0: Array  # the first step, NaN to choose one
+    longest: Array  # step
 
     @property
     def before(self) -> Array:
@@ -281,7 +282,9 @@ def start(method: Method, constants: Arrays, run: Run) -> LoopState:
     if method.halt is not None:
         h = jnp.where(method.halt(t0, y0), HALTED, h)
     zero = jnp.zeros(t0.shape, jnp.int32)
-    return LoopState(y0, t0, lax.stop_gradient(h), zero, zero, zero)
+    # Stops at the start or behind it need no step.
+    behind = jnp.sum(run.stops[:-1] <= t0[None], 0, dtype=jnp.int32)
+    return LoopState(y0, t0, lax.stop_gradient(h), behind, zero, zero)
 
 
 def going(method: Method, run: Run, loop: LoopState, until: Array | None) -> Array:
@@ -297,9 +300,9 @@ def _attempt(
     """One attempt at a step of every body, and its row."""
     on = going(method, run, loop, until)
     begin, end = at(run.stops, loop.stop), at(run.before, loop.stop)
-    # A stop that is passed already, such as a jump before the start, needs no step.
+    # A stop that is passed already, such as the second of two at one time, needs no step.
     arrived = on & (loop.t >= begin)
-    moving, own = on & ~arrived, lax.stop_gradient(loop.h)
+    moving, own = on & ~arrived, lax.stop_gradient(jnp.minimum(loop.h, run.longest))
     cut = jnp.zeros_like(on)
     if until is not None:
         cut = until < end
@@ -321,7 +324,12 @@ def _attempt(
         y=jnp.where(lift(accept, y), y, loop.y),
         t=jnp.where(accept, jnp.where(reached, begin, late), loop.t),
         h=lax.stop_gradient(following),
-        stop=loop.stop + (arrived | reached).astype(jnp.int32),
+        # Those at the end are passed at once.
+        stop=jnp.where(
+            reached & (begin >= run.stops[-1]),
+            run.stops.shape[0],
+            loop.stop + (arrived | reached).astype(jnp.int32),
+        ).astype(jnp.int32),
         steps=loop.steps + moving.astype(jnp.int32),
         rejected=loop.rejected + (moving & ~accept).astype(jnp.int32),
     )

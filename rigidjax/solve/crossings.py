@@ -35,7 +35,7 @@ from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.equations import on_the_group
-from rigidjax.motion.torques.base import jumps_of, lacking
+from rigidjax.motion.torques.base import lacking
 from rigidjax.solve import crossing_loop, validation
 from rigidjax.solve.adaptive import taken_out
 from rigidjax.solve.adaptive_loop import Method, Run, first_step, of_body, outcome, tried
@@ -43,6 +43,7 @@ from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.crossing_loop import Located, Motion, Search
 from rigidjax.solve.explicit import AbstractExplicit, explicit
 from rigidjax.solve.linear_map import as_known, nan_derivatives
+from rigidjax.solve.momentum import ByMomentum, by_momentum
 from rigidjax.solve.run import (
     Free,
     Loop,
@@ -51,6 +52,7 @@ from rigidjax.solve.run import (
     equations_of_motion,
     solve,
 )
+from rigidjax.solve.stops import stopped
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 
@@ -239,7 +241,7 @@ def solve_until(
     before = ~(crossed.time(ts) > crossed.time(end))
     short = jnp.concatenate([jnp.where(before, ts, end), jnp.where(met, end, ts[-1])[None]])
     ys, stats, result = solve(setup, state0, short)
-    y = ravel_pytree(jax.tree.map(lambda leaf: leaf[-1], ys))[0]
+    y = crossed.vector(end, jax.tree.map(lambda leaf: leaf[-1], ys))
     jumps = found.jumps[0]
     s, y = correction(crossed, numbers[0], crossed.time(end), y, met & ~jumps)
     met = met & (result == dfx.RESULTS.successful)
@@ -251,7 +253,7 @@ def solve_until(
     time, y = (jnp.where(met, leaf, jnp.nan) for leaf in (crossed.time(s), y))
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
     ys = nan_derivatives(jax.tree.map(rows, ys), inputs)
-    time, state = _with_derivatives((time, crossed.tree(y)), jumps, inputs)
+    time, state = _with_derivatives((time, crossed.state(time, y)), jumps, inputs)
     return ys, stats, dfx.RESULTS.where(met, dfx.RESULTS.event_occurred, result), time, state
 
 
@@ -276,7 +278,7 @@ def _solved(
     found = located(crossed, Search(event.direction, many, max_steps), numbers)
     times, states = _as_found(found.times, found.states, found.jumps, setup, event, state0, ts)
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
-    out = crossed.time(times), jax.vmap(crossed.tree)(states)
+    out = crossed.time(times), jax.vmap(crossed.state)(crossed.time(times), states)
     times, states = _with_derivatives(out, found.jumps, inputs)
     result = outcome(found.h, found.t, crossed.time(ts[-1]), found.number >= many)
     result = of_body(result, setup.body)
@@ -305,7 +307,7 @@ def _corrected(
     last = jnp.max(jnp.where(there, times, lax.stop_gradient(crossed.time(ts[0]))))
     s = jnp.where(there, times, last)
     ys, *_ = solve(setup, state0, jnp.concatenate([ts[:1], crossed.time(s)]))
-    ys = jax.vmap(lambda y: ravel_pytree(y)[0])(ys)[1:]
+    ys = jax.vmap(crossed.vector)(crossed.time(s), jax.tree.map(lambda leaf: leaf[1:], ys))
     times, states = jax.vmap(partial(correction, crossed, constants))(s, ys, there & ~jumps)
     return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
 
@@ -325,6 +327,15 @@ class Section(NamedTuple):
     tree: Callable[[Array], Any]  # the state of a vector
     sizes: list[int]  # of the arrays of the state
     sign: Array
+    form: ByMomentum | None = None
+
+    def vector(self, t: Array, state: Any) -> Array:
+        """The numbers that are integrated, of a state at the time t."""
+        return ravel_pytree(state if self.form is None else self.form.enter(t, state))[0]
+
+    def state(self, t: Array, y: Array) -> Any:
+        """The state at the time t of the numbers that are integrated."""
+        return self.tree(y) if self.form is None else self.form.leave(t, self.tree(y))
 
     def project(self, y: Array) -> Array:
         return ravel_pytree(on_the_group(self.tree(y)))[0]
@@ -340,23 +351,31 @@ Numbers = tuple[Arrays, Run, Array]
 
 def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[Section, Numbers]:
     """The section between `ts[0]` and `ts[-1]`, and what it is made of."""
-    condition: Any = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
-    (y0, tree), dtype = ravel_pytree(state0), ts.dtype
+    form = by_momentum(setup.body, state0, setup.torque) if isinstance(setup, Loop) else None
+
+    def condition(t: Array, y: Any) -> Array:
+        return value(event, setup.body, t, y if form is None else form.leave(t, y))
+
+    inside = state0 if form is None else form.enter(ts[0], state0)
+    (y0, tree), dtype = ravel_pytree(inside), ts.dtype
     sign = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
     way = setup.sign if isinstance(setup, Loop) else sign
-    jumps = jumps_of(setup.torque).astype(dtype)
-    field: Any = equations_of_motion(setup.body, state0, setup.torque)
-    field, condition, along, jumps = ahead(way, field, condition, ts[jnp.array([0, -1])], jumps)
-    longest = whole = lax.stop_gradient(along[1] - along[0])
+    field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
+    field, asked, along, jumps = ahead(way, field, condition, ts[jnp.array([0, -1])])
+    whole: Any = lambda s, y, *sides: ravel_pytree(field(s, tree(y), sides or None))[0]  # noqa: E731
+    ready = stopped(whole, jumps, along[0], along[1], y0)
+    longest = length = lax.stop_gradient(along[1] - along[0])
     if event.max_step is not None:
         longest = lax.stop_gradient(jnp.asarray(event.max_step, dtype))
+    if isinstance(setup, Loop) and setup.max_step is not None:
+        longest = jnp.minimum(longest, setup.max_step)
 
     def slope(s: Array, y: Array) -> Array:
-        return ravel_pytree(field(s, tree(y), None))[0]
+        return ready.field(ready.constants, s, y)
 
     def rates(s: Array, y: Array) -> tuple[Array, Array, Array]:
         there = slope(s, y)
-        of_y = lambda s, y: condition(s, tree(y))  # noqa: E731
+        of_y = lambda s, y: asked(s, tree(y))  # noqa: E731
         return *jax.jvp(of_y, (s, y), (jnp.ones_like(s), there)), there
 
     if isinstance(setup, Loop):
@@ -366,13 +385,13 @@ def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[S
     else:
         solver, free = None, FreeMotion(setup.body, state0)
         motion = lambda s, _: ravel_pytree(free(sign.astype(s.dtype) * s - ts[0]))[0]  # noqa: E731
-        longest = jnp.minimum(longest, _spacing(setup.body, state0, whole))
+        longest = jnp.minimum(longest, _spacing(setup.body, state0, length))
         rtol, atol, h0 = jnp.zeros((), y0.dtype), jnp.zeros((), y0.dtype), longest
-    (of_motion, of_rates), constants, _ = taken_out([motion, rates], along[0], y0)
-    stops = jnp.concatenate([jnp.clip(jnp.sort(jumps), along[0], along[1]), along[1:]])
+    (of_motion, of_rates), constants = taken_out([motion, rates], along[0], y0)
+    stops = jnp.concatenate([ready.stops, along[1:]])
     sizes = [leaf.size for leaf in jax.tree.leaves(state0)]
-    crossed = Section(solver, of_motion, of_rates, tree, sizes, sign)
-    run = Run(along[0], stops, stops[:0], y0, rtol, atol, h0)
+    crossed = Section(solver, of_motion, of_rates, tree, sizes, sign, form)
+    run = Run(along[0], stops, stops[:0], y0, rtol, atol, h0, longest)
     return crossed, (constants, run, longest)
 
 

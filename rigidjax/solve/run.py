@@ -1,5 +1,7 @@
 """A run in one compiled piece: by the closed form, by diffrax, or by our own loop."""
 
+import dataclasses
+import warnings
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -8,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Int
 
 from rigidjax import _checks
@@ -18,19 +20,23 @@ from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.coupled import Coupled, CoupledEquations, started
+from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of, started
 from rigidjax.motion.equations import (
     AttitudeEquations,
     EulerEquations,
     NewtonEuler,
     on_the_group,
 )  # fmt: skip
-from rigidjax.motion.torques.base import Torque, jumps_of
+from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.adaptive_loop import NONFINITE, finite, of_body
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
+from rigidjax.solve.momentum import by_momentum, changing, left
+from rigidjax.solve.sides import declared_jumps, on_sides
+from rigidjax.solve.stops import stopped, traced
+from rigidjax.solve.switching import MOST, analysis_of
 
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
@@ -55,6 +61,9 @@ class Setup(eqx.Module):
     progress_meter: dfx.AbstractProgressMeter
     max_steps: int | None = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
+    # Whether steps end where the law switches, in s = σt: under no controller of one's own.
+    stops: bool = eqx.field(static=True, default=False)
+    sign: Array | None = None  # σ as of `Loop`
 
 
 class Loop(eqx.Module):
@@ -70,6 +79,7 @@ class Loop(eqx.Module):
     max_steps: int = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
     cuts: Array | None = None  # where a step has to end, beside the jumps of the torque
+    max_step: Any = None
 
 
 class Ends(eqx.Module):
@@ -119,25 +129,22 @@ def direction(times: Array) -> Int[Array, ""] | None:
 
 
 def ahead(
-    sign: Array | None, field: Callable[..., Any], condition: Any, ts: Array, jumps: Array
-) -> tuple[Callable[..., Any], Any, Array, Array]:
-    """A vector field, a condition, times and jump times in s = σt; `sign` σ is `None` for s = t."""
-    if sign is None:
-        return field, condition, ts, jumps
-    time = lambda s: sign.astype(s.dtype) * s  # noqa: E731
+    sign: Array | None, field: Callable[..., Any], condition: Any, ts: Array
+) -> tuple[Callable[..., Any], Any, Array, list[Array]]:
+    """A vector field, a condition, times and jump times in s = σt; `sign` σ is `None` for s = t.
 
-    def directed(s: Array, y: Any, args: Any = None) -> Any:
-        t = time(s)
-        if jumps.size:
-            # A law has its new value from the jump on; a step back that begins there wants the old
-            # one. The oldest JAX has no derivative of `nextafter`, not even one to be stopped.
-            still = lax.stop_gradient(t)
-            before = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
-            t = t + jnp.where(sign < 0, before - still, jnp.zeros_like(still))
-        return jax.tree.map(lambda leaf: sign.astype(leaf.dtype) * leaf, field(t, y, args))
+    The field takes the stops of its parts that jump, in s, as its third argument (see `adaptive`).
+    """
+
+    def time(s: Array) -> Array:
+        return s if sign is None else sign.astype(s.dtype) * s
+
+    def directed(s: Array, y: Any, sides: Any = None) -> Any:
+        sided = on_sides(field, sign, None if sides is None else [time(side) for side in sides])
+        return jax.tree.map(time, sided(time(s), y, None))
 
     asked = None if condition is None else lambda s, y: condition(time(s), y)
-    return directed, asked, time(ts), time(jumps)
+    return directed, asked, time(ts), [time(jumps) for jumps in declared_jumps(field)]
 
 
 @eqx.filter_jit
@@ -156,7 +163,7 @@ def solve(
         run: Any = _loop if isinstance(setup, Loop) else _by_diffrax
         ys, stats, result, end = run(setup, watch, state0, ts)
         if setup.throw:
-            ys = refuse(ys, result)
+            ys = refuse(ys, result, setup.torque)
         if watch is not None:
             ended = result == dfx.RESULTS.event_occurred
             stats |= {"ended": ended, "end_time": end[0], "end_state": end[1]}
@@ -166,18 +173,46 @@ def solve(
     return nan_derivatives(ys, inputs), stats, of_body(result, setup.body)
 
 
+class _OfNumbers(eqx.Module):
+    """A field of the numbers of a state as one of states, for diffrax."""
+
+    constants: Any
+    field: Any = eqx.field(static=True)
+    tree: Any = eqx.field(static=True)
+
+    def __call__(self, t: Any, y: Any, args: object = None) -> Any:
+        return self.tree(self.field(self.constants, t, ravel_pytree(y)[0]))
+
+
 def _by_diffrax(
     setup: Setup, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
-    subs = [dfx.SubSaveAt(ts=ts)] + [dfx.SubSaveAt(t1=True)] * (watch is not None)
-    term = dfx.ODETerm(equations_of_motion(setup.body, state0, setup.torque))
+    form = by_momentum(setup.body, state0, setup.torque)
+    field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
+    state0 = state0 if form is None else form.enter(ts[0], state0)
+    controller, over, along, ends = setup.controller, None, ts, watch
+    if setup.stops:
+        numbers, tree = ravel_pytree(state0)
+        directed, ends, along, jumps = ahead(setup.sign, field, watch, ts)
+        of_one = lambda s, y, *sides: ravel_pytree(directed(s, tree(y), sides or None))[0]  # noqa: E731
+        ready = stopped(of_one, jumps, along[0], along[-1], numbers)
+        over = ready.over
+        if setup.sign is not None or len(ready.constants) > ready.smooth:
+            field = _OfNumbers(ready.constants, ready.field, tree)
+        if ready.stops.size:
+            controller = dfx.ClipStepSizeController(controller, jump_ts=ready.stops)
+    subs = [dfx.SubSaveAt(ts=along)] + [dfx.SubSaveAt(t1=True)] * (watch is not None)
+    event = None if ends is None else dfx.Event(lambda t, y, args, **_: ends(t, y))
+    term = dfx.ODETerm(field)
     out = dfx.diffeqsolve(
-        term, setup.solver, ts[0], ts[-1], setup.dt0, state0,
-        saveat=dfx.SaveAt(subs=subs), stepsize_controller=setup.controller, adjoint=setup.adjoint,
+        term, setup.solver, along[0], along[-1], setup.dt0, state0,
+        saveat=dfx.SaveAt(subs=subs), stepsize_controller=controller, adjoint=setup.adjoint,
         max_steps=setup.max_steps, throw=False, progress_meter=setup.progress_meter,
-        event=None if watch is None else dfx.Event(watch),
+        event=event,
     )  # fmt: skip
     stats: dict[str, Any] = {k: value for k, value in out.stats.items() if k != "max_steps"}
+    if over is not None:
+        stats["switches_missed"] = over
     (times, *last_time), (ys, *last) = out.ts, out.ys  # pyright: ignore
 
     def reached(leaf: Array) -> Array:
@@ -185,11 +220,13 @@ def _by_diffrax(
         there = jnp.isfinite(times).reshape(-1, *[1] * (leaf.ndim - 1))
         return jnp.where(there, leaf, jnp.full_like(leaf, jnp.nan))
 
-    ys, result = jax.tree.map(reached, ys), out.result
+    ys, result = left(form, ts, jax.tree.map(reached, ys)), out.result
     if not isinstance(setup.controller, dfx.AbstractAdaptiveStepSizeController):
         # Equal steps look at no error, and would go on with NaN.
         ill = (result == dfx.RESULTS.successful) & ~finite(ys)
         result = dfx.RESULTS.where(ill, NONFINITE, result)
+    if setup.stops and setup.sign is not None:
+        last_time = [setup.sign.astype(ts.dtype) * t for t in last_time]
     end = jax.tree.map(lambda leaf: leaf[0], (*last_time, *last))
     return ys, stats, result, end
 
@@ -197,18 +234,37 @@ def _by_diffrax(
 def _loop(
     setup: Loop, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
-    field, jumps = equations_of_motion(setup.body, state0, setup.torque), jumps_of(setup.torque)
+    form = by_momentum(setup.body, state0, setup.torque)
+    field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
+    state0 = state0 if form is None else form.enter(ts[0], state0)
+    field, watch, along, jumps = ahead(setup.sign, field, watch, ts)
     if setup.cuts is not None:
-        jumps = jnp.concatenate([jumps.astype(ts.dtype), setup.cuts])
-    field, watch, along, jumps = ahead(setup.sign, field, watch, ts, jumps)
+        cuts = setup.cuts if setup.sign is None else setup.sign.astype(ts.dtype) * setup.cuts
+        jumps = [*jumps, cuts]
     how = dict(rtol=setup.rtol, atol=setup.atol, dt0=setup.dt0, max_steps=setup.max_steps)
+    how |= dict(max_step=setup.max_step)
     out = adaptive(setup.solver, field, along, state0, jumps=jumps, halt=watch, **how)
     taken = (out.num_steps, out.num_steps - out.num_rejected, out.num_rejected)
     sign = setup.sign
     last_time = out.last_time if sign is None else sign.astype(ts.dtype) * out.last_time
-    return out.ys, dict(zip(_COUNTS, taken, strict=True)), out.result, (last_time, out.last)
+    stats: dict[str, Any] = dict(zip(_COUNTS, taken, strict=True))
+    if out.over is not None:
+        stats["switches_missed"] = out.over
+    last = out.last if form is None else form.leave(last_time, out.last)
+    return left(form, ts, out.ys), stats, out.result, (last_time, last, out.next_step)
 
 
+_INERTIA = (
+    "simulate: the motion under ChangingInertia became NaN or infinite. Is inertia(t) the tensor "
+    "of a body at every time of the run: symmetric, with positive moments of which none exceeds "
+    "the sum of the other two? throw=False keeps what came before"
+)
+_MANY_STEPS = (
+    "simulate: the maximum number of solver steps, max_steps, did not reach the last time. Has the "
+    "motion many turns? then give a larger one. Does a law switch by the state (sign, where) and "
+    "hold it there? then no number of steps is enough: smooth the switch, or end the run there by "
+    "an Event"
+)
 _NONFINITE_WORDS = (
     "simulate: the motion became NaN or infinite. Is the torque finite at every time and state of "
     "the run? With fixed steps: are they short enough for this spin? throw=False keeps what came "
@@ -225,17 +281,77 @@ def _shortest_step_words(dtype: Any) -> str:
     )
 
 
-def refuse(ys: Any, result: dfx.RESULTS) -> Any:
+def refuse(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
     """The states `ys`, or an error in words where the run did not get to its end."""
+    if changing(torque) is not None:
+        ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
     shortest = _shortest_step_words(jax.tree.leaves(ys)[0].dtype)
     for why, words in (
+        (dfx.RESULTS.max_steps_reached, _MANY_STEPS),
         (NONFINITE, _NONFINITE_WORDS),
         (dfx.RESULTS.dt_min_reached, shortest),
     ):
         ys = eqx.error_if(ys, result == why, words)
         ill = ill & (result != why)
     return result.error_if(ys, ill)
+
+
+def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) -> None:
+    """Warn if a law switches by the time more often than steps can end at its switches."""
+    missed = stats.get("switches_missed", False)
+    if not _checks.known((missed, state0, ts)) or not np.any(np.asarray(missed)):
+        return
+    state0 = started(setup.body, state0, setup.torque, ts[0])
+    form = by_momentum(setup.body, state0, setup.torque)
+    field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
+    analysis = analysis_of(traced(lambda t, y: field(t, y, None), ts[0], state0).closed)
+    lines = [] if analysis is None else list(dict.fromkeys(s.line for s in analysis.switches))
+    warnings.warn(
+        f"simulate: a law switches by the time more than {MOST} times ({'; '.join(lines)}): steps "
+        "end at the first of them, and the derivative by the others is lost. Give the law "
+        "`jump_times`, all its jumps in s, or take torques.Held or Pulses for a table",
+        stacklevel=4,
+    )
+
+
+@eqx.filter_jit
+def _end_of(loop: Loop, state0: Any, ts: Array) -> Any:
+    """Where a run ends: time, next step, number of steps, and state."""
+    state0 = started(loop.body, on_the_group(state0), loop.torque, ts[0])
+    *_, stats, _, end = _loop(loop, None, state0, ts)
+    return *end, stats["num_steps"]
+
+
+# Steps so much shorter than their mean that the motion stands still at one place.
+_STUCK = 1e-2
+
+
+def words_of_steps(loop: Loop, state0: Any, ts: Array, error: RuntimeError) -> RuntimeError:
+    """The same error; if a run has taken all its steps, with what they were spent on."""
+    numbers = (loop, state0, ts)
+    if _MANY_STEPS not in str(error) or not isinstance(loop, Loop) or not _checks.known(numbers):
+        return error
+    t, state, step, count = _end_of(dataclasses.replace(loop, throw=False), state0, ts)
+    begun, end, t = float(ts[0]), float(ts[-1]), float(t)
+    gone, step = abs(t - begun), float(step)
+    words = f"simulate: the maximum number of solver steps, {int(count)}, "
+    words += f"led to t = {t:.9g} s, and not to {end:.9g} s"
+    if step * int(count) < _STUCK * gone:
+        return type(error)(
+            f"{words}; the last are {step:.1e} s long, all at one place: does a law switch there "
+            "by the state (sign, where) and hold it at the switch, as Coulomb friction does at "
+            "rest? No number of steps is enough: smooth the switch (tanh(x / width) for sign(x)), "
+            "or end the run there by an Event and go on with the law that holds then"
+        )
+    if hasattr(motion_of(state), "omega"):
+        rates = (motion_of(y).omega for y in (state0, state))
+        rate = max(float(np.linalg.norm(np.asarray(w))) for w in rates)
+        turns, share = rate * gone / (2 * np.pi), abs(end - begun) / max(gone, 1e-300)
+        if turns > 1:
+            words += f": {int(count) / turns:.3g} steps a turn for {turns * share:.3g} turns"
+    needed = 1.2 * int(count) * abs(end - begun) / max(gone, 1e-300)
+    return type(error)(f"{words}; give max_steps={int(float(f'{needed:.1g}')):_} or more")
 
 
 def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:

@@ -14,13 +14,22 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame
 from rigidjax.motion.coupled import Coupled
-from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import validation
 from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.error import error_of_run, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected, Watched
-from rigidjax.solve.run import Free, Loop, Setup, direction, refuse, refuse_ended, solve
+from rigidjax.solve.run import (
+    Free,
+    Loop,
+    Setup,
+    direction,
+    refuse,
+    refuse_ended,
+    solve,
+    warn_of_missed,
+    words_of_steps,
+)
 from rigidjax.solve.solution import Solution, State, told
 from rigidjax.solve.splitting import AbstractSplitting
 
@@ -49,6 +58,7 @@ def simulate(
     atol: ScalarLike | None = None,
     accuracy: ScalarLike | None = None,
     dt0: ScalarLike | None = None,
+    max_step: ScalarLike | None = None,
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
     event: Event | Callable[..., Any] | None = None,
@@ -66,8 +76,11 @@ def simulate(
       body. For many, `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`; with
       `throw=False` return `.result`, too: one for each body.
     - `ts`: (T,) increasing times, s, or decreasing ones, backwards in time. The first is the start.
-    - `torque`: a torque of `rigidjax.torques` (the stepper gets the jumps of a schedule), or any
-      callable Module `(t, state, body) → (3,)`, N m, body frame; `None` for a free body. A torque's
+    - `torque`: a torque of `rigidjax.torques`, or any callable Module `(t, state, body) → (3,)`,
+      N m, body frame; `None` for a free body. Steps end where it declares jumps (`jump_times`), and
+      where it compares the time with what no state changes (`jnp.where(t < te, …)`): such times are
+      found before the run, and have derivatives. Steps do not end at switches by the state, and
+      their derivatives are lost: end a run there by an `event`, and begin another. A torque's
       own states (`rigidjax.torques.AbstractTorque`) are in `own`. For a `Point` it is a scene of
       `rigidjax.scenes`, a `MovingFrame`, or a force per mass `(t, state, None) → (3,)`, m/s².
     - `solver`: `None` is the cheapest accurate choice: the closed form (`rigidjax.exact`) for a
@@ -86,6 +99,9 @@ def simulate(
       a `UserWarning` says from which time on; under `jit` look at `sol.error.relative`.
     - `dt0`, `stepsize_controller`: first step and controller where the tolerances are not enough,
       such as `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
+    - `max_step`: the longest step, s, such as half of the shortest event in a law that steps could
+      pass over (a smooth bump, a switch by the state). The closed form takes no steps; a
+      `stepsize_controller` has its own limit.
     - `adjoint`: how derivatives through a solver of diffrax are taken, as there. `None` is
       `diffrax.RecursiveCheckpointAdjoint()` for `jax.grad`, with 4096 checkpoints where `rtol` is
       known to be below 1e-10; `diffrax.ForwardMode()` is for `jax.jacfwd`. Our loop and the closed
@@ -125,6 +141,15 @@ def simulate(
         raise ValueError("simulate: give either an accuracy or rtol and atol, not both")
     if accuracy is not None and _checks.known(accuracy):
         _checks.positive(accuracy, "accuracy")
+    if max_step is not None:
+        if stepsize_controller is not None:
+            raise ValueError(
+                "simulate: give max_step without a stepsize_controller, which has its own limit "
+                "(dtmax of diffrax.PIDController)"
+            )
+        if _checks.known(max_step):
+            _checks.positive(max_step, "max_step")
+        max_step = jnp.asarray(max_step, times.dtype)
     if stepsize_controller is None:
         rtol, atol = validation.tolerances(rtol, atol, times.dtype)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
@@ -140,7 +165,7 @@ def simulate(
         way = direction(times)
         # As arrays: another tolerance does not compile again.
         rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
-        loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw)  # pyright: ignore
+        loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw, None, max_step)  # pyright: ignore
         if accuracy is None:
             return _solution(loop, event, state0, times)
         return _accurate(loop, event, state0, times, accuracy)
@@ -157,18 +182,17 @@ def simulate(
         )
     meter, control = progress_meter or NO_METER, stepsize_controller
     setup = Setup(body, torque, solver, control, first, adjoint, meter, max_steps, throw)
-    return _solution(_completed(setup, rtol, atol, times), None, state0, times)
+    return _solution(_completed(setup, rtol, atol, times, max_step), None, state0, times)
 
 
-def _completed(setup: Setup, rtol: Any, atol: Any, times: Array) -> Setup:
+def _completed(setup: Setup, rtol: Any, atol: Any, times: Array, max_step: Any) -> Setup:
     """A run by diffrax with what was left to its defaults."""
     solver, control, adjoint, dt0 = setup.solver, setup.controller, setup.adjoint, setup.dt0
     if control is None:
-        control = Watched(dfx.PIDController(rtol=rtol, atol=atol))
-        if hasattr(setup.torque, "jump_times") and (jumps := jumps_of(setup.torque)).size:
-            # An adaptive step may pass over a short pulse.
-            jumps = jnp.sort(jumps.astype(times.dtype))
-            control = dfx.ClipStepSizeController(control, jump_ts=jumps)
+        control = Watched(dfx.PIDController(rtol=rtol, atol=atol, dtmax=max_step))
+        # A splitting looks into the field, of a known class.
+        stops = not isinstance(solver, AbstractSplitting)
+        setup = dataclasses.replace(setup, stops=stops, sign=direction(times))
     elif isinstance(control, dfx.AbstractAdaptiveStepSizeController):
         control = Watched(control)
     # Ours project inside their one kernel; a second time outside of it breaks the kernel up.
@@ -178,7 +202,8 @@ def _completed(setup: Setup, rtol: Any, atol: Any, times: Array) -> Setup:
         rtol = getattr(control, "rtol", None)
         tight = rtol is not None and _checks.known(rtol) and float(rtol) < _TIGHT
         adjoint = _EVERY_STEP if tight else ADJOINT
-    dt0 = None if dt0 is None else dt0 * jnp.sign(times[-1] - times[0])
+    if dt0 is not None and not setup.stops:
+        dt0 = dt0 * jnp.sign(times[-1] - times[0])
     new = dict(solver=solver, controller=control, adjoint=adjoint, dt0=dt0)
     return dataclasses.replace(setup, **new)
 
@@ -196,7 +221,7 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
     try:
         if run is not None:
             ys, stats, result = run
-            ys = refuse(ys, result) if setup.throw else ys
+            ys = refuse(ys, result, setup.torque) if setup.throw else ys
         elif event is None:
             ys, stats, result = solve(setup, state0, times)
         else:
@@ -204,7 +229,8 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
             state0 = ready(event, setup.body, state0, setup.torque, times[0])
             ys, stats, result, event_time, event_state = solve_until(setup, event, state0, times)
     except RuntimeError as error:
-        raise _checks.bare(error) from None
+        raise words_of_steps(setup, state0, times, _checks.bare(error)) from None
+    warn_of_missed(setup, state0, times, stats)
     if setup.throw and "ended" in stats:
         ys = refuse_ended(setup.torque, ys, stats, times)
     motion, own = (ys.motion, ys.own) if isinstance(ys, Coupled) else (ys, None)

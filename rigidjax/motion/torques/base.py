@@ -181,11 +181,12 @@ def act(
     require_scene(law, state, body)
     dtype = state.omega.dtype
     t = _checks.floating(t, (), "t").astype(dtype)
+    name = f"torque {getattr(law, 'law_name', type(law).__name__)}"
     # A table in float64 must not lift a float32 solve, nor stop it under strict promotion.
     try:
         found = in_precision(law, dtype)(t, state, in_precision(body, dtype))
     except AttributeError as wrong:
-        told = lacking(f"torque {type(law).__name__}", wrong)
+        told = lacking(name, wrong)
         if told is None:
             raise
         hint = "; a subclass of AbstractTorque declares the state that it reads by feels"
@@ -193,7 +194,7 @@ def act(
     # Not by class: torques of moving frames give one, too, and do not import this module.
     if hasattr(found, "force"):
         return found.force.astype(dtype), found.torque.astype(dtype)
-    value = _checks.floating(found, (3,), f"torque {type(law).__name__}", hint="body-frame N m")
+    value = _checks.floating(found, (3,), name, hint="body-frame N m")
     return None, value.astype(dtype)
 
 

@@ -12,6 +12,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin, Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import Inertia, tensor_of, with_tensor
 from rigidjax.body.symmetric3 import from_components
+from rigidjax.body.validation import is_real
 from rigidjax.motion.torques import base
 from rigidjax.motion.torques.inputs import require_no_jumps
 from rigidjax.rotation import quaternion
@@ -83,10 +84,13 @@ class ChangingInertia(eqx.Module):
 
     **Arguments:** `inertia` kg m², body frame, about the point that the body turns about (the
     centre of mass of a `Rigid`): a function of time, t → (3, 3), such as `Linear(times, tensors)`,
-    or a Module with `feels` (as torques have) of `(t, state, body)`, such as `Tide`. Its derivative
-    along the motion is taken: it must not jump (`Held`). `torque` all other torques, or `None`:
-    give them here, not beside it in a `Sum`, because their τ acts on I, and they get the body with
-    I.
+    or a Module with `feels` (as torques have) of `(t, state, body)`, such as `Tide`. `simulate`
+    integrates the momentum under a function of time: where it jumps, `jnp.where(t < t1, I0, I1)`,
+    the momentum stays. Elsewhere (`rigidjax.batch.rollout`), and of a Module with `feels`, the
+    derivative along the motion is taken, which has no jumps. A tensor of no body (not symmetric,
+    moments that are not positive or break the triangle inequality) is NaN, and ends the run.
+    `torque` all other torques, or `None`: give them here, not beside it in a `Sum`, because their
+    τ acts on I, and they get the body with I.
 
     A function of time replaces the inertia of the body given to `simulate`. Parts that move inside
     must have no momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend
@@ -139,7 +143,7 @@ class ChangingInertia(eqx.Module):
         def momentum(t: Any, q: Any, omega: Any) -> tuple[Vec3, Mat3]:
             here = eqx.tree_at(lambda s: s.omega, state, omega)
             here = here if q is None else eqx.tree_at(lambda s: s.q, here, q)
-            now = self.tensor(t, here, body).astype(omega.dtype)
+            now = real_or_nan(self.tensor(t, here, body).astype(omega.dtype))
             return apply(now, omega), now
 
         # Ω̇ is not known yet: I(Ω) Ω is linear in it. One program along four ways: t and q, e_i.
@@ -158,6 +162,11 @@ class ChangingInertia(eqx.Module):
         slope = solve(slopes[1:].T, turning)
         torque = apply(fixed, slope) - cross(apply(fixed, omega), omega)
         return torque if force is None else base.Wrench(force, torque)
+
+
+def real_or_nan(tensor: Mat3) -> Mat3:
+    """The inertia tensor (3, 3) of a body, kg m²; NaN for any other numbers, which end a run."""
+    return jnp.where(is_real(tensor), tensor, jnp.full_like(tensor, jnp.nan))
 
 
 class Tide(eqx.Module):

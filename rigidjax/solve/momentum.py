@@ -1,0 +1,87 @@
+"""A body whose inertia is a function of time, integrated by its momentum.
+
+The momentum p = I(t) Ω obeys `dp/dt = p × Ω + τ` however I changes: where I jumps, p stays and Ω
+jumps, and no derivative of I is needed. States of the run have Ω̃ = I₀⁻¹ p in the place of Ω, with
+the inertia I₀ of the body that `simulate` was given: a rate, to which tolerances apply as to Ω.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from rigidjax._types import ScalarLike
+from rigidjax.body.inertia import MassProperties, tensor_of, with_tensor
+from rigidjax.motion import Attitude
+from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of
+from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
+from rigidjax.motion.torques import ChangingInertia, Sum
+from rigidjax.motion.torques.base import in_precision
+from rigidjax.motion.torques.composite import parts_of, real_or_nan
+from rigidjax.motion.torques.states import freeze
+from rigidjax.rotation.linalg3 import apply, solve
+
+
+class _Changing(eqx.Module):
+    """The slope of a state whose rate stands for the momentum, at a state with the true rate."""
+
+    body: Any
+    law: ChangingInertia
+
+    def __call__(self, t: ScalarLike, y: Any, args: object = None) -> Any:
+        dtype = y.omega.dtype
+        body, law = in_precision(self.body, dtype), in_precision(self.law, dtype)
+        now = real_or_nan(law.tensor(jnp.asarray(t, dtype)).astype(dtype))
+        kind: Any = AttitudeEquations if isinstance(y, Attitude) else EulerEquations
+        kind = NewtonEuler if isinstance(body, MassProperties) else kind
+        slope = kind(with_tensor(body, now), law.torque)(t, y)
+        change = solve(tensor_of(body), apply(now, slope.omega))
+        return eqx.tree_at(lambda s: s.omega, slope, change)
+
+
+class ByMomentum(eqx.Module):
+    """The equations of motion for states with Ω̃ in the place of Ω, and the way there and back."""
+
+    field: Any  # `_Changing`, or `CoupledEquations` of it
+
+    def __call__(self, t: ScalarLike, y: Any, args: object = None) -> Any:
+        return self.field(t, self.leave(t, y))
+
+    def enter(self, t: Any, y: Any) -> Any:
+        """Return the state of the run at the time `t`, s, of a state with the body rate."""
+        return self._with_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
+
+    def leave(self, t: Any, y: Any) -> Any:
+        """Return the state with the body rate at the time `t`, s, of a state of the run."""
+        return self._with_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
+
+    def _with_rate(self, y: Any, rate: Any, t: Any) -> Any:
+        motion, own = motion_of(y), y.own if isinstance(y, Coupled) else ()
+        dtype = motion.omega.dtype
+        inner: Any = self.field.field if isinstance(self.field, CoupledEquations) else self.field
+        now = freeze(inner.law, own).tensor(jnp.asarray(t, dtype)) if own else inner.law.tensor(t)
+        fixed = tensor_of(inner.body).astype(dtype)
+        omega = rate(now.astype(dtype), fixed, motion.omega)
+        return eqx.tree_at(lambda s: motion_of(s).omega, y, omega)
+
+
+def by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
+    """Return the equations by momentum if the inertia is a function of time, else `None`."""
+    if not isinstance(law := changing(torque), ChangingInertia) or hasattr(law.inertia, "feels"):
+        return None
+    field: Any = _Changing(body, law)
+    return ByMomentum(CoupledEquations(field, body) if isinstance(state0, Coupled) else field)
+
+
+def changing(torque: Any) -> ChangingInertia | None:
+    """Return the `ChangingInertia` that a torque is, or `None`."""
+    # Scenes of particles, and none, are no torques.
+    parts = parts_of(torque) if isinstance(torque, ChangingInertia | Sum) else ()
+    return parts[0] if len(parts) == 1 and isinstance(parts[0], ChangingInertia) else None
+
+
+def left(form: ByMomentum | None, ts: Array, ys: Any) -> Any:
+    """Return the states `ys` at `ts` (T,) with their body rates."""
+    return ys if form is None else jax.vmap(form.leave)(ts, ys)

@@ -1,0 +1,100 @@
+"""The parts of a torque that declare their jumps, each on its own side of them.
+
+Two parts that jump at the same time have two stops, one a little after the other: between both the
+first part has its new value, the other its old one. So each jump has its own derivative.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from rigidjax.motion.torques.base import jumps_of, one_law
+from rigidjax.motion.torques.inputs import Delayed, Lagged
+from rigidjax.motion.torques.piecewise import Held, Linear, Pulses, Tabulated
+from rigidjax.motion.torques.states import has_own
+from rigidjax.solve.switching import DECLARED
+
+# The laws of this package with jumps of their own; the others pass on those of their parts.
+_OWN = (Held, Linear, Pulses, Tabulated, Delayed, Lagged)
+
+
+class Sided(eqx.Module):
+    """A law that is called on the side of its jumps that a step is on.
+
+    `stops` (n,) s are the times at which steps end for the `jumps` (n,) of the law, at most some
+    units of round-off away; `None` where they are the same. `sign` is as for `ahead`.
+    """
+
+    law: Any
+    jumps: Any
+    stops: Any
+    sign: Any
+
+    def __getattr__(self, name: str) -> Any:
+        # The law's members (`feels`, `rate_free`, …).
+        if name.startswith("__") or name in ("law", "jumps", "stops", "sign"):
+            raise AttributeError(name)
+        return getattr(self.law, name)
+
+    @property
+    def law_name(self) -> str:
+        """The name of the law's class."""
+        return type(self.law).__name__
+
+    def __call__(self, t: Any, *args: Any) -> Any:
+        one_law(self.law)
+        with jax.named_scope(DECLARED):
+            return self.law(self.seen(t), *args)
+
+    def seen(self, t: Any) -> Any:
+        """The time that the law is called with: `t`, or the nearest one on the side of the step."""
+        if self.sign is None and self.stops is None:
+            return t
+        still = lax.stop_gradient(jnp.asarray(t))
+        low = jnp.full_like(still, -jnp.inf)
+        now = still
+        if self.sign is not None:
+            # A law has its new value from the jump on; a step back that begins there wants the old
+            # one. The oldest JAX has no derivative of `nextafter`, not even one to be stopped.
+            now = jnp.where(self.sign < 0, jnp.nextafter(still, low), still)
+        if self.stops is not None:
+            jumps, stops = (a.astype(still.dtype) for a in (self.jumps, self.stops))
+            jumps = lax.stop_gradient(jumps)
+            new, before = now >= stops, jnp.nextafter(jumps, jnp.full_like(jumps, -jnp.inf))
+            now = jnp.maximum(now, jnp.max(jnp.where(new, jumps, -jnp.inf)))
+            now = jnp.minimum(now, jnp.min(jnp.where(new, jnp.inf, before)))
+        return t + (now - still)
+
+
+def _declares(node: Any) -> bool:
+    """Return whether a law has jumps of its own, or says that it has none."""
+    if isinstance(node, type) or not hasattr(node, "jump_times"):
+        return False
+    if type(node).__module__.startswith("rigidjax."):
+        return isinstance(node, _OWN) and jumps_of(node).shape[0] > 0
+    return True
+
+
+def declared_jumps(field: Any) -> list[Array]:
+    """Return the `jump_times`, s, of each part of a vector field that has some."""
+    parts = filter(_declares, jax.tree.leaves(field, is_leaf=_declares))
+    return [jumps for part in parts if (jumps := jnp.asarray(jumps_of(part))).shape[0]]
+
+
+def on_sides(field: Any, sign: Any, sides: Any) -> Any:
+    """Return the field whose parts are on their sides of `sides`, the stops of each, or `None`."""
+    stops = iter(sides or ())
+
+    def on_side(part: Any) -> Any:
+        if not _declares(part):
+            return part
+        jumps = jnp.asarray(jumps_of(part))
+        own = next(stops, None) if jumps.shape[0] else None
+        # A law with states of its own has kinks alone, and is looked for by its class.
+        return part if has_own(part) else Sided(part, jumps, own, sign if jumps.shape[0] else None)
+
+    return jax.tree.map(on_side, field, is_leaf=_declares)

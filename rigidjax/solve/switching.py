@@ -1,0 +1,357 @@
+"""Find the times at which a vector field switches by the time, from its traced program.
+
+A law of one's own such as `jnp.where(t < self.te, push, 0.0)` declares no `jump_times`. The program
+of the field holds its comparison; if that depends on the time and on no state, the times at which
+it changes are found before the run by halving, however short a firing is: a comparison of straight
+lines in time, or of what only rises or only falls, changes once. The steps of the run end there.
+In the run each such comparison is replaced by the side of its stops that a step is on, so that no
+rounding decides it, and of two that change at the same time each has its own side. The derivative
+of a switching time is that of the implicit function `gap(p, t) = 0`.
+"""
+
+import os
+from collections.abc import Callable, Iterator
+from itertools import count
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import (
+    ClosedJaxpr,  # pyright: ignore[reportPrivateImportUsage]
+    Jaxpr,
+    Literal,
+)
+from jax.extend.source_info_util import summarize
+
+from rigidjax.solve.batching import Arrays
+
+# The scope of a part that declares its jumps: no switch is looked for in it.
+DECLARED = "rigidjax_declared_jumps"
+_PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
+
+# Primitives whose result changes where the first operand meets the second, where it meets zero, and
+# where it meets another whole number.
+COMPARISONS = {"lt", "le", "gt", "ge", "lt_to", "le_to"}
+_LEVELS = {"floor", "ceil", "round", "convert_element_type", "rem"}
+# The ones whose result has a kink there.
+KINKS = {"max", "min", "abs", "clamp"}
+# Primitives that choose by a comparison of elements, those that nothing is known of, and the ones
+# whose result varies between its jumps.
+_CHOICES = {"argmax", "argmin", "sort", "top_k", "bitcast_convert_type", "nextafter"}
+_OPAQUE = {"pure_callback", "io_callback", "custom_call", "ffi_call"}
+_SAWS = {"rem", "atan2", "sort", "top_k", "nextafter"}
+# Calls whose body becomes part of the program; and calls that stay whole, whose body is looked at.
+_CALLS = {"jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2"}
+_WHOLE = {"cond", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
+# Primitives that are linear in all operands, or in either of two.
+_LINEAR = {
+    "add", "sub", "add_any", "neg", "copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze",
+    "slice", "transpose", "rev", "concatenate", "reduce_sum", "cumsum", "expand_dims",
+    "convert_element_type", "stop_gradient", "optimization_barrier", "gather", "dynamic_slice",
+}  # fmt: skip
+_PRODUCTS = {"mul", "dot_general"}
+# Functions of one operand that rise or fall everywhere.
+_MONOTONE = {
+    "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "tanh", "logistic", "erf", "sinh",
+    "asinh", "atan",
+}  # fmt: skip
+# How a value depends on the time: not; in constant pieces, which change only where another value
+# does; in a straight line; by rising or falling only; otherwise.
+CONSTANT, PIECES, STRAIGHT, MONOTONE, BENT = range(5)
+
+MOST = 64  # times of one law, and of one rounding
+_FEW = 32  # a comparison of more elements is a table
+_FEW_KINKS = 3  # more kinks in one operation cost more steps than they save
+NEAR = 16  # places at which it is looked for between them
+
+
+class Node(NamedTuple):
+    """An equation of a flat program: its values have numbers, its inputs are these or literals."""
+
+    primitive: Any
+    params: dict[str, Any]
+    inputs: list[Any]
+    outputs: list[int]
+    kinds: list[Any]  # the dtype of each input
+    shapes: list[Any]  # of the outputs
+    source: Any
+    declared: bool  # whether it belongs to a part that declares its jumps
+
+    @property
+    def name(self) -> str:
+        """The primitive's name; that of the function for a call of `searchsorted`."""
+        return _name(self)
+
+
+class Program(NamedTuple):
+    """A function f(t, y, …) as a flat list of equations: value 0 is the time, value 1 the state."""
+
+    nodes: list[Node]
+    constants: list[int]
+    inner: dict[int, Any]  # the constants of inner calls
+    inputs: list[int]
+    output: Any
+
+
+class Switch(NamedTuple):
+    """An equation whose result changes at once, or has a kink, at times that no state decides."""
+
+    node: Node
+    degree: int
+    size: int  # of the elements that are compared
+    jumps: bool
+
+    @property
+    def most(self) -> int:
+        """The number of times at which one element may change, if it only rises or falls."""
+        return MOST if self.node.name in _LEVELS else 1
+
+    @property
+    def places(self) -> int:
+        """The number of changes that are looked for."""
+        return MOST + 2 * NEAR if self.degree == BENT else self.size * self.most
+
+    @property
+    def exact(self) -> bool:
+        """Whether no element can change more often than is looked for."""
+        return self.degree < BENT and self.most == 1
+
+    @property
+    def line(self) -> str:
+        """The primitive and the user's line that wrote the equation."""
+        return f"{self.node.name}, {summarize(self.node.source)}"
+
+
+class Analysis(NamedTuple):
+    """The `switches` of a program, the lines that switch by the state, and those not understood.
+
+    `kinks` are too many for steps to end at each, and serve the search for bent switches.
+    """
+
+    program: Program
+    switches: list[Switch]
+    kinks: list[Switch]
+    by_state: list[str]
+    unseen: list[str]
+
+
+def _bodies(params: dict[str, Any]) -> Iterator[tuple[Any, Any]]:
+    """Yield each program among the parameters of an equation, with its constants."""
+    for value in params.values():
+        for part in value if isinstance(value, list | tuple) else (value,):
+            if isinstance(part, ClosedJaxpr):
+                yield part.jaxpr, part.consts
+            elif isinstance(part, Jaxpr):
+                yield part, ()
+
+
+def _name(eqn: Any) -> str:
+    called = eqn.params.get("name")
+    return "searchsorted" if called == "searchsorted" else eqn.primitive.name
+
+
+def _kinds(eqn: Any) -> list[Any]:
+    return [atom.aval.dtype for atom in eqn.invars if hasattr(atom.aval, "dtype")]
+
+
+def _is_float(kind: Any) -> bool:
+    return jnp.issubdtype(kind, jnp.floating)
+
+
+def _jumps(name: str, params: dict[str, Any], kinds: list[Any]) -> bool:
+    """Return whether the result of an equation jumps where its floating operands do not."""
+    if not kinds or not _is_float(kinds[0]):
+        return False
+    if name == "convert_element_type":
+        return not _is_float(params["new_dtype"])
+    return name in COMPARISONS | _LEVELS | _CHOICES | {"sign", "atan2", "searchsorted"}
+
+
+def _bends(name: str, kinds: list[Any]) -> bool:
+    """Return whether the result of an equation has a kink where its floating operands have none."""
+    return bool(kinds) and _is_float(kinds[-1]) and name in KINKS
+
+
+def _any_switch(jaxpr: Any, bent: bool = False) -> bool:
+    """Return whether a program, or one within it, holds a jump, or if `bent` a kink."""
+    for eqn in jaxpr.eqns:
+        name, kinds = _name(eqn), _kinds(eqn)
+        if _jumps(name, eqn.params, kinds) or (bent and _bends(name, kinds)) or name in _OPAQUE:
+            return True
+        if any(_any_switch(body, bent) for body, _ in _bodies(eqn.params)):
+            return True
+    return False
+
+
+def flatten(closed: ClosedJaxpr) -> Program:
+    """Write a traced function as one list of equations; bodies of calls become part of it."""
+    numbers, nodes, inner = count(), [], {}
+
+    def enter(jaxpr: Any, consts: Any, inputs: list[Any], declared: bool) -> list[Any]:
+        scope: dict[Any, Any] = dict(zip(jaxpr.invars, inputs, strict=True))
+        scope |= dict(zip(jaxpr.constvars, consts, strict=True))
+        read = lambda atom: atom if isinstance(atom, Literal) else scope[atom]  # noqa: E731
+        for eqn in jaxpr.eqns:
+            args, name = [read(atom) for atom in eqn.invars], _name(eqn)
+            own = declared or DECLARED in str(eqn.source_info.name_stack)
+            if name in _CALLS:
+                ((body, held),) = _bodies(eqn.params)
+                outputs = enter(body, kept(held), args, own)
+            else:
+                outputs = [next(numbers) for _ in eqn.outvars]
+                shapes = [variable.aval for variable in eqn.outvars]
+                node = Node(
+                    eqn.primitive, eqn.params, args, outputs, _kinds(eqn), shapes,
+                    eqn.source_info, own,
+                )  # fmt: skip
+                nodes.append(node)
+                if name in _WHOLE:
+                    for body, held in _bodies(eqn.params):
+                        enter(body, kept(held), args[len(args) - len(body.invars) :], own)
+            scope.update(zip(eqn.outvars, outputs, strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def kept(consts: Any) -> list[int]:
+        names = [next(numbers) for _ in consts]
+        inner.update(zip(names, consts, strict=True))
+        return names
+
+    inputs = [next(numbers) for _ in closed.jaxpr.invars]
+    constants = [next(numbers) for _ in closed.consts]
+    outputs = enter(closed.jaxpr, constants, inputs, False)
+    return Program(nodes, constants, inner, inputs, outputs[0])
+
+
+def degree_of(node: Node, operands: list[int]) -> int:
+    """Return how the result of an equation depends on the time, from how its operands do."""
+    timed, name = [d for d in operands if d != CONSTANT], node.name
+    if not timed:
+        return CONSTANT
+    if max(timed) == PIECES:
+        return PIECES
+    if _jumps(name, node.params, node.kinds):
+        return BENT if name in _SAWS else PIECES
+    if name in ("gather", "dynamic_slice") and max(operands[1:], default=CONSTANT) > CONSTANT:
+        return BENT
+    alone = len(timed) == 1
+    if name in _LINEAR:
+        return max(timed) if alone or set(timed) == {STRAIGHT} else BENT
+    if alone and (name in _PRODUCTS or (name == "div" and operands[1] == CONSTANT)):
+        return timed[0]
+    if alone and name in _MONOTONE | {"max", "min"} and timed[0] <= MONOTONE:
+        return MONOTONE
+    if alone and name == "clamp" and operands[1] in (STRAIGHT, MONOTONE):
+        return MONOTONE
+    if name == "select_n" and operands[0] == CONSTANT and len(set(timed)) == 1:
+        return timed[0]
+    return BENT
+
+
+def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
+    """Find the places where a traced field f(t, y, …) switches; `None` if it has no comparison."""
+    if not _any_switch(closed.jaxpr, bent=True):
+        return None
+    program = flatten(closed)
+    degrees, of_state = {program.inputs[0]: STRAIGHT}, set(program.inputs[1:])
+    switches, kinks, by_state, unseen = [], [], [], []
+    for node in program.nodes:
+        inputs = [i for i in node.inputs if not isinstance(i, Literal)]
+        look = lambda i: CONSTANT if isinstance(i, Literal) else degrees.get(i, CONSTANT)  # noqa: E731
+        operands = [look(i) for i in node.inputs]
+        stateful = any(i in of_state for i in inputs)
+        degrees.update(dict.fromkeys(node.outputs, degree_of(node, operands)))
+        if stateful:
+            of_state.update(node.outputs)
+        # What is constant between the times of other switches has no times of its own.
+        timed = max(operands, default=CONSTANT) > PIECES
+        if not (timed or stateful) or node.declared or not _may_switch(node) or _is_ours(node):
+            continue
+        where = f"{node.name}, {summarize(node.source)}"
+        jumps = _jumps(node.name, node.params, node.kinds)
+        if jumps and stateful:
+            by_state.append(where)
+        elif _hides(node):
+            unseen += [where] * timed
+        elif timed and not stateful:
+            switch = _switch_of(program, node, operands, jumps)
+            if switch.size <= (_FEW if jumps else _FEW_KINKS):
+                switches.append(switch)
+            elif switch.size <= _FEW:
+                kinks.append(switch)
+    bent = any(switch.degree == BENT for switch in switches)
+    return Analysis(program, switches, kinks if bent else [], by_state, unseen)
+
+
+def _is_ours(node: Node) -> bool:
+    """Return whether an equation is of this package, whose laws declare their jumps."""
+    return summarize(node.source).startswith(_PACKAGE)
+
+
+def _may_switch(node: Node) -> bool:
+    name = node.name
+    jumps = _jumps(name, node.params, node.kinds) or _bends(name, node.kinds)
+    return jumps or name in _OPAQUE or any(True for _ in _bodies(node.params))
+
+
+def _hides(node: Node) -> bool:
+    """Return whether an equation may switch where no switch can be looked for."""
+    if node.name in _CHOICES | {"atan2"}:
+        return True
+    if node.name in _WHOLE | {"searchsorted"}:
+        return False
+    return node.name in _OPAQUE or any(_any_switch(body) for body, _ in _bodies(node.params))
+
+
+def _switch_of(program: Program, node: Node, operands: list[int], jumps: bool) -> Switch:
+    """Return the switch that an equation is."""
+    name = node.name
+    compared = operands[: 1 if name in _LEVELS - {"rem"} else 3]
+    timed = [d for d in compared if d != CONSTANT]
+    steady = len(timed) == 1 or set(timed) == {STRAIGHT}
+    steady = steady and not (name == "rem" and compared[1] != CONSTANT)
+    steady = steady and not (name == "searchsorted" and compared[0] != CONSTANT)
+    shape = node.shapes[0].shape
+    size = int(np.prod(shape)) * (2 if name == "clamp" else 1)
+    if name == "searchsorted":
+        # Of one time among edges.
+        size = _edges(program, node) if shape == () else _FEW + 1
+    return Switch(node, max(timed) if steady else BENT, size, jumps)
+
+
+def _edges(program: Program, node: Node) -> int:
+    """Return the number of edges that one time is searched among."""
+    ((body, _),) = _bodies(node.params)
+    return int(np.prod(body.invars[0].aval.shape))
+
+
+def evaluator(
+    program: Program, wanted: list[Any], replaced: dict[int, Any] | None = None
+) -> Callable[..., list[Any]]:
+    """Return a function (constants, *inputs) → the wanted values, of the equations they need.
+
+    `replaced` has a function (read, *inputs) for the output of some equations.
+    """
+    replaced = replaced or {}
+    needed, nodes = {i for i in wanted if not isinstance(i, Literal)}, []
+    for node in reversed(program.nodes):
+        if any(output in needed for output in node.outputs):
+            nodes.append(node)
+            own = replaced.get(node.outputs[0])
+            inputs = node.inputs if own is None else own.reads
+            needed.update(i for i in inputs if not isinstance(i, Literal))
+
+    def evaluate(constants: Arrays, *inputs: Any) -> list[Any]:
+        known = dict(zip(program.constants, constants, strict=True)) | program.inner
+        known |= dict(zip(program.inputs, inputs, strict=False))
+        read = lambda i: i.val if isinstance(i, Literal) else known[i]  # noqa: E731
+        for node in reversed(nodes):
+            if node.outputs[0] in replaced:
+                known[node.outputs[0]] = replaced[node.outputs[0]].value(read, inputs)
+                continue
+            params = node.primitive.get_bind_params(node.params)
+            out = node.primitive.bind(*(read(i) for i in node.inputs), **params)
+            out = out if node.primitive.multiple_results else [out]
+            known.update(zip(node.outputs, out, strict=True))
+        return [read(i) for i in wanted]
+
+    return evaluate

@@ -1,0 +1,337 @@
+"""The times at which the switches of a traced field change, and the field on either side of them.
+
+A switch that only rises or only falls in time changes once: its time is found by halving between
+the ends of the run. One that is bent is looked for on a grid, and where its gap comes closest to
+zero between two points of it. The derivative of a time is that of the implicit function
+`gap(p, t) = 0`.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from rigidjax.solve.batching import Arrays
+from rigidjax.solve.switching import (
+    BENT,
+    COMPARISONS,
+    KINKS,
+    MONOTONE,
+    MOST,
+    NEAR,
+    STRAIGHT,
+    Analysis,
+    Program,
+    Switch,
+    evaluator,
+)
+
+_HALVINGS = {"float64": 62, "float32": 36}
+_GRID = 4096  # points of the search for a switch that is bent in time
+
+
+def _gap(switch: Switch, x: Any, *rest: Any) -> Any:
+    """Return what is zero, or a whole number, where the elements of a switch change."""
+    name = switch.node.name
+    if name == "clamp":
+        return jnp.concatenate([jnp.ravel(rest[0] - x), jnp.ravel(rest[0] - rest[1])])
+    if name == "searchsorted":
+        return jnp.ravel(x - rest[0])
+    if name in COMPARISONS | {"max", "min"}:
+        return jnp.ravel(x - rest[0])
+    return jnp.ravel(x / rest[0] if name == "rem" else x)
+
+
+def _value(switch: Switch, x: Any, *rest: Any) -> Any:
+    """Return what changes, as numbers, an element each."""
+    name = switch.node.name
+    if name in KINKS | {"searchsorted"}:
+        return _gap(switch, x, *rest) > 0
+    return jnp.ravel(jnp.trunc(x / rest[0]) if name == "rem" else rest[-1])
+
+
+class Times(NamedTuple):
+    """The times at which the switches of a field may change, in s, one for each place.
+
+    A place is one change of one element of one switch.
+    """
+
+    times: Array  # (k,) with derivatives; the end of the run where nothing changes
+    element: Array  # (k,) of the switch
+    change: Array  # (k,) of the element's value
+    first: Arrays  # the values of the elements of each switch at the start
+    outputs: Arrays  # of a search among edges at the start; empty for other switches
+    over: Array  # whether an element changes more often than it has places
+
+
+class _Watched(NamedTuple):
+    """A switch of a program with its constants: its `size` elements as functions of the time."""
+
+    program: Program
+    switch: Switch
+    constants: Arrays
+
+    @property
+    def still(self) -> "_Watched":
+        """The same switch without derivatives."""
+        return self._replace(constants=lax.stop_gradient(self.constants))
+
+    def operands(self, t: Array) -> list[Any]:
+        """Return the operands and the result of the equation."""
+        node = self.switch.node
+        wanted = [*node.inputs, node.outputs[0]]
+        return evaluator(self.program, wanted)(self.constants, t)
+
+    def value(self, t: Array) -> Array:
+        return _value(self.switch, *self.operands(t)).astype(t.dtype)
+
+    def gap(self, t: Array) -> Array:
+        return _gap(self.switch, *self.operands(t)).astype(t.dtype)
+
+    def values(self, t: Array, element: Any) -> Array:
+        """Return the value of one element at each of the times t (k,)."""
+        return self._of_each(self.value, t, element)
+
+    def gaps(self, t: Array, element: Any) -> Array:
+        return self._of_each(self.gap, t, element)
+
+    def _of_each(self, of: Callable[[Array], Array], t: Array, element: Any) -> Array:
+        if self.switch.size == 1:
+            return jax.vmap(lambda t: of(t).reshape(()))(t)
+        return jax.vmap(lambda t, i: of(t)[i])(t, element)
+
+
+# Times, elements and changes at the places of a switch, and whether there are more.
+_Places = tuple[Array, Array, Array, Array]
+
+
+def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times:
+    """Find the times in a < t ≤ b at which the switches of a field change."""
+    start, end = lax.stop_gradient((a, b))
+    # What changes within some round-off of the start has changed.
+    start = start + 8 * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end - start))
+    watched = [_Watched(analysis.program, s, constants) for s in analysis.switches]
+    others = [_Watched(analysis.program, s, constants) for s in analysis.kinks]
+    steady = [one for one in watched + others if one.switch.degree <= MONOTONE]
+    found = _of_steady(steady, start, end)
+    known = [places[0] for places in found]
+    parts: list[_Places] = []
+    for one in watched:
+        if one.switch.degree == BENT:
+            parts.append(_of_bent(one, start, end, known))
+            known.append(parts[-1][0])
+        else:
+            parts.append(found.pop(0))
+    t, element, change = (jnp.concatenate([part[i] for part in parts]) for i in range(3))
+    over = jnp.any(jnp.stack([part[3] for part in parts]))
+    first = [one.still.value(start) for one in watched]
+    outputs = [
+        one.still.operands(start)[-1] if one.switch.node.name == "searchsorted" else start[None][:0]
+        for one in watched
+    ]
+    return Times(jnp.where(t < end, t, b), element, change, first, outputs, over)
+
+
+def _of_steady(watched: list[_Watched], start: Array, end: Array) -> list[_Places]:
+    """Find the changes of what only rises or only falls."""
+    starts, rises, elements, levels = [], [], [], []
+    for one in watched:
+        element, level = (np.ravel(a) for a in np.mgrid[: one.switch.size, 1 : one.switch.most + 1])
+        first, last = one.still.value(start), one.still.value(end)
+        starts, rises = [*starts, first[element]], [*rises, last - first]
+        elements, levels = [*elements, element], [*levels, level.astype(start.dtype)]
+    edges = [(jnp.full(a.shape, start), jnp.full(a.shape, end)) for a in elements]
+    found = _halved(watched, edges, elements, starts, levels)
+    parts = []
+    for one, t, element, level, change in zip(watched, found, elements, levels, rises, strict=True):
+        rise, most = change[element], one.switch.most
+        there = jnp.abs(rise) >= level
+        t, _ = _moving(one, jnp.where(there, t, end), element, there)
+        over = jnp.any(jnp.abs(change) > most) & (most > 1)
+        change = jnp.where(there, rise if most == 1 else jnp.sign(rise), 0)
+        parts.append((t, jnp.asarray(element, jnp.int32), change, over))
+    return parts
+
+
+def _of_bent(one: _Watched, start: Array, end: Array, known: list[Array]) -> _Places:
+    """Find the changes of a switch by a grid, to which the `known` times of others are added."""
+    before = jnp.concatenate(known) if known else jnp.zeros(0, start.dtype)
+    low, high, element, over = _cells(one.still, start, end, lax.stop_gradient(before))
+    base = one.still.values(low, element)
+    level = np.full(low.shape, 0.5, start.dtype)
+    (t,) = _halved([one], [(low, high)], [element], [base], [level])
+    value = one.still.values(t, element)
+    there = value != base
+    t, moves = _moving(one, jnp.where(there, t, end), element, there)
+    if known:
+        # Where an operand jumps, the switch moves as that jump does.
+        near, still = jnp.argmin(jnp.abs(before[None] - t[:, None]), 1), lax.stop_gradient(t)
+        same = jnp.abs(before[near] - still) <= 8 * jnp.finfo(t.dtype).eps * jnp.abs(still)
+        t = jnp.where(there & ~moves & same, before[near], t)
+    return t, element, jnp.where(there, value - base, 0), over
+
+
+def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array, ...]:
+    """Return intervals (k,) in which an element changes once, the element, and whether all fit."""
+    size, dtype = one.switch.size, start.dtype
+    grid = start + (end - start) * jnp.linspace(0.0, 1.0, max(256, _GRID // size), dtype=dtype)
+    if known.shape[0]:
+        beside = jnp.nextafter(known, jnp.full_like(known, -jnp.inf))
+        grid = jnp.sort(
+            jnp.concatenate([grid, jnp.clip(jnp.stack([known, beside]), start, end).ravel()])
+        )
+    value, gap = jax.vmap(one.value)(grid), jax.vmap(one.gap)(grid)
+    changes = jnp.ravel(value[1:] != value[:-1])
+    many = jnp.sum(changes)
+    # The first of them: `nonzero` takes five times as long to compile.
+    _, cell = lax.top_k(changes.astype(jnp.int32), MOST)
+    row, element = cell // size, cell % size
+    low = grid[row]
+    high = jnp.where(jnp.arange(MOST) < many, grid[row + 1], low)
+    # Between two points it may be met twice, near where the gap comes closest to zero.
+    middle, sides = jnp.abs(gap[1:-1]), jnp.stack([jnp.abs(gap[:-2]), jnp.abs(gap[2:])])
+    calm = (
+        (value[1:-1] == value[:-2]) & (value[1:-1] == value[2:]) & jnp.all(middle[None] <= sides, 0)
+    )
+    depth = jnp.max(sides, 0) - middle + jnp.finfo(dtype).tiny
+    nearness, cell = lax.top_k(-jnp.ravel(jnp.where(calm, middle / depth, jnp.inf)), NEAR)
+    row, which = cell // size, cell % size
+    left = grid[row]
+    right = jnp.where(jnp.isfinite(nearness), grid[row + 2], left)
+    sign = jnp.sign(gap[row + 1, which])
+
+    def shorter(_: Any, ends: Any) -> Any:
+        left, right = ends
+        third = (right - left) / 3
+        ends = (one.gaps(t, which) for t in (left + third, right - third))
+        falls = sign * next(ends) > sign * next(ends)
+        return jnp.where(falls, left + third, left), jnp.where(falls, right, right - third)
+
+    a, b = lax.fori_loop(0, _HALVINGS[dtype.name], shorter, (left, right))
+    lowest = 0.5 * (a + b)
+    low, high = jnp.concatenate([low, left, lowest]), jnp.concatenate([high, lowest, right])
+    return low, high, jnp.concatenate([element, which, which]), many > MOST
+
+
+def _halved(
+    watched: list[_Watched], edges: Any, elements: Any, bases: list[Array], levels: Any
+) -> list[Array]:
+    """Return the first times (k,) at which elements are so far from their bases, of each switch."""
+
+    def half(_: Any, edges: Any) -> Any:
+        halves = []
+        for one, (low, high), element, base, level in zip(
+            watched, edges, elements, bases, levels, strict=True
+        ):
+            middle = low + 0.5 * (high - low)
+            new = jnp.abs(one.still.values(middle, element) - base) >= level
+            halves.append((jnp.where(new, low, middle), jnp.where(new, middle, high)))
+        return halves
+
+    if not watched:
+        return []
+    edges = lax.stop_gradient(edges)
+    count = _HALVINGS[edges[0][0].dtype.name]
+    return [high for _, high in lax.fori_loop(0, count, half, edges)]
+
+
+def _moving(one: _Watched, t: Array, element: Any, there: Array) -> tuple[Array, Array]:
+    """Return the times with the derivatives of implicit functions, and whether they have some."""
+    degree = one.switch.degree
+    still, moves, slope, here = lax.stop_gradient(t), there, jnp.zeros_like(t), jnp.zeros_like(t)
+    t = still
+    # Each step of Newton's method of value zero adds an order of derivatives.
+    for _ in range(1 if degree == STRAIGHT else 2):
+        gaps = lambda t: one.gaps(t, element)  # noqa: E731
+        here, slope = jax.jvp(gaps, (t,), (jnp.ones_like(t),))
+        moves = moves & jnp.isfinite(slope) & (slope != 0)
+        rise = here - lax.stop_gradient(here)
+        t = t - jnp.where(moves, rise / jnp.where(moves, slope, 1), 0)
+    if degree == BENT:
+        # A jump of the operand itself is no zero of its gap.
+        beside = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
+        step, eps = jnp.abs(slope) * (still - beside), jnp.finfo(t.dtype).eps
+        jump = jnp.abs(here - one.gaps(beside, element))
+        moves = moves & (jump <= 64 * (step + eps * (1 + jnp.abs(here))))
+    return t, moves
+
+
+class _Side(NamedTuple):
+    """An equation's result by the stops that a step is past, in the place of its comparison."""
+
+    switch: Switch
+    number: int
+    places: slice
+
+    @property
+    def reads(self) -> list[Any]:
+        """The inputs of the equation that are still needed."""
+        return [] if self.switch.exact else self.switch.node.inputs
+
+    def value(self, read: Callable[[Any], Any], inputs: tuple[Any, ...]) -> Any:
+        """Return the result at the time `inputs[0]`, from the stops and values `inputs[-1]`."""
+        node, (stops, found) = self.switch.node, inputs[-1]
+        past = inputs[0] >= stops[self.places]
+        steps, size = jnp.where(past, found.change[self.places], 0), self.switch.size
+        if self.switch.degree < BENT:
+            steps = steps.reshape(size, -1)
+        else:
+            element = found.element[self.places][None]
+            own = element == np.arange(size, dtype=element.dtype)[:, None]
+            steps = jnp.where(own, steps[None], 0)
+        steps = jnp.sum(steps, 1)
+        here, out = found.first[self.number] + steps, node.shapes[0]
+        if node.name == "searchsorted":
+            return (found.outputs[self.number] - jnp.sum(steps)).astype(out.dtype)
+        operands = [read(i) for i in self.reads]
+        if node.name in COMPARISONS:
+            here = here > 0.5
+        if node.name == "rem":
+            x, y = operands
+            here = x - y * here.reshape(out.shape).astype(x.dtype)
+        here = here.reshape(out.shape).astype(out.dtype)
+        if self.switch.exact:
+            return here
+        params = node.primitive.get_bind_params(node.params)
+        return jnp.where(found.over > 0, node.primitive.bind(*operands, **params), here)
+
+
+def by_sides(analysis: Analysis) -> Callable[..., Array]:
+    """Return the field f(constants, t, y, …, (stops, `Times`)) with its switches at the stops."""
+    replaced, begin = {}, 0
+    for number, switch in enumerate(analysis.switches):
+        if switch.jumps:
+            places = slice(begin, begin + switch.places)
+            replaced[switch.node.outputs[0]] = _Side(switch, number, places)
+        begin += switch.places
+    evaluate = evaluator(analysis.program, [analysis.program.output], replaced)
+    return lambda constants, *inputs: evaluate(constants, *inputs)[0]
+
+
+def separated(times: Array, a: Array, b: Array) -> tuple[Array, Array]:
+    """Return stops between a and b in order, and those of each of `times` (k,); equal ones apart.
+
+    Two jumps at the same time have a very short step between them, so that each has its derivative.
+    """
+    inside = (times > a) & (times < b)
+    t = jnp.where(inside, times, jnp.where(times <= a, a, b))
+    still, last = lax.stop_gradient((t, b))
+    count = np.arange(t.shape[0])
+    # Comparisons of few with each other are quicker than a sort.
+    earlier = still[None] < still[:, None]
+    earlier = earlier | ((still[None] == still[:, None]) & (count[None] < count[:, None]))
+    rank = jnp.sum(earlier, 1)
+    here = rank[None] == count[:, None]
+    ordered = lambda a: jnp.sum(jnp.where(here, a[None], 0), 1)  # noqa: E731
+    t = ordered(t)
+    still, inside = lax.stop_gradient(t), ordered(inside.astype(t.dtype)) > 0
+    gap = 4 * jnp.finfo(t.dtype).eps * lax.stop_gradient(jnp.maximum(jnp.abs(a), jnp.abs(b)))
+    shift = gap * count.astype(t.dtype)
+    pushed = lax.cummax(jnp.where(inside, still - shift, -jnp.inf)) + shift
+    apart = jnp.where(inside, jnp.maximum(still, jnp.minimum(pushed, last)), still)
+    t = t + (apart - still)
+    return t, t[rank]
