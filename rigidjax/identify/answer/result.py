@@ -56,10 +56,9 @@ class Fit(eqx.Module):
     by name; `search` the first answer, whose `word` is `found`, `not alone` or `not ended`;
     `explanation` the second one: `explains the readings`, `leaves a part`, `does not explain the
     readings`; `left` the indices of the sensors whose errors it does not explain; `limits` the
-    distance of each body from a flat one; `near` the point of the derivatives beside a flat body, else `None`;
-    `freedom` what the degrees of freedom of variances follow from;
-    `linear` the errors and their derivatives at that point, from which covariance, quantities and
-    causes follow.
+    distance of each body from a flat one; `near` the point of the derivatives beside a flat body,
+    else `None`; `freedom` what the degrees of freedom of variances follow from; `linear` the errors
+    and their derivatives at that point, from which covariance, quantities and causes follow.
 
     >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> [quantity.name for quantity in found.quantities[:2]], found.covariance.shape
