@@ -113,6 +113,7 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
         for empty in ("dict", "empty list")
     ),
     ("identify.best_first_rate", "body: None", "taken*", "None is documented: a sphere"),
+    ("identify.Recording", "inputs: dict", "taken*", "no input at all is documented: none is read"),
     ("identify.windows", "inputs: dict", "taken*", "no input at all is documented: none is read"),
     ("identify.fit_windows", "windows: huge", "*", SCENE),
     ("identify.fit_windows", "windows: large", "*", SCENE),

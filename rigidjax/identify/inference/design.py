@@ -25,7 +25,8 @@ def expected(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, ...]:
     and inputs (the readings themselves do not matter); `x` (n,) the free numbers of the motion that
     is planned, as `Model.start` gives them. **Returns** the quantities of `Fit.quantities` (`name`,
     `value`, `deviation`, `unit`) with the standard deviations of the Cramér–Rao bound, infinite
-    where the motion would show nothing. **Raises:** `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
+    where the motion would show nothing. **Raises:** `ValueError` for a sensor whose noise is not
+    given, or numbers that are not finite.
 
     >>> model = rj.datasets.toutatis.model()
     >>> plan = model.start(rj.Inertia.from_principal(3.1, 3.2, 1.0))
