@@ -194,10 +194,8 @@ def _faults(xp: Any, tensor: Any, thin: bool) -> tuple[Any, Any, Any]:
 
 def is_real(tensor: Float[Array, "*batch 3 3"]) -> Bool[Array, "*batch"]:
     """Return whether some mass has this inertia tensor, kg m², with no moment of zero."""
-    a = lax.stop_gradient(tensor)
-    flat, broken = _impossible(jnp, a, _slack(a))
-    skew = jnp.abs(a - a.swapaxes(-1, -2)).max(axis=(-1, -2))
-    return ~(flat | broken) & (skew <= _slack(a) * jnp.abs(a).max(axis=(-1, -2)))
+    flat, broken, skew = _faults(jnp, lax.stop_gradient(tensor), thin=False)
+    return ~(flat | broken | skew)
 
 
 def unit_quaternion(q: Quaternion) -> Quat:

@@ -247,7 +247,9 @@ class Model(eqx.Module):
         elif integrator is None and torque is not None:
             integrator = integrator_for(turn)
         self.integrator = integrator
-        self.filter_steps = max(1, math.ceil(turn / TURN_OF_A_FILTER_STEP))
+        # Without a number of steps: NaN in a recording is refused in words where it is used.
+        steps = turn / TURN_OF_A_FILTER_STEP
+        self.filter_steps = math.ceil(steps) if 1.0 < steps < math.inf else 1
 
     @property
     def size(self) -> int:
@@ -345,7 +347,7 @@ class Model(eqx.Module):
 
         With several recordings another axis leads.
         """
-        require_numbers(self, x)
+        x = require_numbers(self, x)
 
         def of_one(row: Array, record: Recording, *rest: Any) -> Any:
             scene = scene_of(self, row, record, *rest)
@@ -356,7 +358,7 @@ class Model(eqx.Module):
 
     def errors(self, x: Float[Array, " n"]) -> tuple[Float[Array, "*records times _"], ...]:
         """Return reading minus prediction for each sensor, in its unit; zero where masked."""
-        require_numbers(self, x)
+        x = require_numbers(self, x)
         out = all_errors(self, x)
         return tuple(e[0] for e in out) if self.count == 1 else out
 
