@@ -64,9 +64,7 @@ def test_a_masked_reading_is_an_absent_one(tumble):
         record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), values, mask))
         problem = rj.identify.Model(record, rj.identify.PrincipalRatios())
         results.append(rj.identify.fit(problem, starts=1))
-    for a, b in zip(
-        jax.tree.leaves(results[0].x), jax.tree.leaves(results[1].x), strict=True
-    ):
+    for a, b in zip(jax.tree.leaves(results[0].x), jax.tree.leaves(results[1].x), strict=True):
         np.testing.assert_array_equal(a, b)
 
 

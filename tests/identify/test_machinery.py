@@ -114,9 +114,7 @@ def test_models_are_compared_and_the_right_one_wins(records, joint):
     rows = identify.compare({"drag": joint, "no drag": identify.fit(plain, starts=1)})
     assert [row.name for row in rows] == ["drag", "no drag"]
     assert rows[0].information == 0 and rows[1].information > 10
-    short = identify.fit(
-        identify.Model(records[:1], identify.Tensor(1.5), free=FREE[1:]), starts=1
-    )
+    short = identify.fit(identify.Model(records[:1], identify.Tensor(1.5), free=FREE[1:]), starts=1)
     with pytest.raises(ValueError, match="wanted fits of the same readings"):
         identify.compare({"all": joint, "one": short})
 

@@ -204,9 +204,7 @@ def test_numbers_that_rows_tie_together_stay_in_the_core():
     # Joints of pieces tie the state of a piece to that of the next one.
     ts = np.linspace(0.0, 8.0, 90)
     rates = np.asarray(rj.simulate(BODY, rj.Spin([1.0, 2.0, 0.5]), ts).ys.omega)
-    whole = identify.Model(
-        identify.Recording(ts, (identify.Gyro(0.01), rates)), identify.Ratios()
-    )
+    whole = identify.Model(identify.Recording(ts, (identify.Gyro(0.01), rates)), identify.Ratios())
     linear = linear_at(pieces(whole, 9, width=0.1))
     rows = jacobian(linear)
     wanted = np.linalg.pinv(rows) @ np.linalg.pinv(rows).T

@@ -55,7 +55,10 @@ def rounds():
 def test_both_rounds_fit_from_blind_starts(rounds):
     for found in rounds:
         print(found.status, found.rms, found.correlation, found.interval(), found.values)
-        assert found.search.word == "found" and found.explanation.word != "does not explain the readings"
+        assert (
+            found.search.word == "found"
+            and found.explanation.word != "does not explain the readings"
+        )
         good = [s for s in found.starts if s.converged and s.fits]
         assert len(good) >= 2
 

@@ -68,4 +68,6 @@ def test_a_fit_of_readings_that_no_body_makes(moments):
     if moments[2] == 1.9:
         assert fit.ok
     else:
-        assert not fit.ok and fit.explanation.reasons[0].startswith("no real body has these numbers")
+        assert not fit.ok and fit.explanation.reasons[0].startswith(
+            "no real body has these numbers"
+        )

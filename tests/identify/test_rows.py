@@ -116,7 +116,10 @@ def test_i3_no_start_is_called_right_that_is_wrong():
             assert off(found) < 0.05
             right += 1
         else:
-            assert found.search.word == "not ended" or found.explanation.word != "explains the readings"
+            assert (
+                found.search.word == "not ended"
+                or found.explanation.word != "explains the readings"
+            )
     assert right >= 30
 
 

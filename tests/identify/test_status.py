@@ -36,9 +36,7 @@ def law(inertia=0.6, axis=(0.0, 0.0, 1.0), drag=(0.06, 0.05, 0.04), late=0.0):
 def gyro(rates, noise=SIGMA, chart=None, ts=TS, starts=2, **options):
     """A gyro alone."""
     record = identify.Recording(ts, (identify.Gyro(noise), rates), **options)
-    return identify.fit(
-        identify.Model(record, chart or identify.PrincipalRatios()), starts=starts
-    )
+    return identify.fit(identify.Model(record, chart or identify.PrincipalRatios()), starts=starts)
 
 
 def both(rates, turns, ts=TS, **sensor):

@@ -50,7 +50,9 @@ def test_no_throw_diverges_from_a_blind_start(found, model):
     for group in GROUPS:
         # Errors of tenths of a per cent are not white: the status says so.
         assert {f.search.word for f in found[group][model]} == {"found"}
-        assert "does not explain the readings" not in {f.explanation.word for f in found[group][model]}
+        assert "does not explain the readings" not in {
+            f.explanation.word for f in found[group][model]
+        }
 
 
 def test_a_right_throw_has_no_cause_of_its_errors_and_one_read_wrong_has_its_own(found, model):
@@ -158,7 +160,9 @@ def test_a_drag_that_can_drive_does_not_lose_a_throw():
         identify.Free(lambda s: s.sensors[0].bias, "bias", scale=0.05),
     ]
     found = identify.fit(identify.Model(record, identify.Tensor(3e-4), free=free), starts=1)
-    assert found.search.word == "found" and found.explanation.word != "does not explain the readings"
+    assert (
+        found.search.word == "found" and found.explanation.word != "does not explain the readings"
+    )
     # Linear drag explains the same throw with 0.05 rad/s.
     assert found.rms[0] < 0.1
 
