@@ -81,7 +81,7 @@ def one(records: Any, index: Any) -> Any:
     return jax.tree.map(pick, records)
 
 
-def _constant(array: np.ndarray) -> Array:
+def _constant(array: np.ndarray | np.generic) -> Array:
     """Return an array of JAX that is known, also within a trace."""
     with jax.ensure_compile_time_eval():
         return jnp.asarray(array)

@@ -68,6 +68,7 @@ def test_a_known_torque_acts_beside_the_random_one():
     np.testing.assert_allclose(drawn.states.omega, wanted.omega, atol=1e-8)
 
 
+@pytest.mark.usefixtures("unhooked")
 def test_what_is_refused():
     process, key = rj.torques.RandomTorque(1.0), jax.random.key(0)
 
