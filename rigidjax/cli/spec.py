@@ -154,8 +154,7 @@ def read_log(
     - `channels`, `wheels`: what to read; speeds become inputs, by the names of `input_names`;
     - `time`, `time_unit`: the time column; its name says the unit if that is `None`, else it is s;
     - `window`: (from, to), s from the first stamp, or `None` for all;
-    - `free`: some of `bias`, `drag`, `delay`: for `bias` the sensors get one, so that a fit can move
-      it.
+    - `free`: some of `bias`, `drag`, `delay`: for `bias` the sensors get one, which a fit can move.
 
     It **warns** as `read_table`, of rows that are left out because their times do not increase, and
     of times that are plainly in another unit. **Raises** `LogError` as `read_table`, and for rates

@@ -180,6 +180,6 @@ def _levelled(starts: Float[Array, "starts n"], model: Model) -> Float[Array, "s
             shape = jnp.where(seen, reading.values[0] - error, 0.0)
             better = level * jnp.sum(shape * reading.values[0]) / jnp.sum(shape * shape)
         step = slot.step(level, better)
-        return start.at[slot.shared].set(step.reshape(slot.shared.shape))
+        return start.at[slot.shared].set(step.reshape(jnp.asarray(slot.shared).shape))
 
     return jax.vmap(one)(starts)

@@ -57,8 +57,8 @@ class Fit(eqx.Module):
     by name; `search` the first answer, whose `word` is `found`, `not alone` or `not ended`;
     `explanation` the second one: `explains the readings`, `leaves a part`, `does not explain the
     readings`; `left` the indices of the sensors whose errors it does not explain; `limits` the
-    distance of each body from a flat one; `near` the point of the derivatives beside a flat body, else `None`;
-    `freedom` what the degrees of freedom of variances follow from;
+    distance of each body from a flat one; `near` the point of the derivatives beside a flat body,
+    else `None`; `freedom` what the degrees of freedom of variances follow from;
     `linear` errors and derivatives there, which all of these come from; `considered` the errors of
     sensors that the covariance allows for by their `Tolerance`; `allowance` says so in words, or
     what a sensor that is off would do to the result.

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -126,7 +126,7 @@ def first_belief(
                 "needs " + ", ".join(wanted)
             )
     parts = [in_shape(deviations[name], (3,), name) for name in wanted]
-    return belief_at(record.t[0], state, jnp.concatenate(parts), scene, model.walks)
+    return belief_at(record.t[0], cast(Any, state), jnp.concatenate(parts), scene, model.walks)
 
 
 def belief_at(

@@ -295,8 +295,8 @@ def refit(
 
     A fit that allows for an unknown torque, the process of its model: `refit(LogDensity(fit))`
     finds body, initial states, all `Free`s, and the torque's density, starting from `fit`, by
-    Fisher's scoring: Levenberg–Marquardt with the expected information of the innovations as the normal
-    matrix (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714). The draws come from a wide
+    Fisher's scoring: Levenberg–Marquardt with the expected information of the innovations as the
+    normal matrix (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714). The draws come from a wide
     Student's t about that point, weighted by the density over that of the t (importance sampling:
     Geweke 1989, doi:10.2307/1913710). Draws of more than some dozen numbers are worth little
     (`effective`); intervals then come from the information, which is enough if each recording is

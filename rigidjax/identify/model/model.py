@@ -174,7 +174,8 @@ class Model(eqx.Module):
             _are_recordings(recordings)
         else:
             require_windows(windows)
-            recordings, charts, names = [], chart, ("",) * windows.count
+            recordings, names = [], ("",) * windows.count
+            charts: Any = Bodies(chart) if isinstance(chart, Mapping) else chart
         for one in charts_of(charts):
             known = isinstance(one, Inertia | MassProperties)
             hint = "give a known body as Known(body)" if known else ""

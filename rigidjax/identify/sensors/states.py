@@ -33,7 +33,7 @@ class StateSensor(AbstractSensor):
     """
 
     kind: type = eqx.field(static=True)
-    noise: Float[Array, "*records k"]
+    noise: Float[Array, "*records k"] | None
     nominal: bool = eqx.field(static=True)
     unit: ClassVar[str] = ""
 

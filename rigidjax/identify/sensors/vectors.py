@@ -59,9 +59,10 @@ class Gyro(VectorSensor):
     reading at it counts as "at least that much", `None` finds it from the readings; `offset` s: the
     reading at t belongs to t + offset; `jitter` s the standard deviation of the time stamps, each a
     number of its own, or `"estimated"`; `lowpass` the `LowPass` of the readings; `tolerance` a
-    `Tolerance`, how far scale, axes, bias and clock may be off; `g_sensitivity` G (3, 3), rad/s per m/s²: the effect on each channel of the specific force f, in the body's axes,
-    at the gyro's place: `place` (3,) m and `gravity` (3,) m/s² as for `Accelerometer`, the centre
-    of mass and `None` unless given.
+    `Tolerance`, how far scale, axes, bias and clock may be off; `g_sensitivity` G (3, 3),
+    rad/s per m/s²: the effect on each channel of the specific force f, in the body's axes, at the
+    gyro's place: `place` (3,) m and `gravity` (3,) m/s² as for `Accelerometer`, the centre of mass
+    and `None` unless given.
 
     With jitter a reading is also wrong along the change of the prediction, by the change in the
     stamp's error: to first order, for motions that turn little in that time.
@@ -144,8 +145,8 @@ class Magnetometer(VectorSensor):
 
     **Arguments:** `noise` in the field's unit, one number or (3,), `None` to estimate it; `field`
     (3,) b, world frame, any unit; `bias` (the body's own magnetism), `scale`, `mounting`, `skew`,
-    `limit`, `offset`, `jitter`, `lowpass`, `tolerance` as for `Gyro`. For a direction without a strength use
-    `Direction`. **Raises** `ValueError` as `Gyro`.
+    `limit`, `offset`, `jitter`, `lowpass`, `tolerance` as for `Gyro`. For a direction without a
+    strength use `Direction`. **Raises** `ValueError` as `Gyro`.
 
     >>> Magnetometer(noise=1e-7, field=[2e-5, 0.0, 4e-5]).reading_shape
     (3,)

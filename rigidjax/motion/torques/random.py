@@ -18,8 +18,8 @@ class RandomTorque(AbstractTorque):
 
     `simulate` and a fit of `rigidjax.identify` use its mean, zero. It is the `process` of a
     `rigidjax.identify.Model`: `filter`, `smooth` and `log_likelihood` allow for it, and `sample`
-    draws a motion under it. Several are added by `Sum`. Source: Gelb, Applied Optimal Estimation (1974), §3.6. **Raises:**
-    `ValueError` for a density below zero.
+    draws a motion under it. Several are added by `Sum`. Source: Gelb, Applied Optimal
+    Estimation (1974), §3.6. **Raises:** `ValueError` for a density below zero.
 
     >>> RandomTorque(1e-4).density
     Array([0.0001, 0.0001, 0.0001], dtype=float64)
