@@ -33,7 +33,7 @@ class Freedom(eqx.Module):
     considered: np.ndarray
 
     def of(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom of the variances of functions, of derivative `slope` (…, n).
+        """Return the degrees of freedom of the variances of functions of derivative `slope` (…, n).
 
         The variance of considered errors is known: of a sum of both the degrees grow with the
         square of the whole over the estimated part.
