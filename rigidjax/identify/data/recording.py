@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks, _show
 from rigidjax.identify.sensors import AbstractSensor
+from rigidjax.motion.torques import Held
 
 
 class Reading(eqx.Module):
@@ -171,6 +172,19 @@ def recording_of(t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]
 def readings_of(recording: Recording, kind: type) -> list[Any]:
     """The readings of the sensors of one kind."""
     return [reading for reading in recording.readings if isinstance(reading.sensor, kind)]
+
+
+def sources_of(recording: Recording) -> dict[str, Any]:
+    """Return the inputs as functions of time: each sample is held for one step of even times."""
+    t, out = recording.t, {}
+    for name, source in recording.inputs.items():
+        if not callable(source):
+            # The last one begins a step before the last time; of windows some are before the first.
+            steps = jnp.arange(t.size - 1 - len(source), t.size, dtype=t.dtype)
+            times = t[0] + (t[1] - t[0]) * steps
+            source = Held(times, jnp.concatenate([source, source[-1:]]))
+        out[name] = source
+    return out
 
 
 def count_of(reading: Reading) -> int:

@@ -32,8 +32,13 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
 
 
 def of_few_lengths(model: Any) -> Any:
-    """Return the model with masked readings up to one of four lengths an octave: few programs."""
+    """Return the model with masked readings up to one of four lengths an octave: few programs.
+
+    Windows, which are many and of one length, stay as they are.
+    """
     records = model.records
+    if model.clusters is not None:
+        return model
     longer = lengthened(records, _length(records.t.shape[1]), _length(_rows(records, 1)), 1)
     return eqx.tree_at(lambda m: m.records, model, longer)
 

@@ -166,8 +166,8 @@ def states_at(
 class HeldSteps(AbstractIntegrator):
     """One step of order 4 from one sample to the next, with the inputs held through it.
 
-    Samples are evenly spaced. A delayed input changes inside a step, which is split there. `last` is
-    the number of the last time that is needed, `None` for all.
+    Samples are evenly spaced. A delayed input changes inside a step, which is split there. `last`
+    is the number of the last time that is needed, `None` for all.
 
     >>> HeldSteps().last
     """

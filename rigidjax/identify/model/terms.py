@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.data import stacking
-from rigidjax.identify.data.recording import Recording
+from rigidjax.identify.data.recording import Recording, sources_of
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.model.charts import Bodies, body_of_recording
 from rigidjax.identify.model.free import put
@@ -59,7 +59,7 @@ def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[An
         unbound = {name: Input(name) for name in samples}
         torque = bind(scene.torque, functions | unbound)
         states = model.integrator.driven(body, scene.start, record.t, torque, samples)
-        return states, torque
+        return states, bind(scene.torque, sources_of(record))
     torque = bind(scene.torque, functions)
     return states_at(model.integrator, body, scene.start, record.t, torque), torque
 
