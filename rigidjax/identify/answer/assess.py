@@ -265,7 +265,7 @@ def assess(
     held = [limit.slope for limit in limits if limit.free < 0]
     near_end = AT_THE_END
     if count := nominal_count(model):
-        near_end *= np.sqrt(2.0 * best_cost / count)
+        near_end *= float(np.sqrt(2.0 * best_cost / count))
     done = bool(best.converged) or uncertainty.distance(linear, white, held) < near_end
     chi2, dof, explanation, left = goodness(model, noise, linear, times, white.seen)
     believable = explanation.word != FAILS
