@@ -248,14 +248,14 @@ def assess(
     times = uncertainty.correlation_times(linear)
     white = uncertainty.of_white(linear)
     stretches = stretches_of(model, linear)
+    numbers, of = values_and_slopes(model, x, near), charts(model)
     hidden = np.zeros((0, linear.size))
     if stretches is None:
         spread = uncertainty.spread(linear, times, white)
     else:
         spread, hidden = by_stretches(stretches, white), stretches.hidden
-        remarks = (*remarks, *remarks_on(stretches, model, x, white))
+        remarks = (*remarks, *remarks_on(stretches, model, numbers, white))
     remarks = (*remarks, *words_on_delays(model, x))
-    numbers, of = values_and_slopes(model, x, near), charts(model)
     parts = considered.considerations(model, linear, noise, white.seen)
     spread = _with_considered(spread, parts, model)
     shifts = considered.stacked_shifts(parts, linear.size)

@@ -6,14 +6,14 @@ doi:10.1093/biomet/61.1.1; of neighbours in one block: Künsch 1989, doi:10.1214
 """
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from rigidjax.identify.model.model import Model, values_of
+from rigidjax.identify.model.model import Model
 from rigidjax.identify.uncertainty.covariance import Linearised, Spread, blinded, inverted
+from rigidjax.identify.uncertainty.quantities import labels
 
 # A number hangs on one stretch, of so many at least, if that makes this part of its variance.
 HANGS, FEWEST = 0.85, 6
@@ -34,16 +34,6 @@ class Stretches(eqx.Module):
     def hidden(self) -> Float[np.ndarray, "k n"]:
         """The directions whose scatter between stretches is not known."""
         return np.concatenate(self.null)
-
-    @property
-    def hanging(self) -> list[tuple[int, int]]:
-        """The place of each number that hangs on one stretch, and that stretch."""
-        if len(self.steps) < FEWEST:
-            return []
-        squares = self.steps**2
-        most = squares.argmax(axis=0)
-        far = squares.max(axis=0) > HANGS * np.maximum(squares.sum(axis=0), 1e-300)
-        return [(int(self.places[k]), int(most[k])) for k in np.flatnonzero(far)]
 
 
 def stretches_of(model: Model, linear: Linearised) -> Stretches | None:
@@ -106,48 +96,44 @@ def by_stretches(stretches: Stretches, white: Spread) -> Spread:
     return dataclasses.replace(white, covariance=shown, seen=covariance, kind=kind)
 
 
-def remarks(stretches: Stretches, model: Model, x: Float[Array, " n"], white: Spread) -> list[str]:
-    """Return a remark on each number that hangs on one stretch, with its value without that one."""
-    count = len(stretches.steps)
+def remarks(
+    stretches: Stretches,
+    model: Model,
+    numbers: tuple[np.ndarray, np.ndarray],
+    white: Spread,
+) -> list[str]:
+    """Return a remark on each reported quantity that one stretch decides.
+
+    **Arguments:** `numbers` the reported quantities and their derivatives, as
+    `quantities.values_and_slopes` gives them; `white` the covariance for white errors.
+    """
+    count, names = len(stretches.steps), labels(model)
     if count == 1:
         return ["deviations come from the differences between windows, and there is one"]
+    values, slopes = (part[: len(names)] for part in numbers)
+    steps = stretches.steps @ slopes[:, stretches.places].T
+    squares = steps**2
+    hanging = squares.max(axis=0) > HANGS * np.maximum(squares.sum(axis=0), 1e-300)
+    unseen = _touched(slopes, white.null_directions)
+    alone = np.stack([_touched(slopes, null) & ~unseen for null in stretches.null])
     edges = -(-np.arange(count + 1) * model.count // count)
-    names, out = _names_of_places(model), []
-    unseen = _touched(white.null_directions)
-    for stretch, null in enumerate(stretches.null):
-        for place in np.flatnonzero(_touched(null) & ~unseen):
-            shown = names.get(int(place), ((f"number {place} of the body", ""), ()))[0]
+    out = []
+    for index, (name, _, positive) in enumerate(names):
+        for stretch in np.flatnonzero(alone[:, index]):
+            out.append(f"only windows {edges[stretch]} … {edges[stretch + 1] - 1} show {name}")
+        if hanging[index] and not alone[:, index].any() and count >= FEWEST:
+            stretch = int(squares[:, index].argmax())
+            value = float(values[index] + steps[stretch, index])
             out.append(
-                f"only windows {edges[stretch]} … {edges[stretch + 1] - 1} show {''.join(shown)}"
+                f"{name} hangs on one stretch (without windows {edges[stretch]} … "
+                f"{edges[stretch + 1] - 1} it is {np.exp(value) if positive else value:.3g})"
             )
-    hidden = _touched(stretches.hidden)
-    for place, stretch in stretches.hanging:
-        if hidden[place]:
-            continue
-        step = stretches.steps[stretch, list(stretches.places).index(place)]
-        name, index = names.get(place, (f"number {place} of the body", None))
-        without = x.at[place].add(step)
-        value = without[place] if index is None else values_of(model, without)[name[0]][index]
-        shown = name if index is None else name[0] + name[1]
-        first, last = edges[stretch], edges[stretch + 1] - 1
-        out.append(
-            f"{shown} hangs on one stretch (without windows {first} … {last} it is "
-            f"{float(value):.3g})"
-        )
     return out
 
 
-def _touched(null: Float[np.ndarray, "k n"]) -> Bool[np.ndarray, " n"]:
-    return np.abs(null).max(axis=0, initial=0.0) > 1e-6
-
-
-def _names_of_places(model: Model) -> dict[int, tuple[Any, Any]]:
-    """Return the name of each shared number, and its index in the value, by its place."""
-    names: dict[int, tuple[Any, Any]] = {}
-    for slot in model.slots:
-        if slot.shared is None:
-            continue
-        for index, place in np.ndenumerate(np.asarray(slot.shared)):
-            inner = "".join(f" {'xyz'[i] if i < 3 else i}" for i in index[1:])
-            names[int(place)] = (slot.name, inner), index if slot.labels else index[1:]
-    return names
+def _touched(
+    slopes: Float[np.ndarray, "q n"], null: Float[np.ndarray, "k n"]
+) -> Bool[np.ndarray, " q"]:
+    """Return whether each quantity changes along one of these directions."""
+    size = np.abs(slopes).max(axis=-1, initial=1e-300)
+    return np.abs(slopes @ null.T).max(axis=-1, initial=0.0) > 1e-6 * size
