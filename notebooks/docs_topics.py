@@ -89,7 +89,7 @@ TOPICS = {
         "How it searches": "SoftL1 Huber AbstractLoss FixedSteps Adaptive Descent Entropic",
         "Uncertainty, comparison": "profile compare cross_validate",
         "Before the experiment": "simulate_readings expected best_first_rate fisher",
-        "Short windows of driven bodies": "windows Windows fit_windows WindowFit",
+        "Short windows of driven bodies": "windows Windows predict_windows",
         "Log files": "read_table",
     },
     "rj.estimate": {
