@@ -179,10 +179,9 @@ def sources_of(recording: Recording) -> dict[str, Any]:
     t, out = recording.t, {}
     for name, source in recording.inputs.items():
         if not callable(source):
-            # The last one begins a step before the last time; of windows some are before the first.
-            steps = jnp.arange(t.size - 1 - len(source), t.size, dtype=t.dtype)
-            times = t[0] + (t[1] - t[0]) * steps
-            source = Held(times, jnp.concatenate([source, source[-1:]]))
+            # Of windows some are before the first time.
+            steps = jnp.arange(t.size - len(source), t.size, dtype=t.dtype)
+            source = Held(t[0] + (t[1] - t[0]) * steps, source)
         out[name] = source
     return out
 
@@ -206,8 +205,7 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
                     f"{samples.shape}; for samples at other times give a function of time such as "
                     "rigidjax.torques.Series(times, samples)"
                 )
-            # The last sample is held beyond the last time.
-            source = jnp.asarray(_checks.finite(samples, f"inputs[{name!r}]")[:-1])
+            source = jnp.asarray(_checks.finite(samples, f"inputs[{name!r}]"))
         out[name] = source
     return out
 

@@ -106,9 +106,8 @@ def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
         return jax.tree.leaves((r.t, parts))
 
     shorter = eqx.tree_at(long, recording, [leaf[begin:end] for leaf in long(recording)])
-    # A sample is held until the next time: there is none for the last.
     inputs = {
-        name: source[begin : end - 1] if eqx.is_array(source) else source
+        name: source[begin:end] if eqx.is_array(source) else source
         for name, source in recording.inputs.items()
     }
     return eqx.tree_at(lambda r: r.inputs, shorter, inputs) if inputs else shorter

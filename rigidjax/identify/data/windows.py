@@ -114,7 +114,13 @@ class Windows(eqx.Module):
         sensor = StateSensor(kind, noise, self.noise is None)
         values = jnp.asarray(np.concatenate(rows, axis=-1))
         reading = Reading(sensor, values, jnp.asarray(mask))
-        return recording_of(jnp.asarray(t), (reading,), self.inputs)
+        # Nothing is read of the input at the last time.
+        inputs = {name: np.asarray(rows) for name, rows in self.inputs.items()}
+        inputs = {
+            name: jnp.asarray(np.concatenate([rows, rows[:, -1:]], axis=1))
+            for name, rows in inputs.items()
+        }
+        return recording_of(jnp.asarray(t), (reading,), inputs)
 
     def held(self) -> Horizons:
         """The errors of a prediction that holds the state at the start: what a model must beat.

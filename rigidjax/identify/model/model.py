@@ -505,7 +505,7 @@ def words_on_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
         return []
     t, rows = np.asarray(model.records.t)[0], max(len(a[0]) for a in model.records.inputs.values())
     step = float(t[1] - t[0])
-    known, length = (rows + 1 - t.size) * step, (t.size - 1) * step
+    known, length = (rows - t.size) * step, (t.size - 1) * step
     return mistakes_of_delays(_scenes(model, x).torque, known, length)
 
 
