@@ -88,7 +88,7 @@ TOPICS = {
         "How it searches": "SoftL1 Huber AbstractLoss FixedSteps Adaptive Descent Entropic",
         "Uncertainty, comparison": "profile compare cross_validate",
         "Before the experiment": "simulate_readings expected best_first_rate fisher",
-        "Short windows of driven bodies": "windows Windows fit_windows WindowFit",
+        "Short windows of driven bodies": "windows Windows predict_windows",
         "Unknown torques: filter and smoother": "Walk first_belief filter smooth step",
         "Likelihood, simulated motions": "log_likelihood sample",
         "Posterior": "LogDensity refit Refit posterior Posterior Nuts",

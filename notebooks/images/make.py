@@ -77,7 +77,7 @@ def fit():
     motion = rj.simulate(truth, rj.Spin([1.0, 0.5, 1.2]), t).ys
     rates = motion.omega + 0.05 * jax.random.normal(jax.random.key(0), (101, 3))
     record = identify.Recording(t, (identify.Gyro(noise=0.05), rates))
-    found = identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=1)
+    found = identify.fit(identify.Model(record, identify.PrincipalRatios()), starts=1)
     figure = rj.plot.fit(found)
     figure.set_size_inches(7.6, 4.8)
     save(figure, "fit.png")

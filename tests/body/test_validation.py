@@ -79,7 +79,7 @@ BATCH = {
 
 def _problem():
     record = identify.Recording([0.0, 1.0], (identify.Gyro(0.1), np.tile(OMEGA, (2, 1))))
-    return identify.Problem(record, identify.Ratios())
+    return identify.Model(record, identify.Ratios())
 
 
 @pytest.mark.parametrize("kind", NO_BODY)

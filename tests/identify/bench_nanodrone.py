@@ -27,37 +27,6 @@ PLACES = 0.0353 * np.array([[1.0, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
 UP = np.tile([0.0, 0, 1.0], (4, 1))
 
 
-class Craft(eqx.Module):
-    """The free numbers, each of order 1."""
-
-    spread: jax.Array  # a root of the second moment about the centre of mass, 1e-2.5 kg^½ m
-    centre: jax.Array  # of mass, mm
-    thrust: jax.Array  # of each rotor, 3.4e-8 N s²
-    drag: jax.Array  # of each rotor, 2e-10 N m s²
-    linear: jax.Array  # drag of the body, 1e-2 kg/s
-    quadratic: jax.Array  # 1e-2 kg/m
-    damping: jax.Array  # 1e-6 N m s
-    twist: jax.Array  # a constant torque, 1e-5 N m
-    flap: jax.Array  # torque by velocity, body axes, 1e-5 N s
-    ahead: jax.Array  # the rotors act so many samples before they are logged
-
-
-def scene(craft):
-    root = jnp.zeros((3, 3)).at[np.tril_indices(3)].set(craft.spread)
-    body = rj.MassProperties(0.045, np.zeros(3), 1e-5 * root @ root.T)
-    speeds = Between(craft.ahead)
-    law = torques.Sum(
-        torques.UniformGravity([0.0, 0.0, -9.81]),
-        torques.Rotors(PLACES - 1e-3 * craft.centre, UP, [1.0, -1, 1, -1],
-                       3.4e-8 * craft.thrust, 2e-10 * craft.drag, speeds),
-        torques.BodyDrag(1e-2 * craft.linear, 1e-2 * craft.quadratic),
-        torques.Damping(1e-6 * craft.damping),
-        torques.ConstantTorque(1e-5 * craft.twist),
-        Flapping(1e-5 * craft.flap),
-    )  # fmt: skip
-    return body, law
-
-
 class Flapping(AbstractForce):
     """The moment of rotors in a cross-flow, linear in the velocity in body axes."""
 
@@ -80,11 +49,65 @@ class Between(eqx.Module):
         return self.now(t) + self.ahead * (self.soon(t) - self.now(t))
 
 
-GUESS = Craft(
-    spread=jnp.array([1.6, 0.0, 1.4, 0.0, 0.0, 1.4]), centre=jnp.zeros(3), thrust=jnp.ones(4),
-    drag=jnp.ones(4), linear=jnp.ones(3), quadratic=jnp.zeros(3), damping=jnp.ones(3),
-    twist=jnp.zeros(3), flap=jnp.zeros((3, 3)), ahead=jnp.asarray(0.5),
+MASS, SPINS = 0.045, np.array([1.0, -1, 1, -1])
+
+
+class Craft(AbstractForce):
+    """A quadrotor: gravity, rotors about the centre of mass, drag, and what else is free."""
+
+    feels = rj.motion.HasPose
+    centre: jax.Array  # of mass, m
+    thrust: jax.Array  # of each rotor, N s²
+    drag: jax.Array  # of each rotor, N m s²
+    linear: jax.Array  # drag of the body, kg/s
+    quadratic: jax.Array  # kg/m
+    damping: jax.Array  # N m s
+    twist: jax.Array  # a constant torque, N m
+    flap: jax.Array  # torque by velocity, body axes, N s
+    speeds: Between
+
+    def __call__(self, t, state, body):
+        law = torques.Sum(
+            torques.UniformGravity([0.0, 0.0, -9.81]),
+            torques.Rotors(PLACES - self.centre, UP, SPINS, self.thrust, self.drag, self.speeds),
+            torques.BodyDrag(self.linear, self.quadratic),
+            torques.Damping(self.damping),
+            torques.ConstantTorque(self.twist),
+            Flapping(self.flap),
+        )
+        return law(t, state, body)
+
+
+SIZES = dict(
+    centre=1e-3, thrust=3.4e-8, drag=2e-10, linear=1e-2, quadratic=1e-2, damping=1e-6, twist=1e-5,
+    flap=1e-5,
 )  # fmt: skip
+FREE = (
+    *(identify.Free(lambda s, k=k: getattr(s.torque, k), k, scale=size) for k, size in SIZES.items()),
+    identify.Free(lambda s: s.torque.speeds.ahead, "ahead"),
+)  # fmt: skip
+GUESS = Craft(
+    centre=jnp.zeros(3), thrust=3.4e-8 * jnp.ones(4), drag=2e-10 * jnp.ones(4),
+    linear=1e-2 * jnp.ones(3), quadratic=jnp.zeros(3), damping=1e-6 * jnp.ones(3),
+    twist=jnp.zeros(3), flap=jnp.zeros((3, 3)), speeds=Between(jnp.asarray(0.5)),
+)  # fmt: skip
+
+
+class Root(identify.AbstractBodyChart):
+    """A root of the second moment about the centre of mass, in units of 1e-2.5 kg^½ m."""
+
+    size, log_names, unit = 6, ("I1", "I2", "I3"), "kg m²"
+
+    def body(self, vector):
+        first = jnp.array([1.6, 0.0, 1.4, 0.0, 0.0, 1.4])
+        root = jnp.zeros((3, 3)).at[np.tril_indices(3)].set(first + vector)
+        return rj.MassProperties(MASS, np.zeros(3), 1e-5 * root @ root.T)
+
+    def vector(self, body):
+        return jnp.zeros(6)
+
+    def logs(self, body):
+        return jnp.log(body.inertia.moments)
 
 
 def cut(path, length, stride):
@@ -119,18 +142,19 @@ if __name__ == "__main__":
         )
     )
     begin = time.process_time()
-    found = identify.fit_windows(train, scene, GUESS)
+    model = identify.Model(train, Root(), torque=GUESS, free=FREE)
+    found = identify.fit(model, starts=1)
+    cost = 0.5 * found.chi2 / (train.count * train.length)
     print(
-        f"{train.count} windows: {found.steps} steps, cost {found.cost:.4f}, "
-        f"{time.process_time() - begin:.1f} CPU s; converged {found.converged} {found.message}"
+        f"{train.count} windows: cost {cost:.4f}, {time.process_time() - begin:.1f} CPU s; "
+        f"{found.status}"
     )
-    for name in found.value.__dataclass_fields__:
-        value, deviation = (np.asarray(getattr(c, name)) for c in (found.value, found.deviation))
-        print(name, np.round(value, 3), "±", np.round(deviation, 3))
-    print("I =", np.asarray(scene(found.value)[0].inertia.tensor), "kg m²")
+    for one in found.quantities:
+        print(f"{one.name} {one.value:.3g} ± {one.deviation:.2g}")
+    print("I =", np.asarray(found.body.inertia.tensor), "kg m²")
     of_each = {name: cut(runs[name], 50, 1) for name in HELD_OUT}
     for name, test in {"both": identify.Windows.joined(*of_each.values()), **of_each}.items():
-        model, held = found.predict(test), test.held()
+        model, held = identify.predict_windows(found, test), test.held()
         for measure in ("mean_absolute", "mean_norm"):
             print(name, measure)
             shown("model", getattr(model, measure))

@@ -1,4 +1,4 @@
-"""How often the intervals of `fit_windows` hold, where errors last and windows overlap.
+"""How often the intervals of a fit of windows hold, where errors last and windows overlap.
 
     python tests/identify/bench_window_intervals.py [--records 150] [--samples 801]
 
@@ -16,7 +16,7 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
-from test_windows import BODY, TRUE, H, Push, scene
+from test_windows import BODY, DAMPING, GAIN, TRUE, H, Push
 
 import rigidjax as rj
 from rigidjax import identify, torques
@@ -27,8 +27,7 @@ START = np.array([0.5, 1.0, -0.4])
 
 @jax.jit
 def motion(u, unknown):
-    known = scene(TRUE)[1]
-    law = torques.Sum(*known.parts, Push(jnp.ones(3), torques.Input("unknown")))
+    law = torques.Sum(Push(**TRUE), Push(jnp.ones(3), 0.0, torques.Input("unknown")))
     one = rj.Spin(jnp.asarray(START)[None])
     given = {"u": u[None], "unknown": unknown[None]}
     return rj.batch.rollout(BODY, one, H, u.size, law, inputs=given, save_every=1).omega[0]
@@ -53,22 +52,24 @@ def main():
     parser.add_argument("--records", type=int, default=150)
     parser.add_argument("--samples", type=int, default=801)
     options = parser.parse_args()
-    flat = lambda tree: np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
+    truth = np.append(TRUE["gain"], TRUE["damping"])
     for memory in (0.0, 1.0, 4.0):
         for length, stride in ((8, 8), (8, 2), (25, 5)):
             held, deviations, errors = [], [], []
             for seed in range(options.records):
                 t, rates, u = record(options.samples, memory, seed)
                 cut = identify.windows(t, rj.Spin(rates), {"u": u}, length=length, stride=stride)
-                found = identify.fit_windows(cut, scene, TRUE)
-                low, high = map(flat, found.interval())
-                held.append((low < flat(TRUE)) & (flat(TRUE) < high))
-                deviations.append(flat(found.deviation))
-                errors.append(flat(found.value) - flat(TRUE))
+                body, free = identify.Known(BODY), [GAIN, DAMPING]
+                model = identify.Model(cut, body, torque=Push(**TRUE), free=free)
+                numbers = identify.fit(model).quantities
+                low, high = np.transpose([one.interval() for one in numbers])
+                held.append((low < truth) & (truth < high))
+                deviations.append([one.deviation for one in numbers])
+                errors.append([one.value for one in numbers] - truth)
             ratio = np.sqrt(np.mean(np.square(deviations), 0) / np.mean(np.square(errors), 0))
             print(
                 f"torque over {memory:g} s, windows of {length} every {stride}: "
-                f"{np.mean(held):.3f} hold (damping, gains: {np.mean(held, 0).round(2)}); "
+                f"{np.mean(held):.3f} hold (gains, damping: {np.mean(held, 0).round(2)}); "
                 f"deviations over errors {ratio.round(2)}",
                 flush=True,
             )

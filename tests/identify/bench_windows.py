@@ -6,9 +6,9 @@ FOLDER with the csv files of the nano-drone benchmark (see `bench_nanodrone.py`;
 project). 1359 windows of 50 steps, 25 free numbers: errors and their derivatives, summed to normal
 equations. Times of the processor, one thread each, medians of interleaved repeats, compile apart.
 
-- ours: one evaluation of the errors and their derivatives, as `identify.fit_windows` takes it;
+- ours: one evaluation of the errors and their derivatives, as `identify.fit` takes it;
 - numba: the same equations written out as loops, Runge–Kutta of order 4, forward differences;
-- `--fit`: whole fits from the same start: `fit_windows`; SciPy's `least_squares` on numba's errors;
+- `--fit`: whole fits from the same start: `identify.fit`; SciPy's `least_squares` on numba's errors;
 - `--mjx`: the runs alone, without derivatives, of MuJoCo's XLA version with its Runge–Kutta.
 """
 
@@ -18,6 +18,7 @@ import os
 import time
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,9 +28,8 @@ jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
 from rigidjax import identify, torques
-from rigidjax.identify.data.windows import by_horizon
-from rigidjax.identify.search import window_fit
-from rigidjax.identify.search.least_squares import Settings
+from rigidjax.identify.search import stages
+from rigidjax.motion.torques.base import AbstractForce
 
 _spec = importlib.util.spec_from_file_location(
     "nanodrone", Path(__file__).with_name("bench_nanodrone.py")
@@ -46,20 +46,38 @@ GUESS = np.concatenate(
 )
 
 
-def scene(x):
-    root = jnp.zeros((3, 3)).at[np.tril_indices(3)].set(x[:6])
-    body = rj.MassProperties(MASS, np.zeros(3), 1e-5 * root @ root.T)
-    centre = jnp.concatenate([x[6:8], jnp.zeros(1)])
-    flap = jnp.zeros((3, 3)).at[0, 1].set(x[22]).at[1, 0].set(x[23])
-    law = torques.Sum(
-        torques.UniformGravity([0.0, 0.0, -9.81]),
-        torques.Rotors(nanodrone.PLACES - 1e-3 * centre, nanodrone.UP, SPINS,
-                       3.4e-8 * x[8:12], 2e-10 * x[12:16], nanodrone.Between(x[24])),
-        torques.BodyDrag(1e-2 * x[16:19]),
-        torques.Damping(1e-6 * x[19:22]),
-        nanodrone.Flapping(1e-5 * flap),
-    )  # fmt: skip
-    return body, law
+class Law(AbstractForce):
+    """The law of the 19 numbers after the six of the body."""
+
+    feels = rj.motion.HasPose
+    x: jax.Array
+    speeds: nanodrone.Between
+
+    def __call__(self, t, state, body):
+        x = self.x
+        centre = jnp.concatenate([x[:2], jnp.zeros(1)])
+        flap = jnp.zeros((3, 3)).at[0, 1].set(x[16]).at[1, 0].set(x[17])
+        law = torques.Sum(
+            torques.UniformGravity([0.0, 0.0, -9.81]),
+            torques.Rotors(nanodrone.PLACES - 1e-3 * centre, nanodrone.UP, SPINS,
+                           3.4e-8 * x[2:6], 2e-10 * x[6:10], self.speeds),
+            torques.BodyDrag(1e-2 * x[10:13]),
+            torques.Damping(1e-6 * x[13:16]),
+            nanodrone.Flapping(1e-5 * flap),
+        )  # fmt: skip
+        return law(t, state, body)
+
+
+FREE = (
+    identify.Free(lambda s: s.torque.x, "x"),
+    identify.Free(lambda s: s.torque.speeds.ahead, "ahead"),
+)
+
+
+def numbers(fit):
+    """The 25 numbers of a fit, as numba's loops take them."""
+    x = fit.values
+    return np.concatenate([GUESS[:6] + fit.x[:6], x["x"], x["ahead"][None]])
 
 
 def cut(folder, count):
@@ -233,26 +251,25 @@ def main():
     options = parser.parse_args()
     windows = cut(options.folder, options.count)
     print(f"{windows.count} windows of {LENGTH} steps, {GUESS.size} numbers; {os.getloadavg()}")
-    found, scales = {}, window_fit._scales(windows, LENGTH, None)
-    padded, count = window_fit._padded(windows), np.asarray(windows.count, np.int32)
+    law = Law(jnp.asarray(GUESS[6:24]), nanodrone.Between(jnp.asarray(GUESS[24])))
+    found, scales = {}, windows.scales
+    model = identify.Model(windows, nanodrone.Root(), torque=law, free=FREE)
+    start = model.start()
 
     def ours():
-        found["fit"] = identify.fit_windows(windows, scene, jnp.asarray(GUESS))
+        again = identify.Model(windows, nanodrone.Root(), torque=law, free=FREE)
+        found["fit"] = identify.fit(again, starts=1)
 
     def evaluated():
         # A search of no steps, the inside of the fit.
-        jax.block_until_ready(
-            window_fit._searched(
-                scene, jnp.asarray(GUESS), padded, count, scales, None,
-                Settings(0.0, 1.0, 0), np.int32(LENGTH), 12,
-            )
-        )  # fmt: skip
+        jax.block_until_ready(stages.errors_and_slopes(model, start))
+
+    errors_alone = eqx.filter_jit(identify.Model.errors)
 
     def alone():
-        found = window_fit.all_errors(windows, scene, jnp.asarray(GUESS))
-        by_horizon(windows.starts, found)
+        jax.block_until_ready(errors_alone(model, start))
 
-    timed("ours, errors alone and their means", alone, options.repeats)
+    timed("ours, errors alone", alone, options.repeats)
     once = timed("ours, errors and derivatives", evaluated, options.repeats)
     errors = with_numba(windows, scales)
     if errors is not None:
@@ -262,10 +279,10 @@ def main():
     if options.fit:
         timed("ours, whole fit", ours, 2)
         best = found["fit"]
-        print(f"steps {best.steps}, cost {best.cost:.6f}, converged {best.converged}")
+        count = windows.count * LENGTH
+        print(f"cost {0.5 * best.chi2 / count:.6f}, {best.search}")
         if errors is not None:
-            count = windows.count * LENGTH
-            for name, x in (("the start", GUESS), ("our end", np.asarray(best.value))):
+            for name, x in (("the start", GUESS), ("our end", numbers(best))):
                 print(f"numba's cost at {name}: {0.5 * np.sum(errors(x) ** 2) / count:.6f}")
             begun = time.process_time()
             end = least_squares(errors, GUESS, method="lm", max_nfev=2000)

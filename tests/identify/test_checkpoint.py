@@ -11,12 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from rigidjax.identify.checkpoint import Checkpoint, SearchState, fingerprint
+from rigidjax.identify.checkpoint import Checkpoint, fingerprint
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify import checkpoint
-from rigidjax.identify.search import Tried
+from rigidjax.identify.search.stages import Attempt
 
 TS = np.linspace(0.0, 3.0, 25)
 
@@ -25,11 +24,11 @@ def problem():
     body = rj.Inertia.from_principal(1.0, 1.5, 2.2)
     read = rj.simulate(body, rj.Spin([0.7, -0.3, 1.4]), TS).ys.omega
     record = identify.Recording(TS, (identify.Gyro(0.01), read))
-    return identify.Problem([record, record], identify.PrincipalRatios())
+    return identify.Model([record, record], identify.PrincipalRatios())
 
 
-def tried(problem):
-    return Tried(problem.start(None, [0.7, -0.3, 1.4]))
+def attempt(problem):
+    return Attempt(problem.start(None, [0.7, -0.3, 1.4]))
 
 
 def names(folder):
@@ -38,41 +37,41 @@ def names(folder):
 
 @pytest.fixture
 def kept(tmp_path):
-    like = tried(problem())
-    return Checkpoint(tmp_path / "fit.npz", like, "print"), SearchState(1, 2, like), tmp_path
+    like = attempt(problem())
+    return Checkpoint(tmp_path / "fit.npz", like, "print"), like, tmp_path
 
 
 def test_a_full_disk_is_said_with_the_name_of_the_file(kept):
-    keep, position, folder = kept
-    keep.save([position.tried], position)
+    keep, like, folder = kept
+    keep.save([like])
     before = keep.path.read_bytes()
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         # The kernel refuses every byte, as a full disk does.
         resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
         with pytest.warns(UserWarning, match=rf"{keep.path} is not up to date \(File too large\)"):
-            keep.save([position.tried] * 2, position)
+            keep.save([like] * 2)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert names(folder) == ["fit.npz"] and keep.path.read_bytes() == before
-    keep.save([position.tried] * 2, position)
-    assert len(Checkpoint(keep.path, position.tried, "print").done) == 2
+    keep.save([like] * 2)
+    assert len(Checkpoint(keep.path, like, "print").done) == 2
 
 
 def test_two_programs_write_to_one_checkpoint(kept, monkeypatch):
-    keep, position, folder = kept
-    other, write = Checkpoint(keep.path, position.tried, "print"), eqx.tree_serialise_leaves
+    keep, like, folder = kept
+    other, write = Checkpoint(keep.path, like, "print"), eqx.tree_serialise_leaves
 
     def meanwhile(file, tree):
         # In the middle of the first program's writing the second one writes all of its own.
         monkeypatch.setattr(eqx, "tree_serialise_leaves", write)
-        other.save([position.tried] * 3, position)
+        other.save([like] * 3)
         write(file, tree)
 
     monkeypatch.setattr(eqx, "tree_serialise_leaves", meanwhile)
-    keep.save([position.tried], position)
+    keep.save([like])
     assert names(folder) == ["fit.npz"]
-    assert len(Checkpoint(keep.path, position.tried, "print").done) == 1
+    assert len(Checkpoint(keep.path, like, "print").done) == 1
 
 
 def test_a_fit_whose_folder_vanishes_is_not_lost(tmp_path):
@@ -121,11 +120,8 @@ def test_a_function_in_a_law_counts_by_its_name():
 
 
 def test_a_checkpoint_that_is_written_says_nothing(kept):
-    keep, position, _ = kept
+    keep, like, _ = kept
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        keep.save([position.tried], position)
-    assert checkpoint.SearchState(*Checkpoint(keep.path, position.tried, "print").position)[:2] == (
-        1,
-        2,
-    )
+        keep.save([like])
+    assert len(Checkpoint(keep.path, like, "print").done) == 1

@@ -7,8 +7,6 @@ import jax
 import numpy as np
 import pytest
 
-from rigidjax import identify
-
 ROOT = Path(__file__).parents[2]
 LOGS = ROOT.parent / "shared" / "data" / "crazyflie"
 pytestmark = [
@@ -33,34 +31,38 @@ def cells():
 
 
 def test_it_converges_from_a_factor_of_two(cells):
-    assert cells["found"].converged and cells["again"].converged
-    np.testing.assert_allclose(cells["moments"](cells["again"].value), cells["i"], rtol=5e-3)
+    found, again = cells["found"], cells["again"]
+    assert found.search.word == again.search.word == "found"
+    np.testing.assert_allclose(cells["moments"](again), cells["moments"](found), rtol=5e-3)
 
 
 def test_moments_lag_and_delay(cells):
-    (moments, craft), (width, deviation) = cells["last"].value, cells["last"].deviation
-    low, high = (end[0] for end in cells["last"].interval())
-    np.testing.assert_allclose(moments, [1.88, 2.12, 2.21], atol=0.02)
+    found = cells["found"]
+    low, high = found.interval_of(cells["moments"])
+    np.testing.assert_allclose(cells["moments"](found), [1.88, 2.12, 2.21], atol=0.02)
     np.testing.assert_allclose((high - low)[:2] / 2, [0.27, 1.25], rtol=0.05)
-    np.testing.assert_allclose([50 * craft.lag, 10 * craft.delay], [39.1, 13.5], atol=0.3)
-    assert 2.2 * 50 * deviation.lag < 8
+    late = [1e3 * found.values[name] for name in ("lag", "delay")]
+    np.testing.assert_allclose(late, [39.1, 13.5], atol=0.3)
+    least, most = found.interval()["lag"]
+    assert most - least < 16e-3
     # About z nearly all of the motion lies in three seconds: without them Iz is not determined.
-    assert high[2] - low[2] > 10 and width[2] > 10 * width[0]
-    assert "number 1 (without windows 488 … 548 it is 2." in cells["last"].message
+    assert high[2] - low[2] > 10 * (high[0] - low[0])
+    assert "Iy hangs on one stretch (without windows 488 … 548 it is 2." in found.status
 
 
 def test_one_step_leaves_a_stretch_out_as_a_fit_does(cells):
-    fit, last = cells["fit"], cells["last"]
+    fit, found = cells["fit"], cells["found"]
     stretch = np.arange(fit.count) * 12 // fit.count
     moments = []
     for k in range(12):
         few = jax.tree.map(lambda a, k=k: a[stretch != k], fit)
-        again = identify.fit_windows(
-            few, cells["scene"], cells["found"].value, noise=cells["NOISE"]
-        )
-        moments.append(cells["moments"](again.value))
-    off = np.array(moments) - np.asarray(last.value[0])
-    by_fits, deviation = np.sqrt(11 / 12 * np.sum(off**2, 0)), np.asarray(last.deviation[0])
+        again = cells["fitted"](few, cells["law"], cells["Moments"](cells["second"]))
+        moments.append(cells["moments"](again))
+    off = np.array(moments) - np.asarray(cells["moments"](found))
+    by_fits = np.sqrt(11 / 12 * np.sum(off**2, 0))
+    low, high = found.interval_of(cells["moments"])
+    # Student's with 11 degrees of freedom.
+    deviation = (high - low) / 2 / 2.201
     np.testing.assert_allclose(deviation[:2], by_fits[:2], rtol=0.3)
     # Where a stretch has nearly all that shows a number, the step is longer than that of a fit.
     assert deviation[2] > by_fits[2] > 5 * deviation[0]

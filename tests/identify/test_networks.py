@@ -53,31 +53,31 @@ def distance(law):
     return float(jnp.sqrt(jnp.mean((of(law) - true) ** 2) / jnp.mean(true**2)))
 
 
+WEIGHTS = [
+    identify.Free(lambda s, i=i, part=part: getattr(s.torque.net.layers[i], part), f"{part} {i}")
+    for i in (0, 1)
+    for part in ("weight", "bias")
+]
+
+
+def fitted(fit):
+    law = fit.model.scenes(fit.x).torque
+    return jax.tree.map(lambda leaf: leaf[0] if eqx.is_array(leaf) else leaf, law)
+
+
 def test_the_weights_of_a_network_are_fitted_to_recordings():
     records = [
-        identify.Recording(TS, (identify.Gyro(1e-3), rates(start).omega), torque=network())
-        for start in STARTS
+        identify.Recording(TS, (identify.Gyro(1e-3), rates(start).omega)) for start in STARTS
     ]
-    free = [
-        identify.Free(
-            lambda r, i=i, part=part: getattr(r.torque.net.layers[i], part), f"{part} {i}"
-        )
-        for i in (0, 1)
-        for part in ("weight", "bias")
-    ]
-    problem = identify.Problem(records, identify.Known(BODY), free=free)
-    fit = identify.fit(problem, initial=problem.start(), max_steps=40)
-    law = problem.scenes(fit.parameters).torque
-    fitted = jax.tree.map(lambda leaf: leaf[0] if eqx.is_array(leaf) else leaf, law)
-    assert fitted.net.activation is jnp.tanh
-    assert distance(network()) > 0.5 and distance(fitted) < 0.1
+    model = identify.Model(records, identify.Known(BODY), torque=network(), free=WEIGHTS)
+    fit = identify.fit(model, initial=model.start(), max_steps=40)
+    assert fitted(fit).net.activation is jnp.tanh
+    assert distance(network()) > 0.5 and distance(fitted(fit)) < 0.1
 
 
 def test_the_weights_of_a_network_are_fitted_to_windows():
     cut = [identify.windows(TS, rates(start), length=5, stride=3) for start in STARTS]
-    fit = identify.fit_windows(
-        identify.Windows.joined(*cut), lambda law: (BODY, law), network(), max_steps=60
-    )
-    assert fit.value.net.activation is jnp.tanh and distance(fit.value) < 0.1
-    low, high = fit.interval()
-    assert bool((low.net.layers[0].weight <= high.net.layers[0].weight).all())
+    windows = identify.Windows.joined(*cut)
+    model = identify.Model(windows, identify.Known(BODY), torque=network(), free=WEIGHTS)
+    fit = identify.fit(model, max_steps=60)
+    assert fitted(fit).net.activation is jnp.tanh and distance(fitted(fit)) < 0.1

@@ -1,4 +1,4 @@
-"""Recordings are stacked number by number; what else a law holds is left alone."""
+"""Recordings are stacked number by number; what else a law or an input holds is left alone."""
 
 from collections.abc import Callable
 from typing import ClassVar
@@ -12,7 +12,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify, torques
 from rigidjax._types import HasSpin
-from rigidjax.identify import padding
+from rigidjax.identify.data import stacking
 
 BODY = rj.Inertia.from_principal(1.0, 1.7, 2.3)
 TS = np.linspace(0.0, 3.0, 31)
@@ -38,19 +38,22 @@ class Friction(eqx.Module):
         return value
 
 
-def recording(strength, omega, law=None):
-    law = Friction(jnp.asarray(strength), jnp.tanh) if law is None else law
+def recording(strength, omega, **inputs):
+    law = Friction(jnp.asarray(strength), jnp.tanh)
     read = rj.simulate(BODY, rj.Spin(omega), TS, law).ys.omega
-    return identify.Recording(TS, (identify.Gyro(0.01), read), torque=law)
+    return identify.Recording(TS, (identify.Gyro(0.01), read), inputs=inputs)
 
 
 FIRST, SECOND = ([0.9, 0.4, 1.3], [0.3, -1.1, 0.8])
-STRENGTH = identify.Free(lambda r: r.torque.strength, "strength", positive=True)
+STRENGTH = identify.Free(lambda s: s.torque.strength, "strength", positive=True)
 
 
 def test_only_numbers_are_stacked():
-    records, _ = padding.stack([recording(0.1, FIRST), recording(0.3, SECOND)])
-    law = records.torque
+    laws = [Friction(jnp.asarray(strength), jnp.tanh) for strength in (0.1, 0.3)]
+    pair = [
+        recording(0.1, start, law=law) for start, law in zip((FIRST, SECOND), laws, strict=True)
+    ]
+    law = stacking.stack(pair)[0].inputs["law"]
     np.testing.assert_array_equal(law.strength, [0.1, 0.3])
     np.testing.assert_array_equal(law.gain, [2.0, 2.0])
     assert law.shape is jnp.tanh and law.sign == "minus" and law.power == 1 and law.on is True
@@ -58,24 +61,24 @@ def test_only_numbers_are_stacked():
 
 @pytest.mark.parametrize("many", [1, 2])
 def test_a_law_that_holds_a_function_predicts_what_simulate_does(many):
-    laws = [recording(0.15, FIRST), recording(0.15, SECOND)][:many]
-    problem = identify.Problem(laws, identify.Known(BODY), free=[STRENGTH])
+    records = [recording(0.15, FIRST), recording(0.15, SECOND)][:many]
+    law = Friction(jnp.asarray(0.15), jnp.tanh)
+    problem = identify.Model(records, identify.Known(BODY), torque=law, free=[STRENGTH])
     errors = problem.errors(problem.start(None, FIRST) if many == 1 else _at_the_truth(problem))
     assert float(jnp.abs(errors[0]).max()) < 1e-6
     assert problem.values(problem.start())["strength"] == pytest.approx(0.15)
-    assert problem.recordings[-1].torque.shape is jnp.tanh
+    assert problem.torque.shape is jnp.tanh
 
 
 def _at_the_truth(problem):
     rates = jnp.asarray([FIRST, SECOND]) / problem.reference.rate[:, None]
-    return eqx.tree_at(lambda p: p.own.spin, problem.start(), rates)
+    return problem.start().at[problem.index.start[:, -3:]].set(rates)
 
 
 def test_recordings_must_hold_the_same_functions():
-    other = Friction(jnp.asarray(0.1), jnp.arctan)
-    pair = [recording(0.1, FIRST), recording(0.1, SECOND, other)]
+    pair = [recording(0.1, FIRST, law=jnp.tanh), recording(0.1, SECOND, law=jnp.arctan)]
     with pytest.raises(ValueError, match="index 1 differs from the first in its sensors or"):
-        identify.Problem(pair, identify.Known(BODY))
+        identify.Model(pair, identify.Known(BODY))
 
 
 def test_a_potential_given_as_a_function_is_taken():
@@ -83,6 +86,6 @@ def test_a_potential_given_as_a_function_is_taken():
     start = rj.Attitude([1.0, 0, 0, 0], FIRST)
     states = rj.simulate(BODY, start, TS, law).ys
     read = [(identify.Gyro(0.01), states.omega), (identify.AttitudeSensor(0.01), states.q)]
-    problem = identify.Problem(identify.Recording(TS, *read), identify.Known(BODY), torque=law)
+    problem = identify.Model(identify.Recording(TS, *read), identify.Known(BODY), torque=law)
     for errors in problem.errors(problem.start(None, FIRST)):
         assert float(jnp.abs(errors).max()) < 1e-5

@@ -140,13 +140,13 @@ def test_the_deviation_of_a_positive_number_is_in_its_unit(size):
     law = rj.torques.Damping([size, size, size])
     body, start = rj.Inertia.from_principal(9 * size, 13 * size, 16 * size), [1.0, 0.2, 0.4]
     motion = rj.simulate(body, rj.Spin(start), TIMES, law).ys
-    record = identify.Recording(TIMES, (identify.Gyro(0.01), motion.omega), torque=law)
+    record = identify.Recording(TIMES, (identify.Gyro(0.01), motion.omega))
     planned = []
     for positive in (False, True):
         scale = 1.0 if positive else size
-        where = lambda r: r.torque.coefficient
+        where = lambda s: s.torque.coefficient
         free = identify.Free(where, "damping", scale=scale, positive=positive)
-        problem = identify.Problem(record, identify.Known(body), free=[free])
+        problem = identify.Model(record, identify.Known(body), torque=law, free=[free])
         planned.append(identify.expected(problem, problem.start(None, start))[3:])
     for plain, positive in zip(*planned, strict=True):
         assert plain.value == pytest.approx(size) == positive.value and positive.positive

@@ -1,5 +1,8 @@
 """Windows whose starts are not exactly known: beside SciPy's fit of all unknowns together."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +10,7 @@ from scipy.optimize import least_squares
 
 import rigidjax as rj
 from rigidjax import identify, torques
+from rigidjax.identify import Free, Known, Model
 
 H, T, LENGTH = 0.05, 81, 10
 BODY = rj.Inertia.from_principal(1.0, 1.0, 1.0)
@@ -16,16 +20,28 @@ SIGMA = 0.02
 RNG = np.random.default_rng(4)
 TIMES = H * np.arange(T)
 READ = np.exp(-np.outer(TIMES, TRUE)) * [1.0, -2.0, 1.5] + SIGMA * RNG.normal(size=(T, 3))
-CUT = identify.windows(TIMES, rj.Spin(READ), length=LENGTH, stride=LENGTH + 1)
+RATES = Free(lambda s: s.torque.coefficient, "rates")
 
 
-def scene(rates):
-    return BODY, torques.Damping(rates)
+def cut_with(**options):
+    return identify.windows(
+        TIMES, rj.Spin(READ), length=LENGTH, stride=LENGTH + 1, **{"noise": {"omega": SIGMA}, **options}
+    )  # fmt: skip
+
+
+def fitted(cut):
+    model = Model(cut, Known(BODY), torque=torques.Damping(jnp.ones(3)), free=[RATES])
+    return identify.fit(model, tolerance=1e-5)
+
+
+def best_cost(fit):
+    return min(start.cost for start in fit.starts)
 
 
 def together(deviation):
     """The rates and all starts at once, in closed form exp(−k t), by `least_squares`."""
-    starts, wanted = np.asarray(CUT.starts.omega), np.asarray(CUT.wanted.omega)
+    cut = cut_with()
+    starts, wanted = np.asarray(cut.starts.omega), np.asarray(cut.wanted.omega)
     ahead = H * np.arange(1, LENGTH + 1)
 
     def residual(z):
@@ -41,19 +57,17 @@ def together(deviation):
 
 @pytest.mark.parametrize("deviation", [SIGMA, np.inf])
 def test_rates_are_those_of_the_whole_problem(deviation):
-    found = identify.fit_windows(
-        CUT, scene, jnp.ones(3), noise={"omega": SIGMA}, starts={"omega": deviation}
-    )
+    found = fitted(cut_with(starts={"omega": deviation}))
     rates, cost = together(deviation)
-    assert found.converged
+    assert found.search.word == "found"
     # Steps of order 4 lack (k h)⁵/120 of the exponential: the rates take it up.
     lack = rates * (rates * H) ** 4 / 120
+    wide = np.array([quantity.deviation for quantity in found.quantities])
     # A fit ends at steps of 1e-5 deviations.
-    assert np.all(np.abs(found.value - rates - lack) < 1e-5 * np.asarray(found.deviation))
-    np.testing.assert_allclose(found.cost * CUT.count * LENGTH, cost, rtol=1e-6)
-    known = identify.fit_windows(CUT, scene, jnp.ones(3), noise={"omega": SIGMA})
+    assert np.all(np.abs(found.values["rates"] - rates - lack) < 1e-5 * wide)
+    np.testing.assert_allclose(best_cost(found), cost, rtol=1e-6)
     # Noise of the starts that is not allowed for shows in the errors that are left.
-    assert known.cost > 1.2 * found.cost
+    assert best_cost(fitted(cut_with())) > 1.2 * best_cost(found)
 
 
 def test_starts_of_every_kind_move():
@@ -64,40 +78,37 @@ def test_starts_of_every_kind_move():
     start = rj.Rigid([0.0, 0, 0], [3.0, 1.0, -2.0], [1.0, 0, 0, 0], [1.0, 2.0, -1.0])
     ts = H * np.arange(41)
     ys = rj.simulate(body, start, ts, torques.Drag(0.3), rtol=1e-11, atol=1e-12).ys
-    cut = identify.windows(ts, ys, length=8, stride=8)
+    noise = {"x": 1e-3, "v": 1e-3, "q": 1e-3, "omega": 1e-3}
+    free = dict.fromkeys(noise, np.inf)
+    cut = identify.windows(ts, ys, length=8, stride=8, noise=noise, starts=free)
     rng = np.random.default_rng(0)
     n = cut.count
-    noise = {"x": 1e-3, "v": 1e-3, "q": 1e-3, "omega": 1e-3}
-    turns = rng.normal(size=(n, 3)) * 0.03
-    off = rj.Rigid(
+    turns = jnp.asarray(rng.normal(size=(n, 3)) * 0.03)
+    moved = rj.Rigid(
         cut.starts.x + 0.05 * rng.normal(size=(n, 3)),
         cut.starts.v + 0.05 * rng.normal(size=(n, 3)),
-        np.stack(
-            [
-                np.asarray(rj.quaternion.multiply(q, rj.quaternion.exp(jnp.asarray(turn))))
-                for q, turn in zip(cut.starts.q, turns, strict=True)
-            ]
-        ),
+        jax.vmap(rj.quaternion.multiply)(cut.starts.q, jax.vmap(rj.quaternion.exp)(turns)),
         cut.starts.omega + 0.05 * rng.normal(size=(n, 3)),
     )
-    wrong = identify.Windows(cut.step, off, cut.wanted, cut.inputs)
-    free = dict.fromkeys(noise, np.inf)
-    found = identify.fit_windows(
-        wrong, lambda k: (body, torques.Drag(k)), jnp.asarray(0.1), noise=noise, starts=free
-    )
-    np.testing.assert_allclose(found.value, 0.3, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(found.cost, 0.0, atol=1e-5)
+    wrong = dataclasses.replace(cut, starts=moved)
+    drag = Free(lambda s: s.torque.coefficient, "drag")
+    model = Model(wrong, Known(body), torque=torques.Drag(0.1), free=[drag])
+    assert model.size == 1 + 12 * n
+    found = identify.fit(model)
+    np.testing.assert_allclose(found.values["drag"], 0.3, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(best_cost(found), 0.0, atol=1e-4)
+    states = found.state0
+    np.testing.assert_allclose(states.v, cut.starts.v, atol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("change", "kind", "words"),
+    ("options", "words"),
     [
-        (dict(noise=None, starts={"omega": 0.1}), ValueError, "starts: .*give noise"),
-        (dict(starts={"q": 0.1}), ValueError, r"starts: wanted a number for each of \('omega',\), got \('q',\)"),
-        (dict(starts={"omega": 0.0}), ValueError, r"starts\['omega'\]: wanted a positive deviation"),
+        (dict(noise=None, starts={"omega": 0.1}), "starts: .*give noise"),
+        (dict(starts={"q": 0.1}), r"starts: wanted a number for each of \('omega',\), got \('q',\)"),
+        (dict(starts={"omega": 0.0}), r"starts\['omega'\]: wanted a positive deviation"),
     ],
 )  # fmt: skip
-def test_mistakes_are_named(change, kind, words):
-    given = {"noise": {"omega": SIGMA}, **change}
-    with pytest.raises(kind, match=words):
-        identify.fit_windows(CUT, scene, jnp.ones(3), **given)
+def test_mistakes_are_named(options, words):
+    with pytest.raises(ValueError, match=words):
+        cut_with(**options)

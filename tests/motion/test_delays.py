@@ -97,32 +97,43 @@ def test_a_fit_of_windows_finds_delay_and_lag():
     rng = np.random.default_rng(2)
     t = H * np.arange(81)
     u = np.repeat(rng.normal(size=27), 3)
-    true = {"delay": jnp.asarray(1.7 * H), "lag": jnp.asarray(1.5 * H)}
+    true = {"delay": 1.7 * H, "lag": 1.5 * H}
 
-    def scene(free):
-        late = torques.Delayed(torques.Input("u"), free["delay"])
-        return BODY, torques.Sum(
-            Push(torques.Lagged(late, free["lag"])), torques.Damping([0.3, 0.3, 0.3])
-        )
+    def law(delay, lag):
+        late = torques.Delayed(torques.Input("u"), delay)
+        return torques.Sum(Push(torques.Lagged(late, lag)), torques.Damping([0.3, 0.3, 0.3]))
 
-    law = scene(true)[1]
-    run = rj.batch.rollout(BODY, spins(1), H, 80, law, inputs={"u": u[None, :80]}, save_every=1)
+    free = [
+        identify.Free(lambda s: s.torque.parts[0].source.source.delay, "delay", scale=H),
+        identify.Free(lambda s: s.torque.parts[0].source.time, "lag", scale=H),
+    ]
+
+    def model(cut, delay):
+        return identify.Model(cut, identify.Known(BODY), torque=law(delay, 0.05), free=free)
+
+    run = rj.batch.rollout(
+        BODY, spins(1), H, 80, law(**true), inputs={"u": u[None, :80]}, save_every=1
+    )
     omega = np.concatenate([np.zeros((1, 3)), run.motion.omega[0]])
     cut = identify.windows(t, rj.Spin(omega), {"u": u}, length=80, before=0)
     with pytest.raises(
         ValueError, match=r"a delay of 0\.02 s, and inputs that are known 0 s before"
     ):
-        identify.fit_windows(cut, scene, {"delay": jnp.asarray(0.02), "lag": jnp.asarray(0.05)})
+        model(cut, 0.02)
     cut = identify.windows(t, rj.Spin(omega), {"u": u}, length=8, stride=8, before=12)
     assert cut.inputs["u"].shape == (cut.count, 20)
-    found = identify.fit_windows(cut, scene, {"delay": jnp.asarray(0.02), "lag": jnp.asarray(0.05)})
-    assert found.converged
+    found = identify.fit(model(cut, 0.02))
+    assert found.search.word == "found"
     # What the lag was 12 samples before a window is not known: e⁻⁷ of it is left there.
-    np.testing.assert_allclose(found.value["delay"], true["delay"], rtol=0, atol=1e-3 * H)
-    np.testing.assert_allclose(found.value["lag"], true["lag"], rtol=0, atol=1e-3 * H)
-    late = {"delay": jnp.asarray(0.7), "lag": jnp.asarray(0.05)}
+    for name, value in true.items():
+        np.testing.assert_allclose(found.values[name], value, rtol=0, atol=1e-3 * H)
     with pytest.raises(ValueError, match=r"known 0\.6 s before a window"):
-        identify.fit_windows(cut, scene, late)
+        model(cut, 0.7)
+    # A fit that ends at a delay beyond the inputs says so.
+    few = identify.windows(t, rj.Spin(omega), {"u": u}, length=8, stride=8, before=1)
+    late = identify.fit(model(few, 0.02))
+    assert float(late.values["delay"]) > H
+    assert any("known 0.05 s before a window" in reason for reason in late.search.reasons)
 
 
 class Push(Turn):

@@ -14,7 +14,6 @@ BY_NUMBER = (
     "which its docstring states, it gives NaN there and the right numbers beside"
 )
 NO_NUMBERS = "a function of arrays, number by number: of no numbers it makes none"
-SCENE = "the scene is a function of the user's: it takes the guess that it takes, and refuses"
 OF_TIME = "a function of time is documented; its value is looked at where it is used"
 CRAMER = (
     "a well conditioned matrix is documented; it stands in the middle of vector fields, where the "
@@ -115,10 +114,6 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ("identify.best_first_rate", "body: None", "taken*", "None is documented: a sphere"),
     ("identify.Recording", "inputs: dict", "taken*", "no input at all is documented: none is read"),
     ("identify.windows", "inputs: dict", "taken*", "no input at all is documented: none is read"),
-    ("identify.fit_windows", "windows: huge", "*", SCENE),
-    ("identify.fit_windows", "windows: large", "*", SCENE),
-    ("identify.fit_windows", "guess: *", "was not raised by the library*", SCENE),
-    ("identify.fit_windows", "guess: *", "names none of*", SCENE),
     *(
         (f"motion.torques.{law}", "*: function", "taken without a word*", OF_TIME)
         for law in (

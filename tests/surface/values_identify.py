@@ -587,12 +587,16 @@ def our_cut(w, u, j):
 
 
 def our_window_fit(w, j):
-    plain = identify.windows(0.5 * np.arange(8), rj.Spin(w), length=3, stride=2)
-    fit = identify.fit_windows(
-        plain, lambda torque: (rj.Inertia(j * jnp.eye(3)), rj.torques.ConstantTorque(torque)),
-        jnp.zeros(3), noise={"omega": 1.0},
+    plain = identify.windows(
+        0.5 * np.arange(8), rj.Spin(w), length=3, stride=2, noise={"omega": 1.0}
+    )
+    model = identify.Model(
+        plain, identify.Known(rj.Inertia(j * jnp.eye(3))),
+        torque=rj.torques.ConstantTorque(jnp.zeros(3)),
+        free=[identify.Free(lambda s: s.torque.torque, "torque")],
     )  # fmt: skip
-    return fit.value, fit.predict(plain).rms["omega"]
+    fit = identify.fit(model, tolerance=1e-9)
+    return fit.values["torque"], identify.predict_windows(fit, plain).rms["omega"]
 
 
 way(
@@ -601,16 +605,11 @@ way(
     our_cut, (v.normal(8, 3), v.normal(8, 2), between(0.5, 2.0)), lambda *a: cut(*a)[:-2],
     batched=False, norm=True, cost=2,
 )  # fmt: skip
-# The search ends within 0.05 standard deviations, here some hundredths of the value.
 way(
-    "identify.fit_windows identify.WindowFit identify.WindowFit.predict", our_window_fit,
-    (v.normal(8, 3), between(0.5, 2.0)), lambda w, j: cut(w, w, j)[-2:], batched=False, rtol=0.01,
+    "identify.predict_windows", our_window_fit,
+    (v.normal(8, 3), between(0.5, 2.0)), lambda w, j: cut(w, w, j)[-2:], batched=False, rtol=1e-8,
     norm=True, cost=4,
 )  # fmt: skip
-leave_out(
-    "windows are left out and the fit is made again: tests/identify/test_windows.py",
-    "identify.WindowFit.interval",
-)
 
 
 # Two frequencies: the series of those that are found is the signal, to the noise that it is said

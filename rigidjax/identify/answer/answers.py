@@ -89,8 +89,12 @@ def advice(
         )
     if above > FAR:
         return f"The intervals cannot be trusted: the sensors make no errors of this size.{tries}"
+    if kind.startswith("jackknife") and model.word != LEAVES:
+        remarks = "; read the remarks, too" if search.reasons or model.reasons else ""
+        words = "The intervals allow for errors that differ from stretch to stretch of the windows"
+        return f"{words}{remarks}. {allowed}"
     if model.word == LEAVES:
-        lasting = "allow" if kind.startswith("sandwich") else "do not allow"
+        lasting = "allow" if kind.startswith(("sandwich", "jackknife")) else "do not allow"
         return f"The intervals {lasting} for autocorrelated errors of this size. {allowed}{tries}"
     if search.reasons or model.reasons:
         return f"The intervals allow for the noise; read the remarks, too. {allowed}{tries}"

@@ -21,10 +21,15 @@ from rigidjax.identify.answer.answers import (
 )
 from rigidjax.identify.answer.causes import clock
 from rigidjax.identify.answer.result import Fit, Start
-from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.model import Model, words_on_delays
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.search.noise import median_of_chi2
-from rigidjax.identify.search.stages import Attempt, errors_and_slopes
+from rigidjax.identify.search.stages import (
+    Attempt,
+    errors_and_slopes,
+    nominal,
+    nominal_count,
+)
 from rigidjax.identify.uncertainty import considered, covariance as uncertainty, flat_limit
 from rigidjax.identify.uncertainty.covariance import Linearised, Times, scatter
 from rigidjax.identify.uncertainty.degrees_of_freedom import freedom_of
@@ -243,12 +248,14 @@ def assess(
     times = uncertainty.correlation_times(linear)
     white = uncertainty.of_white(linear)
     stretches = stretches_of(model, linear)
+    numbers, of = values_and_slopes(model, x, near), charts(model)
+    hidden = np.zeros((0, linear.size))
     if stretches is None:
         spread = uncertainty.spread(linear, times, white)
     else:
-        spread = by_stretches(stretches, white)
-        remarks = (*remarks, *remarks_on(stretches, model, x))
-    numbers, of = values_and_slopes(model, x, near), charts(model)
+        spread, hidden = by_stretches(stretches, white), stretches.hidden
+        remarks = (*remarks, *remarks_on(stretches, model, numbers, white))
+    remarks = (*remarks, *words_on_delays(model, x))
     parts = considered.considerations(model, linear, noise, white.seen)
     spread = _with_considered(spread, parts, model)
     shifts = considered.stacked_shifts(parts, linear.size)
@@ -256,11 +263,14 @@ def assess(
     limits = flat_limit.limits(model, numbers, -white.seen @ linear.slope, [n for n, _ in of])
     # Steps stay short in a long curved valley, although hardly anything is left to gain.
     held = [limit.slope for limit in limits if limit.free < 0]
-    done = bool(best.converged) or uncertainty.distance(linear, white, held) < AT_THE_END
+    near_end = AT_THE_END
+    if count := nominal_count(model):
+        near_end *= float(np.sqrt(2.0 * best_cost / count))
+    done = bool(best.converged) or uncertainty.distance(linear, white, held) < near_end
     chi2, dof, explanation, left = goodness(model, noise, linear, times, white.seen)
     believable = explanation.word != FAILS
     # Ten units of log-likelihood, of the noise as estimated; autocorrelated errors count as fewer.
-    guessed = not all(reading.known_noise for reading in model.records.readings)
+    guessed = not all(r.known_noise and not nominal(r) for r in model.records.readings)
     unit = 2 * best_cost / model.records.size if guessed else 1.0
     margin = 10.0 * unit * max(times.longest, 1.0)
 
@@ -275,7 +285,12 @@ def assess(
     reasons = (*unreal, *explanation.reasons)
     explanation = Answer(explanation.word, reasons) if best_cost < np.inf else Answer(FAILS)
     quantities = quantities_of(
-        model, numbers, spread.seen, spread.null_directions, limits, freedom.of(numbers[1])
+        model,
+        numbers,
+        spread.seen,
+        np.concatenate([spread.null_directions, hidden]),
+        limits,
+        freedom.of(numbers[1]),
     )
     words = _allowance(model, linear, noise, white.seen, parts, quantities, numbers[1])
     return Fit(
@@ -302,6 +317,7 @@ def assess(
         linear.first_times(shown.records.t.shape[1]),
         parts,
         words,
+        jnp.asarray(hidden),
     )
 
 

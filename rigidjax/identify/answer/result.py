@@ -61,7 +61,8 @@ class Fit(eqx.Module):
     else `None`; `freedom` what the degrees of freedom of variances follow from;
     `linear` errors and derivatives there, which all of these come from; `considered` the errors of
     sensors that the covariance allows for by their `Tolerance`; `allowance` says so in words, or
-    what a sensor that is off would do to the result.
+    what a sensor that is off would do to the result; `hidden` (k, n) of a fit of windows the
+    directions that one stretch of them alone shows, whose variance is infinite.
 
     >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> [quantity.name for quantity in found.quantities[:2]], found.covariance.shape
@@ -91,6 +92,7 @@ class Fit(eqx.Module):
     linear: Linearised | None = None
     considered: tuple[Consideration, ...] = ()
     allowance: str = ""
+    hidden: Float[Array, "hidden n"] | None = None
 
     @property
     def status(self) -> str:
@@ -235,6 +237,8 @@ class Fit(eqx.Module):
         middle = np.asarray(_checks.finite(value(self.x), "of(point)"))
         slope = np.asarray(jax.jacfwd(value)(self.derivative_point))
         seen, null = np.asarray(self.seen), np.asarray(self.null_directions)
+        if self.hidden is not None:
+            null = np.concatenate([null, np.asarray(self.hidden)])
         reach = quantile(level, self.degrees(slope))
         return around(middle, slope, seen, null, reach, self.limits)
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks, _show
 from rigidjax.identify.sensors import AbstractSensor
+from rigidjax.motion.torques import Held
 
 
 class Reading(eqx.Module):
@@ -177,6 +178,18 @@ def readings_of(recording: Recording, kind: type) -> list[Any]:
     return [reading for reading in recording.readings if isinstance(reading.sensor, kind)]
 
 
+def sources_of(recording: Recording) -> dict[str, Any]:
+    """Return the inputs as functions of time: each sample is held for one step of even times."""
+    t, out = recording.t, {}
+    for name, source in recording.inputs.items():
+        if not callable(source):
+            # Of windows some are before the first time.
+            steps = jnp.arange(t.size - len(source), t.size, dtype=t.dtype)
+            source = Held(t[0] + (t[1] - t[0]) * steps, source)
+        out[name] = source
+    return out
+
+
 def count_of(reading: Reading) -> int:
     """The number of numbers read: unmasked readings times the components of an error."""
     return reading.sensor.components * int(reading.seen.sum())
@@ -196,8 +209,7 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
                     f"{samples.shape}; for samples at other times give a function of time such as "
                     "rigidjax.torques.Series(times, samples)"
                 )
-            # The last sample is held beyond the last time.
-            source = jnp.asarray(_checks.finite(samples, f"inputs[{name!r}]")[:-1])
+            source = jnp.asarray(_checks.finite(samples, f"inputs[{name!r}]"))
         out[name] = source
     return out
 

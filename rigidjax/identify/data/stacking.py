@@ -40,8 +40,13 @@ def _is_number(leaf: Any) -> bool:
 
 
 def of_few_lengths(model: Any) -> Any:
-    """Return the model with masked readings up to one of four lengths an octave: few programs."""
+    """Return the model with masked readings up to one of four lengths an octave: few programs.
+
+    Windows, which are many and of one length, stay as they are.
+    """
     records = model.records
+    if model.clusters is not None:
+        return model
     longer = lengthened(records, _length(records.t.shape[1]), _length(_rows(records, 1)), 1)
     return eqx.tree_at(lambda m: m.records, model, longer)
 
@@ -106,9 +111,8 @@ def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
         return jax.tree.leaves((r.t, parts))
 
     shorter = eqx.tree_at(long, recording, [leaf[begin:end] for leaf in long(recording)])
-    # A sample is held until the next time: there is none for the last.
     inputs = {
-        name: source[begin : end - 1] if eqx.is_array(source) else source
+        name: source[begin:end] if eqx.is_array(source) else source
         for name, source in recording.inputs.items()
     }
     return eqx.tree_at(lambda r: r.inputs, shorter, inputs) if inputs else shorter

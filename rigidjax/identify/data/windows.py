@@ -19,6 +19,7 @@ from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.sensors.states import StateSensor
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import minus_small, names, parts
+from rigidjax.motion.torques.inputs import delays_of
 
 
 class Horizons(NamedTuple):
@@ -113,7 +114,13 @@ class Windows(eqx.Module):
         sensor: Any = StateSensor(kind, noise, self.noise is None)  # pyright: ignore[reportCallIssue]
         values = jnp.asarray(np.concatenate(rows, axis=-1))
         reading = Reading(sensor, values, jnp.asarray(mask))
-        return recording_of(jnp.asarray(t), (reading,), self.inputs)
+        # Nothing is read of the input at the last time.
+        inputs = {name: np.asarray(rows) for name, rows in self.inputs.items()}
+        inputs = {
+            name: jnp.asarray(np.concatenate([rows, rows[:, -1:]], axis=1))
+            for name, rows in inputs.items()
+        }
+        return recording_of(jnp.asarray(t), (reading,), inputs)
 
     def held(self) -> Horizons:
         """The errors of a prediction that holds the state at the start: what a model must beat.
@@ -300,6 +307,28 @@ def require_windows(windows: Any) -> None:
                     f"windows: wanted a row for each of N windows in {name}, got {leaf.shape}"
                 )
             _checks.finite(leaf, f"windows: {name}")
+
+
+def mistakes_of_delays(law: Any, known: float, length: float) -> list[str]:
+    """Return the mistake of each delay that reads an input beyond those of a window, in words.
+
+    **Arguments:** `known` s, the time before a window from which its inputs are known; `length` s
+    of a window.
+    """
+    out = []
+    for name, delay in delays_of(law):
+        least, most = float(np.min(np.asarray(delay))), float(np.max(np.asarray(delay)))
+        if -least > length:
+            out.append(
+                f"inputs[{name!r}]: a delay of {least:.6g} s reaches beyond the end of windows "
+                f"of {length:.6g} s; is it in seconds?"
+            )
+        elif most > known:
+            out.append(
+                f"inputs[{name!r}]: a delay of {most:.6g} s, and inputs that are known "
+                f"{known:.6g} s before a window: cut them with windows(…, before=k)"
+            )
+    return out
 
 
 def starts_of_windows(

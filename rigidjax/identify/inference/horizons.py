@@ -16,7 +16,7 @@ from rigidjax.identify.data.windows import (
 )
 from rigidjax.identify.model.charts import places_of
 from rigidjax.identify.model.index import index_of
-from rigidjax.identify.model.model import Model, with_parts
+from rigidjax.identify.model.model import Model, require_inputs_of_windows, with_parts
 from rigidjax.identify.model.terms import all_errors
 
 
@@ -27,7 +27,7 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
     **Arguments:** `fit` of a `Model` of windows; `windows` those, or others with the same kind of
     state and inputs. **Returns** `steps`, `mean_absolute`, `mean_norm` and `rms` by kind
     (`Horizons`); `windows.held()` is what it must beat. **Raises:** `TypeError` for a fit of other
-    recordings, `ValueError` for a `Free` with a value of each window.
+    recordings, `ValueError` for a `Free` with a value of each window and for missing inputs.
 
     >>> t = np.linspace(0.0, 1.0, 11)
     >>> spin = rj.Spin(np.stack([0 * t, 0 * t, np.exp(-0.5 * t)], 1))
@@ -47,6 +47,7 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
     if any(slot.own is not None for slot in model.slots):
         raise ValueError("predict_windows: a Free has a value of each window; others have none")
     _checks.instance(windows.starts, type(model.reference.state), "windows.starts")
+    require_inputs_of_windows(model.torque, windows)
     there, x = _on_windows(model, fit.x, windows)
     errors = _errors(there, x)[0]
     return by_horizon(windows.starts, errors[:, 1:])

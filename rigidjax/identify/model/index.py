@@ -61,6 +61,7 @@ def index_of(
         return places.reshape(shape)
 
     shared = [None if s.each else take(max(len(s.labels), 1), *s.shape) for s in slots]
+    first_alone = end
     start = np.concatenate([np.zeros((count, 0), int), *(take(count, 3) for _ in range(kinds))], 1)
     own = [take(count, *s.shape) if s.each or s.spread is not None else None for s in slots]
     blocks, twice, columns, column = [bodies], [], [], bodies.shape[1]
@@ -82,7 +83,6 @@ def index_of(
     width = column + start.shape[1]
     places = np.concatenate([*blocks, *twice], axis=1)
     places = np.where(places < 0, end, places)
-    first_alone = start.min(initial=end)
     alone = tuple(np.flatnonzero((places >= first_alone).all(axis=0) & (places < end).all(axis=0)))
     index = Index(
         jnp.asarray(places, jnp.int32),

@@ -20,7 +20,12 @@ from rigidjax.identify.data import stacking
 from rigidjax.identify.data.full_scale import with_limits
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.data.reference_states import ReferenceStates, first_rates, reference_of
-from rigidjax.identify.data.windows import Windows, require_windows, starts_of_windows
+from rigidjax.identify.data.windows import (
+    Windows,
+    mistakes_of_delays,
+    require_windows,
+    starts_of_windows,
+)
 from rigidjax.identify.model.charts import (
     AbstractBodyChart,
     Bodies,
@@ -47,11 +52,13 @@ from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.manifold import dimension
 from rigidjax.motion.torques.base import AbstractForce, Torque, require_law
 from rigidjax.motion.torques.composite import parts_of
-from rigidjax.motion.torques.inputs import inputs_of
+from rigidjax.motion.torques.inputs import delays_of, inputs_of
 
 # The turn, rad, in a step of the filter, by the classical method of order 4: its error is 5e-8 of
 # the turn.
 TURN_OF_A_FILTER_STEP = 0.05
+# Even steps differ by no more than this part of the first.
+EVEN = 1e-3
 
 
 class AbstractPull(eqx.Module):
@@ -110,7 +117,8 @@ class Model(eqx.Module):
     - `integrator`: `FixedSteps(n)` or `Adaptive(rtol, atol)` for a forced motion; `None` chooses by
       the sampling. `Adaptive()` is quicker if the torque is smooth and the body turns by 0.1 rad or
       more between readings, and slow if the torque reads a noisy log. A free body is followed by
-      the closed form.
+      the closed form. Windows, and recordings whose inputs are samples, are followed by one step of
+      order 4 from each time to the next, with the samples held.
     - `stretches` of windows in a row: deviations come from leaving out one after the other; a
       stretch should be longer than the errors of the model last.
     - `noise_each`: an estimated noise is one figure for all recordings (`False`), for each
@@ -200,9 +208,11 @@ class Model(eqx.Module):
         if windows is None:
             recordings = with_limits(recordings)
             _require_inputs(torque, [recording.inputs for recording in recordings])
+            for number, one in enumerate(recordings):
+                _require_even_times(torque, one, number)
             self.records, self.counts = stacking.stack(recordings)
         else:
-            _require_inputs(torque, [windows.inputs])
+            require_inputs_of_windows(torque, windows)
             self.records = windows.records()
             self.counts = np.full(windows.count, windows.length + 1, np.int32)
         self.chart, self.torque, self.process = charts, torque, process
@@ -242,8 +252,8 @@ class Model(eqx.Module):
         self.index, self.slots = index_of(bodies, charts.size, slots, kinds)
         widest = max((float(np.diff(r.t).max()) for r in recordings), default=0.0)
         turn = 1.5 * widest * float(np.max(np.asarray(self.reference.rate)))
-        sampled = any(eqx.is_array(rows) for rows in self.records.inputs.values())
-        if windows is not None or sampled:
+        if windows is not None or _samples_read(torque, self.records):
+            _require_held_steps(integrator, process)
             integrator = HeldSteps()
         elif integrator is None and torque is not None:
             integrator = integrator_for(turn)
@@ -478,6 +488,67 @@ def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) 
                 f"{', '.join(map(repr, some)) or 'no inputs'}; give "
                 "Recording(…, inputs={name: samples or a function of time})"
             )
+
+
+def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
+    """Raise `ValueError` if windows lack an input of the torque, or what a delay reads of it."""
+    missing = [name for name in inputs_of(torque) if name not in windows.inputs]
+    if missing:
+        have = ", ".join(map(repr, windows.inputs)) or "none"
+        raise ValueError(
+            f"inputs: the torque reads {', '.join(map(repr, missing))}, got {have}; give "
+            "windows(t, states, {name: samples}, …)"
+        )
+    known, length = windows.before * windows.step, windows.length * windows.step
+    if wrong := mistakes_of_delays(torque, known, length):
+        raise ValueError("; ".join(wrong))
+
+
+def words_on_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
+    """Return the mistakes of delays at the free numbers x, in words; none of other recordings."""
+    if model.clusters is None or not delays_of(model.torque):
+        return []
+    t, rows = np.asarray(model.records.t)[0], max(len(a[0]) for a in model.records.inputs.values())
+    step = float(t[1] - t[0])
+    known, length = (rows - t.size) * step, (t.size - 1) * step
+    return mistakes_of_delays(_scenes(model, x).torque, known, length)
+
+
+@eqx.filter_jit
+def _scenes(model: Model, x: Float[Array, " n"]) -> Scene:
+    # As one program: outside of a trace each operation of JAX costs as much as a run of 100 steps.
+    return scenes_of(model, x)
+
+
+def _samples_read(torque: Torque | None, recording: Recording) -> list[str]:
+    """Return the names of the inputs that the torque reads and that are samples."""
+    return [name for name in inputs_of(torque) if not callable(recording.inputs[name])]
+
+
+def _require_even_times(torque: Torque | None, recording: Recording, number: int) -> None:
+    """Raise `ValueError` for samples as inputs at uneven times."""
+    names, steps = _samples_read(torque, recording), np.diff(np.asarray(recording.t, float))
+    if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
+        raise ValueError(
+            f"inputs[{names[0]!r}]: samples are held through even steps, and the times of "
+            f"recording {number} have steps from {steps.min():.6g} to {steps.max():.6g} s; resample "
+            "them, or give a function of time such as rigidjax.torques.Linear(t, samples)"
+        )
+
+
+def _require_held_steps(integrator: Any, process: Any) -> None:
+    """Raise `ValueError` for what does not go with samples that are held through steps."""
+    wanted = "a function of time such as rigidjax.torques.Linear(t, samples)"
+    if integrator is not None and not isinstance(integrator, HeldSteps):
+        raise ValueError(
+            "integrator: samples as inputs are held through one step from each time to the next; "
+            f"give None, or {wanted} as the input"
+        )
+    if process is not None:
+        raise ValueError(
+            f"process: a filter does not hold samples through its steps; give {wanted} as the "
+            "input, and recordings instead of windows"
+        )
 
 
 def _by_body(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:

@@ -185,13 +185,14 @@ class HeldSteps(AbstractIntegrator):
         torque: Torque,
         inputs: dict[str, Array],
     ) -> Any:
-        """Return the states at `ts` (T,); `inputs` by name (before + T − 1, *k).
+        """Return the states at `ts` (T,); `inputs` by name (before + T, *k).
 
-        Row before + i is held through the step from time i. A torque's own states follow the rows
-        before the first time, with the body held at its initial state.
+        Row before + i is held through the step from time i, the last one beyond the last time. A
+        torque's own states follow the rows before the first time, with the body held at its initial
+        state.
         """
         count, size = ts.shape[0] - 1, (ts[1] - ts[0]).astype(state0.omega.dtype)
-        before = max((len(rows) - count for rows in inputs.values()), default=0)
+        before = max((len(rows) - ts.shape[0] for rows in inputs.values()), default=0)
         start = started(body, state0, bind(torque, first_row(torque, size, inputs)), 0.0)
         field = equations_of_motion(body, start, torque)
         stepper = stepper_of(in_a_loop(cheapest(field)), field, start)

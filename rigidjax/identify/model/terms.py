@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.data import stacking
-from rigidjax.identify.data.recording import Recording
+from rigidjax.identify.data.recording import Recording, sources_of
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.model.charts import Bodies, body_of_recording
 from rigidjax.identify.model.free import put
@@ -22,7 +22,6 @@ from rigidjax.identify.model.predict import (
     states_at,
 )
 from rigidjax.identify.model.scene import Scene
-from rigidjax.motion.torques import Held
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import Input, bind
 from rigidjax.rotation.barrier import batched_as
@@ -61,18 +60,14 @@ def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[An
         unbound = {name: Input(name) for name in samples}
         torque = bind(scene.torque, functions | unbound)
         states = model.integrator.driven(body, scene.start, record.t, torque, samples)
-        return states, torque
+        return states, torque_of_scene(scene, record)
     torque = torque_of_scene(scene, record)
     return states_at(model.integrator, body, scene.start, record.t, torque), torque
 
 
 def torque_of_scene(scene: Scene, record: Recording) -> Torque | None:
     """Return the torque of a scene, which reads the inputs of a recording."""
-    inputs = {
-        name: source if callable(source) else Held(record.t[:-1], source)
-        for name, source in record.inputs.items()
-    }
-    return bind(scene.torque, inputs)
+    return bind(scene.torque, sources_of(record))
 
 
 def errors_of_one(

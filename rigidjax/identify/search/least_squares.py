@@ -32,6 +32,8 @@ STUCK = 1e12
 # more of its predicted gain than the first did, by ten times of it at least, and that gain is
 # a small part of the cost. Shorter steps of a smooth cost rise by less and less of it.
 NOISY, LITTLE = 10.0, 1e-4
+# Errors of unknown size count as no smaller than this part of their unit: the rest is round-off.
+EXACT = 1e-6
 
 
 def _float(value: Any) -> np.ndarray:
@@ -43,17 +45,17 @@ class Settings(eqx.Module):
     """The settings of a search, as arrays: another value does not compile again.
 
     Steps of `tolerance` standard deviations (of each number alone) end it, and more than `steps`;
-    if it would need more than `PATIENCE` steps at its pace to an `aim` of another search; if a step
-    of about the predicted gain gains less than `level` of what a fit gains from noise; at a cost of
-    `near`. Zero for none.
+    if it would need more than `PATIENCE` steps at its pace to an `aim` of another search; at a cost
+    of `near`. Zero for none. If the size of the errors is unknown, `count` is their number, and a
+    standard deviation is that by their mean square; zero if it is one.
     """
 
     tolerance: Any = eqx.field(converter=_float)
     damping: Any = eqx.field(converter=_float)
     steps: Any = eqx.field(converter=lambda steps: np.asarray(steps, np.int32))
     aim: Any = eqx.field(converter=_float, default=0.0)
-    level: Any = eqx.field(converter=_float, default=0.0)
     near: Any = eqx.field(converter=_float, default=0.0)
+    count: Any = eqx.field(converter=_float, default=0.0)
 
 
 class LMState(eqx.Module):
@@ -90,15 +92,13 @@ def minimise(
     settings: Settings,
     nothing: Any,
     empty: Normal | None = None,
-    by_noise: Callable[[Any, Normal], Array] | None = None,
 ) -> LMState:
     """At most `settings.steps` steps down from `start`; with none, `start` is evaluated.
 
     **Arguments:** `evaluated` point → values to keep, cost, normal matrix, gradient: of half a sum
     of squares, or minus a log-density with Fisher's information (scoring); `order_one` (n,) one for
     numbers of order one, which no step moves far, else zero; `nothing` zeros like the kept values,
-    `empty` like the normal matrix, if that has more than a core; `by_noise` of them and the normal
-    matrix: the expected excess of the cost at the true numbers.
+    `empty` like the normal matrix, if that has more than a core.
     Source: Marquardt 1963, doi:10.1137/0111030; damping by the ratio of actual to predicted gain:
     Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares problems, section 3.2.
     """
@@ -122,7 +122,7 @@ def minimise(
     )
 
     def step(now: LMState) -> LMState:
-        return _after(now, evaluated(now.trial), order_one, settings, by_noise)
+        return _after(now, evaluated(now.trial), order_one, settings)
 
     return lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
 
@@ -132,7 +132,6 @@ def _after(
     trial: tuple[Any, Array, Normal, Array],
     order_one: Array,
     settings: Settings,
-    by_noise: Callable[[Any, Normal], Array] | None,
 ) -> LMState:
     """The state of the search after an evaluation of the trial point, with the next trial."""
     kept, cost, normal, slope = trial
@@ -149,9 +148,6 @@ def _after(
     damping = jnp.maximum(damping, 1e-12)
     fell = jnp.where(better & ~first, jnp.log(jnp.abs(now.cost / cost)), 0.0)
     pace = jnp.where(first, now.pace, 0.5 * (now.pace + fell))
-    level = better & ~first & (ratio > FAIR) & (now.damping <= FREE)
-    if by_noise is not None:
-        level = level & (now.cost - cost < settings.level * by_noise(kept, normal))
     rise = jnp.where(better | ~finite, 0.0, -ratio)
     noisy = (now.rise > 0) & (rise > jnp.maximum(now.rise, NOISY)) & (now.hoped < LITTLE * now.cost)
     point, cost, normal, slope = jax.tree.map(
@@ -163,11 +159,12 @@ def _after(
     sound = jnp.isfinite(move).all()
     move = jnp.where(sound, move, 0.0)
     hoped = -(slope @ move) - 0.5 * move @ (normal @ move)
-    small = (jnp.max(jnp.abs(move) * root) < settings.tolerance) & (damping <= FREE)
+    size = jnp.sqrt(2.0 * jnp.maximum(cost, 0.0) / jnp.maximum(settings.count, 1.0))
+    unit = jnp.where(settings.count > 0, jnp.maximum(size, EXACT), 1.0)
+    small = (jnp.max(jnp.abs(move) * root) < settings.tolerance * unit) & (damping <= FREE)
     # Round-off refuses every step at the minimum itself.
     bottom = hoped <= 1e-14 * jnp.abs(cost)
-    ended = small if by_noise is None else small | level
-    converged = sound & (ended | noisy | (bottom & ~better & ~first))
+    converged = sound & (small | noisy | (bottom & ~better & ~first))
     lost = ~finite & first
     done = converged | lost | (damping > STUCK) | (~sound & (damping > 1.0))
     done = done | ((settings.aim > 0) & (cost > settings.aim * jnp.exp(PATIENCE * pace)))

@@ -177,7 +177,7 @@ def _search(
 ) -> LMState:
     """Return the end of a stride of `steps` from x (see `Settings`)."""
     steps = task.stride if steps is None else steps
-    settings = Settings(task.tolerance, damping, steps, aim, near=near)
+    settings = Settings(task.tolerance, damping, steps, aim, near, nominal_count(task.model))
     return least_squares_from(task.model, x, task.noise, weights, settings)
 
 
@@ -248,10 +248,10 @@ def fit_in_stages(
     """
     model, noise, *_ = task
     end = _search(x, task, whole_record(model), CAREFUL, aim)
+    at_once = _attempt(end)
     if bool(end.converged) and float(end.cost) <= enough(model):
-        attempt = _attempt(end)
-        watch(attempt)
-        return attempt
+        watch(at_once)
+        return at_once
     level = float(end.first)
     for part in HORIZONS[:-1]:
         # A part of the record need not be fitted to convergence.
@@ -265,12 +265,22 @@ def fit_in_stages(
             attempt = Attempt(x, level)
             watch(attempt)
             return attempt
-    return polish(Attempt(x), task, damping=CAREFUL, aim=aim, watch=watch)
+    attempt = polish(Attempt(x), task, damping=CAREFUL, aim=aim, watch=watch)
+    if not float(at_once.cost) < (1.0 - SETTLED) * float(attempt.cost):
+        return attempt
+    # A beginning may lead away from the least misfit of the whole.
+    return at_once if bool(at_once.converged) else polish(at_once, task, aim=aim, watch=watch)
 
 
 def nominal(reading: Any) -> bool:
     """Return whether the noise of a reading is only the unit of its errors."""
     return getattr(reading.sensor, "nominal", False)
+
+
+def nominal_count(model: Model) -> int:
+    """Return the number of errors of unknown size; 0 if a noise gives the size of any."""
+    readings = model.records.readings
+    return sum(map(count_of, readings)) if all(map(nominal, readings)) else 0
 
 
 def enough(model: Model) -> float:

@@ -54,8 +54,8 @@ class AbstractTorque(eqx.Module):
     **States of its own** (a motor's speed, a wheel, a bias that drifts): give the torque `state0`,
     a tree of arrays or a method `(t, state, body)` that returns one, and a method
     `rate(t, own, state, body)`, their derivative. The torque is then called as
-    `(t, state, body, own)`. `simulate` (`sol.own`), `batch.rollout`, `batch.simulate`,
-    `identify.fit` and `identify.fit_windows` integrate them with the body's state. A function of
+    `(t, state, body, own)`. `simulate` (`sol.own`), `batch.rollout`, `batch.simulate`
+    and `identify.fit` integrate them with the body's state. A function of
     time inside a torque may have states, too (`Lagged`); it is called as `(t, own)`. No base class
     is needed:
 

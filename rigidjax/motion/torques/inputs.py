@@ -55,10 +55,10 @@ class Delayed(eqx.Module):
     `delay` s, one number, which may be free in a fit; negative for an earlier time.
 
     Its `jump_times` move with the delay. `simulate` ends steps there: its derivative by the delay
-    is correct although the source jumps. `rigidjax.batch.rollout` and `identify.fit_windows` hold
-    samples through a step; a delayed sample changes inside the step, which is split in two there:
-    that is exact, too. The first sample also holds before its time, the last one after it. `Linear`
-    and `Series` can be delayed anywhere.
+    is correct although the source jumps. `rigidjax.batch.rollout` and `identify.fit`, for inputs
+    that are samples, hold them through a step; a delayed sample changes inside the step, which is
+    split in two there: that is exact, too. The first sample also holds before its time, the last
+    one after it. `Linear` and `Series` can be delayed anywhere.
 
     **Raises:** `TypeError` for a source that has states (delay its input: `Lagged(Delayed(u, d),
     T)`); `ValueError` for a delay as long as the record.

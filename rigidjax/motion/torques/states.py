@@ -116,7 +116,7 @@ def require_frozen(law: Any) -> None:
     """Raise `TypeError` for a torque that is called without its states."""
     if has_own(law):
         words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate and "
-        words += "identify.fit_windows integrate them; elsewhere call it with its states last"
+        words += "identify.fit integrate them; elsewhere call it with its states last"
         raise TypeError(f"{type(law).__name__} {words}: law(t, state, body, own)")
 
 
