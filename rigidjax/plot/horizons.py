@@ -27,9 +27,9 @@ def horizons(
 ) -> Any:
     """Open-loop errors against the horizon, one picture for each kind of state.
 
-    **Arguments:** `found` a `Horizons`, as `identify.predict_windows` and `Windows.held` return them, or
-    several by name, to compare models, windows, or a prediction that holds the start; `step` s
-    between samples, for a scale of time instead of steps; `measure` `mean_absolute` (of a
+    **Arguments:** `found` a `Horizons`, as `identify.predict_windows` and `Windows.held` return
+    them, or several by name, to compare models, windows, or a prediction that holds the start;
+    `step` s between samples, for a scale of time instead of steps; `measure` `mean_absolute` (of a
     component), `mean_norm` or `rms` (of the vector); `title`; `ax` one for each kind. Both scales
     are linear, since errors start at zero. **Returns** the axes, one for each of position,
     velocity, attitude, body rate in the state. **Raises** `ValueError` for none, for kinds that

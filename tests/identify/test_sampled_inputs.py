@@ -88,7 +88,10 @@ def test_samples_that_no_torque_reads_may_have_any_times():
 UNEVEN = np.array([0.0, 0.1, 0.3, 0.4])
 
 
-def record(t=H * np.arange(4.0)):
+EVEN = H * np.arange(4.0)
+
+
+def record(t=EVEN):
     return Recording(t, (Gyro(1e-3), np.ones((4, 3))), inputs={"u": np.ones(4)})
 
 

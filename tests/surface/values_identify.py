@@ -414,11 +414,13 @@ def ball(j, d, noise, y, w):
     return [*found[:6], found[6], found[2], first[0], first[1], found[0][0]]
 
 
+# Readings are put in its place without the checks of known numbers: a recording is of the host.
+EMPTY = identify.Recording(TS, (identify.Gyro(1.0), np.zeros((4, 3))))
+
+
 def our_ball(j, d, noise, y, w):
-    # Made without the checks of known numbers: a recording is of the host.
-    empty = identify.Recording(TS, (identify.Gyro(1.0), np.zeros((4, 3))))
     body = identify.Known(rj.Inertia(j * jnp.eye(3)))
-    model = identify.Model(empty, body, process=rj.torques.RandomTorque(d))
+    model = identify.Model(EMPTY, body, process=rj.torques.RandomTorque(d))
     reading = Reading(identify.Gyro(noise), y, jnp.ones(4, bool))
     rows = jax.tree.map(lambda leaf: leaf[None], reading)
     model = eqx.tree_at(lambda m: m.records.readings[0], model, rows)

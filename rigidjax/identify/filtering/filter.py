@@ -108,15 +108,14 @@ def first_belief(
     [0.1, 0.1, 0.1]
     """
     scene, record = scene_at(model, x)
-    if state is None:
-        if x is None:
-            _require_shown(record, scene.start)
-        state = scene.start
-    _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
-    state = on_the_group(state)
+    start: Any = scene.start if state is None else state
+    if state is None and x is None:
+        _require_shown(record, start)
+    _checks.single(start, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
+    start = on_the_group(start)
     deviations = {"attitude": attitude, "rate": rate, "position": position, "velocity": velocity}
     words = {"x": "position", "v": "velocity", "q": "attitude", "omega": "rate"}
-    kind, wanted = type(state).__name__, [words[part] for part in names(state)]
+    kind, wanted = type(start).__name__, [words[part] for part in names(start)]
     for name, value in deviations.items():
         if name not in wanted and value is not None:
             raise ValueError(f"{name}: a {kind} has none; leave it out")
@@ -126,7 +125,7 @@ def first_belief(
                 "needs " + ", ".join(wanted)
             )
     parts = [in_shape(deviations[name], (3,), name) for name in wanted]
-    return belief_at(record.t[0], cast(Any, state), jnp.concatenate(parts), scene, model.walks)
+    return belief_at(record.t[0], start, jnp.concatenate(parts), scene, model.walks)
 
 
 def belief_at(

@@ -531,8 +531,8 @@ def _require_even_times(torque: Torque | None, recording: Recording, number: int
     if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
         raise ValueError(
             f"inputs[{names[0]!r}]: samples are held through even steps, and the times of "
-            f"recording {number} have steps from {steps.min():.6g} to {steps.max():.6g} s; resample "
-            "them, or give a function of time such as rigidjax.torques.Linear(t, samples)"
+            f"recording {number} have steps from {steps.min():.6g} to {steps.max():.6g} s; "
+            "resample them, or give a function of time such as rigidjax.torques.Linear(t, samples)"
         )
 
 
