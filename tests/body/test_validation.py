@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax import body as bodies, estimate, identify, lagrangian, torques
+from rigidjax import body as bodies, identify, lagrangian, torques
 from rigidjax.body import validation
 from rigidjax.frames.libration import libration, libration_integral
 from rigidjax.plot import inertia_ellipsoid, phase_portrait, polhode, tumble
@@ -57,7 +57,6 @@ KNOWN = {
     "equations_of_motion": lambda b: rj.equations_of_motion(b, SPIN),
     "Known": identify.Known,
     "Entropic": lambda b: identify.Entropic(b, 1.0),
-    "Model": estimate.Model,
     "Scene": lambda b: Scene("x", "x", b, TURN, None, 1.0),
     "inertia_ellipsoid": inertia_ellipsoid,
     "tumble": lambda b: tumble(b, TIMES, STATES),

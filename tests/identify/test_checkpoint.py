@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from rigidjax.identify.checkpoint import Checkpoint, fingerprint
 
 import rigidjax as rj
 from rigidjax import identify
+from rigidjax.identify.search.checkpoint import Checkpoint, fingerprint
 from rigidjax.identify.search.stages import Attempt
 
 TS = np.linspace(0.0, 3.0, 25)
