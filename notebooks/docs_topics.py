@@ -85,7 +85,7 @@ TOPICS = {
         "Sensors": "Gyro Accelerometer AttitudeSensor Direction Magnetometer Marker Position "
         "Velocity Range LowPass AbstractSensor SensorInput",
         "The fit and its result": "fit Fit Unpacked",
-        "How it searches": "SoftL1 Huber AbstractLoss FixedSteps Adaptive Descent Entropic",
+        "How it searches": "SoftL1 Huber AbstractLoss FixedSteps Adaptive Descent descend Entropic",
         "Uncertainty, comparison": "profile compare cross_validate",
         "Before the experiment": "simulate_readings expected best_first_rate fisher",
         "Short windows of driven bodies": "windows Windows predict_windows",

@@ -67,7 +67,7 @@ from rigidjax.identify.model.priors import (
 )
 from rigidjax.identify.model.scene import Scene as Scene
 from rigidjax.identify.model.walks import Walk as Walk
-from rigidjax.identify.search.stochastic_gradient import Descent as Descent
+from rigidjax.identify.search.stochastic_gradient import Descent as Descent, descend as descend
 from rigidjax.identify.sensors import (
     AbstractSensor as AbstractSensor,
     Accelerometer as Accelerometer,

@@ -10,7 +10,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.search.stages import cost_of
-from rigidjax.identify.search.stochastic_gradient import chosen_recordings, descend, misfit_of
+from rigidjax.identify.search.stochastic_gradient import chosen_recordings, descend_from, misfit_of
 
 TS = jnp.linspace(0.0, 4.0, 25)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -80,7 +80,7 @@ def test_descent_alone_comes_near_and_a_fit_ends_at_the_bottom(problem):
     np.testing.assert_allclose(start.body.moments, plain.body.moments, rtol=1e-6)
     blind = problem.start().at[:2].add(0.8)
     said = []
-    near, _ = descend(blind, problem, NOISE, how, jax.random.key(3), said.append)
+    near, _ = descend_from(blind, problem, NOISE, how, jax.random.key(3), said.append)
     before, after = (cost_of(problem, x, NOISE) for x in (blind, near))
     # 1800 readings: the bottom is at 900; descent in noise of its own stays a little above.
     assert after < 1.5 * 900 < 0.01 * before
@@ -91,7 +91,7 @@ def test_descent_alone_comes_near_and_a_fit_ends_at_the_bottom(problem):
 def test_where_the_misfit_is_lost_the_point_before_is_kept(problem):
     how = identify.Descent(optax.sgd(1e300), steps=100, batch=2)
     start = problem.start(BODY)
-    kept, whole = descend(start, problem, NOISE, how, jax.random.key(0))
+    kept, whole = descend_from(start, problem, NOISE, how, jax.random.key(0))
     assert whole
     assert np.isfinite(kept).all()
 
@@ -105,3 +105,19 @@ def test_mistakes_are_told(problem):
         identify.fit(problem, starts=1, descent=identify.Descent(optax.sgd(1.0), steps=1, batch=25))
     with pytest.raises(TypeError, match="Descent"):
         identify.fit(problem, starts=1, descent=optax.sgd(1.0))
+
+
+def test_too_many_numbers_for_least_squares_are_named():
+    class Wide(eqx.Module):
+        weights: jax.Array
+        feels = rj.motion.HasSpin
+
+        def __call__(self, t, state, body):
+            return 1e-3 * jnp.sum(self.weights, axis=0)
+
+    record = identify.Recording(np.arange(4.0), (identify.Gyro(0.1), np.ones((4, 3))))
+    free = [identify.Free(lambda s: s.torque.weights, "weights")]
+    law = Wide(jnp.zeros((400, 3)))
+    wide = identify.Model(record, identify.Known(BODY), torque=law, free=free)
+    with pytest.raises(ValueError, match=r"1200 free numbers .* Use identify\.descend"):
+        identify.fit(wide)

@@ -85,6 +85,12 @@ row(
 )
 row("identify.Descent", lambda: dict(optimiser=optax.adam(1e-2), steps=3, batch=1), transforms=())
 row(
+    "identify.descend",
+    lambda: dict(model=s.model(), descent=identify.Descent(optax.adam(1e-2), steps=1, batch=1)),
+    groups=("stranger",),
+    transforms=(),
+)
+row(
     "identify.Model",
     lambda: dict(
         recording=s.recording(),

@@ -672,7 +672,7 @@ leave_out(
     "identify.Fit.status", "tumblers.LightCurve.status", "identify.Fit.advice", "identify.Fit.causes",
     "identify.Answer", "identify.Cause",
     "identify.Model.count", "identify.Model.size", "identify.Recording.size",
-    "identify.Descent", "identify.Combination",
+    "identify.Descent", "identify.descend", "identify.Combination",
 )  # fmt: skip
 leave_out(
     "holds what it was given, or numbers of a row above",

@@ -18,7 +18,7 @@ from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.model.model import Model, require_numbers
 from rigidjax.identify.model.predict import AbstractIntegrator, Adaptive
-from rigidjax.identify.model.terms import Noise, all_errors
+from rigidjax.identify.model.terms import all_errors
 from rigidjax.identify.search.checkpoint import (
     Checkpoint,
     fingerprint,
@@ -26,7 +26,7 @@ from rigidjax.identify.search.checkpoint import (
     require_folder,
     without_arrays,
 )
-from rigidjax.identify.search.noise import estimate_noise
+from rigidjax.identify.search.noise import estimate_noise, first_noise
 from rigidjax.identify.search.stages import (
     Attempt,
     Task,
@@ -37,9 +37,11 @@ from rigidjax.identify.search.stages import (
     polish,
 )
 from rigidjax.identify.search.starts import starting_points
-from rigidjax.identify.search.stochastic_gradient import Descent, descend
+from rigidjax.identify.search.stochastic_gradient import Descent, descend_from
 from rigidjax.identify.uncertainty.covariance import linearise, of_white
 
+# More free numbers that recordings share make the dense normal equations slow.
+MOST_SHARED = 1000
 # Steps are fine enough if finer ones change no prediction by more of its noise.
 _MATTERS = 0.05
 # Rounds of the search for noise, and for the width of the recordings' deviations from a shared
@@ -88,8 +90,9 @@ def fit(
     all is well. An interrupt (Ctrl-C) ends the search and keeps the best point so far; the status
     says so.
 
-    **Raises:** `TypeError` unless `model` is a `Model`, `ValueError` for fewer than one start, a
-    checkpoint that is damaged or of another model, or one in a folder that does not exist.
+    **Raises:** `TypeError` unless `model` is a `Model`, `ValueError` for fewer than one start, more
+    than 1000 free numbers that recordings share (`descend` takes any number), a checkpoint that is
+    damaged or of another model, or one in a folder that does not exist.
 
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
@@ -112,8 +115,16 @@ def fit(
         require_folder(checkpoint)
     wanted = "a Descent(optimiser, …) or None"
     _checks.instance(descent, (Descent, NoneType), "fit", wanted=wanted)
+    shared = model.size - len(model.index.alone) * model.count
+    if shared > MOST_SHARED:
+        raise ValueError(
+            f"fit: {shared} free numbers that recordings share are too many for least squares, "
+            f"which is made for {MOST_SHARED} and fewer: its matrices are dense. Use "
+            "identify.descend(model, Descent(optax.adam(1e-2), steps=…, batch=…)), which takes "
+            "gradients of a few recordings at a time"
+        )
     padded = stacking.of_few_lengths(model)
-    task = Task(padded, _first_noise(padded), tolerance, max_steps)
+    task = Task(padded, first_noise(padded), tolerance, max_steps)
     points = [] if initial is None else [initial]
     if starts > len(points):
         points += starting_points(model, starts - len(points), key)
@@ -188,7 +199,7 @@ def _descended(
     keys = jax.random.split(jax.random.key(1) if key is None else key, len(points))
     out: list[Array] = []
     for point, own in zip(points, keys, strict=True):
-        near, ended = descend(point, task.model, task.noise, descent, own, progress)
+        near, ended = descend_from(point, task.model, task.noise, descent, own, progress)
         out.append(near)
         if not ended:
             interrupts.append(f"interrupted in the descent of start {len(out)} of {len(points)}")
@@ -286,21 +297,6 @@ def _finer_integrator(best: Attempt, task: Task, rough: list[str]) -> AbstractIn
         if apart > _MATTERS:
             rough.append(f"the shortest steps still change readings by {apart:.1g} of their noise")
     return None if steps is model.integrator else steps
-
-
-def _first_noise(model: Model) -> Noise:
-    """Return the noise of each sensor, a tenth of its signal where it is to be estimated."""
-    out = []
-    for reading in model.records.readings:
-        sensor = reading.sensor
-        if reading.known_noise:
-            out.append(sensor.noise)
-        else:
-            # What counts is that no channel drowns another.
-            values = reading.values.reshape(*reading.mask.shape, -1)
-            size = jnp.sqrt(jnp.mean(jnp.sum(values**2, axis=-1)) + 1e-300)
-            out.append(jnp.full((model.count, sensor.components), 0.1) * size)
-    return tuple(out)
 
 
 def _with_widths(best: Attempt, task: Task) -> tuple[Attempt, Task]:

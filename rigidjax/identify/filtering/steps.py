@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin, Mat3, Scalar
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.filtering import roots
@@ -351,7 +352,7 @@ def sample(
     ((3, 3), ())
     """
     _checks.key(key)
-    _checks.single(body, (Inertia, MassProperties), "body")
+    body = validation.single(body, (Inertia, MassProperties), "body")
     _checks.single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
     require_process(process)
     if torque is not None:

@@ -66,6 +66,21 @@ def estimate_noise(model: Model, x: Array, blocks: Any, noise: Noise) -> tuple[M
     return model, tuple(out)
 
 
+def first_noise(model: Model) -> Noise:
+    """Return the noise of each sensor, a tenth of its signal where it is to be estimated."""
+    out = []
+    for reading in model.records.readings:
+        sensor = reading.sensor
+        if reading.known_noise:
+            out.append(sensor.noise)
+        else:
+            # What counts is that no channel drowns another.
+            values = reading.values.reshape(*reading.mask.shape, -1)
+            size = jnp.sqrt(jnp.mean(jnp.sum(values**2, axis=-1)) + 1e-300)
+            out.append(jnp.full((model.count, sensor.components), 0.1) * size)
+    return tuple(out)
+
+
 def _by_median(squares: np.ndarray, kept: np.ndarray, groups: np.ndarray) -> np.ndarray:
     """The variance of each group by the median of whole readings: outliers do not change it.
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
 from rigidjax.identify.data import stacking
-from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.model import Model, require_numbers
 from rigidjax.identify.model.terms import (
     Noise,
     all_errors,
@@ -20,6 +20,7 @@ from rigidjax.identify.model.terms import (
     reading_residuals,
 )
 from rigidjax.identify.search.checkpoint import report_progress
+from rigidjax.identify.search.noise import first_noise
 
 if TYPE_CHECKING:
     import optax
@@ -57,6 +58,53 @@ class Descent(eqx.Module):
 
 
 def descend(
+    model: Model,
+    descent: Descent,
+    *,
+    initial: Float[Array, " n"] | None = None,
+    key: PRNGKeyArray | None = None,
+    progress: Callable[[str], Any] | None = None,
+) -> Float[Array, " n"]:
+    """Fit the free numbers of a model by stochastic gradient descent alone.
+
+    It is for many numbers, such as the weights of a network in the torque, where the dense matrices
+    of `fit` are too large; it gives no intervals. **Arguments:**
+
+    - `model`: the readings and the free numbers; a sensor without noise counts by a tenth of its
+      signal.
+    - `descent`: optimiser, steps and batch.
+    - `initial`: (n,) the free numbers to begin with, `model.start()` unless given.
+    - `key`: random key of the batches, always the same unless given.
+    - `progress`: called with a line of text after every 50 steps, such as `print`.
+
+    **Returns** the free numbers (n,) after the last step, or before the first one whose misfit is
+    not finite: `model.unpack(x)`, `model.scenes(x)` say what they are. An interrupt (Ctrl-C)
+    returns the numbers reached. **Raises:** `ValueError` for a batch of more recordings than there
+    are.
+
+    >>> import optax
+    >>> ts = jnp.linspace(0.0, 3.0, 31)
+    >>> body, law = rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.Damping([0.3, 0.3, 0.3])
+    >>> rates = rj.simulate(body, rj.Spin([1.0, 0.5, 0.8]), ts, law).ys.omega
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), rates))
+    >>> drag = rj.identify.Free(lambda s: s.torque.coefficient, "drag")
+    >>> model = rj.identify.Model(
+    ...     record, rj.identify.Known(body), torque=rj.torques.Damping([0.1, 0.1, 0.1]), free=[drag]
+    ... )
+    >>> x = descend(model, Descent(optax.adam(2e-2), steps=200, batch=1))
+    >>> bool(jnp.abs(model.values(x)["drag"] - 0.3).max() < 0.02)
+    True
+    """
+    _checks.instance(model, Model, "descend", wanted="a Model")
+    _checks.instance(descent, Descent, "descend", wanted="a Descent(optimiser, steps=…, batch=…)")
+    x = model.start() if initial is None else require_numbers(model, initial)
+    random: Any = jax.random.key(0) if key is None else _checks.key(key)
+    if progress is not None:
+        _checks.function(progress, "progress", "of a line of text, such as print")
+    return descend_from(x, model, first_noise(model), descent, random, progress)[0]
+
+
+def descend_from(
     start: Float[Array, " n"],
     model: Model,
     noise: Noise,
