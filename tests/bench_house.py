@@ -37,13 +37,14 @@ def code_lines(text: str) -> set[int]:
     return lines
 
 
-def entered(call: object) -> tuple[int, int]:
-    """How many functions, of how many modules."""
+def entered(call: object, part: str = "") -> tuple[int, int]:
+    """Return how many functions of a part of the library are entered, of how many modules."""
+    root = str(ROOT / part)
     seen: set[tuple[str, str]] = set()
 
     def watch(frame, event, _):
         code = frame.f_code
-        if event == "call" and code.co_filename.startswith(str(ROOT)) and code.co_name[0] != "<":
+        if event == "call" and code.co_filename.startswith(root) and code.co_name[0] != "<":
             seen.add((code.co_filename, code.co_qualname))
 
     sys.setprofile(watch)
@@ -52,6 +53,57 @@ def entered(call: object) -> tuple[int, int]:
     finally:
         sys.setprofile(None)
     return len(seen), len({file for file, _ in seen})
+
+
+def rooms() -> dict[str, set[str]]:
+    """Return which rooms of `identify` each room imports."""
+    home, found = ROOT / "identify", {}
+    for file in sorted(home.glob("*/*.py")):
+        room = file.parent.name
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+                "rigidjax.identify."
+            ):
+                other = str(node.module).split(".")[2]
+                if other != room and (home / other).is_dir():
+                    found.setdefault(room, set()).add(other)
+    return found
+
+
+def of_identification() -> None:
+    """Print the rooms of identification, and what a cold fit, a filter and a fit of windows enter."""
+    arrows = rooms()
+    parts = ("identify", "cli")
+    lines = {
+        p: sum(len(f.read_text().splitlines()) for f in (ROOT / p).rglob("*.py")) for p in parts
+    }
+    print("identify:", f"{sum(map(len, arrows.values()))} arrows between rooms,", lines, "lines")
+    text = "".join(f.read_text() for f in (ROOT / "identify").rglob("*.py"))
+    for word in ("jitter", "Bodies", "flat_limit"):
+        files = [f for f in (ROOT / "identify").rglob("*.py") if word in f.read_text()]
+        print(f"modules with {word}: {len(files)}", end="; ")
+    print("jax.jacfwd or jvp in identify:", text.count("jax.jacfwd(") + text.count("jax.jvp("))
+    t = jnp.linspace(0.0, 5.0, 40)
+    body = rj.Inertia.from_principal(1.0, 1.6, 2.2)
+    rates = rj.simulate(body, rj.Spin([1.0, 0.5, 1.2]), t).ys.omega
+    record = rj.identify.Recording(t, (rj.identify.Gyro(0.01), rates))
+    jax.clear_caches()
+    model = rj.identify.Model(record, rj.identify.PrincipalRatios())
+    call = lambda: rj.identify.fit(model, starts=1).x
+    print("functions and modules of a cold fit", *entered(call, "identify"))
+    noise = rj.torques.RandomTorque(1e-4)
+    followed = rj.identify.Model(record, rj.identify.Known(body), process=noise)
+    first = rj.identify.first_belief(followed, rate=0.1)
+    jax.clear_caches()
+    call = lambda: rj.identify.filter(followed, first).log_likelihood
+    print("functions and modules of a cold filter", *entered(call, "identify"))
+    drag = rj.torques.Damping([0.1, 0.1, 0.1])
+    cut = rj.identify.windows(t, rj.Spin(rates), length=8, stride=4)
+    free = [rj.identify.Free(lambda s: s.torque.coefficient, "drag")]
+    jax.clear_caches()
+    model = rj.identify.Model(cut, rj.identify.Known(body), torque=drag, free=free)
+    call = lambda: rj.identify.fit(model).x
+    print("functions and modules of a cold fit of windows", *entered(call, "identify"))
 
 
 def main() -> None:
@@ -92,6 +144,7 @@ def main() -> None:
     print("functions and modules of a cold forced value", *entered(lambda: last(omega)))
     jax.clear_caches()
     print("functions and modules of its gradient", *entered(lambda: jax.grad(last)(omega)))
+    of_identification()
 
 
 if __name__ == "__main__":
