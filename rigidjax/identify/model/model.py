@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -47,6 +47,7 @@ from rigidjax.identify.model.terms import (
     template,
 )
 from rigidjax.identify.model.walks import Drift, Walk, find_drifts
+from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.manifold import dimension
@@ -179,42 +180,24 @@ class Model(eqx.Module):
         windows = recording if isinstance(recording, Windows) else None
         if windows is None:
             recordings, charts, names = _by_body(recording, chart)
-            _are_recordings(recordings)
         else:
             require_windows(windows)
             recordings, names = [], ("",) * windows.count
             charts: Any = Bodies(chart) if isinstance(chart, Mapping) else chart
-        for one in charts_of(charts):
-            known = isinstance(one, Inertia | MassProperties)
-            hint = "give a known body as Known(body)" if known else ""
-            hint = "was () forgotten?" if isinstance(one, type) else hint
-            wanted = "what of the body is free, such as Ratios() or PrincipalRatios()"
-            _checks.instance(one, AbstractBodyChart, "Model", wanted=wanted, hint=hint)
-        if isinstance(free, str):
-            free = (free,)  # pyright: ignore[reportAssignmentType]
-        _checks.instance(free, Sequence, "free", wanted="a sequence of Free(where, name)")
-        for name, value, kind in (
-            ("loss", loss, AbstractLoss),
-            ("prior", prior, Entropic),
-            ("integrator", integrator, AbstractIntegrator),
-        ):
-            if value is not None:
-                _checks.instance(value, kind, name)
+        free = (free,) if isinstance(free, str) else free  # pyright: ignore[reportAssignmentType]
+        _require_parts(charts, free, loss, prior, integrator)
         if torque is not None:
             require_law(torque)
             require_known_torque(torque)
         if process is not None:
             require_process(process)
         if windows is None:
-            recordings = with_limits(recordings)
-            _require_inputs(torque, [recording.inputs for recording in recordings])
-            for number, one in enumerate(recordings):
-                _require_even_times(torque, one, number)
-            self.records, self.counts = stacking.stack(recordings)
+            data = _data_of_recordings(recordings, torque, charts)
         else:
-            require_inputs_of_windows(torque, windows)
-            self.records = windows.records()
-            self.counts = np.full(windows.count, windows.length + 1, np.int32)
+            data = _data_of_windows(windows, torque, charts, stretches)
+        self.records, self.counts, self.reference = data.records, data.counts, data.reference
+        self.state_kind = data.state_kind
+        self.start_weight, self.clusters = data.start_weight, data.clusters
         self.chart, self.torque, self.process = charts, torque, process
         self.loss, self.prior = loss, prior
         self.body_names, self.which, self.pull = names, None, None
@@ -226,32 +209,13 @@ class Model(eqx.Module):
         if isinstance(apart, bool):
             apart = tuple(range(len(names))) if apart else ("",) * len(names)
         self.noise_groups, _ = group_of_each(apart, names, "noise_each")
-        sensors = self.records.sensors
-        self.state_kind = _state_kind(sensors, torque, charts)
-        self.start_weight, self.clusters = None, None
-        if windows is None:
-            sensors = recordings[0].sensors
-            # The readings are known: so are these numbers, within a trace of the torque, too.
-            with jax.ensure_compile_time_eval():
-                self.reference = reference_of(recordings, self.state_kind)
-        else:
-            parts = starts_of_windows(windows, _checks.whole(stretches, "stretches", 2))
-            self.reference, self.start_weight, self.clusters = parts
-            _require_states(windows, self.state_kind)
-        scene = Scene(None, torque, process, sensors, None)
+        scene = Scene(None, torque, process, data.sensors, None)
         self.walks = find_drifts(walks, scene)
         slots = find_slots(free, scene, names)
-        taken = {name for one in charts_of(charts) for name in (*one.log_names, *one.plain_names)}
-        for slot in slots:
-            if slot.name in taken | {"Ωx", "Ωy", "Ωz"}:
-                wanted = "a quantity of the body has this name; give another"
-                raise ValueError(f"Free {slot.name!r}: {wanted}")
+        _require_own_names(slots, charts)
         bodies = places_of(charts, self.which, len(names))
-        kinds = dimension(stacking.one(self.reference.state, 0)) // 3
-        kinds = kinds if windows is None or self.start_weight is not None else 0
-        self.index, self.slots = index_of(bodies, charts.size, slots, kinds)
-        widest = max((float(np.diff(r.t).max()) for r in recordings), default=0.0)
-        turn = 1.5 * widest * float(np.max(np.asarray(self.reference.rate)))
+        self.index, self.slots = index_of(bodies, charts.size, slots, data.kinds)
+        turn = 1.5 * data.widest * float(np.max(np.asarray(self.reference.rate)))
         if windows is not None or _samples_read(torque, self.records):
             _require_held_steps(integrator, process)
             integrator = HeldSteps()
@@ -372,6 +336,84 @@ class Model(eqx.Module):
         x = require_numbers(self, x)
         out = all_errors(self, x)
         return tuple(e[0] for e in out) if self.count == 1 else out
+
+
+class _Data(NamedTuple):
+    """What a model takes from its recordings or windows.
+
+    `sensors` are those of one recording; `kinds` is how many kinds of three numbers an initial
+    state has that is free; `widest` the longest time between two samples, s.
+    """
+
+    records: Recording
+    counts: Int[np.ndarray, " records"]
+    sensors: tuple[AbstractSensor, ...]
+    state_kind: type
+    reference: ReferenceStates
+    start_weight: Float[Array, "records n"] | None
+    clusters: Int[Array, " records"] | None
+    kinds: int
+    widest: float
+
+
+def _data_of_recordings(recordings: list[Recording], torque: Any, charts: Any) -> _Data:
+    """Return the data of recordings: each starts in a free state."""
+    _are_recordings(recordings)
+    recordings = with_limits(recordings)
+    _require_inputs(torque, [recording.inputs for recording in recordings])
+    for number, one in enumerate(recordings):
+        _require_even_times(torque, one, number)
+    records, counts = stacking.stack(recordings)
+    sensors = recordings[0].sensors
+    state_kind = _state_kind(sensors, torque, charts)
+    # The readings are known: so are these numbers, within a trace of the torque, too.
+    with jax.ensure_compile_time_eval():
+        reference = reference_of(recordings, state_kind)
+    kinds = dimension(stacking.one(reference.state, 0)) // 3
+    widest = max(float(np.diff(r.t).max()) for r in recordings)
+    return _Data(records, counts, sensors, state_kind, reference, None, None, kinds, widest)
+
+
+def _data_of_windows(windows: Windows, torque: Any, charts: Any, stretches: int) -> _Data:
+    """Return the data of windows: each starts in a measured state, known or free about it."""
+    require_inputs_of_windows(torque, windows)
+    records = windows.records()
+    counts = np.full(windows.count, windows.length + 1, np.int32)
+    state_kind = _state_kind(records.sensors, torque, charts)
+    stretches = _checks.whole(stretches, "stretches", 2)
+    reference, weight, clusters = starts_of_windows(windows, stretches)
+    _require_states(windows, state_kind)
+    kinds = 0 if weight is None else dimension(stacking.one(reference.state, 0)) // 3
+    return _Data(
+        records, counts, records.sensors, state_kind, reference, weight, clusters, kinds, 0.0
+    )
+
+
+def _require_parts(charts: Any, free: Any, loss: Any, prior: Any, integrator: Any) -> None:
+    """Raise `TypeError` unless the parts of a model are of their types."""
+    for one in charts_of(charts):
+        known = isinstance(one, Inertia | MassProperties)
+        hint = "give a known body as Known(body)" if known else ""
+        hint = "was () forgotten?" if isinstance(one, type) else hint
+        wanted = "what of the body is free, such as Ratios() or PrincipalRatios()"
+        _checks.instance(one, AbstractBodyChart, "Model", wanted=wanted, hint=hint)
+    _checks.instance(free, Sequence, "free", wanted="a sequence of Free(where, name)")
+    for name, value, kind in (
+        ("loss", loss, AbstractLoss),
+        ("prior", prior, Entropic),
+        ("integrator", integrator, AbstractIntegrator),
+    ):
+        if value is not None:
+            _checks.instance(value, kind, name)
+
+
+def _require_own_names(slots: Sequence[Slot], charts: Any) -> None:
+    """Raise `ValueError` for a `Free` with the name of a quantity of the body."""
+    taken = {name for one in charts_of(charts) for name in (*one.log_names, *one.plain_names)}
+    for slot in slots:
+        if slot.name in taken | {"Ωx", "Ωy", "Ωz"}:
+            wanted = "a quantity of the body has this name; give another"
+            raise ValueError(f"Free {slot.name!r}: {wanted}")
 
 
 def unpacked(model: Model, x: Float[Array, " n"]) -> Unpacked:
