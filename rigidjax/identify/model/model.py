@@ -178,7 +178,8 @@ class Model(eqx.Module):
             _are_recordings(recordings)
         else:
             require_windows(windows)
-            recordings, charts, names = [], chart, ("",) * windows.count
+            charts: Any = chart
+            recordings, names = [], ("",) * windows.count
         for one in charts_of(charts):
             known = isinstance(one, Inertia | MassProperties)
             hint = "give a known body as Known(body)" if known else ""
@@ -448,8 +449,8 @@ def require_numbers(model: Model, x: Any) -> Float[Array, " n"]:
 def with_parts(model: Model, **parts: Any) -> Model:
     """Return the model with these fields in the place of its own, as they are.
 
-    `dataclasses.replace` would call `Model(…)`, and `equinox.tree_at` cannot replace a tuple without
-    leaves.
+    `dataclasses.replace` would call `Model(…)`, and `equinox.tree_at` cannot replace a tuple
+    without leaves.
     """
     new = object.__new__(Model)
     for field in dataclasses.fields(Model):
@@ -526,8 +527,8 @@ def _require_even_times(torque: Torque | None, recording: Recording, number: int
     if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
         raise ValueError(
             f"inputs[{names[0]!r}]: samples are held through even steps, and the times of "
-            f"recording {number} have steps from {steps.min():.6g} to {steps.max():.6g} s; resample "
-            "them, or give a function of time such as rigidjax.torques.Linear(t, samples)"
+            f"recording {number} have steps from {steps.min():.6g} to {steps.max():.6g} s; "
+            "resample them, or give a function of time such as rigidjax.torques.Linear(t, samples)"
         )
 
 
@@ -547,7 +548,7 @@ def _require_held_steps(integrator: Any, process: Any) -> None:
 
 
 def _by_body(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
-    """Return the recordings in a row, the chart or charts, and the name of each recording's body."""
+    """Return the recordings in a row, their chart or charts, and the name of each one's body."""
     if isinstance(recording, Mapping) or isinstance(body, Mapping):
         if not (isinstance(recording, Mapping) and isinstance(body, Mapping)):
             raise TypeError(
