@@ -111,7 +111,8 @@ class Windows(eqx.Module):
         rows = [np.concatenate(pair, axis=1) for pair in zip(first, later, strict=True)]
         mask = np.broadcast_to(steps > 0, t.shape)
         noise = jnp.asarray(np.broadcast_to(scales, (self.count, scales.size)).astype(t.dtype))
-        sensor: Any = StateSensor(kind, noise, self.noise is None)  # pyright: ignore[reportCallIssue]
+        unknown = self.noise is None
+        sensor = StateSensor(kind, noise, unknown)  # pyright: ignore[reportCallIssue]
         values = jnp.asarray(np.concatenate(rows, axis=-1))
         reading = Reading(sensor, values, jnp.asarray(mask))
         # Nothing is read of the input at the last time.

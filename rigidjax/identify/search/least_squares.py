@@ -46,7 +46,8 @@ class Settings(eqx.Module):
 
     Steps of `tolerance` standard deviations (of each number alone) end it, and more than `steps`;
     if it would need more than `PATIENCE` steps at its pace to an `aim` of another search; at a cost
-    of `near`. Zero for none. If the size of the errors is unknown, `count` is their number, and a
+    of `near`; if a step of about the predicted gain gains less than `level` of what a fit gains
+    from noise. Zero for none. If the size of the errors is unknown, `count` is their number, and a
     standard deviation is that by their mean square; zero if it is one.
     """
 
@@ -56,6 +57,7 @@ class Settings(eqx.Module):
     aim: Any = eqx.field(converter=_float, default=0.0)
     near: Any = eqx.field(converter=_float, default=0.0)
     count: Any = eqx.field(converter=_float, default=0.0)
+    level: Any = eqx.field(converter=_float, default=0.0)
 
 
 class LMState(eqx.Module):
@@ -92,13 +94,17 @@ def minimise(
     settings: Settings,
     nothing: Any,
     empty: Normal | None = None,
+    gain_of_noise: Callable[[Any, Normal], Array] | None = None,
 ) -> LMState:
-    """At most `settings.steps` steps down from `start`; with none, `start` is evaluated.
+    """Return the end of at most `settings.steps` steps down from `start`.
+
+    With no steps, `start` alone is evaluated.
 
     **Arguments:** `evaluated` point → values to keep, cost, normal matrix, gradient: of half a sum
     of squares, or minus a log-density with Fisher's information (scoring); `order_one` (n,) one for
     numbers of order one, which no step moves far, else zero; `nothing` zeros like the kept values,
-    `empty` like the normal matrix, if that has more than a core.
+    `empty` like the normal matrix, if that has more than a core; `gain_of_noise` gives the gain of
+    a fit from noise (see `Settings.level`), from the kept values and the normal matrix.
     Source: Marquardt 1963, doi:10.1137/0111030; damping by the ratio of actual to predicted gain:
     Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares problems, section 3.2.
     """
@@ -122,7 +128,7 @@ def minimise(
     )
 
     def step(now: LMState) -> LMState:
-        return _after(now, evaluated(now.trial), order_one, settings)
+        return _after(now, evaluated(now.trial), order_one, settings, gain_of_noise)
 
     return lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
 
@@ -132,8 +138,9 @@ def _after(
     trial: tuple[Any, Array, Normal, Array],
     order_one: Array,
     settings: Settings,
+    gain_of_noise: Callable[[Any, Normal], Array] | None,
 ) -> LMState:
-    """The state of the search after an evaluation of the trial point, with the next trial."""
+    """Return the state after an evaluation of the trial point, with the next trial."""
     kept, cost, normal, slope = trial
     parts = jax.tree.leaves((cost, normal, slope))
     finite = jnp.stack([jnp.isfinite(part).all() for part in parts]).all()
@@ -148,6 +155,9 @@ def _after(
     damping = jnp.maximum(damping, 1e-12)
     fell = jnp.where(better & ~first, jnp.log(jnp.abs(now.cost / cost)), 0.0)
     pace = jnp.where(first, now.pace, 0.5 * (now.pace + fell))
+    flat = better & ~first & (ratio > FAIR) & (now.damping <= FREE)
+    if gain_of_noise is not None:
+        flat = flat & (now.cost - cost < settings.level * gain_of_noise(kept, normal))
     rise = jnp.where(better | ~finite, 0.0, -ratio)
     noisy = (now.rise > 0) & (rise > jnp.maximum(now.rise, NOISY)) & (now.hoped < LITTLE * now.cost)
     point, cost, normal, slope = jax.tree.map(
@@ -164,7 +174,8 @@ def _after(
     small = (jnp.max(jnp.abs(move) * root) < settings.tolerance * unit) & (damping <= FREE)
     # Round-off refuses every step at the minimum itself.
     bottom = hoped <= 1e-14 * jnp.abs(cost)
-    converged = sound & (small | noisy | (bottom & ~better & ~first))
+    ended = small if gain_of_noise is None else small | flat
+    converged = sound & (ended | noisy | (bottom & ~better & ~first))
     lost = ~finite & first
     done = converged | lost | (damping > STUCK) | (~sound & (damping > 1.0))
     done = done | ((settings.aim > 0) & (cost > settings.aim * jnp.exp(PATIENCE * pace)))

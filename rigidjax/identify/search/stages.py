@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -30,6 +31,12 @@ STRIDE = 25
 SETTLED = 1e-7
 # A fit to a part of the record may raise the misfit of the whole by at most this factor.
 WILD = 100.0
+# A search over windows ends if a step gains less than this part of the gain of a fit from noise
+# alone: about 0.05 standard deviations from the least misfit. A rough one need not come so near.
+LEVEL, ROUGH = 0.05**2, 1.0
+# The first searches over windows use a ninth and a third of their steps, if these are so many, and
+# take so few steps down.
+PARTS, SHORTEST, FEW = (9, 3), 5, 10
 # Samples after the last one with weight: a low-pass filter looks ahead.
 _BEYOND = 2
 
@@ -100,7 +107,10 @@ def least_squares_from(
     empty = normal_of(
         (jnp.zeros((places.shape[0], 0, 0, places.shape[1]), kind),), places, number, alone
     )
-    end = minimise(evaluated, x, is_order_one(model, kind), settings, nothing, empty)
+    windows = model.clusters is not None
+    by_noise = partial(_gain_of_noise, model, noise, weights) if windows else None
+    bounded = is_order_one(model, kind)
+    end = minimise(evaluated, x, bounded, settings, nothing, empty, by_noise)
     # A wild step can end in NaN: the start is then the better point.
     lost = ~jnp.isfinite(end.cost)
     return dataclasses.replace(
@@ -109,6 +119,40 @@ def least_squares_from(
         cost=jnp.where(lost, jnp.inf, end.cost),
         converged=end.converged & ~lost,
     )
+
+
+def _gain_of_noise(
+    model: Model,
+    noise: Noise,
+    weights: Float[Array, "records times"],
+    kept: Any,
+    normal: Normal,
+) -> Float[Array, ""]:
+    """Return ½ tr(K G⁻¹), the mean excess of the cost at the true numbers, of windows.
+
+    G is the normal matrix of the shared numbers, without the starts of the windows; K adds up
+    g gᵀ of the gradient g of each stretch of windows, whose errors may be alike: Takeuchi 1976;
+    Burnham and Anderson 2002, doi:10.1007/b97636, section 7.2. `kept` are the errors and their
+    derivatives (`terms.blocks`). A start is at its own optimum near the least cost, so that its
+    gradient is left out.
+    """
+    assert model.clusters is not None
+    places, number = model.index.places, model.size
+    residuals, rows = terms.with_rows(
+        lambda e: terms.reading_residuals(model, e, noise, weights), *kept
+    )
+    # There are no more stretches than windows.
+    slopes = jnp.zeros((model.count, number), normal.core.dtype)
+    for e, row in zip(residuals, rows, strict=True):
+        slope = jnp.einsum("rtki,rtk->ri", row, e)
+        slopes = slopes.at[model.clusters[:, None], places].add(slope, mode="drop")
+    starts = jnp.asarray(model.index.start).reshape(-1)
+    slopes = slopes.at[:, starts].set(0.0)
+    felt = normal.diagonal
+    root = jnp.sqrt(jnp.maximum(felt, 1e-12 * jnp.max(felt)))
+    firm = normal.scaled(1.0 / root).plus(jnp.full_like(root, 1e-12))
+    scaled = slopes / root[None, :]
+    return 0.5 * jnp.sum(scaled * firm.solve(scaled.T).T)
 
 
 def is_order_one(model: Model, kind: Any) -> Float[Array, " n"]:
@@ -174,10 +218,11 @@ def _search(
     aim: float = 0.0,
     near: float = 0.0,
     steps: int | None = None,
+    level: float = LEVEL,
 ) -> LMState:
     """Return the end of a stride of `steps` from x (see `Settings`)."""
-    steps = task.stride if steps is None else steps
-    settings = Settings(task.tolerance, damping, steps, aim, near, nominal_count(task.model))
+    steps, count = task.stride if steps is None else steps, nominal_count(task.model)
+    settings = Settings(task.tolerance, damping, steps, aim, near, count, level)
     return least_squares_from(task.model, x, task.noise, weights, settings)
 
 
@@ -247,6 +292,8 @@ def fit_in_stages(
     what is reached over the whole of the records.
     """
     model, noise, *_ = task
+    if model.clusters is not None:
+        return _fit_windows(x, task, aim, watch)
     end = _search(x, task, whole_record(model), CAREFUL, aim)
     at_once = _attempt(end)
     if bool(end.converged) and float(end.cost) <= enough(model):
@@ -270,6 +317,27 @@ def fit_in_stages(
         return attempt
     # A beginning may lead away from the least misfit of the whole.
     return at_once if bool(at_once.converged) else polish(at_once, task, aim=aim, watch=watch)
+
+
+def _fit_windows(
+    x: Float[Array, " n"], task: Task, aim: float, watch: Callable[[Attempt], None]
+) -> Attempt:
+    """Return the end of the search over windows: first over a ninth and a third of their steps.
+
+    A long run from a poor guess diverges.
+    """
+    model, begin = task.model, x
+    length = model.records.t.shape[1] - 1
+    for part in PARTS:
+        steps = length // part
+        if steps >= SHORTEST:
+            seen = beginning(model, (steps + 0.5) / length)
+            end = _search(begin, task, seen, BOLD, steps=FEW, level=ROUGH)
+            begin = end.point if np.isfinite(float(end.cost)) else begin
+    attempt = polish(Attempt(begin), task, aim=aim, watch=watch)
+    if begin is not x and not float(attempt.cost) <= cost_of(model, x, task.noise):
+        attempt = polish(Attempt(x), task, aim=aim, watch=watch)
+    return attempt
 
 
 def nominal(reading: Any) -> bool:

@@ -66,18 +66,6 @@ def ends(
     return end(-1.0), end(1.0)
 
 
-def in_words(body: Inertia | MassProperties) -> str | None:
-    """The remark on a flat body, if a fit ended at one without an interval for it."""
-    values = np.linalg.eigvalsh(np.asarray(body.second_moment))
-    if not values[0] < THIN * values.sum():
-        return None
-    flatness = 2 * values[0] / (values[1] + values[2])
-    return (
-        f"the fitted body is flat: (I1 + I2 − I3)/I3 = {flatness:.2g}; if the true body is not, "
-        "the model is incomplete"
-    )
-
-
 def thickened(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     """Return the free numbers x with flat bodies a little thicker; `None` if no body is flat.
 
