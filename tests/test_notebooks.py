@@ -60,7 +60,7 @@ def chains(source):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_names_of_the_library_exist(path):
-    known = {"rj": rj} | {part: getattr(rj, part) for part in ("identify", "estimate", "torques")}
+    known = {"rj": rj} | {part: getattr(rj, part) for part in ("identify", "torques")}
     notebook = json.loads(path.read_text(encoding="utf-8"))
     count = 0
     for cell in notebook["cells"]:

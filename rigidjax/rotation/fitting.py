@@ -99,10 +99,14 @@ def wahba(
         raise ValueError(words) from None
     # (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det b: 0 where a turn is free.
     eps = float(jnp.finfo(w.dtype).eps)
-    loose = jnp.zeros((), bool)
-    for weights, least in ((jnp.sign(heavy), 4 * np.sqrt(eps)), (heavy, 64 * eps)):
-        b = _weighted_sum(weights, those, these)
-        firmness = determinant(_curvature(lax.stop_gradient(best), b / jnp.sqrt((b * b).sum())))
+    loose, seen, one = jnp.zeros((), bool), jnp.sign(heavy), jnp.eye(3, dtype=w.dtype)
+    # Without weights the directions of each frame alone: `best` is not the best turn of these.
+    for turn, b, least in (
+        (one, _weighted_sum(seen, those, those), 4 * np.sqrt(eps)),
+        (one, _weighted_sum(seen, these, these), 4 * np.sqrt(eps)),
+        (lax.stop_gradient(best), _weighted_sum(heavy, those, these), 64 * eps),
+    ):
+        firmness = determinant(_curvature(turn, b / jnp.sqrt((b * b).sum())))
         loose = loose | ~(firmness > least)
     return _checks.refuse(best, loose, words)
 

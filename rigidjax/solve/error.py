@@ -330,7 +330,10 @@ def _closer(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
         where = lambda s: (inside(s.controller)[0].rtol, inside(s.controller)[0].atol)  # noqa: E731
         setup = eqx.tree_at(where, setup, both)
         if sudden.size:
-            control = dfx.ClipStepSizeController(setup.controller, step_ts=jnp.sort(sudden))
+            # A run whose switches are sought goes forward, in the time times its sign.
+            turned = setup.stops and setup.sign is not None
+            along = setup.sign.astype(ts.dtype) * sudden if turned else sudden
+            control = dfx.ClipStepSizeController(setup.controller, step_ts=jnp.sort(along))
             setup = dataclasses.replace(setup, controller=control)
         return setup, jnp.asarray(found[0].rtol, ts.dtype), 1.0
     if not isinstance(setup.controller, dfx.ConstantStepSize):

@@ -65,8 +65,8 @@ def test_the_names_of_the_columns_say_the_units_of_sensors_and_wheels(tmp_path):
     record = spec.read_log(path, channels, wheels=[spec.wheel("motor (rpm):1e-6:x")])
     np.testing.assert_allclose(record.readings[0].values, RATES, atol=1e-9)
     np.testing.assert_allclose(record.readings[1].values, 9.80665 * RATES, atol=1e-7)
-    wheel = record.torque.parts[0].momentum
-    np.testing.assert_allclose(wheel.speed(0.5), 2 * np.pi, rtol=1e-12)
+    (speed,) = record.inputs.values()
+    np.testing.assert_allclose(speed(0.5), 2 * np.pi, rtol=1e-12)
     for text, named in (("gyro=x (°/s),y (°/s),z (°/s):rad/s", "deg/s"),):
         with pytest.raises(LogError, match=f"is in {named} by its name, and rad/s is stated"):
             spec.read_log(path, [spec.channel(text)])
@@ -95,8 +95,8 @@ def test_bad_stamps_outside_the_window_are_no_matter_to_sensors_and_wheels(tmp_p
     path = written(tmp_path, t, speeds, "t,wx,wy,wz,s")
     record = spec.read_log(path, GYRO, window=(0.4, 1.2), wheels=[spec.wheel("s:1e-6")])
     np.testing.assert_allclose(record.t, T[20:61], atol=1e-12)
-    wheel = record.torque.parts[0].momentum
-    np.testing.assert_allclose(wheel.speed(1.7), 100 + 7 * 1.7, rtol=1e-6)
+    (speed,) = record.inputs.values()
+    np.testing.assert_allclose(speed(1.7), 100 + 7 * 1.7, rtol=1e-6)
 
 
 @pytest.mark.parametrize("begin", [0.0, 1.75e9])
@@ -107,9 +107,9 @@ def test_a_wheel_is_read_where_rows_are_left_out_or_stamps_are_rounded(begin, tm
     path = written(tmp_path, t, speeds, "t,wx,wy,wz,s", stamp="%.6f")
     with pytest.warns(LogWarning, match="1 of 100 rows are left out"):
         record = spec.read_log(path, GYRO, wheels=[spec.wheel("s:1e-6")])
-    wheel = record.torque.parts[0].momentum
+    (speed,) = record.inputs.values()
     times = np.array([0.3, 0.97, 1.0, 1.03, 1.9])
-    np.testing.assert_allclose([wheel.speed(t) for t in times], 100 + 7 * times, rtol=1e-7)
+    np.testing.assert_allclose([speed(t) for t in times], 100 + 7 * times, rtol=1e-7)
 
 
 def test_a_wheel_at_uneven_times_is_refused(tmp_path):

@@ -100,7 +100,6 @@ def record(t=EVEN):
     [
         (lambda: Model([record(), record(UNEVEN)], Known(BODY), torque=Push(GAIN)), r"inputs\['u'\]: samples are held through even steps, and the times of recording 1 have steps from 0\.1 to 0\.2 s"),
         (lambda: Model(record(), Known(BODY), torque=Push(GAIN), integrator=identify.Adaptive()), "integrator: samples as inputs are held through one step"),
-        (lambda: Model(record(), Known(BODY), torque=Push(GAIN), process=torques.RandomTorque(0.1)), "process: a filter does not hold samples"),
         (lambda: Recording(UNEVEN, (Gyro(1e-3), np.ones((4, 3))), inputs={"u": np.ones(3)}), "wanted a sample for each of 4 times"),
         (lambda: Model(record(), Known(BODY), torque=Push(GAIN, torques.Input("v"))), "it reads 'v', and recording 0 has 'u'"),
     ],

@@ -309,7 +309,7 @@ TIMES = np.arange(10.0)
         (lambda: Model(identify.windows(TIMES, SPINS, length=2), Known(BODY), torque=GUESS), "the torque reads 'u', got none"),
         (lambda: Model(identify.windows(TIMES, SPINS, {"v": np.ones(10)}, length=2), Known(BODY), torque=GUESS), "the torque reads 'u', got 'v'"),
         (lambda: Model(identify.windows(TIMES, SPINS, length=2), Known(BODY), torque=torques.Damping(jnp.ones(3)), integrator=identify.FixedSteps(2)), "integrator: samples as inputs are held"),
-        (lambda: Model(identify.windows(TIMES, SPINS, length=2), Known(BODY), process=torques.RandomTorque(0.1)), "process: a filter does not hold samples"),
+        (lambda: Model(identify.windows(TIMES, SPINS, length=2), Known(BODY), process=torques.RandomTorque(0.1)), "process: a filter follows one record"),
         (lambda: Model(identify.windows(TIMES, SPINS, length=2), Known(BODY), stretches=1), "stretches: wanted"),
     ],
 )  # fmt: skip

@@ -199,7 +199,9 @@ HELD = torques.Held([0.0, 1.0], np.zeros((2, 3)))
     "make",
     [
         lambda: torques.Flywheel(HELD),
-        lambda: torques.Flywheel(torques.Delayed(torques.Input("h"), 0.1)),
+        lambda: torques.bind(
+            torques.Flywheel(torques.Delayed(torques.Input("h"), 0.1)), {"h": HELD}
+        )(0.5, rj.Spin(OMEGA), INERTIA),
         lambda: torques.ChangingInertia(torques.Held([0.0, 1.0], np.zeros((2, 3, 3)))),
     ],
 )

@@ -91,21 +91,28 @@ def last_rate(law, **tolerances):
     ]
 
 
-# The rate is size·end/2, of which a half is lost; or stop + (3 − 2 stop)/8, of which all is lost.
-LOST = {
-    "half": (lambda x, **how: last_rate(Until(x, x), **how), 1.1, 1.1),
+# The rate is size·end/2; or stop + (3 − 2 stop)/8, whose slope by `stop` comes from the switch.
+TIMED = {
+    "size": (lambda x, **how: last_rate(Until(x, x), **how), 1.1, 1.1),
     "time": (lambda x, **how: last_rate(Until(x, jnp.ones(())), **how), 1.7, 0.5),
-    "state": (lambda x, **how: last_rate(Burn(x), **how), 0.6, 0.75),
 }
 
 
-@pytest.mark.parametrize("name", LOST)
-def test_a_derivative_that_misses_a_switch_is_not_known(name):
-    f, x, right = LOST[name]
+@pytest.mark.parametrize("name", TIMED)
+def test_a_derivative_by_a_switching_time_is_right_and_known(name):
+    f, x, right = TIMED[name]
+    error = rj.error_of(f, jnp.asarray(x))
+    assert bool(error.known)
+    off = abs(float(error.derivative) - right)
+    assert off <= 2 * float(error.derivative_error) + 1e-15 and off < 1e-9
+
+
+@pytest.mark.parametrize("stop", [0.6, 0.9])
+def test_a_derivative_that_misses_a_switch_is_not_known(stop):
     with pytest.warns(UserWarning, match="a torque that switches at a time or a state"):
-        error = rj.error_of(f, jnp.asarray(x))
+        error = rj.error_of(lambda x, **how: last_rate(Burn(x), **how), jnp.asarray(stop))
     assert not bool(error.known)
-    assert abs(float(error.derivative) - right) <= 2 * float(error.derivative_error)
+    assert abs(float(error.derivative) - 0.75) <= 2 * float(error.derivative_error)
 
 
 def test_the_last_digits_of_zeros_count():
@@ -135,6 +142,7 @@ def test_a_flat_body_has_a_difference_on_one_side(moments):
 
 def test_smooth_functions_agree_with_their_differences():
     from rigidjax.solve.difference import sides_of, slopes_of, values_at
+    from rigidjax.solve.error import FunctionError
 
     rng = np.random.default_rng(5)
     functions = (
@@ -147,9 +155,7 @@ def test_smooth_functions_agree_with_their_differences():
         for _ in range(20):
             x = jnp.asarray(rng.normal(size=2))
             value, slope = f(x), jax.jacfwd(f)(x)
-            error = rj.solve.FunctionError(
-                value, 1e-10 * jnp.abs(value), slope, 1e-9 * jnp.abs(slope)
-            )
+            error = FunctionError(value, 1e-10 * jnp.abs(value), slope, 1e-9 * jnp.abs(slope))
             step, sides = sides_of(x, value, error.value_error, slope)
             values = values_at(lambda x, _: f(x), sides, jnp.zeros(2))
             assert not np.any(slopes_of(x, value, step, sides, values, error).differ)

@@ -83,6 +83,7 @@ row(
     arguments=("where", "scale", "prior"),
     **HOST,
 )
+row("identify.Tolerance", dict(scale=0.01, cross_axis=0.02, bias=0.1, clock=1e-3), **HOST)
 row("identify.Descent", lambda: dict(optimiser=optax.adam(1e-2), steps=3, batch=1), transforms=())
 row(
     "identify.descend",
@@ -183,6 +184,7 @@ records = (
     "Linearised",
     "Scene",
     "Unpacked",
+    "Consideration",
 )
 leave_out("a record that the library fills", *(f"identify.{name}" for name in records))
 leave_out(

@@ -679,7 +679,8 @@ leave_out(
     "identify.Belief.torques", "identify.Belief.walks", "identify.Filtered.t",
     "identify.Smoothed.t", "identify.Walk", "identify.Push", "identify.Extended", "identify.Start",
     "identify.Model.recording", "identify.Model.recordings", "identify.Scene",
-    "identify.Model.bodies", "identify.Model.scenes",
+    "identify.Model.bodies", "identify.Model.scenes", "identify.Tolerance",
+    "identify.Windows.records", "identify.Windows.scales",
     "identify.Recording.sensors", "identify.Fit.values",
     "identify.Fit.spreads", "identify.Fit.noise", "identify.Fit.jitter", "identify.Fit.rms", "tumblers.Alias",
     "tumblers.LightCurve", "tumblers.LightCurve.rivals", "identify.Comparison",
@@ -692,6 +693,12 @@ leave_out(
     "body.parameters.flat_bend", "identify.Fit.derivative_point", "identify.Limit", "identify.Limit.bound",
     "identify.Limit.deviation", "identify.Limit.is_near",
 )  # fmt: skip
+leave_out(
+    "errors that are considered, against refits of readings that are off: "
+    "tests/identify/uncertainty/test_considered.py",
+    "identify.Consideration",
+    "identify.Freedom.of_estimated",
+)
 leave_out(
     "the errors and derivatives of a fit, from which its covariance follows: "
     "tests/identify/test_uncertainty.py",

@@ -354,8 +354,9 @@ def log_likelihood(
     """Return the logarithm of the density of all readings, the unknown torques integrated out.
 
     `Σ log N(ν; 0, s)` over innovations (Schweppe 1965, doi:10.1109/TIT.1965.1053737): maximise it
-    over moments, a density, a noise, an initial state. Arguments and errors are those of `filter`;
-    it is differentiable in forward and reverse mode.
+    over moments, a density, a noise, an initial state. It is differentiable in forward and reverse
+    mode. **Arguments:** `model`, `first`, `x`, `substeps` as those of `filter`; **raises** the
+    errors of `filter`.
 
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(1.0), [[1.0, 0, 0]] * 2))
     >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 1.0, 1.0))

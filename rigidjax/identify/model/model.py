@@ -216,8 +216,13 @@ class Model(eqx.Module):
         bodies = places_of(charts, self.which, len(names))
         self.index, self.slots = index_of(bodies, charts.size, slots, data.kinds)
         turn = 1.5 * data.widest * float(np.max(np.asarray(self.reference.rate)))
+        if windows is not None and process is not None:
+            raise ValueError(
+                "process: a filter follows one record from its beginning; give a Recording instead "
+                "of windows"
+            )
         if windows is not None or _samples_read(torque, self.records):
-            _require_held_steps(integrator, process)
+            _require_held_steps(integrator)
             integrator = HeldSteps()
         elif integrator is None and torque is not None:
             integrator = integrator_for(turn)
@@ -578,18 +583,13 @@ def _require_even_times(torque: Torque | None, recording: Recording, number: int
         )
 
 
-def _require_held_steps(integrator: Any, process: Any) -> None:
-    """Raise `ValueError` for what does not go with samples that are held through steps."""
-    wanted = "a function of time such as rigidjax.torques.Linear(t, samples)"
+def _require_held_steps(integrator: Any) -> None:
+    """Raise `ValueError` for steps through which samples are not held."""
     if integrator is not None and not isinstance(integrator, HeldSteps):
         raise ValueError(
             "integrator: samples as inputs are held through one step from each time to the next; "
-            f"give None, or {wanted} as the input"
-        )
-    if process is not None:
-        raise ValueError(
-            f"process: a filter does not hold samples through its steps; give {wanted} as the "
-            "input, and recordings instead of windows"
+            "give None, or a function of time such as rigidjax.torques.Linear(t, samples) as the "
+            "input"
         )
 
 

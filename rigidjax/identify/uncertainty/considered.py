@@ -31,6 +31,15 @@ class Consideration(eqx.Module):
     deviation. `shifts` (n, c) are the changes of the n free numbers by an error of one standard
     deviation in each of its c ways, which are independent: three channels of a scale, six pairs of
     axes, three biases, one clock.
+
+    >>> t = jnp.linspace(0.0, 2.0, 41)
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    >>> rates = rj.simulate(body, rj.Spin([1.0, 2.0, 3.0]), t).ys.omega
+    >>> gyro = rj.identify.Gyro(0.01, tolerance=rj.identify.Tolerance(scale=0.01))
+    >>> record = rj.identify.Recording(t, (gyro, rates))
+    >>> found = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()), starts=1)
+    >>> [(part.kind, part.deviation, part.shifts.shape) for part in found.considered]
+    [('scale', 0.01, (5, 3))]
     """
 
     sensor: int = eqx.field(static=True)
