@@ -331,8 +331,8 @@ def _closer(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
         setup = eqx.tree_at(where, setup, both)
         if sudden.size:
             # A run whose switches are sought goes forward, in the time times its sign.
-            turned = setup.stops and setup.sign is not None
-            along = setup.sign.astype(ts.dtype) * sudden if turned else sudden
+            sign = setup.sign if setup.stops else None
+            along = sudden if sign is None else sign.astype(ts.dtype) * sudden
             control = dfx.ClipStepSizeController(setup.controller, step_ts=jnp.sort(along))
             setup = dataclasses.replace(setup, controller=control)
         return setup, jnp.asarray(found[0].rtol, ts.dtype), 1.0
