@@ -56,14 +56,18 @@ def _load(default_run):
 
 
 # Tests that took some three seconds or more of a run beside others; of many cases the shortest stays.
-LONG = frozenset((Path(__file__).parent / "long.txt").read_text(encoding="utf-8").splitlines())
+MARKED = {
+    mark: frozenset((Path(__file__).parent / name).read_text(encoding="utf-8").splitlines())
+    for mark, name in (("long", "long.txt"), ("slow", "slow.txt"))
+}
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
     for item in items:
-        if item.nodeid in LONG:
-            item.add_marker("long")
+        for mark, listed in MARKED.items():
+            if item.nodeid in listed:
+                item.add_marker(mark)
 
 
 _MAPS, _MANY, _TESTS = Path("/proc/self/maps"), 45_000, itertools.count()

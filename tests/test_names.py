@@ -123,8 +123,9 @@ def test_what_few_programs_need_is_loaded_when_it_is_asked_for():
     assert out.returncode == 0, out.stderr
 
 
-def test_the_tests_that_a_default_run_is_spared_are_there():
-    lines = (ROOT / "tests" / "long.txt").read_text(encoding="utf-8").splitlines()
+@pytest.mark.parametrize("name", ["long.txt", "slow.txt"])
+def test_the_tests_that_a_default_run_is_spared_are_there(name):
+    lines = (ROOT / "tests" / name).read_text(encoding="utf-8").splitlines()
     assert lines == sorted(set(lines))
     for line in lines:
         path, _, name = line.partition("::")
