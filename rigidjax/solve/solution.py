@@ -90,7 +90,7 @@ class Solution(eqx.Module, Generic[State]):
 
         A solver's own errors grow as much. If `growth * rtol` exceeds 1, the states have no correct
         digit, and gradients through them mean nothing: a `UserWarning` names the first such time.
-        End the run earlier then, or fit it in pieces (multiple shooting).
+        End the run earlier then, or fit shorter recordings.
 
         Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
         Ruelle 1985, doi:10.1103/RevModPhys.57.617).

@@ -109,8 +109,8 @@ def least_squares_from(
     )
     windows = model.clusters is not None
     by_noise = partial(_gain_of_noise, model, noise, weights) if windows else None
-    bounded = is_order_one(model, kind)
-    end = minimise(evaluated, x, bounded, settings, nothing, empty, by_noise)
+    order_one = is_order_one(model, kind)
+    end = minimise(evaluated, x, order_one, settings, nothing, empty, by_noise)
     # A wild step can end in NaN: the start is then the better point.
     lost = ~jnp.isfinite(end.cost)
     return dataclasses.replace(
