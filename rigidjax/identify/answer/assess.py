@@ -177,26 +177,31 @@ def _white(
 
     total, degrees = 0.0, 0
     for channel in range(e.shape[-1]):
-        rows, taken = [], []
-        for x, seen, j, c in zip(
-            e[..., channel], kept[..., channel], slope[..., channel, :], covariance, strict=True
-        ):
-            if seen.sum() >= 2 * LAGS:
-                j = j[seen] - j[seen].mean(axis=0)
-                rows.append(x[seen] - x[seen].mean())
-                taken.append((j @ c, j))
-        size = sum(row.size for row in rows)
-        own = sum(float(row @ row) for row in rows)
+        long = kept[..., channel].sum(axis=1) >= 2 * LAGS
+        seen = kept[long, :, channel]
+        x = _gathered(e[long, :, channel, None], seen)[..., 0]
+        j = _gathered(slope[long, :, channel], seen)
+        taken, count = j @ covariance[long], len(seen)
+        size, own = int(seen.sum()), float(np.sum(x * x))
         squares = max(own, float(size)) if given else own
         if not squares > 0:
             continue
         for lag in range(1, LAGS + 1):
-            pairs = size - lag * len(rows)
-            lost = pairs / size * len(rows) + sum(np.sum(a[lag:] * b[:-lag]) for a, b in taken)
-            rho = (sum(float(row[lag:] @ row[:-lag]) for row in rows) + lost * own / size) / squares
+            pairs = size - lag * count
+            lost = pairs / size * count + np.sum(taken[:, lag:] * j[:, :-lag])
+            rho = (float(np.sum(x[:, lag:] * x[:, :-lag])) + lost * own / size) / squares
             total += size * (size + 2.0) * rho**2 / pairs
             degrees += 1
     return degrees == 0 or bool(chdtrc(degrees, total) > RARE)
+
+
+def _gathered(rows: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return rows (R, T, m) about their mean: first those of `seen` (R, T), then zeros."""
+    order = np.argsort(~seen, axis=1, kind="stable")
+    shown = np.take_along_axis(seen, order, axis=1)[..., None]
+    moved = np.where(shown, np.take_along_axis(rows, order[..., None], axis=1), 0.0)
+    mean = moved.sum(axis=1, keepdims=True) / shown.sum(axis=1, keepdims=True)
+    return np.where(shown, moved - mean, 0.0)
 
 
 # A search may end so near to the least misfit, in standard deviations.

@@ -280,7 +280,9 @@ class Model(eqx.Module):
         else:
             vector = _numbers(self.chart, body)
         kind = jnp.result_type(float)
-        if omega is None:
+        if omega is None and not self.index.start.size:
+            rates = np.zeros((1, 3))
+        elif omega is None:
             rates = first_rates(self.records, self.counts)
         else:
             rates = _checks.floating(omega, (3,), "omega").astype(kind)[None]

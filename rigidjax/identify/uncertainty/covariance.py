@@ -247,8 +247,19 @@ def of_white(linear: Linearised) -> Spread:
     lift = np.zeros((n, shared.size))
     lift[shared, np.arange(shared.size)] = 1.0
     ties = np.concatenate([np.diag(firm[shared]), extra[of < 0][:, shared]])
-    rest, own, values, null = [ties], [], [], []
+    # A recording without numbers of its own, as a window of a long run, has nothing to eliminate.
+    bare = ~np.isin(np.arange(len(triangles)), owner)
+    none = np.zeros(0, int), np.zeros((0, 0)), np.zeros((0, shared.size))
+    rest, own, values, null = (
+        [ties, _rows_of_shared(linear, triangles, size, bare, shared)],
+        [],
+        [],
+        [],
+    )
     for record, (triangle, columns) in enumerate(zip(triangles, linear.places, strict=True)):
+        if bare[record]:
+            own.append(none)
+            continue
         mine = np.flatnonzero(owner == record)
         wide, held = np.zeros((len(triangle), n + 1)), np.zeros((mine.size, n))
         wide[:, columns], held[np.arange(mine.size), mine] = triangle, firm[mine]
@@ -276,6 +287,25 @@ def of_white(linear: Linearised) -> Spread:
         directions,
         root,
     )
+
+
+def _rows_of_shared(
+    linear: Linearised,
+    triangles: np.ndarray,
+    size: np.ndarray,
+    some: np.ndarray,
+    shared: np.ndarray,
+) -> np.ndarray:
+    """Return the triangular factor (q, s) of the rows of several recordings.
+
+    The recordings, `some` (R,), change with the s numbers `shared` alone. `triangles` (R, q, m) are
+    the factors of their weighted derivatives; columns are in units of `size` (n,).
+    """
+    wide = np.zeros((int(some.sum()), triangles.shape[1], linear.size + 1))
+    columns = np.broadcast_to(linear.places[some][:, None, :], triangles[some].shape)
+    np.put_along_axis(wide, columns, triangles[some], axis=2)
+    rows = (wide[..., :-1] / size).reshape(-1, linear.size)
+    return np.linalg.qr(rows[:, shared], mode="r")
 
 
 def _owners(linear: Linearised) -> np.ndarray:
