@@ -175,6 +175,7 @@ def stand_in():
             recordings=(SimpleNamespace(t=TS, readings=(reading,)),),
             count=1,
             unpack=lambda x: SimpleNamespace(body=shaped(x), state0=None),
+            bodies=shaped,
         ),
         residuals=(errors,),
         noise=(np.full(3, 0.01),),
