@@ -474,7 +474,11 @@ def _spread(changes: Array) -> Array:
 
 def _nudged(leaf: Array, rng: np.random.Generator, size: Array) -> Array:
     """Numbers changed by up to a unit in the last digit of `size`; what is symmetric stays so."""
-    noise = rng.uniform(-1.0, 1.0, (_NEIGHBOURS, *leaf.shape))
+    shape = (_NEIGHBOURS + 1) // 2, *leaf.shape
+    # Half a unit at least, and to both sides: a smaller change would often be rounded away, and a
+    # motion of many turns is a staircase of the last digits, which one side may not show.
+    noise = rng.uniform(0.5, 1.0, shape) * rng.choice([-1.0, 1.0], shape)
+    noise = np.concatenate([noise, -noise])[:_NEIGHBOURS]
     if leaf.ndim > 1 and leaf.shape[-1] == leaf.shape[-2]:
         noise = 0.5 * (noise + np.swapaxes(noise, -1, -2))
     return leaf[None] + size[None] * jnp.asarray(np.finfo(leaf.dtype).eps * noise, leaf.dtype)

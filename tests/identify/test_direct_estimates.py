@@ -104,3 +104,14 @@ def test_an_attitude_sensor_that_is_mounted_askew(motion):
     t, w = rates(record)
     true = np.stack([np.interp(t, TS, np.asarray(motion.omega)[:, k]) for k in range(3)], axis=1)
     assert np.abs(w - true).max() < 0.02 * np.linalg.norm(true, axis=1).max()
+
+
+def test_a_model_starts_at_the_attitude_that_markers_or_directions_show(motion):
+    fall, box = rj.torques.UniformGravity([0.0, 0.0, 0.0]), rj.shapes.box(1.0, [0.3, 0.2, 0.1])
+    dots = markers(motion, PLACES, 0.0)
+    rotate_back = jax.vmap(rj.quaternion.rotate_inverse, (0, None))
+    along = [(identify.Direction(w, 0.01), rotate_back(motion.q, jnp.asarray(w))) for w in WORLD]
+    for record in (dots, identify.Recording(TS, *along)):
+        model = identify.Model(record, identify.Known(box), torque=fall)
+        q = model.reference.state.q[0]
+        np.testing.assert_allclose(abs(float(q @ motion.q[0])), 1.0, atol=1e-12)

@@ -1,5 +1,7 @@
 """What data do not determine is named: made-up singular vectors whose meaning is known."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest

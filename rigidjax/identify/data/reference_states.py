@@ -24,6 +24,7 @@ from rigidjax.identify.sensors import (
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import names, plus
 from rigidjax.rotation import quaternion, so3
+from rigidjax.rotation.fitting import nearest
 
 # The turn, rad, between two attitudes that give a rate: large against noise, small enough that the
 # axis hardly moves.
@@ -35,7 +36,7 @@ _FIRM = 1e-3
 
 def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,), s, and attitudes (n, 4), body → world, that the readings show; n may be 0: of an
-    attitude sensor, or by `rigidjax.so3.wahba` from three markers or two directions.
+    attitude sensor, or as `rigidjax.so3.wahba` has it from three markers or two directions.
     """
     t = np.asarray(recording.t)
     for reading in readings_of(recording, AttitudeSensor):
@@ -68,12 +69,17 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     firm = s[:, 1] + np.sign(np.linalg.det(b)) * s[:, 2] > _FIRM * s[:, 0]
     if not firm.any():
         return np.zeros(0), np.zeros((0, 4))
-    return t[seen][firm], np.asarray(_nearest(rows[firm], sides[firm]))
+    return t[seen][firm], np.asarray(_attitudes_of(b[firm]))
 
 
 @jax.jit
-def _nearest(body: ArrayLike, world: ArrayLike) -> Array:
-    return jax.vmap(lambda a, b: quaternion.from_matrix(so3.wahba(a, b)))(body, world)
+def _attitudes_of(sums: ArrayLike) -> Array:
+    """Return the attitudes (n, 4) that fit directions best, from Σ world bodyᵀ (n, 3, 3) of each.
+
+    This is `so3.wahba` without its check: `equinox.error_if` always raises in a compiled function
+    that is called within `jax.ensure_compile_time_eval`, as the model calls this one.
+    """
+    return jax.vmap(lambda one: quaternion.from_matrix(nearest(one)))(sums)
 
 
 def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:

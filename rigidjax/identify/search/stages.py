@@ -41,6 +41,15 @@ PARTS, SHORTEST, FEW = (9, 3), 5, 10
 _BEYOND = 2
 
 
+class Kept(NamedTuple):
+    """What a search keeps of the last evaluation: `blocks` the errors of all readings and their
+    derivatives (`terms.blocks`), `pulls` (R, m) the part of each recording in the gradient.
+    """
+
+    blocks: Any
+    pulls: Float[Array, "records m"]
+
+
 class Attempt(eqx.Module):
     """The end of the search from one start.
 
@@ -87,13 +96,14 @@ def least_squares_from(
 
     def evaluated(x: Array) -> tuple[Any, Array, Normal, Array]:
         errors, slopes = terms.blocks(model, x)
-        total, slope = jnp.zeros((), kind), jnp.zeros(number + 1, kind)
         residuals, rows = terms.with_rows(
             lambda e: terms.reading_residuals(model, e, noise, weights), errors, slopes
         )
+        total, pulls = jnp.zeros((), kind), jnp.zeros(places.shape, kind)
         for e, row in zip(residuals, rows, strict=True):
             total = total + jnp.sum(e**2)
-            slope = slope.at[places].add(jnp.einsum("rtki,rtk->ri", row, e))
+            pulls = pulls + jnp.einsum("rtki,rtk->ri", row, e)
+        slope = jnp.zeros(number + 1, kind).at[places].add(pulls)
         normal = normal_of(rows, places, number, alone).plus(prior**2)
         total, slope = total + jnp.sum((prior * x) ** 2), slope[:-1] + prior**2 * x
         row, e = terms.with_jacobian(lambda x: terms.extra_residuals(model, x), x)
@@ -101,14 +111,14 @@ def least_squares_from(
             total, slope = total + jnp.sum(e**2), slope + e @ row
             normal = normal.wider(row)
         normal = normal.wider(_bends(model, x, slope))
-        return (errors, slopes), 0.5 * total, normal, slope
+        return Kept((errors, slopes), pulls), 0.5 * total, normal, slope
 
     nothing = _nothing(model, kind)
     empty = normal_of(
         (jnp.zeros((places.shape[0], 0, 0, places.shape[1]), kind),), places, number, alone
     )
     windows = model.clusters is not None
-    by_noise = partial(_gain_of_noise, model, noise, weights) if windows else None
+    by_noise = partial(_gain_of_noise, model) if windows else None
     order_one = is_order_one(model, kind)
     end = minimise(evaluated, x, order_one, settings, nothing, empty, by_noise)
     # A wild step can end in NaN: the start is then the better point.
@@ -121,31 +131,18 @@ def least_squares_from(
     )
 
 
-def _gain_of_noise(
-    model: Model,
-    noise: Noise,
-    weights: Float[Array, "records times"],
-    kept: Any,
-    normal: Normal,
-) -> Float[Array, ""]:
+def _gain_of_noise(model: Model, kept: Kept, normal: Normal) -> Float[Array, ""]:
     """Return ½ tr(K G⁻¹), the mean excess of the cost at the true numbers, of windows.
 
     G is the normal matrix of the shared numbers, without the starts of the windows; K adds up
     g gᵀ of the gradient g of each stretch of windows, whose errors may be alike: Takeuchi 1976;
-    Burnham and Anderson 2002, doi:10.1007/b97636, section 7.2. `kept` are the errors and their
-    derivatives (`terms.blocks`). A start is at its own optimum near the least cost, so that its
-    gradient is left out.
+    Burnham and Anderson 2002, doi:10.1007/b97636, section 7.2. A start is at its own optimum near
+    the least cost, so that its gradient is left out.
     """
     assert model.clusters is not None
-    places, number = model.index.places, model.size
-    residuals, rows = terms.with_rows(
-        lambda e: terms.reading_residuals(model, e, noise, weights), *kept
-    )
     # There are no more stretches than windows.
-    slopes = jnp.zeros((model.count, number), normal.core.dtype)
-    for e, row in zip(residuals, rows, strict=True):
-        slope = jnp.einsum("rtki,rtk->ri", row, e)
-        slopes = slopes.at[model.clusters[:, None], places].add(slope, mode="drop")
+    slopes = jnp.zeros((model.count, model.size), normal.core.dtype)
+    slopes = slopes.at[model.clusters[:, None], model.index.places].add(kept.pulls, mode="drop")
     starts = jnp.asarray(model.index.start).reshape(-1)
     slopes = slopes.at[:, starts].set(0.0)
     felt = normal.diagonal
@@ -183,13 +180,14 @@ def _as_far_as(model: Model, weights: Float[Array, "records times"]) -> Model:
     return eqx.tree_at(lambda m: m.integrator, model, shorter)
 
 
-def _nothing(model: Model, kind: Any) -> Any:
-    """Return zeros of the shapes of `terms.blocks`: to trace it once more takes seconds."""
+def _nothing(model: Model, kind: Any) -> Kept:
+    """Return zeros of the shapes that are kept: to trace `terms.blocks` once more takes seconds."""
     count, times = model.records.t.shape
     columns = model.index.places.shape[1]
     shapes = [(count, times, sensor.components) for sensor in model.records.sensors]
     errors = tuple(jnp.zeros(shape, kind) for shape in shapes)
-    return errors, tuple(jnp.zeros((*shape, columns), kind) for shape in shapes)
+    slopes = tuple(jnp.zeros((*shape, columns), kind) for shape in shapes)
+    return Kept((errors, slopes), jnp.zeros(model.index.places.shape, kind))
 
 
 def whole_record(model: Model) -> Float[Array, "records times"]:
@@ -206,8 +204,8 @@ def beginning(model: Model, part: float) -> Float[Array, "records times"]:
 
 
 def _attempt(end: LMState) -> Attempt:
-    kept = end.kept if bool(end.kept_at_best) else None
-    return Attempt(end.point, end.cost, end.converged, kept)
+    blocks = end.kept.blocks if bool(end.kept_at_best) else None
+    return Attempt(end.point, end.cost, end.converged, blocks)
 
 
 def _search(
@@ -234,7 +232,7 @@ def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Any:
     """Return errors and derivatives (`terms.blocks`), by the program of the search."""
     kind, sensors = model.records.t.dtype, model.records.sensors
     ones = (np.ones((model.count, sensor.components), kind) for sensor in sensors)
-    return _at(model, x, tuple(map(jnp.asarray, ones))).kept
+    return _at(model, x, tuple(map(jnp.asarray, ones))).kept.blocks
 
 
 def cost_of(model: Model, x: Float[Array, " n"], noise: Noise) -> float:
@@ -266,8 +264,10 @@ def polish(
             watch(attempt)
             break
         attempt = _attempt(end)
-        # Round-off refuses every step at the minimum: the test is whether the point moved.
+        # Round-off refuses every step at the minimum: the test is whether the point moved. One or
+        # two steps alone, of a small `max_steps`, are also refused where they are too long.
         stands = before - float(attempt.cost) < SETTLED * (1.0 + abs(before))
+        stands = stands and task.stride == STRIDE
         settled = bool(attempt.converged) or stands
         # The same gain again would not reach the aim.
         hopeless = aim > 0 and not settled and float(attempt.cost) ** 2 > aim * before
