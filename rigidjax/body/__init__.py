@@ -1,4 +1,6 @@
-"""Bodies: inertia, mass, second moments; see also `rj.shapes`, `rj.volumes`, `rj.parameters`."""
+"""Describe bodies: inertia, mass, second moments; see also `rj.shapes`, `rj.volumes`,
+`rj.parameters`.
+"""
 
 from rigidjax._names import show
 from rigidjax.body.divergence import divergence as divergence
