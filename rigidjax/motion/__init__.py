@@ -1,4 +1,6 @@
-"""States of a body. What a motion conserves: `rj.conserved`, `rj.drift`, `rj.energy`."""
+"""Describe states of a body. For what a motion conserves see `rj.conserved`, `rj.drift`,
+`rj.energy`.
+"""
 
 from rigidjax._names import show
 from rigidjax._types import HasAttitude as HasAttitude, HasPose as HasPose, HasSpin as HasSpin
