@@ -1,4 +1,4 @@
-"""Moving frames, and scenes of particles seen from them. No body is needed."""
+"""Describe moving frames, and scenes of particles in them. No body is needed."""
 
 from rigidjax._names import show
 from rigidjax.frames.base import AbstractScene as AbstractScene, Force as Force

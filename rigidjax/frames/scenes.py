@@ -1,4 +1,4 @@
-"""Ready-made scenes for `rigidjax.simulate(None, Point(x, v), ts, scene)`; no body is needed."""
+"""Provide scenes for `rigidjax.simulate(None, Point(x, v), ts, scene)`; no body is needed."""
 
 from rigidjax._names import show
 from rigidjax.frames.earth import (
