@@ -1,4 +1,4 @@
-"""The three-body problem and Hill's: periodic orbits, families, manifolds; no body is needed.
+"""Solve the three-body problem and Hill's: periodic orbits, families, manifolds; no body is needed.
 
 `rigidjax.simulate(None, Point(x, v), ts, orbits.cr3bp(mu))` solves one motion.
 """
