@@ -25,7 +25,7 @@ from rigidjax import (
     motion as motion,
     solve as solve,
 )
-from rigidjax._names import show, wrong
+from rigidjax._names import refuse, show
 from rigidjax.body import (
     Inertia as Inertia,
     MassProperties as MassProperties,
@@ -73,9 +73,18 @@ __version__ = "0.2.0"
 # methods.
 _LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "tumblers", "workprecision")
 
+__all__ = [
+    "Attitude", "Event", "Inertia", "MassProperties", "Point", "Rigid", "Spin", "angular_momentum",
+    "batch", "body", "conserved", "crossings", "datasets", "drift", "elliptic", "energy",
+    "equations_of_motion", "error_of", "euler", "exact", "frames", "identify", "kinetic_energy",
+    "lagrangian", "lyapunov_exponents", "motion", "mrp", "orbits", "parameters", "plot",
+    "quaternion", "rodrigues", "scenes", "shapes", "simulate", "so3", "solve", "solvers",
+    "spatial_angular_momentum", "torques", "tumblers", "volumes", "workprecision",
+]  # fmt: skip
+
 show(__name__)
 
 
 def __getattr__(name: str) -> ModuleType:
     later = name in _LATER
-    return importlib.import_module(f"rigidjax.{name}") if later else wrong(__name__, name)
+    return importlib.import_module(f"rigidjax.{name}") if later else refuse(__name__, name)

@@ -19,4 +19,10 @@ from rigidjax.body.inertials import (
 )
 from rigidjax.body.principal_axes import matrix_function as matrix_function, principal as principal
 
+__all__ = [
+    "Inertia", "MassProperties", "angular_momentum", "divergence", "ellipsoid", "kinetic_energy",
+    "kinetic_energy_about", "kinetic_energy_of_matrix_rate", "matrix_function", "principal",
+    "read_inertials", "spatial_angular_momentum", "write_inertials",
+]  # fmt: skip
+
 show(__name__)

@@ -65,7 +65,7 @@ def mesh(
 def mesh_file(
     path: str | os.PathLike[str], density: ScalarLike, *, scale: float = 1.0
 ) -> MassProperties:
-    """Return the solid inside a closed mesh read from a file: STL, OBJ, PLY, OFF, GLB, …
+    """Return the solid inside a closed mesh read from a file, such as STL, OBJ, PLY, OFF or GLB.
 
     The package `trimesh` is needed (`pip install "rigidjax[mesh]"`); it also merges equal vertices.
 

@@ -250,4 +250,9 @@ def _hold(exponent: Array, bend: Callable[[Array], Array] = jnp.log1p) -> Array:
     return jnp.where(beyond > 0, jnp.sign(exponent) * (limit + bend(beyond)), exponent)
 
 
+__all__ = [
+    "FLAT", "flat_bend", "pack", "pack_moments", "pack_second_moment", "pack_shape", "unpack",
+    "unpack_moments", "unpack_second_moment", "unpack_shape",
+]  # fmt: skip
+
 show(__name__)

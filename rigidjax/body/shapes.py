@@ -192,4 +192,9 @@ def _centred(mass, per_mass):
     return MassProperties(m, jnp.zeros_like(per_mass), jnp.diag(m * per_mass))
 
 
+__all__ = [
+    "box", "capsule", "cone", "cylinder", "ellipsoid", "hollow_cylinder", "hollow_sphere", "mesh",
+    "mesh_file", "plate", "points", "quadrature", "rod", "shell", "sphere", "torus", "voxels",
+]  # fmt: skip
+
 show(__name__)

@@ -99,4 +99,9 @@ def torus(major: ScalarLike, minor: ScalarLike) -> Scalar:
     return 2.0 * jnp.pi**2 * R * r * r
 
 
+__all__ = [
+    "box", "capsule", "cone", "cylinder", "ellipsoid", "hollow_cylinder", "hollow_sphere", "sphere",
+    "torus",
+]  # fmt: skip
+
 show(__name__)

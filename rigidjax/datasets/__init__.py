@@ -3,4 +3,6 @@
 from rigidjax._names import show
 from rigidjax.datasets import moon as moon, toutatis as toutatis
 
+__all__ = ["moon", "toutatis"]
+
 show(__name__)

@@ -294,4 +294,6 @@ def _split(rows: np.ndarray, parts: int) -> np.ndarray:
     return out.reshape(count * parts, k, terms)
 
 
+__all__ = ["CITATION", "DAY", "EPOCH", "Moon"]
+
 show(__name__)

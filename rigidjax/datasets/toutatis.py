@@ -146,4 +146,9 @@ def remarks(fit: Fit) -> str:
     return "\n".join(lines)
 
 
+__all__ = [
+    "ATTITUDE_NOISE_DEG", "CITATION", "DAY", "OBSERVATIONS", "RATE_NOISE_DEG_A_DAY", "model",
+    "recording", "remarks", "rms_degrees", "rows",
+]  # fmt: skip
+
 show(__name__)

@@ -7,4 +7,6 @@ from rigidjax.frames.moving import MovingFrame as MovingFrame
 from rigidjax.frames.point import Point as Point
 from rigidjax.frames.rotation_models import AboutAxis as AboutAxis, Uniform as Uniform
 
+__all__ = ["AboutAxis", "AbstractScene", "BodyInFrame", "Force", "MovingFrame", "Point", "Uniform"]
+
 show(__name__)

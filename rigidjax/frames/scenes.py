@@ -13,4 +13,9 @@ from rigidjax.frames.libration import (
     libration_integral as libration_integral,
 )
 
+__all__ = [
+    "Earth", "Foucault", "Hoop", "earth", "foucault", "hoop", "libration", "libration_integral",
+    "turntable",
+]  # fmt: skip
+
 show(__name__)

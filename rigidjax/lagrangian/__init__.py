@@ -21,4 +21,10 @@ from rigidjax.lagrangian.hamiltonian import (
     lie_poisson_with_direction as lie_poisson_with_direction,
 )
 
+__all__ = [
+    "Coordinates", "EulerAngleTop", "HeavyTopHamiltonian", "Momentum", "RotationalHamiltonian",
+    "equations_of_motion", "from_attitude", "lie_poisson", "lie_poisson_with_direction",
+    "to_attitude",
+]  # fmt: skip
+
 show(__name__)

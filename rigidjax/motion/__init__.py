@@ -6,4 +6,6 @@ from rigidjax._names import show
 from rigidjax._types import HasAttitude as HasAttitude, HasPose as HasPose, HasSpin as HasSpin
 from rigidjax.motion.equations import Attitude as Attitude, Rigid as Rigid, Spin as Spin
 
+__all__ = ["Attitude", "HasAttitude", "HasPose", "HasSpin", "Rigid", "Spin"]
+
 show(__name__)

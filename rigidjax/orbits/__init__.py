@@ -7,4 +7,6 @@ from rigidjax._names import show
 from rigidjax.orbits.cr3bp import Hill as Hill, ThreeBody as ThreeBody, cr3bp as cr3bp, hill as hill
 from rigidjax.orbits.differential_correction import PeriodicOrbit as PeriodicOrbit
 
+__all__ = ["Hill", "PeriodicOrbit", "ThreeBody", "cr3bp", "hill"]
+
 show(__name__)

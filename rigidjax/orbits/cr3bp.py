@@ -70,7 +70,7 @@ class ThreeBody(AbstractReversible):
         return jnp.sqrt(first * first + flat), jnp.sqrt(second * second + flat)
 
     def jacobi_constant(self, state: Point) -> Scalar:
-        """C = 2U − |v|², conserved along the motion (Szebehely 1967, eq 1.5(20)).
+        """Return C = 2U − |v|², conserved along the motion (Szebehely 1967, eq 1.5(20)).
 
         >>> float(rj.orbits.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
         4.0

@@ -23,4 +23,9 @@ from rigidjax.plot.residuals import residuals as residuals
 from rigidjax.plot.style import COLOURS as COLOURS
 from rigidjax.plot.time_series import motion as motion
 
+__all__ = [
+    "COLOURS", "body_axes", "fit", "frames", "herpolhode", "horizons", "inertia_ellipsoid",
+    "motion", "phase_portrait", "player", "polhode", "residuals", "tumble",
+]  # fmt: skip
+
 show(__name__)

@@ -248,4 +248,9 @@ def _vanishing(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool
     return size, jnp.abs(size) < 4 * jnp.finfo(middle.dtype).eps
 
 
+__all__ = [
+    "from_matrix", "from_quaternion", "is_singular", "omega_to_rates", "rates_to_omega",
+    "to_matrix", "to_quaternion",
+]  # fmt: skip
+
 show(__name__)

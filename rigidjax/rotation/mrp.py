@@ -118,4 +118,9 @@ def rates_to_omega(sigma: Vec3Like, rates: Vec3Like) -> Vec3:
     return 4 / (1 + s) ** 2 * turned
 
 
+__all__ = [
+    "from_matrix", "from_quaternion", "omega_to_rates", "rates_to_omega", "shadow", "switch",
+    "to_matrix", "to_quaternion",
+]  # fmt: skip
+
 show(__name__)

@@ -285,4 +285,10 @@ def _turn(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
     return jnp.stack([y[i] + (w * t[i] + again[i]) for i in range(3)])
 
 
+__all__ = [
+    "about_axis", "advance", "angle", "canonical", "check", "conjugate", "exp", "from_matrix",
+    "from_xyzw", "interpolate", "log", "multiply", "normalise", "rate", "rotate", "rotate_inverse",
+    "to_matrix", "to_xyzw", "uniform",
+]  # fmt: skip
+
 show(__name__)

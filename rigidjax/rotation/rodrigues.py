@@ -95,4 +95,9 @@ def rates_to_omega(g: Vec3Like, rates: Vec3Like) -> Vec3:
     return 2 / (1 + dot(g, g)) * (rates - cross(g, rates))
 
 
+__all__ = [
+    "from_matrix", "from_quaternion", "is_singular", "omega_to_rates", "rates_to_omega",
+    "to_matrix", "to_quaternion",
+]  # fmt: skip
+
 show(__name__)

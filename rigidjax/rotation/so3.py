@@ -268,4 +268,12 @@ def check(
     return rotation_matrix(_checks.floating(matrix, (3, 3), name, batched=True), name)
 
 
+__all__ = [
+    "about_axis", "adjoint", "align", "apply", "basis", "body_rate", "check", "conjugate", "cross",
+    "determinant", "distance", "dot", "exp", "hat", "interpolate", "left_jacobian",
+    "left_jacobian_inverse", "log", "mean", "mean_quaternion", "product", "project", "rate",
+    "right_jacobian", "right_jacobian_inverse", "solve", "to_body", "to_world", "uniform", "vee",
+    "wahba", "world_rate",
+]  # fmt: skip
+
 show(__name__)

@@ -13,4 +13,6 @@ from rigidjax.workprecision.peers import methods as methods
 from rigidjax.workprecision.scene import Scene as Scene
 from rigidjax.workprecision.standard_scenes import scenes as scenes
 
+__all__ = ["Scene", "choose", "diffrax_method", "draw", "measure", "methods", "scenes", "table"]
+
 show(__name__)

@@ -46,4 +46,12 @@ from rigidjax.motion.torques.random import (
 from rigidjax.motion.torques.spline import Series as Series, Wheel as Wheel
 from rigidjax.motion.torques.wheels import Flywheel as Flywheel, ReactionWheels as ReactionWheels
 
+__all__ = [
+    "AbstractTorque", "BodyDrag", "CentralGravity", "ChangingInertia", "Chebyshev",
+    "ConstantTorque", "CorrelatedTorque", "Damping", "Delayed", "Drag", "Flywheel", "FromPotential",
+    "GravityGradient", "HeavyTop", "Held", "InSpace", "Input", "Lagged", "Linear", "MagneticDipole",
+    "Pulses", "QuadraticDamping", "RandomTorque", "ReactionWheels", "Rotors", "Series", "Sum",
+    "Tabulated", "Tide", "UniformGravity", "Wheel", "Wrench", "bind",
+]  # fmt: skip
+
 show(__name__)

@@ -130,7 +130,7 @@ class Lagged(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the source jumps: the value has a kink there."""
+        """Return the times, s, at which the source jumps: the value has a kink there."""
         return jumps_of(self.source)
 
     def state0(self, t: ScalarLike, state: Any, body: Any) -> Array:
@@ -138,7 +138,7 @@ class Lagged(eqx.Module):
         return self.source(t) if self.start is None else self.start
 
     def rate(self, t: ScalarLike, own: Array, state: Any, body: Any) -> Array:
-        """dy/dt, in the source's unit per second."""
+        """Return dy/dt, in the source's unit per second."""
         wanted = _checks.numbers(self.source(t), "source(t)").astype(own.dtype)
         if wanted.shape != own.shape:
             raise ValueError(f"Lagged: start has the shape {own.shape}, the source {wanted.shape}")
