@@ -1,14 +1,15 @@
-"""Differentiable rigid-body and rotating-frame mechanics for JAX.
+"""Compute rigid-body and rotating-frame mechanics that JAX can differentiate.
 
 From the ground up: `quaternion`, `so3`, `euler` and `body`, `motion` and `torques`, `frames`,
-`exact` and `solve` (the motion in closed form, or by a solver), and what uses them: `identify`,
-`batch`, `workprecision`, `plot`. `elliptic`, `lagrangian`, `orbits` and `tumblers` are loaded when
-they are asked for. Most programs begin with `simulate`.
+`exact` and `solve` (the motion in closed form, or by a solver), and the packages that use them:
+`identify`, `batch`, `workprecision`, `plot`. `elliptic`, `lagrangian`, `orbits` and `tumblers` are
+loaded when they are asked for. Most programs begin with `simulate`.
 
 Every function raises `TypeError` for an argument of another type (also half precision) and
 `ValueError` for a wrong shape; docstrings list the other errors. Under `jit` they are errors of
-`equinox`. A container of many states or bodies has leading axes, the same in all of its parts;
-functions and methods take one. Examples know `import rigidjax as rj` and `import jax.numpy as jnp`.
+`equinox`. A container of many states or bodies has equal leading axes in all of its parts;
+functions and methods take one state or body. The examples assume `import rigidjax as rj` and
+`import jax.numpy as jnp`.
 """
 
 import importlib
@@ -24,7 +25,7 @@ from rigidjax import (
     motion as motion,
     solve as solve,
 )
-from rigidjax._names import show, wrong
+from rigidjax._names import refuse, show
 from rigidjax.body import (
     Inertia as Inertia,
     MassProperties as MassProperties,
@@ -68,12 +69,22 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"
 
-# Loaded when first asked for: few programs draw, fewer compare methods.
+# These packages are loaded when they are first asked for: few programs draw, and fewer compare
+# methods.
 _LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "tumblers", "workprecision")
+
+__all__ = [
+    "Attitude", "Event", "Inertia", "MassProperties", "Point", "Rigid", "Spin", "angular_momentum",
+    "batch", "body", "conserved", "crossings", "datasets", "drift", "elliptic", "energy",
+    "equations_of_motion", "error_of", "euler", "exact", "frames", "identify", "kinetic_energy",
+    "lagrangian", "lyapunov_exponents", "motion", "mrp", "orbits", "parameters", "plot",
+    "quaternion", "rodrigues", "scenes", "shapes", "simulate", "so3", "solve", "solvers",
+    "spatial_angular_momentum", "torques", "tumblers", "volumes", "workprecision",
+]  # fmt: skip
 
 show(__name__)
 
 
 def __getattr__(name: str) -> ModuleType:
     later = name in _LATER
-    return importlib.import_module(f"rigidjax.{name}") if later else wrong(__name__, name)
+    return importlib.import_module(f"rigidjax.{name}") if later else refuse(__name__, name)

@@ -1,4 +1,4 @@
-"""Checks at public boundaries: what was wanted, what came, and the likely cause."""
+"""Check arguments at public boundaries; say what was wanted, what came, and the likely cause."""
 
 import functools
 import importlib
@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Bool
 
 Numbers = TypeVar("Numbers", bound=Any)
 
-# The units of arguments whose names mean one kind of quantity in the whole library.
+# The units of arguments whose names mean one kind of quantity everywhere in the library.
 _UNITS = {
     "omega": "rad/s", "angle": "rad", "angles": "rad", "latitude": "rad",
     "t": "s", "ts": "s", "dt": "s", "delay": "s", "mass": "kg", "com": "m", "gravity": "m/s²",
@@ -42,11 +42,12 @@ def floating(
     batched: bool = False,
     unit: str = "",
 ) -> Array:
-    """Return `value` as a float32 or float64 array of exactly `shape`, or say what is wrong.
+    """Return `value` as a float32 or float64 array of exactly `shape`, or raise an error.
 
-    Integers become the default float type; with `batched`, leading axes may be before `shape`.
-    `name` is the argument's name in messages, and `hint` a likely cause of a wrong shape. A
-    quantity with a unit must be of the kind of `unit`, or of the name's, if there is one.
+    Integers become the default float type. With `batched`, `value` may have leading axes before
+    `shape`. `name` is the argument's name in messages, and `hint` a likely cause of a wrong shape.
+    A quantity with a unit must have the dimension of `unit`, or of the unit that belongs to `name`,
+    if there is one.
 
     **Raises:** `TypeError` for anything but an array of real numbers, for half precision (its 3
     digits cannot hold a rotation), and for another unit; `ValueError` for a wrong shape.
@@ -61,7 +62,7 @@ def floating(
 
 
 def rows(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
-    """Return `value` as an array of any number of `shape`, (n, *shape), as `floating` does."""
+    """Return `value` as an array (n, *shape) with n rows, converted as by `floating`."""
     array = numbers(value, name)
     if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
         wanted = ", ".join(map(str, ("n", *shape))) + ("," if not shape else "")
@@ -74,14 +75,14 @@ def _and(hint: str) -> str:
 
 
 def kind(value: Any) -> str:
-    """The name of a value's type for a message, or of the class if it is one."""
+    """Return the name of a value's type for a message, or of the value if it is a class."""
     if isinstance(value, jax.Array):
         return f"an array of shape {value.shape}"
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
 
 def numbers(value: Any, name: str, unit: str = "") -> Array:
-    """Return `value` as a float32 or float64 array of any shape, as `floating` does."""
+    """Return `value` as a float32 or float64 array of any shape, converted as by `floating`."""
     value = _in_si(value, name, unit)
     try:
         array = jnp.asarray(value)
@@ -103,7 +104,8 @@ def numbers(value: Any, name: str, unit: str = "") -> Array:
 def unmasked(value: Any) -> tuple[Any, np.ndarray | None]:
     """Return the data of a masked array and its mask, true where an entry has no value.
 
-    The mask is `None` if no entry is masked, and for other values, which are returned as they are.
+    The mask is `None` if no entry is masked, and for a value that is no masked array, which is
+    returned unchanged.
     """
     mask = getattr(value, "mask", None) if isinstance(value, np.ndarray) else None
     if mask is None:
@@ -114,9 +116,9 @@ def unmasked(value: Any) -> tuple[Any, np.ndarray | None]:
 
 
 def without_mask(value: Any, name: str) -> Any:
-    """Return `value`, of a masked array its data; refuse masked entries.
+    """Return `value`, or the data of a masked array; refuse masked entries.
 
-    What lies under a mask is often a wild reading.
+    The number under a mask is often a wild reading.
     """
     value, mask = unmasked(value)
     if mask is not None:
@@ -129,7 +131,7 @@ def without_mask(value: Any, name: str) -> Any:
 
 
 def _in_si(value: Any, name: str, wanted: str = "") -> Any:
-    """Quantities of astropy or pint as numbers in SI; other values as they are."""
+    """Return quantities of astropy or pint as numbers in SI, and other values unchanged."""
     value = without_mask(value, name)
     if isinstance(value, (list, tuple)):
         items = [_in_si(item, name, wanted) for item in value]
@@ -153,7 +155,9 @@ def _in_si(value: Any, name: str, wanted: str = "") -> Any:
 
 
 def _dimension(value: Any, unit: Any) -> dict[str, Any] | None:
-    """The powers of SI units in a unit of astropy or pint, angles left out; else `None`."""
+    """Return the powers of SI units in a unit of astropy or pint, without angles; `None` for other
+    values.
+    """
     if hasattr(value, "dimensionality"):
         return {_PINT.get(name, str(name)): power for name, power in value.dimensionality.items()}
     if not hasattr(unit, "decompose"):
@@ -164,10 +168,10 @@ def _dimension(value: Any, unit: Any) -> dict[str, Any] | None:
 
 
 def same_batch(**arrays: tuple[Array, int]) -> None:
-    """Refuse arrays whose leading axes, before the last `n` of each, differ.
+    """Refuse arrays whose leading axes, those before the last `n` of each, differ.
 
     **Arguments:** `name=(array, n)`, for each part of one container. A container of many bodies has
-    the same leading axes everywhere; one body has none.
+    equal leading axes everywhere; one body has none.
 
     **Raises:** `ValueError`.
     """
@@ -183,7 +187,7 @@ def same_batch(**arrays: tuple[Array, int]) -> None:
 
 @functools.cache
 def _warn_of_lost_digits() -> None:
-    # Cached: once in a process.
+    # The cache makes this warning appear once in a process.
     warnings.warn(
         "rigidjax: float64 numbers become float32, seven digits, because JAX's 64 bits are off; "
         "set jax.config.update('jax_enable_x64', True), or pass float32 if that is meant",
@@ -192,23 +196,23 @@ def _warn_of_lost_digits() -> None:
 
 
 def known(value: Any) -> bool:
-    """Whether `value` is an array of known numbers, not one that is being traced."""
+    """Return whether `value` is an array of known numbers, and not traced."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
 
 
 def namespace(value: Any) -> Any:
-    """NumPy where `value` is known, else `jax.numpy`.
+    """Return NumPy for a known `value`, else `jax.numpy`.
 
     A check of known numbers is done by NumPy on the host: a JAX operation outside `jit` costs some
-    30 µs, ten of them more than a whole short simulation.
+    30 µs, and ten of them cost more than a whole short simulation.
     """
     return np if known(value) else jnp
 
 
 def refuse(value: Any, bad: Bool[ArrayLike, "..."], message: str) -> Any:
-    """Return `value` unless `bad`; then raise with `message`, the same under `jit` and `vmap`.
+    """Return `value` unless `bad`; then raise an error with `message`, also under `jit`.
 
-    Outside a trace this is a `ValueError` with the bare text. Inside one it is
+    Outside a trace this is a `ValueError` with the text alone. Inside a trace it is
     `equinox.error_if`; the result must be used, or the check is dropped.
     """
     if known(bad):
@@ -219,13 +223,15 @@ def refuse(value: Any, bad: Bool[ArrayLike, "..."], message: str) -> Any:
 
 
 def bare(error: RuntimeError) -> RuntimeError:
-    r"""The same error with its own sentence alone, without the long text that Equinox adds."""
+    r"""Return an equal error with its own sentence alone, without the long text that Equinox
+    adds.
+    """
     found = re.search(r"^\S*EquinoxRuntimeError: (.+?)\n\n-+$", str(error), re.M | re.S)
     return type(error)(found[1]) if found else error
 
 
 def finite(value: Numbers, name: str) -> Numbers:
-    """Return `value` unless it holds a NaN or an infinity."""
+    """Return `value`, or refuse it if it contains a NaN or an infinity."""
     xp = namespace(value)
     bad = ~xp.isfinite(value)
     where = ""
@@ -241,18 +247,18 @@ def given(value: Any, shape: tuple[int, ...], name: str, **how: Any) -> Array:
 
 
 def scalars(**named: Any) -> list[Array]:
-    """Numbers by name, as `floating` does, in one precision."""
+    """Return named numbers, each converted as by `floating`, in one common precision."""
     found = [floating(value, (), name) for name, value in named.items()]
     return [value.astype(jnp.result_type(*found)) for value in found]
 
 
 def time(value: Any, name: str = "t") -> Array:
-    """Return a time: one number, which must be finite if it is known."""
+    """Return a time, which is one number; it must be finite if it is known."""
     return given(value, (), name)
 
 
 def sign(value: Array, name: str, wanted: str, *, zero: bool = False) -> Array:
-    """Return `value` unless a number of it is not finite, or not above 0 (`zero`: or is below)."""
+    """Return `value` if all numbers are finite and positive (with `zero`: ≥ 0), or refuse it."""
     xp = namespace(value)
     numbers = xp.asarray(value)
     bad = ~(((numbers >= 0) if zero else (numbers > 0)) & xp.isfinite(numbers))
@@ -261,26 +267,27 @@ def sign(value: Array, name: str, wanted: str, *, zero: bool = False) -> Array:
 
 
 def if_known(check: Callable[..., Array], value: Array, *args: Any, **options: Any) -> Array:
-    """`check(value, …)` if its numbers are known, and there are some; otherwise `value`."""
+    """Return `check(value, …)` for known numbers, at least one; return other values unchanged."""
     return check(value, *args, **options) if known(value) and value.size else value
 
 
 def instance(
     value: Any, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
 ) -> Any:
-    """Return `value` if it is one of `kinds`; else raise `TypeError` with what was wanted."""
+    """Return `value` if it is an instance of `kinds`, or raise `TypeError` with what was wanted."""
     if isinstance(value, kinds):
         return value
     if not wanted:
         several = kinds if isinstance(kinds, tuple) else (kinds,)
         wanted = " or ".join(kind.__name__ for kind in several)
-    # A whole solution in the place of its states, a body with mass in the place of its inertia.
+    # Common mistakes are a whole solution instead of its states, or a body with mass instead of its
+    # inertia.
     own = [name for name in ("ys", "inertia") if isinstance(getattr(value, name, None), kinds)]
     hint = hint or (f"give its .{own[0]}" if own else "")
     raise TypeError(f"{name}: wanted {wanted}, got {kind(value)}{_and(hint)}")
 
 
-# The arrays of one body or one state, by the name of the field.
+# The shape of each field of one body or one state, by the name of the field.
 _ONE = {
     "tensor": (3, 3), "mass": (), "com": (3,), "second_moment": (3, 3),
     "x": (3,), "v": (3,), "q": (4,), "omega": (3,),
@@ -290,10 +297,10 @@ _ONE = {
 def single(
     value: Any, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
 ) -> Any:
-    """Return `value` if it is one of `kinds`, and one body or state: no leading axes.
+    """Return `value` if it is an instance of `kinds`, and one body or state, without leading axes.
 
-    A container of many bodies has the same type; without this check its shape would raise an error
-    in the middle of the arithmetic.
+    A container of many bodies has the type of one body; without this check its shape would raise an
+    error in the middle of the arithmetic.
     """
     instance(value, kinds, name, wanted=wanted, hint=hint)
     for field in (field for field in _ONE if field in vars(value)):
@@ -304,7 +311,8 @@ def single(
 
 
 def function(value: Any, name: str, of: str, *, hint: str = "") -> Any:
-    """Return `value` if it is a function and no class; `of` gives arguments and result: "t → (3,)".
+    """Return `value` if it is a function and no class; `of` describes arguments and result, as in
+    "t → (3,)".
 
     The number of arguments is checked if `of` begins with a list: "(t, state, body) → scalar".
     """
@@ -318,7 +326,7 @@ def function(value: Any, name: str, of: str, *, hint: str = "") -> Any:
 
 
 def _takes(value: Any, count: int) -> bool:
-    """Whether a function can be called with so many arguments, by its signature."""
+    """Return whether the function `value` can be called with `count` arguments."""
     try:
         inspect.signature(value).bind(*[None] * count)
     except (TypeError, ValueError) as error:
@@ -328,7 +336,7 @@ def _takes(value: Any, count: int) -> bool:
 
 
 def whole(value: Any, name: str, least: int) -> int:
-    """Return `value` as a whole number of at least `least`, known before anything is compiled."""
+    """Return `value` as a Python integer of at least `least`, known before anything is compiled."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name}: wanted a whole number of Python, got {_shown(value)}")
     if value < least:
@@ -337,7 +345,7 @@ def whole(value: Any, name: str, least: int) -> int:
 
 
 def number(value: Any, name: str) -> float:
-    """Return `value` as a number of Python, known before anything is compiled."""
+    """Return `value` as one Python float, known before anything is compiled."""
     array = on_host(value, name)
     if array.shape != ():
         raise ValueError(f"{name}: wanted one number, got shape {array.shape}")
@@ -345,7 +353,7 @@ def number(value: Any, name: str) -> float:
 
 
 def positive(value: Any, name: str, what: str = "a positive number") -> float:
-    """Return `value` as a positive, finite number of Python, known before anything is compiled."""
+    """Return `value` as a positive, finite Python float, known before anything is compiled."""
     found = number(value, name)
     if not 0 < found < np.inf:
         raise ValueError(f"{name}: wanted {what}, got {found}")
@@ -353,7 +361,7 @@ def positive(value: Any, name: str, what: str = "a positive number") -> float:
 
 
 def fraction(value: Any, name: str, what: str = "a number between 0 and 1") -> float:
-    """Return `value` as a number of Python above 0 and below 1."""
+    """Return `value` as a Python float above 0 and below 1."""
     found = positive(value, name, what)
     if not found < 1:
         raise ValueError(f"{name}: wanted {what}, got {found}")
@@ -361,7 +369,7 @@ def fraction(value: Any, name: str, what: str = "a number between 0 and 1") -> f
 
 
 def not_negative(value: Any, name: str) -> float:
-    """Return `value` as a finite number of Python ≥ 0, known before anything is compiled."""
+    """Return `value` as a finite Python float ≥ 0, known before anything is compiled."""
     found = number(value, name)
     return 0.0 if found == 0 else positive(found, name, "a number ≥ 0")
 
@@ -385,7 +393,7 @@ def on_host(value: Any, name: str) -> np.ndarray:
 
 
 def path(value: Any, name: str = "path") -> Path:
-    """Return the path of a file that `value` names."""
+    """Return the path of a file from its name, `value`."""
     named = isinstance(value, str | os.PathLike) and isinstance(os.fspath(value), str)
     if not named or value == "":
         raise TypeError(f"{name}: wanted the name of a file, got {_shown(value)}")
@@ -393,12 +401,12 @@ def path(value: Any, name: str = "path") -> Path:
 
 
 def printable(text: Any) -> str:
-    """The text, with control characters (escapes, ends of line) as Python writes them."""
+    """Return the text with control characters (escapes, ends of line) as Python writes them."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
 
 
 def plain(text: Any) -> str:
-    """The text as matplotlib shows it unchanged: no formula between `$`, no hidden label."""
+    """Return the text as matplotlib shows it unchanged: no formula between `$`, no hidden label."""
     text = str(text).replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
@@ -429,7 +437,7 @@ def key(value: Any, name: str = "key") -> Any:
 
 
 def library(module: str, extra: str, who: str) -> Any:
-    """The module, imported now; `ModuleNotFoundError` says which extra of ours installs it."""
+    """Import the module and return it, or raise an error that names the extra to install."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -451,7 +459,7 @@ def float_type(value: Any, name: str = "dtype") -> Any:
 
 
 def later_origin(dtype: Any) -> str:
-    """Return the advice for times so large that `dtype` cannot resolve their steps."""
+    """Return the advice for times that are so large that `dtype` cannot resolve their steps."""
     if np.dtype(dtype) == np.float64:
         return "count time from a later origin, such as the first time of the run"
     return "count time from a later origin, or use float64"

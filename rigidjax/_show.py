@@ -1,4 +1,4 @@
-"""How states and bodies are printed: with their numbers."""
+"""Print states and bodies with their numbers."""
 
 import dataclasses
 from typing import Any
@@ -8,12 +8,12 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-# More numbers than this are printed as their shape.
+# An array with more numbers than this is printed as its shape.
 MOST = 16
 
 
 def numbers(self: Any) -> str:
-    """`Name(field=numbers, …)`; a traced or large array is shown by its shape."""
+    """Return `Name(field=numbers, …)`; a traced or large array is shown by its shape."""
     fields = [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.repr]
     fields = [(name, value) for name, value in fields if value is not None]
     parts = ", ".join(f"{name}={shown(value)}" for name, value in fields)
@@ -21,7 +21,7 @@ def numbers(self: Any) -> str:
 
 
 def shown(value: Any) -> str:
-    """The numbers of an array, or its shape if it is traced or has many."""
+    """Return the numbers of an array, or its shape if it is traced or has many."""
     known = isinstance(value, (jax.Array, np.ndarray)) and not isinstance(value, Tracer)
     if not known or value.size > MOST:
         return eqx.tree_pformat(value)
@@ -29,7 +29,9 @@ def shown(value: Any) -> str:
 
 
 def time(t: Any, span: Any, digits: int = 6) -> str:
-    """A time, with so many digits of the `span` of its record: seconds since 1970 need more."""
+    """Return a time with `digits` digits of the `span` of its record: seconds since 1970 need more
+    of them.
+    """
     t, span = float(t), float(span)
     more = np.log10(abs(t) / span) if span > 0 and 0 < abs(t) < np.inf else 0.0
     return f"{t:.{digits + max(0, int(np.ceil(more)))}g}"

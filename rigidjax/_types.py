@@ -1,7 +1,7 @@
-"""Names for the arrays that everything passes around.
+"""Define names for the arrays that all parts of the library exchange.
 
-`Vec3`, `Mat3`, `Quat`, `Scalar` are what functions return: JAX arrays. The `…Like` forms are what
-they take: anything NumPy-like of the same shape. One body at a time; batch with `jax.vmap`.
+Functions return `Vec3`, `Mat3`, `Quat`, `Scalar`: JAX arrays. They take the `…Like` forms: anything
+NumPy-like of the same shape. A function takes one body at a time; batch with `jax.vmap`.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ Vec3Like = Float[ArrayLike, "3"]
 Mat3Like = Float[ArrayLike, "3 3"]
 QuatLike = Float[ArrayLike, "4"]
 
-# What the constructors take: an array, or nested lists of numbers.
+# Constructors take an array, or nested lists of numbers.
 Numbers = Sequence[Any]
 Vector = Vec3Like | Numbers
 Matrix = Mat3Like | Numbers
@@ -32,7 +32,7 @@ Scalars = Float[ArrayLike, "*batch"] | Numbers | float
 
 @runtime_checkable
 class HasSpin(Protocol):
-    """A state with a body rate `omega` (rad/s, body frame).
+    """Describe a state with a body rate `omega` (rad/s, body frame).
 
     >>> isinstance(rj.Spin([0.0, 0.0, 1.0]), HasSpin), isinstance(rj.Inertia(jnp.eye(3)), HasSpin)
     (True, False)
@@ -44,7 +44,7 @@ class HasSpin(Protocol):
 
 @runtime_checkable
 class HasAttitude(HasSpin, Protocol):
-    """A state with a body rate and an attitude `q` (w, x, y, z), body → world.
+    """Describe a state with a body rate and an attitude `q` (w, x, y, z), body → world.
 
     >>> isinstance(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), HasAttitude)
     True
@@ -56,7 +56,8 @@ class HasAttitude(HasSpin, Protocol):
 
 @runtime_checkable
 class HasPose(HasAttitude, Protocol):
-    """A state with a rate, an attitude, and `x`, `v` of the centre of mass (m, m/s, world frame).
+    """Describe a state with a rate, an attitude, and `x`, `v` of the centre of mass (m, m/s, world
+    frame).
 
     >>> isinstance(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), HasPose)  # it has no position
     False

@@ -17,4 +17,6 @@ from rigidjax.batch.rollout import rollout as rollout
 from rigidjax.batch.sharding import compiler_options as compiler_options
 from rigidjax.batch.simulate import Steps as Steps, simulate as simulate
 
+__all__ = ["Steps", "compiler_options", "distributed", "rollout", "simulate"]
+
 show(__name__)

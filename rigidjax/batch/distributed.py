@@ -202,4 +202,6 @@ def _together(send: Callable[[Any], Any], tree: Any, checkpoint: Any) -> Any:
         ) from error
 
 
+__all__ = ["connect", "gather", "recover", "save", "share", "total"]
+
 show(__name__)

@@ -1,4 +1,6 @@
-"""Bodies: inertia, mass, second moments; see also `rj.shapes`, `rj.volumes`, `rj.parameters`."""
+"""Describe bodies: inertia, mass, second moments; see also `rj.shapes`, `rj.volumes`,
+`rj.parameters`.
+"""
 
 from rigidjax._names import show
 from rigidjax.body.divergence import divergence as divergence
@@ -16,5 +18,11 @@ from rigidjax.body.inertials import (
     write_inertials as write_inertials,
 )
 from rigidjax.body.principal_axes import matrix_function as matrix_function, principal as principal
+
+__all__ = [
+    "Inertia", "MassProperties", "angular_momentum", "divergence", "ellipsoid", "kinetic_energy",
+    "kinetic_energy_about", "kinetic_energy_of_matrix_rate", "matrix_function", "principal",
+    "read_inertials", "spatial_angular_momentum", "write_inertials",
+]  # fmt: skip
 
 show(__name__)

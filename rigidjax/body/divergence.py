@@ -1,4 +1,4 @@
-"""The divergence of two bodies, a prior for fits that does not depend on the frame."""
+"""Measure the divergence of two bodies, a prior for fits that does not depend on the frame."""
 
 from functools import partial
 
@@ -12,17 +12,17 @@ from rigidjax.rotation.linalg3 import dot
 
 
 def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
-    """Entropic (Bregman, log-determinant) divergence of two bodies, without units.
+    """Return the entropic (Bregman, log-determinant) divergence of two bodies, without units.
 
-    `D = Tr(J₀⁻¹ J) − log det(J₀⁻¹ J) − 4` with the 4×4 pseudo-inertia
-    `J = [[𝔖 + m c cᵀ, m c], [m cᵀ, m]]`. It is zero only if the bodies are equal, convex in J, and
-    infinite at plates and rods. It does not change if both bodies are seen from another frame or in
-    other units. It is twice the Kullback–Leibler divergence of the masses as Gaussians; its error
-    is the round-off of the trace. Add `weight * divergence(body, guess)` to a loss: quantities that
-    the data do not determine then stay near the guess.
+    `D = Tr(J₀⁻¹ J) − log det(J₀⁻¹ J) − 4` with the 4×4 pseudo-inertia `J = [[𝔖 + m c cᵀ, m c], [m
+    cᵀ, m]]`. The divergence is zero only if the bodies are equal, convex in J, and infinite at
+    plates and rods. It does not change if both bodies are expressed in another frame or in other
+    units. It is twice the Kullback–Leibler divergence of the masses as Gaussians. Its error is the
+    round-off of the trace. Add `weight * divergence(body, guess)` to a loss: quantities that the
+    data do not determine then stay near the guess.
 
-    **Arguments:** `body`; `reference` a body with a positive definite 𝔖; the same frame and units.
-    Source: Lee, Wensing and Park 2020, "Geometric robot dynamic identification: a convex
+    **Arguments:** `body`; `reference`, a body with a positive definite 𝔖, in the frame and units of
+    `body`. Source: Lee, Wensing and Park 2020, "Geometric robot dynamic identification: a convex
     programming approach", IEEE T-RO 36:348, doi:10.1109/TRO.2019.2926491.
 
     >>> body = rj.shapes.box(1.0, [1.0, 2.0, 3.0])
@@ -32,10 +32,10 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     _checks.single(body, MassProperties, "body")
     _checks.single(reference, MassProperties, "reference")
     ratio = body.mass / reference.mass
-    # By factors, not by cofactors, which lose twice the digits of a long, thin body.
+    # By Cholesky factors: cofactors lose twice as many digits for a long, thin body.
     root = jnp.linalg.cholesky(reference.second_moment / reference.mass)
-    seen = partial(solve_triangular, root, lower=True)
-    overlap = seen(seen(body.second_moment / body.mass).T)
-    d = seen(body.com - reference.com)
+    whiten = partial(solve_triangular, root, lower=True)
+    overlap = whiten(whiten(body.second_moment / body.mass).T)
+    d = whiten(body.com - reference.com)
     distance = ratio * (jnp.trace(overlap) + dot(d, d) + 1.0) - jnp.linalg.slogdet(overlap)[1]
     return distance - 4.0 * jnp.log(ratio) - 4.0

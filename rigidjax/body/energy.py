@@ -1,4 +1,4 @@
-"""Kinetic energy and angular momentum of a turning body, and its ellipsoids.
+"""Compute the kinetic energy and angular momentum of a turning body, and its ellipsoids.
 
 The notes write the energy of rotation in three forms. Printed eqs 61–65 lack the factor ½ of eqs 57
 and 73–75; here all have it and agree. `kinetic_energy` of `Inertia.from_second_moment(jnp.diag(λ))`
@@ -33,12 +33,12 @@ _HINT = "Inertia.from_tensor takes a matrix"
 
 
 def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> Scalar:
-    """Kinetic energy of a body in a state of motion, J: `T = ½ m |v|² + ½ Ω·IΩ`.
+    """Return the kinetic energy of a body in a state of motion, J: `T = ½ m |v|² + ½ Ω·IΩ`.
 
-    **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties`; `state`
-    anything with `.omega` (Ω, rad/s, body frame), or Ω (3,) itself. The first term counts for
-    `MassProperties` and a state that moves (`.v`, m/s, of the centre of mass, world frame). Source:
-    notes, eqs 75 and 79, in any body axes.
+    **Arguments:** `body`, an `Inertia` about the point that the body turns about, or
+    `MassProperties`; `state` anything with `.omega` (Ω, rad/s, body frame), or Ω (3,) itself. The
+    first term is added for `MassProperties` and a state with a velocity (`.v`, m/s, of the centre
+    of mass, world frame). Source: notes, eqs 75 and 79, in any body axes.
 
     >>> kinetic_energy(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array(3., dtype=float64)
@@ -53,7 +53,7 @@ def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> S
 def kinetic_energy_about(
     body: MassProperties, q: Quaternion, velocity: Vector, omega: Vector
 ) -> Scalar:
-    """Kinetic energy by the velocity of a point other than the centre of mass, J.
+    """Return the kinetic energy from the velocity of a point other than the centre of mass, J.
 
     `T = ½ m |V|² + m V·R(Ω × c) + ½ Ω·I_o Ω`. The notes (eqs 54–57) have no cross term: their
     origin is the centre of mass.
@@ -78,7 +78,8 @@ def kinetic_energy_about(
 
 
 def kinetic_energy_of_matrix_rate(second_moment: Matrix, matrix_rate: Matrix) -> Scalar:
-    """Energy of rotation `½ Tr(Ṁ 𝔖 Ṁᵀ) = ½ Tr(J'ᵀ J' 𝔖)`, J (notes, eqs 63, 65 with their ½).
+    """Return the energy of rotation, J: `½ Tr(Ṁ 𝔖 Ṁᵀ) = ½ Tr(J'ᵀ J' 𝔖)` (notes, eqs 63, 65 with the
+    factor ½).
 
     **Arguments:** `second_moment` (3, 3) 𝔖, kg m², body frame; `matrix_rate` (3, 3), 1/s: dM/dt of
     the rotation matrix body → world, or its generator in the body `J' = Mᵀ Ṁ = hat(Ω)`.
@@ -93,10 +94,11 @@ def kinetic_energy_of_matrix_rate(second_moment: Matrix, matrix_rate: Matrix) ->
 
 
 def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) -> Vec3:
-    """Angular momentum in the body frame, `Π = IΩ`, (3,), kg m²/s.
+    """Return the angular momentum in the body frame, `Π = IΩ`, (3,), kg m²/s.
 
-    **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties` (then
-    about the centre of mass); `state` anything with `.omega`, or Ω (3,) itself, rad/s, body frame.
+    **Arguments:** `body`, an `Inertia` about the point that the body turns about, or
+    `MassProperties` (then about the centre of mass); `state` anything with `.omega`, or Ω (3,)
+    itself, rad/s, body frame.
 
     >>> angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array([1., 2., 3.], dtype=float64)
@@ -105,11 +107,12 @@ def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) ->
 
 
 def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude) -> Vec3:
-    """Angular momentum in the world frame, `R Π`, (3,), kg m²/s: constant for a free body.
+    """Return the angular momentum in the world frame, `R Π`, (3,), kg m²/s: constant for a free
+    body.
 
     **Arguments:** as `angular_momentum`; `state` has `.q` (4,), body → world, and `.omega`. For
-    `MassProperties` and a state that moves (`.x`, `.v`) the orbital part `m x × v` about the
-    world's origin is added. **Raises:** `TypeError` for a state without attitude.
+    `MassProperties` and a state with `.x` and `.v`, the orbital part `m x × v` about the world's
+    origin is added. **Raises:** `TypeError` for a state without attitude.
 
     >>> turned = rj.Attitude([0.0, 1.0, 0, 0], [0.0, 0, 1])
     >>> spatial_angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), turned)[2]
@@ -129,14 +132,15 @@ def ellipsoid(
     kind: Literal["energy", "momentum", "mass"],
     size: ScalarLike | None = None,
 ) -> tuple[Vec3, Quat]:
-    """The ellipsoid of the rates Ω of one energy or momentum, or the uniform one of equal inertia.
+    """Return the ellipsoid of all rates Ω with one energy or momentum, or the solid ellipsoid with
+    the inertia of the body.
 
     **Arguments:** `body`; `kind` and `size`:
 
     - `"energy"`: `½ Ω·IΩ = T`, semi-axes `√(2T/I_k)` rad/s; `size` T ≥ 0, J;
     - `"momentum"`: `|IΩ| = h`, semi-axes `h/I_k` rad/s; `size` h ≥ 0, kg m²/s;
-    - `"mass"`: the uniform solid ellipsoid of the same mass, centre and 𝔖, semi-axes `√(5 λ_k/m)`,
-      m, of `MassProperties`, without a `size`. It moves exactly as the body does.
+    - `"mass"`: the uniform solid ellipsoid with the mass, centre and 𝔖 of the body, semi-axes
+      `√(5 λ_k/m)`, m, of `MassProperties`, without a `size`. It moves exactly as the body does.
 
     **Returns** `(semi_axes, q)`: (3,) in the order of ascending moments (`"mass"`: ascending), and
     (4,) the rotation principal axes → body axes. In free motion Ω stays on the intersection of the

@@ -1,4 +1,4 @@
-"""The inertia of a body, and its mass, centre of mass and second moment.
+"""Hold the inertia of a body, and its mass, centre of mass and second moment.
 
 The second moment `𝔖 = ∫ r rᵀ dm` (notes, eq 60) and the inertia tensor `I = Tr(𝔖) 1 − 𝔖`
 (eqs 76–78) have the same information. A matrix is the 𝔖 of a real body exactly if it is positive
@@ -38,13 +38,13 @@ from rigidjax.rotation import quaternion
 
 
 class Inertia(eqx.Module):
-    """The inertia tensor I of a body about the point it turns about.
+    """Hold the inertia tensor I of a body about the point that the body turns about.
 
     **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor checks shape and dtype only;
-    `from_tensor`, `from_principal`, `from_second_moment`, and all that takes a body, check that it
-    is real.
-    `scale` "arbitrary" if only the ratios of the components are known, as after a fit of free
-    motion: `simulate` then warns of torques, and `shifted` raises `ValueError`.
+    `from_tensor`, `from_principal`, `from_second_moment`, and every function that takes a body,
+    check that some mass has this inertia. `scale` "arbitrary" if only the ratios of the components
+    are known, as after a fit of free motion: `simulate` then warns of torques, and `shifted` raises
+    `ValueError`.
 
     The object stores I, not 𝔖: `from_tensor` changes no digit, and the small moment of a rod keeps
     all its digits. Source: notes, eqs 76–78.
@@ -67,7 +67,7 @@ class Inertia(eqx.Module):
 
     @staticmethod
     def from_tensor(tensor: Matrix) -> "Inertia":
-        """A body with this inertia tensor.
+        """Return the body with this inertia tensor.
 
         **Arguments:** `tensor` (3, 3), kg m², body frame, about the point it turns about. Plates,
         rods and points (zero second moments) are bodies. **Raises:** `ValueError` (`equinox` error
@@ -82,7 +82,8 @@ class Inertia(eqx.Module):
 
     @staticmethod
     def from_principal(i1: ScalarLike, i2: ScalarLike, i3: ScalarLike) -> "Inertia":
-        """A body with moments `i1`, `i2`, `i3`, kg m², about the body axes; else as `from_tensor`.
+        """Return the body with moments `i1`, `i2`, `i3`, kg m², about the body axes. **Raises:** as
+        `from_tensor`.
 
         >>> Inertia.from_principal(1.0, 2.0, 3.0).tensor[2, 2]
         Array(3., dtype=float64)
@@ -92,7 +93,7 @@ class Inertia(eqx.Module):
 
     @staticmethod
     def from_second_moment(second_moment: Matrix) -> "Inertia":
-        """A body with this second moment: `I = Tr(𝔖) 1 − 𝔖` (notes, eqs 60, 76–78).
+        """Return the body with this second moment: `I = Tr(𝔖) 1 − 𝔖` (notes, eqs 60, 76–78).
 
         **Arguments:** `second_moment` (3, 3) 𝔖 = ∫ r rᵀ dm, kg m², body frame, about the point it
         turns about. **Raises:** `ValueError` (`equinox` error under `jit`) if it is not symmetric
@@ -106,16 +107,16 @@ class Inertia(eqx.Module):
 
     @property
     def second_moment(self) -> Float[Array, "*batch 3 3"]:
-        """𝔖 = ½ Tr(I) 1 − I, (3, 3), kg m², body frame (notes, eqs 76–78 solved)."""
+        """Return 𝔖 = ½ Tr(I) 1 − I, (3, 3), kg m², body frame (notes, eqs 76–78 solved)."""
         return swap_trace_back(self.tensor)
 
     @property
     def moments(self) -> Vec3:
-        """Principal moments I1 ≤ I2 ≤ I3, (3,), kg m²."""
+        """Return the principal moments I1 ≤ I2 ≤ I3, (3,), kg m²."""
         return eigensystem(validation.symmetric(self.tensor, "inertia tensor"))[0]
 
     def principal(self) -> tuple[Vec3, Quat]:
-        """Principal moments, ascending, and the rotation principal axes → body axes.
+        """Return the principal moments, ascending, and the rotation principal axes → body axes.
 
         **Returns** `(moments, q)`, (3,) kg m² and (4,), with `I = R(q) diag(moments) R(q)ᵀ`.
         Derivatives are finite for any body; `rigidjax.body.principal` says what they mean at equal
@@ -127,11 +128,11 @@ class Inertia(eqx.Module):
         return principal(self.tensor)
 
     def shifted(self, r: Vector, mass: ScalarLike) -> "Inertia":
-        """The inertia about a point away from the centre of mass: `I + m (|r|² 1 − r rᵀ)`.
+        """Return the inertia about a point away from the centre of mass: `I + m (|r|² 1 − r rᵀ)`.
 
-        **Arguments:** `self` about the centre of mass; `r` (3,) from the centre of mass to the new
-        point or back, m, body frame; `mass` kg; a negative one undoes a shift. Source: Steiner;
-        Landau and Lifshitz, eq 32.12.
+        **Arguments:** `self` is about the centre of mass; `r` (3,) from the centre of mass to the
+        new point, or back, m, body frame; `mass` kg; a negative mass undoes a shift. Source:
+        Steiner; Landau and Lifshitz, eq 32.12.
 
         >>> Inertia.from_principal(1.0, 1.0, 1.0).shifted([0.0, 0.0, 2.0], 3.0).moments
         Array([ 1., 13., 13.], dtype=float64)
@@ -142,10 +143,10 @@ class Inertia(eqx.Module):
         return Inertia(self.tensor + swap_trace(m * outer(r, r)))
 
     def rotated(self, q: Quaternion) -> "Inertia":
-        """The same body turned, or seen from other axes: `R(q) I R(q)ᵀ`.
+        """Return the inertia of the turned body, or of the body in other axes: `R(q) I R(q)ᵀ`.
 
-        **Arguments:** `q` (4,) unit quaternion (w, x, y, z), active: what was at `r` is then at
-        `R(q) r`. With q body → world this is the inertia in world axes.
+        **Arguments:** `q` (4,) unit quaternion (w, x, y, z), active: the mass at `r` moves to `R(q)
+        r`. With q body → world the result is the inertia in world axes.
 
         >>> half = 0.5**0.5
         >>> Inertia.from_principal(1.0, 2.0, 2.5).rotated([half, 0, 0, half]).tensor[0, 0]
@@ -155,20 +156,22 @@ class Inertia(eqx.Module):
         return Inertia(product(m, product(self.tensor, m.T)), self.scale)
 
     def invertible(self) -> "Inertia":
-        """The same body; `ValueError` if a moment, by which Euler's equations divide, is zero."""
+        """Return `self`. **Raises:** `ValueError` if a moment is zero: Euler's equations divide by
+        the moments.
+        """
         return validation.possible(self, self.tensor, None, throw=True)
 
     def __add__(self, other: "Inertia") -> "Inertia":
-        """Two bodies turning as one about the same point, in the same axes."""
+        """Return the inertia of two bodies that turn as one about one point, in common axes."""
         return Inertia(self.tensor + other.tensor)
 
     def __sub__(self, other: "Inertia") -> "Inertia":
-        """The body without a part, about the same point, in the same axes."""
+        """Return the inertia of the body without a part, about one point, in common axes."""
         return Inertia(self.tensor - other.tensor)
 
 
 class MassProperties(eqx.Module):
-    """Mass, centre of mass and second moment of a body.
+    """Hold the mass, centre of mass and second moment of a body.
 
     **Arguments:** `mass` m, kg; `com` (3,) centre of mass c, m, body frame (from the body's
     origin); `second_moment` (3, 3) 𝔖 **about the centre of mass**, kg m², body axes (notes, eq 60).
@@ -197,18 +200,20 @@ class MassProperties(eqx.Module):
         _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(s, 2))
         dtype = jnp.result_type(mass, com, s)
         mass = _checks.if_known(validation.real_mass, mass.astype(dtype))
-        # A traced mass that no body has makes the body NaN.
+        # A traced mass that is not positive makes the body NaN: an error needs `checked`.
         self.mass = mass if _checks.known(mass) else jnp.where(mass > 0, mass, jnp.nan)
         self.com = _checks.if_known(_checks.finite, com.astype(dtype), "com")
         self.second_moment = _checks.if_known(validation.real_second_moment, s.astype(dtype))
 
     @property
     def inertia(self) -> Inertia:
-        """The inertia about the centre of mass, body axes."""
+        """Return the inertia about the centre of mass, body axes."""
         return Inertia(swap_trace(self.second_moment))
 
     def checked(self) -> "MassProperties":
-        """The same body, its values checked also under `jit`. **Raises:** as the constructor."""
+        """Return an equal body whose values are checked, also under `jit`. **Raises:** as the
+        constructor.
+        """
         return MassProperties(
             validation.real_mass(self.mass),
             _checks.finite(self.com, "com"),
@@ -216,11 +221,11 @@ class MassProperties(eqx.Module):
         )
 
     def invertible(self) -> "MassProperties":
-        """The same body; `ValueError` if a moment about its centre of mass is zero."""
+        """Return `self`. **Raises:** `ValueError` if a moment about the centre of mass is zero."""
         return validation.possible(self, self.inertia.tensor, self.mass, throw=True)
 
     def second_moment_about(self, point: Vector) -> Mat3:
-        """𝔖 about another point, (3, 3), kg m², body axes: `𝔖 + m d dᵀ`, `d = c − point`.
+        """Return 𝔖 about another point, (3, 3), kg m², body axes: `𝔖 + m d dᵀ`, `d = c − point`.
 
         **Arguments:** `point` (3,) m, body frame. Source: eq 60 of the notes with
         `r' = (r' − c) + d`; the cross terms vanish.
@@ -233,7 +238,8 @@ class MassProperties(eqx.Module):
         return self.second_moment + self.mass * outer(d, d)
 
     def inertia_about(self, point: Vector) -> Inertia:
-        """The inertia about another `point` (3,) of the body, m, body frame, such as a pivot.
+        """Return the inertia about another `point` (3,) of the body, m, body frame, such as a
+        pivot.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> body.inertia_about([0.0, 0, 0]).moments
@@ -242,7 +248,7 @@ class MassProperties(eqx.Module):
         return Inertia(swap_trace(self.second_moment_about(point)))
 
     def shifted(self, r: Vector) -> "MassProperties":
-        """The body shifted by `r` (3,), m, in its own axes: only its centre of mass changes.
+        """Return the body shifted by `r` (3,), m, in its own axes: only its centre of mass changes.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> body.shifted([0.0, 1.0, 0.0]).com
@@ -252,7 +258,8 @@ class MassProperties(eqx.Module):
         return MassProperties(self.mass, com, self.second_moment)
 
     def rotated(self, q: Quaternion) -> "MassProperties":
-        """The body turned about its origin by `q` (4,) unit, active: `c → R c`, `𝔖 → R 𝔖 Rᵀ`.
+        """Return the body turned about its origin by `q` (4,), unit, active: `c → R c`, `𝔖 → R 𝔖
+        Rᵀ`.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> body.rotated([0.0, 0, 0, 1]).com
@@ -263,7 +270,8 @@ class MassProperties(eqx.Module):
         return MassProperties(self.mass, apply(m, self.com), second_moment)
 
     def __add__(self, other: "MassProperties") -> "MassProperties":
-        """Two bodies as one, in the same axes: `𝔖 = 𝔖a + 𝔖b + (ma mb / m) d dᵀ`, d = cb − ca.
+        """Return two bodies as one, in common axes: `𝔖 = 𝔖a + 𝔖b + (ma mb / m) d dᵀ` with `d = cb −
+        ca`.
 
         >>> part = MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> (part + part.shifted([2.0, 0, 0])).second_moment[0, 0]
@@ -274,11 +282,11 @@ class MassProperties(eqx.Module):
         return _joined(self, other.mass, other.com, other.second_moment)
 
     def __radd__(self, other: int) -> "MassProperties":
-        """`sum(parts)` starts from 0."""
+        """Return `self` for 0, with which `sum(parts)` starts."""
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
     def __sub__(self, other: "MassProperties") -> "MassProperties":
-        """The body without a part, in the same axes.
+        """Return the body without a part, in common axes.
 
         **Raises:** `ValueError` if the part has more mass than the body.
 
@@ -292,7 +300,9 @@ class MassProperties(eqx.Module):
 
 
 def tensor_of(body: Inertia | MassProperties) -> Float[Array, "*batch 3 3"]:
-    """The inertia tensor (3, 3), kg m²: of an `Inertia`, or about the centre of mass."""
+    """Return the inertia tensor (3, 3), kg m²; of `MassProperties` the one about the centre of
+    mass.
+    """
     return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
 
 
@@ -300,7 +310,9 @@ Body = TypeVar("Body", Inertia, MassProperties)
 
 
 def with_tensor(body: Body, tensor: Mat3) -> Body:
-    """The body with another inertia tensor, unchecked: parts of a body need not be real bodies."""
+    """Return the body with another inertia tensor, unchecked, since a part of a body need not be a
+    real body.
+    """
     if isinstance(body, Inertia):
         return Inertia(tensor)
     return eqx.tree_at(lambda b: b.second_moment, body, swap_trace_back(tensor))
@@ -309,7 +321,8 @@ def with_tensor(body: Body, tensor: Mat3) -> Body:
 def _joined(body, mass, com, second_moment):
     total = body.mass + mass
     d = com - body.com
-    # From the heavier one: a light and distant part moves the centre little.
+    # Start at the centre of the heavier part: a light and distant part moves it little, so that
+    # no digit is lost.
     heavy = body.mass >= mass
     moved = jnp.where(heavy, mass, -body.mass) / total * d
     both = body.second_moment + second_moment + (body.mass * (mass / total)) * outer(d, d)

@@ -1,4 +1,4 @@
-"""Mass, centre of mass and inertia from and to robot descriptions: URDF and MuJoCo's XML."""
+"""Read and write mass, centre of mass and inertia in robot descriptions: URDF and MuJoCo's XML."""
 
 import warnings
 import xml.etree.ElementTree as Tree
@@ -19,7 +19,7 @@ _KEYS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
 def read_inertials(path: str | Path) -> dict[str, MassProperties]:
-    """Return the bodies with inertia in a URDF or MuJoCo XML file, by name, in their own frames.
+    """Return the bodies with inertia in a URDF or MuJoCo XML file, by name, each in its own frame.
 
     URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`, `inertia`. MuJoCo: `<inertial>` with
     `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`; an inertia that MuJoCo would compute from
@@ -57,8 +57,8 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     return bodies
 
 
-# What MuJoCo does with the masses in a file by an attribute of `<compiler>` with another value than
-# these.
+# With these values an attribute of `<compiler>` leaves the masses of the file unchanged;
+# `_CHANGES` says what MuJoCo does with other values.
 _UNCHANGED = {
     "inertiafromgeom": ("false", "auto"), "settotalmass": ("-1", "0"), "balanceinertia": ("false",),
     "boundmass": ("0",), "boundinertia": ("0",), "coordinate": ("local",),
@@ -67,14 +67,16 @@ _CHANGES = {
     "inertiafromgeom": "takes all masses and inertias from the geometry instead",
     "settotalmass": "scales all masses and inertias to this total mass",
     "balanceinertia": "replaces the moments of what is no real body by their mean",
-    "boundmass": "raises smaller masses to this one",
-    "boundinertia": "raises smaller moments to this one",
+    "boundmass": "raises smaller masses to this value",
+    "boundinertia": "raises smaller moments to this value",
     "coordinate": "reads places and orientations in the frame of the world",
 }
 
 
 def _settings(root: Tree.Element) -> list[str]:
-    """Return the settings by which MuJoCo has other masses than the file's inertials."""
+    """Return warnings of settings that make MuJoCo use other masses than the inertials in the
+    file.
+    """
     words = []
     for compiler in root.iter("compiler"):
         for key, unchanged in _UNCHANGED.items():
@@ -87,7 +89,7 @@ def _settings(root: Tree.Element) -> list[str]:
 
 
 def _is_one_of(value: str, words: Sequence[str]) -> bool:
-    """Whether an attribute has one of these values, as a word or as a number."""
+    """Return whether an attribute has one of these values, as a word or as a number."""
     try:
         return float(value) in map(float, words)
     except ValueError:
@@ -97,7 +99,7 @@ def _is_one_of(value: str, words: Sequence[str]) -> bool:
 def write_inertials(
     path: str | Path, bodies: Mapping[str, MassProperties], source: str | Path
 ) -> None:
-    """Copy a URDF or MuJoCo XML file, with these bodies in the place of its inertials.
+    """Copy a URDF or MuJoCo XML file with `bodies` instead of its inertials.
 
     **Arguments:** `path` of the new file; `bodies` name → `MassProperties`, in the frames of the
     file's links or bodies; `source` the file to copy; its other content does not change.
@@ -126,7 +128,7 @@ def write_inertials(
 
 
 def _opened(path: Path) -> tuple[Tree.Element, dict[str, Tree.Element]]:
-    """The file's root, `robot` or `mujoco`, and its links or bodies by name."""
+    """Return the file's root, `robot` or `mujoco`, and its links or bodies by name."""
     if not path.exists():
         raise ValueError(f"{path}: no such file")
     try:
@@ -180,7 +182,7 @@ def _body(mass: float, place: np.ndarray, turn: Any, six: Any) -> MassProperties
     moments = np.linalg.eigvalsh(tensor)
     if not moments[2] > 0 or least < -ROUNDED * moments[2]:
         shown = ", ".join(f"{moment:.6g}" for moment in moments)
-        raise ValueError(f"no body has the moments {shown}: I1 + I2 ≥ I3 and I1 ≥ 0 are wanted")
+        raise ValueError(f"wanted moments of a body, I1 ≥ 0 and I1 + I2 ≥ I3, got {shown}")
     if least < 0:
         second = second - least * np.eye(3)
     return MassProperties(mass, place, second)
@@ -190,12 +192,12 @@ def _numbers(node: Any, key: str, count: int, otherwise: Any = None) -> np.ndarr
     text = None if node is None else node.get(key)
     if text is None:
         if otherwise is None:
-            raise ValueError(f"wanted {key}")
+            raise ValueError(f"wanted an attribute {key}, got none")
         return np.array(otherwise)
     try:
         numbers = np.array([float(part) for part in text.split()])
     except ValueError:
-        raise ValueError(f"{key}: {text!r} are no numbers") from None
+        raise ValueError(f"{key}: wanted numbers, got {text!r}") from None
     if numbers.size != count or not np.isfinite(numbers).all():
         raise ValueError(f"{key}: wanted {count} finite numbers, got {text!r}")
     return numbers

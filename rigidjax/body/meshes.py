@@ -1,4 +1,4 @@
-"""Mass properties of the solid inside a closed triangle mesh, by exact integrals.
+"""Integrate the mass properties of the solid inside a closed triangle mesh, exactly.
 
 The solid is a signed sum of tetrahedra from one inner point to each face. Over a tetrahedron with
 corners 0, a, b, c the integrals of 1, r and r rᵀ are polynomials of a, b, c, so that the result is
@@ -26,16 +26,16 @@ def mesh(
     faces: Int[ArrayLike, "m 3"] | Numbers,
     density: ScalarLike,
 ) -> MassProperties:
-    """The solid of one density inside a closed triangle mesh.
+    """Return the solid of one density inside a closed triangle mesh.
 
     **Arguments:** `vertices` (n, 3) m, body frame; `faces` (m, 3) vertex numbers from 0,
     counter-clockwise seen from outside (a hole inside is a closed mesh with the opposite order);
-    `density` kg/m³. It is differentiable in `vertices` and `density`. Faces without area are
+    `density` kg/m³. The body is differentiable in `vertices` and `density`. Faces without area are
     allowed. Source: integrals over a tetrahedron, e.g. Tonon 2004, J. Math. Stat. 1:8.
 
-    **Raises:** `ValueError` for a mesh that is open, whose faces disagree about outside, that is
-    inside out, or has a face with a repeated or missing vertex. Under `jit` the faces are checked
-    if they are known.
+    **Raises:** `ValueError` for a mesh that is open, whose faces disagree about which side is
+    outside, that is inside out, or that has a face with a repeated or missing vertex. Under `jit`
+    the faces are checked if they are known.
 
     >>> corners = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     >>> body = mesh(corners, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], density=6.0)
@@ -54,7 +54,8 @@ def mesh(
     six, (a, b, c) = _tetrahedra(corners - centre[None, :], faces)
     com = (six[:, None] * (a + b + c)).sum(axis=0) / (4.0 * six.sum())
     volume = _outward(six.sum() / 6.0, corners, faces)
-    # About the centre of mass itself: nothing is subtracted afterwards.
+    # The second moments are summed about the centre of mass itself, so that no large term is
+    # subtracted afterwards.
     six, (a, b, c) = _tetrahedra(corners - (centre + com)[None, :], faces)
     rows = (a, b, c, a + b + c)
     entries = ((six * sum(r[:, i] * r[:, j] for r in rows)).sum() / 120.0 for i, j in PAIRS)
@@ -64,9 +65,9 @@ def mesh(
 def mesh_file(
     path: str | os.PathLike[str], density: ScalarLike, *, scale: float = 1.0
 ) -> MassProperties:
-    """The solid inside a closed mesh read from a file: STL, OBJ, PLY, OFF, GLB, …
+    """Return the solid inside a closed mesh read from a file, such as STL, OBJ, PLY, OFF or GLB.
 
-    It needs `trimesh` (`pip install "rigidjax[mesh]"`), which also merges equal vertices.
+    The package `trimesh` is needed (`pip install "rigidjax[mesh]"`); it also merges equal vertices.
 
     **Arguments:** `path` of the file; `density` kg/m³; `scale` metres per unit of the file (most
     STL files are in millimetres: 1e-3). **Raises:** `FileNotFoundError`; `ImportError` without
@@ -97,13 +98,16 @@ def mesh_file(
 
 
 def _tetrahedra(corners: Array, faces: Array) -> tuple[Array, list[Array]]:
-    """Six volumes (m,) of the tetrahedra from the origin to the faces, and their three corners."""
+    """Return six times the volume (m,) of the tetrahedra from the origin to the faces, and their
+    three corners.
+    """
     a, b, c = rows = [corners[faces[:, k]] for k in range(3)]
     return (a * jnp.cross(b, c)).sum(axis=1), rows
 
 
 def _outward(volume, corners, faces):
-    # Flat to round-off: its thickness is the last digit of its length.
+    """Return the volume; refuse one that is negative (inside out) or zero to round-off."""
+    # A mesh is flat to round-off if its thickness is the last digit of its length.
     a, b, c = (jax.lax.stop_gradient(corners[faces[:, k]]) for k in range(3))
     longest = jnp.ptp(corners, axis=0).max()
     area = 0.5 * jnp.sqrt((jnp.cross(b - a, c - a) ** 2).sum(axis=1)).sum()
@@ -116,7 +120,7 @@ def _outward(volume, corners, faces):
 
 
 def faces_of(faces: Any, n: int) -> Array:
-    """The faces as an array (m, 3) of vertex numbers below n, checked if they are known."""
+    """Return the faces as an array (m, 3) of vertex numbers below n; known faces are checked."""
     if not _checks.known(faces):
         return faces
     faces = _checks.without_mask(faces, "faces")

@@ -1,4 +1,4 @@
-"""Unconstrained numbers ↔ real bodies.
+"""Convert unconstrained numbers to real bodies, and back.
 
 The second moment is the square of a symmetric matrix, 𝔖 ∝ (1 + V)² with V trace-free. Every vector
 is then a real body, and an optimiser needs no constraint. Plates and rods are ordinary points:
@@ -21,12 +21,12 @@ from rigidjax.body.symmetric3 import apply, from_components, product
 from rigidjax.body.validation import real_moments, real_second_moment
 from rigidjax.rotation.linalg3 import cross
 
-# A body is flat if its least second moment is below this share of their sum.
+# A body is flat if its least second moment is below this fraction of their sum.
 FLAT = 1e-3
 
 
 def pack(body: MassProperties) -> Float[Array, "10"]:
-    """Ten unconstrained numbers of a body.
+    """Return ten unconstrained numbers that describe a body.
 
     **Arguments:** `body`, also a plate or a rod. **Returns** (10,)
     `(α, ρ, d1, d2, s12, s23, s13, t1, t2, t3)`: `mass = e^{2α}`, `com = t` (m, body frame), and
@@ -45,11 +45,11 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
 
 
 def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
-    """The body of any ten unconstrained numbers.
+    """Return the body that ten unconstrained numbers describe; any ten numbers do.
 
-    **Arguments:** `vector` (10,) as `pack` returns them. Exponents beyond the range of the dtype
-    (|α|, |α + ρ| over 330 in float64, 31 in float32) grow logarithmically instead: a step of an
-    optimiser that is much too long gives a large body, not an infinite one.
+    **Arguments:** `vector` (10,) as `pack` returns them. The exponents α and α + ρ beyond the range
+    of the dtype (330 in float64, 31 in float32) are replaced by numbers that grow logarithmically:
+    a step of an optimiser that is much too long gives a large body, not an infinite one.
 
     >>> unpack(jnp.zeros(10)).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -61,10 +61,10 @@ def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
 
 
 def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
-    """Six unconstrained numbers of a second moment.
+    """Return six unconstrained numbers that describe a second moment.
 
-    **Arguments:** `second_moment` (3, 3) 𝔖, kg m², positive semi-definite. **Returns** (6,)
-    `(ρ, d1, d2, s12, s23, s13)`: `Tr 𝔖 = 3 e^{2ρ}`, and the shape as in `pack_shape`. **Raises:**
+    **Arguments:** `second_moment` (3, 3) 𝔖, kg m², positive semi-definite. **Returns** (6,) `(ρ,
+    d1, d2, s12, s23, s13)`: `Tr 𝔖 = 3 e^{2ρ}`, and the other five as in `pack_shape`. **Raises:**
     `ValueError` (`equinox` error under `jit`) for an invalid or zero second moment.
 
     >>> pack_second_moment(jnp.eye(3))
@@ -74,7 +74,8 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
 
 
 def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
-    """The second moment (3, 3), kg m², of a `vector` (6,) as of `pack_second_moment`.
+    """Return the second moment (3, 3), kg m², of a `vector` (6,) as `pack_second_moment` returns
+    it.
 
     >>> unpack_second_moment(jnp.zeros(6))[0]
     Array([1., 0., 0.], dtype=float64)
@@ -84,7 +85,8 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
 
 
 def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
-    """Five unconstrained numbers of a second moment up to its scale, which free motion shows.
+    """Return five unconstrained numbers that describe a second moment up to its scale: what free
+    motion determines.
 
     **Arguments:** `second_moment` (3, 3) 𝔖, positive semi-definite, any units. **Returns** (5,)
     `(d1, d2, s12, s23, s13)`: the root √𝔖 scaled to trace 3 is `1 + V`, where V is symmetric with
@@ -98,7 +100,8 @@ def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
 
 
 def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
-    """The second moment (3, 3) of trace 1 (so `Tr I = 2`) of a `vector` (5,) as of `pack_shape`.
+    """Return the second moment (3, 3) with trace 1 (so `Tr I = 2`) of a `vector` (5,) as
+    `pack_shape` returns it.
 
     >>> float(jnp.trace(unpack_shape(jnp.ones(5))))
     1.0
@@ -107,7 +110,7 @@ def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
 
 
 def pack_moments(moments: Vector) -> Float[Array, "3"]:
-    """Three unconstrained numbers of principal moments whose axes are known.
+    """Return three unconstrained numbers that describe principal moments whose axes are known.
 
     **Arguments:** `moments` (3,) I1, I2, I3 in any order, kg m². **Returns** (3,) `(ρ, d1, d2)` as
     in `pack_second_moment`, of the second moments `λ1 = ½(I2 + I3 − I1)`, … (notes, eqs 76–78).
@@ -125,7 +128,8 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
 
 
 def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
-    """Principal moments (3,), kg m², of a `vector` (3,) as of `pack_moments`: of a real body.
+    """Return the principal moments (3,), kg m², of a real body, from a `vector` (3,) as
+    `pack_moments` returns it.
 
     >>> unpack_moments([0.0, 0.0, 0.0])
     Array([2., 2., 2.], dtype=float64)
@@ -141,12 +145,14 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
 def flat_bend(
     shape: Float[ArrayLike, "5"] | Numbers, slope: Float[ArrayLike, "5"] | Numbers
 ) -> Float[Array, "3 5"]:
-    """Rows b (3, 5): the chart's curvature adds Σ b bᵀ to the second derivative of a misfit.
+    """Return rows b (3, 5) such that the chart's curvature adds Σ b bᵀ to the second derivative of
+    a misfit.
 
-    Near a flat body the least second moment is a square, λ = a² with a number a of the chart.
-    Products of first derivatives do not show its curvature `d²λ = 2 |dA n|²`, n the axis of a. The
-    misfit's derivative by λ is the part along n nᵀ of that by the root A. The rows are zero for a
-    body that is not flat, and for a misfit that does not decrease towards λ < 0.
+    Near a flat body the least second moment is a square, λ = a², where a is the least eigenvalue of
+    the root A = 1 + V and n is its axis. Products of first derivatives do not contain the curvature
+    `d²λ = 2 |dA n|²`. The misfit's derivative by λ is the part along n nᵀ of its derivative by A.
+    The rows are zero for a body that is not flat, and for a misfit that does not decrease towards λ
+    < 0.
 
     **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the misfit's derivative by it.
 
@@ -157,7 +163,8 @@ def flat_bend(
     shape = _checks.floating(shape, (5,), "shape")
     slope = _checks.floating(slope, (5,), "slope")
     root = _root_of(shape)
-    # Of a flat body the columns of the adjugate are along n: no eigenvalues in every step of a fit.
+    # The columns of a flat body's adjugate are along n: this is cheaper than eigenvectors, in every
+    # step of a fit.
     rows = root[0], root[1], root[2]
     adjugate = jnp.stack([cross(rows[k - 2], rows[k - 1]) for k in range(3)])
     longest = adjugate[jnp.argmax(jnp.abs(jnp.diagonal(adjugate)))]
@@ -170,7 +177,7 @@ def flat_bend(
     pull = from_components(d1 + d3, d2 + d3, d3, 0.5 * s12, 0.5 * s13, 0.5 * s23)
     square = jnp.sum(root * root)
     gained = a * (n @ apply(pull, n)) / 2.0
-    # NaN passes.
+    # With `~(… <= 0)` a NaN passes, so that the caller sees it.
     flat = (a * a < FLAT * square) & ~(gained <= 0)
     size = jnp.where(flat, jnp.sqrt(2.0 * jnp.where(flat, gained, 1.0)), 0.0)
     size = size / jnp.where(flat, jnp.abs(a), 1.0)
@@ -181,22 +188,22 @@ def flat_bend(
 
 
 def _shape(v: Float[Array, "5"]) -> Mat3:
-    """(1 + V)² over its trace."""
+    """Return (1 + V)² over its trace."""
     root = _root_of(v)
-    # Scaled first: the squares of a far too long step of an optimiser overflow.
+    # The root is scaled first: after a far too long step of an optimiser its squares overflow.
     root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
     square = product(root, root)
     return square / (square[0, 0] + square[1, 1] + square[2, 2])
 
 
 def _root_of(shape: Float[Array, "5"]) -> Mat3:
-    """The root 1 + V of a second moment, of trace 3."""
+    """Return the root 1 + V of a second moment; its trace is 3."""
     d1, d2, s12, s23, s13 = shape
     return from_components(1.0 + d1, 1.0 + d2, 1.0 - d1 - d2, s12, s13, s23)
 
 
 def _factors(s: Mat3) -> Float[Array, "6"]:
-    """(ρ, d1, d2, s12, s23, s13) of 𝔖 = 3 e^{2ρ} (1 + V)² / Tr (1 + V)²."""
+    """Return (ρ, d1, d2, s12, s23, s13) of 𝔖 = 3 e^{2ρ} (1 + V)² / Tr (1 + V)²."""
     total = _not_a_point(s[0, 0] + s[1, 1] + s[2, 2])
     root = _root(_share(real_second_moment(s), total))
     v = 3.0 * root / (root[0, 0] + root[1, 1] + root[2, 2]) - jnp.eye(3, dtype=s.dtype)
@@ -206,15 +213,15 @@ def _factors(s: Mat3) -> Float[Array, "6"]:
 
 @jax.custom_jvp
 def _root(s: Mat3) -> Mat3:
-    """The symmetric, positive semi-definite root."""
+    """Return the symmetric, positive semi-definite root A of a second moment, A A = 𝔖."""
     values, axes = eigensystem(s)
     return product(axes * jnp.sqrt(jnp.maximum(values, 0.0))[None], axes.T)
 
 
 @_root.defjvp
 def _root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
-    # dA of A dA + dA A = d𝔖 as nine equations: right at equal moments, too, where axes have no
-    # derivative.
+    # A dA + dA A = d𝔖 is solved for dA as nine equations. This is right also at equal moments,
+    # where the axes have no derivative.
     root, one = _root(*primals), jnp.eye(3, dtype=primals[0].dtype)
     sums = jnp.kron(root, one) + jnp.kron(one, root)
     change = 0.5 * (tangents[0] + tangents[0].T)
@@ -227,15 +234,25 @@ def _not_a_point(total: Scalar) -> Scalar:
 
 
 def _share(part: Array, total: Scalar) -> Array:
-    """The quotient. XLA multiplies by the reciprocal, which for the Earth in float32 is zero."""
+    """Return the quotient `part / total`, with both divided by 4 first.
+
+    XLA multiplies by the reciprocal of `total`, which is zero for the Earth in float32.
+    """
     return (0.25 * part) / (0.25 * total)
 
 
 def _hold(exponent: Array, bend: Callable[[Array], Array] = jnp.log1p) -> Array:
-    """The exponent, bent to a logarithm beyond the range of the dtype; `expm1` is the inverse."""
+    """Return the exponent, bent beyond the range of the dtype: `log1p` to a logarithm, `expm1`
+    back.
+    """
     limit = 31.0 if exponent.dtype == jnp.float32 else 330.0
     beyond = jnp.maximum(jnp.abs(exponent) - limit, 0.0)
     return jnp.where(beyond > 0, jnp.sign(exponent) * (limit + bend(beyond)), exponent)
 
+
+__all__ = [
+    "FLAT", "flat_bend", "pack", "pack_moments", "pack_second_moment", "pack_shape", "unpack",
+    "unpack_moments", "unpack_second_moment", "unpack_shape",
+]  # fmt: skip
 
 show(__name__)

@@ -1,4 +1,4 @@
-"""Mass properties by sums: points, voxels, quadrature over a volume."""
+"""Sum mass properties over points, voxels, or the nodes of a quadrature."""
 
 from collections.abc import Callable
 
@@ -17,7 +17,7 @@ from rigidjax.rotation.linalg3 import determinant
 def points(
     masses: Float[ArrayLike, "n"] | Numbers, positions: Float[ArrayLike, "n 3"] | Numbers
 ) -> MassProperties:
-    """The body made of point masses: `𝔖 = Σ m (r − c)(r − c)ᵀ` (notes, eq 60).
+    """Return the body made of point masses: `𝔖 = Σ m (r − c)(r − c)ᵀ` (notes, eq 60).
 
     **Arguments:** `masses` (n,) kg, none negative; `positions` (n, 3) m, body frame, at any
     distance from the origin: they are shifted to the centre first. **Raises:** `ValueError` for a
@@ -40,12 +40,12 @@ def points(
 def voxels(
     density: Float[ArrayLike, "nx ny nz"] | Numbers, spacing: Vector, corner: Vector
 ) -> MassProperties:
-    """The body of a density given on the cells of a box, constant in each cell.
+    """Return the body whose density is given on the cells of a box, constant in each cell.
 
-    It is exact for that density: each cell adds its own `m h²/12`. **Arguments:** `density` (nx,
-    ny, nz) kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, m; `corner` (3,)
-    of cell [0, 0, 0] with the smallest x, y, z, m, body frame. **Raises:** `ValueError` for a
-    negative density.
+    The result is exact for this density: each cell adds `m h²/12` of its own. **Arguments:**
+    `density` (nx, ny, nz) kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, m;
+    `corner` (3,) of cell [0, 0, 0] with the smallest x, y, z, m, body frame. **Raises:**
+    `ValueError` for a negative density.
 
     >>> voxels(jnp.ones((1, 2, 3)), [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]).com
     Array([0.5, 1. , 1.5], dtype=float64)
@@ -69,11 +69,11 @@ def quadrature(
     place: Callable[[Float[Array, "3"]], Float[Array, "3"]],
     order: int = 12,
 ) -> MassProperties:
-    """The body that fills a parametrised volume: `∫ ρ(r(u)) |∂r/∂u| d³u` over the unit cube.
+    """Return the body that fills a parametrised volume: `∫ ρ(r(u)) |∂r/∂u| d³u` over the unit cube.
 
     `order` Gauss–Legendre points in each direction are exact for polynomials of degree `2·order −
-    1`. It is differentiable in all numbers of `density` and `place`. **Arguments:** `density` ρ,
-    from r (3,) m to kg/m³; `place` from u (3,) in [0, 1]³ to r (3,) m, body frame, one to one
+    1`. The body is differentiable in all numbers of `density` and `place`. **Arguments:** `density`
+    ρ, from r (3,) m to kg/m³; `place` from u (3,) in [0, 1]³ to r (3,) m, body frame, one to one
     inside; `order`. **Raises:** `ValueError` for a result that is no body.
 
     >>> body = quadrature(lambda r: jnp.ones(()), lambda u: u * jnp.array([1.0, 2.0, 3.0]), 2)
@@ -102,7 +102,10 @@ def quadrature(
 
 
 def summed(masses: Float[Array, "n"], positions: Float[Array, "n 3"]) -> MassProperties:
-    """Mass, centre and second moment of points; single masses are not checked."""
+    """Return the mass, centre and second moment of points; the masses are not checked one by
+    one.
+    """
+    # Positions are taken from the first point: far from the origin the sums would lose digits.
     start = jax.lax.stop_gradient(positions[0])
     from_start = positions - start[None, :]
     mass = masses.sum()

@@ -1,4 +1,4 @@
-"""Principal moments and axes, and functions of a symmetric matrix, for differentiated functions.
+"""Compute principal moments and axes, and functions of a symmetric matrix, with finite derivatives.
 
 The derivative of `eigh` divides by differences of eigenvalues: it is NaN for a sphere and for every
 symmetric top, and in JAX also for distinct moments above 1e16 kg m² (jax#669).
@@ -19,13 +19,14 @@ from rigidjax.body.symmetric3 import product
 
 # Moments closer than this many units of round-off of the largest count as equal.
 _EQUAL = 64.0
-# Convergence is quadratic: double precision needs four or five.
+# Convergence is quadratic: double precision needs four or five sweeps.
 _SWEEPS = 6
 # Eigenvalues within this fraction of the largest are handled by an integral, not a quotient.
 _CLOSE = 1.0 / 32.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
-# Which of the ascending eigenvalues, without order: (i, j), and (i, k, j).
+# Divided differences do not depend on the order of their arguments: they are computed for the
+# sorted pairs (i, j) and triples (i, k, j) of eigenvalues, and read from these by index.
 _PAIRS = list(itertools.combinations_with_replacement(range(3), 2))
 _TRIPLES = list(itertools.combinations_with_replacement(range(3), 3))
 _PAIR = np.array([_PAIRS.index(tuple(sorted(t))) for t in np.ndindex(3, 3)]).reshape(3, 3)
@@ -34,19 +35,20 @@ _TRIPLE = _TRIPLE.reshape(3, 3, 3)
 
 
 def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
-    """Principal moments, ascending, and the rotation principal axes → body axes.
+    """Return the principal moments, ascending, and the rotation principal axes → body axes.
 
     **Arguments:** `tensor` (3, 3) symmetric: I (kg m²) or 𝔖 (kg m²), body frame. **Returns**
-    `(moments, q)`: (3,), ascending, in the units of `tensor`, and (4,) a unit quaternion (w, x, y,
-    z) with `A = R(q) diag(moments) R(q)ᵀ`. Of the four right-handed choices it is the smallest
-    turn, hence `w ≥ ½`.
+    `(moments, q)`: (3,), ascending, in the units of `tensor`, and (4,), a unit quaternion (w, x, y,
+    z) with `A = R(q) diag(moments) R(q)ᵀ`. Of the four right-handed choices q is the smallest turn,
+    hence `w ≥ ½`.
 
     The derivative is exact if the moments differ. Moments that are equal to round-off have one
-    eigenspace: their derivatives are their own diagonal entries, and the axes do not turn inside
-    it. This is right for every function of the eigenspaces that is symmetric in the moments. No
-    finite derivative of an axis describes how axes mix inside an eigenspace. For a smooth function
-    of the whole matrix, such as a square root, use `rigidjax.body.matrix_function`; to solve, use
-    the matrix itself. Source: notes, eqs 71–72; first-order perturbation theory, Kato 1966, II.2.
+    eigenspace: their derivatives are the diagonal entries of the change of the tensor, and the axes
+    do not turn inside the eigenspace. This is right for every function of the eigenspaces that is
+    symmetric in the moments. How axes mix inside an eigenspace, no finite derivative of an axis can
+    describe. For a smooth function of the whole matrix, such as a square root, use
+    `rigidjax.body.matrix_function`; to solve, use the matrix itself. Source: notes, eqs 71–72;
+    first-order perturbation theory, Kato 1966, II.2.
 
     >>> moments, q = principal(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     >>> moments, q
@@ -61,10 +63,11 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
 @jax.custom_jvp
 @jax.jit
 def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
-    """Ascending eigenvalues and a right-handed matrix of eigenvectors, as columns.
+    """Return the ascending eigenvalues and a right-handed matrix of eigenvectors, as columns.
 
-    By cyclic Jacobi rotations (Golub and Van Loan 2013, section 8.5): in a batch eight times as
-    fast as LAPACK's `eigh`, and accurate for the small moment of a slender body along the axes.
+    They are found by cyclic Jacobi rotations (Golub and Van Loan 2013, section 8.5). In a batch
+    these are eight times as fast as LAPACK's `eigh`, and accurate for the small moment of a slender
+    body along the axes.
     """
     # A power of two, so that scaling costs no digit.
     exponent = exponent_of(a)
@@ -131,20 +134,21 @@ def _nearest_signs(axes) -> Mat3:
 
 
 def _quaternion_near_identity(m: Mat3) -> Quat:
-    """The quaternion of a rotation matrix with trace ≥ 0: no branch is needed."""
+    """Return the quaternion of a rotation matrix with trace ≥ 0: no branch is needed."""
     w = 0.5 * jnp.sqrt(1.0 + m[0, 0] + m[1, 1] + m[2, 2])
     f = 0.25 / w
     return jnp.stack([w, f * (m[2, 1] - m[1, 2]), f * (m[0, 2] - m[2, 0]), f * (m[1, 0] - m[0, 1])])
 
 
 def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> Mat3:
-    """`f(A) = R diag(f(λ)) Rᵀ` of a symmetric matrix, such as its square root or exponential.
+    """Return `f(A) = R diag(f(λ)) Rᵀ` of a symmetric matrix A, such as its square root or
+    exponential.
 
     Its first and second derivatives are correct for every body, also for a sphere and a symmetric
-    top, whose principal axes have none; third derivatives are not available. With fixed axes and
-    the change `E = Rᵀ dA R`, `f(Λ + E)_ij = f(λ_i) δ_ij + f[λ_i, λ_j] E_ij + Σ_k f[λ_i, λ_k, λ_j]
-    E_ik E_kj + …`; its divided differences are smooth at equal eigenvalues (Daleckii and Krein
-    1965; Higham 2008, "Functions of Matrices", section 3.2).
+    top, whose principal axes have no derivatives; third derivatives are not available. With fixed
+    axes and the change `E = Rᵀ dA R`, `f(Λ + E)_ij = f(λ_i) δ_ij + f[λ_i, λ_j] E_ij + Σ_k f[λ_i,
+    λ_k, λ_j] E_ik E_kj + …`; its divided differences are smooth at equal eigenvalues (Daleckii and
+    Krein 1965; Higham 2008, "Functions of Matrices", section 3.2).
 
     **Arguments:** `function` f, scalar → scalar, written in `jax.numpy`, smooth on the spectrum; it
     may depend on differentiated values; `tensor` (3, 3) symmetric, I or 𝔖, any units. **Returns**
@@ -155,8 +159,8 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     """
     a = validation.symmetric(_checks.floating(tensor, (3, 3), "tensor"), "tensor")
     _checks.function(function, "function", "number → number, written in jax.numpy")
-    # In units of the largest entry (a power of two), so that no product leaves the dtype's range.
-    # One power less, so that it is a number for the largest of the dtype, too.
+    # The unit is a power of two near the largest entry: no product leaves the dtype's range. It is
+    # one power smaller, since for the largest number of the dtype the next power is infinite.
     unit = times_power_of_two(jnp.ones((), a.dtype), exponent_of(a) - 1)
     a = 0.5 * (a + a.T) / unit
 
@@ -176,7 +180,9 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
 
 
 def _first(f, x, y, close):
-    """f[x, y], x ≤ y: the mean of f' between x and y (Hermite–Genocchi if they are close)."""
+    """Return the divided difference f[x, y], x ≤ y: the mean of f' between x and y
+    (Hermite–Genocchi if they are close).
+    """
     near = y - x <= close
     end = jnp.where(near, y, x)
     slope = jax.vmap(lambda s: jax.grad(f)(x + s * (end - x)))(jnp.asarray(_NODES, x.dtype))
@@ -185,7 +191,9 @@ def _first(f, x, y, close):
 
 
 def _second(f, x, y, z, close):
-    """f[x, y, z], x ≤ y ≤ z: an integral of f'' over the triangle of the three."""
+    """Return the divided difference f[x, y, z], x ≤ y ≤ z: an integral of f'' over the triangle of
+    the three.
+    """
     near = z - x <= close
     middle, end = jnp.where(near, y, x), jnp.where(near, z, x)
     u = np.repeat(_NODES, len(_NODES))

@@ -1,4 +1,4 @@
-"""Mass properties of solids, shells, plates and rods in closed form.
+"""Give mass properties of solids, shells, plates and rods in closed form.
 
 Each function takes the mass and then the dimensions, and is differentiable in all of them. It
 raises `ValueError` for a mass ≤ 0 or a negative length. Every shape has its **centre of mass at the
@@ -22,7 +22,8 @@ from rigidjax.body.point_masses import points as points, quadrature as quadratur
 
 
 def box(mass: ScalarLike, size: Vector) -> MassProperties:
-    """A solid box of `mass` kg and full edge lengths `size` (3,), m. `𝔖 = m diag(a², b², c²)/12`.
+    """Return a solid box of `mass` kg and full edge lengths `size` (3,) = (a, b, c), m. `𝔖 = m
+    diag(a², b², c²)/12`.
 
     >>> box(12.0, [1.0, 2.0, 3.0]).inertia.moments
     Array([ 5., 10., 13.], dtype=float64)
@@ -32,7 +33,8 @@ def box(mass: ScalarLike, size: Vector) -> MassProperties:
 
 
 def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
-    """A solid ellipsoid of `mass` kg and `semi_axes` (3,), m. `𝔖 = m diag(a², b², c²)/5`.
+    """Return a solid ellipsoid of `mass` kg and `semi_axes` (3,) = (a, b, c), m. `𝔖 = m diag(a²,
+    b², c²)/5`.
 
     >>> ellipsoid(5.0, [1.0, 2.0, 3.0]).inertia.moments
     Array([ 5., 10., 13.], dtype=float64)
@@ -42,7 +44,7 @@ def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
 
 
 def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
-    """A solid sphere of `mass` kg, `radius` m. `𝔖 = m r²/5 · 1`, so `I = ⅖ m r² · 1`.
+    """Return a solid sphere of `mass` kg, `radius` m. `𝔖 = m r²/5 · 1`, so `I = ⅖ m r² · 1`.
 
     >>> sphere(5.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -52,9 +54,10 @@ def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
 
 
 def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> MassProperties:
-    """A ball with a concentric hole. `λ = m/5 · (R⁵ − r⁵)/(R³ − r³)`, the quotient divided out.
+    """Return a ball with a concentric hole. `λ = m/5 · (R⁵ − r⁵)/(R³ − r³)`, with the factor R − r
+    cancelled.
 
-    **Arguments:** `mass` kg; `inner` r ≤ `outer` R radii, m; equal ones give a shell.
+    **Arguments:** `mass` kg; `inner` r ≤ `outer` R radii, m; equal radii give a shell.
 
     >>> hollow_sphere(3.0, 1.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -67,7 +70,7 @@ def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> Mas
 
 
 def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
-    """A thin spherical shell of `mass` kg, `radius` m. `𝔖 = m r²/3 · 1`.
+    """Return a thin spherical shell of `mass` kg, `radius` m. `𝔖 = m r²/3 · 1`.
 
     >>> shell(3.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -77,7 +80,8 @@ def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
 
 
 def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
-    """A solid cylinder along z of `mass` kg, `radius`, `height` m. `𝔖 = m diag(r²/4, r²/4, h²/12)`.
+    """Return a solid cylinder along z of `mass` kg, `radius`, `height` m. `𝔖 = m diag(r²/4, r²/4,
+    h²/12)`.
 
     >>> cylinder(12.0, 1.0, 1.0).inertia.moments
     Array([4., 4., 6.], dtype=float64)
@@ -89,7 +93,8 @@ def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassPr
 def hollow_cylinder(
     mass: ScalarLike, inner: ScalarLike, outer: ScalarLike, height: ScalarLike
 ) -> MassProperties:
-    """A tube along z. `𝔖 = m diag((R² + r²)/4, (R² + r²)/4, h²/12)`; equal radii: a thin one.
+    """Return a tube along z. `𝔖 = m diag((R² + r²)/4, (R² + r²)/4, h²/12)`; equal radii give a thin
+    tube.
 
     **Arguments:** `mass` kg; `inner` r ≤ `outer` R radii and `height` h, m.
 
@@ -101,7 +106,7 @@ def hollow_cylinder(
 
 
 def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassProperties:
-    """A cylinder along z with a half ball on each end, of one density.
+    """Return a cylinder along z with a half ball on each end, of one density.
 
     With `f = h/(h + 4r/3)` of the mass in the cylinder: across, `f r²/4 + (1 − f) r²/5`; along,
     `f h²/12 + (1 − f)(r²/5 + 3hr/8 + h²/4)`. **Arguments:** `mass` kg; `radius` r > 0, m; `length`
@@ -119,7 +124,7 @@ def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassPro
 
 
 def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
-    """A solid cone along z. `𝔖 = m diag(3r²/20, 3r²/20, 3h²/80)`.
+    """Return a solid cone along z. `𝔖 = m diag(3r²/20, 3r²/20, 3h²/80)`.
 
     **Arguments:** `mass` kg; `radius` of the base, `height` m. Its centre of mass, at the origin,
     is `height/4` above the base.
@@ -132,7 +137,8 @@ def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProper
 
 
 def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassProperties:
-    """A solid ring around z. `𝔖 = m diag(R²/2 + 3r²/8, R²/2 + 3r²/8, r²/4)`; minor 0: a hoop.
+    """Return a solid ring around z. `𝔖 = m diag(R²/2 + 3r²/8, R²/2 + 3r²/8, r²/4)`; `minor` 0 gives
+    a hoop.
 
     **Arguments:** `mass` kg; `major` R from the centre to the middle of the tube, `minor` r ≤ R of
     the tube, m.
@@ -145,7 +151,8 @@ def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassPropert
 
 
 def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
-    """A thin rod along z of `mass` kg, `length` m (no moment about z). `𝔖 = m diag(0, 0, ℓ²/12)`.
+    """Return a thin rod along z of `mass` kg, `length` m (no moment about z). `𝔖 = m diag(0, 0,
+    ℓ²/12)`.
 
     >>> rod(12.0, 1.0).inertia.moments
     Array([0., 1., 1.], dtype=float64)
@@ -155,7 +162,7 @@ def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
 
 
 def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProperties:
-    """A plate in the x–y plane of `mass` kg and `size` (2,), m. `𝔖 = m diag(a², b², 0)/12`.
+    """Return a plate in the x–y plane of `mass` kg and `size` (2,), m. `𝔖 = m diag(a², b², 0)/12`.
 
     >>> plate(12.0, [1.0, 2.0]).inertia.moments
     Array([1., 4., 5.], dtype=float64)
@@ -184,5 +191,10 @@ def _centred(mass, per_mass):
     m = _checks.floating(mass, (), "mass")
     return MassProperties(m, jnp.zeros_like(per_mass), jnp.diag(m * per_mass))
 
+
+__all__ = [
+    "box", "capsule", "cone", "cylinder", "ellipsoid", "hollow_cylinder", "hollow_sphere", "mesh",
+    "mesh_file", "plate", "points", "quadrature", "rod", "shell", "sphere", "torus", "voxels",
+]  # fmt: skip
 
 show(__name__)

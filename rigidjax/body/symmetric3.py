@@ -1,4 +1,4 @@
-"""Symmetric 3×3 matrices written out in components, as in `rigidjax.rotation.linalg3`."""
+"""Compute with symmetric 3×3 matrices on components, as `rigidjax.rotation.linalg3` does."""
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +16,12 @@ from rigidjax.rotation.linalg3 import (
 
 @jax.custom_jvp
 def inverse(a: Mat3) -> Mat3:
-    """The inverse of a symmetric 3×3 matrix with trace > 0, by cofactors.
+    """Return the inverse of a symmetric 3×3 matrix with trace > 0, by cofactors.
 
     The matrix is divided by its trace first: 1e-20 or 1e37 kg m² neither underflow nor overflow. A
-    zero moment gives infinities; `Inertia.invertible` refuses it in words.
+    zero moment gives infinities; `Inertia.invertible` raises an error for it.
     """
-    # One split: indexed, each entry is a kernel.
+    # All entries by one split: each entry taken by an index would be a kernel.
     xx, _, _, _, yy, _, _, _, zz = entries(a)
     scale = xx + yy + zz
     unit = a / scale
@@ -48,30 +48,30 @@ def from_components(
     xz: Float[ArrayLike, ""],
     yz: Float[ArrayLike, ""],
 ) -> Mat3:
-    """The symmetric matrix of six components: the diagonal first, then xy, xz, yz."""
+    """Return the symmetric matrix of six components: the diagonal first, then xy, xz, yz."""
     return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
 
 
 def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
-    """The matrix `a bᵀ`."""
+    """Return the matrix `a bᵀ`."""
     return a[:, None] * b[None, :]
 
 
-# One program: outside of a trace each operation would be one.
+# Compiled as one program: outside of a trace each operation would be a program.
 @jax.jit
 def swap_trace(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """`Tr(A) 1 − A` without the cancellation: `[A22 + A33, −A12, …]` (notes, eqs 76–78)."""
+    """Return `Tr(A) 1 − A` without the cancellation: `[A22 + A33, −A12, …]` (notes, eqs 76–78)."""
     x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
     return _opposite(a, jnp.stack([y + z, z + x, x + y], axis=-1))
 
 
 def swap_trace_back(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """`½ Tr(A) 1 − A`, the inverse of `swap_trace`."""
+    """Return `½ Tr(A) 1 − A`, the inverse of `swap_trace`."""
     x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
     return _opposite(a, 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1))
 
 
 def _opposite(a: Array, diagonal: Array) -> Array:
-    """−A but for its diagonal."""
+    """Return −A with this `diagonal` instead of its own."""
     eye = jnp.broadcast_to(jnp.eye(3, dtype=bool), a.shape)
     return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)

@@ -1,8 +1,8 @@
-"""Checks that a body has these numbers, with errors in words.
+"""Check that some body has these numbers; say what is wrong if none has.
 
-Each returns its argument, and refuses numbers of no real body: known values with plain exceptions
-and the numbers, traced ones with `equinox.error_if`, without them. A few units of round-off are
-tolerated: plates, rods and points lie on the boundary and pass.
+Each check returns its argument and refuses numbers that no real body has: known values with a plain
+exception that shows the numbers, traced values with `equinox.error_if`, without the numbers. A few
+units of round-off are tolerated: plates, rods and points lie on the boundary and pass.
 """
 
 import functools
@@ -20,7 +20,7 @@ from rigidjax._types import Quat, Quaternion
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.validation import near_unit, tolerance
 
-# Units of round-off, of the largest entry. A product R I Rᵀ is off by about ten.
+# The tolerance in units of round-off of the largest entry. A product R I Rᵀ is off by about ten.
 _FORGIVEN = 64.0
 
 
@@ -30,15 +30,16 @@ def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 
 
 def real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Refuse an inertia tensor that is not symmetric, or has moments of no real body."""
+    """Refuse an inertia tensor that is not symmetric, or whose moments no real body has."""
     tensor = _symmetric(_checks.finite(tensor, "inertia tensor"), "inertia tensor")
     return _moments_of_a_body(tensor, _eigenvalues(tensor))
 
 
 def real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Refuse principal moments, in any order, of no real body."""
+    """Refuse principal moments, in any order, that no real body has."""
     if not _checks.known(moments) and _checks.known(plain := lax.stop_gradient(moments)):
-        # Only differentiated: one look at the numbers, in the place of twenty programs.
+        # The numbers are known and only differentiated: one check by NumPy instead of twenty
+        # programs.
         real_moments(plain)
         return moments
     moments = _checks.finite(moments, "principal moments")
@@ -62,10 +63,10 @@ def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 
 def single(
     value: Any, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
 ) -> Any:
-    """Return `value` if it is one body of one of `kinds`, and some mass has its numbers.
+    """Return `value` if it is one body of one of `kinds` and some mass has its numbers.
 
-    Known numbers of no real body are refused; a traced body of such numbers becomes NaN. A moment
-    may be zero: what divides by the moments calls `possible`.
+    Known numbers that no real body has are refused; a traced body with such numbers becomes NaN. A
+    moment may be zero: a function that divides by the moments calls `possible`.
     """
     _checks.single(value, kinds, name, wanted=wanted, hint=hint)
     has_mass = hasattr(value, "mass")
@@ -74,7 +75,9 @@ def single(
 
 
 def symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
-    """Return a symmetric matrix; refuse a known one that is not, make a traced one NaN."""
+    """Return a symmetric matrix; refuse a known one that is not symmetric, and make a traced one
+    NaN.
+    """
     if _checks.known(a):
         return _symmetric(a, name)
     return jnp.where(_asymmetry(a)[1], jnp.nan, a)
@@ -90,13 +93,14 @@ def possible(
 ) -> Any:
     """Return `body` if some mass has these numbers and, unless `thin`, no moment is zero.
 
-    `mass` may be `None`. Other numbers are refused if they are known, or if `throw`; else the
-    traced body becomes NaN.
+    `mass` may be `None`. Other numbers are refused if they are known, or if `throw` is true; else
+    the traced body becomes NaN.
     """
     tensor = _checks.numbers(tensor, "inertia tensor")
     is_known = _checks.known((tensor, mass))
     if not is_known and _checks.known(plain := lax.stop_gradient((tensor, mass))):
-        # Only differentiated: one look at the numbers, in the place of thirty programs.
+        # The numbers are known and only differentiated: one check by NumPy instead of thirty
+        # programs.
         faults = _faults(np, plain[0], thin)
         if not any(f.any() for f in faults) and (mass is None or (np.asarray(plain[1]) > 0).all()):
             return body
@@ -122,7 +126,7 @@ def possible(
 def first_impossible(tensors: Float[Array, "n 3 3"]) -> int | None:
     """Return the index of the first of these known tensors that no body has, or `None`.
 
-    A tensor with a NaN is passed over: among many bodies it gets a status of its own.
+    A tensor with a NaN is skipped: in a batch of bodies it gets a status of its own.
     """
     many = tensors.shape[0] > _MANY
     with np.errstate(invalid="ignore", over="ignore"):
@@ -130,7 +134,7 @@ def first_impossible(tensors: Float[Array, "n 3 3"]) -> int | None:
     return int(index) if bad else None
 
 
-# With more bodies one compiled pass is quicker than NumPy, and they stay on their device.
+# For more bodies one compiled pass is quicker than NumPy, and the bodies stay on their device.
 _MANY = 4096
 
 
@@ -159,12 +163,14 @@ _THIN = (
 
 
 def _faults(xp: Any, tensor: Any, thin: bool) -> tuple[Any, Any, Any]:
-    """Whether a moment is zero or NaN (never if `thin`), no mass has these moments, I ≠ Iᵀ.
+    """Return three answers: is a moment zero or NaN (never if `thin`), has no mass these moments,
+    is I ≠ Iᵀ.
 
-    The moments of a mass are judged by the minors of its second moment 𝔖, in units of the trace.
+    Whether a mass has these moments is judged by the minors of its second moment 𝔖, in units of the
+    trace.
     """
     slack = _slack(tensor)
-    # Nine numbers by NumPy cost a tenth of nine arrays.
+    # The nine entries are split by one operation: NumPy needs a tenth of the time of nine slices.
     nine = xp.moveaxis(xp.asarray(tensor).reshape(*tensor.shape[:-2], 9), -1, 0)
     xx, xy, xz, yx, yy, yz, zx, zy, zz = np.ascontiguousarray(nine) if xp is np else nine
     trace = xx + yy + zz
@@ -183,7 +189,7 @@ def _faults(xp: Any, tensor: Any, thin: bool) -> tuple[Any, Any, Any]:
     whole = sx * minors[2] - sy * squares[1] - sz * squares[0] - product
     broken = trace < 0
     for minor in (sx, sy, sz, *minors, whole):
-        # With a NaN the other entries are not scaled, and say nothing.
+        # If an entry is NaN the others are not scaled, so that their minors mean nothing.
         broken = broken | (some & (minor < -slack))
     if thin:
         return broken & False, broken, skew
@@ -199,7 +205,9 @@ def is_real(tensor: Float[Array, "*batch 3 3"]) -> Bool[Array, "*batch"]:
 
 
 def unit_quaternion(q: Quaternion) -> Quat:
-    """A unit quaternion (w, x, y, z): normalised if off by round-off, else refused."""
+    """Return a unit quaternion (w, x, y, z), normalised if it is off by round-off; refuse any
+    other.
+    """
     q = _checks.given(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
     return quaternion.normalise(near_unit(q, "q", tolerance(q.dtype)))
 
@@ -225,7 +233,7 @@ def _moments_of_a_body(value, moments):
 
 
 def _asymmetry(a):
-    """The largest difference A − Aᵀ, and whether it is more than round-off."""
+    """Return the largest difference A − Aᵀ, and whether it exceeds round-off."""
     difference = abs(_values(a) - _values(a).swapaxes(-1, -2)).max(axis=(-1, -2))
     return difference, (difference > _slack(a) * abs(_values(a)).max(axis=(-1, -2))).any()
 
@@ -241,7 +249,9 @@ def _symmetric(a, name):
 
 
 def _values(a):
-    """The numbers, without derivatives: NumPy if known, so that a check costs microseconds."""
+    """Return the numbers without derivatives, by NumPy if they are known: a check then costs
+    microseconds.
+    """
     return np.asarray(a) if _checks.known(a) else lax.stop_gradient(a)
 
 

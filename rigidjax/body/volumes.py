@@ -1,4 +1,4 @@
-"""Volumes of the solids of `shapes`, to make a mass from a density.
+"""Give volumes of the solids of `shapes`, to make a mass from a density.
 
 `shapes.box(density * volumes.box(size), size)` is differentiable in the density and in the size.
 """
@@ -11,7 +11,7 @@ from rigidjax._types import Scalar, ScalarLike, Vector
 
 
 def box(size: Vector) -> Scalar:
-    """Volume of a box, m³. **Arguments:** `size` (3,) full edge lengths, m.
+    """Return the volume of a box, m³. **Arguments:** `size` (3,) full edge lengths, m.
 
     >>> box([1.0, 2.0, 3.0])
     Array(6., dtype=float64)
@@ -21,7 +21,7 @@ def box(size: Vector) -> Scalar:
 
 
 def ellipsoid(semi_axes: Vector) -> Scalar:
-    """Volume of an ellipsoid, m³, `4π abc/3`. **Arguments:** `semi_axes` (3,) m.
+    """Return the volume of an ellipsoid, m³, `4π abc/3`. **Arguments:** `semi_axes` (3,) m.
 
     >>> round(float(ellipsoid([1.0, 1.0, 0.75])), 12)
     3.14159265359
@@ -30,7 +30,7 @@ def ellipsoid(semi_axes: Vector) -> Scalar:
 
 
 def sphere(radius: ScalarLike) -> Scalar:
-    """Volume of a sphere, m³, `4π r³/3`. **Arguments:** `radius` m.
+    """Return the volume of a sphere, m³, `4π r³/3`. **Arguments:** `radius` m.
 
     >>> round(float(sphere(1.0)), 12)
     4.188790204786
@@ -39,7 +39,8 @@ def sphere(radius: ScalarLike) -> Scalar:
 
 
 def hollow_sphere(inner: ScalarLike, outer: ScalarLike) -> Scalar:
-    """Volume between two concentric spheres, m³. **Arguments:** radii `inner`, `outer`, m.
+    """Return the volume between two concentric spheres, m³. **Arguments:** radii `inner`, `outer`,
+    m.
 
     >>> round(float(hollow_sphere(0.0, 1.0)), 12)
     4.188790204786
@@ -49,7 +50,7 @@ def hollow_sphere(inner: ScalarLike, outer: ScalarLike) -> Scalar:
 
 
 def cylinder(radius: ScalarLike, height: ScalarLike) -> Scalar:
-    """Volume of a cylinder, m³, `π r² h`. **Arguments:** `radius`, `height` m.
+    """Return the volume of a cylinder, m³, `π r² h`. **Arguments:** `radius`, `height` m.
 
     >>> round(float(cylinder(1.0, 1.0)), 12)
     3.14159265359
@@ -59,7 +60,8 @@ def cylinder(radius: ScalarLike, height: ScalarLike) -> Scalar:
 
 
 def hollow_cylinder(inner: ScalarLike, outer: ScalarLike, height: ScalarLike) -> Scalar:
-    """Volume of a tube, m³, `π (R² − r²) h`. **Arguments:** `inner`, `outer`, `height` m.
+    """Return the volume of a tube, m³, `π (R² − r²) h`. **Arguments:** `inner`, `outer`, `height`
+    m.
 
     >>> round(float(hollow_cylinder(0.0, 1.0, 1.0)), 12)
     3.14159265359
@@ -69,7 +71,8 @@ def hollow_cylinder(inner: ScalarLike, outer: ScalarLike, height: ScalarLike) ->
 
 
 def capsule(radius: ScalarLike, length: ScalarLike) -> Scalar:
-    """Volume of a capsule, m³. **Arguments:** `radius`, `length` of the cylindrical part, m.
+    """Return the volume of a capsule, m³. **Arguments:** `radius`, `length` of the cylindrical
+    part, m.
 
     >>> round(float(capsule(1.0, 0.0)), 12)
     4.188790204786
@@ -78,7 +81,7 @@ def capsule(radius: ScalarLike, length: ScalarLike) -> Scalar:
 
 
 def cone(radius: ScalarLike, height: ScalarLike) -> Scalar:
-    """Volume of a cone, m³, `π r² h/3`. **Arguments:** `radius`, `height` m.
+    """Return the volume of a cone, m³, `π r² h/3`. **Arguments:** `radius`, `height` m.
 
     >>> round(float(cone(1.0, 3.0)), 12)
     3.14159265359
@@ -87,7 +90,7 @@ def cone(radius: ScalarLike, height: ScalarLike) -> Scalar:
 
 
 def torus(major: ScalarLike, minor: ScalarLike) -> Scalar:
-    """Volume of a ring, m³, `2π² R r²`. **Arguments:** `major`, `minor` radii, m.
+    """Return the volume of a ring, m³, `2π² R r²`. **Arguments:** `major`, `minor` radii, m.
 
     >>> round(float(torus(0.5, 1.0)), 12)
     9.869604401089
@@ -95,5 +98,10 @@ def torus(major: ScalarLike, minor: ScalarLike) -> Scalar:
     R, r = _checks.floating(major, (), "major"), _checks.floating(minor, (), "minor")
     return 2.0 * jnp.pi**2 * R * r * r
 
+
+__all__ = [
+    "box", "capsule", "cone", "cylinder", "ellipsoid", "hollow_cylinder", "hollow_sphere", "sphere",
+    "torus",
+]  # fmt: skip
 
 show(__name__)

@@ -1,8 +1,9 @@
-"""The Moon's place and attitude from JPL's ephemeris DE421, 1900 to 2199.
+"""Provide the Moon's place and attitude from JPL's ephemeris DE421, 1900 to 2199.
 
 W. M. Folkner, J. G. Williams, D. H. Boggs, "The planetary and lunar ephemeris DE421", IPN Progress
-Report 42-178 (2009). Read from the package `de421` (`pip install 'rigidjax[moon]'`). World axes are
-those of the ICRF, body axes the Moon's principal ones; times are barycentric dynamical time.
+Report 42-178 (2009). The numbers are read from the package `de421` (`pip install
+'rigidjax[moon]'`). World axes are those of the ICRF, body axes the Moon's principal axes; times are
+barycentric dynamical time.
 """
 
 from importlib.util import find_spec
@@ -29,7 +30,7 @@ from rigidjax.rotation.linalg3 import cross
 
 CITATION = "Folkner, Williams & Boggs 2009, IPN Progress Report 42-178"
 DAY = 86400.0
-# Only the units of mass depend on it, no motion does.
+# Only the units of mass depend on this constant; no motion does.
 _G = 6.6743e-11
 # Julian date of the start, and the blocks of 32 days.
 _FIRST, _BLOCK, _BLOCKS = 2414992.5, 32, 3426
@@ -38,14 +39,14 @@ EPOCH = 2000 + (2440400.5 - 2451545.0) / 365.25
 
 
 class Moon(eqx.Module):
-    """Years of the ephemeris, as functions of the time in s from the first year.
+    """Hold some years of the ephemeris, as functions of the time in s from the first year.
 
     **Arguments:** `first`, `last` year, such as 1970.0 and 1976.0: Julian years, 2000.0 is Julian
     date 2451545.0. Tables begin and end at least ten days beyond them.
 
     **Fields:** `earth`, `sun` Chebyshev tables of their places as seen from the Moon, m, ICRF;
-    `angles` of the 3-1-3 Euler angles (φ, θ, ψ), rad, body → ICRF; `constants` DE421's own, by
-    name, in its units (au, day, km); `first`.
+    `angles` of the 3-1-3 Euler angles (φ, θ, ψ), rad, body → ICRF; `constants` of DE421, by name,
+    in its units (au, day, km); `first`.
 
     **Raises:** `ModuleNotFoundError` without the package; `ValueError` for years outside of 1900
     to 2199, or not in order.
@@ -73,7 +74,7 @@ class Moon(eqx.Module):
             raise ValueError(f"Moon: wanted years in order in 1900 to 2199, got {first}, {last}")
 
         def table(name: str, step: int) -> np.ndarray:
-            """Coefficients on intervals of `step` days."""
+            """Return coefficients on intervals of `step` days."""
             rows = np.load(Path(found.origin or "").parent / f"jpl-{name}.npy", mmap_mode="r")
             a_block = len(rows) // _BLOCKS
             return _split(rows[low * a_block : high * a_block], _BLOCK // a_block // step)
@@ -91,7 +92,7 @@ class Moon(eqx.Module):
         self.first = first
 
     def attitude(self, t: ScalarLike) -> Attitude:
-        """Attitude and body rate at `t`, s."""
+        """Return the attitude and body rate at `t`, s."""
         t = jnp.asarray(t, float)
         angles, rates = jax.jvp(self.angles, (t,), (jnp.ones_like(t),))
         turned = jnp.remainder(angles, 2 * jnp.pi)
@@ -100,9 +101,10 @@ class Moon(eqx.Module):
     def body(
         self, beta: ScalarLike | None = None, gamma: ScalarLike | None = None, *, core: bool = False
     ) -> Inertia:
-        """The inertia, kg m², of DE421's J2, β = (C − A)/B and γ = (B − A)/C, or other ones.
+        """Return the inertia, kg m², with DE421's J2, and β = (C − A)/B and γ = (B − A)/C.
 
-        With `core` that of the mantle alone, which then turns under `torque(core=True)`.
+        `beta` and `gamma` are DE421's unless they are given. With `core` it is the inertia of the
+        mantle alone, which then turns under `torque(core=True)`.
         """
         c = self.constants
         b = jnp.asarray(c["LBET"] if beta is None else beta)
@@ -113,20 +115,20 @@ class Moon(eqx.Module):
         return whole - self._core if core else whole
 
     def chart(self, *, core: bool = False) -> AbstractBodyChart:
-        """The chart of `body` for a fit: β and γ are free."""
+        """Return the chart of `body` for a fit: β and γ are free."""
         return _Shape(self, core)
 
     def torque(
         self, degree: int = 4, *, tide: bool = False, core: bool = False, figure: bool = False
     ) -> Any:
-        """The torque of Earth and Sun.
+        """Return the torque of Earth and Sun.
 
         **Arguments:** `degree` of the Moon's gravity in the Earth's field, 2 to 4; `tide` whether
         the Earth and the spin deform the Moon; `core` whether a liquid core turns in the mantle;
         `figure` whether the Earth is oblate. DE421 gives the core's rate at `EPOCH`; the initial
-        one, at `first`, is that of a core carried from there by the mantle of the ephemeris.
-        **Raises:** `ValueError` for a core in float32 (unless `first` is `EPOCH`): decades in s
-        have no digit within a minute.
+        rate, at `first`, is that of a core which the mantle of the ephemeris has carried along from
+        `EPOCH`. **Raises:** `ValueError` for a core in float32 (unless `first` is `EPOCH`): decades
+        in s have no digit within a minute.
         """
         c = self.constants
         rows = []
@@ -135,8 +137,8 @@ class Moon(eqx.Module):
             rows.append(self._mass * self._radius**n * jnp.array([-c[f"J{n}M"], *pairs]))
         earths = [(self._mu_earth, 0.0)]
         if figure:
-            # Of the same J2: two negative masses on the axis, at the radius of the equator. The
-            # axis is that of the ICRF, from which precession takes the Earth's by 0.1° in 20 years.
+            # Two negative masses on the axis, at the radius of the equator, give the Earth's J2.
+            # The axis is that of the ICRF; precession turns the Earth's by 0.1° in 20 years.
             few, radius = -0.5 * c["J2E"] * self._mu_earth, 1e3 * c["AE"]
             earths = [(self._mu_earth - 2 * few, 0.0), (few, radius), (few, -radius)]
         law: Any = Sum(
@@ -157,14 +159,14 @@ class Moon(eqx.Module):
 
     @property
     def _core(self) -> Inertia:
-        """The core's inertia: a share of the Moon's largest, flattened."""
+        """Return the core's inertia: a fraction of the Moon's largest moment, flattened."""
         c = self.constants
         share, flat = c["IFAC"] * self.body().tensor[2, 2], 1 - c["COBLAT"]
         return Inertia(share * jnp.diag(jnp.array([flat, flat, 1.0])))
 
     @property
     def _in_si(self) -> float:
-        """m³/s² of one au³/day²."""
+        """Return the number of m³/s² in one au³/day²."""
         return (1e3 * self.constants["AU"]) ** 3 / DAY**2
 
     @property
@@ -182,7 +184,7 @@ class Moon(eqx.Module):
 
 
 class _Shape(AbstractBodyChart):
-    """β and γ: the logarithms of their ratios to DE421's, in thousandths."""
+    """Describe β and γ by the logarithms of their ratios to DE421's, in thousandths."""
 
     size: ClassVar[int] = 2
     log_names: ClassVar[tuple[str, ...]] = ("β", "γ")
@@ -207,11 +209,11 @@ class _Shape(AbstractBodyChart):
 
 
 class _Core(eqx.Module):
-    """A liquid core in the mantle: friction at the boundary, and its flattening.
+    """Describe a liquid core in the mantle: friction at the boundary, and its flattening.
 
-    Its own state is its angular velocity (3,), rad/s, mantle frame. Source: Folkner and others 2014
-    (DE430), section III; Williams and others 2001, Lunar rotational dissipation in solid body and
-    molten core, JGR 106:27933.
+    The state of this torque is the core's angular velocity (3,), rad/s, mantle frame. Source:
+    Folkner and others 2014 (DE430), section III; Williams and others 2001, Lunar rotational
+    dissipation in solid body and molten core, JGR 106:27933.
     """
 
     feels: ClassVar[type] = HasAttitude
@@ -236,7 +238,7 @@ class _Core(eqx.Module):
 
 
 class _AlongEphemeris(eqx.Module):
-    """The equation of a core's angular velocity in the mantle of the ephemeris."""
+    """Evaluate the equation of a core's angular velocity in the mantle of the ephemeris."""
 
     core: _Core
     moon: Moon
@@ -246,7 +248,9 @@ class _AlongEphemeris(eqx.Module):
 
 
 def _carried(core: _Core, year: float) -> Float[Array, "3"]:
-    """The core's angular velocity at a `year`, rad/s, mantle frame; `core.state0` is at `EPOCH`."""
+    """Return the core's angular velocity at a `year`, rad/s, mantle frame, from `core.state0` at
+    `EPOCH`.
+    """
     if core.state0.dtype != jnp.float64:
         raise ValueError(
             f"torque: a core from EPOCH to {year} needs float64: set "
@@ -269,13 +273,15 @@ def _followed(field: _AlongEphemeris, own: Array, ends: Float[Array, "2"]) -> Fl
 
 
 def _raised(table: Chebyshev, z: float) -> Chebyshev:
-    """The same places, higher by z."""
+    """Return the table of places with z added to their third component."""
     moved = table.coefficients.at[:, 2, 0].add(z)
     return eqx.tree_at(lambda t: t.coefficients, table, moved)
 
 
 def _split(rows: np.ndarray, parts: int) -> np.ndarray:
-    """The same polynomials (intervals, k, terms) on intervals of a fraction of the length."""
+    """Return polynomials (intervals, k, terms) on intervals shortened by `parts`, equal to those
+    given.
+    """
     count, k, terms = rows.shape
     if parts == 1:
         return rows
@@ -287,5 +293,7 @@ def _split(rows: np.ndarray, parts: int) -> np.ndarray:
         out[:, part] = rows @ (back @ at).T
     return out.reshape(count * parts, k, terms)
 
+
+__all__ = ["CITATION", "DAY", "EPOCH", "Moon"]
 
 show(__name__)

@@ -1,4 +1,4 @@
-"""The tumbling asteroid 4179 Toutatis, observed by radar in December 1992.
+"""Provide the observations of the tumbling asteroid 4179 Toutatis, by radar in December 1992.
 
 Published figures: Y. Takahashi, M. W. Busch, D. J. Scheeres, "Spin state and moment of inertia
 characterization of 4179 Toutatis", The Astronomical Journal 146:95 (2013), table 3,
@@ -50,13 +50,15 @@ OBSERVATIONS = (
     ("1992-12-17T06:49", 130.6, 76.1, 234.9, 12.6, 33.9, -94.0),
     ("1992-12-18T07:09", 91.6, 81.6, 142.4, -24.3, 29.6, -102.0),
 )
-# The paper's own figure for a direction. For the rates it gives none: twice the scatter seen.
+# The first is the paper's own figure for a direction. The paper has no figure for the rates: the
+# second is twice their scatter about the fit.
 ATTITUDE_NOISE_DEG = 15.0
 RATE_NOISE_DEG_A_DAY = 10.0
 
 
 def recording() -> Recording:
-    """The 17 observations: times in s from the first, attitudes body → ecliptic, body rates.
+    """Return the 17 observations: times in s from the first, attitudes body → ecliptic, and body
+    rates.
 
     >>> recording().t.shape
     (17,)
@@ -99,7 +101,7 @@ def _direction(body: Any, state: Any) -> Array:
 
 
 def rows(fit: Fit) -> list[Row]:
-    """Periods and the direction of the angular momentum as rows for `report.table`.
+    """Return the periods and the direction of the angular momentum as rows for `report.table`.
 
     **Arguments:** `fit` of `model()`. **Returns** rows (name, value, low, high, unit): days, and
     degrees of ecliptic longitude and latitude (J2000), with 95 % intervals.
@@ -107,7 +109,7 @@ def rows(fit: Fit) -> list[Row]:
 
     def ranges(of: Any, names: tuple[str, str], shown: Any) -> Any:
         bounds = fit.interval_of(lambda point: of(point.body, point.state0))
-        # What the data do not determine has an end at infinity.
+        # A number that the data do not determine has an interval that ends at infinity.
         with np.errstate(over="ignore"):
             numbers = [shown(np.asarray(v)) for v in (of(fit.body, fit.state0), *bounds)]
         return zip(names, *numbers, strict=True)
@@ -122,12 +124,12 @@ def rows(fit: Fit) -> list[Row]:
 
 
 def rms_degrees(fit: Fit) -> float:
-    """Root mean square angle between observed and fitted attitudes of `fit`, degrees."""
+    """Return the root mean square angle between observed and fitted attitudes of `fit`, degrees."""
     return float(np.degrees(fit.rms[0]))
 
 
 def remarks(fit: Fit) -> str:
-    """The observations furthest from the `fit`, and a comparison of the noise, in words."""
+    """Return sentences about the observations furthest from the `fit`, and about the noise."""
     lines = []
     scatter = rms_degrees(fit) / np.sqrt(3)
     if scatter < 0.5 * ATTITUDE_NOISE_DEG:
@@ -143,5 +145,10 @@ def remarks(fit: Fit) -> str:
         lines.append(f"{words} (it counts linearly, not quadratically)")
     return "\n".join(lines)
 
+
+__all__ = [
+    "ATTITUDE_NOISE_DEG", "CITATION", "DAY", "OBSERVATIONS", "RATE_NOISE_DEG_A_DAY", "model",
+    "recording", "remarks", "rms_degrees", "rows",
+]  # fmt: skip
 
 show(__name__)

@@ -20,4 +20,9 @@ from rigidjax.elliptic.legendre import (
     ellippiinc as ellippiinc,
 )
 
+__all__ = [
+    "am", "ellipe", "ellipeinc", "ellipf", "ellipk", "ellippi", "ellippiinc", "rc", "rd", "rf",
+    "rj_", "sncndn",
+]  # fmt: skip
+
 show(__name__)

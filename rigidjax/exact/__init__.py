@@ -7,4 +7,6 @@ from rigidjax.exact.periods import (
     precession_period as precession_period,
 )
 
+__all__ = ["FreeBody", "body_period", "free_body", "precession_period"]
+
 show(__name__)

@@ -1,4 +1,4 @@
-"""Moving frames, and scenes of particles seen from them. No body is needed."""
+"""Describe moving frames, and scenes of particles in them. No body is needed."""
 
 from rigidjax._names import show
 from rigidjax.frames.base import AbstractScene as AbstractScene, Force as Force
@@ -6,5 +6,7 @@ from rigidjax.frames.frame_dynamics import BodyInFrame as BodyInFrame
 from rigidjax.frames.moving import MovingFrame as MovingFrame
 from rigidjax.frames.point import Point as Point
 from rigidjax.frames.rotation_models import AboutAxis as AboutAxis, Uniform as Uniform
+
+__all__ = ["AboutAxis", "AbstractScene", "BodyInFrame", "Force", "MovingFrame", "Point", "Uniform"]
 
 show(__name__)

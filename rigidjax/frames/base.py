@@ -1,4 +1,4 @@
-"""The base class of scenes of a particle: a vector field, and conserved quantities."""
+"""Define the base class of scenes of a particle: a vector field, and conserved quantities."""
 
 import abc
 from collections.abc import Callable
@@ -15,13 +15,14 @@ from rigidjax.frames.point import Point
 
 
 class AbstractScene(eqx.Module):
-    """The equations of motion of a particle: subclass it with `acceleration` and `conserved`.
+    """Define the equations of motion of a particle: subclass this with `acceleration` and
+    `conserved`.
 
-    `rigidjax.simulate(None, Point(x, v), ts, scene)` solves it; `diffrax.ODETerm(scene.field)` is
-    the same in plain diffrax. A scene that ends a run, for example at a collision, has two more
+    `rigidjax.simulate(None, Point(x, v), ts, scene)` solves a scene; `diffrax.ODETerm(scene.field)`
+    is its term in plain diffrax. A scene that ends a run, for example at a collision, has two more
     methods: `ends(t, state)`, true at the end, and `end_words(t, state)`, the reason (under `jit`
     both are traced: words without numbers). `stats` of the solution then has `ended`, `end_time`
-    and `end_state`. Only scenes of a particle end runs so.
+    and `end_state`. Only scenes of a particle can end a run in this way.
 
     >>> class Spring(AbstractScene):
     ...     def acceleration(self, t, state):
@@ -34,18 +35,19 @@ class AbstractScene(eqx.Module):
 
     @abc.abstractmethod
     def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
-        """d²x/dt² (3,), in the frame of the scene: forces per mass (notes, eq 84)."""
+        """Return d²x/dt² (3,), in the frame of the scene: forces per mass (notes, eq 84)."""
 
     @abc.abstractmethod
     def conserved(self, t: ScalarLike, state: Any) -> dict[str, Scalar]:
-        """The conserved quantities of the exact motion, by name; empty if there are none."""
+        """Return the conserved quantities of the exact motion, by name; empty if there are none."""
 
     def field(self, t: ScalarLike, y: Any, args: object = None) -> Any:
-        """The vector field `(dx/dt, dv/dt)` as a `Point`, for `diffrax.ODETerm`."""
+        """Return the vector field `(dx/dt, dv/dt)` as a `Point`, for `diffrax.ODETerm`."""
         return Point(y.v, self.acceleration(t, y))
 
     def drift(self, ts: Float[Array, " times"], ys: Any) -> dict[str, Scalar]:
-        """The largest change of each conserved quantity of `ys` at `ts` (T,) from its first value.
+        """Return the largest change of each conserved quantity of `ys` at `ts` (T,) from its first
+        value.
 
         >>> still = Point(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
         >>> float(rj.scenes.earth(0.8).drift(jnp.arange(2.0), still)["jacobi"])
@@ -56,7 +58,7 @@ class AbstractScene(eqx.Module):
 
 
 class Force(AbstractScene):
-    """Your own force per mass as a scene, in an inertial frame (notes, eq 84).
+    """Make a scene of your own force per mass, in an inertial frame (notes, eq 84).
 
     **Arguments:** `force` a callable Module `(t, state, body) → (3,)`, m/s²; `body` is `None`. For
     a free particle `force` is `None`.
@@ -74,7 +76,7 @@ class Force(AbstractScene):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the force jumps or has a kink: its own `jump_times`, if it has them."""
+        """Return the times, s, at which the force jumps or has a kink, by its own `jump_times`."""
         return jumps_within(self.force)
 
     def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
@@ -87,17 +89,24 @@ class Force(AbstractScene):
 
 
 def per_mass(value: Any, force: object) -> Vec3:
-    """The value of a force, its shape checked: a user's force may return anything."""
+    """Return the value of a force after a check of its shape: a user's force may return
+    anything.
+    """
     name = getattr(force, "__name__", type(force).__name__)
     return _checks.floating(value, (3,), f"force {name}", hint="force per mass, m/s²")
 
 
 def jumps_within(*laws: Any) -> Float[Array, " n"]:
-    """The `jump_times` of the laws that have them, s: a solver does not see those of inner ones."""
+    """Return the `jump_times` of the laws that have them, s.
+
+    A scene or torque that contains laws must pass their times on: a solver does not see them.
+    """
     found = [jnp.asarray(law.jump_times, float) for law in laws if hasattr(law, "jump_times")]
     return jnp.concatenate([jnp.zeros(0), *found])
 
 
 def like(x: Array, *values: Array) -> tuple[Array, ...]:
-    """The constants of a scene in the dtype of the state, so that float32 stays float32."""
+    """Return the constants of a scene in the dtype of the state `x`, so that float32 stays
+    float32.
+    """
     return tuple(value.astype(x.dtype) for value in values)

@@ -1,4 +1,4 @@
-"""The turning Earth: dropped and thrown bodies, and Foucault's pendulum."""
+"""Describe the turning Earth: dropped and thrown bodies, and Foucault's pendulum."""
 
 import jax.numpy as jnp
 
@@ -14,11 +14,11 @@ GRAVITY = 9.80665
 
 
 class Earth(AbstractScene):
-    """Free fall and throws near one place of the turning Earth; `scenes.earth` makes it.
+    """Describe free fall and throws near one place of the turning Earth; `scenes.earth` makes it.
 
-    Axes east, north, up; up is the plumb line. Gravity is uniform and contains the centrifugal
-    acceleration at the origin; the change of the latter with x' is added. **Fields:** `latitude`
-    rad, `gravity` m/s², `rate` rad/s.
+    The axes are east, north, up; up is the plumb line. Gravity is uniform and contains the
+    centrifugal acceleration at the origin; the change of the centrifugal acceleration with x' is
+    added. **Fields:** `latitude` rad, `gravity` m/s², `rate` rad/s.
 
     >>> scene = earth(0.5)
     >>> float(scene.latitude), float(scene.gravity)
@@ -30,12 +30,12 @@ class Earth(AbstractScene):
     rate: Scalar
 
     def angular_velocity(self) -> Vec3:
-        """Ω (0, Ω cos λ, Ω sin λ) (3,), rad/s, east, north, up."""
+        """Return Ω = (0, Ω cos λ, Ω sin λ) (3,), rad/s, in the axes east, north, up."""
         north, up = self.rate * jnp.cos(self.latitude), self.rate * jnp.sin(self.latitude)
         return jnp.stack([jnp.zeros_like(north), north, up])
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """Acceleration g − Ω×(Ω×x') − 2Ω×v' (3,), m/s² (notes, eq 91)."""
+        """Return the acceleration g − Ω×(Ω×x') − 2Ω×v' (3,), m/s² (notes, eq 91)."""
         x, v = components(state.x), components(state.v)
         dtype = state.x.dtype
         _, north, up = components(self.angular_velocity().astype(dtype))
@@ -49,7 +49,7 @@ class Earth(AbstractScene):
         return {"jacobi": self.jacobi_integral(state)}
 
     def jacobi_integral(self, state: Point) -> Scalar:
-        """½|v'|² + g z − ½|Ω × x'|², m²/s², conserved along the motion."""
+        """Return ½|v'|² + g z − ½|Ω × x'|², m²/s², conserved along the motion."""
         require_point(state)
         x, v = components(state.x), components(state.v)
         dtype = state.x.dtype
@@ -60,9 +60,10 @@ class Earth(AbstractScene):
         return 0.5 * (speed - moved) + self.gravity.astype(dtype) * x[2]
 
     def eastward_deflection(self, height: ScalarLike) -> Scalar:
-        """The eastward deflection of a body dropped from `height` h, m: ⅓ Ω g cos λ (2h/g)^{3/2}.
+        """Return the eastward deflection of a body dropped from `height` h, m: ⅓ Ω g cos λ
+        (2h/g)^{3/2}.
 
-        To first order in Ω (Landau and Lifshitz, Mechanics, sec. 39, problem 1).
+        The formula is of first order in Ω (Landau and Lifshitz, Mechanics, sec. 39, problem 1).
 
         >>> round(float(earth(0.0).eastward_deflection(100.0)), 5)
         0.02195
@@ -74,7 +75,7 @@ class Earth(AbstractScene):
 
 
 def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike = RATE) -> Earth:
-    """A place on the turning Earth, for dropped and thrown bodies.
+    """Return the scene of one place on the turning Earth, for dropped and thrown bodies.
 
     **Arguments:** `latitude` λ, rad, geodetic, north positive; `gravity` along the plumb line,
     m/s²; `rate` Ω of the Earth, rad/s (WGS84: 7.292115e-5, one turn in 86164.1 s). States are
@@ -92,11 +93,11 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
 
 
 class Foucault(AbstractScene):
-    """A pendulum on the turning Earth; `scenes.foucault` makes it.
+    """Describe a pendulum on the turning Earth; `scenes.foucault` makes it.
 
-    The bob keeps the distance `length` from the pivot at the origin; axes east, north, up. The
-    string's force is eliminated: the length is kept to the solver's tolerance, not exactly, and
-    `drift` reports it. **Fields:** `place` the `Earth` scene; `length` m.
+    The bob keeps the distance `length` from the pivot at the origin; the axes are east, north, up.
+    The string's force is eliminated: the length is constant to the solver's tolerance, not exactly,
+    and `drift` reports the error. **Fields:** `place` the `Earth` scene; `length` m.
 
     >>> pendulum = foucault(0.85, 67.0)
     >>> float(pendulum.length), float(pendulum.place.latitude)
@@ -107,7 +108,9 @@ class Foucault(AbstractScene):
     length: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """d²x'/dt² (3,), m/s²: the free one minus its part along the string (notes, eq 91)."""
+        """Return d²x'/dt² (3,), m/s²: the free acceleration minus its part along the string (notes,
+        eq 91).
+        """
         x, v = components(state.x), components(state.v)
         a = components(self.place.acceleration(t, state))
         pull = (dot_components(x, a) + dot_components(v, v)) / dot_components(x, x)
@@ -118,7 +121,7 @@ class Foucault(AbstractScene):
         return {"jacobi": self.place.jacobi_integral(state), "length": length}
 
     def start(self, east: ScalarLike, north: ScalarLike) -> Point:
-        """The bob at rest, `east` and `north` of its lowest place, m.
+        """Return the bob at rest, at the distances `east` and `north` from its lowest place, m.
 
         >>> foucault(0.5, 10.0).start(6.0, 0.0).x.tolist()
         [6.0, 0.0, -8.0]
@@ -128,7 +131,8 @@ class Foucault(AbstractScene):
     def state(
         self, east: ScalarLike, north: ScalarLike, east_speed: ScalarLike, north_speed: ScalarLike
     ) -> Point:
-        """The bob below the pivot at a horizontal place, m, within the string; speeds in m/s.
+        """Return the bob below the pivot at the horizontal place `east`, `north`, m, within the
+        string; speeds in m/s.
 
         >>> foucault(0.5, 10.0).state(6.0, 0.0, 4.0, 0.0).v.tolist()
         [4.0, 0.0, 3.0]
@@ -142,7 +146,7 @@ class Foucault(AbstractScene):
         return Point(jnp.stack([e, n, up]), jnp.stack([ve, vn, -(e * ve + n * vn) / up]))
 
     def small_swing(self, state: Point, t: ScalarLike) -> Point:
-        """The state of small swings at `t`, s, in closed form.
+        """Return the state of small swings at `t`, s, in closed form.
 
         s = east + i north and Ω_z = Ω sin λ obey s'' + 2iΩ_z s' + ω₀² s = 0. The solution is s =
         e^{−iΩ_z t} (A cos ωt + B sin ωt), ω² = ω₀² + Ω_z², ω₀² = g/L (Landau and Lifshitz,
@@ -161,7 +165,7 @@ class Foucault(AbstractScene):
         place = self.place
         up = (place.rate * jnp.sin(place.latitude)).astype(t.dtype)
         swing = jnp.sqrt(place.gravity.astype(t.dtype) / self.length.astype(t.dtype) + up * up)
-        # It is a plain oscillator in axes that turn with the plane of swing.
+        # In axes that turn with the plane of swing the bob is a plain oscillator.
         ax, ay, bx, by = x, y, (vx - up * y) / swing, (vy + up * x) / swing
         c, s = jnp.cos(swing * t), jnp.sin(swing * t)
         px, py = ax * c + bx * s, ay * c + by * s
@@ -173,7 +177,7 @@ class Foucault(AbstractScene):
         return Point(jnp.stack([ex, ey, -self.length.astype(t.dtype)]), jnp.stack([wx, wy, zero]))
 
     def precession_rate(self) -> Scalar:
-        """The rate of the plane of small swings, rad/s, −Ω sin λ: clockwise in the north.
+        """Return the rate of the plane of small swings, rad/s, −Ω sin λ: clockwise in the north.
 
         >>> round(float(2 * jnp.pi / -foucault(jnp.pi / 6, 67.0).precession_rate()))
         172328
@@ -184,7 +188,7 @@ class Foucault(AbstractScene):
 def foucault(
     latitude: ScalarLike, length: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike = RATE
 ) -> Foucault:
-    """Foucault's pendulum.
+    """Return the scene of Foucault's pendulum.
 
     **Arguments:** `latitude` λ, rad, north positive; `length` of the string, m; `gravity` m/s²,
     along the plumb line; `rate` of the Earth, rad/s (WGS84 by default). All may be traced: latitude

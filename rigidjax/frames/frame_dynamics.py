@@ -1,4 +1,4 @@
-"""Integrate inside a moving frame: a particle, or a body."""
+"""Integrate motions inside a moving frame: of a particle, or of a body."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -18,7 +18,7 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class InFrame(AbstractScene):
-    """A particle whose motion is solved in a moving frame: eq 91 of the notes, corrected.
+    """Describe a particle whose motion is solved in a moving frame: eq 91 of the notes, corrected.
 
     **Arguments:**
 
@@ -49,7 +49,7 @@ class InFrame(AbstractScene):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where a force jumps or has a kink."""
+        """Return the times, s, at which a force jumps or has a kink."""
         return jumps_within(self.inside, self.outside)
 
     def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
@@ -74,7 +74,9 @@ class InFrame(AbstractScene):
 
 
 def scene_of(force: Any) -> AbstractScene:
-    """The scene that `simulate` solves: a scene, a frame seen from inside, or a plain force."""
+    """Return the scene that `simulate` solves, made from a scene, a moving frame or a plain
+    force.
+    """
     if isinstance(force, AbstractScene):
         return force
     if isinstance(force, MovingFrame):
@@ -88,26 +90,31 @@ def scene_of(force: Any) -> AbstractScene:
 
 
 class FrameWrench(eqx.Module):
-    """A force on the centre of mass, N, axes of S', and a torque about it, N m, body axes, (3,)."""
+    """Hold a force on the centre of mass, N, axes of S', and a torque about it, N m, body axes,
+    (3,).
+    """
 
     force: Vec3
     torque: Vec3
 
 
 class BodyInFrame(eqx.Module):
-    """The torque, and for `Rigid` the force, that make a body's equations valid in a moving frame.
+    """Give the torque, and for `Rigid` the force, that make a body's equations valid in a moving
+    frame.
 
-    Give it to `simulate` as the torque of an `Attitude` or `Rigid` state in S': q' body → S'; Ω'
-    the rate relative to S', in body axes; x', v' of the centre of mass. With W = Q'ᵀ Ω the frame's
-    rate in body axes, Ω' = Ω_abs − W, and I dΩ_abs/dt = IΩ_abs × Ω_abs + τ, the equation of Ω' is
+    Pass this to `simulate` as the torque of an `Attitude` or `Rigid` state in S'. Such a state has
+    q', body → S'; Ω', the rate relative to S', in body axes; x', v' of the centre of mass. With W =
+    Q'ᵀ Ω the frame's rate in body axes, Ω' = Ω_abs − W, and I dΩ_abs/dt = IΩ_abs × Ω_abs + τ, the
+    equation of Ω' is
 
     I dΩ'/dt = IΩ' × Ω' + [τ + IΩ_abs × Ω_abs − IΩ' × Ω' − I(Q'ᵀ dΩ/dt − Ω' × W)],
 
     and the centre of mass moves as a `Point` does (eq 91). **Arguments:** `frame` the `MovingFrame`
-    S'; `torque` the real τ, `(t, state in S', body) → (3,)`, N m, body axes, or a model of it that
-    gives a `Wrench`, with its force in the axes of S'; or `None`. `simulate` refuses laws of the
-    absolute rate beside it or inside: wheels, `ChangingInertia`. Source: notes, eqs 50, 91, for a
-    body instead of a point. **Raises:** `TypeError` for a force on a state that only turns.
+    S'; `torque` the real τ, `(t, state in S', body) → (3,)`, N m, body axes, or a model that
+    returns a `Wrench`, with its force in the axes of S'; or `None`. `simulate` refuses torques that
+    need the absolute rate (wheels, `ChangingInertia`), inside a `BodyInFrame` or in a sum with it.
+    Source: notes, eqs 50, 91, for a body instead of a point. **Raises:** `TypeError` for a force on
+    a state that only turns.
 
     >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
     >>> still = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, -1.0])
@@ -126,7 +133,7 @@ class BodyInFrame(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the torque jumps or has a kink."""
+        """Return the times, s, at which the torque jumps or has a kink."""
         return jumps_within(self.torque)
 
     def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | FrameWrench:
@@ -147,8 +154,8 @@ class BodyInFrame(eqx.Module):
             if hasattr(real, "force"):
                 if force is None:
                     raise TypeError(
-                        f"BodyInFrame: {type(self.torque).__name__} gives a force, got a state "
-                        f"{type(state).__name__} that only turns; a force needs a Rigid state"
+                        f"BodyInFrame: {type(self.torque).__name__} returns a force: wanted a "
+                        f"Rigid state, got {type(state).__name__}, which has no position"
                     )
                 force, real = force + real.force.astype(omega.dtype), real.torque
             real = _checks.floating(real, (3,), "torque", hint="body-frame N m")

@@ -1,4 +1,4 @@
-"""A moving frame at one instant: the kinematics of section 3 of the notes."""
+"""Compute with a moving frame at one instant: the kinematics of section 3 of the notes."""
 
 from typing import Any
 
@@ -10,7 +10,8 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class Instant(eqx.Module):
-    """Position, rotation and motion of a moving frame S' at one time, by `MovingFrame.at(t)`.
+    """Hold the position, rotation and motion of a moving frame S' at one time; `MovingFrame.at(t)`
+    makes it.
 
     **Fields:** `rotation` M (3, 3), S' → S; `rate` Ω (3,), rad/s, and `rate_change` dΩ/dt (3,),
     rad/s², both in the axes of S'; `origin`, `origin_velocity`, `origin_acceleration` of S', (3,),
@@ -29,7 +30,7 @@ class Instant(eqx.Module):
     origin_acceleration: Vec3
 
     def to_inertial(self, state: Any) -> Any:
-        """A state in S', transformed to S (notes, eqs 85, 88): `MovingFrame.to_inertial`."""
+        """Return a state given in S', transformed to S (notes, eqs 85, 88)."""
         _can_travel(state)
         turned = {}
         if hasattr(state, "x"):
@@ -45,7 +46,7 @@ class Instant(eqx.Module):
         return _replaced(state, turned)
 
     def from_inertial(self, state: Any) -> Any:
-        """A state in S, transformed to S' (notes, eqs 86, 88): `MovingFrame.from_inertial`."""
+        """Return a state given in S, transformed to S' (notes, eqs 86, 88)."""
         _can_travel(state)
         turned = {}
         if hasattr(state, "x"):
@@ -61,37 +62,41 @@ class Instant(eqx.Module):
         return _replaced(state, turned)
 
     def outward(self, y: Vector) -> Vec3:
-        """Components in S' → components in S, M y' (notes, eq 85): forces, directions."""
+        """Return the components in S, M y', of a vector given in S' (notes, eq 85): a force, a
+        direction.
+        """
         y = _checks.floating(y, (3,), "y")
         return linalg3.apply(self.rotation.astype(y.dtype), y)
 
     def inward(self, y: Vector) -> Vec3:
-        """Components in S → components in S', Mᵀ y (notes, eq 86; f = MᵀF of eq 91)."""
+        """Return the components in S', Mᵀ y, of a vector given in S (notes, eq 86; f = MᵀF of eq
+        91).
+        """
         y = _checks.floating(y, (3,), "y")
         return linalg3.apply(self.rotation.T.astype(y.dtype), y)
 
     def centrifugal(self, x: Vector) -> Vec3:
-        """Centrifugal acceleration −Ω × (Ω × x')."""
+        """Return the centrifugal acceleration −Ω × (Ω × x')."""
         x = _checks.floating(x, (3,), "x")
         rate = self.rate.astype(x.dtype)
         return linalg3.cross(linalg3.cross(rate, x), rate)
 
     def coriolis(self, v: Vector) -> Vec3:
-        """Coriolis acceleration −2 Ω × v'."""
+        """Return the Coriolis acceleration −2 Ω × v'."""
         v = _checks.floating(v, (3,), "v")
         return 2 * linalg3.cross(v, self.rate.astype(v.dtype))
 
     def euler_acceleration(self, x: Vector) -> Vec3:
-        """Euler acceleration −dΩ/dt × x'."""
+        """Return the Euler acceleration −dΩ/dt × x'."""
         x = _checks.floating(x, (3,), "x")
         return linalg3.cross(x, self.rate_change.astype(x.dtype))
 
     def translation(self) -> Vec3:
-        """Acceleration −Mᵀ d²X/dt² of an accelerated origin."""
+        """Return the acceleration −Mᵀ d²X/dt² of an accelerated origin."""
         return -self.inward(self.origin_acceleration)
 
     def fictitious(self, x: Vector, v: Vector) -> Vec3:
-        """The sum of the four inertial accelerations."""
+        """Return the sum of the four inertial accelerations (notes, eq 91)."""
         x, v = _checks.floating(x, (3,), "x"), _checks.floating(v, (3,), "v")
         turning = self.centrifugal(x) + self.coriolis(v) + self.euler_acceleration(x)
         return turning + self.translation().astype(x.dtype)
@@ -103,8 +108,8 @@ def _can_travel(state: Any) -> None:
     if not (point or attitude):
         alone = "; a rate alone has no direction in another frame"
         raise TypeError(
-            "a moving frame carries states with x and v (Point), with q and omega (Attitude), or "
-            f"with all four (Rigid), got {type(state).__name__}"
+            "state: wanted x and v (Point), q and omega (Attitude), or all four (Rigid), to "
+            f"transform between frames, got {type(state).__name__}"
             + (alone if hasattr(state, "omega") else "")
         )
     hint = "one state at one time; batch with jax.vmap(frame.to_inertial)(states, times)"

@@ -1,4 +1,4 @@
-"""A bead on a turning hoop, and a turntable."""
+"""Describe a bead on a turning hoop, and a turntable."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +15,8 @@ from rigidjax.rotation.linalg3 import components
 
 
 class Hoop(AbstractScene):
-    """A bead that slides on a hoop turning about its vertical diameter; `scenes.hoop` makes it.
+    """Describe a bead that slides on a hoop turning about its vertical diameter; `scenes.hoop`
+    makes it.
 
     Axes of the hoop: x in its plane, y across it, z up; the centre is the origin. **Fields:**
     `radius` m, `rate` rad/s, `gravity` m/s².
@@ -30,7 +31,9 @@ class Hoop(AbstractScene):
     gravity: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """d²x'/dt² (3,), m/s²: gravity and centrifugal along the hoop, and the hoop's pull."""
+        """Return d²x'/dt² (3,), m/s²: gravity and the centrifugal acceleration along the hoop, and
+        the hoop's pull.
+        """
         x, _, z = components(state.x)
         vx, _, vz = components(state.v)
         rate, gravity = like(x, self.rate, self.gravity)
@@ -45,7 +48,8 @@ class Hoop(AbstractScene):
         return {"jacobi": jacobi, "radius": jnp.sqrt(x * x + z * z)}
 
     def side_push(self, state: Point) -> Scalar:
-        """The hoop's force per mass across its plane, m/s² along y: 2Ω v_x, opposite to Coriolis.
+        """Return the hoop's force per mass across its plane, m/s² along y: 2Ω v_x, opposite to
+        Coriolis.
 
         >>> float(hoop(1.0, 3.0).side_push(Point([0.0, 0, -1], [2.0, 0, 0])))
         12.0
@@ -54,7 +58,7 @@ class Hoop(AbstractScene):
         return 2 * like(state.x, self.rate)[0] * state.v[0]
 
     def state(self, angle: ScalarLike, speed: ScalarLike = 0.0) -> Point:
-        """The bead at an angle from the lowest place, rad, with dθ/dt = `speed`, rad/s.
+        """Return the bead at an angle from the lowest place, rad, with dθ/dt = `speed`, rad/s.
 
         >>> hoop(2.0, 3.0).state(0.0, 1.0).v.tolist()
         [2.0, 0.0, 0.0]
@@ -66,7 +70,7 @@ class Hoop(AbstractScene):
         return Point(radius * place, radius * speed.astype(angle.dtype) * along)
 
     def equilibrium_angle(self) -> Scalar:
-        """The stable equilibrium of the bead, rad: arccos(g/(Ω²R)), or 0 for a slow hoop.
+        """Return the stable equilibrium of the bead, rad: arccos(g/(Ω²R)), or 0 for a slow hoop.
 
         >>> float(hoop(1.0, 1.0).equilibrium_angle())
         0.0
@@ -77,7 +81,7 @@ class Hoop(AbstractScene):
 
 
 def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) -> Hoop:
-    """A bead without friction on a hoop that turns about its vertical diameter.
+    """Return the scene of a bead without friction on a hoop that turns about its vertical diameter.
 
     **Arguments:** `radius` R, m; `rate` Ω, rad/s; `gravity` m/s². Source: Goldstein, Mechanics,
     sec. 2.7 (θ'' = sin θ (Ω² cos θ − g/R)); notes, eq 91. **Raises:** `ValueError` for a radius
@@ -92,7 +96,7 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
 
 
 class _Angle(eqx.Module):
-    """½αt² + Ωt."""
+    """Compute the angle ½αt² + Ωt, with Ω the `rate` and α the `growth`."""
 
     rate: Scalar
     growth: Scalar
@@ -103,7 +107,7 @@ class _Angle(eqx.Module):
 
 
 def turntable(rate: ScalarLike, growth: ScalarLike = 0.0) -> InFrame:
-    """A frictionless table that turns about z, and the motion of a puck in its frame.
+    """Return the scene of a puck on a frictionless table that turns about z, in the table's frame.
 
     **Arguments:** `rate` Ω at t = 0, rad/s; `growth` dΩ/dt, rad/s². The puck moves straight in the
     inertial frame; `turntable(…).frame` transforms states in both directions (notes, eqs 85–91).

@@ -1,4 +1,4 @@
-"""A body in orbit under the gravity-gradient torque: attitude in the orbital frame."""
+"""Describe a body in orbit under the gravity-gradient torque: attitude in the orbital frame."""
 
 from typing import Any, ClassVar
 
@@ -15,7 +15,9 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class Tide(eqx.Module):
-    """Gravity-gradient torque 3n² u × I u, u away from the planet (Hughes 1986, sec. 8.1)."""
+    """Compute the gravity-gradient torque 3n² u × I u, with u away from the planet (Hughes 1986,
+    sec. 8.1).
+    """
 
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True
@@ -28,10 +30,11 @@ class Tide(eqx.Module):
 
 
 def libration(rate: ScalarLike) -> BodyInFrame:
-    """The torque on a body in a circular orbit, for `simulate` with `Attitude` states.
+    """Return the torque on a body in a circular orbit, for `simulate` with `Attitude` states.
 
-    Orbital frame: x away from the planet, y along the motion, z along the orbit's normal; it turns
-    at n about z. `q` takes body axes to it; `omega` is the rate relative to it, in body axes.
+    The orbital frame has x away from the planet, y along the motion and z along the orbit's normal;
+    it turns at the rate n about z. `q` takes body axes to the orbital frame; `omega` is the rate
+    relative to this frame, in body axes.
 
     **Arguments:** `rate` n of the orbit, rad/s. Small librations in the orbital plane of a body
     with moments (a, b, c) about (x, y, z) have the rate n √(3 (b − a)/c). Source: Hughes 1986,
@@ -47,7 +50,8 @@ def libration(rate: ScalarLike) -> BodyInFrame:
 
 
 def libration_integral(state: Any, body: Any, rate: ScalarLike) -> Scalar:
-    """½Ω'·IΩ' + (3/2)n² u·Iu − ½n² w·Iw, J: the conserved Jacobi integral of `libration`.
+    """Return the Jacobi integral of `libration`, J, which is conserved: ½Ω'·IΩ' + (3/2)n² u·Iu −
+    ½n² w·Iw.
 
     **Arguments:** `state` an `Attitude` in the orbital frame; `body` an `Inertia`; `rate` n, rad/s.
     u and w are the frame's first and third axes in body axes (Hughes 1986, sec. 9.1).

@@ -1,4 +1,4 @@
-"""A moving frame: any R(t), any origin(t) (notes, section 3, eqs 84–91)."""
+"""Describe a moving frame with any R(t) and any origin(t) (notes, section 3, eqs 84–91)."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,7 +16,8 @@ from rigidjax.rotation import linalg3
 
 
 class MovingFrame(eqx.Module):
-    """A frame S' that turns and moves in any differentiable way, relative to an inertial S.
+    """Describe a frame S' that turns and moves in any differentiable way, relative to an inertial
+    frame S.
 
     Coordinates transform as x = X(t) + M(t) x' (notes, eqs 85, 86, with an origin added).
     **Arguments:**
@@ -30,8 +31,8 @@ class MovingFrame(eqx.Module):
     - `rate`: Ω (3,), rad/s, **axes of S'**, as a function of time, if it is known; else Ω =
       vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation, which always gives dΩ/dt.
 
-    Its numbers may be traced: a rate or an origin has gradients. **Raises:** `TypeError` for
-    another `rotation`; when used, `ValueError` for a known value that is no rotation.
+    The numbers of a frame may be traced: a rate or an origin has gradients. **Raises:** `TypeError`
+    for another `rotation`; at its use, `ValueError` for a known value that is no rotation.
 
     >>> turntable = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
     >>> turntable.centrifugal([1.0, 0.0, 0.0], 0.3).tolist()
@@ -53,7 +54,7 @@ class MovingFrame(eqx.Module):
             hint = "for a uniform turn take frames.Uniform(omega)"
             _checks.function(rotation, "rotation", wanted, hint=hint)
         if origin is not None:
-            hint = "for one at rest pass lambda t: point"
+            hint = "for an origin at rest pass lambda t: point"
             _checks.function(origin, "origin", "of time to (3,)", hint=hint)
         if rate is not None:
             _checks.function(rate, "rate", "of time to (3,)")
@@ -61,11 +62,11 @@ class MovingFrame(eqx.Module):
         self.rate = getattr(rotation, "rate", None) if rate is None else rate
 
     def matrix(self, t: ScalarLike) -> Mat3:
-        """M(t) (3, 3), S' → S (notes, eq 85)."""
+        """Return M(t) (3, 3), S' → S (notes, eq 85)."""
         return rotation_models.matrix(self.rotation, _checks.time(t))
 
     def at(self, t: ScalarLike) -> Instant:
-        """The frame at time `t`, s: M, Ω, dΩ/dt, and the origin with its two derivatives.
+        """Return the frame at time `t`, s: M, Ω, dΩ/dt, and the origin with its two derivatives.
 
         >>> MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
@@ -78,7 +79,7 @@ class MovingFrame(eqx.Module):
         return Instant(self.matrix(t), rate, rate_change, origin, velocity, acceleration)
 
     def angular_velocity(self, t: ScalarLike) -> Vec3:
-        """Ω(t) (3,), rad/s, axes of S': given, or vee(Mᵀ dM/dt) (notes, eqs 45–50)."""
+        """Return Ω(t) (3,), rad/s, axes of S': `rate`, or vee(Mᵀ dM/dt) (notes, eqs 45–50)."""
         t = _checks.time(t)
         if self.rate is not None:
             return _checks.floating(self.rate(t), (3,), "rate").astype(t.dtype)
@@ -89,7 +90,7 @@ class MovingFrame(eqx.Module):
         return linalg3.vee(linalg3.product(m.T, m_dot))
 
     def to_inertial(self, state: Any, t: ScalarLike) -> Any:
-        """A state given in S', transformed to S, of the same type.
+        """Return a state given in S', transformed to S, of the same type.
 
         **Arguments:** `state` a `Point`, `Attitude` or `Rigid`, or any Module with `x` and `v`,
         with `q` and `omega`, or with all four; one state. `t` time, s. Then
@@ -106,9 +107,10 @@ class MovingFrame(eqx.Module):
         return self.at(t).to_inertial(state)
 
     def from_inertial(self, state: Any, t: ScalarLike) -> Any:
-        """A state given in S, transformed to S': the inverse of `to_inertial`.
+        """Return a state given in S, transformed to S': the inverse of `to_inertial`.
 
-        **Arguments:** as there. x' = Mᵀ(x − X), v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs 86–88).
+        **Arguments:** as for `to_inertial`. x' = Mᵀ(x − X), v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs
+        86–88).
 
         >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.from_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 2, 0]), 0.0).v.tolist()
@@ -117,25 +119,31 @@ class MovingFrame(eqx.Module):
         return self.at(t).from_inertial(state)
 
     def centrifugal(self, x: Vector, t: ScalarLike) -> Vec3:
-        """Acceleration −Ω × (Ω × x') (3,), m/s², axes of S' (notes, eq 91), at `x` (3,), m."""
+        """Return the centrifugal acceleration −Ω × (Ω × x') (3,), m/s², axes of S', at `x` (3,), m
+        (notes, eq 91).
+        """
         return self.at(t).centrifugal(x)
 
     def coriolis(self, v: Vector, t: ScalarLike) -> Vec3:
-        """Acceleration −2 Ω × v' (3,), m/s², axes of S' (notes, eq 91), at `v` (3,), m/s."""
+        """Return the Coriolis acceleration −2 Ω × v' (3,), m/s², axes of S', at `v` (3,), m/s
+        (notes, eq 91).
+        """
         return self.at(t).coriolis(v)
 
     def euler_acceleration(self, x: Vector, t: ScalarLike) -> Vec3:
-        """Acceleration −dΩ/dt × x' (3,), m/s², axes of S' (eq 91, "inercial"), at `x` (3,), m."""
+        """Return the Euler acceleration −dΩ/dt × x' (3,), m/s², axes of S', at `x` (3,), m (eq 91,
+        "inercial").
+        """
         return self.at(t).euler_acceleration(x)
 
     def translation(self, t: ScalarLike) -> Vec3:
-        """The acceleration by an accelerated origin, −Mᵀ d²X/dt² (3,), m/s², axes of S'."""
+        """Return the acceleration by an accelerated origin, −Mᵀ d²X/dt² (3,), m/s², axes of S'."""
         return self.at(t).translation()
 
     def acceleration(
         self, x: Vector, v: Vector, t: ScalarLike, force: Vector | None = None
     ) -> Vec3:
-        """The acceleration in S': eq 91 of the notes, corrected, with a moving origin.
+        """Return the acceleration in S': eq 91 of the notes, corrected, with a moving origin.
 
         d²x'/dt² = f − Ω×(Ω×x') − 2Ω×v' − dΩ/dt×x' − Mᵀ d²X/dt². (Eq 91 prints one more x'' inside
         its bracket, a slip: see eq 90.)
@@ -152,20 +160,22 @@ class MovingFrame(eqx.Module):
         return free if force is None else _checks.floating(force, (3,), "force") + free
 
     def acceleration_to_inertial(self, x: Vector, v: Vector, a: Vector, t: ScalarLike) -> Vec3:
-        """The acceleration in S (3,), m/s², of `x`, `v`, `a` (3,) in S' at `t` (eqs 89, 90)."""
+        """Return the acceleration in S (3,), m/s², of a particle with `x`, `v`, `a` (3,) in S' at
+        `t` (eqs 89, 90).
+        """
         now, a = self.at(t), _checks.floating(a, (3,), "a")
         return now.outward(a - now.fictitious(x, v))
 
     def force_from_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
-        """Force f = MᵀF (3,): a force, or any direction, in the axes of S' (notes, eq 91)."""
+        """Return f = MᵀF (3,): a force F, or any direction, in the axes of S' (notes, eq 91)."""
         return linalg3.apply(self.matrix(t).T, _checks.floating(force, (3,), "force"))
 
     def force_to_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
-        """Force F = M f (3,): a force, or any direction, in the axes of S (notes, eq 85)."""
+        """Return F = M f (3,): a force f, or any direction, in the axes of S (notes, eq 85)."""
         return linalg3.apply(self.matrix(t), _checks.floating(force, (3,), "force"))
 
     def jacobi_integral(self, state: Any, t: ScalarLike, potential: ScalarLike = 0.0) -> Scalar:
-        """½|v'|² − ½|Ω × x'|² + V, m²/s²: conserved if Ω and V(x') do not depend on time.
+        """Return ½|v'|² − ½|Ω × x'|² + V, m²/s²: conserved if Ω and V(x') do not depend on time.
 
         **Arguments:** `state` a `Point` in S'; `t` s; `potential` V per mass at its place, m²/s².
         Source: Goldstein, Mechanics, sec. 3.12 (in the three-body problem it is −C/2).
@@ -177,7 +187,8 @@ class MovingFrame(eqx.Module):
         return 0.5 * (speed - linalg3.dot(moved, moved)) + v
 
     def then(self, inner: "MovingFrame") -> "MovingFrame":
-        """The frame that moves as `inner` does **within this one**: M = M₁M₂, X = X₁ + M₁X₂.
+        """Return the frame that moves as `inner` does **within this frame**: M = M₁M₂, X = X₁ +
+        M₁X₂.
 
         >>> half = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
         >>> half.then(half).at(0.0).rate.tolist()
@@ -187,12 +198,14 @@ class MovingFrame(eqx.Module):
         return MovingFrame(both.rotation, both.origin, both.rate)
 
     def inverse(self) -> "MovingFrame":
-        """S relative to S': M → Mᵀ, X → −MᵀX. `frame.then(frame.inverse())` does not move."""
+        """Return S relative to S': M → Mᵀ, X → −MᵀX. `frame.then(frame.inverse())` does not
+        move.
+        """
         back = _Inverse(self)
         return MovingFrame(back.rotation, back.origin, back.rate)
 
     def place(self, t: ScalarLike) -> Vec3:
-        """X(t) (3,), m, axes of S."""
+        """Return the origin X(t) (3,), m, axes of S."""
         t = _checks.time(t)
         if self.origin is None:
             return jnp.zeros(3, t.dtype)
@@ -200,7 +213,7 @@ class MovingFrame(eqx.Module):
 
 
 def require_frame(frame: Any, name: str) -> Any:
-    """Return `frame` if it is a `MovingFrame`; else raise in words."""
+    """Return `frame` if it is a `MovingFrame`; raise `TypeError` for anything else."""
     hint = "make one from a rotation with MovingFrame(rotation)"
     return _checks.instance(frame, MovingFrame, name, wanted="a MovingFrame", hint=hint)
 

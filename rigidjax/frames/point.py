@@ -1,4 +1,4 @@
-"""The state of a particle, without a body."""
+"""Hold the state of a particle, without a body."""
 
 from typing import Any
 
@@ -11,9 +11,9 @@ from rigidjax._types import Vectors
 
 
 class Point(eqx.Module):
-    """Position and velocity of a particle, in the frame of its scene.
+    """Hold the position and velocity of a particle, in the frame of its scene.
 
-    **Arguments:** `x` (3,) position, m; `v` (3,) its velocity **in that frame**, m/s. Scenes with
+    **Arguments:** `x` (3,) position, m; `v` (3,) its velocity **in this frame**, m/s. Scenes with
     units of their own (the restricted three-body problem) say so. Source: notes, eq 84 (x, and ẋ).
 
     >>> Point([1.0, 0, 0], [0.0, 2, 0]).v.shape
@@ -35,7 +35,7 @@ class Point(eqx.Module):
 
 
 def require_point(state: Any, name: str = "state") -> Any:
-    """Return `state` if it has one place and one velocity; else raise in words."""
+    """Return `state` if it has one place and one velocity; raise an error for anything else."""
     if isinstance(state, type) or not (hasattr(state, "x") and hasattr(state, "v")):
         raise TypeError(f"{name}: wanted a Point(x, v), got {_checks.kind(state)}")
     for part in ("x", "v"):

@@ -1,4 +1,4 @@
-"""Rotations as functions of time: uniform, about one axis, or from another motion."""
+"""Describe rotations as functions of time: uniform, about one axis, or from another motion."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,7 +16,7 @@ from rigidjax.rotation.validation import near_unit, rotation_matrix
 
 
 class Uniform(eqx.Module):
-    """A uniform turn M(t) = exp(t hat Ω), M(0) = 1, of `omega` Ω (3,), rad/s, axes of S or S'.
+    """Turn uniformly: M(t) = exp(t hat Ω), M(0) = 1, of `omega` Ω (3,), rad/s, axes of S or S'.
 
     >>> Uniform([0.0, 0.0, 1.0])(jnp.pi).round(12)[0].tolist()
     [-1.0, -0.0, 0.0]
@@ -32,12 +32,12 @@ class Uniform(eqx.Module):
         return so3.exp(t * self.omega.astype(t.dtype))
 
     def rate(self, t: Any) -> Vec3:
-        """Ω, which is constant."""
+        """Return Ω, which is constant."""
         return self.omega.astype(_checks.time(t).dtype)
 
 
 class AboutAxis(eqx.Module):
-    """A turn about a fixed `axis` (3,), of any length, by any `angle`, a function of time to rad.
+    """Turn about a fixed `axis` (3,), of any length, by any `angle`, a function of time to rad.
 
     >>> float(AboutAxis([0.0, 0.0, 2.0], lambda t: 3.0 * t**2).rate(1.0)[2])
     6.0
@@ -59,14 +59,14 @@ class AboutAxis(eqx.Module):
         return so3.exp(_checks.floating(self.angle(t), (), "angle") * self.axis.astype(t.dtype))
 
     def rate(self, t: Any) -> Vec3:
-        """Ω (3,), rad/s: the axis times the angle's derivative."""
+        """Return Ω (3,), rad/s: the axis times the angle's derivative."""
         t = _checks.time(t)
         _, speed = jax.jvp(self.angle, (t,), (jnp.ones_like(t),))
         return speed * self.axis.astype(t.dtype)
 
 
 def differentiable(rotation: Any) -> Any:
-    """`rotation`, with its own solves in forward mode, which dΩ/dt needs."""
+    """Return `rotation` with its own solves in forward mode, which dΩ/dt needs."""
 
     def reverse(part: Any) -> bool:
         return isinstance(part, dfx.RecursiveCheckpointAdjoint)
@@ -75,12 +75,14 @@ def differentiable(rotation: Any) -> Any:
 
 
 def state_of(rotation: Any, t: Array) -> Any:
-    """The value of `rotation` at `t`: a matrix, a quaternion, or a state with `q` and `omega`."""
+    """Return the value of `rotation` at `t`: a matrix, a quaternion, or a state with `q` and
+    `omega`.
+    """
     return rotation.evaluate(t) if hasattr(rotation, "evaluate") else rotation(t)
 
 
 def matrix(rotation: Any, t: Array) -> Mat3:
-    """M(t) of the rotation of a frame: a function to (3, 3) or (4,), or a solution."""
+    """Return M(t) of the rotation of a frame: a function to (3, 3) or (4,), or a solution."""
     value = state_of(rotation, t)
     value = getattr(value, "q", value)
     shape = jnp.shape(value)

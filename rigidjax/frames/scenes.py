@@ -1,4 +1,4 @@
-"""Ready-made scenes for `rigidjax.simulate(None, Point(x, v), ts, scene)`; no body is needed."""
+"""Provide scenes for `rigidjax.simulate(None, Point(x, v), ts, scene)`; no body is needed."""
 
 from rigidjax._names import show
 from rigidjax.frames.earth import (
@@ -12,5 +12,10 @@ from rigidjax.frames.libration import (
     libration as libration,
     libration_integral as libration_integral,
 )
+
+__all__ = [
+    "Earth", "Foucault", "Hoop", "earth", "foucault", "hoop", "libration", "libration_integral",
+    "turntable",
+]  # fmt: skip
 
 show(__name__)

@@ -84,4 +84,16 @@ from rigidjax.identify.sensors import (
     Velocity as Velocity,
 )
 
+__all__ = [
+    "AbstractBodyChart", "AbstractLoss", "AbstractSensor", "Accelerometer", "Adaptive",
+    "AttitudeSensor", "Descent", "Direction", "Entropic", "Fit", "FixedSteps", "Free", "Gyro",
+    "Huber", "Known", "LinearModel", "LogDensity", "LowPass", "Magnetometer", "Marker", "Mass",
+    "Model", "Nuts", "Position", "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios",
+    "Recording", "Refit", "Scene", "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked",
+    "Velocity", "Walk", "Windows", "best_first_rate", "compare", "cross_validate", "descend",
+    "expected", "filter", "first_belief", "fisher", "fit", "linear_filter", "linear_smooth",
+    "log_likelihood", "posterior", "predict_windows", "profile", "read_table", "refit", "report",
+    "sample", "simulate_readings", "smooth", "step", "windows",
+]  # fmt: skip
+
 show(__name__)

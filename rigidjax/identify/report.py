@@ -312,4 +312,8 @@ def _cells(lines: Iterable[tuple[str, ...]]) -> str:
     return "".join(f"<tr>{line}</tr>" for line in cells)
 
 
+__all__ = [
+    "Row", "as_dict", "as_html", "numbers", "rows", "table", "verdict", "write_html", "write_json",
+]  # fmt: skip
+
 show(__name__)

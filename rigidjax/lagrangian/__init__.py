@@ -1,8 +1,8 @@
-"""Equations of motion from any Lagrangian by differentiation, and from any Hamiltonian.
+"""Derive equations of motion from any Lagrangian by differentiation, and from any Hamiltonian.
 
-For cross-checks, for teaching, and for scenes with their own coordinates. For a rigid body the
-equations of `Attitude` cost less and have no singular attitude. Those in Euler angles are singular
-at sin θ = 0, and need many small steps near it. `lie_poisson` is the Hamiltonian side.
+They serve cross-checks, teaching, and scenes with their own coordinates. For a rigid body the
+equations of `Attitude` cost less and have no singular attitude. Equations in Euler angles are
+singular at sin θ = 0, and need many small steps near it. `lie_poisson` is the Hamiltonian side.
 """
 
 from rigidjax._names import show
@@ -20,5 +20,11 @@ from rigidjax.lagrangian.hamiltonian import (
     lie_poisson as lie_poisson,
     lie_poisson_with_direction as lie_poisson_with_direction,
 )
+
+__all__ = [
+    "Coordinates", "EulerAngleTop", "HeavyTopHamiltonian", "Momentum", "RotationalHamiltonian",
+    "equations_of_motion", "from_attitude", "lie_poisson", "lie_poisson_with_direction",
+    "to_attitude",
+]  # fmt: skip
 
 show(__name__)

@@ -1,4 +1,6 @@
-"""Equations of motion from any Lagrangian by differentiation; Euler angles as the worked case."""
+"""Derive equations of motion from any Lagrangian by differentiation; Euler angles are the worked
+case.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +21,7 @@ from rigidjax.rotation import euler, linalg3
 
 
 class Coordinates(eqx.Module):
-    """The state of a Lagrangian system: coordinates and their rates.
+    """Hold the state of a Lagrangian system: coordinates and their rates.
 
     **Arguments:** `q` (n,) generalised coordinates, in the Lagrangian's units; `rate` (n,) dq/dt,
     per second.
@@ -43,7 +45,8 @@ class Coordinates(eqx.Module):
 
 
 class LagrangeEquations(eqx.Module):
-    """Lagrange's equations as a vector field of `lagrangian` and `force`, by `equations_of_motion`.
+    """Evaluate Lagrange's equations of `lagrangian` and `force` as a vector field;
+    `equations_of_motion` makes it.
 
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
     >>> round(float(pendulum.energy(Coordinates([0.0], [2.0]))), 6)  # ½ v² − 9.81 cos q
@@ -63,7 +66,7 @@ class LagrangeEquations(eqx.Module):
         return Coordinates(rate, _solve(jax.jacfwd(lambda v: momentum(q, v))(rate), push))
 
     def energy(self, y: Coordinates) -> Scalar:
-        """Jacobi's integral `q̇·∂L/∂q̇ − L`, J: conserved without a `force`."""
+        """Return Jacobi's integral `q̇·∂L/∂q̇ − L`, J: conserved without a `force`."""
         momentum = jax.grad(self._value, argnums=1)(y.q, y.rate)
         return jnp.sum(y.rate * momentum) - self._value(y.q, y.rate)
 
@@ -74,15 +77,16 @@ class LagrangeEquations(eqx.Module):
 def equations_of_motion(
     lagrangian: Callable[[Any, Any], Any], force: Callable[[Any, Any, Any], Any] | None = None
 ) -> LagrangeEquations:
-    """The vector field `f(t, y, args)` on `Coordinates` of any Lagrangian L(q, q̇).
+    """Return the vector field `f(t, y, args)` on `Coordinates` of any Lagrangian L(q, q̇).
 
     `d/dt ∂L/∂q̇ = ∂L/∂q + Q`, solved for q̈: `(∂²L/∂q̇∂q̇) q̈ = ∂L/∂q − (∂²L/∂q̇∂q) q̇ + Q`.
 
     **Arguments:** `lagrangian` a callable, best a Module (its numbers can be differentiated, and
     changed without compiling again), `(q, q̇) → L`, J, with `q`, `q̇` (n,); `force` generalised
     forces without a potential, `(t, q, q̇) → Q` (n,), or `None`. **Returns** a Module, for
-    `diffrax.ODETerm`. It solves for up to three coordinates by cofactors, for more by LU
-    (`lineax`). Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after eq 57.
+    `diffrax.ODETerm`. The linear system is solved by cofactors for up to three coordinates, by LU
+    (`lineax`) for more. Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after
+    eq 57.
 
     A singular ∂²L/∂q̇∂q̇ (a singular chart, a coordinate without mass) gives infinities or NaN.
 
@@ -97,13 +101,13 @@ def equations_of_motion(
 
 
 class EulerAngleTop(eqx.Module):
-    """L = ½ Ω·IΩ − U of a body about a fixed point, in the notes' Euler angles.
+    """Compute L = ½ Ω·IΩ − U of a body about a fixed point, in the notes' Euler angles.
 
-    **Arguments:** `inertia` about the fixed point (or the centre of mass, if free); `torque` one
-    with a potential that does not depend on time, such as `HeavyTop`, or `None`. It is called with
-    the angles (φ, θ, ψ), sequence 3-1-3, rad, and their rates, and returns L, J. It is singular at
-    sin θ = 0. Source: notes, eqs 33, 75, 81–83. **Raises:** `TypeError` for a torque without a
-    potential.
+    **Arguments:** `inertia` about the fixed point (or the centre of mass, if free); `torque`, a
+    torque with a potential that does not depend on time, such as `HeavyTop`, or `None`. The object
+    is called with the angles (φ, θ, ψ), sequence 3-1-3, rad, and their rates, and returns L, J. L
+    is singular at sin θ = 0. Source: notes, eqs 33, 75, 81–83. **Raises:** `TypeError` for a torque
+    without a potential.
 
     >>> free = EulerAngleTop(rj.Inertia.from_principal(1.0, 1.0, 2.0))
     >>> free(jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))
@@ -135,7 +139,8 @@ class EulerAngleTop(eqx.Module):
 
 
 def to_attitude(y: Coordinates) -> Attitude:
-    """Attitude and body rate of `y`, 3-1-3 Euler angles, rad, and rates (notes, eqs 33, 81–83).
+    """Return the attitude and body rate of `y`: 3-1-3 Euler angles, rad, and their rates (notes,
+    eqs 33, 81–83).
 
     >>> to_attitude(Coordinates([0.0, 0.0, 0.0], [0.0, 0.0, 2.0])).omega.tolist()
     [0.0, 0.0, 2.0]
@@ -146,7 +151,7 @@ def to_attitude(y: Coordinates) -> Attitude:
 
 
 def from_attitude(state: HasAttitude) -> Coordinates:
-    """3-1-3 Euler angles and their rates of an attitude and a body rate.
+    """Return the 3-1-3 Euler angles and their rates of an attitude and a body rate.
 
     **Arguments:** `state` with `.q` (4,), body → world, and `.omega` (3,), rad/s. **Raises:**
     `ValueError` (`EquinoxRuntimeError` under `jit`) at sin θ = 0, where the angles are not unique

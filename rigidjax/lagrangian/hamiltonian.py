@@ -1,4 +1,4 @@
-"""Lie–Poisson equations from any Hamiltonian of the body's momentum."""
+"""Derive Lie–Poisson equations from any Hamiltonian of the body's momentum."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +18,7 @@ _WANTED = "of the momentum to H, J"
 
 
 class Momentum(eqx.Module):
-    """The state of Lie–Poisson motion: the angular momentum in the body.
+    """Hold the state of Lie–Poisson motion: the angular momentum in the body.
 
     **Arguments:** `pi` (3,) Π = IΩ, N m s, body frame.
 
@@ -33,7 +33,7 @@ class Momentum(eqx.Module):
 
 
 class MomentumAndDirection(eqx.Module):
-    """The state of a heavy top reduced by its symmetry: momentum, and a fixed direction.
+    """Hold the state of a heavy top reduced by its symmetry: momentum, and a fixed direction.
 
     **Arguments:** `pi` (3,) Π, N m s, body frame; `gamma` (3,) γ = Rᵀ d, body frame, of a vector d
     that is fixed in the world. Any length and unit: for `HeavyTopHamiltonian` d = g, m/s².
@@ -52,7 +52,9 @@ class MomentumAndDirection(eqx.Module):
 
 
 class LiePoisson(eqx.Module):
-    """`dΠ/dt = Π × ∇H(Π)` as a vector field, H the `hamiltonian`; `lie_poisson` makes it."""
+    """Evaluate `dΠ/dt = Π × ∇H(Π)` as a vector field, H the `hamiltonian`; `lie_poisson` makes
+    it.
+    """
 
     hamiltonian: Callable[[Any], Any]
 
@@ -61,7 +63,9 @@ class LiePoisson(eqx.Module):
 
 
 class LiePoissonWithDirection(eqx.Module):
-    """`LiePoisson` for a `hamiltonian` H(Π, γ); `lie_poisson_with_direction` makes it."""
+    """Evaluate the vector field of a `hamiltonian` H(Π, γ); `lie_poisson_with_direction` makes
+    it.
+    """
 
     hamiltonian: Callable[[Any, Any], Any]
 
@@ -74,7 +78,7 @@ class LiePoissonWithDirection(eqx.Module):
 
 
 def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
-    """The vector field `dΠ/dt = Π × ∇H(Π)` on `Momentum`, of any Hamiltonian H(Π).
+    """Return the vector field `dΠ/dt = Π × ∇H(Π)` on `Momentum`, of any Hamiltonian H(Π).
 
     **Arguments:** `hamiltonian` a callable, best a Module, `Π → H`, J, with Π (3,), N m s, body
     frame; ∇H is then the body rate Ω. For `½ Π·I⁻¹Π`, `RotationalHamiltonian(inertia)`, these are
@@ -89,7 +93,8 @@ def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
 
 
 def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoissonWithDirection:
-    """The heavy-top form: `dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ`, `dγ/dt = γ × ∂H/∂Π`, of any H(Π, γ).
+    """Return the heavy-top vector field of any H(Π, γ): `dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ`, `dγ/dt = γ
+    × ∂H/∂Π`.
 
     **Arguments:** `hamiltonian` a callable, best a Module, `(Π, γ) → H`, J; for a heavy top
     `HeavyTopHamiltonian(inertia, top)`. H and the Casimirs |γ|² and Π·γ are conserved. Source: the
@@ -109,7 +114,7 @@ def _invertible(inertia: Any) -> _inertia.Inertia:
 
 
 class RotationalHamiltonian(eqx.Module):
-    """H = ½ Π·I⁻¹Π, the energy of rotation, J, a function of Π (3,).
+    """Compute H = ½ Π·I⁻¹Π, the energy of rotation, J, a function of Π (3,).
 
     **Arguments:** `inertia` about the centre of mass or a fixed point. **Raises:** `ValueError` for
     a moment known to be zero.
@@ -129,11 +134,11 @@ class RotationalHamiltonian(eqx.Module):
 
 
 class HeavyTopHamiltonian(eqx.Module):
-    """H = ½ Π·I⁻¹Π − m c·γ with γ = Rᵀ g, the energy of a heavy top, J.
+    """Compute H = ½ Π·I⁻¹Π − m c·γ with γ = Rᵀ g, the energy of a heavy top, J.
 
-    **Arguments:** `inertia` about the fixed point; `top` a `HeavyTop`, which gives m and c. It is a
-    function of Π (3,) and γ (3,), m/s², body frame; `start` makes the state. **Raises:**
-    `ValueError` for a moment known to be zero.
+    **Arguments:** `inertia` about the fixed point; `top` a `HeavyTop`, which gives m and c. The
+    object is a function of Π (3,) and γ (3,), m/s², body frame; `start` makes the state.
+    **Raises:** `ValueError` for a moment known to be zero.
 
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0, 0.5], [0.0, 0, -9.81])
     >>> H = HeavyTopHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0), top)
@@ -158,7 +163,7 @@ class HeavyTopHamiltonian(eqx.Module):
         return 0.5 * dot(pi, apply(self.inverse, pi)) - self.top.mass * dot(self.top.com, gamma)
 
     def start(self, state: HasAttitude) -> MomentumAndDirection:
-        """Π = IΩ and γ = Rᵀ g of an attitude and a body rate."""
+        """Return Π = IΩ and γ = Rᵀ g of an attitude and a body rate."""
         pi: Vec3 = apply(self.inertia.tensor, state.omega)
         return MomentumAndDirection(pi, quaternion.rotate_inverse(state.q, self.top.gravity))
 

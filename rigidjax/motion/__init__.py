@@ -1,7 +1,11 @@
-"""States of a body. What a motion conserves: `rj.conserved`, `rj.drift`, `rj.energy`."""
+"""Describe states of a body. For what a motion conserves see `rj.conserved`, `rj.drift`,
+`rj.energy`.
+"""
 
 from rigidjax._names import show
 from rigidjax._types import HasAttitude as HasAttitude, HasPose as HasPose, HasSpin as HasSpin
 from rigidjax.motion.equations import Attitude as Attitude, Rigid as Rigid, Spin as Spin
+
+__all__ = ["Attitude", "HasAttitude", "HasPose", "HasSpin", "Rigid", "Spin"]
 
 show(__name__)

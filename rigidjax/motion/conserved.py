@@ -1,4 +1,4 @@
-"""The conserved quantities of a scene, and their drift in a computed motion."""
+"""Compute the conserved quantities of a scene, and their drift in a computed motion."""
 
 from typing import Any
 
@@ -25,7 +25,8 @@ def energy(
     torque: Torque | None = None,
     t: ScalarLike = 0.0,
 ) -> Scalar:
-    """Kinetic energy and the potential of each torque and force, J: `½ m |v|² + ½ Ω·IΩ + U`.
+    """Return the kinetic energy plus the potential of each torque and force, J: `½ m |v|² + ½ Ω·IΩ
+    + U`.
 
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for torques that depend on
     time. Wheels add no energy, except for `ReactionWheels`. Under a torque with states of its own
@@ -40,8 +41,8 @@ def energy(
     turning, parts, t = _scene(body, state, torque, t)
     for part in parts:
         if not hasattr(part, "energy"):
-            words = f"energy: {type(part).__name__} has no potential (no energy(t, state, body))"
-            raise TypeError(f"{words}; give only the torques that have one, or see kinetic_energy")
+            words = f"energy: wanted torques with a potential, got {type(part).__name__}, which has"
+            raise TypeError(f"{words} no method energy(t, state, body); or take kinetic_energy")
     return _energy(in_precision(body, turning.omega.dtype), turning, parts, t)
 
 
@@ -51,11 +52,12 @@ def conserved(
     torque: Torque | None = None,
     t: ScalarLike = 0.0,
 ) -> dict[str, Float[Array, "..."]]:
-    """The conserved quantities of this scene's exact motion, at one state.
+    """Return the quantities that the exact motion of this scene conserves, at one state.
 
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s. A torque declares what it
-    conserves by optional members (see `rigidjax.torques.AbstractTorque`); without them nothing is
-    conserved. **Returns** a dict of the conserved quantities here, the same names at all times:
+    conserves by optional members (see `rigidjax.torques.AbstractTorque`); without these members
+    nothing is conserved. **Returns** a dict of the conserved quantities of this state, with one set
+    of names for all times:
 
     - `energy`, J: every torque has a potential and none depends on time;
     - `momentum` (3,), kg m²/s, world frame, `R(IΩ + h)`, and `momentum_squared`, the Casimir
@@ -93,7 +95,7 @@ def conserved(
             found["momentum_along_axis"] = dot(momentum, axis) / jnp.where(length > 0, length, 1)
     if isinstance(turning, HasPose) and isinstance(body, MassProperties):
         plain = [(part, part.law if isinstance(part, Frozen) else part) for part in parts]
-        # A torque that feels the place may return a force, too.
+        # A torque whose `feels` is `HasPose` may return a force as well.
         turns = lambda law: isinstance(law, AbstractTorque) and law.feels is not HasPose  # noqa: E731
         pushed = [part for part, law in plain if not turns(law)]
         if not pushed:
@@ -109,7 +111,8 @@ def drift(
     body: Inertia | MassProperties,
     torque: Torque | None = None,
 ) -> dict[str, Scalar]:
-    """The drift of each conserved quantity during a run, relative to its size.
+    """Return the drift of each conserved quantity during a run, relative to the size of the
+    quantity.
 
     **Arguments:** `ts` (T,) s; `ys` states with a leading time axis, as a `Coupled` if the torque
     has states of its own; `body`, `torque` as for `simulate`. **Returns** for each name of
@@ -149,7 +152,7 @@ def drift(
 
 
 def _scene(body: Any, state: Any, torque: Any, t: Any) -> tuple[Any, tuple[Any, ...], Scalar]:
-    """The body's state, its torques with their own states put in, and the time."""
+    """Return the body's state, its torques with their own states inserted, and the time."""
     if isinstance(state, Coupled):
         state, torque = state.motion, freeze(torque, state.own)
     parts = parts_of(torque)
@@ -167,7 +170,9 @@ def _energy(body: Any, state: HasSpin, parts: tuple[Any, ...], t: Scalar) -> Sca
 
 
 def _momentum(body: Any, state: HasSpin, parts: tuple[Any, ...], t: ScalarLike) -> Vec3:
-    """The whole angular momentum, (3,), body frame, with that of the wheels."""
+    """Return the whole angular momentum, (3,), body frame: that of the body plus that of the
+    wheels.
+    """
     momentum = angular_momentum(body, state)
     for part in parts:
         if hasattr(part, "internal_momentum"):
@@ -181,5 +186,5 @@ def _spin_size(body: Any, state: Any, torque: Torque | None, t: ScalarLike) -> S
 
 
 def _size(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:
-    """The length of each row; of numbers, their size."""
+    """Return the length of each row, or the absolute values of plain numbers."""
     return jnp.abs(values) if values.ndim == 1 else jnp.sqrt(jnp.sum(values**2, axis=-1))

@@ -1,4 +1,4 @@
-"""A body's state and the states of its torques, integrated together."""
+"""Integrate a body's state and the states of its torques together."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,12 +13,12 @@ from rigidjax.motion.torques.states import first_states, freeze, has_states, rat
 
 
 class Coupled(eqx.Module):
-    """The state of a body whose torque has states of its own, for the integrators.
+    """Hold the state of a body whose torque has states of its own, for the integrators.
 
-    `simulate` makes it itself and returns its parts, `sol.ys` and `sol.own`;
+    `simulate` makes a `Coupled` itself and returns its parts, `sol.ys` and `sol.own`;
     `rigidjax.batch.rollout` returns it; `rigidjax.conserved` and `energy` take it. **Arguments:**
-    `motion` a `Spin`, `Attitude` or `Rigid`; `own` a tuple of the states of each torque that has
-    some, as `Solution.own`.
+    `motion` a `Spin`, `Attitude` or `Rigid`; `own`, a tuple with the states of each torque that has
+    states, as `Solution.own`.
 
     >>> wheel = rj.torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0])
     >>> Coupled.start(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0, 2.0]), wheel).own
@@ -30,7 +30,9 @@ class Coupled(eqx.Module):
 
     @staticmethod
     def start(body: Any, state0: Any, torque: Any, t: ScalarLike = 0.0) -> "Coupled":
-        """The initial `state0` and states of `torque` (see `rigidjax.simulate`) at `t`, s."""
+        """Return the `Coupled` of `state0` and the initial states of `torque` (see
+        `rigidjax.simulate`) at `t`, s.
+        """
         _checks.single(body, (Inertia, MassProperties), "body")
         _checks.single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
         dtype = state0.omega.dtype
@@ -40,7 +42,7 @@ class Coupled(eqx.Module):
 
 
 class CoupledEquations(eqx.Module):
-    """The equations of a body, `field`, and of its torques' states as one vector field."""
+    """Evaluate the equations of a body, `field`, and of its torques' states as one vector field."""
 
     field: Callable[..., Any]
     body: Any
@@ -54,12 +56,12 @@ class CoupledEquations(eqx.Module):
 
 
 def started(body: Any, state0: Any, torque: Any, t: ScalarLike) -> Any:
-    """`state0`, as `Coupled` if the torque has states of its own."""
+    """Return `state0`, as a `Coupled` if the torque has states of its own."""
     if isinstance(state0, Coupled) or not has_states(torque):
         return state0
     return Coupled.start(body, state0, torque, t)
 
 
 def motion_of(y: Any) -> Any:
-    """The body's part of a state."""
+    """Return the body's part of the state `y`, which may be a `Coupled`."""
     return y.motion if isinstance(y, Coupled) else y

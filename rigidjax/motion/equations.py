@@ -1,4 +1,4 @@
-"""The states of a body and their equations of motion."""
+"""Define the states of a body and their equations of motion."""
 
 from typing import TypeVar
 
@@ -22,7 +22,7 @@ _HINT = "Inertia.from_tensor takes a matrix; from MassProperties pass .inertia"
 
 
 class Spin(eqx.Module):
-    """The state of a turning body without its attitude: the body rate alone.
+    """Hold the state of a turning body without its attitude: the body rate alone.
 
     **Arguments:** `omega` (3,) angular velocity Ω in the body frame, rad/s (notes, eq 49).
 
@@ -39,7 +39,7 @@ class Spin(eqx.Module):
 
 
 class Attitude(eqx.Module):
-    """The state of a body that turns: attitude and body rate.
+    """Hold the state of a body that turns: attitude and body rate.
 
     **Arguments:** `q` (4,) unit quaternion (w, x, y, z), **scalar first**, body → world (the `M` of
     the notes, eq 8); `omega` (3,) Ω in the body frame, rad/s. `simulate` and
@@ -61,7 +61,7 @@ class Attitude(eqx.Module):
 
 
 class Rigid(eqx.Module):
-    """The state of a body that moves: its place and velocity, attitude and body rate.
+    """Hold the state of a body that moves: position and velocity, attitude and body rate.
 
     **Arguments:** `x` (3,) position of the centre of mass, m, world frame (the `X` of the notes, eq
     1); `v` (3,) its velocity, m/s, world frame; `q` (4,) unit quaternion (w, x, y, z), scalar
@@ -87,7 +87,7 @@ class Rigid(eqx.Module):
 
 
 class EulerEquations(eqx.Module):
-    """Euler's equations `I dΩ/dt = IΩ × Ω + τ` as a vector field `f(t, y, args)`.
+    """Evaluate Euler's equations `I dΩ/dt = IΩ × Ω + τ` as a vector field `f(t, y, args)`.
 
     `inertia` is about the point that the body turns about; `torque` τ in the body frame, N m, or
     `None`. Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau
@@ -102,9 +102,11 @@ class EulerEquations(eqx.Module):
         _checks.single(inertia, Inertia, "inertia", hint=_HINT)
         if torque is not None:
             require_law(torque)
-        # Traced numbers are checked when a motion is computed: a fit may pass through bad ones.
+        # Traced numbers are checked when a motion is computed: on its way a fit may reach numbers
+        # that no body has.
         self.inertia = inertia.invertible() if _checks.known(inertia.tensor) else inertia
-        # Once per solve: a division inside the field costs 25 times the rest of it.
+        # The inverse is computed once per solve: a division inside the field costs 25 times as much
+        # as the rest of it.
         self.inverse = inverse(inertia.tensor)
         self.torque = torque
 
@@ -112,14 +114,14 @@ class EulerEquations(eqx.Module):
         return Spin(self.rate_of(t, y))
 
     def rate_of(self, t: ScalarLike, state: HasSpin) -> Vec3:
-        """dΩ/dt (3,), rad/s², body frame, of any state with a body rate."""
+        """Return dΩ/dt (3,), rad/s², body frame, of any state with a body rate."""
         torque = None
         if self.torque is not None:
             torque = evaluate(self.torque, t, state, self.inertia)
         return self.turned_by(torque, state)
 
     def turned_by(self, torque: Vec3 | None, state: HasSpin) -> Vec3:
-        """dΩ/dt (3,), rad/s², body frame, under a known torque (3,), N m, body frame."""
+        """Return dΩ/dt (3,), rad/s², body frame, under a known torque (3,), N m, body frame."""
         dtype = state.omega.dtype
         momentum = apply(self.inertia.tensor.astype(dtype), state.omega)
         turning = cross(momentum, state.omega)
@@ -129,7 +131,7 @@ class EulerEquations(eqx.Module):
 
 
 class AttitudeEquations(eqx.Module):
-    """Euler's equations and `dq/dt = ½ q ⊗ (0, Ω)` (notes, eq 50) as a vector field."""
+    """Evaluate Euler's equations and `dq/dt = ½ q ⊗ (0, Ω)` (notes, eq 50) as a vector field."""
 
     euler: EulerEquations
 
@@ -141,7 +143,8 @@ class AttitudeEquations(eqx.Module):
 
 
 class NewtonEuler(eqx.Module):
-    """Newton–Euler equations about the centre of mass as a vector field (notes, eqs 1, 50, 56, 84).
+    """Evaluate the Newton–Euler equations about the centre of mass as a vector field (notes, eqs 1,
+    50, 56, 84).
 
     `m dv/dt = F`, `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`; `torque` gives τ, or a `Wrench`.
     """
@@ -167,7 +170,9 @@ class NewtonEuler(eqx.Module):
 
 
 def on_the_group(state: State) -> State:
-    """The same state with its quaternion, if it has one, scaled to length 1; zero is refused."""
+    """Return the state with its quaternion, if it has one, scaled to length 1; refuse a quaternion
+    of zero.
+    """
     if isinstance(state, Coupled):
         return eqx.tree_at(lambda s: s.motion, state, on_the_group(state.motion))
     if isinstance(state, HasAttitude):
@@ -180,11 +185,11 @@ def on_the_group(state: State) -> State:
 
 
 def _unit(q: Quat) -> Quat:
-    """q/|q|, with the same rounding in every program.
+    """Return q/|q|, with equal rounding in every program.
 
     XLA replaces q/√n by a product with 1/√n in some programs. Reverse mode runs steps again in
-    another program: a different last digit changes step lengths, and the gradient belongs to
-    another discretisation (an error of 7e-6 at a tolerance of 1e-11). A separate root and quotient
-    are exact.
+    another program: a different last digit changes step lengths, and the gradient would belong to
+    another discretisation (an error of 7e-6 at a tolerance of 1e-11). A root and a quotient that
+    are separate operations round equally everywhere.
     """
     return q / lax.optimization_barrier(jnp.sqrt(square4(components(q))))

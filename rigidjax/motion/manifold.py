@@ -1,10 +1,10 @@
-"""Small changes of a state: ⊕, ⊖, the size of a change, and the names of its parts.
+"""Compute small changes of a state: ⊕, ⊖, the size of a change, and the names of its parts.
 
 A state is any tree of arrays: a `Spin`, an `Attitude`, a `Rigid`, a `Coupled`, a `frames.Point`, an
-array. A change of it is one vector, the numbers of the leaves in their order. A quaternion q of a
-state with an attitude has three, the rotation vector δθ (rad, body frame) of `q exp(δθ)`: a change
-of a `Rigid` is (x, v, δθ, Ω). Source: Solà, Deray and Atchuthan 2018, arXiv:1812.01537, right-⊕ and
-right-⊖.
+array. A change of a state is one vector, with the numbers of the leaves in their order. A
+quaternion q of a state with an attitude has three numbers there, the rotation vector δθ (rad, body
+frame) of `q exp(δθ)`: a change of a `Rigid` is (x, v, δθ, Ω). Source: Solà, Deray and Atchuthan
+2018, arXiv:1812.01537, right-⊕ and right-⊖.
 """
 
 import math
@@ -22,30 +22,36 @@ from rigidjax.rotation.linalg3 import components
 
 
 def dimension(state: Any) -> int:
-    """The size of a change of `state`: one less than its numbers for each quaternion."""
+    """Return the size of a change of `state`: the count of its numbers, less one for each
+    quaternion.
+    """
     return max((place.stop for place in _places(state)), default=0)
 
 
 def names(state: Any) -> tuple[str, ...]:
-    """The names of the leaves, in the order of their numbers in a change."""
+    """Return the names of the leaves, in the order of their numbers in a change."""
     paths = jax.tree.leaves_with_path(state)
     return tuple(jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths)
 
 
 def parts(state: Any, change: Float[Array, "*batch n"]) -> dict[str, Float[Array, "*batch _"]]:
-    """The numbers of each leaf in a change, by name; a quaternion has three."""
+    """Return the numbers of each leaf in a change, by name; a quaternion has three numbers
+    there.
+    """
     cut = (change[..., place] for place in _places(state))
     return dict(zip(names(state), cut, strict=True))
 
 
 def turns(state: Any) -> tuple[slice, ...]:
-    """The places of the rotation vectors in a change, one for each quaternion."""
+    """Return the slices of the rotation vectors in a change, one for each quaternion."""
     pairs = zip(_places(state), _turned(state), strict=True)
     return tuple(place for place, turned in pairs if turned)
 
 
 def plus(state: Any, change: Float[Array, " n"]) -> Any:
-    """`state ⊕ change`: q exp(δθ), and sums; exactly `state` at 0."""
+    """Return `state ⊕ change`: q exp(δθ) for quaternions, sums for other leaves; exactly `state` at
+    0.
+    """
 
     def turned(q: Array, part: Array) -> Array:
         return quaternion.multiply(q, vector_to_quaternion(part))
@@ -54,7 +60,9 @@ def plus(state: Any, change: Float[Array, " n"]) -> Any:
 
 
 def minus(state: Any, reference: Any) -> Float[Array, " n"]:
-    """`state ⊖ reference`: the change with `plus(reference, change) = state`, a turn of up to π."""
+    """Return `state ⊖ reference`: the change with `plus(reference, change) = state`, a turn of up
+    to π.
+    """
     return _vector(
         state,
         reference,
@@ -64,7 +72,10 @@ def minus(state: Any, reference: Any) -> Float[Array, " n"]:
 
 
 def minus_small(state: Any, reference: Any) -> Float[Array, " n"]:
-    """`minus` for a near state, without an arctangent: a turn by θ gives 2 sin(θ/2), not θ."""
+    """Return `state ⊖ reference` for a near state, without an arctangent.
+
+    A turn by θ gives 2 sin(θ/2), not θ.
+    """
 
     def turn(q: Array, q0: Array) -> Array:
         w, *u = components(quaternion.multiply(quaternion.conjugate(q0), q))
@@ -75,12 +86,12 @@ def minus_small(state: Any, reference: Any) -> Float[Array, " n"]:
 
 
 def tangent(state: Any, change: Float[Array, " n"]) -> Any:
-    """The derivative of `plus(state, ·)` at zero along a change: a tangent vector of JAX."""
+    """Return the derivative of `plus(state, ·)` at zero along `change`: a tangent vector of JAX."""
     return _leaf_by_leaf(state, change, quaternion.rate, lambda _, part: part)
 
 
 def coordinates(state: Any, along: Any) -> Float[Array, " n"]:
-    """The change whose `tangent` at `state` is `along`: the inverse of `tangent`."""
+    """Return the change whose `tangent` at `state` is `along`: the inverse of `tangent`."""
     return _vector(
         along,
         state,
@@ -90,7 +101,7 @@ def coordinates(state: Any, along: Any) -> Float[Array, " n"]:
 
 
 def _turned(state: Any) -> list[bool]:
-    """Whether each leaf is the quaternion of a state with an attitude."""
+    """Return, for each leaf, whether it is the quaternion of a state with an attitude."""
     out = []
     for node in jax.tree.leaves(state, is_leaf=lambda node: isinstance(node, HasAttitude)):
         q = node.q if isinstance(node, HasAttitude) else None
@@ -99,7 +110,7 @@ def _turned(state: Any) -> list[bool]:
 
 
 def _places(state: Any) -> list[slice]:
-    """The places of the numbers of each leaf in a change."""
+    """Return the slice of each leaf's numbers in a change."""
     end, out = 0, []
     for leaf, turned in zip(jax.tree.leaves(state), _turned(state), strict=True):
         begin, end = end, end + math.prod(jnp.shape(leaf)) - turned
@@ -113,6 +124,7 @@ def _leaf_by_leaf(
     of_quaternion: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> Any:
+    """Return the tree of `of_quaternion` or `of_others`, of each leaf and its part of `change`."""
     (leaves, tree), out = jax.tree.flatten(state), []
     for leaf, place, turned in zip(leaves, _places(state), _turned(state), strict=True):
         part = change[place] if turned else change[place].reshape(jnp.shape(leaf))
@@ -126,6 +138,7 @@ def _vector(
     of_quaternions: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> Array:
+    """Return one vector of `of_quaternions` or `of_others`, of the leaves of two trees in pairs."""
     pairs = zip(jax.tree.leaves(first), jax.tree.leaves(second), _turned(second), strict=True)
     out = [
         of_quaternions(a, b) if turned else of_others(a, b).reshape(-1) for a, b, turned in pairs

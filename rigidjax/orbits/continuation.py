@@ -1,4 +1,6 @@
-"""Families of periodic orbits: continuation by the orbit's derivatives, stability, branches."""
+"""Follow families of periodic orbits: continuation by the orbit's derivatives, stability,
+branches.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -26,16 +28,17 @@ def family(
     *,
     hold: str = "x",
 ) -> PeriodicOrbit:
-    """The members of the family of `orbit` at which `hold` has these values, one by one.
+    """Return the members of the family of `orbit` at which the number `hold` has the given
+    `values`.
 
-    The start of each member comes from the member before and its tangent; `periodic_orbit` corrects
-    it.
+    The members are computed one by one: the member before and its tangent give the start, which
+    `periodic_orbit` corrects.
 
-    **Arguments:** `orbit` one near the first of them; `values` (N,), each near the one before;
+    **Arguments:** `orbit`, near the first member; `values` (N,), each near the value before it;
     `hold` `"x"`, `"z"`, `"vy"` or `"period"`, which must be monotone along the family (use `follow`
     past a fold). **Returns** a `PeriodicOrbit` with a leading axis; its derivatives by μ and
     `values` are those of the family, forward and reverse. **Raises:** `ValueError`
-    (`EquinoxRuntimeError` under `jit`) with the value at which it was lost.
+    (`EquinoxRuntimeError` under `jit`) with the value at which the family was lost.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> start = moon.lyapunov_guess(1, 0.01)
@@ -58,7 +61,7 @@ def family(
 
 
 def _lost(start: Array, numbers: Array, left: Array) -> Array:
-    """The members that Newton's method did not find, or for which it found another solution."""
+    """Return, for each member, whether Newton's method failed or found another solution."""
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
     return ~((left <= correction.usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
@@ -67,7 +70,9 @@ def _lost(start: Array, numbers: Array, left: Array) -> Array:
 def _found(
     numbers: Array, lost: Array, where: Callable[[int], str], what: str, advice: str
 ) -> PeriodicOrbit:
-    """The members, unless one was lost; a known one is named by `where` of its number."""
+    """Return the members as orbits; raise an error if one was lost, with `where` of its number if
+    it is known.
+    """
     known = _checks.known(lost) and bool(lost.any())
     words = what + (where(int(np.argmax(np.asarray(lost)))) if known else "") + advice
     return jax.vmap(orbit_of)(_checks.refuse(numbers, lost.any(), words))
@@ -86,7 +91,7 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
         numbers = correction.together(found, value, index)
         return numbers, (numbers, left)
 
-    # A first correction: its tangent is wanted at an orbit, not at a guess.
+    # The guess is corrected first: the tangent is needed at an orbit.
     held_now = lax.stop_gradient(start[index])
     found, _ = correction.corrected(index, tolerance, still, start[free], held_now)
     _, out = lax.scan(step, correction.together(found, start[index], index), held)
@@ -94,11 +99,11 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
 
 
 def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> PeriodicOrbit:
-    """The derivative of an orbit's start and period along its family, by `hold`.
+    """Return the derivative by `hold` of an orbit's start and period along its family.
 
-    **Arguments:** `orbit` a member of it; `hold` as in `family`. **Returns** the derivatives in the
-    shape of an orbit: `.period` is d period/d hold. They are exact (implicit function theorem).
-    **Raises:** `ValueError` at a fold of the family in `hold`.
+    **Arguments:** `orbit` a member of the family; `hold` as in `family`. **Returns** the
+    derivatives in the shape of an orbit: `.period` is d period/d hold. They are exact (implicit
+    function theorem). **Raises:** `ValueError` at a fold of the family in `hold`.
 
     >>> hill, start = rj.orbits.hill(), rj.Point([0.3, 0, 0], [0.0, 1.6, 0])
     >>> orbit = hill.periodic_orbit(rj.orbits.PeriodicOrbit(start, 1.2))
@@ -112,7 +117,9 @@ def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> Period
 
 
 def _along(scene: Any, numbers: Array, index: int) -> Float[Array, "3"]:
-    """The derivative of the other numbers of an orbit by the held one, along its family."""
+    """Return the derivative of the other three numbers of an orbit by the held number, along its
+    family.
+    """
     _, matrix = correction.value_and_jacobian(lambda n: correction.miss(scene, n), numbers)
     return -jnp.linalg.solve(matrix[:, np.delete(np.arange(4), index)], matrix[:, index])
 
@@ -121,22 +128,23 @@ def _along(scene: Any, numbers: Array, index: int) -> Float[Array, "3"]:
 def _slope(scene: Any, numbers: Array, index: int) -> PeriodicOrbit:
     unknown = _along(scene, numbers, index)
     change = orbit_of(correction.together(unknown, jnp.ones_like(unknown[0]), index))
-    # `period` held means the whole of it, the number in `numbers` is the half.
+    # To hold `period` means the whole period; the fourth of `numbers` is half of it.
     return jax.tree.map(lambda leaf: 0.5 * leaf, change) if index == 3 else change
 
 
 def follow(
     scene: Any, orbit: PeriodicOrbit, step: ScalarLike, count: int, *, rising: str = "x"
 ) -> PeriodicOrbit:
-    """The next `count` members of a family, at fixed steps of arclength, past its folds.
+    """Return the next `count` members of a family, at fixed steps of arclength, past its folds.
 
-    Pseudo-arclength continuation in (x, z, v_y, T/2): a member is a `step` along the tangent,
-    corrected by Newton's method across it (Keller 1977, in Applications of Bifurcation Theory).
+    Pseudo-arclength continuation in (x, z, v_y, T/2): each member is a `step` along the tangent,
+    then Newton's method across the tangent (Keller 1977, in Applications of Bifurcation Theory).
 
     **Arguments:** `orbit` a member, not returned; `step` arclength, with the sign of the direction;
     `rising` the number that grows at first for a positive `step`. **Returns** a `PeriodicOrbit`
     with a leading axis; for derivatives of a member give it to `periodic_orbit`. **Raises:**
-    `ValueError` (`EquinoxRuntimeError` under `jit`) with the number of members before it was lost.
+    `ValueError` (`EquinoxRuntimeError` under `jit`) with the number of members found before the
+    family was lost.
     """
     start, index = crossing(orbit), named(rising)
     length = _checks.floating(step, (), "step").astype(start.dtype)
@@ -159,7 +167,7 @@ def _follow(scene: Any, start: Array, step: Array, count: int, index: int, toler
         return correction.miss(scene, numbers)
 
     def tangent(matrix: Array, before: Array) -> Array:
-        """The direction in which the residual stays 0, on the side of `before`."""
+        """Return the unit direction in which the residual stays 0, on the side of `before`."""
         rows = jnp.concatenate([matrix, before[None]])
         along = jnp.linalg.solve(rows, jnp.zeros(4, start.dtype).at[3].set(1))
         return along / jnp.sqrt(jnp.sum(along * along))
@@ -182,7 +190,9 @@ def _follow(scene: Any, start: Array, step: Array, count: int, index: int, toler
 
 
 def stability_indices(monodromy: Float[Array, "6 6"]) -> Complex[Array, "2"]:
-    """The two ν = ½(λ + 1/λ) of the multipliers λ that are not 1, from tr M and tr M²."""
+    """Return the two indices ν = ½(λ + 1/λ) of the multipliers λ that are not 1, from tr M and tr
+    M².
+    """
     total = jnp.trace(monodromy) - 2
     squares = jnp.sum(monodromy * monodromy.T) + 2
     half = 0.5 * total
@@ -201,17 +211,17 @@ def bifurcation(
     value: float = 1.0,
     hold: str = "x",
 ) -> PeriodicOrbit:
-    """The member of a family between two others at which a stability index has a given value.
+    """Return the member between two members of a family at which a stability index equals `value`.
 
     At 1 a family of the same period branches off, or the family has a fold; at −1 one of twice the
     period; at cos(2πp/q) one of q times the period. `index` 1 of planar Lyapunov orbits belongs to
     motion across the plane; the halo orbits begin at its value 1.
 
     **Arguments:** `orbit`, `other` two members near each other, with the value between their
-    indices; `index` 0 or 1 of `stability_indices`; `value` of it; `hold` the number of the family
-    for the search, `"x"`, `"z"`, `"vy"` or `"period"`. It works on the host. Source: Howell 1984,
-    doi:10.1007/BF01358403; Robin and Markellos 1980, doi:10.1007/BF01231183. **Raises:**
-    `ValueError` if the value does not lie between, or the indices are complex.
+    indices; `index` 0 or 1 of `stability_indices`; `value` of this index; `hold` the number of the
+    family for the search, `"x"`, `"z"`, `"vy"` or `"period"`. The search runs on the host. Source:
+    Howell 1984, doi:10.1007/BF01358403; Robin and Markellos 1980, doi:10.1007/BF01231183.
+    **Raises:** `ValueError` if the value does not lie between, or the indices are complex.
     """
     from scipy.optimize import brentq
 

@@ -1,4 +1,6 @@
-"""The circular restricted three-body problem, and its limit near the small body: Hill's problem."""
+"""Describe the circular restricted three-body problem, and its limit near the small body: Hill's
+problem.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,17 +19,17 @@ from rigidjax.rotation.linalg3 import components
 
 
 def smallest_distance(dtype: Any) -> float:
-    """The distance at which an attraction is known only to eps/r = eps^0.6: eps^0.4."""
+    """Return eps^0.4, the distance r at which an attraction is known only to eps/r = eps^0.6."""
     return float(jnp.finfo(dtype).eps) ** 0.4
 
 
 class ThreeBody(AbstractReversible):
-    """A particle under two bodies on circular orbits; `orbits.cr3bp(mu)` makes it.
+    """Describe a particle under two bodies on circular orbits; `orbits.cr3bp(mu)` makes it.
 
-    Rotating axes, origin at the common centre of mass, the first body (mass 1 − μ) at (−μ, 0, 0),
-    the second (mass μ) at (1 − μ, 0, 0). Units: their distance, their total mass, and 1/(their
-    angular rate); their period is 2π. **Fields:** `mu` μ, scalar; `radii` (2,) of the bodies, for
-    collisions.
+    The axes rotate, with the origin at the common centre of mass, the first body (mass 1 − μ) at
+    (−μ, 0, 0), the second (mass μ) at (1 − μ, 0, 0). Units: their distance, their total mass, and
+    1/(their angular rate); their period is 2π. **Fields:** `mu` μ, scalar; `radii` (2,) of the
+    bodies, for collisions.
 
     >>> scene = cr3bp(0.5)
     >>> [float(r) for r in scene.distances(jnp.array([0.0, 0.0, 0.0]))]
@@ -38,7 +40,9 @@ class ThreeBody(AbstractReversible):
     radii: Float[Array, "2"]
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """d²x/dt² (3,), rotating axes: attraction, centrifugal and Coriolis (notes, eq 91)."""
+        """Return d²x/dt² (3,), rotating axes: attraction, centrifugal and Coriolis (notes, eq
+        91).
+        """
         x, y, z = components(state.x)
         vx, vy, _ = components(state.v)
         mu = self.mu.astype(x.dtype)
@@ -50,21 +54,23 @@ class ThreeBody(AbstractReversible):
         return jnp.stack([2 * vy + x - a1 * first - a2 * second, y - 2 * vx - pull * y, -pull * z])
 
     def potential(self, x: Vector) -> Scalar:
-        """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ at `x` (3,) (Szebehely, sec. 1.5, no constant)."""
+        """Return U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ at `x` (3,) (Szebehely, sec. 1.5, no
+        constant).
+        """
         x = _checks.floating(x, (3,), "x")
         r1, r2 = self.distances(x)
         mu = self.mu.astype(x.dtype)
         return 0.5 * (x[0] * x[0] + x[1] * x[1]) + (1 - mu) / r1 + mu / r2
 
     def distances(self, x: Vector) -> tuple[Scalar, Scalar]:
-        """The distances of a place (3,) from the first and from the second body."""
+        """Return the distances of a place (3,) from the first and from the second body."""
         a, b, c = components(_checks.floating(x, (3,), "x"))
         mu = self.mu.astype(a.dtype)
         first, second, flat = a + mu, (a - 1) + mu, b * b + c * c
         return jnp.sqrt(first * first + flat), jnp.sqrt(second * second + flat)
 
     def jacobi_constant(self, state: Point) -> Scalar:
-        """C = 2U − |v|², conserved along the motion (Szebehely 1967, eq 1.5(20)).
+        """Return C = 2U − |v|², conserved along the motion (Szebehely 1967, eq 1.5(20)).
 
         >>> float(rj.orbits.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
         4.0
@@ -73,7 +79,9 @@ class ThreeBody(AbstractReversible):
         return self.speed_squared(state.x, 0.0) - jnp.sum(state.v * state.v)
 
     def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:
-        """|v|² = 2U(x) − C at `x` (3,) for C = `jacobi`; negative where no such particle comes."""
+        """Return |v|² = 2U(x) − C at `x` (3,) for C = `jacobi`; it is negative where no particle
+        with this C can be.
+        """
         u = self.potential(x)
         return 2 * u - _checks.floating(jacobi, (), "jacobi").astype(u.dtype)
 
@@ -82,7 +90,8 @@ class ThreeBody(AbstractReversible):
         xs: Float[ArrayLike, " columns"] | Sequence[float],
         ys: Float[ArrayLike, " rows"] | Sequence[float],
     ) -> Float[Array, "rows columns"]:
-        """2U on a grid of the plane z = 0, rows along y; a particle of constant C stays at 2U ≥ C.
+        """Return 2U on a grid of the plane z = 0, rows along y; a particle of constant C stays
+        where 2U ≥ C.
 
         **Arguments:** `xs`, `ys` places along the axes. `matplotlib.pyplot.contour(xs, ys, grid,
         levels=[C])` draws the curve of zero velocity (Szebehely 1967, sec. 4.7).
@@ -102,21 +111,23 @@ class ThreeBody(AbstractReversible):
         return jax.vmap(along, (None, 0))(columns, rows.astype(columns.dtype))
 
     def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-        """Distances from the two bodies, and the distances of a collision, which ends a run."""
+        """Return the distances from the two bodies, and the distances at which a collision ends the
+        run.
+        """
         gaps = jnp.stack(self.distances(state.x))
         return gaps, jnp.maximum(self.radii.astype(gaps.dtype), smallest_distance(gaps.dtype))
 
     @property
     def lagrange_points(self) -> Float[Array, "5 3"]:
-        """L1 … L5 (5, 3), rotating axes (Szebehely 1967, sec. 4.4), differentiable by μ."""
+        """Return L1 … L5 (5, 3), rotating axes (Szebehely 1967, sec. 4.4), differentiable by μ."""
         return richardson.points(self.mu)
 
     def hessian(self, x: Vector) -> Mat3:
-        """The second derivatives of U (3, 3) at a place."""
+        """Return the second derivatives of U (3, 3) at a place."""
         return jax.hessian(self.potential)(_checks.floating(x, (3,), "x"))
 
     def exponents(self, x: Vector) -> Complex[Array, "6"]:
-        """The six exponents λ of small motions about an equilibrium in the plane, e^{λt}.
+        """Return the six exponents λ of small motions e^{λt} about an equilibrium in the plane.
 
         **Arguments:** `x` (3,), such as a row of `lagrange_points`. The equilibrium is stable to
         first order if no real part is positive: L4 and L5 below Routh's μ = ½(1 − √(23/27)), L1–L3
@@ -137,14 +148,14 @@ class ThreeBody(AbstractReversible):
         return jnp.concatenate([roots, -roots])
 
     def lyapunov_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
-        """A start near a planar Lyapunov orbit about L1, L2 or L3, for `periodic_orbit`.
+        """Return a start near a planar Lyapunov orbit about L1, L2 or L3, for `periodic_orbit`.
 
         **Arguments:** `point` 1, 2 or 3; `amplitude` along x. Source: `richardson.guess`.
         """
         return richardson.guess(self.mu, point, amplitude, None)
 
     def halo_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
-        """A start near a halo orbit about L1, L2 or L3, for `periodic_orbit(…, hold="z")`.
+        """Return a start near a halo orbit about L1, L2 or L3, for `periodic_orbit(…, hold="z")`.
 
         **Arguments:** `point` 1, 2 or 3; `amplitude` along z, whose sign is that of the branch.
         Source: Richardson 1980, doi:10.1007/BF01229511 (third order).
@@ -153,7 +164,7 @@ class ThreeBody(AbstractReversible):
 
 
 def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> ThreeBody:
-    """The circular restricted three-body problem with mass ratio μ.
+    """Return the circular restricted three-body problem with mass ratio μ.
 
     **Arguments:** `mu` μ = m₂/(m₁ + m₂), 0 < μ ≤ ½ (Earth–Moon 0.01215…); `radii` (2,) of the two
     bodies in units of their distance. A run that comes closer ends, with the collision's body, time
@@ -173,10 +184,11 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
 
 
 class Hill(AbstractReversible):
-    """A particle near a small body on a circular orbit about a large one; `orbits.hill()` makes it.
+    """Describe a particle near a small body on a circular orbit about a large one; `orbits.hill()`
+    makes it.
 
-    Rotating axes centred on the small body, x away from the large one. Units: μ^{1/3} of the
-    bodies' distance, and 1/(their angular rate). **Field:** `radius` of the small body.
+    The rotating axes are centred on the small body, with x away from the large body. Units: μ^{1/3}
+    of the bodies' distance, and 1/(their angular rate). **Field:** `radius` of the small body.
 
     >>> scene = hill()
     >>> float(scene.acceleration(0.0, Point([1.0, 0, 0], [0.0, 0, 0]))[0])  # 3 x − x/r³
@@ -186,7 +198,7 @@ class Hill(AbstractReversible):
     radius: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """d²x/dt² = 2 v_y + 3x − x/r³, −2 v_x − y/r³, −z − z/r³."""
+        """Return d²x/dt² = 2 v_y + 3x − x/r³, −2 v_x − y/r³, −z − z/r³."""
         x, y, z = components(state.x)
         vx, vy, _ = components(state.v)
         square = x * x + y * y + z * z
@@ -194,7 +206,7 @@ class Hill(AbstractReversible):
         return jnp.stack([2 * vy + 3 * x - pull * x, -2 * vx - pull * y, -z - pull * z])
 
     def jacobi_constant(self, state: Point) -> Scalar:
-        """C = 3x² − z² + 2/r − |v|² (Hill 1878).
+        """Return C = 3x² − z² + 2/r − |v|² (Hill 1878).
 
         >>> float(Hill(jnp.asarray(0.0)).jacobi_constant(Point([1.0, 0, 0], [0.0, 0, 0])))
         5.0
@@ -205,20 +217,22 @@ class Hill(AbstractReversible):
         return 3 * x * x - z * z + 2 / jnp.sqrt(x * x + y * y + z * z) - speed
 
     def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
-        """Distance from the small body, and the distance of a collision, which ends a run."""
+        """Return the distance from the small body, and the distance at which a collision ends the
+        run.
+        """
         gap = jnp.sqrt(jnp.sum(state.x * state.x, keepdims=True))
         least = jnp.maximum(self.radius.astype(gap.dtype), smallest_distance(gap.dtype))
         return gap, least.reshape(1)
 
     @property
     def lagrange_points(self) -> Float[Array, "2 3"]:
-        """L1 and L2 (2, 3), at x = ∓3^{−1/3}."""
+        """Return L1 and L2 (2, 3), at x = ∓3^{−1/3}."""
         place = jnp.zeros(3, self.radius.dtype).at[0].set(3.0 ** (-1 / 3))
         return jnp.stack([-place, place])
 
 
 def hill(radius: ScalarLike = 0.0) -> Hill:
-    """Hill's problem, the limit of `cr3bp(mu)` as μ → 0 in units of μ^{1/3}.
+    """Return the scene of Hill's problem, the limit of `cr3bp(mu)` as μ → 0 in units of μ^{1/3}.
 
     **Arguments:** `radius` of the small body, in these units, for collisions. Source: Hill 1878,
     doi:10.2307/2369430; Szebehely 1967, sec. 10.4.

@@ -1,4 +1,4 @@
-"""Periodic orbits by Newton's method, with the derivatives of their family."""
+"""Find periodic orbits by Newton's method, with the derivatives of their family."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ MAX_STEPS = 25
 
 
 class PeriodicOrbit(eqx.Module):
-    """A periodic orbit: a state on it, and its period.
+    """Hold a periodic orbit: a state on it, and its period.
 
     **Arguments:** `state` a `Point`; `period` its period, in the scene's unit of time.
 
@@ -44,16 +44,16 @@ class PeriodicOrbit(eqx.Module):
 def periodic_orbit(
     scene: Any, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float | None = None
 ) -> PeriodicOrbit:
-    """The periodic orbit near `guess`, by differentiable correction.
+    """Return the periodic orbit near `guess`, by differentiable correction.
 
-    It finds orbits symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and most others in
-    use. They cross this plane at a right angle (y = v_x = v_z = 0) twice a period. Newton's method
-    on three of (x, z, v_y, T/2) makes y, v_x, v_z vanish at the half period.
+    The method finds orbits that are symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and
+    most others in use. These cross the plane at a right angle (y = v_x = v_z = 0) twice a period.
+    Newton's method on three of (x, z, v_y, T/2) makes y, v_x, v_z vanish at the half period.
 
     **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right angle;
-    `hold` the fixed one of `"x"`, `"z"`, `"vy"`, `"period"`, which labels the orbit within its
-    family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` largest |y|, |v_x|, |v_z|
-    at the half period, 1e-12 by default (1e-4 in float32).
+    `hold` the number that stays fixed, `"x"`, `"z"`, `"vy"` or `"period"`, which labels the orbit
+    within its family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` the largest
+    |y|, |v_x|, |v_z| at the half period, 1e-12 by default (1e-4 in float32).
 
     **Returns** a `PeriodicOrbit`. Its derivatives by μ and the held number are those of the family,
     by the implicit function theorem, forward and reverse. Source: Howell 1984,
@@ -85,12 +85,12 @@ def periodic_orbit(
 
 
 def named(hold: str) -> int:
-    """The index of `hold` among the four numbers of a crossing."""
+    """Return the index of `hold` among the four numbers of a crossing."""
     return _NAMES.index(_checks.word(hold, _NAMES, "hold"))
 
 
 def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
-    """The four numbers of an orbit that crosses y = 0 at a right angle: x, z, v_y, T/2."""
+    """Return the four numbers of an orbit that crosses y = 0 at a right angle: x, z, v_y, T/2."""
     made = "lyapunov_guess and halo_guess make one"
     wanted = "a PeriodicOrbit(state, period)"
     _checks.instance(guess, PeriodicOrbit, "guess", wanted=wanted, hint=made)
@@ -105,28 +105,33 @@ def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
 
 
 def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
-    """The inverse of `crossing`."""
+    """Return the orbit with these four numbers: the inverse of `crossing`."""
     x, z, vy, half = components(numbers)
     zero = jnp.zeros_like(x)
     return PeriodicOrbit(Point(jnp.stack([x, zero, z]), jnp.stack([zero, vy, zero])), 2 * half)
 
 
 def together(unknown: Float[Array, "3"], held: Scalar, index: int) -> Float[Array, "4"]:
-    """The four numbers of a crossing, with the held one in its place among the others."""
+    """Return the four numbers of a crossing: the three unknown ones with the held one inserted at
+    `index`.
+    """
     parts = list(unknown)
     parts.insert(index, held)
     return jnp.stack(parts)
 
 
 def usual_tolerance(numbers: Array) -> float:
-    """The tolerance of y, v_x, v_z at the half period: 1e-12, in float32 1e-4."""
+    """Return the tolerance of y, v_x, v_z at the half period: 1e-12, in float32 1e-4."""
     return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
 
 
 def solved(
     scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **how: Any
 ) -> dfx.Solution:
-    """The motion from 0 to `t`, with derivatives in forward mode; `how` as for `diffeqsolve`."""
+    """Return the motion from 0 to `t`, with derivatives in forward mode.
+
+    Further arguments `how` are those of `diffrax.diffeqsolve`.
+    """
     motion = dfx.ODETerm(scene.field), dfx.Dopri8(), jnp.zeros_like(t), t, None, state
     how |= dict(adjoint=dfx.ForwardMode(), max_steps=100_000, throw=False)
     how["stepsize_controller"] = dfx.PIDController(rtol=rtol, atol=atol)
@@ -137,7 +142,7 @@ def solved(
 def after(
     scene: AbstractScene, numbers: Float[Array, "6"], t: Array, *, rtol: float, atol: float
 ) -> Float[Array, "6"]:
-    """(x, v) a time `t` after `numbers`; an error if the solve fails."""
+    """Return (x, v) at a time `t` after the state `numbers`; raise an error if the solve fails."""
     out = solved(scene, Point(numbers[:3], numbers[3:]), t.astype(numbers.dtype), rtol, atol)
     end: Any = out.result.error_if(out.ys, out.result != dfx.RESULTS.successful)
     return jnp.concatenate([end.x[0], end.v[0]])
@@ -146,7 +151,9 @@ def after(
 def transition(
     scene: Any, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
 ) -> Float[Array, "6 6"]:
-    """The state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) of `state`, by forward mode."""
+    """Return the state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) from `state`, by forward
+    mode.
+    """
     _checks.instance(state, Point, "state", wanted="a Point(x, v)")
     t = _checks.finite(_checks.floating(t, (), "t"), "t")
     return _transition(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
@@ -159,7 +166,7 @@ def _transition(scene: Any, numbers: Array, t: Array, rtol: float, atol: float) 
 
 
 def miss(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
-    """y, v_x and v_z at the half period: an orbit is periodic if they vanish."""
+    """Return y, v_x and v_z at the half period: an orbit is periodic if they vanish."""
     orbit = orbit_of(numbers)
     tight = float(jnp.finfo(numbers.dtype).eps)
     out = solved(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight)
@@ -169,13 +176,15 @@ def miss(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
 
 
 def value_and_jacobian(f: Any, x: Array) -> tuple[Array, Array]:
-    """f(x) and its Jacobian from one pass in forward mode."""
+    """Return f(x) and its Jacobian from one pass in forward mode."""
     along = jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 1))
     return along(jnp.eye(x.shape[0], dtype=x.dtype))
 
 
 def newton(f: Any, x: Array, tolerance: float) -> Array:
-    """A zero of `f` near `x`: steps until the residual is a tenth of the tolerance."""
+    """Return a zero of `f` near `x`, by Newton steps until the residual is below a tenth of the
+    tolerance.
+    """
 
     def keep_on(carry: Any) -> Any:
         _, left, count = carry
@@ -185,14 +194,15 @@ def newton(f: Any, x: Array, tolerance: float) -> Array:
         x, _, count = carry
         missed, slope = value_and_jacobian(f, x)
         moved = x - jnp.linalg.solve(slope, missed)
-        # The miss before the last move says how good the last start was; stop once it is small.
+        # The residual is that at the start of this step: it costs no further solve. Newton's method
+        # converges quadratically, so that the result is better still.
         return jnp.where(jnp.isfinite(moved), moved, x), jnp.max(jnp.abs(missed)), count + 1
 
     return lax.while_loop(keep_on, step, (x, jnp.full_like(x[0], jnp.inf), 0))[0]
 
 
-# Newton itself is not differentiated: the rule below is linear in the tangents, so that the same
-# one serves jacfwd and grad although the solves within run in forward mode.
+# Newton's method itself is not differentiated. The rule below is linear in the tangents, so that
+# one rule serves jacfwd and grad, although the solves inside run in forward mode.
 @eqx.filter_jit
 def _solve(scene: Any, unknown: Array, held: Array, index: int, tolerance: float) -> Any:
     return corrected(index, float(tolerance), scene, unknown, held)
@@ -212,8 +222,8 @@ def _corrected_jvp(primals: Any, tangents: Any) -> Any:
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents
     found, left = corrected(index, tolerance, scene, unknown, held)
-    # All derivatives of the miss as one matrix, so that the rule stays linear in the tangents and
-    # can be transposed.
+    # All derivatives of the residual are one matrix, so that the rule stays linear in the tangents
+    # and can be transposed.
     numbers, rest = eqx.partition(scene, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(numbers)
     flat, unflatten = ravel_pytree((leaves, held, found))

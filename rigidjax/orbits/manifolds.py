@@ -1,4 +1,4 @@
-"""Stable and unstable manifolds of periodic orbits."""
+"""Compute stable and unstable manifolds of periodic orbits."""
 
 from functools import partial
 from typing import Any
@@ -21,17 +21,17 @@ from rigidjax.solve.run import Ends
 # A motion backwards in time is the mirror image in y → −y: x, y, z, vx, vy, vz.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 _TIGHT = dict(rtol=1e-13, atol=1e-14)
-# What is left of an eigenvector after each step of inverse iteration is a hundredth at most.
+# Each step of inverse iteration reduces the error of an eigenvector to a hundredth at most.
 _ITERATIONS = 12
 
 
 class Manifold(eqx.Module):
-    """Motions from a periodic orbit, or towards it.
+    """Hold motions that start near a periodic orbit, or approach it.
 
     **Fields:** `ts` (T,) since the start near the orbit, in the scene's unit, decreasing for a
     stable manifold; `states` a `Point` with axes (N, T), one motion for each phase, NaN after a
-    collision; `phases` (N,) of their starts on the orbit, in periods; `multiplier` λ of a small
-    distance along it in a period.
+    collision; `phases` (N,) of their starts on the orbit, in periods; `multiplier` λ, by which a
+    small distance along the manifold grows in a period.
 
     >>> ts, phases = jnp.array([0.0, 0.1]), jnp.array([0.0])
     >>> states = Point(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)))
@@ -46,9 +46,10 @@ class Manifold(eqx.Module):
 
 
 def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]:
-    """The multiplier λ of an orbit with the largest size, and its eigenvector, of length 1.
+    """Return the multiplier λ of an orbit with the largest size, and its eigenvector, of length 1.
 
-    From traces, inverse iteration and one bordered solve; NaN if none is real and larger than 1.
+    They are found from traces, inverse iteration and one bordered solve; they are NaN if no
+    multiplier is real and larger than 1.
     """
     index = continuation.stability_indices(monodromy)
     real = jnp.abs(index.imag) <= 1e-6 * jnp.abs(index)
@@ -58,7 +59,7 @@ def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]
     safe = jnp.where(free, index, 2.0)
     value = safe + jnp.sign(safe) * jnp.sqrt(safe * safe - 1)
     eye = jnp.eye(6, dtype=monodromy.dtype)
-    # A shift off the root of round-off: else the matrix may be singular to the last digit.
+    # The shift differs from the eigenvalue by √eps: else the matrix may be singular to round-off.
     near = value * (1 + jnp.finfo(value.dtype).eps ** 0.5)
     still, shift = lax.stop_gradient((monodromy, near))
 
@@ -70,7 +71,8 @@ def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]
 
     first = jnp.asarray(np.full(6, 6**-0.5), monodromy.dtype)
     right, left = lax.fori_loop(0, _ITERATIONS, closer, (first, first))
-    # (M − λ) v + m left = 0, right · v = 1.
+    # The bordered system (M − λ) v + m left = 0, right · v = 1 is regular although M − λ is not; it
+    # gives v its derivatives.
     top = jnp.concatenate([monodromy - value * eye, left[:, None]], 1)
     last = jnp.concatenate([right, jnp.zeros(1, right.dtype)])[None]
     wanted = jnp.zeros(7, right.dtype).at[6].set(1)
@@ -83,7 +85,7 @@ def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]
 def branch(
     scene: Any, orbit: PeriodicOrbit, phase: Scalar, which: str, side: int, distance: Scalar
 ) -> tuple[Point, Scalar]:
-    """The start at `phase`, and the multiplier: see `manifold_start`."""
+    """Return the start of the manifold at `phase`, and the multiplier: see `manifold_start`."""
     _checks.word(which, ("stable", "unstable"), "which")
     if isinstance(side, bool) or side not in (1, -1):
         raise ValueError(f"side: wanted 1 (to larger x at the orbit's start) or -1, got {side!r}")
@@ -96,7 +98,7 @@ def _branch(
     scene: Any, orbit: PeriodicOrbit, phase: Scalar, which: str, side: int, distance: Scalar
 ) -> tuple[Point, Scalar]:
     value, vector = unstable(scene.monodromy(orbit))
-    # The mirror turns the unstable manifold into the stable one, and the phase round.
+    # The mirror image of the unstable manifold is the stable one, with the opposite phase.
     turned = phase if which == "unstable" else -phase
     turned = turned - lax.stop_gradient(jnp.floor(turned))
     later = partial(after, scene, t=turned * orbit.period, **_TIGHT)
@@ -120,7 +122,7 @@ def manifold(
     samples: int = 200,
     distance: ScalarLike = 1e-5,
 ) -> Manifold:
-    """Motions from an unstable periodic orbit, or towards it: its invariant manifolds.
+    """Return motions from an unstable periodic orbit, or towards it: its invariant manifolds.
 
     **Arguments:** `orbit` as of `periodic_orbit`; `which` `"unstable"` (motions leave it) or
     `"stable"` (they approach it, and times decrease); `time` their length, two periods by default;
@@ -132,7 +134,7 @@ def manifold(
     along the orbit by the transition matrix. The stable manifold is the mirror image, in y → −y, of
     the unstable one. **Returns** a `Manifold`. Source: Koon, Lo, Marsden and Ross 2011, Dynamical
     Systems, the Three-Body Problem and Space Mission Design, sec. 7.4. **Raises:** `ValueError` for
-    an orbit without such a multiplier, and for another word.
+    an orbit without a real multiplier larger than 1, and for another word.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
@@ -162,7 +164,7 @@ def manifold_start(
     side: int = 1,
     distance: ScalarLike = 1e-5,
 ) -> Point:
-    """The start of the motion of a manifold that belongs to a phase of the orbit.
+    """Return the start of the motion of a manifold that belongs to a phase of the orbit.
 
     **Arguments:** `phase` in periods from the orbit's start, of any size; others as for `manifold`.
     Derivatives by `phase`, the orbit and the scene's numbers are in forward mode: with them

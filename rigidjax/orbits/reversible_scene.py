@@ -1,4 +1,6 @@
-"""Scenes that are symmetric under time reversal: their periodic orbits, families, stability."""
+"""Describe scenes that are symmetric under time reversal: their periodic orbits, families,
+stability.
+"""
 
 import abc
 
@@ -15,7 +17,7 @@ from rigidjax.orbits.differential_correction import PeriodicOrbit
 
 
 class AbstractReversible(AbstractScene):
-    """A scene that does not change under (t, y) → (−t, −y): `ThreeBody` and `Hill`.
+    """Define a scene that does not change under (t, y) → (−t, −y): `ThreeBody` and `Hill`.
 
     An orbit that crosses the xz-plane at a right angle twice is then periodic (Roy and Ovenden
     1955, doi:10.1093/mnras/115.3.296).
@@ -23,22 +25,24 @@ class AbstractReversible(AbstractScene):
 
     @abc.abstractmethod
     def approach(self, t: ScalarLike, state: Point) -> tuple[Array, Array]:
-        """Distances from the bodies (k,), and the distances at which a run ends as a collision."""
+        """Return the distances from the bodies (k,), and the distances at which a collision ends a
+        run.
+        """
 
     @abc.abstractmethod
     def jacobi_constant(self, state: Point) -> Scalar:
-        """Jacobi's constant C of a state."""
+        """Return Jacobi's constant C of a state."""
 
     def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
         return {"jacobi": self.jacobi_constant(state)}
 
     def ends(self, t: ScalarLike, state: Point) -> Bool[Array, ""]:
-        """Whether the particle has collided with one of the bodies."""
+        """Return whether the particle has collided with one of the bodies."""
         gaps, least = self.approach(t, state)
         return jnp.any(gaps <= least)
 
     def end_words(self, t: ScalarLike, state: Point) -> str:
-        """A collision in words: the body, the time, and the distance."""
+        """Return a sentence about a collision: the body, the time, and the distance."""
         gaps = self.approach(t, state)[0]
         if not _checks.known(gaps):
             return "the particle collided with one of the scene's bodies"
@@ -47,11 +51,14 @@ class AbstractReversible(AbstractScene):
         return f"collision with {which} at t = {when:.9g}, distance {near.min():.3g}"
 
     def monodromy(self, orbit: PeriodicOrbit) -> Float[Array, "6 6"]:
-        """The transition matrix over one period; its eigenvalues are 1, 1 and pairs λ, 1/λ."""
+        """Return the transition matrix over one period; its eigenvalues are 1, 1 and pairs λ,
+        1/λ.
+        """
         return self.transition(orbit.state, orbit.period)
 
     def stability_indices(self, orbit: PeriodicOrbit) -> Complex[Array, "2"]:
-        """The two ν = ½(λ + 1/λ) of the multipliers λ that are not 1, larger real part first.
+        """Return the two indices ν = ½(λ + 1/λ) of the multipliers λ ≠ 1, the larger real part
+        first.
 
         The orbit is stable to first order if both are real and |ν| ≤ 1. Many:
         `jax.vmap(scene.stability_indices)(scene.family(…))`. Source: Howell 1984,

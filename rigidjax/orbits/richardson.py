@@ -1,4 +1,6 @@
-"""The equilibrium points, and starts near Lyapunov and halo orbits: Richardson's third order."""
+"""Find the equilibrium points, and starts near Lyapunov and halo orbits: Richardson's third
+order.
+"""
 
 import math
 
@@ -13,7 +15,9 @@ from rigidjax.orbits.differential_correction import PeriodicOrbit
 
 
 def points(mu: Scalar) -> Float[Array, "5 3"]:
-    """L1 … L5 (5, 3) of 0 < μ ≤ ½ by Euler's quintics (Szebehely 1967, sec. 4.4), rotating axes."""
+    """Return L1 … L5 (5, 3) of 0 < μ ≤ ½ by Euler's quintics (Szebehely 1967, sec. 4.4), rotating
+    axes.
+    """
     between, beyond, opposite = distances(mu)
     half, zero, height = 0.5 - mu, jnp.zeros_like(mu), jnp.full_like(mu, 0.75**0.5)
     x = jnp.stack([1 - mu - between, 1 - mu + beyond, -mu - opposite, half, half])
@@ -22,7 +26,7 @@ def points(mu: Scalar) -> Float[Array, "5 3"]:
 
 
 def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """The distances of L1 and L2 from the second primary, and of L3 from the first."""
+    """Return the distances of L1 and L2 from the second primary, and of L3 from the first."""
     one = jnp.ones_like(mu)
     hill = jnp.cbrt(mu / (3 * (1 - mu)))
     between = _root([one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3))
@@ -33,7 +37,9 @@ def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
 
 
 def _root(coefficients: list[Scalar], start: Scalar) -> Scalar:
-    """Newton's root of a polynomial, highest power first; `start` is near it for every μ."""
+    """Return a root of a polynomial by Newton's method, highest power first; `start` is near it for
+    every μ.
+    """
 
     def step(_: object, x: Scalar) -> Scalar:
         value, slope = coefficients[0], jnp.zeros_like(x)
@@ -47,14 +53,15 @@ def _root(coefficients: list[Scalar], start: Scalar) -> Scalar:
 def guess(
     mu: Scalar, point: int, along_x: ScalarLike | None, along_z: ScalarLike | None
 ) -> PeriodicOrbit:
-    """A start on the xz-plane near the orbit about L1, L2 or L3 (`point`) of the given amplitude.
+    """Return a start on the xz-plane near the orbit about L1, L2 or L3 (`point`) with the given
+    amplitude.
 
-    One of `along_x` (a planar Lyapunov orbit) and `along_z` (a halo orbit, its sign is the branch)
-    is given, small beside the distance to the nearer body. Source: Richardson 1980, Celest. Mech.
-    22, 241, doi:10.1007/BF01229511, at τ = 0.
+    Either `along_x` (the amplitude of a planar Lyapunov orbit) or `along_z` (that of a halo orbit;
+    its sign is the branch) is given; it is small beside the distance to the nearer body. Source:
+    Richardson 1980, Celest. Mech. 22, 241, doi:10.1007/BF01229511, at τ = 0.
     """
     if point not in (1, 2, 3):
-        raise ValueError(f"point: wanted 1, 2 or 3, the collinear ones, got {point}")
+        raise ValueError(f"point: wanted 1, 2 or 3, a collinear point, got {point}")
     unit = distances(mu)[point - 1]
     c2, c3, c4 = (_legendre(mu, unit, point, n) for n in (2, 3, 4))
     rate = jnp.sqrt(0.5 * (2 - c2 + jnp.sqrt((c2 - 2) ** 2 + 4 * (c2 - 1) * (1 + 2 * c2))))
@@ -85,7 +92,8 @@ def guess(
     s1 = (s1 - 0.375 * c4 * (3 * k2 * k2 - 8 * k2 + 8)) / below
     s2 = 1.5 * c3 * (2 * a22 * (k2 - 2) + a24 * (k2 + 2) + 2 * k * b22 + 5 * d21)
     s2 = (s2 + 0.375 * c4 * (12 - k2)) / below
-    # What the third order adds to the first harmonic of y, where that of x is the amplitude.
+    # The third order adds b33 and b34 to the first harmonic of y; the first harmonic of x is the
+    # amplitude itself.
     b33 = 12 * c3 * (b21 - 2 * k * a21 + k * a23) + 3 * c4 * k * (3 * k2 - 4)
     b33 = -k / (16 * w) * (b33 + 16 * s1 * w * (w * k - 1))
     b34 = -12 * c3 * k * a22 + 3 * c4 * k + 8 * s2 * w * (w * k - 1)
@@ -116,7 +124,7 @@ def _amplitude(value: ScalarLike | None) -> Scalar:
 
 
 def _legendre(mu: Scalar, unit: Scalar, point: int, n: int) -> Scalar:
-    """The n-th coefficient of the potential about the point (Richardson 1980, eq 8)."""
+    """Return the n-th coefficient of the potential about the point (Richardson 1980, eq 8)."""
     g = unit
     if point == 3:
         return ((1 - mu) + mu * (g / (1 + g)) ** (n + 1)) / g**3

@@ -1,10 +1,10 @@
-"""Pictures (extra `view`): matplotlib and viser are imported when a function is called.
+"""Draw pictures (extra `view`): matplotlib and viser are imported when a function is called.
 
 Each function draws into your axes (`ax`) or into new ones, and returns the axes. Okabe and Ito's
 colours are distinct also for colour-blind readers. **Raises:** `ModuleNotFoundError`, with the
-command that installs what is missing; `TypeError` for states without an attitude where it is drawn,
-or flat axes for 3-D ones; `ValueError` for a batch in the place of one body, other lengths, an
-unknown unit or word, axes of another shape.
+command that installs what is missing; `TypeError` for states without the attitude that is to be
+drawn, or for flat axes where 3-D axes are needed; `ValueError` for a batch instead of one body, for
+lengths that differ, an unknown unit or word, axes of another shape.
 """
 
 from rigidjax._names import show
@@ -22,5 +22,10 @@ from rigidjax.plot.poinsot import (
 from rigidjax.plot.residuals import residuals as residuals
 from rigidjax.plot.style import COLOURS as COLOURS
 from rigidjax.plot.time_series import motion as motion
+
+__all__ = [
+    "COLOURS", "body_axes", "fit", "frames", "herpolhode", "horizons", "inertia_ellipsoid",
+    "motion", "phase_portrait", "player", "polhode", "residuals", "tumble",
+]  # fmt: skip
 
 show(__name__)

@@ -1,4 +1,4 @@
-"""A tumbling body as an animation: a film, or an interactive page."""
+"""Show a tumbling body as an animation: a film, or an interactive page."""
 
 import base64
 import html
@@ -28,7 +28,8 @@ SHADES = np.stack([0.4 * _FULL + 0.6, _FULL], axis=1).reshape(6, 3)
 
 
 class Film(eqx.Module):
-    """An animation in memory: a notebook shows it, `save` writes it (`data`, `kind`, `height` px).
+    """Hold an animation in memory: a notebook shows it, `save` writes it (`data`, `kind`, `height`
+    px).
 
     >>> Film(b"<p>hello</p>", "html", 100)._repr_html_()[:7]
     '<iframe'
@@ -42,7 +43,7 @@ class Film(eqx.Module):
         return f"Film({self.kind}, {len(self.data) // 1024} kB)"
 
     def save(self, path: str | Path) -> Path:
-        """Write the file; **returns** its path.
+        """Write the file, and **return** its path.
 
         **Arguments:** `path` that ends in `.gif` or `.html`, or `.mp4` if the program ffmpeg is
         installed. A page of `player` is `.html` only. **Raises** `ValueError` for another suffix,
@@ -77,7 +78,7 @@ def _to_mp4(gif: bytes, path: Path) -> None:
     program = shutil.which("ffmpeg")
     if program is None:
         raise FileNotFoundError("save: a film in .mp4 needs the program ffmpeg; .gif needs nothing")
-    # Sizes of that format are even.
+    # The video format needs even sizes.
     even = "scale=trunc(iw/2)*2:trunc(ih/2)*2"
     options = ["-vf", even, "-pix_fmt", "yuv420p", "-movflags", "faststart"]
     run = [program, "-y", "-loglevel", "error", "-f", "gif", "-i", "-", *options, str(path)]
@@ -94,11 +95,11 @@ def tumble(
     size: int = 400,
     title: str = "",
 ) -> Film:
-    """A GIF of the body's box as it tumbles, with the path of its longest axis.
+    """Return a GIF of the body's box as it tumbles, with the path of its longest axis.
 
-    The box is the uniform solid one with the same 𝔖, which moves as the body does. Faces across its
-    principal axes are blue, orange and green, shortest axis first; faces on the negative side are
-    pale, to show a flip; the origin is fixed.
+    The box is the uniform solid box with the 𝔖 of the body, which moves as the body does. Faces
+    across its principal axes are blue, orange and green, shortest axis first; faces on the negative
+    side are pale, to show a flip; the origin is fixed.
 
     **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, with less
     than a quarter turn from one to the next; `seconds` of the film, by default the duration of the
@@ -121,11 +122,11 @@ def tumble(
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
     from PIL import Image
 
-    # Without pyplot: a film must not keep a figure, nor open a window.
+    # The figure is made without pyplot: a film must not keep a figure, nor open a window.
     figure = Figure(figsize=(3.6, 3.6), dpi=size / 3.6)
     canvas = FigureCanvasAgg(figure)
     ax: Any = figure.add_axes((0.0, 0.08, 0.86, 0.84), projection="3d")
-    # At every given state: at the pictures alone the path would be a zigzag.
+    # The path has every given state: from the states of the pictures alone it would be a zigzag.
     when, tips = np.asarray(ts, dtype=float), matrices(attitudes(states)) @ tip
     unit = ", m" if isinstance(body, MassProperties) else ""
     cube(ax, reach, (f"x{unit}", f"y{unit}", f"z{unit}"))
@@ -141,10 +142,11 @@ def tumble(
         ax.set_title(plain(f"{title}  t = {moment:.3g} s".strip()), fontsize=10)
         canvas.draw()
         shots.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
-    # One palette for all, or the grey of the panes flickers; of many, or colours are missing.
-    some = shots[:: max(len(shots) // 12, 1)]
-    together = Image.fromarray(np.concatenate([np.asarray(shot) for shot in some]))
-    palette = together.quantize(64)
+    # All pictures share one palette, or the grey of the panes flickers. It is made from a dozen of
+    # them, or colours are missing.
+    sample = shots[:: max(len(shots) // 12, 1)]
+    joined = Image.fromarray(np.concatenate([np.asarray(shot) for shot in sample]))
+    palette = joined.quantize(64)
     shots = [shot.quantize(64, palette=palette, dither=Image.Dither.NONE) for shot in shots]
     out = io.BytesIO()
     how = dict(save_all=True, append_images=shots[1:], loop=0)
@@ -153,7 +155,7 @@ def tumble(
 
 
 def _length(ts: Any, seconds: float | int | None, fps: float | int) -> tuple[float, int]:
-    """The seconds of a film, and its number of pictures."""
+    """Return the seconds of a film, and its number of pictures."""
     if seconds is None:
         when = _checks.on_host(ts, "ts")
         seconds = min(abs(float(when[-1] - when[0])), 20.0) if when.ndim == 1 and when.size else 1.0
@@ -170,12 +172,12 @@ def player(
     fps: float | int = 20,
     height: int = 420,
 ) -> Film:
-    """A page that plays the motion in 3-D; you can turn and zoom it while it runs.
+    """Return a page that plays the motion in 3-D; you can turn and zoom it while it runs.
 
-    The box is the uniform solid one with the same 𝔖, the line the path of its longest axis. The
-    page contains everything, also viser's program (0.8 MB): a notebook shows it without a network
-    or a running kernel, and `.save("tumble.html")` writes it to a file. **Arguments:** as `tumble`;
-    `height` px in a notebook. **Returns** a `Film`. **Raises** as `tumble`.
+    The box is the uniform solid box with the 𝔖 of the body, the line is the path of its longest
+    axis. The page contains everything, also viser's program (0.8 MB): a notebook shows it without a
+    network or a running kernel, and `.save("tumble.html")` writes it to a file. **Arguments:** as
+    `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises** as `tumble`.
     """
     seconds, pictures = _length(ts, seconds, fps)
     _, q = evenly(ts, states, pictures)
@@ -189,7 +191,7 @@ def player(
 
     # Viser records the commands to a server; no client has to connect to it.
     console = rich.get_console()
-    told, console.quiet = console.quiet, True
+    was_quiet, console.quiet = console.quiet, True
     try:
         server = viser.ViserServer(host="127.0.0.1", verbose=False)
         try:
@@ -197,7 +199,7 @@ def player(
         finally:
             server.stop()
     finally:
-        console.quiet = told
+        console.quiet = was_quiet
     return Film(page.encode("utf-8"), "html", height)
 
 
@@ -224,7 +226,9 @@ def _record(server: Any, corners: Any, tip: Any, reach: float, q: Any, seconds: 
 
 
 def evenly(ts: Any, states: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times evenly spaced, and the attitudes there (count, 4), along the shorter arc."""
+    """Return `count` evenly spaced times, and the attitudes (count, 4) at these times, along the
+    shorter arc.
+    """
     q = attitudes(states)
     t = times(ts, q.shape[0])
     if t.size < 2:
@@ -238,7 +242,9 @@ def evenly(ts: Any, states: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _box(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray, float]:
-    """The corners (8, 3) of the body's box, the end (3,) of its longest axis, its half diagonal."""
+    """Return the corners (8, 3) of the body's box, the end (3,) of its longest axis, and its half
+    diagonal.
+    """
     half, turn = box_of(body)
     longest = np.argmax(half)
     corners = (CORNERS * half) @ turn.T
@@ -246,14 +252,15 @@ def _box(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray, float]
 
 
 def box_of(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
-    """Half-lengths (3,) a of the uniform box with λ = m a²/3, and its axes (3, 3) in the body.
+    """Return the half-lengths (3,) a of the uniform box with λ = m a²/3, and its axes (3, 3) in the
+    body.
 
-    In m for `MassProperties`; for an `Inertia` the longest is 1.
+    The half-lengths are in m for `MassProperties`; for an `Inertia` the longest is 1.
     """
     second, q = principal(body.second_moment)
     size = np.sqrt(np.maximum(np.asarray(second, dtype=float), 0.0))
     if not size.max() > 0:
-        raise ValueError("the body has no extension, its 𝔖 is zero: there is no box to draw")
+        raise ValueError("body: wanted a body with an extension, got 𝔖 = 0; there is no box")
     if isinstance(body, MassProperties):
         size = size * np.sqrt(3 / float(body.mass))
     else:

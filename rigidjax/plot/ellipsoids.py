@@ -1,4 +1,4 @@
-"""A body as the ellipsoid with the same motion, and its uncertainty by a fit."""
+"""Draw a body as the ellipsoid with the same motion, and its uncertainty by a fit."""
 
 from typing import Any
 
@@ -22,12 +22,13 @@ def inertia_ellipsoid(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """The outline of a body's ellipsoid from three sides; for a fit with its uncertainty.
+    """Draw the outline of a body's ellipsoid from three sides; for a fit with its uncertainty.
 
     The ellipsoid `r·𝔖⁻¹r = const` is long along the body's long axis and moves as the body does.
-    For `MassProperties` it is the uniform solid one of the same mass, in m. An `Inertia` has no
-    size: its unit is √Tr 𝔖 of the given body (of the fit's best). Thin lines are bodies drawn from
-    the fit's Gaussian: the data do not determine the shape where the lines differ.
+    For `MassProperties` it is the uniform solid ellipsoid of equal mass, in m. An `Inertia` has no
+    size: the unit is then √Tr 𝔖 of the given body (of the best body of a fit). Thin lines are
+    bodies drawn from the fit's Gaussian: the data do not determine the shape where the lines
+    differ.
 
     **Arguments:** `body` an `Inertia`, a `MassProperties` or a `rigidjax.identify.Fit`; `truth` a
     body to compare with, as a broken line; `samples` the number of thin lines; `title`; `ax` three
@@ -41,7 +42,7 @@ def inertia_ellipsoid(
     solid = isinstance(best, MassProperties)
     size = 1.0 if solid else float(np.trace(np.asarray(best.second_moment)))
     if not size > 0:
-        raise ValueError("inertia_ellipsoid: the body has no extension, its 𝔖 is zero")
+        raise ValueError("body: wanted a body with an extension, got 𝔖 = 0; there is no ellipsoid")
     shapes = {"body": np.asarray(_shape(best))[None] / size}
     if drawn is not None:
         shapes["cloud"] = np.asarray(jax.vmap(_shape)(drawn)) / size
@@ -60,7 +61,9 @@ def inertia_ellipsoid(
 
 
 def _given(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
-    """The body, and bodies drawn from the Gaussian of a fit (a leading axis), `None` without."""
+    """Return the body, and bodies drawn from the Gaussian of a fit (a leading axis), or `None` if
+    it is no fit.
+    """
     if isinstance(body, Inertia | MassProperties):
         return validation.single(body, (Inertia, MassProperties), "body"), None
     if not hasattr(body, "x") or not hasattr(body, "model"):
@@ -71,25 +74,25 @@ def _given(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
         raise ValueError(f"inertia_ellipsoid: {words}")
     x = body.derivative_point
     values, vectors = np.linalg.eigh(np.asarray(body.seen))
-    # A fixed seed: the same fit gives the same picture.
+    # With a fixed seed one fit always gives one picture.
     steps = np.random.default_rng(0).standard_normal((samples, values.size))
     steps = jnp.asarray(steps * np.sqrt(np.maximum(values, 0.0)) @ vectors.T, x.dtype)
     return body.body, jax.vmap(lambda step: body.model.bodies(x + step))(steps)
 
 
 def _outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
-    """The outlines of `body`, `cloud` and `truth`, each (n, 3, 3), on the three planes."""
+    """Draw the outlines of `body`, `cloud` and `truth`, each (n, 3, 3), on the three planes."""
     # The outline reaches √A_ii along axis i. All three panels have one scale, for comparison.
     reaches = {name: np.sqrt(np.einsum("nii->ni", shape)) for name, shape in shapes.items()}
     reach = 1.1 * max(float(one.max()) for one in reaches.values())
     apart = np.abs(reaches.get("cloud", reaches["body"]) - reaches["body"]).max(initial=0.0)
     wide = apart > 0.01 * reach
-    told = "within the uncertainty" if wide else "uncertainty: below a line's width"
+    label = "within the uncertainty" if wide else "uncertainty: below a line's width"
     for one, (i, j) in zip(ax, _PLANES, strict=True):
         if "cloud" in shapes:
             for shape in shapes["cloud"]:
                 one.plot(*_outline(shape, i, j), color=COLOURS[5], lw=0.5, alpha=0.25)
-            one.plot([], [], color=COLOURS[5], lw=1, label=told)
+            one.plot([], [], color=COLOURS[5], lw=1, label=label)
         one.plot(*_outline(shapes["body"][0], i, j), color=COLOURS[0], lw=2, label="body")
         if "truth" in shapes:
             outline = _outline(shapes["truth"][0], i, j)
@@ -101,14 +104,16 @@ def _outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
 
 
 def _shape(body: Inertia | MassProperties) -> Any:
-    """The matrix whose ellipsoid r·A⁻¹r = 1 is drawn."""
+    """Return the matrix whose ellipsoid r·A⁻¹r = 1 is drawn."""
     if isinstance(body, MassProperties):
         return body.second_moment * (5.0 / body.mass)
     return body.second_moment
 
 
 def _outline(shape: np.ndarray, i: int, j: int) -> np.ndarray:
-    """The silhouette of r·A⁻¹r = 1 on a coordinate plane: the ellipse of the 2 × 2 block of A."""
+    """Return the silhouette of r·A⁻¹r = 1 on a coordinate plane: the ellipse of the 2 × 2 block of
+    A.
+    """
     values, vectors = np.linalg.eigh(shape[np.ix_((i, j), (i, j))])
     angle = np.linspace(0, 2 * np.pi, 121)
     circle = np.stack([np.cos(angle), np.sin(angle)])

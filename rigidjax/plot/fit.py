@@ -1,4 +1,4 @@
-"""A fit beside its data."""
+"""Draw a fit beside its data."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from rigidjax.solve import simulate
 def fit(
     found: Any, *, index: int = 0, time_unit: str = "s", rate_unit: str = "rad/s", title: str = ""
 ) -> Any:
-    """Data and fit of each sensor above, the residuals below.
+    """Draw data and fit of each sensor above, and the residuals below.
 
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s` or
     `day`; `rate_unit` `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib figure.
@@ -45,7 +45,9 @@ def fit(
 
 
 def _between(found: Any, record: Any, index: int) -> tuple[np.ndarray, Any] | None:
-    """Times and states between sparse samples of a free body, for a smooth line; else `None`."""
+    """Return the times and states between sparse samples of a free body, for a smooth line; else
+    `None`.
+    """
     model, body, state0 = found.model, found.body, found.state0
     if model.torque is not None or record.t.shape[0] > 300:
         return None

@@ -1,4 +1,4 @@
-"""One path, in a moving frame and in an inertial one."""
+"""Draw one path in a moving frame and in an inertial frame."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -24,12 +24,12 @@ def frames(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """The path in the moving frame on the left, in the inertial one on the right.
+    """Draw a path in the moving frame on the left, and in the inertial frame on the right.
 
     **Arguments:** `frame` the `MovingFrame`; `ts` (T,); `inside` the path in the moving frame, a
-    `Point` with a leading time axis (`frame.from_inertial` makes it from the other); `plane` two of
-    `xyz`; `unit` of length; `marks` places at rest in the frame, name → (3,); `title`; `ax` two
-    axes. **Returns** the axes (2,).
+    `Point` with a leading time axis (`frame.from_inertial` makes it from a path in the inertial
+    frame); `plane` two of `xyz`; `unit` of length; `marks` places at rest in the frame, name →
+    (3,); `title`; `ax` two axes. **Returns** the axes (2,).
 
     >>> turntable = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
     >>> ts = jnp.linspace(0.0, 3.0, 20)

@@ -1,4 +1,4 @@
-"""The phase portrait of a heavy symmetric top: tilt against its rate."""
+"""Draw the phase portrait of a heavy symmetric top: tilt against its rate."""
 
 from typing import Any
 
@@ -25,16 +25,17 @@ def phase_portrait(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """Tilt θ against θ̇ of a symmetric top, with the curves of equal energy around its path.
+    """Draw the tilt θ against θ̇ of a symmetric top, with the curves of equal energy around its
+    path.
 
     `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ` with the momenta of the initial
-    state, p_φ about the vertical and p_ψ about the top's axis. The cross is steady precession, the
-    least energy. Source: Landau and Lifshitz, Mechanics, § 35, problem 1.
+    state, p_φ about the vertical and p_ψ about the top's axis. The cross is steady precession,
+    which has the least energy. Source: Landau and Lifshitz, Mechanics, § 35, problem 1.
 
-    **Arguments:** `inertia` about the pivot; `top` weight and place of the centre of mass, which is
-    on the axis of symmetry; `states` of one body with a leading time axis; `levels` the number of
-    thin curves; `title`; `ax`. **Returns** the axes. **Raises** `ValueError` without symmetry about
-    the axis through the centre of mass, and without weight.
+    **Arguments:** `inertia` about the pivot; `top` the weight and the centre of mass, which is on
+    the axis of symmetry; `states` of one body with a leading time axis; `levels` the number of thin
+    curves; `title`; `ax`. **Returns** the axes. **Raises** `ValueError` without symmetry about the
+    axis through the centre of mass, and without weight.
 
     >>> body = rj.Inertia.from_principal(2.0, 2.0, 1.0)
     >>> top = rj.torques.HeavyTop(1.0, [0.0, 0, 1.0], [0, 0, -9.81])
@@ -67,14 +68,14 @@ def phase_portrait(
     reach = 1.6 * max(float(np.abs(rate[seen]).max(initial=0.0)), 0.2 * np.sqrt(weight / across))
     middle, half = 0.5 * (tilt.max() + tilt.min()), 0.5 * np.ptp(tilt)
     wide = max(1.8 * half, 0.15)
-    # Not from 0 to π: the barrier is infinite where the axis stands upright or hangs.
+    # The grid excludes 0 and π: the potential is infinite where the axis is upright or hangs.
     grid = np.linspace(max(middle - wide, 1e-3), min(middle + wide, np.pi - 1e-3), 400)
     rates = np.linspace(-reach, reach, 301)
     energy = 0.5 * across * rates[:, None] ** 2 + potential(grid)
     floor = energy.min()
     own = 0.5 * across * rate[seen] ** 2 + potential(tilt[seen])
     top_level = max(float(np.median(own)) * 2 - floor, floor + 1e-3 * weight)
-    # Evenly spaced in the amplitude of the nutation, not in energy.
+    # The levels are evenly spaced in the amplitude of the nutation, not in energy.
     steps = np.linspace(0, 1.5, levels + 1)[1:] ** 2
     heights = floor + steps * (top_level - floor) / 2
     ax.contour(np.degrees(grid), rates, energy, levels=heights, colors="0.6", linewidths=0.7)
@@ -92,13 +93,13 @@ def phase_portrait(
 def _symmetric(
     inertia: Inertia, top: HeavyTop
 ) -> tuple[float, float, np.ndarray, float, np.ndarray]:
-    """I₁, I₃, the body's axis (3,), m g l, and the upward direction (3,)."""
+    """Return I₁, I₃, the body's axis (3,), m g l, and the upward direction (3,)."""
     tensor = np.asarray(inertia.tensor, dtype=float)
     com, gravity = np.asarray(top.com, dtype=float), np.asarray(top.gravity, dtype=float)
     lever, pull = np.linalg.norm(com), np.linalg.norm(gravity)
     weight = float(top.mass) * float(lever * pull)
     if not weight > 0:
-        raise ValueError("phase_portrait: the top has no weight about its pivot")
+        raise ValueError("top: wanted a weight away from the pivot, got m g l = 0")
     axis = com / lever
     along = float(axis @ tensor @ axis)
     across = 0.5 * (float(np.trace(tensor)) - along)

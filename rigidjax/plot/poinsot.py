@@ -1,4 +1,6 @@
-"""A motion on a sphere: body axes, and Poinsot's polhode in the body and herpolhode in space."""
+"""Draw a motion on a sphere: body axes, and Poinsot's polhode in the body and herpolhode in
+space.
+"""
 
 from typing import Any
 
@@ -15,7 +17,7 @@ from rigidjax.plot.style import COLOURS, plain, rows
 
 
 def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
-    """The paths of the three body axes on the unit sphere, world frame.
+    """Draw the paths of the three body axes on the unit sphere, world frame.
 
     A dot marks the start, a triangle the end; the path behind the sphere is faint. **Arguments:**
     `states` of one body with a leading time axis; `title`; `ax` your 3-D axes; set their view
@@ -34,7 +36,7 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
         style.around_ball(ax, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
         ax.plot(*path[:1].T, color=colour, marker="o", ms=6, ls="")
         ax.plot(*path[-1:].T, color=colour, marker="^", ms=7, ls="")
-    # Of no axis: grey.
+    # The legend of the marks is grey: they belong to no axis.
     for mark, name in (("o", "start"), ("^", "end")):
         ax.plot([], [], [], color="0.4", marker=mark, ms=6, ls="", label=name)
     style.cube(ax, 1.0, ("x", "y", "z"))
@@ -46,9 +48,10 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
 def polhode(
     inertia: Inertia, states: HasSpin, *, energies: int = 9, title: str = "", ax: Any = None
 ) -> Any:
-    """The path of Π = IΩ on the intersection of the sphere |Π| = h and the ellipsoid ΣΠᵢ²/Iᵢ = 2T.
+    """Draw the path of Π = IΩ on the intersection of the sphere |Π| = h and the ellipsoid ΣΠᵢ²/Iᵢ =
+    2T.
 
-    The axes are the principal ones (ascending moments), the unit is h, the initial |Π|. Thin lines
+    The axes are the principal axes (ascending moments); the unit is h, the initial |Π|. Thin lines
     are other energies at the same h; broken lines are the separatrix through the middle axis. Lines
     behind the sphere are dotted (this motion) or faint (the others). Source: Landau and Lifshitz,
     Mechanics, § 37.
@@ -77,12 +80,12 @@ def polhode(
     twice_energy = float(np.sum(pi[0] ** 2 / i))
 
     ax = style.solid_axes(ax)
-    # The order is set here. matplotlib takes one depth for a whole surface, and would draw the
-    # sphere over the path.
+    # The drawing order is set here: matplotlib takes one depth for a whole surface, and would draw
+    # the sphere over the path.
     ax.computed_zorder = False
     style.globe(ax, COLOURS[5], 0.15)
     semi_axes = np.sqrt(twice_energy * i)
-    # By meridians and parallels: its inside stays visible.
+    # The ellipsoid is drawn by meridians and parallels, so that its inside stays visible.
     how: dict[str, Any] = dict(color=COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
     ax.plot_wireframe(*(semi_axes[:, None, None] * style.ball()), rstride=4, cstride=6, **how)
     # All energies are equal if all moments are equal: there are no lines to draw.
@@ -104,11 +107,12 @@ def polhode(
 
 
 def _others(ax: Any, i: np.ndarray, energies: int) -> None:
-    """Curves of equal energy on the unit momentum sphere."""
+    """Draw curves of equal energy on the unit momentum sphere."""
     import contourpy
 
     def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
-        # The pole along the axis of the middle moment: no family of loops goes round it.
+        # The pole is along the axis of the middle moment: no family of loops goes round this axis,
+        # so that no curve is cut where the angle jumps.
         return style.on_sphere(around, down)[[1, 2, 0]]
 
     inverse = 1 / i
@@ -127,7 +131,7 @@ def _others(ax: Any, i: np.ndarray, energies: int) -> None:
 
 
 def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
-    """The path of the world rate ω on the invariable plane, across the angular momentum.
+    """Draw the path of the world rate ω on the invariable plane, across the angular momentum.
 
     The motion must be free: the part of ω along the momentum is then 2T/h and constant. The circles
     are the least and the largest distance of this motion. **Arguments:** `inertia`; `states`

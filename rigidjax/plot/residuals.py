@@ -1,4 +1,4 @@
-"""Residuals of a fit, and a comparison with white noise."""
+"""Draw residuals of a fit, and a comparison with white noise."""
 
 from typing import Any
 
@@ -13,13 +13,13 @@ _MOST = 2000
 def residuals(
     found: Any, *, index: int = 0, time_unit: str = "s", title: str = "", ax: Any = None
 ) -> Any:
-    """Residuals of each sensor over its noise: in time, histogram, autocorrelation, spectrum.
+    """Draw residuals of each sensor over its noise: in time, histogram, autocorrelation, spectrum.
 
     From left to right: the residuals, evenly within ±2 for a good fit (those beyond ±8 are
-    triangles at the edge); their histogram against the normal curve; the correlation of each with a
-    later one, inside the band ±2/√N for white noise; their power spectrum, 1 at all frequencies for
-    white noise of the given size (Welch's estimate; Lomb's for uneven times). A line in the
-    spectrum is a motion or a torque that the model lacks.
+    triangles at the edge); their histogram against the normal curve; the correlation of each
+    residual with a later one, which for white noise is inside the band ±2/√N; their power spectrum,
+    which is 1 at all frequencies for white noise of the given size (Welch's estimate; Lomb's for
+    uneven times). A line in the spectrum is a motion or a torque that the model lacks.
 
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`,
     `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
@@ -46,7 +46,8 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     over_time, spread, memory, spectrum = row
     colours, names = COLOURS[: scaled.shape[1]], "xyz"[: scaled.shape[1]]
     everything = scaled[seen].ravel()
-    # One wild reading must not press all others into a line: what lies beyond is put at the edge.
+    # One wild reading must not press all others into a line: readings beyond `reach` are drawn at
+    # the edge.
     reach = float(np.clip(np.abs(everything).max(initial=0.0) * 1.1, 4.0, 8.0))
     beyond = int((np.abs(everything) > reach).sum())
     shown = np.where(np.abs(scaled[seen]) <= reach, scaled[seen], np.nan)
@@ -57,7 +58,7 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
         for axis, (values, colour) in enumerate(zip(scaled[seen].T, colours, strict=True)):
             for side, mark in ((1, "^"), (-1, "v")):
                 where = t[seen][side * values > reach]
-                # A row an axis: one reading is often wild on all of them.
+                # Each axis has a row of its own: one reading is often wild on all axes.
                 at = np.full(where.size, side * reach * (0.95 - 0.09 * axis))
                 over_time.plot(where, at, color=colour, marker=mark, ms=5, ls="")
         name = f"beyond ±{reach:.0f}"
@@ -65,16 +66,17 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     over_time.axhspan(-2, 2, color="0.9", zorder=0)
     over_time.legend(loc="upper right", ncols=4, fontsize=8, markerscale=2, columnspacing=1)
     over_time.set_ylim(-reach, 1.35 * reach)
-    # As wide as the data: errors far smaller than their noise would all lie in two or three bins.
+    # The histogram is as wide as the data: errors far smaller than their noise would otherwise all
+    # lie in two or three bins.
     inside = everything[np.abs(everything) <= reach]
     low, high = (inside.min(), inside.max()) if inside.size else (-1.0, 1.0)
     middle, half = 0.5 * (low + high), max(0.5 * (high - low), 1e-3 * reach)
     count = int(np.clip(2 * np.sqrt(everything.size), 9, 41))
-    # No less than from `low` to `high`: rounding must not leave the last reading out.
+    # The bins reach at least from `low` to `high`: rounding must not leave the last reading out.
     bins = np.linspace(min(low, middle - half), max(high, middle + half), count)
-    told = f"{beyond} beyond" if beyond else None
+    label = f"{beyond} beyond" if beyond else None
     weights = np.full(everything.size, 1 / (everything.size * (bins[1] - bins[0])))
-    spread.hist(everything, bins=bins, weights=weights, color=COLOURS[5], alpha=0.8, label=told)
+    spread.hist(everything, bins=bins, weights=weights, color=COLOURS[5], alpha=0.8, label=label)
     x = np.linspace(-reach, reach, 200)
     spread.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi), color="0.2", lw=1.4, label="normal")
     spread.set(xlabel="error / noise", ylabel="density")
@@ -94,7 +96,9 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
 
 
 def power(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies and power (F,) of residuals over their noise: white noise has power 1."""
+    """Return the frequencies and power (F,) of residuals over their noise: white noise has power
+    1.
+    """
     from scipy.signal import lombscargle, welch
 
     gaps = np.diff(t)
@@ -102,7 +106,7 @@ def power(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(0), np.zeros(0)
     gap = float(np.median(gaps))
     if (np.abs(gaps - gap) <= 1e-3 * gap).all():
-        # Several segments: the noise of the estimate is then small.
+        # Several segments reduce the noise of the estimate.
         segment = min(t.size, max(64, min(t.size // 4, 512)))
         frequencies, density = welch(values, 1 / gap, nperseg=segment)
         return frequencies[1:], density[1:] / (2 * gap)

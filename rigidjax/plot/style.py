@@ -1,4 +1,4 @@
-"""Shared parts of all pictures: colours, axes, the import of matplotlib, checks of arguments."""
+"""Share parts of all pictures: colours, axes, the import of matplotlib, checks of arguments."""
 
 from typing import Any
 
@@ -18,7 +18,9 @@ RATES = {"rad/s": 1.0, "deg/s": 180 / np.pi, "rpm": 30 / np.pi, "deg/day": 86400
 
 
 def pyplot() -> Any:
-    """`matplotlib.pyplot`, imported now; `ModuleNotFoundError` names the extra `view`."""
+    """Return `matplotlib.pyplot`, imported now. **Raises:** `ModuleNotFoundError`, which names the
+    extra `view`.
+    """
     try:
         import matplotlib.pyplot as plt
     except ModuleNotFoundError as error:
@@ -28,12 +30,16 @@ def pyplot() -> Any:
 
 
 def unit(name: str, known: dict[str, float], what: str) -> float:
-    """The factor of a unit, by its name, to or from SI; `ValueError` lists the known names."""
+    """Return the factor of a unit to or from SI, by its name; the error for other names lists the
+    known names.
+    """
     return known[_checks.word(name, tuple(known), what)]
 
 
 def of_fit(found: Any, index: Any) -> tuple[Any, list[np.ndarray], list[np.ndarray]]:
-    """A recording of a fit, residuals and their deviations; raises in words if it has none."""
+    """Return a recording of a fit, its residuals and their standard deviations; raise an error if
+    there is none.
+    """
     if np.shape(getattr(found, "chi2", 0.0)) != ():
         raise ValueError("found: wanted one Fit, got one with leading axes; draw them one by one")
     wanted = ("model", "x", "residuals")
@@ -50,14 +56,16 @@ def of_fit(found: Any, index: Any) -> tuple[Any, list[np.ndarray], list[np.ndarr
 
 
 def flat_axes(ax: Any, **how: Any) -> Any:
-    """The axes given, or a figure with one of its own."""
+    """Return `ax`, or the axes of a new figure for `None`."""
     if ax is not None:
         return ax
     return pyplot().subplots(layout="constrained", **{"figsize": (6.4, 4.4), **how})[1]
 
 
 def solid_axes(ax: Any) -> Any:
-    """The 3-D axes given, or a figure with its own; `TypeError` for flat ones."""
+    """Return `ax` if it is 3-D, or new 3-D axes for `None`. **Raises:** `TypeError` for flat
+    axes.
+    """
     if ax is None:
         figure = pyplot().figure(layout="constrained", figsize=(6.0, 5.6))
         return figure.add_subplot(projection="3d")
@@ -67,7 +75,9 @@ def solid_axes(ax: Any) -> Any:
 
 
 def several_axes(ax: Any, shape: tuple[int, ...], **how: Any) -> Any:
-    """As many axes as given, or new ones (`how` of `subplots`); `ValueError` for another shape."""
+    """Return `ax` if it has this shape, or new axes (`how` of `subplots`) for `None`. **Raises:**
+    `ValueError` for another shape.
+    """
     if ax is None:
         ax = np.reshape(pyplot().subplots(layout="constrained", **how)[1], shape)
     ax = np.atleast_1d(np.asarray(ax, dtype=object))
@@ -79,13 +89,17 @@ def several_axes(ax: Any, shape: tuple[int, ...], **how: Any) -> Any:
 
 
 def legend_below(ax: Any, *entries: Any, down: float = 0.16) -> None:
-    """The legend under the axes, by `down` of their height: inside it would lie on the curves."""
+    """Draw the legend under the axes, by `down` of their height: inside it would lie on the
+    curves.
+    """
     place = dict(loc="upper center", bbox_to_anchor=(0.5, -down))
     ax.legend(*entries, **place, ncols=3, fontsize=8, frameon=False)
 
 
 def times(ts: Any, count: int, what: str = "the states have") -> np.ndarray:
-    """Times (T,) as NumPy float64; `ValueError` unless there are as many as states."""
+    """Return the times (T,) as NumPy float64. **Raises:** `ValueError` unless there are as many
+    times as states.
+    """
     t = _checks.on_host(ts, "ts")
     if t.shape != (count,):
         raise ValueError(f"ts: wanted ({count},) as {what}, got {t.shape}")
@@ -93,7 +107,9 @@ def times(ts: Any, count: int, what: str = "the states have") -> np.ndarray:
 
 
 def rows(values: Any, width: int, name: str) -> np.ndarray:
-    """Values of one body over time (T, width) as NumPy float64; `ValueError` for another shape."""
+    """Return values of one body over time (T, width) as NumPy float64. **Raises:** `ValueError` for
+    another shape.
+    """
     out = _checks.on_host(values, name)
     if out.ndim != 2 or out.shape[1] != width:
         hint = "; draw one body of a batch at a time" if out.ndim == 3 else ""
@@ -104,7 +120,9 @@ def rows(values: Any, width: int, name: str) -> np.ndarray:
 
 
 def attitudes(states: Any) -> np.ndarray:
-    """Quaternions (T, 4) of states; `TypeError` for states without them."""
+    """Return the quaternions (T, 4) of states. **Raises:** `TypeError` for states without an
+    attitude.
+    """
     if not hasattr(states, "q"):
         found = type(states).__name__
         raise TypeError(f"states: wanted states with an attitude (Attitude, Rigid), got {found}")
@@ -112,13 +130,15 @@ def attitudes(states: Any) -> np.ndarray:
 
 
 def matrices(q: np.ndarray) -> np.ndarray:
-    """Rotation matrices (T, 3, 3), body → world, of quaternions (T, 4), for pictures."""
+    """Return rotation matrices (T, 3, 3), body → world, of quaternions (T, 4), for pictures."""
     unit = jnp.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
     return np.asarray(jax.vmap(quaternion.to_matrix)(unit), dtype=float)
 
 
 def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Places (3, …) on the unit sphere, by the angles about z and from it."""
+    """Return places (3, …) on the unit sphere, by the angle `around` z and the angle `down` from
+    z.
+    """
     ring, height = np.sin(down), np.cos(down)
     return np.stack(np.broadcast_arrays(np.cos(around) * ring, np.sin(around) * ring, height))
 
@@ -126,12 +146,14 @@ def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
 def around_ball(
     ax: Any, path: np.ndarray, *, behind: dict[str, Any] | None = None, **how: Any
 ) -> None:
-    """A line `path` (T, 3) on the unit sphere, in the style `behind` where hidden."""
+    """Draw a line `path` (T, 3) on the unit sphere, in the style `behind` where the sphere hides
+    it.
+    """
     up, around = np.radians(ax.elev), np.radians(ax.azim)
     eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
     front, label = path @ eye > 0, how.pop("label", None)
     for seen, more in ((front, {"label": label}), (~front, behind or {"alpha": 0.25})):
-        # One point over the edge on both sides, so that no gap opens between the two.
+        # Each part has one point more on both sides of the edge, so that no gap opens between them.
         wide = seen | np.roll(seen, 1) | np.roll(seen, -1)
         wide[0], wide[-1] = seen[0], seen[-1]
         line = np.where(wide[:, None], path, np.nan)
@@ -139,23 +161,24 @@ def around_ball(
 
 
 def ball() -> np.ndarray:
-    """A grid (3, 49, 25) on the unit sphere."""
+    """Return a grid (3, 49, 25) on the unit sphere."""
     return on_sphere(np.linspace(0, 2 * np.pi, 49)[:, None], np.linspace(0, np.pi, 25))
 
 
 def globe(ax: Any, colour: str, alpha: float) -> None:
-    """The unit sphere, translucent."""
+    """Draw the unit sphere, translucent."""
     ax.plot_surface(*ball(), color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1)
 
 
 def cube(ax: Any, reach: float, labels: tuple[str, str, str]) -> None:
-    """Equal scales on all three axes, few ticks, names that do not run into them."""
+    """Set equal scales on all three axes, few ticks, and names that do not run into the ticks."""
     from matplotlib.ticker import MaxNLocator
 
     ax.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
     ax.set_box_aspect((1, 1, 1))
     for axis, label in zip((ax.xaxis, ax.yaxis, ax.zaxis), labels, strict=True):
-        # The ends left out: at the corners of the cube they would lie on those of the next axis.
+        # The outer ticks are left out: at the corners of the cube their numbers would lie on the
+        # numbers of the next axis.
         axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="both"))
         axis.set_label_text(label)
         axis.labelpad = 4

@@ -1,4 +1,4 @@
-"""Attitude and body rate against time."""
+"""Draw attitude and body rate against time."""
 
 from typing import Any
 
@@ -24,13 +24,13 @@ def motion(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """Body rate against time, and above it the attitude if the states have one.
+    """Draw the body rate against time, and above it the attitude if the states have one.
 
     **Arguments:** `ts` (T,) s; `states` of one body with a leading time axis, such as `sol.ys`;
-    `attitude` its form: `quaternion` (w, x, y, z), `axes` (the height of each body axis along world
-    z) or `angles` (3-1-3, notes eq 31, deg); `time_unit` `s`, `min`, `h`, `day`; `rate_unit`
-    `rad/s`, `deg/s`, `rpm`, `deg/day`; `title`; `ax` two axes (one for a `Spin`). **Returns** the
-    axes, (2,) or (1,).
+    `attitude` the form of the attitude: `quaternion` (w, x, y, z), `axes` (the height of each body
+    axis along world z) or `angles` (3-1-3, notes eq 31, deg); `time_unit` `s`, `min`, `h`, `day`;
+    `rate_unit` `rad/s`, `deg/s`, `rpm`, `deg/day`; `title`; `ax` two axes (one for a `Spin`).
+    **Returns** the axes, (2,) or (1,).
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Spin([0, 1, 0.1]), [0.0, 1.0, 2.0])
@@ -53,7 +53,7 @@ def motion(
     for one in ax:
         one.margins(x=0)
         one.grid(alpha=0.3)
-        # Beside the picture: a legend inside would cover a line.
+        # The legend is beside the picture: inside it would cover a line.
         one.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     if title:
         ax[0].set_title(plain(title))
@@ -77,7 +77,8 @@ def _attitude(ax: Any, t: np.ndarray, q: np.ndarray, how: str) -> None:
 
 def _angles(q: np.ndarray) -> np.ndarray:
     degrees = np.degrees(np.asarray(jax.vmap(euler.from_quaternion)(jnp.asarray(q))))
-    # A line across the whole picture at a jump of an angle from 180° to −180° would be no motion.
+    # Where an angle jumps from 180° to −180° there is a gap: a line across the whole picture would
+    # look like a motion.
     jump = np.abs(np.diff(degrees, axis=0)) > 180
     degrees[1:][jump] = np.nan
     return degrees

@@ -1,1 +1,1 @@
-"""Rotations, public as `rj.so3`, `rj.quaternion`, `rj.euler`, `rj.mrp` and `rj.rodrigues`."""
+"""Hold rotations, public as `rj.so3`, `rj.quaternion`, `rj.euler`, `rj.mrp` and `rj.rodrigues`."""

@@ -1,4 +1,6 @@
-"""Hints to XLA: numbers that are computed once for all their uses, and single kernels."""
+"""Give hints to XLA: which numbers to compute once for all their uses, and what to compile as one
+kernel.
+"""
 
 import functools
 from collections.abc import Callable
@@ -18,7 +20,9 @@ _DROPPED = jax.__version_info__ < (0, 11)
 
 
 def barrier(tree: Tree) -> Tree:
-    """The same numbers, computed once: `lax.optimization_barrier`, or `once` if XLA drops it.
+    """Return the numbers of `tree` unchanged, such that XLA computes them once for all their uses.
+
+    This is `lax.optimization_barrier`, or `compute_once` where XLA drops barriers.
 
     On a GPU each barrier ends a kernel, which costs more than what is computed twice.
     """
@@ -27,25 +31,26 @@ def barrier(tree: Tree) -> Tree:
     if not _DROPPED:
         return lax.optimization_barrier(tree)
     real = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
-    return jax.tree.map(lambda x: once(x) if real(x) else x, tree)
+    return jax.tree.map(lambda x: compute_once(x) if real(x) else x, tree)
 
 
-def once(x: Array) -> Array:
-    """The same number, computed once for all uses, here and in the gradient.
+def compute_once(x: Array) -> Array:
+    """Return the number `x` unchanged, such that XLA on CPU computes it once, here and in the
+    gradient.
 
-    It is divided by one (by 2 if NaN): XLA on CPU computes a quotient once, but repeats anything
-    cheaper, with all its inputs, for every component.
+    The number is divided by one (by 2 if it is NaN). XLA on CPU computes a quotient once; it
+    repeats anything cheaper, with all its inputs, for every component.
     """
     return x / jnp.where(x == x, 1, 2)
 
 
 def one_kernel(function: Function) -> Function:
-    """The same function of trees of arrays, compiled as one kernel if it is not batched.
+    """Return `function`, of trees of arrays, compiled as one kernel where it is not batched.
 
-    A kernel of one body takes long to compile, whatever its size; XLA on CPU makes one of a loop
-    with a small state. This is a loop of one turn: XLA knows neither the number of turns nor that
-    the arguments stay, so it moves nothing out of the loop. Batches and derivatives use `function`
-    itself.
+    Many small kernels for one body take long to compile; XLA on CPU makes one kernel of a loop with
+    a small state. So `function` runs in a loop of one turn. XLA knows neither the number of turns
+    nor that the arguments stay the same, so it moves nothing out of the loop. Batches and
+    derivatives use `function` itself.
     """
     # Traced once for all the uses below.
     plain = jax.jit(function, inline=True)
@@ -86,10 +91,11 @@ def one_kernel(function: Function) -> Function:
 
 @jax.custom_jvp
 def batched_as(out: Any, args: Any) -> Any:
-    """`out`, all of it batched if any of `args` is, as `_batched` of `one_kernel` returns it.
+    """Return `out` with every leaf batched if any leaf of `args` is batched.
 
-    Under `jit` JAX takes the axes of a batch from the function, and the values from the rule for
-    its derivative: where the two differ, arrays have wrong shapes, and nothing says so.
+    This repeats what the batching rule of `one_kernel` returns. Under `jit`, JAX takes the axes of
+    a batch from the function and the values from the rule for its derivative. Where the two differ,
+    arrays have wrong shapes, and no error is raised.
     """
     return _grown(out, args)
 

@@ -1,4 +1,4 @@
-"""Euler angles in all 24 sequences; the default is 3-1-3, "ZXZ", as in the notes.
+"""Convert Euler angles in all 24 sequences; the default is 3-1-3, "ZXZ", as in the notes.
 
 A sequence is three letters; the angles have its order, and all are active, in radians. **Capitals
 are intrinsic**: each turn is about the moved axis, and M = R_1(a) R_2(b) R_3(c) (notes, eqs 12,
@@ -30,7 +30,7 @@ _MANY_TURNS = 8 * np.pi
 
 
 def to_quaternion(angles: Vec3Like, sequence: str = "ZXZ") -> Quat:
-    """The unit quaternion, body → world, of three Euler angles.
+    """Return the unit quaternion, body → world, of three Euler angles.
 
     **Arguments:** `angles` (3,), rad, in the order of `sequence`. **Warns** if a known angle is
     beyond four turns: it may be in degrees.
@@ -44,7 +44,8 @@ def to_quaternion(angles: Vec3Like, sequence: str = "ZXZ") -> Quat:
 
 
 def to_matrix(angles: Vec3Like, sequence: str = "ZXZ") -> Mat3:
-    """The rotation matrix, body → world, of three Euler angles (notes, eqs 31, 33 for "ZXZ").
+    """Return the rotation matrix, body → world, of three Euler angles (notes, eqs 31, 33 for
+    "ZXZ").
 
     **Arguments:** `angles` (3,), rad, in the order of `sequence`: (φ, θ, ψ) for "ZXZ".
 
@@ -55,7 +56,7 @@ def to_matrix(angles: Vec3Like, sequence: str = "ZXZ") -> Mat3:
 
 
 def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
-    """The Euler angles of a rotation matrix, rad, in the order of `sequence`.
+    """Return the Euler angles of a rotation matrix, rad, in the order of `sequence`.
 
     **Arguments:** `matrix` (3, 3) rotation, body → world; values are not checked (`so3.check`).
     **Returns:** (3,): outer angles in (−π, π], the middle one in [0, π] if the first and the last
@@ -69,7 +70,8 @@ def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
 
 
 def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
-    """The Euler angles of a quaternion, rad, in the order of `sequence`; the same bits for −q.
+    """Return the Euler angles of a quaternion, rad, in the order of `sequence`; q and −q give the
+    same bits.
 
     **Arguments:** `q` (4,) of any length, body → world. **Raises:** `ValueError` for zero or NaN.
     Half the sum and half the difference of the outer angles come from two atan2, so that the matrix
@@ -108,7 +110,7 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
 
 
 def is_singular(angles: Vec3Like, sequence: str = "ZXZ") -> Bool[Array, ""]:
-    """Whether the outer turns of these angles have one axis, to 4 units of round-off.
+    """Return whether the outer turns of these angles have the same axis, to 4 units of round-off.
 
     **Arguments:** `angles` (3,), rad, in the order of `sequence`. For a matrix:
     `is_singular(from_matrix(matrix, sequence), sequence)`.
@@ -127,7 +129,8 @@ def rates_to_omega(
     *,
     frame: Literal["body", "world"] = "body",
 ) -> Vec3:
-    """Angular velocity from Euler angles and their rates (notes, eqs 80–83 for "ZXZ" and "body").
+    """Return the angular velocity of Euler angles and their rates (notes, eqs 80–83 for "ZXZ" and
+    "body").
 
     **Arguments:** `angles` (3,), rad, and `rates` (3,), rad/s, in the order of `sequence`; `frame`
     of the result, (3,), rad/s.
@@ -151,7 +154,7 @@ def omega_to_rates(
     *,
     frame: Literal["body", "world"] = "body",
 ) -> Vec3:
-    """Rates of the Euler angles from the angular velocity: eqs 81–83 of the notes, solved.
+    """Return the rates of the Euler angles for an angular velocity: eqs 81–83 of the notes, solved.
 
     **Arguments:** `angles` (3,), rad, in the order of `sequence`; `omega` (3,), rad/s, in `frame`.
     **Returns:** (3,) rad/s. In the singular case (`is_singular`) the last rate is 0, and the part
@@ -177,7 +180,9 @@ def omega_to_rates(
 
 
 def _axes(sequence: str) -> tuple[tuple[int, int, int], bool]:
-    """Axis numbers of the turns, intrinsic, and whether the angles are listed in reverse."""
+    """Return the axis numbers of the three intrinsic turns, and whether the angles are listed in
+    reverse.
+    """
     extrinsic = isinstance(sequence, str) and sequence.islower()
     letters = "xyz" if extrinsic else "XYZ"
     if not isinstance(sequence, str) or len(sequence) != 3 or not set(sequence) <= set(letters):
@@ -209,7 +214,7 @@ def _in_order(numbers: Vec3, reverse: bool) -> tuple[Scalar, Scalar, Scalar]:
 
 
 def _handed(i: int, j: int) -> int:
-    """+1 if e_i × e_j is the third basis vector, −1 if it is its opposite."""
+    """Return +1 if e_i × e_j is the third basis vector, −1 if it is the opposite vector."""
     return 1 if (j - i) % 3 == 1 else -1
 
 
@@ -220,13 +225,15 @@ def _about(axis: int, angle: Scalar) -> Quat:
 
 
 def _wrap(angle: Scalar) -> Scalar:
-    """An angle in (−2π, 2π) brought into (−π, π]."""
+    """Return an angle in (−2π, 2π) shifted by a full turn into (−π, π]."""
     angle = jnp.where(angle > np.pi, angle - 2 * np.pi, angle)
     return jnp.where(angle <= -np.pi, angle + 2 * np.pi, angle)
 
 
 def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3, Vec3]:
-    """The axes of the three turns in the body frame: what each unit rate adds to Ω."""
+    """Return the axes of the three turns in the body frame: what a unit rate of each angle adds to
+    Ω.
+    """
     _, j, k = axes
     first, second, third = (jnp.eye(3, dtype=angles[0].dtype)[axis] for axis in axes)
     middle, last = _about(j, angles[1]), _about(k, angles[2])
@@ -235,10 +242,15 @@ def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3
 
 
 def _vanishing(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
-    """The product first · (third × second) of the axes, and whether it is 0 to round-off."""
+    """Return the product first · (third × second) of the axes, and whether it is 0 to round-off."""
     i, j, k = axes
     size = jnp.sin(middle) if i == k else -_handed(i, j) * jnp.cos(middle)
     return size, jnp.abs(size) < 4 * jnp.finfo(middle.dtype).eps
 
+
+__all__ = [
+    "from_matrix", "from_quaternion", "is_singular", "omega_to_rates", "rates_to_omega",
+    "to_matrix", "to_quaternion",
+]  # fmt: skip
 
 show(__name__)

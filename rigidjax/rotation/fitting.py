@@ -1,4 +1,4 @@
-"""The rotation that fits best: projection, alignment, Wahba's problem, the mean of rotations.
+"""Find the rotation that fits best: projection, alignment, Wahba's problem, the mean of rotations.
 
 Singular values and eigenvectors are not used: their derivatives are NaN at every rotation, where
 all three singular values are 1. The best rotation R of a 3×3 matrix B, with the largest Tr(RᵀB),
@@ -37,7 +37,8 @@ _LIGHT = 1e-3
 
 
 def project(matrix: Mat3Like) -> Mat3:
-    """The rotation nearest to a matrix (Frobenius norm), with the correct derivative also on SO(3).
+    """Return the rotation nearest to a matrix (Frobenius norm); its derivative is correct also on
+    SO(3).
 
     **Arguments:** `matrix` (3, 3), det > 0. **Returns:** (3, 3) with RᵀR = 1 to round-off.
     **Raises:** `ValueError` if a known matrix is left-handed (no rotation is nearest to a mirror
@@ -64,12 +65,12 @@ def wahba(
     world: Float[ArrayLike, "n 3"],
     weights: Float[ArrayLike, "n"] | None = None,
 ) -> Mat3:
-    """The rotation M, body → world, least in Σ w_i |world_i − M body_i|² (Wahba 1965).
+    """Return the rotation M, body → world, that minimises Σ w_i |world_i − M body_i|² (Wahba 1965).
 
     **Arguments:** `body`, `world` (n, 3), n ≥ 2: the same directions in both frames, any units;
-    `weights` (n,), not negative, 1 if not given; they may differ by 1e13 (1e5 in float32). It
-    solves the quartic of Markley 1993 (FOAM, J. Astronaut. Sci. 41, 261), then takes Newton steps
-    on the group.
+    `weights` (n,), not negative, 1 if not given; they may differ by 1e13 (1e5 in float32). The
+    method solves the quartic of Markley 1993 (FOAM, J. Astronaut. Sci. 41, 261), then takes Newton
+    steps on the group.
 
     **Raises:** an error, also under `jit`, if the directions do not determine the rotation: fewer
     than two, or all parallel (to 5e-4 rad in float64, 4° in float32, where half the digits would be
@@ -100,7 +101,8 @@ def wahba(
     # (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det b: 0 where a turn is free.
     eps = float(jnp.finfo(w.dtype).eps)
     loose, seen, one = jnp.zeros((), bool), jnp.sign(heavy), jnp.eye(3, dtype=w.dtype)
-    # Without weights the directions of each frame alone: `best` is not the best turn of these.
+    # The first two rows test the directions of each frame alone, without weights, at the identity:
+    # `best` is the best rotation of the weighted pairs only.
     for turn, b, least in (
         (one, _weighted_sum(seen, those, those), 4 * np.sqrt(eps)),
         (one, _weighted_sum(seen, these, these), 4 * np.sqrt(eps)),
@@ -114,17 +116,18 @@ def wahba(
 def _weighted_sum(
     w: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
 ) -> Mat3:
-    """Σ w_i world_i body_iᵀ."""
+    """Return Σ w_i world_i body_iᵀ."""
     return (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
 
 
 def _newton_step(
     best: Mat3, w: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
 ) -> Mat3:
-    """A Newton step from `best` towards the largest Σ w_i world_i · M body_i.
+    """Return the rotation after a Newton step from `best` towards the largest Σ w_i world_i · M
+    body_i.
 
-    The moment of each direction is taken of the small difference of both vectors: the rounding of a
-    heavy one does not turn the body about it.
+    The moment of each direction is computed from the small difference of the two vectors. So the
+    rounding of a direction with a large weight does not turn the body about it.
     """
     moved = (best[None] * body[:, None, :]).sum(-1)
     lengths = [jnp.sqrt((x * x).sum(-1)) for x in lax.stop_gradient((moved, world))]
@@ -135,7 +138,7 @@ def _newton_step(
 
 
 def align(a: Vec3Like, b: Vec3Like) -> Mat3:
-    """The smallest rotation that takes the direction of a into that of b.
+    """Return the smallest rotation that takes the direction of a into that of b.
 
     **Arguments:** `a`, `b` (3,), in one frame, any lengths. **Returns:** (3, 3), R a ∥ b. If a and
     b are opposite to round-off it is half a turn about a normal to a, as near as possible to the
@@ -162,7 +165,7 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
 
 
 def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | None = None) -> Mat3:
-    """The Karcher mean: the rotation least in Σ w_i |angle to R_i|².
+    """Return the Karcher mean: the rotation that minimises Σ w_i |angle to R_i|².
 
     **Arguments:** `matrices` (n, 3, 3) rotations within a quarter turn of the mean: it is then
     unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative. **Returns:**
@@ -181,10 +184,10 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
 def mean_quaternion(
     quaternions: Float[ArrayLike, "n 4"], weights: Float[ArrayLike, "n"] | None = None
 ) -> Quat:
-    """The Karcher mean of unit quaternions; each may have either sign.
+    """Return the Karcher mean of unit quaternions; each may have either sign.
 
     **Arguments:** `quaternions` (n, 4); `weights` (n,). See `mean`. **Returns:** (4,), w ≥ 0.
-    **Raises:** as `quaternion.check`, if they are known now.
+    **Raises:** as `quaternion.check`, for known values.
 
     >>> mean_quaternion(jnp.array([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]])).tolist()
     [1.0, 0.0, 0.0, 0.0]
@@ -197,6 +200,7 @@ def mean_quaternion(
 # Compiled once: outside of `jit` the loop would be compiled again at each call.
 @partial(jax.jit, inline=True)
 def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
+    """Return the Karcher mean of the quaternions `q` with weights `w`, by Newton's method."""
 
     def newton(_: Any, start: Quat, q: Array, w: Array) -> Quat:
         apart = jax.vmap(lambda each: quaternion.multiply(quaternion.conjugate(start), each))(q)
@@ -215,12 +219,17 @@ def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
 
 
 def of_order_one(x: Array) -> Array:
-    """The array times a power of two, for formulas of ratios: no product overflows."""
+    """Return the array multiplied by a power of two that brings its largest entry near 1.
+
+    It serves formulas of ratios, in which the scale cancels: no product overflows.
+    """
     return near_one(jnp.max(jnp.abs(x))) * x
 
 
 def weights_of(weights: Any, like: Array, of: str) -> Array:
-    """One weight for each row, 1 if not given; known weights must have a positive sum."""
+    """Return one weight for each row of `like`, 1 where `weights` is `None`; known weights must
+    have a positive sum.
+    """
     if like.shape[0] == 0:
         raise ValueError(f"{of}: wanted at least one row, got none")
     if weights is None:
@@ -234,7 +243,9 @@ def weights_of(weights: Any, like: Array, of: str) -> Array:
 
 
 def _quartic(b: Mat3) -> tuple[Scalar, Scalar]:
-    """The sum of the singular values λ (signed by det), and ζ, of a matrix of Frobenius norm 1."""
+    """Return λ, the sum of the singular values (signed by the determinant), and ζ, of a matrix `b`
+    of Frobenius norm 1 (Markley 1993).
+    """
     det, adjugate = determinant(b), cofactors(b)
     flat = 4 * (adjugate * adjugate).sum()
 
@@ -243,13 +254,13 @@ def _quartic(b: Mat3) -> tuple[Scalar, Scalar]:
         slope = 4 * root * excess - 8 * det
         return root - (excess * excess - 8 * det * root - flat) / jnp.where(slope > 0, slope, 1)
 
-    # From above the largest root, Newton's method comes down to it without overshooting.
+    # Newton's method starts above the largest root and comes down to it without overshooting.
     root = lax.fori_loop(0, 24, newton, jnp.full_like(det, np.sqrt(3)))
     return root, 0.5 * (root * root - 1) * root - det
 
 
 def _curvature(r: Mat3, b: Mat3) -> Mat3:
-    """Tr(S) 1 − S, S = sym(Rᵀb): the curvature of the gain Tr(Rᵀb) around R."""
+    """Return Tr(S) 1 − S with S = sym(Rᵀb), the curvature of the gain Tr(Rᵀb) around R."""
     m = product(r.T, b)
     s = 0.5 * (m + m.T)
     return (s[0, 0] + s[1, 1] + s[2, 2]) * jnp.eye(3, dtype=r.dtype) - s
@@ -257,7 +268,7 @@ def _curvature(r: Mat3, b: Mat3) -> Mat3:
 
 @jax.custom_jvp
 def nearest(b: Mat3) -> Mat3:
-    """The rotation R with the largest Tr(Rᵀb), for a matrix of any size."""
+    """Return the rotation R with the largest Tr(Rᵀb), for a matrix of any size."""
     b = of_order_one(b)
     b = b / jnp.sqrt((b * b).sum())
     root, zeta = _quartic(b)
@@ -276,7 +287,7 @@ def nearest(b: Mat3) -> Mat3:
 def _best_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     (b,), (db,) = primals, tangents
     r = nearest(b)
-    # Of any size: both are made smaller alike.
+    # `b` may have any size: a common factor for `b` and `db` leaves the derivative unchanged.
     scale = near_one(jnp.max(jnp.abs(b)))
     b, db = scale * b, scale * db
     return r, product(r, hat(solve(_curvature(r, b), 2 * vee(product(r.T, db)))))

@@ -1,4 +1,6 @@
-"""The costly maps of `quaternion` and `so3`, without checks; also compiled outside of `jit`."""
+"""Compute the costly maps of `quaternion` and `so3`, without checks, compiled also outside of
+`jit`.
+"""
 
 from collections.abc import Sequence
 from functools import partial
@@ -9,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
-from rigidjax.rotation.barrier import once
+from rigidjax.rotation.barrier import compute_once
 from rigidjax.rotation.linalg3 import (
     components,
     cross_components,
@@ -26,7 +28,7 @@ _compiled = partial(jax.jit, inline=True)
 
 @_compiled
 def vector_to_quaternion(v: Vec3) -> Quat:
-    """The unit quaternion (cos θ/2, ½ v sin(θ/2)/(θ/2))."""
+    """Return the unit quaternion (cos θ/2, ½ v sin(θ/2)/(θ/2)) of a rotation vector v, θ = |v|."""
     x, y, z = parts = components(v)
     s = 0.25 * square(parts)
     half = 0.5 * stumpff(1, s)
@@ -35,16 +37,20 @@ def vector_to_quaternion(v: Vec3) -> Quat:
 
 @_compiled
 def vector_to_matrix(v: Vec3) -> Mat3:
-    """The rotation matrix 1 + A hat v + B (hat v)²."""
+    """Return the rotation matrix 1 + A hat v + B (hat v)², A = sin θ/θ, B = (1 − cos θ)/θ², θ =
+    |v|.
+    """
     parts = components(v)
     s = 0.25 * square(parts)
     half = stumpff(1, s)
-    return hat_polynomial(parts, once(stumpff(0, s) * half), once(0.5 * half * half))
+    return hat_polynomial(
+        parts, compute_once(stumpff(0, s) * half), compute_once(0.5 * half * half)
+    )
 
 
 @_compiled
 def matrix_to_quaternion(m: Mat3) -> Quat:
-    """The canonical unit quaternion, by the largest row of 4 q qᵀ."""
+    """Return the canonical unit quaternion q of a rotation matrix, by the largest row of 4 q qᵀ."""
     a, b, c, d, e, f, g, h, i = entries(m)
     w, x, y, z = 1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i
     wx, wy, wz, xy, yz, zx = h - f, c - g, d - b, b + d, f + h, c + g
@@ -54,20 +60,21 @@ def matrix_to_quaternion(m: Mat3) -> Quat:
     down = jnp.maximum(y, z) > jnp.maximum(w, x)
     row = [jnp.where(down, one, other) for one, other in zip(lower, upper, strict=True)]
     scale = 1 / jnp.sqrt(row[0] ** 2 + row[1] ** 2 + row[2] ** 2 + row[3] ** 2)
-    scale = jnp.where(flipped(row), -scale, scale)
+    scale = jnp.where(is_noncanonical(row), -scale, scale)
     return jnp.stack([scale * part for part in row])
 
 
 @jax.custom_jvp
 def _log(q: Quat) -> Vec3:
-    """The shortest rotation vector of either sign of q."""
+    """Return the shortest rotation vector of q, the same for −q."""
     w, x, y, z = parts = components(near_one(*components(q)) * q)
     n2 = x * x + y * y + z * z
-    # tan of the half angle is n/|w|, of the quarter n/a, of the eighth n/b: nothing cancels.
+    # With n² = x² + y² + z², the tangent of θ/2 is n/|w|, of θ/4 n/a, of θ/8 n times `inverse`:
+    # all terms of the sums are positive, so nothing cancels.
     a = jnp.abs(w) + jnp.sqrt(n2 + w * w)
     inverse = 1 / (a + jnp.sqrt(n2 + a * a))
     scale = 8 * inverse * arctan_ratio(n2 * inverse * inverse)
-    scale = jnp.where(flipped(parts), -scale, scale)
+    scale = jnp.where(is_noncanonical(parts), -scale, scale)
     return jnp.stack([scale * x, scale * y, scale * z])
 
 
@@ -75,11 +82,11 @@ def _log(q: Quat) -> Vec3:
 def _log_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     (q,), (dq,) = primals, tangents
     v = _log(q)
-    # Any length is allowed: both are scaled by the same factor.
+    # q may have any length: a common factor for q and dq leaves the derivative unchanged.
     scale = near_one(*components(q))
     w, *u = parts = components(scale * q)
     dw, *du = components(scale * dq)
-    # The turn seen from the body, 2 vec(q̄ dq)/|q|², then the inverse right Jacobian.
+    # First the small turn in the body frame, 2 vec(q̄ dq)/|q|², then the inverse right Jacobian.
     scale, aside = 2 / square4(parts), cross_components(u, du)
     turn = [scale * (w * du[i] - dw * u[i] - aside[i]) for i in range(3)]
     vs = components(v)
@@ -94,13 +101,13 @@ quaternion_to_vector = _compiled(_log)
 
 @_compiled
 def normalised(q: Quat) -> Quat:
-    """The quaternion of length 1 in the direction of q."""
+    """Return the quaternion of length 1 in the direction of q."""
     q = near_one(*components(q)) * q
     return q / jnp.sqrt(square4(components(q)))
 
 
 def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar | float) -> Mat3:
-    """The matrix 1 + a hat v + b (hat v)²."""
+    """Return the matrix 1 + a hat v + b (hat v)²."""
     x, y, z = v
     xx, yy, zz = b * x * x, b * y * y, b * z * z
     xy, yz, zx = b * x * y, b * y * z, b * z * x
@@ -110,18 +117,18 @@ def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar | float) -> Mat3:
 
 
 def left_jacobian_inverse(v: Vec3) -> Mat3:
-    """The matrix 1 − ½ hat v + g (hat v)²."""
+    """Return the matrix 1 − ½ hat v + g (hat v)², with g of `inverse_kernel`."""
     t = square(parts := components(v))
     return hat_polynomial(parts, jnp.full_like(t, -0.5), inverse_kernel(t))
 
 
 def square4(q: Sequence[Scalar]) -> Scalar:
-    """Squared length of four scalars."""
+    """Return the squared length of four scalars."""
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
 
 
 def product4(p: Any, q: Any) -> tuple[Any, ...]:
-    """The quaternion product p q of four scalars each, of JAX or NumPy."""
+    """Return the quaternion product p q; p and q are four scalars each, of JAX or NumPy."""
     a, b, c, d = p
     e, f, g, h = q
     return (
@@ -132,8 +139,8 @@ def product4(p: Any, q: Any) -> tuple[Any, ...]:
     )
 
 
-def flipped(q: Sequence[Scalar]) -> Array:
-    """Whether −q, not q, is canonical."""
+def is_noncanonical(q: Sequence[Scalar]) -> Array:
+    """Return whether −q, and not q, is canonical (see `quaternion.canonical`)."""
     w, x, y, z = q
     lead = jnp.where(w != 0, w, jnp.where(x != 0, x, jnp.where(y != 0, y, z)))
     return lead < 0

@@ -1,4 +1,4 @@
-"""Vectors and 3×3 matrices, written on components.
+"""Compute with vectors and 3×3 matrices, written on components.
 
 `@` on 3×3 matrices is slow in gradients on CPU and runs in TF32 on some GPUs; these functions avoid
 both. Range: the products in a formula (of two entries in `cross`, `dot`, `product` and `apply`, of
@@ -16,21 +16,23 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3, Vec3Like
-from rigidjax.rotation.barrier import once
+from rigidjax.rotation.barrier import compute_once
 
 
 def components(v: Float[Array, "n"]) -> tuple[Scalar, ...]:
-    """The entries of a vector, as scalars: one `lax.split` is faster in gradients than indices."""
+    """Return the entries of a vector as scalars; one `lax.split` is faster in gradients than
+    indices.
+    """
     return tuple(part.reshape(()) for part in lax.split(v, (1,) * v.shape[0]))
 
 
 def entries(m: Float[Array, "3 3"]) -> tuple[Scalar, ...]:
-    """The nine entries of a 3×3 matrix, row by row, as scalars."""
+    """Return the nine entries of a 3×3 matrix, row by row, as scalars."""
     return components(m.reshape(9))
 
 
 def cross(a: Vec3Like, b: Vec3Like) -> Vec3:
-    """Vector product a × b of two vectors (3,) in one frame, any units.
+    """Return the vector product a × b of two vectors (3,) in one frame, any units.
 
     >>> cross(jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])).tolist()
     [0.0, 0.0, 1.0]
@@ -40,26 +42,28 @@ def cross(a: Vec3Like, b: Vec3Like) -> Vec3:
 
 
 def cross_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> tuple[Scalar, ...]:
-    """Vector product of two triples of scalars."""
+    """Return the vector product of two triples of scalars."""
     (ax, ay, az), (bx, by, bz) = a, b
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
 def dot_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
-    """Scalar product of two triples of scalars."""
+    """Return the scalar product of two triples of scalars."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def square(v: Sequence[Scalar]) -> Scalar:
-    """Squared length of a triple of scalars, as the argument of a costly function."""
-    return once(dot_components(v, v))
+    """Return the squared length of a triple of scalars, computed once since costly functions take
+    it.
+    """
+    return compute_once(dot_components(v, v))
 
 
 def near_one(*parts: Scalar) -> Scalar:
-    """A power of two that brings the largest of some scalars near 1, with derivative zero.
+    """Return a power of two that brings the largest of some scalars near 1, with derivative zero.
 
-    For formulas that do not depend on the length of their argument: times this number, it keeps all
-    its digits, and its squares do not overflow.
+    It serves formulas that do not depend on the length of their argument. The argument multiplied
+    by this power of two keeps all its digits, and its squares do not overflow.
     """
     sizes = [jnp.abs(lax.stop_gradient(part)) for part in parts]
     info = jnp.finfo(sizes[0].dtype)
@@ -69,7 +73,8 @@ def near_one(*parts: Scalar) -> Scalar:
 
 
 def hat(w: Vec3Like) -> Mat3:
-    """The matrix J with J y = w × y (notes, eqs 41–43, 49), of `w` (3,) in any units and frame.
+    """Return the matrix J with J y = w × y, of `w` (3,) in any units and frame (notes, eqs 41–43,
+    49).
 
     >>> hat(jnp.array([1.0, 2.0, 3.0])).tolist()
     [[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]]
@@ -80,7 +85,8 @@ def hat(w: Vec3Like) -> Mat3:
 
 
 def vee(matrix: Mat3Like) -> Vec3:
-    """The vector of an antisymmetric `matrix` (3, 3); else w_i = ½ Tr(A J_iᵀ) (notes, eqs 52, 53).
+    """Return the vector w of an antisymmetric `matrix` (3, 3) A; for any A, w_i = ½ Tr(A J_iᵀ)
+    (notes, eqs 52, 53).
 
     >>> vee(hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]
@@ -90,7 +96,8 @@ def vee(matrix: Mat3Like) -> Vec3:
 
 
 def basis(dtype: Any = float) -> Float[Array, "3 3 3"]:
-    """The matrices J_1, J_2, J_3: J_i y = e_i × y, ½ Tr(J_iᵀ J_j) = δ_ij (notes, eqs 41–43, 53).
+    """Return the matrices J_1, J_2, J_3: J_i y = e_i × y, ½ Tr(J_iᵀ J_j) = δ_ij (notes, eqs 41–43,
+    53).
 
     **Arguments:** `dtype` of the (3, 3, 3) array. Eq 16 of the notes prints −J_3, the transpose of
     J_3; eq 42 is right.
@@ -103,7 +110,8 @@ def basis(dtype: Any = float) -> Float[Array, "3 3 3"]:
 
 
 def product(a: Mat3Like, b: Mat3Like) -> Mat3:
-    """Matrix product of `a`, `b` (3, 3) on components, in full precision on every device.
+    """Return the matrix product of `a`, `b` (3, 3) on components, in full precision on every
+    device.
 
     >>> product(jnp.eye(3), 2.0 * jnp.eye(3)).tolist()
     [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]
@@ -113,7 +121,7 @@ def product(a: Mat3Like, b: Mat3Like) -> Mat3:
 
 
 def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
-    """Matrix `a` (3, 3) times vector `y` (3,), on components.
+    """Return the matrix `a` (3, 3) times the vector `y` (3,), on components.
 
     >>> apply(2.0 * jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [2.0, 4.0, 6.0]
@@ -136,7 +144,7 @@ def solve(a: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def determinant(a: Mat3Like) -> Scalar:
-    """Determinant of `a` (3, 3): +1 for a rotation, −1 for a reflection (notes, eq 10).
+    """Return the determinant of `a` (3, 3): +1 for a rotation, −1 for a reflection (notes, eq 10).
 
     >>> float(determinant(jnp.eye(3)))
     1.0
@@ -146,14 +154,14 @@ def determinant(a: Mat3Like) -> Scalar:
 
 
 def cofactors(a: Mat3) -> Mat3:
-    """The matrix of cofactors, det a · a⁻ᵀ; a need not have an inverse."""
+    """Return the matrix of cofactors, det a · a⁻ᵀ; a need not have an inverse."""
     m = entries(a)
     p, q, r = m[:3], m[3:6], m[6:]
     return jnp.stack([jnp.stack(cross_components(*two)) for two in ((q, r), (r, p), (p, q))])
 
 
 def dot(a: Vec3Like, b: Vec3Like) -> Scalar:
-    """Scalar product a · b of two vectors (3,) in one frame.
+    """Return the scalar product a · b of two vectors (3,) in one frame.
 
     >>> float(dot(jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 1.0])))
     6.0

@@ -1,4 +1,4 @@
-"""Modified Rodrigues parameters σ = n tan(θ/4), and their shadow set.
+"""Convert modified Rodrigues parameters σ = n tan(θ/4), and their shadow set.
 
 Three numbers without a sine, regular up to a full turn, where σ is infinite. σ and its shadow
 −σ/|σ|² are the same rotation; a switch at |σ| = 1 keeps θ ≤ π. Source: Schaub & Junkins, 2018,
@@ -17,7 +17,8 @@ from rigidjax.rotation.validation import direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
-    """σ = q_v/(1 + q_w) of the canonical `q` (4,) unit, |σ| ≤ 1: the same bits for q and −q.
+    """Return σ = q_v/(1 + q_w), |σ| ≤ 1, of the canonical form of `q` (4,) unit; q and −q give the
+    same bits.
 
     >>> from_quaternion(jnp.array([-1.0, 0.0, 0.0, 0.0])).tolist()
     [-0.0, -0.0, -0.0]
@@ -27,13 +28,15 @@ def from_quaternion(q: QuatLike) -> Vec3:
 
 
 def to_quaternion(sigma: Vec3Like) -> Quat:
-    """The unit quaternion ((1 − s), 2σ)/(1 + s), s = |σ|², of `sigma` (3,); −q for the shadow.
+    """Return the unit quaternion ((1 − s), 2σ)/(1 + s), s = |σ|², of `sigma` (3,); the shadow gives
+    −q.
 
     >>> to_quaternion(jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
     sigma = _checks.given(sigma, (3,), "sigma")
-    # Both parts of the ratio by the square of a power of two: 1 is then `one`.
+    # Numerator and denominator are multiplied by the square of a power of two, `one`, so that
+    # |σ|² does not overflow; the number 1 of the formula becomes `one`².
     one = jnp.minimum(near_one(*components(sigma)), 1)
     sigma = one * sigma
     s, one2 = dot(sigma, sigma), one * one
@@ -41,7 +44,7 @@ def to_quaternion(sigma: Vec3Like) -> Quat:
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
-    """The parameters, |σ| ≤ 1, of a rotation `matrix` (3, 3), body → world, unchecked.
+    """Return the parameters, |σ| ≤ 1, of a rotation `matrix` (3, 3), body → world, unchecked.
 
     >>> from_matrix(jnp.eye(3)).tolist()
     [0.0, 0.0, 0.0]
@@ -50,7 +53,7 @@ def from_matrix(matrix: Mat3Like) -> Vec3:
 
 
 def to_matrix(sigma: Vec3Like) -> Mat3:
-    """The rotation matrix, body → world, of `sigma` (3,); the same for the shadow.
+    """Return the rotation matrix, body → world, of `sigma` (3,); the shadow gives the same matrix.
 
     >>> to_matrix(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -59,7 +62,8 @@ def to_matrix(sigma: Vec3Like) -> Mat3:
 
 
 def shadow(sigma: Vec3Like) -> Vec3:
-    """The other parameters of `sigma` (3,), −σ/|σ|² (eq 3.145); `ValueError` for zero or NaN.
+    """Return the shadow −σ/|σ|² of `sigma` (3,): the other parameters of the same rotation (eq
+    3.145). **Raises:** `ValueError` for zero or NaN.
 
     >>> shadow(jnp.array([0.0, 0.5, 0.0])).tolist()
     [-0.0, -2.0, -0.0]
@@ -68,7 +72,7 @@ def shadow(sigma: Vec3Like) -> Vec3:
 
 
 def switch(sigma: Vec3Like) -> Vec3:
-    """`sigma` (3,) if |σ| ≤ 1, else its shadow, the shorter turn. Switch between steps only.
+    """Return `sigma` (3,) if |σ| ≤ 1, else its shadow, the shorter turn. Switch between steps only.
 
     >>> switch(jnp.array([0.0, 2.0, 0.0])).tolist()
     [-0.0, -0.5, -0.0]
@@ -85,7 +89,7 @@ def _shadow(sigma: Vec3) -> Vec3:
 
 
 def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
-    """dσ/dt = ¼ [(1 − s) Ω + 2 σ × Ω + 2 σ (σ·Ω)], 1/s, never singular (eq 3.160).
+    """Return dσ/dt = ¼ [(1 − s) Ω + 2 σ × Ω + 2 σ (σ·Ω)], 1/s, s = |σ|², never singular (eq 3.160).
 
     **Arguments:** `sigma` (3,) dimensionless; `omega` (3,) rad/s, body frame.
 
@@ -99,7 +103,8 @@ def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
 
 
 def rates_to_omega(sigma: Vec3Like, rates: Vec3Like) -> Vec3:
-    """Ω = 4/(1 + s)² [(1 − s) σ̇ − 2 σ × σ̇ + 2 σ (σ·σ̇)], body frame (Schaub & Junkins, eq 3.164).
+    """Return Ω = 4/(1 + s)² [(1 − s) σ̇ − 2 σ × σ̇ + 2 σ (σ·σ̇)], s = |σ|², body frame (Schaub &
+    Junkins, eq 3.164).
 
     **Arguments:** `sigma` (3,) dimensionless; `rates` (3,) 1/s. **Returns:** (3,) rad/s.
 
@@ -112,5 +117,10 @@ def rates_to_omega(sigma: Vec3Like, rates: Vec3Like) -> Vec3:
     turned = (1 - s) * rates - 2 * cross(sigma, rates) + 2 * dot(sigma, rates) * sigma
     return 4 / (1 + s) ** 2 * turned
 
+
+__all__ = [
+    "from_matrix", "from_quaternion", "omega_to_rates", "rates_to_omega", "shadow", "switch",
+    "to_matrix", "to_quaternion",
+]  # fmt: skip
 
 show(__name__)

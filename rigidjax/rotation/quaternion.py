@@ -1,4 +1,5 @@
-"""Unit quaternions (w, x, y, z), scalar first: q turns body vectors into world vectors.
+"""Compute with unit quaternions (w, x, y, z), scalar first: q turns body vectors into world
+vectors.
 
 q and −q are the same rotation. `log`, and every error computed with it, gives the same bits for
 both. The maps take one quaternion and do not normalise it, so that they cost little in a vector
@@ -22,8 +23,8 @@ from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, ScalarLike, Vec3, Vec3Like
 from rigidjax.rotation.kernels import (
-    flipped,
     hat_polynomial,
+    is_noncanonical,
     matrix_to_quaternion,
     normalised,
     product4,
@@ -37,7 +38,7 @@ _HINT = "one quaternion is (w, x, y, z), scalar first; batch with jax.vmap"
 
 
 def exp(v: Vec3Like) -> Quat:
-    """The quaternion of a rotation vector: (cos θ/2, ½ v sin(θ/2)/(θ/2)), θ = |v|.
+    """Return the quaternion of a rotation vector: (cos θ/2, ½ v sin(θ/2)/(θ/2)), θ = |v|.
 
     **Arguments:** `v` (3,) rotation vector, rad (notes, eqs 17, 18, with v = γ y). The angle is
     known to ε|v|. **Returns:** (4,) of norm 1; value and derivatives are correct also at v = 0.
@@ -50,7 +51,7 @@ def exp(v: Vec3Like) -> Quat:
 
 
 def log(q: QuatLike) -> Vec3:
-    """The shortest rotation vector of a quaternion, rad, |v| ≤ π.
+    """Return the shortest rotation vector of a quaternion, rad, |v| ≤ π.
 
     **Arguments:** `q` (4,) of any length. **Returns:** v = 2 atan2(|q_v|, q_w) q_v/|q_v| (3,) of
     `canonical(q)`. The derivative is that of q/|q|, by the inverse right Jacobian, and correct from
@@ -64,7 +65,7 @@ def log(q: QuatLike) -> Vec3:
 
 
 def multiply(p: QuatLike, q: QuatLike) -> Quat:
-    """Product p q: first turn by q, then by p (the matrices multiply in the same order).
+    """Return the product p q: first turn by q, then by p (the matrices multiply in the same order).
 
     **Arguments:** `p`, `q` (4,). With q body → world, `multiply(q, d)` is a turn by d about axes of
     the body, and `multiply(d, q)` about axes of the world (notes, eqs 27–29).
@@ -77,7 +78,7 @@ def multiply(p: QuatLike, q: QuatLike) -> Quat:
 
 
 def conjugate(q: QuatLike) -> Quat:
-    """The opposite rotation (w, −x, −y, −z) of a unit quaternion `q` (4,).
+    """Return the conjugate (w, −x, −y, −z) of `q` (4,), the opposite rotation if `q` is unit.
 
     >>> conjugate(jnp.array([1.0, 2.0, 3.0, 4.0])).tolist()
     [1.0, -2.0, -3.0, -4.0]
@@ -87,7 +88,8 @@ def conjugate(q: QuatLike) -> Quat:
 
 
 def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
-    """Body components `y` (3,) → world components M y', by `q` (4,) unit (notes, eqs 8, 21).
+    """Return the world components M y of a vector with body components `y` (3,), by `q` (4,) unit
+    (notes, eqs 8, 21).
 
     >>> rotate(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0])).tolist()
     [-1.0, -2.0, 3.0]
@@ -97,7 +99,8 @@ def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
 
 
 def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
-    """World components `y` (3,) → body components, Mᵀ y, by `q` (4,) unit (notes, eqs 8, 22).
+    """Return the body components Mᵀ y of a vector with world components `y` (3,), by `q` (4,) unit
+    (notes, eqs 8, 22).
 
     >>> rotate_inverse(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0])).tolist()
     [-1.0, -2.0, 3.0]
@@ -120,7 +123,7 @@ def check(q: Float[ArrayLike, "*batch 4"], *, name: str = "q") -> Float[Array, "
 
 
 def from_xyzw(xyzw: QuatLike) -> Quat:
-    """Scalar-last components `xyzw` (4,) (SciPy, ROS, glTF) → (w, x, y, z).
+    """Return (w, x, y, z) of scalar-last components `xyzw` (4,) (SciPy, ROS, glTF).
 
     >>> from_xyzw(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [1.0, 0.0, 0.0, 0.0]
@@ -129,7 +132,7 @@ def from_xyzw(xyzw: QuatLike) -> Quat:
 
 
 def to_xyzw(q: QuatLike) -> Float[Array, "4"]:
-    """`q` (4,), (w, x, y, z) → scalar-last components (SciPy, ROS, glTF).
+    """Return scalar-last components (SciPy, ROS, glTF) of `q` (4,), (w, x, y, z).
 
     >>> to_xyzw(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -138,7 +141,7 @@ def to_xyzw(q: QuatLike) -> Float[Array, "4"]:
 
 
 def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
-    """The rotation by an angle about an axis (notes, eqs 17, 18).
+    """Return the rotation by an angle about an axis (notes, eqs 17, 18).
 
     **Arguments:** `axis` (3,) of any length; `angle` rad, right-handed about it. **Raises:**
     `ValueError` for an axis of zero, for NaN, and for an angle as `exp`.
@@ -154,7 +157,7 @@ def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
 
 
 def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
-    """The attitude after a constant body rate for a time dt: q exp(Ω dt), exact.
+    """Return the attitude after a constant body rate for a time dt: q exp(Ω dt), exact.
 
     **Arguments:** `q` (4,) unit, body → world; `omega` (3,) rad/s, body frame; `dt` s. **Raises:**
     as `exp`.
@@ -169,7 +172,8 @@ def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
 
 
 def rate(q: QuatLike, omega: Vec3Like) -> Quat:
-    """dq/dt = ½ q (0, Ω), 1/s, of `q` (4,) unit and `omega` (3,), rad/s, body frame (notes, eq 50).
+    """Return dq/dt = ½ q (0, Ω), 1/s, of `q` (4,) unit and `omega` (3,) Ω, rad/s, body frame
+    (notes, eq 50).
 
     >>> float(rate(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))[3])
     1.0
@@ -182,10 +186,10 @@ def rate(q: QuatLike, omega: Vec3Like) -> Quat:
 
 
 def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
-    """The point at s of the shortest turn from p (s = 0) to q (s = 1), at a constant rate.
+    """Return the point at s of the shortest turn from p (s = 0) to q (s = 1), at a constant rate.
 
-    **Arguments:** `p`, `q` (4,) unit, either sign; `s` dimensionless, also beyond [0, 1]. It is p
-    exp(s log(p̄ q)), regular at p = q (Shoemake 1985, doi:10.1145/325334.325242). **Raises:**
+    **Arguments:** `p`, `q` (4,) unit, either sign; `s` dimensionless, also beyond [0, 1]. The point
+    is p exp(s log(p̄ q)), regular at p = q (Shoemake 1985, doi:10.1145/325334.325242). **Raises:**
     `ValueError` if the product p̄ q is zero or NaN.
 
     >>> p, q = exp(jnp.array([0, 0, 1.0])), exp(jnp.array([0, 0, 2.0]))
@@ -199,7 +203,8 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
 
 
 def uniform(key: PRNGKeyArray, dtype: Any = float) -> Quat:
-    """A uniformly distributed random rotation (Haar measure): four normal numbers, normalised.
+    """Return a uniformly distributed random rotation (Haar measure), four normal numbers over their
+    length.
 
     **Arguments:** `key` of `jax.random`; `dtype` float32 or float64 (Muller 1959).
 
@@ -210,7 +215,7 @@ def uniform(key: PRNGKeyArray, dtype: Any = float) -> Quat:
 
 
 def normalise(q: QuatLike) -> Quat:
-    """`q` (4,) scaled to length 1, with its sign. **Raises:** `ValueError` for zero or NaN.
+    """Return `q` (4,) scaled to length 1, with its sign. **Raises:** `ValueError` for zero or NaN.
 
     >>> normalise(jnp.array([0.0, 4.0, 0.0, 0.0])).tolist()
     [0.0, 1.0, 0.0, 0.0]
@@ -219,17 +224,17 @@ def normalise(q: QuatLike) -> Quat:
 
 
 def canonical(q: QuatLike) -> Quat:
-    """The one of `q` (4,) and −q with w > 0; if w = 0, its first nonzero component is positive.
+    """Return that one of `q` (4,) and −q whose first nonzero component is positive.
 
     >>> canonical(jnp.array([-1.0, 0.0, 0.0, 0.0])).tolist()
     [1.0, -0.0, -0.0, -0.0]
     """
     q = _checks.floating(q, (4,), "q", hint=_HINT)
-    return jnp.where(flipped(components(q)), -q, q)
+    return jnp.where(is_noncanonical(components(q)), -q, q)
 
 
 def angle(q: QuatLike) -> Scalar:
-    """The angle of a rotation, rad, in [0, π]; the same bits for q and −q.
+    """Return the angle of a rotation, rad, in [0, π]; q and −q give the same bits.
 
     **Arguments:** `q` (4,) of any length. The angle is 2 atan2(|q_v|, |q_w|). At the identity it
     has no derivative: 0 is returned, the shortest subgradient. **Raises:** `ValueError` for zero or
@@ -241,14 +246,15 @@ def angle(q: QuatLike) -> Scalar:
     q = direction(_checks.floating(q, (4,), "q", hint=_HINT), "q")
     w, *u = components(near_one(*components(q)) * q)
     n2 = dot_components(u, u)
-    # Both atan2 and the root get ones, not zeros, if their derivative would be 0/0.
+    # At the identity atan2 and the root get ones, not zeros: their derivative would be 0/0 = NaN.
     there = n2 != 0
     half = jnp.arctan2(jnp.sqrt(jnp.where(there, n2, 1)), jnp.abs(w))
     return jnp.where(there, 2 * half, 0)
 
 
 def to_matrix(q: QuatLike) -> Mat3:
-    """The rotation matrix M (3, 3), body → world, of `q` (4,) unit; the same bits for −q.
+    """Return the rotation matrix M (3, 3), body → world, of `q` (4,) unit; q and −q give the same
+    bits.
 
     >>> to_matrix(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -258,7 +264,7 @@ def to_matrix(q: QuatLike) -> Mat3:
 
 
 def from_matrix(matrix: Mat3Like) -> Quat:
-    """The canonical unit quaternion of a rotation matrix.
+    """Return the canonical unit quaternion of a rotation matrix.
 
     **Arguments:** `matrix` (3, 3) rotation, body → world. **Returns:** (4,) with w ≥ 0: the largest
     of the four rows of 4 q qᵀ, normalised (Shepperd 1978, doi:10.2514/3.55767b). No case loses
@@ -273,10 +279,16 @@ def from_matrix(matrix: Mat3Like) -> Quat:
 
 
 def _turn(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
-    """The sum y + 2w u×y + 2 u×(u×y)."""
+    """Return the vector y turned by the quaternion (w, u): y + 2w u×y + 2 u×(u×y)."""
     t = [2 * part for part in cross_components(u, y)]
     again = cross_components(u, t)
     return jnp.stack([y[i] + (w * t[i] + again[i]) for i in range(3)])
 
+
+__all__ = [
+    "about_axis", "advance", "angle", "canonical", "check", "conjugate", "exp", "from_matrix",
+    "from_xyzw", "interpolate", "log", "multiply", "normalise", "rate", "rotate", "rotate_inverse",
+    "to_matrix", "to_xyzw", "uniform",
+]  # fmt: skip
 
 show(__name__)

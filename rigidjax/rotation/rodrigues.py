@@ -1,4 +1,4 @@
-"""Rodrigues (Gibbs, Cayley) parameters g = n tan(θ/2).
+"""Convert Rodrigues (Gibbs, Cayley) parameters g = n tan(θ/2).
 
 Rational in both directions, and without a double cover. They are infinite at a half turn, for which
 `is_singular` tests. M = (1 + hat g)(1 − hat g)⁻¹ is Cayley's transform. Source: Schaub & Junkins,
@@ -18,7 +18,7 @@ from rigidjax.rotation.validation import direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
-    """The parameters g = q_v/q_w; infinite at a half turn; the same bits for q and −q.
+    """Return the parameters g = q_v/q_w, infinite at a half turn; q and −q give the same bits.
 
     **Arguments:** `q` (4,), not zero, body → world. **Returns:** (3,) dimensionless. **Raises:**
     `ValueError` for zero or NaN.
@@ -27,13 +27,14 @@ def from_quaternion(q: QuatLike) -> Vec3:
     [0.0, 0.0, 1.0]
     """
     q = direction(quaternion.canonical(q), "q")
-    # The derivative squares the denominator.
+    # The derivative squares the denominator: a q of any length is scaled first, so that nothing
+    # overflows.
     q = near_one(*components(q)) * q
     return q[1:] / q[0]
 
 
 def to_quaternion(g: Vec3Like) -> Quat:
-    """The unit quaternion (1, g)/√(1 + |g|²), with w > 0, of `g` (3,) dimensionless, finite.
+    """Return the unit quaternion (1, g)/√(1 + |g|²), with w > 0, of `g` (3,) dimensionless, finite.
 
     >>> to_quaternion(jnp.zeros(3)).tolist()
     [1.0, 0.0, 0.0, 0.0]
@@ -43,7 +44,7 @@ def to_quaternion(g: Vec3Like) -> Quat:
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
-    """The parameters of a rotation `matrix` (3, 3), unchecked; infinite at a half turn.
+    """Return the parameters of a rotation `matrix` (3, 3), unchecked; infinite at a half turn.
 
     >>> from_matrix(jnp.eye(3)).tolist()
     [0.0, 0.0, 0.0]
@@ -52,7 +53,8 @@ def from_matrix(matrix: Mat3Like) -> Vec3:
 
 
 def to_matrix(g: Vec3Like) -> Mat3:
-    """Cayley's transform (1 + hat g)(1 − hat g)⁻¹, body → world, of `g` (3,), finite.
+    """Return the rotation matrix (1 + hat g)(1 − hat g)⁻¹ (Cayley's transform), body → world, of
+    `g` (3,), finite.
 
     >>> to_matrix(jnp.array([0.0, 0.0, 1.0])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
@@ -61,7 +63,8 @@ def to_matrix(g: Vec3Like) -> Mat3:
 
 
 def is_singular(q: QuatLike) -> Bool[Array, ""]:
-    """Whether `q` (4,) unit is a half turn to 4 units of round-off: g then has no correct digit.
+    """Return whether `q` (4,) unit is a half turn to 4 units of round-off, where g has no correct
+    digit.
 
     >>> bool(is_singular(jnp.array([0.0, 0.0, 0.0, 1.0])))
     True
@@ -71,7 +74,8 @@ def is_singular(q: QuatLike) -> Bool[Array, ""]:
 
 
 def omega_to_rates(g: Vec3Like, omega: Vec3Like) -> Vec3:
-    """dg/dt = ½ [Ω + g × Ω + g (g·Ω)], 1/s, of `g` and `omega` (3,), rad/s, body frame (eq 3.130).
+    """Return dg/dt = ½ [Ω + g × Ω + g (g·Ω)], 1/s, of `g` (3,) and `omega` (3,) Ω, rad/s, body
+    frame (eq 3.130).
 
     >>> omega_to_rates(jnp.zeros(3), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 1.0]
@@ -81,7 +85,8 @@ def omega_to_rates(g: Vec3Like, omega: Vec3Like) -> Vec3:
 
 
 def rates_to_omega(g: Vec3Like, rates: Vec3Like) -> Vec3:
-    """Ω = 2/(1 + |g|²) [ġ − g × ġ], rad/s, body frame, of `g` and `rates` (3,), 1/s (eq 3.132).
+    """Return Ω = 2/(1 + |g|²) [ġ − g × ġ], rad/s, body frame, of `g` (3,) and `rates` (3,) ġ, 1/s
+    (eq 3.132).
 
     >>> rates_to_omega(jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 2.0]
@@ -89,5 +94,10 @@ def rates_to_omega(g: Vec3Like, rates: Vec3Like) -> Vec3:
     g, rates = _checks.floating(g, (3,), "g"), _checks.floating(rates, (3,), "rates")
     return 2 / (1 + dot(g, g)) * (rates - cross(g, rates))
 
+
+__all__ = [
+    "from_matrix", "from_quaternion", "is_singular", "omega_to_rates", "rates_to_omega",
+    "to_matrix", "to_quaternion",
+]  # fmt: skip
 
 show(__name__)

@@ -1,4 +1,4 @@
-"""Rotation matrices M, active, body → world, and their tangent vectors.
+"""Compute with rotation matrices M, active, body → world, and their tangent vectors.
 
 `exp` and `log` take and return one rotation; batch with `jax.vmap`. Every kernel is a smooth
 function of θ²: values and derivatives of any order are correct at θ = 0. Range: as in
@@ -40,7 +40,7 @@ from rigidjax.rotation.validation import rotation_matrix, turn
 
 
 def exp(v: Vec3Like) -> Mat3:
-    """The rotation by |v| about v: 1 + A hat v + B (hat v)² (notes, eqs 15, 17, 18).
+    """Return the rotation by |v| about v: 1 + A hat v + B (hat v)² (notes, eqs 15, 17, 18).
 
     **Arguments:** `v` (3,) rotation vector, rad. A = sin θ/θ and B = (1 − cos θ)/θ² (Rodrigues
     1840) are both computed from θ/2. The angle is known to ε|v|. **Raises:** as `quaternion.exp`.
@@ -52,7 +52,7 @@ def exp(v: Vec3Like) -> Mat3:
 
 
 def log(matrix: Mat3Like) -> Vec3:
-    """The shortest rotation vector of a rotation matrix, rad, |v| ≤ π.
+    """Return the shortest rotation vector of a rotation matrix, rad, |v| ≤ π.
 
     **Arguments:** `matrix` (3, 3) rotation. **Returns:** (3,), by the quaternion: correct to
     round-off, with its derivatives, from 0 to π. At a half turn the first nonzero component is
@@ -65,7 +65,8 @@ def log(matrix: Mat3Like) -> Vec3:
 
 
 def left_jacobian(v: Vec3Like) -> Mat3:
-    """J_l with exp(v + dv) = exp(J_l dv) exp(v): the turn by dv in the world frame.
+    """Return J_l with exp(v + dv) = exp(J_l dv) exp(v) to first order: the turn by dv in the world
+    frame.
 
     **Arguments:** `v` (3,) rotation vector, rad. J_l = 1 + B hat v + C (hat v)², C = (θ − sin θ)/θ³
     (Chirikjian 2012, doi:10.1007/978-0-8176-4944-9; Solà 2018, eq 145). **Raises:** as `exp`.
@@ -79,7 +80,8 @@ def left_jacobian(v: Vec3Like) -> Mat3:
 
 
 def right_jacobian(v: Vec3Like) -> Mat3:
-    """J_r with exp(v + dv) = exp(v) exp(J_r dv), of `v` (3,), rad: J_l(v)ᵀ (Solà 2018, eq 143).
+    """Return J_r with exp(v + dv) = exp(v) exp(J_r dv) to first order, of `v` (3,), rad; J_r =
+    J_l(v)ᵀ (Solà 2018, eq 143).
 
     >>> right_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -88,7 +90,8 @@ def right_jacobian(v: Vec3Like) -> Mat3:
 
 
 def left_jacobian_inverse(v: Vec3Like) -> Mat3:
-    """Inverse of the left Jacobian, 1 − ½ hat v + g (hat v)², g = (1 − (θ/2) cot(θ/2))/θ².
+    """Return the inverse of the left Jacobian: 1 − ½ hat v + g (hat v)², with g = (1 − (θ/2)
+    cot(θ/2))/θ².
 
     **Arguments:** `v` (3,) rotation vector, rad, |v| < 2π (Solà 2018, eq 146).
 
@@ -99,7 +102,8 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
 
 
 def right_jacobian_inverse(v: Vec3Like) -> Mat3:
-    """Inverse of the right Jacobian, 1 + ½ hat v + g (hat v)², of `v` (3,), rad, |v| < 2π.
+    """Return the inverse of the right Jacobian: 1 + ½ hat v + g (hat v)², of `v` (3,), rad, |v| <
+    2π.
 
     >>> right_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -108,7 +112,7 @@ def right_jacobian_inverse(v: Vec3Like) -> Mat3:
 
 
 def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
-    """The angle of the rotation from a to b, rad, in [0, π].
+    """Return the angle of the rotation from a to b, rad, in [0, π].
 
     **Arguments:** `a`, `b` (3, 3) rotations. Computed by atan2 of the quaternion of aᵀb, it is
     right from 1e-12 to π (arccos of the trace is useless below 1e-8). At a = b it has no
@@ -132,7 +136,7 @@ def _between(a: Mat3, b: Mat3) -> Mat3:
 
 
 def about_axis(axis: Vec3Like, angle: ScalarLike) -> Mat3:
-    """The rotation exp(γ J_y) by an angle γ about an axis y (notes, eqs 17, 18).
+    """Return the rotation exp(γ J_y) by an angle γ about an axis y (notes, eqs 17, 18).
 
     **Arguments:** `axis` (3,) of any length; `angle` rad, right-handed about it. **Raises:** as
     `quaternion.about_axis`.
@@ -144,7 +148,8 @@ def about_axis(axis: Vec3Like, angle: ScalarLike) -> Mat3:
 
 
 def adjoint(matrix: Mat3Like) -> Mat3:
-    """Ad_M with M hat(w) Mᵀ = hat(Ad_M w): the `matrix` (3, 3) itself (notes, eq 48 with Mᵀ).
+    """Return Ad_M, with M hat(w) Mᵀ = hat(Ad_M w): the `matrix` (3, 3) itself (notes, eq 48 with
+    Mᵀ).
 
     >>> adjoint(jnp.eye(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -153,7 +158,8 @@ def adjoint(matrix: Mat3Like) -> Mat3:
 
 
 def to_world(matrix: Mat3Like, y: Vec3Like) -> Vec3:
-    """Body components `y` (3,) → world components M y, by `matrix` (3, 3) (notes, eqs 8, 21).
+    """Return the world components M y of body components `y` (3,), by `matrix` (3, 3) (notes, eqs
+    8, 21).
 
     >>> to_world(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [1.0, 2.0, 3.0]
@@ -162,7 +168,8 @@ def to_world(matrix: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
-    """World components `y` (3,) → body components Mᵀ y, by `matrix` (3, 3) (notes, eqs 8, 22).
+    """Return the body components Mᵀ y of world components `y` (3,), by `matrix` (3, 3) (notes, eqs
+    8, 22).
 
     >>> to_body(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [1.0, 2.0, 3.0]
@@ -171,7 +178,8 @@ def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
-    """A `turn` (3, 3) in the body frame → world frame, M T Mᵀ, by `matrix` (notes, eqs 25, 26).
+    """Return M T Mᵀ, in the world frame, of a `turn` (3, 3) T in the body frame, by `matrix` M
+    (notes, eqs 25, 26).
 
     >>> conjugate(jnp.eye(3), jnp.eye(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -182,7 +190,8 @@ def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
 
 
 def rate(matrix: Mat3Like, omega: Vec3Like) -> Mat3:
-    """dM/dt = M hat(Ω) of `matrix` (3, 3) and `omega` (3,), rad/s, body frame (notes, eq 50).
+    """Return dM/dt = M hat(Ω) of `matrix` (3, 3) and `omega` (3,) Ω, rad/s, body frame (notes, eq
+    50).
 
     >>> rate(jnp.eye(3), jnp.array([0.0, 0.0, 2.0]))[1].tolist()
     [2.0, 0.0, 0.0]
@@ -192,7 +201,7 @@ def rate(matrix: Mat3Like, omega: Vec3Like) -> Mat3:
 
 
 def body_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
-    """Ω from M and dM/dt: Ω_i = ½ Tr(Mᵀ Ṁ J_iᵀ) (notes, eqs 48–50, 80).
+    """Return Ω of M and dM/dt: Ω_i = ½ Tr(Mᵀ Ṁ J_iᵀ) (notes, eqs 48–50, 80).
 
     **Arguments:** `matrix` (3, 3), body → world; `rate` (3, 3), 1/s. **Returns:** (3,) rad/s, body
     frame; the symmetric part of MᵀṀ is dropped.
@@ -205,7 +214,8 @@ def body_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
 
 
 def world_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
-    """The angular velocity w in space from M and dM/dt: hat(w) = Ṁ Mᵀ (notes, eqs 36–42, 50).
+    """Return the angular velocity w, world frame, of M and dM/dt: hat(w) = Ṁ Mᵀ (notes, eqs 36–42,
+    50).
 
     **Arguments:** `matrix` (3, 3), body → world; `rate` (3, 3), 1/s. **Returns:** (3,) rad/s, world
     frame.
@@ -218,7 +228,7 @@ def world_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
 
 
 def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
-    """The point at s of the shortest turn from a (s = 0) to b (s = 1): a exp(s log(aᵀb)).
+    """Return the point at s of the shortest turn from a (s = 0) to b (s = 1): a exp(s log(aᵀb)).
 
     **Arguments:** `a`, `b` (3, 3) rotations; `s` dimensionless, also beyond [0, 1]. **Raises:** as
     `distance`.
@@ -233,7 +243,8 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
 
 
 def uniform(key: PRNGKeyArray, dtype: Any = float) -> Mat3:
-    """A uniformly distributed random rotation (Haar): `key` of `jax.random`, `dtype` of floats.
+    """Return a uniformly distributed random rotation (Haar measure): `key` of `jax.random`, `dtype`
+    of floats.
 
     >>> import jax
     >>> uniform(jax.random.key(0)).shape
@@ -245,7 +256,7 @@ def uniform(key: PRNGKeyArray, dtype: Any = float) -> Mat3:
 def check(
     matrix: Float[ArrayLike, "*batch 3 3"], *, name: str = "matrix"
 ) -> Float[Array, "*batch 3 3"]:
-    """Return a matrix from outside unchanged if it is a rotation, else refuse it.
+    """Return a matrix from outside unchanged if it is a rotation; refuse any other.
 
     **Arguments:** `matrix` (..., 3, 3); `name` its name in messages. **Raises:** `ValueError`
     (under `jit` `equinox.error_if`) for NaN, a left-handed frame (det < 0), and |MᵀM − 1| above
@@ -256,5 +267,13 @@ def check(
     """
     return rotation_matrix(_checks.floating(matrix, (3, 3), name, batched=True), name)
 
+
+__all__ = [
+    "about_axis", "adjoint", "align", "apply", "basis", "body_rate", "check", "conjugate", "cross",
+    "determinant", "distance", "dot", "exp", "hat", "interpolate", "left_jacobian",
+    "left_jacobian_inverse", "log", "mean", "mean_quaternion", "product", "project", "rate",
+    "right_jacobian", "right_jacobian_inverse", "solve", "to_body", "to_world", "uniform", "vee",
+    "wahba", "world_rate",
+]  # fmt: skip
 
 show(__name__)

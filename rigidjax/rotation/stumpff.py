@@ -1,4 +1,4 @@
-"""Smooth kernels of θ², correct with all their derivatives from θ = 0 upwards.
+"""Compute smooth kernels of θ², correct with all their derivatives from θ = 0 upwards.
 
 Rotations need sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³, … as functions of t = θ². These are the
 Stumpff functions c_k(t) = Σ (−t)ⁿ/(k + 2n)!  (Stumpff 1959; Battin 1999, sec. 4.5). Their
@@ -27,14 +27,14 @@ _PI_PARTS = {
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)! for t = θ² ≥ 0 (Battin 1999, eq 4.80).
+    """Return the stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)! for t = θ² ≥ 0 (Battin 1999, eq 4.80).
 
     c_0 is cos θ, c_1 sin θ/θ, c_2 (1 − cos θ)/θ², c_3 (θ − sin θ)/θ³. Values and derivatives of
     every order are right to a few units of round-off of 1/k!.
     """
     if k < 2:
         return _cosine_or_sinc(k, t)
-    # From t = π² on, c_{j+2} = (1/j! − c_j)/t loses nothing that matters.
+    # From t = π² on, the recurrence c_{j+2} = (1/j! − c_j)/t loses no digit that matters.
     limit = math.pi**2
     far = t > limit
     divisor = jnp.where(far, t, 1)
@@ -53,24 +53,28 @@ def _stumpff_jvp(k: int, primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def inverse_kernel(t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The kernel (1 − (θ/2) cot(θ/2))/θ² of the inverse Jacobians, t = θ² < (2π)²: 1/12 at 0."""
+    """Return (1 − (θ/2) cot(θ/2))/θ², the kernel of the inverse Jacobians, for t = θ² < (2π)²; it
+    is 1/12 at 0.
+    """
     return (stumpff(3, t) - 2 * stumpff(4, t)) / stumpff(1, 0.25 * t) ** 2
 
 
 def arctan_ratio(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """arctan(√z)/√z for 0 ≤ z ≤ tan²(π/8), by its Taylor series (Abramowitz & Stegun 4.4.42)."""
+    """Return arctan(√z)/√z for 0 ≤ z ≤ tan²(π/8), by its Taylor series (Abramowitz & Stegun
+    4.4.42).
+    """
     tiny = jnp.finfo(z.dtype).eps / 4
     terms = next(n for n in range(1, 40) if _REACH**n / (2 * n + 1) < tiny)
     return _horner([(-1) ** n / (2 * n + 1) for n in range(terms)], z)
 
 
 def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The cosine (k = 0) or sin θ/θ (k = 1) of t = θ²; a θ beyond π/2 is reduced first."""
+    """Return the cosine (k = 0) or sin θ/θ (k = 1) of t = θ²; a θ beyond π/2 is reduced first."""
     limit = (math.pi / 2) ** 2
     far = t > limit
     theta = jnp.sqrt(jnp.where(far, t, 1))
     turns, remainder = half_turns(theta)
-    # A θ beyond 1/ε is only round-off: stay in the range of the polynomials.
+    # A θ beyond 1/ε has no correct digit; its remainder must stay in the range of the polynomials.
     remainder = jnp.clip(remainder, -2.0, 2.0)
     value = _polynomial(k, jnp.where(far, remainder * remainder, t), limit)
     value = value * jnp.where(far, remainder, 1) if k else value
@@ -81,7 +85,7 @@ def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """(n, r) with angle = nπ + r, |r| ≤ π/2; the tangent of r is that of the angle."""
+    """Return n and r with angle = nπ + r, |r| ≤ π/2; the tangent of r is that of the angle."""
     turns = jax.lax.stop_gradient(jnp.round(angle * (1 / math.pi)))
     # Cody & Waite 1980: n × head and n × middle are exact, so that r keeps the digits of the angle.
     head, middle, tail = _PI_PARTS[np.dtype(angle.dtype)]
@@ -89,12 +93,12 @@ def half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[A
 
 
 def parity(n: Float[Array, "..."]) -> Float[Array, "..."]:
-    """(−1)ⁿ."""
+    """Return (−1)ⁿ."""
     return 1 - 2 * (n - 2 * jnp.floor(0.5 * n))
 
 
 def _polynomial(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, "..."]:
-    """The Taylor polynomial of c_k that is exact to round-off for t up to `limit`."""
+    """Return the Taylor polynomial of c_k that is exact to round-off for t up to `limit`."""
     tiny = jnp.finfo(t.dtype).eps / 8
     size = 1 / math.factorial(k)
     terms = next(n for n in range(1, 40) if limit**n / math.factorial(k + 2 * n) < tiny * size)
@@ -102,6 +106,7 @@ def _polynomial(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, ".
 
 
 def _horner(coefficients: list[float], x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the polynomial of x with these coefficients, the constant first (Horner's scheme)."""
     value = jnp.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         value = value * x + coefficient

@@ -1,4 +1,4 @@
-"""Checks of input: matrices and quaternions that are no rotation are refused.
+"""Check input: matrices and quaternions that are no rotation are refused.
 
 The maps do not check traced values: the checks make a batch of 1e5 logarithms five times slower.
 `so3.check` and `quaternion.check` do, inside and outside of `jit`; call them on data from outside.
@@ -12,14 +12,14 @@ from rigidjax import _checks
 
 
 def tolerance(dtype: object) -> float:
-    """The tolerance for a rotation as input: 1e-6 in float64, 1e-3 in float32."""
+    """Return the tolerance for a rotation as input: 1e-6 in float64, 1e-3 in float32."""
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
 def direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
     """Refuse a known vector without a direction: zero, NaN, infinity.
 
-    Below the least normal number, 2e-308, XLA takes a number for zero on some machines.
+    XLA takes a number below the least normal number, 2e-308, for zero on some machines.
     """
     if _checks.known(v) and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest(v) < np.inf:
         _checks.finite(v, name)
@@ -29,7 +29,7 @@ def direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
 
 
 def turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
-    """Refuse a known rotation vector or angle without a correct digit."""
+    """Refuse a known rotation vector or angle that is so large that no digit is correct."""
     if _checks.known(v) and not _largest(v) <= (limit := 1 / float(jnp.finfo(v.dtype).eps)):
         _checks.finite(v, name)
         raise ValueError(
@@ -40,12 +40,13 @@ def turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
 
 
 def _largest(v: Float[Array, "*n"]) -> float:
-    # NaN where one of them is. One look only: this stands before every map that is called eagerly.
+    # The result is NaN if an entry is. It is one call of NumPy only, because it runs before every
+    # map that is called outside of `jit`.
     return float(np.abs(np.asarray(v)).max())
 
 
 def rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
-    """Refuse any matrix but a rotation."""
+    """Refuse any matrix but a rotation, with the determinant or the error in the message."""
     m = _checks.finite(m, name)
     known = _checks.known(m)
     xp, values = (np, np.asarray(m)) if known else (jnp, m)
@@ -76,7 +77,7 @@ def near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"
 
 
 def unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
-    """Normalise a quaternion that is nearly a unit one; refuse any other."""
+    """Return a quaternion scaled to length 1 if its length is nearly 1; refuse any other."""
     q = _checks.finite(q, name)
     # Under `jit` JAX traces what is computed from known numbers, too; NumPy does not.
     xp = _checks.namespace(q)

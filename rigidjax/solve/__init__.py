@@ -9,4 +9,9 @@ from rigidjax.solve.run import equations_of_motion as equations_of_motion
 from rigidjax.solve.simulate import simulate as simulate
 from rigidjax.solve.solution import Solution as Solution
 
+__all__ = [
+    "Event", "Solution", "adaptive", "crossings", "equations_of_motion", "fixed",
+    "lyapunov_exponents", "simulate",
+]  # fmt: skip
+
 show(__name__)

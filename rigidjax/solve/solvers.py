@@ -15,4 +15,9 @@ from rigidjax.solve.splitting import (
     Splitting6 as Splitting6,
 )
 
+__all__ = [
+    "DormandPrince8", "FreeSolver", "Magnus4", "Projected", "RungeKutta4", "Splitting2",
+    "Splitting4", "Splitting6", "Tsitouras5",
+]  # fmt: skip
+
 show(__name__)

@@ -9,4 +9,6 @@ from rigidjax.tumblers.light_curve import (
 from rigidjax.tumblers.sensor import Brightness as Brightness
 from rigidjax.tumblers.two_frequencies import two_frequencies as two_frequencies
 
+__all__ = ["Brightness", "LightCurve", "brightness", "fit_light_curve", "plot", "two_frequencies"]
+
 show(__name__)

@@ -85,4 +85,6 @@ def mesh(
     return jnp.where(both, 0.5 * length * sent, 0.0).sum()
 
 
+__all__ = ["AbstractScattering", "Geometric", "Lambert", "LommelSeeliger", "ellipsoid", "mesh"]
+
 show(__name__)

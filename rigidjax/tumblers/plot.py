@@ -86,4 +86,6 @@ def light_curve(
     return ax
 
 
+__all__ = ["light_curve"]
+
 show(__name__)

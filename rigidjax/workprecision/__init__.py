@@ -1,7 +1,7 @@
-"""Error against cost, of the value and of the gradient: the choice of a method for a scene.
+"""Compare error and cost, of the value and of the gradient: the choice of a method for a scene.
 
-`measure(scene)` runs methods on a scene, `draw` makes the chart with those that nothing beats,
-`choose` the short table. `python -m rigidjax workprecision` is all of it.
+`measure(scene)` runs methods on a scene, `draw` makes the chart and marks the Pareto front,
+`choose` the short table. `python -m rigidjax workprecision` does all of it.
 """
 
 from rigidjax._names import show
@@ -12,5 +12,7 @@ from rigidjax.workprecision.pareto import choose as choose, table as table
 from rigidjax.workprecision.peers import methods as methods
 from rigidjax.workprecision.scene import Scene as Scene
 from rigidjax.workprecision.standard_scenes import scenes as scenes
+
+__all__ = ["Scene", "choose", "diffrax_method", "draw", "measure", "methods", "scenes", "table"]
 
 show(__name__)

@@ -1,4 +1,4 @@
-"""Charts of error against time. matplotlib is imported only when a chart is asked for."""
+"""Draw charts of error against time. matplotlib is imported only when a chart is asked for."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -12,13 +12,14 @@ _COLOURS = {"ours": "tab20", "jax": "Set2", "peer": "Dark2"}
 
 
 def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
-    """Error against time, log–log: values on the left, gradients on the right, the front marked.
+    """Draw the error against time, log–log: values on the left, gradients on the right, with the
+    front marked.
 
-    Each scene has a row. Beside the time of a run it shows the time of a first answer, compiling
-    and one run, if it is known, and the error of each value against the tolerance or accuracy that
-    was asked for. The grey band is the Pareto front of error and time, peers
-    included; its points are ringed. The coloured band is the front of the methods in JAX. Error
-    bars are quartiles of the time.
+    Each scene has a row. Beside the time of a run a panel shows the time of a first answer
+    (compiling and one run), if it is known. Another panel shows the error of each value against the
+    tolerance or accuracy that was asked for. The grey band is the Pareto front of error and time,
+    peers included; its points are ringed. The coloured band is the front of the methods in JAX.
+    Error bars are quartiles of the time.
 
     **Arguments:** `records` as measured; `title` of the whole.
 
@@ -66,12 +67,14 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
 
 
 def _places(records: list[Record]) -> tuple[list[float], list[float]]:
-    """Errors and times, ms."""
+    """Return the errors and the times, ms."""
     return [max(r.error, 1e-16) for r in records], [1e3 * r.time for r in records]
 
 
 def _curves(records: list[Record], labels: list[tuple[str, str]]) -> Iterator[tuple[list, dict]]:
-    """The records of each method, from the smallest setting on, and how they are drawn."""
+    """Yield the records of each method, from the smallest setting on, with the style of its
+    line.
+    """
     import matplotlib as mpl
 
     for i, (label, group) in enumerate(labels):

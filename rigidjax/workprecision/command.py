@@ -1,4 +1,4 @@
-"""`python -m rigidjax workprecision`: measure, print, draw, compare with a stored table."""
+"""Run `python -m rigidjax workprecision`: measure, print, draw, compare with a stored table."""
 
 import argparse
 import math
@@ -16,7 +16,7 @@ from rigidjax.workprecision.standard_scenes import scenes
 
 STORED = Path("tests/workprecision/record.csv")
 QUICK = ("free-top", "heavy-top", "damped-gyrostat")
-# What a quick run looks at, and by which adjoints.
+# The methods of a quick run, each with the adjoints that it measures.
 SMALL = {
     "closed form": ("forward",),
     "simulate": ("forward",),
@@ -26,7 +26,8 @@ SMALL = {
     "diffrax Dopri8": ("forward",),
 }
 DRIFT = "long-drift"
-# Compiling gradients is most of a run: of all scenes, these; of a scene that is named, always.
+# Compiling gradients is most of a run: they are measured for these scenes, and for every scene that
+# is named on the command line.
 GRADED = (*QUICK, "asymmetric-top", "gravity-gradient", "arenstorf")
 _FILE: dict[str, Any] = {"type": Path, "metavar": "FILE"}
 _FLAG: dict[str, Any] = {"action": "store_true"}
@@ -68,7 +69,7 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand; returns the exit code: 0 good, 1 something moved, 2 bad input."""
+    """Run the subcommand. **Returns** the exit code: 0 good, 1 something moved, 2 bad input."""
     try:
         known = [*scenes(), DRIFT]
         for name in options.scene:
@@ -131,7 +132,9 @@ def _measured(options: argparse.Namespace) -> list[Record]:
 
 
 def summary(records: Iterable[Record]) -> str:
-    """Scene by scene: time to each wanted error, µs; on the front *, on that of JAX alone +."""
+    """Return, scene by scene, the time to each wanted error, µs; * marks the front, + the front of
+    JAX alone.
+    """
     records = list(records)
     lines: list[str] = []
     for scene in dict.fromkeys(r.scene for r in records):

@@ -1,4 +1,4 @@
-"""The equations of the scenes in plain arithmetic: for peers and for references.
+"""Write the equations of the scenes in plain arithmetic: for peers and for references.
 
 Written apart from the rest of the library, on numbers that may be floats, `mpmath` or `gmpy2`
 numbers, or a peer's symbols. `sin` and `cos` come in as arguments, everything else is + − × ÷.
@@ -12,7 +12,7 @@ Torque = Callable[[Number, Any, Any], tuple[Number, Number, Number]]
 
 
 def heavy(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Torque:
-    """`τ = c m × Rᵀg`; constants m c (3) and g (3)."""
+    """Return the torque `τ = c m × Rᵀg`; constants m c (3) and g (3)."""
     cx, cy, cz, gx, gy, gz = constants
 
     def torque(t, q, w):
@@ -23,7 +23,9 @@ def heavy(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Torque
 
 
 def gradient(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Torque:
-    """`τ = 3n² r × I r`, r the direction of the planet on a circular orbit; constants n."""
+    """Return the torque `τ = 3n² r × I r`, r the direction of the planet on a circular orbit;
+    constants n.
+    """
     (n,) = constants
     ixx, iyy, izz, ixy, ixz, iyz = inertia
 
@@ -39,7 +41,9 @@ def gradient(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Tor
 
 
 def gyrostat(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Torque:
-    """`τ = h × Ω − c Ω`, a wheel at constant speed and damping; constants h (3), c (3)."""
+    """Return the torque `τ = h × Ω − c Ω` of a wheel at constant speed and damping; constants h
+    (3), c (3).
+    """
     hx, hy, hz, cx, cy, cz = constants
 
     def torque(t, q, w):
@@ -54,7 +58,7 @@ def gyrostat(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Tor
 
 
 def into_body(q, x, y, z):
-    """`Rᵀ(x, y, z)` for a unit quaternion."""
+    """Return `Rᵀ(x, y, z)` for a unit quaternion q."""
     a, b, c, d = q
     return (
         (1 - 2 * (c * c + d * d)) * x + 2 * (b * c + a * d) * y + 2 * (b * d - a * c) * z,
@@ -64,7 +68,7 @@ def into_body(q, x, y, z):
 
 
 def body_rates(inertia: Any, torque: Torque | None) -> Callable[[Number, Any], Any]:
-    """`(t, (q, Ω)) → (q', Ω')` for an inertia (Ixx, Iyy, Izz, Ixy, Ixz, Iyz), 7 numbers."""
+    """Return `(t, (q, Ω)) → (q', Ω')` for an inertia (Ixx, Iyy, Izz, Ixy, Ixz, Iyz), 7 numbers."""
     ixx, iyy, izz, ixy, ixz, iyz = inertia
     kxx, kyy, kzz = iyy * izz - iyz * iyz, ixx * izz - ixz * ixz, ixx * iyy - ixy * ixy
     kxy, kxz, kyz = ixz * iyz - ixy * izz, ixy * iyz - ixz * iyy, ixy * ixz - ixx * iyz
@@ -94,7 +98,9 @@ def body_rates(inertia: Any, torque: Torque | None) -> Callable[[Number, Any], A
 
 
 def foucault(constants: Any, sqrt: Any) -> Callable[[Number, Any], Any]:
-    """A pendulum on the turning Earth, axes east, north, up; constants g, Ω north, Ω up."""
+    """Return the rates of a pendulum on the turning Earth, axes east, north, up; constants g, Ω
+    north, Ω up.
+    """
     g, wn, wu = constants
 
     def rates(t, y):
@@ -111,7 +117,7 @@ def foucault(constants: Any, sqrt: Any) -> Callable[[Number, Any], Any]:
 
 
 def three_body(constants: Any, sqrt: Any) -> Callable[[Number, Any], Any]:
-    """The circular restricted problem in the turning frame; constants μ."""
+    """Return the rates of the circular restricted problem in the turning frame; constants μ."""
     (mu,) = constants
     nu = 1 - mu
 

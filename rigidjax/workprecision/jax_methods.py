@@ -1,4 +1,4 @@
-"""The methods in JAX: ours and diffrax's solvers, on the same field, each compiled once."""
+"""Prepare the methods in JAX: ours and diffrax's solvers, on one field, each compiled once."""
 
 import time
 from collections.abc import Callable
@@ -26,7 +26,10 @@ Make = Callable[[Scene], Flow | None]
 
 
 def compiled(scene: Scene, flow: Flow) -> Ready:
-    """One compiled call for all settings, timed as a user would call it: nothing but numbers in."""
+    """Return one compiled call for all settings.
+
+    It is timed as a user would call it: only numbers go in.
+    """
     numbers = scene.numbers
     start = time.perf_counter()
     ready = jax.jit(flow).lower(numbers, jnp.asarray(1.0, numbers.dtype)).compile()
@@ -34,7 +37,7 @@ def compiled(scene: Scene, flow: Flow) -> Ready:
     memory = ready.memory_analysis()
     held = float(memory.temp_size_in_bytes) if memory is not None else float("nan")
 
-    # Moving a number to the device takes as long as some runs.
+    # Settings stay on the device: to move a number there takes as long as some runs.
     there: dict[float, Any] = {}
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -46,7 +49,9 @@ def compiled(scene: Scene, flow: Flow) -> Ready:
 
 
 def flow_of(scene: Scene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]) -> Flow:
-    """The flow of `run`: body, initial state, both times, setting → states over time, steps."""
+    """Return the flow of `run`, which takes a body, an initial state, both times and a setting to
+    states over time and a number of steps.
+    """
 
     def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
         body, start = scene.assembled(numbers)
@@ -65,7 +70,9 @@ def _closed(scene: Scene) -> Flow | None:
 
 
 def _simulate(scene: Scene, accuracy: bool = False) -> Flow | None:
-    """`simulate` with its defaults, but for the tolerance: traced, so that one program does."""
+    """Return the flow of `simulate` with its defaults, except for the tolerance, which is traced so
+    that one program does.
+    """
 
     def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
         how = dict(accuracy=setting) if accuracy else dict(rtol=setting, atol=1e-3 * setting)
@@ -76,7 +83,7 @@ def _simulate(scene: Scene, accuracy: bool = False) -> Flow | None:
 
 
 def _adaptive(scene: Scene, solver: Any) -> Flow:
-    """The loop that `simulate` runs in under a torque, in both modes."""
+    """Return the flow of the loop in which `simulate` runs under a torque, in both modes."""
 
     def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
         field = equations_of_motion(body, start, scene.torque)
@@ -87,7 +94,7 @@ def _adaptive(scene: Scene, solver: Any) -> Flow:
 
 
 def equal_steps(scene: Scene, solver: Any) -> Flow:
-    """As many equal steps of `solver` as the setting says."""
+    """Return the flow of `solver` with a number of equal steps, which is the setting."""
 
     def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
         field, count = equations_of_motion(body, start, scene.torque), setting.astype(int)
@@ -97,7 +104,7 @@ def equal_steps(scene: Scene, solver: Any) -> Flow:
 
 
 def _in_diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
-    """Our field and state in diffrax's loop."""
+    """Return the flow of our field and state in diffrax's loop."""
 
     def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
         field = equations_of_motion(body, start, scene.torque)
@@ -107,7 +114,9 @@ def _in_diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
 
 
 def _diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
-    """A user's own code: equations written by hand, one array, constants once."""
+    """Return the flow of a user's own code: equations written by hand, one array, constants
+    computed once.
+    """
     plain = scene.plain
     if plain is None:
         return _in_diffrax(scene, solver, adjoint)
@@ -140,7 +149,9 @@ def _solved(
 
 
 def _ready(make: Make, take: Any, scene: Scene) -> Ready | None:
-    """The flow made ready; with `take` the gradient by it of the scene's scalar."""
+    """Return the flow prepared for a scene, or with `take` its gradient of the scene's scalar;
+    `None` if it cannot run.
+    """
     flow = make(scene)
     if flow is None:
         return None
@@ -155,16 +166,17 @@ def _ready(make: Make, take: Any, scene: Scene) -> Ready | None:
     try:
         return compiled(scene, flow if take is None else slopes)
     except TypeError as refused:
-        # A splitting says so where a torque feels the rate.
+        # A splitting refuses a torque that depends on the rate: the scene is left out.
         if "Splitting" in str(refused):
             return None
         raise
 
 
 def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Method:
-    """Any `diffrax` solver as a method, with a step controller, on equations written by hand.
+    """Return any `diffrax` solver as a method, with a step controller, on equations written by
+    hand.
 
-    It runs on our vector field where a scene has none of these (`plain`).
+    For a scene without such equations (`plain`) the solver runs on our vector field.
 
     **Arguments:** `solver` with an error estimate; `gradients` whether its adjoints are measured,
     too: `forward`, `checkpointed`, `backsolve`.
@@ -193,7 +205,7 @@ def _ours(name: str, settings: Any, make: Make, modes: Any = (), equal: bool = F
 
 
 def methods_in_jax() -> list[Method]:
-    """Ours, and diffrax's, in the order of the charts."""
+    """Return our methods and diffrax's, in the order of the charts."""
     eight = solvers.DormandPrince8()
     equal = ((EIGHT, eight), (FOUR, solvers.RungeKutta4()))
     equal += ((EIGHT, solvers.Splitting4()), (EIGHT, solvers.Splitting6()))

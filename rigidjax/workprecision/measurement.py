@@ -1,4 +1,4 @@
-"""Measurements: methods prepared for a scene and timed in turn; the drift of a very long run."""
+"""Measure methods prepared for a scene, timed in turn; and the drift of a very long run."""
 
 import dataclasses
 import time
@@ -23,12 +23,14 @@ from rigidjax.workprecision.jax_methods import equal_steps
 from rigidjax.workprecision.record import Record
 from rigidjax.workprecision.scene import Method, Ready, Reference, Scene, distance
 
-# Runs longer than this, s, are timed three times, those shorter than SHORT thrice as often.
+# Runs longer than LONG, s, are timed three times; runs shorter than SHORT are timed three times as
+# often as the others.
 LONG, SHORT = 0.5, 0.02
-# Short runs are timed so many seconds at a stretch.
+# Short runs are repeated for at least BURST seconds at a stretch, and timed together.
 BURST = 3e-3
 WRONG = 0.5
-# A long run: its steps, its looks at them, its body, and the length of a step, s, by solver.
+# The run of `long_drift`: its number of steps, the moments of its body, the number of states that
+# are looked at, and the length of a step, s, by solver.
 STEPS = 1_000_000
 BODY = (0.7, 1.2, 1.6)
 LOOKS = 101
@@ -58,7 +60,8 @@ def measure(
     rounds: int = 5,
     progress: Callable[[str], None] | None = None,
 ) -> list[Record]:
-    """Error and cost of each method at each of its settings, of the value and of its gradient.
+    """Return the error and cost of each method at each of its settings, of the value and of its
+    gradient.
 
     All runs are in this process, in turn, round after round; compilation is timed separately. The
     records omit methods that cannot do the scene, and runs with an error of more than half a radian
@@ -98,9 +101,11 @@ def measure(
 
 
 def worked_out(scene: Scene, gradients: bool = True) -> Reference:
-    """A reference for a scene without one: order 8 with fixed steps, and with half as many.
+    """Return a reference for a scene without one: order 8 with fixed steps, compared with half as
+    many steps.
 
-    Its error is their difference, no less than a hundred units of round-off.
+    The error of the reference is the difference of the two runs, at least a hundred units of
+    round-off.
     """
     counts = (4000, 2000)
     numbers, scale = scene.numbers, max(1.0, _turn(scene) / 50)
@@ -121,7 +126,9 @@ def worked_out(scene: Scene, gradients: bool = True) -> Reference:
 
 
 def in_float32(scene: Scene, gradients: bool = True) -> Scene:
-    """The scene in single precision; the reference is that of its rounded numbers, in double."""
+    """Return the scene in single precision; its reference is computed in double precision from the
+    rounded numbers.
+    """
 
     def cast(given: Scene, dtype: Any) -> Scene:
         def one(a: Any) -> Any:
@@ -132,12 +139,12 @@ def in_float32(scene: Scene, gradients: bool = True) -> Scene:
 
     low = cast(scene, jnp.float32)
     right = worked_out(dataclasses.replace(cast(low, jnp.float64), reference=None), gradients)
-    # The equations by hand have constants in double.
+    # Without `plain`: the equations written by hand have constants in double precision.
     return dataclasses.replace(low, name=f"{scene.name}, float32", reference=right, plain=None)
 
 
 def _turn(scene: Scene) -> float:
-    """The rough turn in the scene, rad; unknown for a point."""
+    """Return the rough angle turned in the scene, rad; for a point, which has none, 50."""
     return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
 
 
@@ -145,7 +152,7 @@ def _settings(scene: Scene, method: Method, thin: int) -> list[float]:
     found = list(method.settings)[::-1][::thin][::-1]
     if method.equal:
         return [float(round(s * _turn(scene) / 50)) for s in found]
-    # Below ten roundings a step is rejected until no step is left.
+    # A tolerance below ten units of round-off rejects every step.
     least = 10 * float(jnp.finfo(scene.numbers.dtype).eps)
     return [float(s) for s in found if s == 0 or s > least]
 
@@ -185,7 +192,9 @@ def _gradient_errors(scene: Scene, slope: Any, right: Reference) -> dict[str, fl
 
 
 def drifts(scene: Scene, end: Any) -> tuple[float, float]:
-    """The relative drift of energy and momentum (for a point of its integral alone)."""
+    """Return the relative drift of energy and momentum (for a point the drift of its integral, and
+    NaN).
+    """
     if scene.body is None:
         law: Any = scene_of(scene.torque)
         state: Any = scene.state0
@@ -226,12 +235,13 @@ def long_drift(
     *,
     progress: Callable[[str], None] | None = None,
 ) -> list[Record]:
-    """Largest drift of energy and momentum over `steps` equal steps of an asymmetric heavy top.
+    """Return the largest drift of energy and momentum over `steps` equal steps of an asymmetric
+    heavy top.
 
-    There are two records for each method, of the first hundredth of the run and of all of it. The
-    drift is bounded if they agree; it grows with time if the second is a hundred times the first.
-    `setting` is the length of a step, s; `error` is the energy's (the motion forgets its start long
-    before the end).
+    There are two records for each method: of the first hundredth of the run, and of the whole run.
+    The drift is bounded if they agree; it grows with time if the second is a hundred times the
+    first. `setting` is the length of a step, s; `error` is the energy's (the motion forgets its
+    start long before the end).
     """
     body = Inertia.from_principal(*BODY)
     start = Attitude([0.955336489125606, 0.29552020666133955, 0.0, 0.0], [0.4, 0.3, 1.2])

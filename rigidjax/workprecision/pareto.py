@@ -1,4 +1,4 @@
-"""The Pareto front, the time to an error, and the short table that follows from them."""
+"""Find the Pareto front, the time to an error, and the short table that follows from them."""
 
 import dataclasses
 import itertools
@@ -13,10 +13,10 @@ WANTED = (1e-4, 1e-7, 1e-10)
 
 
 def front(records: Iterable[Record]) -> list[Record]:
-    """The records of one scene and kind on the Pareto front of error and time.
+    """Return the records of one scene and kind on the Pareto front of error and time.
 
     A record is compared with the curves of the others, log–log between their settings, not only
-    with the measured points. The records come by falling error.
+    with the measured points. The records are returned by falling error.
     """
     records = [r for r in listed(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
@@ -34,7 +34,7 @@ def front(records: Iterable[Record]) -> list[Record]:
 
 
 def first_answers(records: Iterable[Record]) -> list[Record]:
-    """The same records with the time that a first answer takes: compiling and one run."""
+    """Return the records with the time that a first answer takes: compiling and one run."""
     return [
         dataclasses.replace(r, time=r.time + c, time_low=r.time_low + c, time_high=r.time_high + c)
         for r in listed(records)
@@ -43,13 +43,15 @@ def first_answers(records: Iterable[Record]) -> list[Record]:
 
 
 def time_to(records: Iterable[Record], error: float) -> float:
-    """Time, s, that the method of these records takes to an error, between its settings in log–log.
+    """Return the time, s, that the method of these records takes to an error, interpolated log–log
+    between its settings.
 
-    It is the coarsest setting's if the error is smaller there already, NaN if it is never reached.
+    This is the time of the coarsest setting if its error is already smaller, and NaN if no setting
+    reaches the error.
     """
     error = _checks.positive(error, "error")
     rungs = sorted((r for r in listed(records) if r.error == r.error), key=lambda r: r.time)
-    # Errors need not fall with every setting: what counts is the least error up to a time.
+    # Errors need not fall with every setting: only the least error up to a time counts.
     least, seen = math.inf, []
     for record in rungs:
         if record.error < least:
@@ -67,12 +69,12 @@ def time_to(records: Iterable[Record], error: float) -> float:
 
 
 class Choice(NamedTuple):
-    """A line of the table.
+    """Hold a line of the table.
 
-    **Fields:** for `scene` and the `wanted` error the quickest `method` of ours and its `time`, s;
-    the way to the `gradient` at the same relative error and its `gradient_time`; `default` and
-    `default_gradient`, times of `simulate` as it stands; `peer`, `peer_time`: a quicker method than
-    ours, if there is one.
+    **Fields:** for `scene` and the `wanted` error, the quickest `method` of ours and its `time`, s;
+    the way to the `gradient` at an equal relative error and its `gradient_time`; `default` and
+    `default_gradient`, times of `simulate` with its defaults; `peer`, `peer_time`: a method that is
+    quicker than ours, if there is one.
 
     >>> Choice._fields[:2]
     ('scene', 'wanted')
@@ -91,7 +93,8 @@ class Choice(NamedTuple):
 
 
 def choose(records: Iterable[Record], wanted: Sequence[float] = WANTED) -> list[Choice]:
-    """For each scene and wanted error: the quickest method of ours, and a quicker peer.
+    """Return, for each scene and wanted error, the quickest method of ours, and a quicker peer if
+    there is one.
 
     **Arguments:** `records` as measured, of any scenes; `wanted` errors, rad.
 
@@ -120,7 +123,7 @@ def _choice(here: list[Record], scene: str, error: float) -> Choice:
 
 
 def quickest(records: Iterable[Record], kind: str, error: float) -> dict[str, float]:
-    """Time to an error of each method that reaches it, label → s, the quickest first."""
+    """Return the time to an error of each method that reaches it, label → s, the quickest first."""
     of = [r for r in records if r.kind == kind]
     times = {
         label: time_to([r for r in of if r.label == label], error)
@@ -131,7 +134,7 @@ def quickest(records: Iterable[Record], kind: str, error: float) -> dict[str, fl
 
 
 def table(lines: Iterable[Choice]) -> str:
-    """The lines of `choose` as a table in Markdown.
+    """Return the lines of `choose` as a table in Markdown.
 
     >>> print(table([]).splitlines()[0][:28])
     | scene | wanted error, rad

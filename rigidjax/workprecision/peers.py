@@ -1,4 +1,6 @@
-"""Peers that are no JAX, left out where not installed; and all methods that can be compared."""
+"""Prepare peers that do not use JAX, as far as they are installed; list all methods that can be
+compared.
+"""
 
 import importlib
 import importlib.util
@@ -23,7 +25,7 @@ STEPS = (5e-2, 2e-2, 5e-3)
 
 
 def _rates(scene: Scene, numbers: np.ndarray, **how: Any) -> Any:
-    """The plain equations on floats."""
+    """Return the plain equations of a scene on Python's floats."""
     plain: Any = scene.plain
     return plain(tuple(map(float, numbers)), math.sin, math.cos, math.sqrt, **how)
 
@@ -37,12 +39,16 @@ def _weighed(scene: Scene) -> bool:
 
 
 def _in_double(scene: Scene) -> bool:
-    # To import gradsolve sets JAX to float64.
+    # Importing gradsolve sets JAX to float64: it is refused for other scenes.
     return scene.plain is not None and scene.numbers.dtype == jnp.float64
 
 
 def _peer(module: str, can: Callable[[Scene], bool] = _written_out) -> Callable[[Any], Any]:
-    """A method's `value` of `make(scene, numbers, start, module) → run`, timed without imports."""
+    """Return a decorator that makes a method's `value` from `make(scene, numbers, start, module) →
+    run`.
+
+    The time to import `module` is not counted.
+    """
 
     def wrapped(make: Callable[[Scene, np.ndarray, np.ndarray, Any], Any]) -> Any:
         def ready(scene: Scene) -> Ready | None:
@@ -63,7 +69,7 @@ def _stepped(end: float, start: np.ndarray, f: Any) -> Any:
     from scipy.integrate import DOP853
 
     def run(setting: float) -> tuple[Any, Any]:
-        # The stepper itself: solve_ivp would keep every step.
+        # The stepper is called directly: solve_ivp would store every step.
         stepper = DOP853(f, 0.0, start, end, rtol=setting, atol=1e-3 * setting)
         steps = 0
         while stepper.status == "running":
@@ -94,7 +100,9 @@ def _numba(scene: Scene, numbers: np.ndarray, start: np.ndarray, numba: Any) -> 
 
 @_peer("mujoco", _weighed)
 def _mujoco(scene: Scene, numbers: np.ndarray, start: np.ndarray, mujoco: Any) -> Any:
-    """A body on a ball joint, MuJoCo's own Runge–Kutta 4; tops and free bodies only."""
+    """Return the run of a body on a ball joint by MuJoCo's own Runge–Kutta 4; tops and free bodies
+    only.
+    """
     notes, body = scene.notes, scene.body
     assert notes is not None and body is not None
     mass, com = notes["mass"], np.asarray(notes["com"])
@@ -109,7 +117,7 @@ def _mujoco(scene: Scene, numbers: np.ndarray, start: np.ndarray, mujoco: Any) -
         f'fullinertia="{words(about[at] for at in PAIRS)}"/></body></worldbody></mujoco>'
     )
     data: Any = mujoco.MjData(model)
-    # It would write a file into the folder one works in where a step is too long.
+    # Without this MuJoCo writes a file into the working folder where a step is too long.
     mujoco.set_mju_user_warning(lambda message: None)
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -132,7 +140,9 @@ def _system(scene: Scene, hy: Any, numbers: Any) -> Any:
 
 
 def _propagated(hy: Any, end: float, start: np.ndarray, system: Any, **how: Any) -> Any:
-    """Tolerance → the state at the end, steps. Order and code follow from it: each is compiled."""
+    """Return the run tolerance → (state at the end, steps). Order and code depend on the tolerance:
+    each is compiled.
+    """
     made: dict[float, Any] = {}
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -156,7 +166,9 @@ def _taylor(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> An
 
 @_peer("heyoka")
 def _varied(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> Any:
-    """Variational equations by the initial state and the inertia, contracted with the scalar's."""
+    """Return the run of the variational equations by initial state and inertia, contracted with the
+    scalar's gradient.
+    """
     size = 6 if scene.body is not None else 0
     symbols = [hy.par[i] for i in range(size)] or list(numbers)
     system = _system(scene, hy, [*symbols, *numbers[size:]] if size else symbols)
@@ -170,7 +182,8 @@ def _varied(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> An
     def run(setting: float) -> tuple[Any, Any]:
         state, steps = end_of(setting)
         slope = np.asarray(pull(state[:n])) @ state[n:].reshape(n, -1)
-        # By the initial state, carried on to the numbers of the scene; then by the parameters.
+        # The derivative by the initial state is carried on to the numbers of the scene; then the
+        # derivative by the parameters is added.
         found = slope[:n] @ chain
         found[:size] += slope[n : n + size]
         return found, steps
@@ -179,12 +192,14 @@ def _varied(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> An
 
 
 class _Ensemble:
-    """A scene as gradsolve wants it, an ensemble of one; its parameters are the scene's numbers."""
+    """Present a scene to gradsolve as an ensemble of one; its parameters are the scene's
+    numbers.
+    """
 
     is_stiff, t0 = False, 0.0
 
     def __init__(self, scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any):
-        # One scene is recorded by NumPy otherwise, a thousand times as slowly.
+        # Otherwise NumPy records a single scene, a thousand times as slowly.
         os.environ.setdefault("GRADSOLVE_RECORDER", "jax")
         self.module, self.plain = module, scene.plain
         self.name, self.t1 = scene.name, scene.end
@@ -214,7 +229,9 @@ def _recorded(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any)
 
 @_peer("gradsolve", _in_double)
 def _replayed(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any) -> Any:
-    """The gradient through recorded steps; they are recorded once, and not timed."""
+    """Return the run of the gradient through recorded steps; the recording is made once, and not
+    timed.
+    """
     ensemble = _Ensemble(scene, numbers, start, module)
     made: dict[float, Any] = {}
 
@@ -239,7 +256,7 @@ def _replayed(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any)
 
 
 def methods_outside() -> list[Method]:
-    """The peers that can be imported here, of SciPy, numba, MuJoCo, heyoka and gradsolve.
+    """Return the peers that can be imported here, of SciPy, numba, MuJoCo, heyoka and gradsolve.
 
     heyoka.py's adaptive Taylor method: Biscani and Izzo 2021, doi:10.1093/mnras/stab1032.
     gradsolve's replay of the recorded steps of Verner's method of order 7: arXiv:2609.02876.
@@ -256,7 +273,7 @@ def methods_outside() -> list[Method]:
 
 
 def methods(group: str | None = None) -> list[Method]:
-    """The methods that can be compared here: ours, others in JAX, and the peers installed.
+    """Return the methods that can be compared here: ours, others in JAX, and the peers installed.
 
     **Arguments:** `group` `ours`, `jax` or `peer` for those alone.
 

@@ -1,4 +1,4 @@
-"""Records of measurements, one line for each run; their file; changes from a stored table.
+"""Store records of measurements, one line for each run; list changes from a stored table.
 
 Tables are compared by errors, steps, and ratios of times, never by absolute times.
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rigidjax import _checks
 
-# Errors at round-off wander: nothing below this has moved.
+# Errors at round-off vary from run to run: changes below FLOOR do not count.
 FLOOR = 1e-13
 WORSE, STEPS, SLOWER = 3.0, 0.02, 2.0
 BASE = "diffrax Dopri8"
@@ -19,16 +19,17 @@ BASE = "diffrax Dopri8"
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """One method at one setting on one scene: its errors and its cost.
+    """Hold the errors and the cost of one method at one setting on one scene.
 
     **Fields:** `scene`, `method` names; `group` `ours`, `jax` or `peer`; `kind` `value` or
     `gradient`; `adjoint` how a gradient was taken; `setting` the tolerance, or the number of equal
-    steps; `error` of the attitude, an angle in rad (of a point its place, relative), and of a
-    gradient relative, |g − g*|/|g*|; `error_rate` of Ω relative to |Ω0| (of a point the velocity);
-    `energy`, `momentum` the larger drift of the conserved ones, relative; `by_inertia`, `by_rate`,
-    `by_attitude` the parts of a gradient's error, each relative to its own part (of a point the
-    last two: velocity, place); `steps`; `time`, `time_low`, `time_high` median and quartiles, s;
-    `compile` s; `memory` bytes of the compiled run's temporaries. NaN where it does not apply.
+    steps; `error` of the attitude, an angle in rad (for a point the relative error of its
+    position), and for a gradient the relative error |g − g*|/|g*|; `error_rate` of Ω relative to
+    |Ω0| (for a point that of the velocity); `energy`, `momentum` the relative drift of the energy,
+    and the larger drift of the conserved momenta; `by_inertia`, `by_rate`, `by_attitude` the parts
+    of a gradient's error, each relative to its own part (for a point the last two are velocity and
+    position); `steps`; `time`, `time_low`, `time_high` median and quartiles, s; `compile` s;
+    `memory` bytes of the compiled run's temporaries. A field that does not apply is NaN.
 
     >>> Record("free-top", "closed form", "ours", "value", "", 0.0, error=1e-15).time
     nan
@@ -56,7 +57,7 @@ class Record:
 
     @property
     def label(self) -> str:
-        """Method and adjoint as one name."""
+        """Return method and adjoint as one name."""
         return f"{self.method}, {self.adjoint}" if self.adjoint else self.method
 
 
@@ -64,7 +65,7 @@ _WORDS = ("scene", "method", "group", "kind", "adjoint")
 
 
 def listed(records: Iterable[Record], name: str = "records") -> list[Record]:
-    """The records as a list; `TypeError` where something else is among them."""
+    """Return the records as a list. **Raises:** `TypeError` if something else is among them."""
     _checks.instance(records, Iterable, name, wanted="records")
     found = list(records)
     for record in found:
@@ -73,7 +74,7 @@ def listed(records: Iterable[Record], name: str = "records") -> list[Record]:
 
 
 def write_csv(records: Iterable[Record], path: str | Path) -> None:
-    """Keep records in a file, one line each under a header; NaN is left empty."""
+    """Write records to a file, one line each under a header; NaN is left empty."""
     with Path(path).open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(field.name for field in dataclasses.fields(Record))
@@ -83,7 +84,9 @@ def write_csv(records: Iterable[Record], path: str | Path) -> None:
 
 
 def read_csv(path: str | Path) -> list[Record]:
-    """The records of a file that `write_csv` wrote; `ValueError` for another file."""
+    """Return the records of a file that `write_csv` wrote. **Raises:** `ValueError` for another
+    file.
+    """
     with Path(path).open(newline="") as file:
         rows, names = csv.DictReader(file), [field.name for field in dataclasses.fields(Record)]
         lacks = set(names) - set(rows.fieldnames or ())
@@ -97,11 +100,13 @@ def read_csv(path: str | Path) -> list[Record]:
 
 
 def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str], list[str]]:
-    """The differences of two tables in words: (changed errors or steps, changed times).
+    """Return sentences about the differences of two tables: (changed errors or steps, changed
+    times).
 
-    Lines that both have are compared, without peers: an error more than three times as large or as
-    small, steps by more than 2 %; and the median time over that of `diffrax Dopri8` on the same
-    scene, at common settings, by more than a factor of 2.
+    Lines that both tables have are compared, without peers. A difference is an error more than
+    three times as large or as small, steps that changed by more than 2 %, or a median time, over
+    that of `diffrax Dopri8` on the same scene at common settings, that changed by more than a
+    factor of 2.
     """
     records, stored = listed(records), listed(stored, "stored")
     now = {_key(r): r for r in records if r.group != "peer"}
@@ -128,7 +133,9 @@ def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str
 
 
 def kept(records: Iterable[Record]) -> list[Record]:
-    """The contents of a stored table: no peers, times as multiples of the base's median."""
+    """Return the records of a stored table: no peers, and times as multiples of the median time of
+    `BASE`.
+    """
     records = [r for r in records if r.group != "peer"]
     middle = _middles(records)
     bases = [middle.get((r.scene, "value", BASE), math.nan) for r in records]
@@ -150,7 +157,7 @@ def _name(record: Record) -> str:
 
 
 def _middles(records: Iterable[Record]) -> dict[tuple[str, str, str], float]:
-    """Median time of each scene, kind and label."""
+    """Return the median time of each scene, kind and label."""
     times: dict[tuple[str, str, str], list[float]] = {}
     for r in records:
         if r.time == r.time:
@@ -159,7 +166,7 @@ def _middles(records: Iterable[Record]) -> dict[tuple[str, str, str], float]:
 
 
 def _ratios(table: dict, common: set) -> dict[tuple[str, str, str], float]:
-    """Median over common settings of each label's time, over that of the base."""
+    """Return the median over common settings of each label's time, divided by that of `BASE`."""
     middle = _middles(record for key, record in table.items() if key in common)
     return {
         label: spent / middle[label[0], "value", BASE]

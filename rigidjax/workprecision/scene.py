@@ -1,4 +1,4 @@
-"""A scene with its reference, and a method that is prepared for it and run."""
+"""Define a scene with its reference, and a method that is prepared for it and run."""
 
 import functools
 import json
@@ -20,16 +20,17 @@ from rigidjax.frames import Point
 from rigidjax.motion import Attitude
 from rigidjax.rotation import quaternion
 
-# The scalar that gradients are taken of: a.R b + c.Ω/|Ω0| at the end, of no particular direction.
+# Gradients are taken of the scalar a.R b + c.Ω/|Ω0| at the end, with directions that are not
+# special.
 A, B, C = (0.6, -0.48, 0.64), (0.36, 0.8, -0.48), (0.28, -0.5, 0.82)
 
 
 class Reference(NamedTuple):
-    """The end of a scene, and the gradient of its scalar.
+    """Hold the end of a scene, and the gradient of its scalar.
 
     **Fields:** `end` the state as one tuple; `error` of its largest number, as estimated by the
-    method that made it; `gradient`, `gradient_error` the same, empty where there is none;
-    `source` words.
+    method that made it; `gradient` of the scene's scalar, empty if there is none, and
+    `gradient_error` of its largest number; `source` a sentence.
 
     >>> top = stored("heavy top")
     >>> top is None or top.error < 1e-12
@@ -45,9 +46,10 @@ class Reference(NamedTuple):
 
 @functools.cache
 def stored(name: str) -> Reference | None:
-    """The stored answer to the standard scene of this name, if there is one.
+    """Return the stored answer to the standard scene of this name, or `None`.
 
-    They are made by `tests/workprecision/make_references.py` at 40 digits and rounded to float64.
+    The answers are made by `tests/workprecision/make_references.py` at 40 digits and rounded to
+    float64.
     """
     file = resources.files("rigidjax.workprecision").joinpath("references.json")
     row = json.loads(file.read_text()).get(name)
@@ -58,14 +60,14 @@ def stored(name: str) -> Reference | None:
 
 
 class Scene(eqx.Module):
-    """One motion for the comparison of methods.
+    """Define one motion for the comparison of methods.
 
     **Fields:** `name`, `title` words; `body` an `Inertia`, `None` for a `Point`; `state0` an
     `Attitude` or a `Point`; `torque` as for `rigidjax.simulate`; `end` s, the run is from 0 to
-    `end`; `plain` the same equations without JAX, `plain(numbers, sin, cos, sqrt) → f(t, y)`, for
-    peers and references (`None`: peers are left out); `reference` the correct answer, `None`:
-    computed by our own method at small steps; `slow` whether only a full run uses it; `notes` data
-    for a peer beyond the equations.
+    `end`; `plain` the equations of the scene without JAX, `plain(numbers, sin, cos, sqrt) → f(t,
+    y)`, for peers and references (`None`: peers are left out); `reference` the correct answer,
+    `None`: computed by our own method at small steps; `slow` whether only a full run uses it;
+    `notes` data for a peer beyond the equations.
 
     >>> from rigidjax import Attitude, Inertia, torques
     >>> scene = Scene("mine", "my body", Inertia(jnp.eye(3)),
@@ -91,7 +93,7 @@ class Scene(eqx.Module):
                 "Scene: wanted an Inertia with an Attitude, or None with a Point, got "
                 f"{type(self.body).__name__} with {type(self.state0).__name__}"
             )
-        hint = "errors are told as angles between attitudes, or as distances"
+        hint = "errors are angles between attitudes, or distances"
         wanted = "an Attitude or a Point"
         _checks.instance(self.state0, (Attitude, Point), "state0", wanted=wanted, hint=hint)
         if self.body is not None:
@@ -100,7 +102,9 @@ class Scene(eqx.Module):
 
     @property
     def numbers(self) -> Float[Array, " parameters"]:
-        """The variables of gradients: Ixx Iyy Izz Ixy Ixz Iyz, Ω0, q0 (13), or x0, v0 (6)."""
+        """Return the variables of gradients: Ixx Iyy Izz Ixy Ixz Iyz, Ω0, q0 (13), or x0, v0
+        (6).
+        """
         if self.body is None:
             return jnp.concatenate([self.state0.x, self.state0.v])  # pyright: ignore
         entries = jnp.stack([self.body.tensor[at] for at in PAIRS])
@@ -109,25 +113,27 @@ class Scene(eqx.Module):
 
     @property
     def blocks(self) -> dict[str, slice]:
-        """The parts of `numbers`, by the name of the error of a gradient by them in a `Record`."""
+        """Return the slices of `numbers`, by the name that a `Record` gives to the error of a
+        gradient by them.
+        """
         if self.body is None:
             return {"by_attitude": slice(0, 3), "by_rate": slice(3, 6)}
         return {"by_inertia": slice(0, 6), "by_rate": slice(6, 9), "by_attitude": slice(9, 13)}
 
     def assembled(self, numbers: Float[Array, " parameters"]) -> tuple[Any, Any]:
-        """Body and initial state of these `numbers`."""
+        """Return the body and the initial state with these `numbers`."""
         if self.body is None:
             return None, Point(numbers[:3], numbers[3:])
         tensor = from_components(*(numbers[i] for i in range(6)))
         return Inertia(tensor), Attitude(quaternion.normalise(numbers[9:]), numbers[6:9])
 
     def flat(self, state: Any) -> Float[Array, " state"]:
-        """A state as one vector, (7,) or (6,)."""
+        """Return a state as one vector, (7,) or (6,)."""
         return jnp.concatenate(jax.tree.leaves(state))
 
     @property
     def size(self) -> tuple[float, float]:
-        """The scales of errors of the halves of the state: 1 rad and |Ω0|, or lengths."""
+        """Return the scales of errors of both halves of the state: 1 rad and |Ω0|, or lengths."""
         state: Any = self.state0
         if self.body is None:
             length = float(np.linalg.norm(state.x))
@@ -135,7 +141,7 @@ class Scene(eqx.Module):
         return 1.0, float(np.linalg.norm(state.omega))
 
     def loss(self, end: Float[Array, " state"]) -> Float[Array, ""]:
-        """The scalar whose gradient is compared, of a state as one vector."""
+        """Return the scalar whose gradient is compared, from a state as one vector."""
         one, two = self.size
         a, b, c = (jnp.asarray(v, end.dtype) for v in (A, B, C))
         if self.body is None:
@@ -144,7 +150,9 @@ class Scene(eqx.Module):
 
 
 def distance(scene: Scene, end: Any, right: Any) -> tuple[float, float]:
-    """Error of attitude (an angle, rad) and of Ω; of a point's place and velocity, all relative."""
+    """Return the errors of attitude (an angle, rad) and of Ω; for a point those of position and
+    velocity, all relative.
+    """
     end, right = np.asarray(end, float), np.asarray(right, float)
     one, two = scene.size
     if scene.body is None:
@@ -160,7 +168,7 @@ def distance(scene: Scene, end: Any, right: Any) -> tuple[float, float]:
 
 
 class Ready(NamedTuple):
-    """A method prepared for a scene.
+    """Hold a method prepared for a scene.
 
     **Fields:** `run` setting → (the last state, or the gradient, as one vector; steps taken),
     complete when it returns; `compile` s that making it took, `memory` bytes of temporaries, each
@@ -177,13 +185,13 @@ class Ready(NamedTuple):
 
 
 class Method(NamedTuple):
-    """A method to compare; give your own, or a peer's, to `measure` as one of these.
+    """Define a method to compare; `measure` takes your own, or a peer's, in this form.
 
-    **Fields:** `name`; `group` `ours`, `jax` (anything else that runs in JAX) or `peer`;
-    `settings` tolerances, or numbers of equal steps, from coarse to fine; `value` makes it ready
-    for a scene, `None` where it cannot do that one; `gradients` adjoint → the same for the gradient
-    of the scene's scalar by its `numbers`; `equal` whether settings are numbers of steps for a run
-    of 50 rad, to be scaled to the scene.
+    **Fields:** `name`; `group` `ours`, `jax` (anything else that runs in JAX) or `peer`; `settings`
+    tolerances, or numbers of equal steps, from coarse to fine; `value` prepares the method for a
+    scene, and returns `None` for a scene that it cannot do; `gradients` adjoint → a function like
+    `value`, for the gradient of the scene's scalar by its `numbers`; `equal` whether settings are
+    numbers of steps for a run of 50 rad, to be scaled to the scene.
 
     >>> import numpy as np
     >>> ready = Ready(lambda setting: (np.ones(7), 0))

@@ -1,4 +1,4 @@
-"""The standard scenes."""
+"""Define the standard scenes."""
 
 import functools
 from collections.abc import Callable
@@ -58,7 +58,7 @@ BODIES: dict[str, tuple[str, Any, Any, float, Any, Any]] = {
 
 
 class Circle(eqx.Module):
-    """A place on a circular orbit in the plane x, y, at an angular rate, rad/s."""
+    """Describe a place on a circular orbit in the plane x, y, at an angular rate, rad/s."""
 
     radius: Float[Array, ""]
     rate: Float[Array, ""]
@@ -74,7 +74,7 @@ def _same(x: Any) -> Any:
 
 
 def _torque(kind: Any, constants: Any) -> Any:
-    """The library's torque of an equation."""
+    """Return the library's torque for an equation of `workprecision.equations`."""
     if kind is equations.heavy:
         return HeavyTop(1.0, constants[:3], constants[3:])
     if kind is equations.gyrostat:
@@ -98,7 +98,7 @@ def _body(
             torque = wrap(kind(numbers[:6], exact, sin, cos, wrap(equations.into_body)))
         return wrap(equations.body_rates(numbers[:6], torque))
 
-    # What MuJoCo can do: weight alone, or nothing.
+    # MuJoCo can do scenes with weight alone, or without torque.
     com, gravity = (constants[:3], constants[3:]) if kind is equations.heavy else ((0.0,) * 3,) * 2
     weighs = kind in (None, equations.heavy)
     return Scene(
@@ -120,7 +120,7 @@ def _point(
 
 
 def _foucault() -> Scene:
-    """Foucault's pendulum, let go at rest, for ten minutes."""
+    """Return Foucault's pendulum, released at rest, for ten minutes."""
     law = places.foucault(0.85, 67.0)
     _, north, up = (float(w) for w in law.place.angular_velocity())
     return _point(
@@ -130,7 +130,7 @@ def _foucault() -> Scene:
 
 
 def _arenstorf() -> Scene:
-    """Arenstorf's orbit about Earth and Moon, once round."""
+    """Return Arenstorf's orbit about Earth and Moon, for one period."""
     mu, x, v, period = ARENSTORF
     return _point(
         "arenstorf", "Arenstorf's orbit", Point([x, 0.0, 0.0], [0.0, v, 0.0]), period,
@@ -139,9 +139,11 @@ def _arenstorf() -> Scene:
 
 
 def scenes() -> dict[str, Callable[[], Scene]]:
-    """The standard scenes: name → a function that makes it (in the default precision of JAX).
+    """Return the standard scenes: name → a function that makes the scene (in the default precision
+    of JAX).
 
-    The drift over a million steps is apart: `python -m rigidjax workprecision` measures it.
+    The drift over a million steps is not among them: `python -m rigidjax workprecision` measures
+    it.
 
     >>> sorted(scenes())[:3]
     ['arenstorf', 'asymmetric-top', 'damped-gyrostat']

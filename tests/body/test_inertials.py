@@ -71,9 +71,9 @@ def test_what_is_written_is_read_and_the_rest_stays(tmp_path, text, name):
 
 
 MISTAKES = [
-    (URDF.replace('"1.5"', '"9.5"'), "body 'upper': no body has the moments"),
+    (URDF.replace('"1.5"', '"9.5"'), "body 'upper': wanted moments of a body"),
     (URDF.replace('"2.0"', '"0"'), "body 'upper': wanted a positive mass, got 0"),
-    (URDF.replace('"2.5"', '"two"'), "body 'upper': iyy: 'two' are no numbers"),
+    (URDF.replace('"2.5"', '"two"'), "body 'upper': iyy: wanted numbers, got 'two'"),
     (URDF.replace("0.1 -0.2 0.3", "0.1 -0.2"), "xyz: wanted 3 finite numbers, got '0.1 -0.2'"),
     (URDF.replace("base", "upper"), "two bodies are called 'upper'"),
     (
@@ -108,8 +108,8 @@ LINK = """<link name="{name}"><inertial>
 </inertial></link>"""
 BAD = {
     "tool": (dict(mass="0", moment="0.01"), "wanted a positive mass, got 0"),
-    "camera": (dict(mass="0.1", moment="0.09"), "no body has the moments 0.02, 0.02, 0.09"),
-    "cover": (dict(mass="1e-3 kg", moment="0.01"), "value: '1e-3 kg' are no numbers"),
+    "camera": (dict(mass="0.1", moment="0.09"), "wanted moments of a body, I1 ≥ 0 and I1 + I2 ≥ I3, got 0.02, 0.02, 0.09"),
+    "cover": (dict(mass="1e-3 kg", moment="0.01"), "value: wanted numbers, got '1e-3 kg'"),
     "plate": (dict(mass="0.1", moment="nan"), "ixx: wanted 1 finite numbers, got 'nan'"),
 }
 
@@ -135,8 +135,8 @@ SETTINGS = {
     'inertiafromgeom="true"': "takes all masses and inertias from the geometry instead",
     'settotalmass="12"': "scales all masses and inertias to this total mass",
     'balanceinertia="true"': "replaces the moments of what is no real body by their mean",
-    'boundmass="0.5"': "raises smaller masses to this one",
-    'boundinertia="1e-3"': "raises smaller moments to this one",
+    'boundmass="0.5"': "raises smaller masses to this value",
+    'boundinertia="1e-3"': "raises smaller moments to this value",
     'coordinate="global"': "reads places and orientations in the frame of the world",
 }
 

@@ -147,7 +147,7 @@ def test_frames_of_trajectories_compose():
 @pytest.mark.usefixtures("unhooked")
 def test_a_force_on_what_only_turns_is_refused():
     law = BodyInFrame(FRAME, rj.torques.UniformGravity([0.0, 0, -9.8]))
-    with pytest.raises(TypeError, match="UniformGravity gives a force, got a state Attitude"):
+    with pytest.raises(TypeError, match="UniformGravity returns a force: wanted a Rigid state, got Attitude"):
         law(0.0, ATTITUDE, BODY)
 
 

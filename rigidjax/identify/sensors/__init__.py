@@ -21,4 +21,9 @@ from rigidjax.identify.sensors.vectors import (
     Magnetometer as Magnetometer,
 )
 
+__all__ = [
+    "AbstractSensor", "Accelerometer", "AttitudeSensor", "Direction", "Gyro", "LowPass",
+    "Magnetometer", "Marker", "Position", "Range", "SensorInput", "Tolerance", "Velocity",
+]  # fmt: skip
+
 show(__name__)

@@ -1,4 +1,4 @@
-"""Torques and forces. Each declares the smallest state that it acts on."""
+"""Provide torques and forces. Each declares the smallest state that it acts on."""
 
 from rigidjax._names import show
 from rigidjax.motion.torques.base import AbstractTorque as AbstractTorque, Wrench as Wrench
@@ -45,5 +45,13 @@ from rigidjax.motion.torques.random import (
 )
 from rigidjax.motion.torques.spline import Series as Series, Wheel as Wheel
 from rigidjax.motion.torques.wheels import Flywheel as Flywheel, ReactionWheels as ReactionWheels
+
+__all__ = [
+    "AbstractTorque", "BodyDrag", "CentralGravity", "ChangingInertia", "Chebyshev",
+    "ConstantTorque", "CorrelatedTorque", "Damping", "Delayed", "Drag", "Flywheel", "FromPotential",
+    "GravityGradient", "HeavyTop", "Held", "InSpace", "Input", "Lagged", "Linear", "MagneticDipole",
+    "Pulses", "QuadraticDamping", "RandomTorque", "ReactionWheels", "Rotors", "Series", "Sum",
+    "Tabulated", "Tide", "UniformGravity", "Wheel", "Wrench", "bind",
+]  # fmt: skip
 
 show(__name__)

@@ -1,4 +1,4 @@
-"""The base classes of torques and forces, and their evaluation in a vector field."""
+"""Define the base classes of torques and forces, and evaluate them in a vector field."""
 
 import abc
 import dataclasses
@@ -18,7 +18,7 @@ from rigidjax.motion.torques.states import Frozen, require_frozen
 
 
 class Wrench(eqx.Module):
-    """A force on the centre of mass and a torque about it: the value of a force model.
+    """Hold a force on the centre of mass and a torque about it: the value of a force model.
 
     **Arguments:** `force` (3,) N, **world** frame; `torque` (3,) N m, **body** frame, about the
     centre of mass; none by default.
@@ -37,19 +37,19 @@ class Wrench(eqx.Module):
 
 
 class AbstractTorque(eqx.Module):
-    """A torque on a body: a function of time, state and body, in N m, body axes.
+    """Define a torque on a body: a function of time, state and body, in N m, body axes.
 
     Subclass it, or give any callable Module. `feels` is the smallest state with the parts that the
-    torque reads: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also `.x`, `.v`);
-    one that feels `HasPose` may return a `Wrench`, a force as well as a torque. `body` is the
+    torque reads: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also `.x`, `.v`); a
+    torque with `feels = HasPose` may return a `Wrench`, a force as well as a torque. `body` is the
     argument of `simulate`: an `Inertia`, or `MassProperties` for `Rigid`.
 
     Optional members. `rate_free`: the torque does not depend on the body rate, and
     `rigidjax.solvers.Splitting4` and others can be used. For `rigidjax.conserved`: a method
     `energy(t, state, body)`, J, if it has a potential; `steady`: it does not depend on time; `axis`
     (3,), world frame, about which it has no torque; a method `internal_momentum(t)` (3,), N m s,
-    body frame, the momentum inside a body that nothing outside turns. `jump_times` (n,), s: the
-    torque jumps or has a kink there.
+    body frame, the momentum inside a body on which no external torque acts. `jump_times` (n,), s:
+    the torque jumps or has a kink there.
 
     **States of its own** (a motor's speed, a wheel, a bias that drifts): give the torque `state0`,
     a tree of arrays or a method `(t, state, body)` that returns one, and a method
@@ -75,30 +75,34 @@ class AbstractTorque(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3:
-        """Torque (3,), N m, body frame."""
+        """Return the torque (3,), N m, body frame."""
 
 
 class AbstractForce(eqx.Module):
-    """A force on a `Rigid` with `MassProperties`: as `AbstractTorque`, but returns a `Wrench`."""
+    """Define a force on a `Rigid` with `MassProperties`: as `AbstractTorque`, but it returns a
+    `Wrench`.
+    """
 
     feels: eqx.AbstractVar[type]
 
     @abc.abstractmethod
     def __call__(self, t: ScalarLike, state: Any, body: Any) -> Wrench:
-        """Force (3,), N, world; torque (3,), N m, body frame, about the centre of mass."""
+        """Return the force (3,), N, world frame, and the torque (3,), N m, body frame, about the
+        centre of mass.
+        """
 
 
 class OfTime(AbstractTorque):
-    """A torque with vectors as fields; one of them may be a function of time."""
+    """Define a torque with vectors as fields, each of which may be a function of time."""
 
     @property
     def steady(self) -> bool:
-        """Whether no vector is a function of time."""
+        """Return whether no vector is a function of time."""
         return not any(callable(part) for part in vars(self).values())
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where a vector jumps or has a kink."""
+        """Return the times, s, at which a vector jumps or has a kink."""
         return jumps_of_parts(self)
 
 
@@ -112,10 +116,10 @@ WORLD = "a vector in world axes, such as [0, 0, -9.81]"
 
 
 def require_law(torque: object, name: str = "torque") -> None:
-    """Raise `TypeError` unless `torque` can be called for its value."""
+    """Raise `TypeError` unless `torque` can be called."""
     if isinstance(torque, type):
         made = f"{torque.__name__}(...)"
-        raise TypeError(f"{name}: got the class {torque.__name__}, wanted one made from it: {made}")
+        raise TypeError(f"{name}: wanted an object, got the class {torque.__name__}; make {made}")
     if not callable(torque):
         advice = ""
         if isinstance(torque, list | tuple) and any(callable(part) for part in torque):
@@ -131,30 +135,38 @@ def require_law(torque: object, name: str = "torque") -> None:
 
 
 def sees_attitude(torque: Torque | None) -> bool:
-    """Whether a torque may read the attitude, by `feels`; true if it has none."""
+    """Return whether a torque may read the attitude, by `feels`; true for a torque without
+    `feels`.
+    """
     if hasattr(torque, "parts"):
         return any(sees_attitude(part) for part in torque.parts)  # pyright: ignore
     return torque is not None and getattr(torque, "feels", None) is not HasSpin
 
 
 def sees_rate(torque: Torque | None) -> bool:
-    """Whether a torque may read the body rate: it is not declared `rate_free`."""
+    """Return whether a torque may read the body rate, that is, unless it is declared
+    `rate_free`.
+    """
     return torque is not None and not getattr(torque, "rate_free", False)
 
 
 def require_rung(torque: Torque, state: object) -> None:
-    """Raise `TypeError` unless `torque` can be called and `state` has the parts that it reads."""
+    """Raise `TypeError` unless `torque` can be called and `state` has the parts that the torque
+    reads.
+    """
     require_law(torque)
     feels = getattr(torque, "feels", None)
     if feels is not None and not isinstance(state, feels):
         raise TypeError(
             f"{type(torque).__name__} needs a state with {feels.__name__}, got "
-            f"{type(state).__name__}; take Attitude, or Rigid for what depends on the position"
+            f"{type(state).__name__}; take Attitude, or Rigid for a torque that reads the position"
         )
 
 
 def require_scene(law: Torque | None, state: object, body: object) -> None:
-    """Raise in words unless these are a body, a state, and one torque or none."""
+    """Raise an error unless the arguments are a torque or `None`, a state that it can act on, and a
+    body.
+    """
     _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
     if law is not None:
         require_rung(law, state)
@@ -164,12 +176,14 @@ def require_scene(law: Torque | None, state: object, body: object) -> None:
 
 
 def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
-    """The torque's value (3,), N m, body frame; `TypeError` for a force, which needs a `Rigid`."""
+    """Return the torque's value (3,), N m, body frame. **Raises:** `TypeError` for a force, which
+    needs a `Rigid`.
+    """
     force, value = act(torque, t, state, body)
     if force is not None:
         raise TypeError(
-            f"{type(torque).__name__} gives a force (a Wrench), got a state {type(state).__name__} "
-            "that only turns; a force needs a Rigid state"
+            f"{type(torque).__name__} returns a force (a Wrench): wanted a Rigid state, got "
+            f"{type(state).__name__}, which has no position"
         )
     return value
 
@@ -177,7 +191,9 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
 def act(
     law: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> tuple[Vec3 | None, Vec3]:
-    """Force on the centre of mass (N, world frame, or `None`), and torque about it (body frame)."""
+    """Return the force on the centre of mass (N, world frame, or `None`), and the torque about it
+    (N m, body frame).
+    """
     require_scene(law, state, body)
     dtype = state.omega.dtype
     t = _checks.floating(t, (), "t").astype(dtype)
@@ -191,7 +207,8 @@ def act(
             raise
         hint = "; a subclass of AbstractTorque declares the state that it reads by feels"
         raise TypeError(told + hint) from wrong
-    # Not by class: torques of moving frames give one, too, and do not import this module.
+    # The test is not by class: torques of moving frames return forces of a class of their own,
+    # since they do not import this module.
     if hasattr(found, "force"):
         return found.force.astype(dtype), found.torque.astype(dtype)
     value = _checks.floating(found, (3,), name, hint="body-frame N m")
@@ -207,7 +224,9 @@ _HIGHER = {
 
 
 def lacking(who: str, wrong: AttributeError) -> str | None:
-    """The message if a user's function reads a part that its state does not have; else `None`."""
+    """Return the message for a user's function that read a part which its state lacks; `None` for
+    any other error.
+    """
     if wrong.name not in _HIGHER or not isinstance(wrong.obj, HasSpin):
         return None
     what, higher = _HIGHER[wrong.name]
@@ -216,7 +235,9 @@ def lacking(who: str, wrong: AttributeError) -> str | None:
 
 
 def one_law(law: Any) -> None:
-    """Raise `ValueError` for an array of another shape than declared, as `jax.vmap` makes them."""
+    """Raise `ValueError` for a field whose shape is not that of one torque, such as a batch made by
+    `jax.vmap`.
+    """
     if not type(law).__module__.startswith(__package__ or ""):
         return
     for field in dataclasses.fields(law):
@@ -230,7 +251,7 @@ def one_law(law: Any) -> None:
 
 
 def in_precision(tree: Any, dtype: Any) -> Any:
-    """The same tree with every floating array in `dtype`."""
+    """Return the tree with every floating array in `dtype`."""
 
     def cast(leaf: Any) -> Any:
         if eqx.is_array_like(leaf) and hasattr(leaf, "dtype"):
@@ -241,40 +262,42 @@ def in_precision(tree: Any, dtype: Any) -> Any:
 
 
 def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:
-    """A vector that is constant, or the value at `t` of a callable Module of time."""
+    """Return `source`, a constant vector, or its value at `t` if it is a function of time."""
     return _checks.floating(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
 def vector(name: str, *, hint: str = "") -> Callable[[Any], Array]:
-    """A converter to a field of three numbers, for `equinox.field(converter=…)`."""
+    """Return a converter to a field of three numbers, for `equinox.field(converter=…)`."""
     return lambda value: _checks.given(value, (3,), name, hint=hint)
 
 
 def number(name: str) -> Callable[[Any], Array]:
-    """A converter to a field of one number."""
+    """Return a converter to a field of one number."""
     return lambda value: _checks.given(value, (), name)
 
 
 def source(name: str) -> Callable[[Any], Any]:
-    """A converter to a field that is a vector, or a function of time to one."""
+    """Return a converter to a field that is a vector, or a function of time to a vector."""
     return lambda value: constant_or_callable(value, name)
 
 
 def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
-    """`source` as it is if it can be called with a time; otherwise as a vector (size,)."""
+    """Return `source` unchanged if it can be called with a time; otherwise as a vector (size,)."""
     if callable(source):
         return _checks.function(source, name, f"of time to ({size},)")
     return _checks.given(source, (size,), name)
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:
-    """The times at which a torque or a function of time jumps, s; empty if it has none."""
+    """Return the times at which a torque or a function of time jumps, s; empty if there are
+    none.
+    """
     found = getattr(source, "jump_times", None)
     return jnp.zeros(0) if found is None else found
 
 
 def jumps_in(*sources: object) -> Float[Array, " n"]:
-    """The times at which any of several torques or functions of time jumps, s, in order."""
+    """Return the times at which any of several torques or functions of time jumps, s, in order."""
     times = [found for source in sources if (found := jumps_of(source)).shape[0]]
     if len(times) < 2:
         return times[0] if times else jnp.zeros(0)
@@ -283,12 +306,12 @@ def jumps_in(*sources: object) -> Float[Array, " n"]:
 
 
 def jumps_of_parts(law: object) -> Float[Array, " n"]:
-    """Times, s, where a part of it jumps or has a kink, in order."""
+    """Return the times, s, at which any field of `law` jumps or has a kink, in order."""
     return jumps_in(*vars(law).values())
 
 
 def unit_rows(value: Any, name: str, count: int) -> Float[Array, "n 3"]:
-    """Directions (count, 3), checked to be unit if they are known."""
+    """Return directions (count, 3); known directions must be unit vectors."""
     rows = _checks.given(value, (count, 3), name)
     if _checks.known(rows):
         lengths = np.linalg.norm(np.asarray(rows, float), axis=1)
@@ -298,7 +321,9 @@ def unit_rows(value: Any, name: str, count: int) -> Float[Array, "n 3"]:
 
 
 def count_of(value: Any, name: str, one: str) -> int:
-    """The number of rows (x, y, z), one for each `one`: at least one."""
+    """Return the number of rows (x, y, z) in `value`, one row for each `one`; at least one row is
+    wanted.
+    """
     shape = _checks.numbers(value, name).shape
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
         raise ValueError(f"{name}: wanted (R, 3), one row for each {one}, got shape {shape}")
@@ -306,12 +331,12 @@ def count_of(value: Any, name: str, one: str) -> int:
 
 
 def each(value: Any, count: int, name: str) -> Array:
-    """One number for all, or one for each of `count`."""
+    """Return one number for all, or one number for each of `count`, by the shape of `value`."""
     return _checks.given(value, (count,) if _checks.numbers(value, name).ndim else (), name)
 
 
 def length_or_zero(v: Vec3) -> Scalar:
-    """|v|, with derivative 0 at v = 0, as a factor of |v| v."""
+    """Return |v|, with derivative 0 at v = 0, as a factor of |v| v."""
     v = _checks.floating(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

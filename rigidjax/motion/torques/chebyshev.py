@@ -1,4 +1,6 @@
-"""A function of time as Chebyshev polynomials on equal intervals, as ephemerides are published."""
+"""Describe a function of time by Chebyshev polynomials on equal intervals, as ephemerides are
+published.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,15 +15,15 @@ from rigidjax.rotation.barrier import barrier
 
 
 class Chebyshev(eqx.Module):
-    """A function of time, t → (k,): a Chebyshev series on each of many equal intervals.
+    """Evaluate a function of time, t → (k,): a Chebyshev series on each of many equal intervals.
 
     **Arguments:** `start` s, the beginning of the first interval; `step` s, the length of each;
     `coefficients` (intervals, k, terms): `Σ_n c_n T_n(x)` with x from −1 to 1 along the interval,
     the layout of JPL's ephemerides. All may be traced.
 
-    A place at any time for `GravityGradient` and `Tide`, without a loss of digits of the table. NaN
-    outside of the intervals. **Raises:** `ValueError` for a step that is not positive. Sum by
-    Clenshaw's recurrence (1955, Mathematical Tables 9:118).
+    The function gives a position at any time for `GravityGradient` and `Tide`, with all digits of
+    the table; it is NaN outside of the intervals. **Raises:** `ValueError` for a step that is not
+    positive. The sum is by Clenshaw's recurrence (1955, Mathematical Tables 9:118).
 
     >>> Chebyshev(0.0, 2.0, [[[1.0, 0.0, 1.0]]])(2.0)  # 1 + T₂(1)
     Array([2.], dtype=float64)
@@ -47,12 +49,12 @@ class Chebyshev(eqx.Module):
         self.step = _checks.sign(step, "step", "a positive length, s").astype(dtype)
 
     def __call__(self, t: ScalarLike) -> Any:
-        """The value at `t` (s), (k,)."""
+        """Return the value at `t` (s), (k,)."""
         count, _, terms = self.coefficients.shape
         place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
         i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 1)
         x = 2 * (place - i.astype(place.dtype)) - 1
-        # XLA:CPU would read the table again for every number computed from it.
+        # Without the barrier XLA on CPU reads the table again for every number computed from it.
         x, row = barrier((x, self.coefficients[i]))
         value, before = jnp.zeros_like(row[:, 0]), jnp.zeros_like(row[:, 0])
         for n in range(terms - 1, 0, -1):

@@ -1,4 +1,4 @@
-"""Several torques at once, and torques on a body whose inertia changes in time."""
+"""Add several torques, and describe a body whose inertia changes in time."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -20,10 +20,10 @@ from rigidjax.rotation.linalg3 import apply, components, cross, dot, solve
 
 
 class Sum(eqx.Module):
-    """Several torques and forces at once; it needs the largest state of its parts.
+    """Add several torques and forces; the sum needs the largest state of its parts.
 
     **Arguments:** `*parts` torques, forces, your own callables. **Raises:** `TypeError` for a part
-    that cannot be called; `ValueError` for none at all.
+    that cannot be called; `ValueError` for an empty sum.
 
     >>> damping = rj.torques.Damping([1.0, 1, 1])
     >>> Sum(damping, rj.torques.HeavyTop(1.0, [0.0, 0, 1], [0.0, 0, -9.81])).feels
@@ -46,19 +46,19 @@ class Sum(eqx.Module):
 
     @property
     def feels(self) -> type:
-        """The largest state that a part needs."""
+        """Return the largest state that a part needs."""
         rungs = [getattr(part, "feels", base.LADDER[0]) for part in self.parts]
         order = lambda r: base.LADDER.index(r) if r in base.LADDER else len(base.LADDER)  # noqa: E731
         return max(rungs, key=order)
 
     @property
     def rate_free(self) -> bool:
-        """Whether no part depends on the body rate."""
+        """Return whether no part depends on the body rate."""
         return all(not base.sees_rate(part) for part in self.parts)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """The times of all parts, s, in order."""
+        """Return the jump times of all parts, s, in order."""
         return base.jumps_in(*self.parts)
 
     def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | base.Wrench:
@@ -73,24 +73,25 @@ class Sum(eqx.Module):
 
 
 def parts_of(torque: base.Torque | None) -> tuple[Any, ...]:
-    """The torques in a sum, and in sums within it; none of `None`."""
+    """Return the torques in a sum, and in sums inside it; an empty tuple for `None`."""
     if isinstance(torque, Sum):
         return tuple(inner for part in torque.parts for inner in parts_of(part))
     return () if torque is None else (torque,)
 
 
 class ChangingInertia(eqx.Module):
-    """The effect of a changing inertia: `d(IΩ)/dt = IΩ × Ω + τ`, that is `I dΩ/dt = … − İΩ + τ`.
+    """Describe the effect of a changing inertia: `d(IΩ)/dt = IΩ × Ω + τ`, that is `I dΩ/dt = … − İΩ
+    + τ`.
 
     **Arguments:** `inertia` kg m², body frame, about the point that the body turns about (the
     centre of mass of a `Rigid`): a function of time, t → (3, 3), such as `Linear(times, tensors)`,
     or a Module with `feels` (as torques have) of `(t, state, body)`, such as `Tide`. `simulate`
     integrates the momentum under a function of time: where it jumps, `jnp.where(t < t1, I0, I1)`,
     the momentum stays. Elsewhere (`rigidjax.batch.rollout`), and of a Module with `feels`, the
-    derivative along the motion is taken, which has no jumps. A tensor of no body (not symmetric,
-    moments that are not positive or break the triangle inequality) is NaN, and ends the run.
-    `torque` all other torques, or `None`: give them here, not beside it in a `Sum`, because their
-    τ acts on I, and they get the body with I.
+    derivative along the motion is taken, which has no jumps. A tensor that no body has (not
+    symmetric, or with moments that are not positive or break the triangle inequality) becomes NaN,
+    which ends the run. `torque` all other torques, or `None`: give them here, not beside it in a
+    `Sum`, because their τ acts on I, and they get the body with I.
 
     A function of time replaces the inertia of the body given to `simulate`. Parts that move inside
     must have no momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend
@@ -122,14 +123,14 @@ class ChangingInertia(eqx.Module):
 
     @property
     def feels(self) -> type:
-        """The smallest state that the inertia and the torque inside act on."""
+        """Return the smallest state that the inertia and the torque inside act on."""
         rungs = [getattr(part, "feels", HasSpin) for part in (self.inertia, self.torque)]
         return max(rungs, key=base.LADDER.index)
 
     jump_times = property(base.jumps_of_parts)
 
     def tensor(self, t: ScalarLike, state: Any = None, body: Any = None) -> Mat3:
-        """I, (3, 3), kg m²; of a function of time without `state` and `body`."""
+        """Return I, (3, 3), kg m²; a function of time needs no `state` and `body`."""
         seen = (t, state, body) if hasattr(self.inertia, "feels") else (t,)
         found = self.inertia(*seen)
         found = found.tensor if isinstance(found, Inertia) else found
@@ -146,7 +147,8 @@ class ChangingInertia(eqx.Module):
             now = real_or_nan(self.tensor(t, here, body).astype(omega.dtype))
             return apply(now, omega), now
 
-        # Ω̇ is not known yet: I(Ω) Ω is linear in it. One program along four ways: t and q, e_i.
+        # Ω̇ is not known yet, but d(IΩ)/dt is linear in it: one linearisation, evaluated along four
+        # directions (t with q, and each e_i of Ω), gives a linear system for Ω̇.
         (held, now), along = jax.linearize(momentum, t, q, omega)
         still, first = jnp.zeros((1, 3), omega.dtype), jnp.eye(4, 1, dtype=omega.dtype)
         turns = None if q is None else first * quaternion.rate(q, omega)[None]
@@ -157,7 +159,7 @@ class ChangingInertia(eqx.Module):
         if self.torque is not None:
             force, torque = base.act(self.torque, t, state, with_tensor(body, now))
             turning = turning + torque
-        # The body's own equations have its own inertia: the torque that brings them to this.
+        # The equations of the body use its own inertia: return the torque that gives them this Ω̇.
         fixed = tensor_of(body)
         slope = solve(slopes[1:].T, turning)
         torque = apply(fixed, slope) - cross(apply(fixed, omega), omega)
@@ -165,12 +167,15 @@ class ChangingInertia(eqx.Module):
 
 
 def real_or_nan(tensor: Mat3) -> Mat3:
-    """The inertia tensor (3, 3) of a body, kg m²; NaN for any other numbers, which end a run."""
+    """Return the inertia tensor (3, 3) of a body, kg m²; return NaN for any other numbers, which
+    end a run.
+    """
     return jnp.where(is_real(tensor), tensor, jnp.full_like(tensor, jnp.nan))
 
 
 class Tide(eqx.Module):
-    """The inertia tensor of an elastic body that a point mass and its own spin deform.
+    """Compute the inertia tensor of an elastic body that a point mass and the body's own spin
+    deform.
 
     `I = I₀ − κ (μ/r³)(u uᵀ − ⅓) + ⅓ κ (Ω Ωᵀ − ⅓ Ω² − n² (e_z e_zᵀ − ⅓))` with the inertia I₀ of
     the body and `u = Rᵀr/r`, both of a time `delay` ago. For
@@ -181,7 +186,7 @@ class Tide(eqx.Module):
     constant, or a callable Module of time; `mean_rate` n rad/s about body z, the spin whose
     deformation I₀ contains.
 
-    The attitude a time ago is that of a turn at the present body rate. Source: Folkner, Williams,
+    The attitude at t − delay is that of a turn at the present body rate. Source: Folkner, Williams,
     Boggs, Park, Kuchynka 2014, The planetary and lunar ephemerides DE430 and DE431, IPN Progress
     Report 42-196, section III.
 

@@ -1,4 +1,6 @@
-"""Constant torques in the body frame or in the world frame, and torques against the body rate."""
+"""Define constant torques in the body frame or in the world frame, and torques against the body
+rate.
+"""
 
 from typing import ClassVar
 
@@ -11,10 +13,10 @@ from rigidjax.rotation import quaternion
 
 
 class ConstantTorque(base.AbstractTorque):
-    """A constant torque in the body frame, such as a thruster's: `τ = const`.
+    """Apply a constant torque in the body frame, such as a thruster's: `τ = const`.
 
-    **Arguments:** `torque` (3,) N m, body frame (in the world frame: `InSpace`). About a principal
-    axis it spins the body up linearly (Euler 1758).
+    **Arguments:** `torque` (3,) N m, body frame (in the world frame: `InSpace`). A constant torque
+    about a principal axis spins the body up linearly (Euler 1758).
 
     >>> ConstantTorque([0.0, 0.0, 1.0])(0.0, rj.Spin([0.0, 0.0, 5.0]), None).tolist()
     [0.0, 0.0, 1.0]
@@ -30,11 +32,11 @@ class ConstantTorque(base.AbstractTorque):
 
 
 class InSpace(base.OfTime):
-    """A torque given in the world frame: `τ = Rᵀ τ_w`.
+    """Apply a torque given in the world frame: `τ = Rᵀ τ_w`.
 
     **Arguments:** `torque` τ_w, N m, world frame: (3,), or a callable Module of time, t → (3,),
-    such as `Linear(times, values)`. A constant τ_w adds τ_w t to the angular momentum; the part
-    across it is conserved.
+    such as `Linear(times, values)`. A constant τ_w adds τ_w t to the angular momentum; the part of
+    the momentum across τ_w is conserved.
 
     >>> turned = rj.Attitude([0.0, 1.0, 0.0, 0.0], [0.0, 0, 0])  # half a turn about x
     >>> InSpace([0.0, 0.0, 1.0])(0.0, turned, None).tolist()  # in body axes
@@ -50,7 +52,7 @@ class InSpace(base.OfTime):
 
 
 class _Against(base.AbstractTorque):
-    """A torque against the body rate, with a coefficient for each body axis."""
+    """Define a torque against the body rate, with a coefficient for each body axis."""
 
     feels: ClassVar[type] = HasSpin
     steady: ClassVar[bool] = True
@@ -60,7 +62,7 @@ class _Against(base.AbstractTorque):
 
 
 class Damping(_Against):
-    """Linear damping `τ = −c Ω`, component by component.
+    """Apply linear damping `τ = −c Ω`, component by component.
 
     **Arguments:** `coefficient` (3,) c along the body axes, N m s/rad. The rate of a sphere of
     inertia I decays as exp(−c t/I); a ball in a viscous fluid has c = 8πηr³ (Kirchhoff 1876; Lamb,
@@ -75,7 +77,8 @@ class Damping(_Against):
 
 
 class QuadraticDamping(_Against):
-    """Quadratic damping `τ = −c |Ω| Ω`, component by component: drag at a large Reynolds number.
+    """Apply quadratic damping `τ = −c |Ω| Ω`, component by component: drag at a large Reynolds
+    number.
 
     **Arguments:** `coefficient` (3,) c along the body axes, N m s²/rad². A rate about a principal
     axis decays as Ω0/(1 + c Ω0 t/I) (Newton, Principia, Book II, Section II). At Ω = 0 the first

@@ -1,4 +1,4 @@
-"""Forces on a body that moves: gravity, a centre of attraction, drag, rotors."""
+"""Define forces on a body that moves: gravity, a centre of attraction, drag, rotors."""
 
 from typing import Any, ClassVar
 
@@ -18,7 +18,7 @@ _NONE: Any = (0.0, 0.0, 0.0)
 
 
 class UniformGravity(base.AbstractForce):
-    """Uniform acceleration: `F = m g`, no torque about the centre, `U = −m g·x`.
+    """Apply uniform gravity: `F = m g`, no torque about the centre, `U = −m g·x`.
 
     **Arguments:** `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81]. Source: notes, eq 84.
 
@@ -33,11 +33,11 @@ class UniformGravity(base.AbstractForce):
     gravity: Float[Array, "3"] = eqx.field(converter=base.vector("gravity", hint=base.WORLD))
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
-        """Potential energy, J: `U = −m g·x`, zero at the world's origin."""
+        """Return the potential energy, J: `U = −m g·x`, zero at the world's origin."""
         return -body.mass * dot(self.gravity, state.x)
 
     def internal_momentum(self, t: ScalarLike) -> Vec3:
-        """Zero, N m s: no torque on the body, and no momentum inside."""
+        """Return zero, N m s: gravity has no torque on the body and no momentum inside."""
         return jnp.zeros_like(self.gravity)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
@@ -45,7 +45,7 @@ class UniformGravity(base.AbstractForce):
 
 
 class CentralGravity(base.AbstractForce):
-    """A centre of attraction at the world's origin, for a body of some size.
+    """Attract a body of some size to a centre at the world's origin.
 
     `U = −μ m/r − (μ/2r³)(Tr I − 3 r̂·I_w r̂)` (MacCullagh's formula), `I_w = R I Rᵀ`, with its
     force and its torque: the energy and the momentum about the origin are conserved. **Arguments:**
@@ -62,32 +62,32 @@ class CentralGravity(base.AbstractForce):
     mu: Float[Array, ""] = eqx.field(converter=base.number("mu"))
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
-        """Potential energy, J, zero far away."""
+        """Return the potential energy, J, which is zero at infinity."""
         r, up, pull, trace = _seen_from_centre(state, body.inertia.tensor)
         return -(self.mu / r) * (body.mass + 0.5 * (trace - 3 * dot(up, pull)) / r / r)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         r, up, pull, trace = _seen_from_centre(state, body.inertia.tensor)
         strength, along = self.mu / r / r, dot(up, pull)
-        # −∂U/∂x in body axes: the part along r, and the part of I r̂ across it.
+        # The force is −∂U/∂x in body axes: a part along r̂, and a part along I r̂.
         radial = -strength * (body.mass + 1.5 * (trace - 5 * along) / r / r)
         force = radial * up - 3 * strength / r / r * pull
         return base.Wrench(quaternion.rotate(state.q, force), cross(3 * strength / r * up, pull))
 
 
 def _seen_from_centre(state: HasPose, tensor: Mat3) -> tuple[Scalar, Vec3, Vec3, Scalar]:
-    """r, r̂ in body axes, I r̂, and Tr I."""
+    """Return r, r̂ in body axes, I r̂, and Tr I."""
     r = jnp.sqrt(dot(state.x, state.x))
     up = quaternion.rotate_inverse(state.q, state.x / r)
     return r, up, apply(tensor, up), tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
 
 
 class Drag(base.AbstractForce):
-    """Drag of a fluid: `F = −k |u| u`, `u = v − wind`, at a point of the body.
+    """Apply the drag of a fluid: `F = −k |u| u`, `u = v − wind`, at a point of the body.
 
-    **Arguments:** `coefficient` k = ½ ρ C_d A, kg/m; `centre` (3,) c the point where it acts, m,
-    body frame, from the centre of mass (`τ = c × RᵀF`); `wind` (3,) the fluid's velocity, m/s,
-    world frame. The body's rotation does not enter u; for its drag take `Damping` or
+    **Arguments:** `coefficient` k = ½ ρ C_d A, kg/m; `centre` (3,) c, the point where the drag
+    acts, m, body frame, from the centre of mass (`τ = c × RᵀF`); `wind` (3,) the fluid's velocity,
+    m/s, world frame. The body's rotation does not enter u; for its drag take `Damping` or
     `QuadraticDamping`. At u = 0 the first derivative is zero, and a second does not exist. Source:
     Newton, Principia, Book II, Section II.
 
@@ -110,7 +110,8 @@ class Drag(base.AbstractForce):
 
 
 class Rotors(base.AbstractForce):
-    """Propellers: thrust `F_i = k_i n_i² d_i` at r_i, and the reaction `τ_i = −s_i c_i n_i² d_i`.
+    """Apply the forces of propellers: thrust `F_i = k_i n_i² d_i` at r_i, and the reaction `τ_i =
+    −s_i c_i n_i² d_i`.
 
     **Arguments:** `positions` r (R, 3) m, body frame, from the centre of mass; `directions` d (R,
     3) of the thrusts, body frame, unit; `spins` s (R,), 1 for a rotor that turns about d by the
@@ -160,7 +161,7 @@ class Rotors(base.AbstractForce):
         n = base.vector_at(self.speeds, t, "speeds", self.spins.shape[0]).astype(self.spins.dtype)
         square = n * n
         lift, twist = self.thrust * square, self.spins * self.drag * square
-        # Written out, rotor by rotor: few, and sums of arrays are slow in a batch.
+        # The sum is written out rotor by rotor: they are few, and in a batch array sums are slow.
         force, torque = jnp.zeros(3, lift.dtype), jnp.zeros(3, lift.dtype)
         for i in range(self.spins.shape[0]):
             along = self.directions[i]
@@ -170,11 +171,13 @@ class Rotors(base.AbstractForce):
 
 
 class BodyDrag(base.AbstractForce):
-    """Drag along the body's axes: `F = −R (a ∘ u + b ∘ |u| u)`, `τ = c × RᵀF`, `u = Rᵀ (v − wind)`.
+    """Apply drag along the body's axes: `F = −R (a ∘ u + b ∘ |u| u)`, `τ = c × RᵀF`, `u = Rᵀ (v −
+    wind)`.
 
-    **Arguments:** `linear` a (3,) kg/s, such as of rotors in a cross-flow; `quadratic` b (3,) kg/m,
-    |u| u taken axis by axis; `centre` c (3,) the point where it acts, m, body frame, from the
-    centre of mass; `wind` (3,) the air's velocity, m/s, world frame. For a sphere see `Drag`.
+    **Arguments:** `linear` a (3,) kg/s, such as that of rotors in a cross-flow; `quadratic` b (3,)
+    kg/m, with |u| u computed axis by axis; `centre` c (3,), the point where the drag acts, m, body
+    frame, from the centre of mass; `wind` (3,) the air's velocity, m/s, world frame. For a sphere
+    see `Drag`.
 
     Source: Faessler, Franchi and Scaramuzza 2018, eq 5, doi:10.1109/LRA.2017.2776353, for the
     linear part; Hoerner 1965, Fluid-Dynamic Drag, for the other.

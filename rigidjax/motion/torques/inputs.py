@@ -1,4 +1,4 @@
-"""Inputs of a torque by name, from a loop or as functions of time; delays and lags."""
+"""Name inputs of a torque, set in a loop or as functions of time; delay and lag them."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeVar
@@ -18,10 +18,10 @@ Law = TypeVar("Law")
 
 
 class Input(eqx.Module):
-    """A named input of a torque, which the loop sets: see `rollout(…, inputs=…)`.
+    """Name an input of a torque, which the loop sets: see `rollout(…, inputs=…)`.
 
-    **Arguments:** `name` its key among the inputs. A torque calls it with the time; `bind` gives it
-    a value.
+    **Arguments:** `name` its key among the inputs. A torque calls the input with the time; `bind`
+    gives it a value.
 
     >>> law = bind(Input("speed"), {"speed": jnp.array([3.0])})
     >>> law(0.0)
@@ -31,7 +31,7 @@ class Input(eqx.Module):
     name: str = eqx.field(static=True)
 
     def __call__(self, t: ScalarLike) -> Any:
-        """**Raises:** `ValueError`: it has no value before `bind`."""
+        """Raise `ValueError`, since an input has no value before `bind`."""
         raise ValueError(
             f"Input({self.name!r}) has no value: give inputs={{{self.name!r}: …}} to "
             "rigidjax.batch.rollout, or put a function of time in its place with "
@@ -40,7 +40,7 @@ class Input(eqx.Module):
 
 
 class _Now(eqx.Module):
-    """A value that does not depend on time."""
+    """Hold a value that does not depend on time."""
 
     value: Array
 
@@ -49,7 +49,7 @@ class _Now(eqx.Module):
 
 
 class Delayed(eqx.Module):
-    """A delayed function of time: `t → source(t − delay)`.
+    """Delay a function of time: `t → source(t − delay)`.
 
     **Arguments:** `source` a function of time such as `Held(times, values)`, or `Input("u")`;
     `delay` s, one number, which may be free in a fit; negative for an earlier time.
@@ -57,8 +57,8 @@ class Delayed(eqx.Module):
     Its `jump_times` move with the delay. `simulate` ends steps there: its derivative by the delay
     is correct although the source jumps. `rigidjax.batch.rollout` and `identify.fit`, for inputs
     that are samples, hold them through a step; a delayed sample changes inside the step, which is
-    split in two there: that is exact, too. The first sample also holds before its time, the last
-    one after it. `Linear` and `Series` can be delayed anywhere.
+    split in two there, and the result is exact as well. The first sample also holds before its
+    time, the last sample after it. `Linear` and `Series` can be delayed anywhere.
 
     **Raises:** `TypeError` for a source that has states (delay its input: `Lagged(Delayed(u, d),
     T)`); `ValueError` for a delay as long as the record.
@@ -92,7 +92,7 @@ class Delayed(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the value jumps: the source's times plus the delay."""
+        """Return the times, s, at which the value jumps: the source's times plus the delay."""
         times = jumps_of(self.source)
         return times + self.delay.astype(times.dtype)
 
@@ -101,15 +101,15 @@ class Delayed(eqx.Module):
 
 
 class Lagged(eqx.Module):
-    """A lag of first order, such as a motor's: `T dy/dt = u(t) − y`, whose value is y.
+    """Apply a lag of first order, such as a motor's: `T dy/dt = u(t) − y`, whose value is y.
 
-    It has a state of its own, integrated with the body's (see `AbstractTorque`), and replaces a
+    The lag has a state of its own, integrated with the body's (see `AbstractTorque`). It replaces a
     function of time: `Rotors(…, speeds=Lagged(Input("speeds"), 0.05))`.
 
     **Arguments:** `source` u, a function of time such as `Held(times, values)`, or `Input("u")`;
-    `time` T, s, > 0: one number, or one a channel, which may be free in a fit; `start` y at the
-    start, `None` for u at the start. If u jumps from 0 to 1, y is `1 − exp(−t/T)` (Åström and
-    Murray, Feedback Systems). **Raises:** `ValueError` for a known time that is not positive.
+    `time` T, s, > 0: one number, or one for each channel, which may be free in a fit; `start` y at
+    the start, or `None` for u at the start. If u jumps from 0 to 1, y is `1 − exp(−t/T)` (Åström
+    and Murray, Feedback Systems). **Raises:** `ValueError` for a known time that is not positive.
 
     >>> push = rj.torques.InSpace(Lagged(lambda t: jnp.array([0.0, 0.0, 1.0]), 0.5, jnp.zeros(3)))
     >>> body, start = rj.Inertia(jnp.eye(3)), rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
@@ -130,15 +130,15 @@ class Lagged(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the source jumps: the value has a kink there."""
+        """Return the times, s, at which the source jumps: the value has a kink there."""
         return jumps_of(self.source)
 
     def state0(self, t: ScalarLike, state: Any, body: Any) -> Array:
-        """The value at the start."""
+        """Return the value at the start."""
         return self.source(t) if self.start is None else self.start
 
     def rate(self, t: ScalarLike, own: Array, state: Any, body: Any) -> Array:
-        """dy/dt, in the source's unit per second."""
+        """Return dy/dt, in the source's unit per second."""
         wanted = _checks.numbers(self.source(t), "source(t)").astype(own.dtype)
         if wanted.shape != own.shape:
             raise ValueError(f"Lagged: start has the shape {own.shape}, the source {wanted.shape}")
@@ -149,9 +149,10 @@ class Lagged(eqx.Module):
 
 
 def require_no_jumps(source: Any, name: str) -> None:
-    """Raise `TypeError` for held samples: a law that takes their derivative loses the jumps.
+    """Raise `TypeError` for held samples, which a torque with their derivative cannot use: it loses
+    the jumps.
 
-    An `Input` is looked at where it has a value: `bind` may give it a smooth function of time.
+    An `Input` is checked when it has a value: `bind` may give it a smooth function of time.
     """
     jumping = (Held, _Now)
     nodes = jax.tree.leaves(source, is_leaf=lambda node: isinstance(node, jumping))
@@ -172,14 +173,16 @@ def _channels(value: Any, name: str) -> Array:
 
 
 class Row(NamedTuple):
-    """The inputs in (a part of) a step: `values` by name, `delayed` of each `Delayed` input."""
+    """Hold the inputs in (a part of) a step: `values` by name, and `delayed` of each `Delayed`
+    input.
+    """
 
     values: Mapping[str, Any]
     delayed: tuple[Any, ...]
 
 
 def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
-    """The torque with values in the place of its `Input`s.
+    """Return the torque with values instead of its `Input`s.
 
     **Arguments:** `law` a torque, a force, or a tree of them; `inputs` by name an array, which is
     constant, or a function of time such as `Held(times, values)`; `None` changes nothing.
@@ -216,19 +219,21 @@ def _is_delayed(node: Any) -> bool:
 
 
 def delays_of(law: Any) -> list[tuple[str, Array]]:
-    """The name and the delay of each delayed input, in their order in the torque."""
+    """Return the name and the delay of each delayed input, in their order in the torque."""
     nodes = jax.tree.leaves(law, is_leaf=_is_delayed)
     return [(node.source.name, node.delay) for node in nodes if _is_delayed(node)]
 
 
 def inputs_of(law: Any) -> list[str]:
-    """The names of the inputs that a torque reads."""
+    """Return the names of the inputs that a torque reads."""
     nodes = jax.tree.leaves(law, is_leaf=lambda node: isinstance(node, Input))
     return list(dict.fromkeys(node.name for node in nodes if isinstance(node, Input)))
 
 
 def require_inputs(law: Any, inputs: Any) -> Mapping[str, Any]:
-    """`inputs` (none: empty), if they are those that the torque reads; `ValueError` for others."""
+    """Return `inputs` as a mapping, empty for `None`. **Raises:** `ValueError` unless they are
+    exactly those that the torque reads.
+    """
     read, found = inputs_of(law), {} if inputs is None else inputs
     if not isinstance(found, Mapping):
         raise TypeError(f"inputs: wanted arrays by name, got {type(found).__name__}")

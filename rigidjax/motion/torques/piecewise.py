@@ -1,4 +1,4 @@
-"""Tables of numbers over time: straight lines between rows, or constant pieces."""
+"""Evaluate tables of numbers over time: straight lines between rows, or constant pieces."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -17,7 +17,7 @@ Rows = Float[ArrayLike, "rows 3"] | Sequence[Any]
 
 
 class _Table(eqx.Module):
-    """Rows of numbers against time."""
+    """Hold rows of numbers against time."""
 
     times: Float[Array, " n"]
     values: Float[Array, "n *k"]
@@ -27,17 +27,18 @@ class _Table(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """The times of the rows, s: the value jumps, or has a kink, at each."""
+        """Return the times of the rows, s: the value jumps, or has a kink, at each."""
         return self.times
 
 
 class Linear(_Table):
-    """A function of time, t → (*k): straight lines between rows, constant beyond the ends.
+    """Interpolate a function of time, t → (*k), by straight lines between rows; it is constant
+    beyond the ends.
 
     **Arguments:** `times` (n,) s, increasing; `values` (n, *k), any number of channels: (n, 3) for
     `InSpace`, `Flywheel`, `MagneticDipole`, `GravityGradient`, (n, R) for `Rotors`, (n, 3, 3) for
     `ChangingInertia`. Both may be traced. The derivative at a row is the slope of the line after
-    it. `Series` is a cubic spline through evenly spaced rows, which has no kinks.
+    this row. `Series` is a cubic spline through evenly spaced rows, which has no kinks.
 
     **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
     increase, NaN.
@@ -47,34 +48,36 @@ class Linear(_Table):
     """
 
     def __call__(self, t: ScalarLike) -> Array:
-        """The value at `t` (s), (*k)."""
+        """Return the value at `t` (s), (*k)."""
         t = jnp.asarray(t, self.times.dtype)
         return _line(self.times, self.values, jnp.clip(t, self.times[0], self.times[-1]))
 
 
 class Held(_Table):
-    """A function of time, t → (*k), that holds each sample until the next one (zero-order hold).
+    """Hold each sample of a function of time, t → (*k), until the next sample (zero-order hold).
 
-    **Arguments:** `times` (n,) s, increasing; `values` (n, *k), row i from time i on, the first
-    also before it. Both may be traced. The value jumps at `times`: a torque that reads it passes
-    its `jump_times` on, and adaptive steps end there. For fixed steps give the samples to
-    `rigidjax.batch.rollout` as `inputs`. **Raises:** as `Linear`.
+    **Arguments:** `times` (n,) s, increasing; `values` (n, *k), where row i holds from time i on,
+    and the first row also before its time. Both may be traced. The value jumps at `times`: a torque
+    that reads it passes its `jump_times` on, and adaptive steps end there. For fixed steps give the
+    samples to `rigidjax.batch.rollout` as `inputs`. **Raises:** as `Linear`.
 
     >>> Held([0.0, 1.0, 2.0], [[5.0], [6.0], [7.0]])(1.5)
     Array([6.], dtype=float64)
     """
 
     def __call__(self, t: ScalarLike) -> Array:
-        """The value at `t` (s), (*k)."""
+        """Return the value at `t` (s), (*k)."""
         i = _row(self.times, jnp.asarray(t, self.times.dtype))
         return self.values[jnp.clip(i, 0, self.times.shape[0] - 1)]
 
 
 class Tabulated(AbstractTorque):
-    """A torque from a table: straight lines between rows, none before the first or after the last.
+    """Interpolate a torque from a table by straight lines between rows; it is zero before the first
+    row and after the last.
 
-    **Arguments:** `times` (n,) s, increasing; `torques` (n, 3) N m, body frame. In space:
-    `InSpace(Linear(times, torques))`. Constant pieces: `Pulses`. **Raises:** as `Linear`.
+    **Arguments:** `times` (n,) s, increasing; `torques` (n, 3) N m, body frame. For a torque in the
+    world frame take `InSpace(Linear(times, torques))`, for constant pieces `Pulses`. **Raises:** as
+    `Linear`.
 
     A solver that steps over a kink loses its order, and a step over a pulse misses it: `simulate`
     gives `jump_times` to the step controller.
@@ -93,7 +96,7 @@ class Tabulated(AbstractTorque):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """The times of the rows, s: the torque has a kink or a jump at each."""
+        """Return the times of the rows, s: the torque has a kink or a jump at each."""
         return self.times
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
@@ -104,7 +107,8 @@ class Tabulated(AbstractTorque):
 
 
 class Pulses(AbstractTorque):
-    """A torque in constant pieces, such as thruster firings: none before or after them.
+    """Apply a torque in constant pieces, such as thruster firings; it is zero before and after
+    them.
 
     **Arguments:** `edges` (n + 1,) s, increasing; `torques` (n, 3) N m, body frame: row i acts from
     edge i until edge i + 1. One pulse: `Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]])`. **Raises:**
@@ -127,12 +131,12 @@ class Pulses(AbstractTorque):
 
     @property
     def jump_times(self) -> Float[Array, " edges"]:
-        """The edges, s: the torque jumps at each."""
+        """Return the edges, s: the torque jumps at each."""
         return self.edges
 
     @property
     def impulse(self) -> Vec3:
-        """The whole impulse ∫ τ dt, (3,), N m s, body frame."""
+        """Return the whole impulse ∫ τ dt, (3,), N m s, body frame."""
         return jnp.sum((self.edges[1:] - self.edges[:-1])[:, None] * self.torques, axis=0)
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
@@ -143,15 +147,17 @@ class Pulses(AbstractTorque):
 
 
 def _row(times: Float[Array, " n"], t: Scalar) -> Any:
-    """The last row whose time is not after t. At a jump this is the piece that begins."""
-    # A comparison with all rows keeps a short table inside the solver's one kernel; a search is a
-    # loop.
+    """Return the index of the last row whose time is not after t. At a jump this is the piece that
+    begins.
+    """
+    # For a short table a comparison with all rows stays inside the solver's one kernel; a binary
+    # search would be a loop of its own.
     method = "compare_all" if times.shape[0] <= 128 else "scan"
     return jnp.searchsorted(times, t, side="right", method=method) - 1
 
 
 def _line(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar) -> Array:
-    """The value at `t` of the straight line between the rows around it."""
+    """Return the value at `t` of the straight line between the rows around it."""
     i = jnp.clip(_row(times, t), 0, times.shape[0] - 2)
     part = (t - times[i]) / (times[i + 1] - times[i])
     return rows[i] + part * (rows[i + 1] - rows[i])
@@ -160,7 +166,11 @@ def _line(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar) -> A
 def _rows(
     name: str, times: Any, other: str, values: Any, extra: int | None = None
 ) -> tuple[Array, Array]:
-    """Times and rows, checked. `extra`: so many more times than rows, and rows of 3 numbers."""
+    """Return the times and rows after checks.
+
+    `extra` is the number of times beyond the number of rows, of 3 numbers each; with `None` both
+    numbers are equal and rows may have any shape.
+    """
     times, rows = _checks.rows(times, (), name), _checks.numbers(values, other)
     count = times.shape[0]
     if count < 2:

@@ -1,4 +1,6 @@
-"""Torques with a potential: gravity on a body with a fixed point, a magnet in a field, any U(q)."""
+"""Define torques with a potential: gravity on a body with a fixed point, a magnet in a field, any
+U(q).
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
@@ -18,7 +20,7 @@ from rigidjax.rotation.linalg3 import apply, components, cross, dot
 
 
 class HeavyTop(base.AbstractTorque):
-    """Gravity on a body with a fixed point: `τ = c × m Rᵀg`, `U = −m g·Rc`.
+    """Apply gravity to a body with a fixed point: `τ = c × m Rᵀg`, `U = −m g·Rc`.
 
     **Arguments:** `mass` m, kg; `com` (3,) c, from the fixed point to the centre of mass, m, body
     frame; `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81]. The body's `Inertia` is the
@@ -26,9 +28,9 @@ class HeavyTop(base.AbstractTorque):
     allowed: Lagrange's, Kovalevskaya's, Goryachev–Chaplygin's, a general one, the physical
     pendulum.
 
-    It conserves the energy and the momentum along g. Source: Landau and Lifshitz, Mechanics, §35;
-    Arnold, Mathematical Methods of Classical Mechanics, §30. **Raises:** `TypeError` on a `Rigid`,
-    which has no fixed point.
+    This torque conserves the energy and the momentum along g. Source: Landau and Lifshitz,
+    Mechanics, §35; Arnold, Mathematical Methods of Classical Mechanics, §30. **Raises:**
+    `TypeError` on a `Rigid`, which has no fixed point.
 
     >>> top = HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
     >>> top.energy(0.0, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), rj.Inertia(jnp.eye(3)))
@@ -44,31 +46,32 @@ class HeavyTop(base.AbstractTorque):
 
     @property
     def axis(self) -> Vec3:
-        """Gravity, world frame: there is no torque about it."""
+        """Return gravity, world frame: there is no torque about it."""
         return self.gravity
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
-        """Potential energy, J: `U = −m g·Rc`, zero where c is level with the pivot."""
+        """Return the potential energy, J: `U = −m g·Rc`, zero where c is level with the pivot."""
         return -self.mass * dot(self.com, quaternion.rotate_inverse(state.q, self.gravity))
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
         if isinstance(state, HasPose):
             raise TypeError(
-                "HeavyTop turns about a fixed point, got a state that moves "
-                f"({type(state).__name__}); with Rigid use UniformGravity, or take an Attitude and "
-                "the inertia about the fixed point"
+                f"HeavyTop: wanted an Attitude, about a fixed point, got {type(state).__name__}, "
+                "which moves; with Rigid use UniformGravity, or take an Attitude and the inertia "
+                "about the fixed point"
             )
         return cross(self.mass * self.com, quaternion.rotate_inverse(state.q, self.gravity))
 
 
 class GravityGradient(base.OfTime):
-    """The torque of a far point mass: `τ = (3μ/r³) u × Iu − Σ (μ/rⁿ⁺¹) u × ∇Hₙ(u)`, `u = Rᵀr/r`.
+    """Apply the torque of a far point mass: `τ = (3μ/r³) u × Iu − Σ (μ/rⁿ⁺¹) u × ∇Hₙ(u)`, `u =
+    Rᵀr/r`.
 
     **Arguments:** `mu` μ = G M of the point mass, m³/s²; `position` r (3,) m, world frame, from the
     body to it (without `harmonics` the sign does not matter): constant, or a callable Module of
-    time, t → (3,), for an orbit; `harmonics` the body's gravity of higher degree n in body axes:
-    an array (2n + 1,) for each n = 3, 4, …, kg mⁿ, its mass times Rⁿ times the Stokes coefficients
-    (Cn0, Cn1, Sn1, Cn2, Sn2, …), not normalised, of a radius R. Several masses: a `Sum`.
+    time, t → (3,), for an orbit; `harmonics` the body's gravity of higher degree n in body axes: an
+    array (2n + 1,) for each n = 3, 4, …, kg mⁿ, its mass times Rⁿ times the Stokes coefficients
+    (Cn0, Cn1, Sn1, Cn2, Sn2, …), not normalised, for a radius R. For several masses take a `Sum`.
 
     Hₙ is the solid harmonic `Σ rⁿ Pₙₘ (C cos mλ + S sin mλ)` of degree n. The potential is
     `U = (μ/2r³)(3 u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`, MacCullagh's formula and its next terms; it
@@ -101,12 +104,14 @@ class GravityGradient(base.OfTime):
 
     @property
     def axis(self) -> Vec3 | None:
-        """The position, world frame, if it is constant: there is no torque about it."""
+        """Return the position, world frame, if it is constant: there is no torque about it."""
         source: Any = self.position
         return None if callable(source) else source
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Scalar:
-        """Potential energy of the attitude, J: `U = (μ/2r³)(3 u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`."""
+        """Return the potential energy of the attitude, J: `U = (μ/2r³)(3 u·Iu − Tr I) − Σ (μ/rⁿ⁺¹)
+        Hₙ(u)`.
+        """
         tensor = tensor_of(body)
         u, strength, slopes = self._seen(t, state)
         trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
@@ -123,7 +128,9 @@ class GravityGradient(base.OfTime):
         return cross(u, pull)
 
     def _seen(self, t, state):
-        """Direction of the point mass in body axes, μ/r³, and (μ/rⁿ⁺¹) ∇Hₙ of each degree."""
+        """Return the direction of the point mass in body axes, μ/r³, and (μ/rⁿ⁺¹) ∇Hₙ of each
+        degree.
+        """
         r = base.vector_at(self.position, t, "position")
         distance = jnp.sqrt(dot(r, r))
         # r³ overflows in float32 beyond 7e12 m: divide by r three times instead.
@@ -137,10 +144,11 @@ class GravityGradient(base.OfTime):
 
 
 def _slopes(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
-    """∇Hₙ at a unit vector, n = 3, 4, … (Cunningham 1970, doi:10.1007/BF01229495)."""
+    """Return ∇Hₙ at a unit vector, n = 3, 4, … (Cunningham 1970, doi:10.1007/BF01229495)."""
     x, y, z = components(u)
     zero = jnp.zeros_like(z)
-    # Real and imaginary part of rⁿ Pₙₘ exp(imλ), m = 0 … n + 1, of this degree and the one before.
+    # Real and imaginary parts of rⁿ Pₙₘ exp(imλ), m = 0 … n + 1, of this degree and of the degree
+    # before it.
     before, here = [(zero, zero)] * 2, [(jnp.ones_like(z), zero), (zero, zero)]
     out = []
     for n in range(1, len(harmonics) + 3):
@@ -157,7 +165,9 @@ def _slopes(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
 
 
 def _slope(row: Sequence[Scalar], n: int, lower: Sequence[tuple[Scalar, Scalar]]) -> Vec3:
-    """∇Hₙ of the coefficients of one degree, by the solid harmonics of the degree below."""
+    """Return ∇Hₙ from the coefficients of one degree and the solid harmonics of the degree
+    below.
+    """
     along, flat_x, flat_y = n * row[0] * lower[0][0], -row[0] * lower[1][0], -row[0] * lower[1][1]
     for m in range(1, n + 1):
         c, s = row[2 * m - 1 : 2 * m + 1]
@@ -170,7 +180,8 @@ def _slope(row: Sequence[Scalar], n: int, lower: Sequence[tuple[Scalar, Scalar]]
 
 
 class MagneticDipole(base.OfTime):
-    """A magnetic moment fixed in the body, in a uniform field: `τ = m × RᵀB`, `U = −m·RᵀB`.
+    """Apply the torque on a magnetic moment fixed in the body, in a uniform field: `τ = m × RᵀB`,
+    `U = −m·RᵀB`.
 
     **Arguments:** `moment` (3,) m, A m², body frame; `field` B, T, world frame: (3,), or a callable
     Module of time, t → (3,), for a field that changes along an orbit. Source: Jackson, Classical
@@ -188,12 +199,12 @@ class MagneticDipole(base.OfTime):
 
     @property
     def axis(self) -> Vec3 | None:
-        """The field, world frame, if it is constant: there is no torque about it."""
+        """Return the field, world frame, if it is constant: there is no torque about it."""
         source: Any = self.field
         return None if callable(source) else source
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
-        """Potential energy, J: `U = −m·RᵀB`."""
+        """Return the potential energy, J: `U = −m·RᵀB`."""
         return -dot(self.moment, self._field_in_body(t, state))
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
@@ -204,7 +215,7 @@ class MagneticDipole(base.OfTime):
 
 
 class FromPotential(base.AbstractTorque):
-    """The torque of any potential `U(q)` on the attitude, by differentiation.
+    """Apply the torque of any potential `U(q)` of the attitude, by differentiation.
 
     **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world. The
     torque about body axis i is `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about it.
@@ -228,7 +239,7 @@ class FromPotential(base.AbstractTorque):
         self.potential = _checks.function(potential, "potential", "q → U, J")
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
-        """Potential energy, J."""
+        """Return the potential energy, J."""
         return self._value(state.q)
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:

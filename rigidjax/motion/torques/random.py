@@ -1,4 +1,4 @@
-"""Random torques, known by their statistics only."""
+"""Define random torques, of which only the statistics are known."""
 
 from typing import Any, ClassVar
 
@@ -11,15 +11,16 @@ from rigidjax.motion.torques.base import AbstractTorque
 
 
 class RandomTorque(AbstractTorque):
-    """White torque noise: `E[τᵢ(t) τᵢ(s)] = density δ(t − s)`, independent along the body axes.
+    """Describe white torque noise: `E[τᵢ(t) τᵢ(s)] = density δ(t − s)`, independent along the body
+    axes.
 
     **Arguments:** `density` N² m² s, one number or one for each body axis (3,), ≥ 0. In a time t
     the rate about an axis of moment I changes by about √(density · t)/I.
 
-    `simulate` and a fit of `rigidjax.identify` use its mean, zero. It is the `process` of a
-    `rigidjax.identify.Model`: `filter`, `smooth` and `log_likelihood` allow for it, and `sample`
-    draws a motion under it. Several are added by `Sum`. Source: Gelb, Applied Optimal
-    Estimation (1974), §3.6. **Raises:** `ValueError` for a density below zero.
+    `simulate` and a fit of `rigidjax.identify` use the mean, zero. As the `process` of a
+    `rigidjax.identify.Model`: `filter`, `smooth` and `log_likelihood` allow for the noise, and
+    `sample` draws a motion under it. Several random torques are added by `Sum`. Source: Gelb,
+    Applied Optimal Estimation (1974), §3.6. **Raises:** `ValueError` for a density below zero.
 
     >>> RandomTorque(1e-4).density
     Array([0.0001, 0.0001, 0.0001], dtype=float64)
@@ -37,11 +38,11 @@ class RandomTorque(AbstractTorque):
 
 
 class CorrelatedTorque(AbstractTorque):
-    """Correlated torque noise (Ornstein–Uhlenbeck): `T dτ/dt = −τ + white noise`.
+    """Describe correlated torque noise (Ornstein–Uhlenbeck): `T dτ/dt = −τ + white noise`.
 
     **Arguments:** `density` N² m² s of the white noise, one number or (3,), ≥ 0; `time` T, s,
     positive: the correlation time. `E[τ(t) τ(s)] = density/(2T) exp(−|t − s|/T)` about each body
-    axis: for T → 0 it is a `RandomTorque` of the same density.
+    axis: for T → 0 this is a `RandomTorque` with an equal density.
 
     `simulate` and a fit use its mean, zero; see `RandomTorque`. The state of a filter contains the
     torque. Source: Uhlenbeck and Ornstein 1930, doi:10.1103/PhysRev.36.823. **Raises:**
@@ -63,7 +64,7 @@ class CorrelatedTorque(AbstractTorque):
 
     @property
     def deviation(self) -> Vec3:
-        """The standard deviation (3,) of the torque at any time, N m."""
+        """Return the standard deviation (3,) of the torque at any time, N m."""
         return jnp.sqrt(0.5 * self.density / self.time)
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
@@ -71,7 +72,9 @@ class CorrelatedTorque(AbstractTorque):
 
 
 def density_of(value: Any, name: str = "density", size: int = 3) -> Array:
-    """A spectral density (size,) from one number or `size` numbers, none below zero."""
+    """Return a spectral density (size,) from one number or `size` numbers, none of them
+    negative.
+    """
     density = _checks.numbers(value, name)
     if density.shape not in ((), (size,)):
         raise ValueError(f"{name}: wanted one number or {size}, got shape {density.shape}")

@@ -1,4 +1,6 @@
-"""A logged quantity as a smooth function of time: a cubic spline through evenly spaced samples."""
+"""Interpolate a logged quantity as a smooth function of time: a cubic spline through evenly spaced
+samples.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,15 +20,15 @@ Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
 
 
 class Series(eqx.Module):
-    """A cubic spline through evenly spaced samples; constant beyond the ends.
+    """Interpolate evenly spaced samples by a cubic spline; it is constant beyond the ends.
 
-    A division finds the interval of a time, so that it costs little in a solver; its derivative is
-    continuous, so that a step may pass over a sample.
+    A division finds the interval of a time, so that the spline costs little in a solver; its
+    derivative is continuous, so that a step may pass over a sample.
 
     **Arguments:** `times` (n,) s, evenly spaced to 1e-6 of a step and the round-off of times such
-    as 1.7e9 s; `values` (n,) or (n, k). Both may be traced: it can be made under `jit`, `vmap` and
-    `grad`. The third derivative does not jump at the second sample and the last but one ("not a
-    knot": de Boor, A Practical Guide to Splines, ch. IV).
+    as 1.7e9 s; `values` (n,) or (n, k). Both may be traced: a spline can be made under `jit`,
+    `vmap` and `grad`. The third derivative does not jump at the second sample and the last but one
+    ("not a knot": de Boor, A Practical Guide to Splines, ch. IV).
 
     **Raises:** `ValueError` (`equinox` error under `jit`) for fewer than four samples, lengths that
     differ, NaN, uneven times.
@@ -59,15 +61,15 @@ class Series(eqx.Module):
         self.slopes = _checks.finite(_slopes(self.values), "Series: slopes of the values")
 
     def __call__(self, t: ScalarLike) -> Any:
-        """The value at `t` (s), () or (k,)."""
+        """Return the value at `t` (s), () or (k,)."""
         n = self.values.shape[0]
         place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
-        # Not clip: at an end itself it has half the derivative.
+        # `jnp.where`, not `jnp.clip`: at an end itself clip has half the derivative.
         place = jnp.where(place < 0.0, 0.0, jnp.where(place > n - 1.0, n - 1.0, place))
         i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, n - 2)
         s = place - i.astype(place.dtype)
         rows = self.values[i], self.values[i + 1], self.slopes[i], self.slopes[i + 1]
-        # XLA:CPU would read the table again for every number computed from it.
+        # Without the barrier XLA on CPU reads the table again for every number computed from it.
         s, (left, right, out, into) = barrier((s, rows))
         # Cubic Hermite form, from the left value.
         bend = 3.0 * (right - left) - 2.0 * out - into
@@ -76,14 +78,20 @@ class Series(eqx.Module):
 
 
 def _numbers(value: Any, name: str) -> Any:
-    """NumPy's float64 if the numbers are known: times of a log have more than seven digits."""
+    """Return the numbers, as NumPy's float64 if they are known: times of a log have more than seven
+    digits.
+    """
     if _checks.known(value):
         return _checks.on_host(value, f"Series: {name}")
     return _checks.numbers(value, f"Series: {name}").astype(jnp.result_type(float))
 
 
 def _slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
-    """The change per step at each sample: s₋ + 4 s + s₊ = 3 (v₊ − v₋), at the ends not a knot."""
+    """Return the change per step at each sample, s_i.
+
+    It solves s₋ + 4 s + s₊ = 3 (v₊ − v₋) for the neighbours − and + of each sample; at the ends the
+    condition is "not a knot".
+    """
     n = values.shape[0]
     v = values.reshape(n, -1)
     rise = v[1:] - v[:-1]
@@ -98,16 +106,16 @@ def _slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
 
 
 class Wheel(eqx.Module):
-    """The momentum of a wheel about a fixed axis whose speed was logged: `h = J s(t) a`.
+    """Describe the momentum of a wheel about a fixed axis whose speed was logged: `h = J s(t) a`.
 
-    Give it to `Flywheel`: a known internal momentum determines the absolute inertia of a body.
+    Pass a wheel to `Flywheel`: a known internal momentum determines the absolute inertia of a body.
 
     **Arguments:** `inertia` J, kg m², about the axis; `axis` (3,) a, body frame, unit; `speed` s,
     rad/s, relative to the body, a callable Module of time such as `Series(times, speeds)`; `delay`
     s: the log's value at t belongs to t − delay; `tilt` (2,) tangents (rad, if small) of the axis's
     tilt towards two directions across it (about x, y and z: the next two axes in turn, y and z, z
-    and x, x and y). `None` is no delay, no tilt. **Raises:** `ValueError` for an axis that is not a
-    unit vector.
+    and x, x and y). `None` means no delay, or no tilt. **Raises:** `ValueError` for an axis that is
+    not a unit vector.
 
     >>> speed = Series([0.0, 1.0, 2.0, 3.0], [0.0, 10.0, 20.0, 30.0])
     >>> bool(abs(Wheel(2.0, [0.0, 0.0, 1.0], speed)(0.5)[2] - 10.0) < 1e-12)
@@ -143,7 +151,7 @@ class Wheel(eqx.Module):
 
     @property
     def direction(self) -> Vec3:
-        """The axis with its tilt, unit."""
+        """Return the axis with its tilt, a unit vector."""
         if self.tilt is None:
             return self.axis
         # The nearest of ±x, ±y and ±z determines the two directions across.

@@ -1,7 +1,8 @@
-"""Torques and functions of time with states of their own, integrated with the body's.
+"""Handle torques and functions of time with states of their own, integrated with the body's.
 
 Such a torque has `state0`, its initial states, and `rate`, their derivative; its states are its
-last argument. `freeze` puts the states in: the rest of the library then sees a plain torque.
+last argument. `freeze` inserts the states: for the rest of the library the result is a plain
+torque.
 """
 
 from collections.abc import Callable
@@ -20,7 +21,7 @@ _OF_STATES = ("energy", "internal_momentum")
 
 
 class Frozen(eqx.Module):
-    """A torque or function of time `law` with its states put in; `freeze` makes it."""
+    """Wrap a torque or function of time `law` with its states inserted; `freeze` makes it."""
 
     law: Any
     own: tuple[Any]
@@ -37,17 +38,17 @@ class Frozen(eqx.Module):
 
 
 def has_own(node: object) -> bool:
-    """Whether this torque, or function of time, itself has states: `state0` and `rate`."""
+    """Return whether this torque, or function of time, itself has states: `state0` and `rate`."""
     return not isinstance(node, type) and hasattr(node, "state0") and hasattr(node, "rate")
 
 
 def has_states(law: Any) -> bool:
-    """Whether a torque, or any part of it, has states of its own."""
+    """Return whether a torque, or any part of it, has states of its own."""
     return any(map(has_own, jax.tree.leaves(law, is_leaf=_stop)))
 
 
 def require_stateless(law: Any, what: str) -> None:
-    """Raise `ValueError` for a torque with states that `what` does not integrate."""
+    """Raise `ValueError` for a torque with states: `what` does not integrate them."""
     if has_states(law):
         raise ValueError(
             f"{what}: wanted a torque without states of its own, got one that has some (such as "
@@ -57,9 +58,9 @@ def require_stateless(law: Any, what: str) -> None:
 
 
 def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
-    """The torque with its states put in, so that it can be called without them.
+    """Return the torque with its states inserted, so that it can be called without them.
 
-    `own` has the states of each part with states, in their order in `law`, inner parts first.
+    `own` has the states of each part that has some, in their order in `law`, inner parts first.
     """
     queue = list(own)
     if not queue and not has_states(law):
@@ -77,7 +78,7 @@ def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
 
 
 def first_states(law: Any, t: ScalarLike, state: Any, body: Any) -> tuple[Any, ...]:
-    """The initial states of a torque, in the precision of the body's state: see `freeze`."""
+    """Return the initial states of a torque, in the precision of the body's state: see `freeze`."""
     found: list[Any] = []
 
     def begin(node: Any) -> Any:
@@ -95,7 +96,9 @@ def first_states(law: Any, t: ScalarLike, state: Any, body: Any) -> tuple[Any, .
 def rates_of(
     law: Any, t: ScalarLike, own: tuple[Any, ...], state: Any, body: Any
 ) -> tuple[Any, ...]:
-    """The derivative of each state, as `own`; `ValueError` for another shape than `state0`."""
+    """Return the derivative of each state in `own`. **Raises:** `ValueError` for a shape other than
+    that of `state0`.
+    """
     queue, found = list(own), []
 
     def one(node: Any) -> Any:
@@ -113,7 +116,7 @@ def rates_of(
 
 
 def require_frozen(law: Any) -> None:
-    """Raise `TypeError` for a torque that is called without its states."""
+    """Raise `TypeError` for a torque with states that is called without them."""
     if has_own(law):
         words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate and "
         words += "identify.fit integrate them; elsewhere call it with its states last"
@@ -121,7 +124,7 @@ def require_frozen(law: Any) -> None:
 
 
 def _visit(tree: Any, own_of: Callable[[Any], Any]) -> Any:
-    """The tree with all states frozen; `own_of(node)` gives them, inner parts first."""
+    """Return the tree with all states inserted; `own_of(node)` gives them, inner parts first."""
 
     def stop(node: Any) -> bool:
         return node is not tree and _stop(node)

@@ -1,4 +1,6 @@
-"""Wheels inside the body (a gyrostat): with a known momentum, or with speeds that are states."""
+"""Define wheels inside the body (a gyrostat): with a known momentum, or with speeds that are
+states.
+"""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -24,11 +26,11 @@ _FADE = 0.05
 
 
 class Flywheel(base.OfTime):
-    """The torque of internal wheels on the body: `τ = h × Ω − dh/dt`.
+    """Apply the torque of internal wheels to the body: `τ = h × Ω − dh/dt`.
 
     **Arguments:** `momentum` h, N m s, body frame, the sum over all wheels: (3,) for wheels of
-    constant speed, or a callable Module of time, t → (3,), such as `Linear(times, values)`; not one
-    that jumps (`Held`, samples of an `Input`): dh/dt acts on the body.
+    constant speed, or a callable Module of time, t → (3,), such as `Linear(times, values)`, but not
+    a function that jumps (`Held`, samples of an `Input`), because dh/dt acts on the body.
 
     The body's `Inertia` must fit h. If it includes the wheels as locked, h is their momentum
     relative to the body. If the wheels' axial moments are subtracted (I − Σ J a aᵀ), h is their
@@ -52,11 +54,11 @@ class Flywheel(base.OfTime):
         require_no_jumps(momentum, "momentum")
 
     def internal_momentum(self, t: ScalarLike) -> Vec3:
-        """The wheels' momentum h at `t`, (3,), N m s, body frame."""
+        """Return the wheels' momentum h at `t`, (3,), N m s, body frame."""
         return base.vector_at(self.momentum, t, "momentum")
 
     def energy(self, t: ScalarLike, state: HasSpin, body: object) -> Scalar:
-        """Zero, J: h × Ω does no work."""
+        """Return zero, J: h × Ω does no work."""
         return jnp.zeros((), state.omega.dtype)
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
@@ -70,7 +72,8 @@ class Flywheel(base.OfTime):
 
 
 class ReactionWheels(base.AbstractTorque):
-    """Wheels on motors inside the body (a gyrostat): `τ = (Σ h a) × Ω − Σ u a`, `dh/dt = u`.
+    """Apply the torque of wheels on motors inside the body (a gyrostat): `τ = (Σ h a) × Ω − Σ u a`,
+    `dh/dt = u`.
 
     **Arguments:** for R wheels
 
@@ -154,28 +157,32 @@ class ReactionWheels(base.AbstractTorque):
 
     @property
     def steady(self) -> bool:
-        """Whether nothing changes the wheels' momenta: then the energy is conserved."""
+        """Return whether the wheels' momenta are constant: then the energy is conserved."""
         parts = (self.motor, self.feedback, self.viscous, self.coulomb)
         return all(part is None for part in parts)
 
     jump_times = property(base.jumps_of_parts)
 
     def without_wheels(self, body: Body) -> Body:
-        """The `body`, an `Inertia` or `MassProperties` with locked wheels, less `Σ J a aᵀ`."""
+        """Return the `body`, an `Inertia` or `MassProperties` with locked wheels, minus `Σ J a
+        aᵀ`.
+        """
         body = validation.single(body, (Inertia, MassProperties), "body")
         rows = (j * outer(a, a) for j, a in zip(self.inertia, self.axes, strict=True))
         taken = sum(rows, jnp.zeros((3, 3), self.axes.dtype))
         return with_tensor(body, tensor_of(body) - taken)
 
     def speeds_of(self, own: Array, state: HasSpin) -> Float[Array, " wheels"]:
-        """The speeds (R,) relative to the body, rad/s, of the momenta `own` and the state."""
+        """Return the speeds (R,) relative to the body, rad/s, from the momenta `own` and the
+        state.
+        """
         own = _checks.floating(own, self.inertia.shape, "own")
         omega = _checks.single(state, HasSpin, "state", wanted="a Spin, Attitude or Rigid").omega
         along = jnp.stack([a[0] * omega[0] + a[1] * omega[1] + a[2] * omega[2] for a in self.axes])
         return own / self.inertia - along
 
     def torques_of(self, t: ScalarLike, own: Array, state: HasSpin) -> Float[Array, " wheels"]:
-        """The torque of motor and bearing on each wheel about its axis, (R,), N m."""
+        """Return the torque of motor and bearing on each wheel about its axis, (R,), N m."""
         speeds, t = self.speeds_of(own, state), _checks.floating(t, (), "t")
         count, total = self.inertia.shape[0], jnp.zeros_like(speeds)
         if self.motor is not None:
@@ -196,27 +203,27 @@ class ReactionWheels(base.AbstractTorque):
         return total
 
     def state0(self, t: ScalarLike, state: HasSpin, body: object) -> Array:
-        """The momenta at the start, (R,), N m s."""
+        """Return the momenta at the start, (R,), N m s."""
         still = self.speeds_of(jnp.zeros_like(self.inertia), state)
         return self.inertia * (self.speeds - still)
 
     def rate(self, t: ScalarLike, own: Array, state: HasSpin, body: object) -> Array:
-        """Their derivatives, (R,), N m."""
+        """Return the derivatives of the momenta, (R,), N m."""
         return self.torques_of(t, own, state)
 
     def internal_momentum(self, t: ScalarLike, own: Array) -> Vec3:
-        """Σ h a, (3,), N m s, body frame."""
+        """Return Σ h a, (3,), N m s, body frame."""
         return self._along(own)
 
     def energy(self, t: ScalarLike, state: HasSpin, body: object, own: Array) -> Scalar:
-        """The wheels' kinetic energy about their axes, Σ h²/2J, J."""
+        """Return the wheels' kinetic energy about their axes, Σ h²/2J, J."""
         return jnp.sum(own * own / (2.0 * self.inertia))
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object, own: Array) -> Vec3:  # pyright: ignore[reportIncompatibleMethodOverride]
         return cross(self._along(own), state.omega) - self._along(self.torques_of(t, own, state))
 
     def _along(self, numbers: Array) -> Vec3:
-        # Written out, wheel by wheel: few, and sums of arrays are slow in a batch.
+        # The sum is written out wheel by wheel: they are few, and in a batch array sums are slow.
         total = jnp.zeros(3, numbers.dtype)
         for i in range(self.axes.shape[0]):
             total = total + numbers[i] * self.axes[i]
@@ -224,12 +231,16 @@ class ReactionWheels(base.AbstractTorque):
 
 
 def _smooth(x: Array) -> Array:
-    """From 0 at 0 to 1 at 1, with no first and second derivative at both."""
+    """Return a smooth step from 0 at x = 0 to 1 at x = 1, whose first two derivatives vanish at
+    both.
+    """
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))
 
 
 def _each(value: Any, count: int, name: str, wanted: str) -> Array | None:
-    """One number for all wheels, or one for each: "> 0" or "≥ 0"."""
+    """Return one number for all wheels, or one number for each, checked to be "> 0" or "≥ 0";
+    `None` for `None`.
+    """
     if value is None:
         return None
     found = base.each(value, count, name)

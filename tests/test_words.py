@@ -1,0 +1,39 @@
+"""Docstrings are sentences: a verb first, a full stop last."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "rigidjax"
+# The rooms that have been read: more are added as they are.
+ROOMS = ("rotation", "body", "frames", "lagrangian", "orbits", "motion", "plot", "datasets", "workprecision")
+FILES = [*PACKAGE.glob("*.py"), *(path for room in ROOMS for path in (PACKAGE / room).rglob("*.py"))]
+VERBS = frozenset(
+    """
+    Add Apply Attract Check Compare Compute Convert Copy Define Delay Derive Describe Draw Evaluate Find Follow Give
+    Handle Hold Import Integrate Interpolate Make Measure Name Normalise Prepare Present Print Provide Raise Read Refuse Return
+    Reverse Run Scale Set Share Show Solve Sort Store Sum Turn Wrap Write Yield
+    """.split()
+)
+
+
+def docstrings(path):
+    """The name, first word and first paragraph of each docstring of a file."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            text = ast.get_docstring(node)
+            if text is not None:
+                yield getattr(node, "name", "module"), text.split()[0].rstrip(",:"), text.split("\n\n")[0]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_a_docstring_is_a_sentence_that_begins_with_a_verb(path):
+    assert [name for name, word, _ in docstrings(path) if word not in VERBS] == []
+    # Before a list or a formula there may be a colon.
+    assert [name for name, _, first in docstrings(path) if first.rstrip()[-1] not in ".:"] == []
+
+
+def test_the_rooms_are_read():
+    count = sum(len(list(docstrings(path))) for path in FILES)
+    assert len(FILES) > 90 and count > 800
