@@ -16,7 +16,7 @@ Result = Float[Array, "..."]
 
 
 def common(**named: Any) -> tuple[Result, ...]:
-    """All arguments as arrays of one dtype and shape; Python numbers take the arrays' dtype."""
+    """Convert the arguments to arrays of one dtype and shape; Python numbers take the dtype."""
     arrays = {
         name: _checks.floating(value, (), name, batched=True) for name, value in named.items()
     }
@@ -30,7 +30,7 @@ def common(**named: Any) -> tuple[Result, ...]:
 
 
 def complementary(name: str, value: Any, complement: Any) -> dict[str, Any]:
-    """The pair (value, 1 − value) for `common`; a complement that is given must fit the value."""
+    """Return `value` and 1 − `value` by name; a `complement` that is given must fit `value`."""
     value = _checks.floating(value, (), name, batched=True)
     if complement is None:
         return {name: value, name + "1": 1 - value}
@@ -49,7 +49,7 @@ def complementary(name: str, value: Any, complement: Any) -> dict[str, Any]:
 
 @jax.custom_jvp
 def exact_complement(value: Result, complement: Result) -> Any:
-    """`value`, whose derivative by its `complement` is −1 and by itself 0."""
+    """Return `value` with the derivative −1 by its `complement` (1 − `value`) and 0 by itself."""
     return batched_as(value, complement)
 
 

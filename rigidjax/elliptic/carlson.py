@@ -23,7 +23,7 @@ _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}
 
 
 def rf(x: Real, y: Real, z: Real) -> Result:
-    """R_F(x, y, z) = ½ ∫₀^∞ dt / √((t+x)(t+y)(t+z)), Carlson's integral of the first kind.
+    """Return R_F(x, y, z) = ½ ∫₀^∞ dt / √((t+x)(t+y)(t+z)), Carlson's integral of the first kind.
 
     **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, in one unit; the result has the power
     −½ of this unit. Two zeros give infinity, a negative argument gives NaN. **Returns:** R_F (DLMF
@@ -37,7 +37,7 @@ def rf(x: Real, y: Real, z: Real) -> Result:
 
 
 def rd(x: Real, y: Real, z: Real) -> Result:
-    """R_D(x, y, z) = (3/2) ∫₀^∞ dt / ((t+z) √((t+x)(t+y)(t+z))), of the second kind.
+    """Return R_D(x, y, z) = (3/2) ∫₀^∞ dt / ((t+z) √((t+x)(t+y)(t+z))), of the second kind.
 
     **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, in one unit. The result is
     infinite for z = 0 or x = y = 0, and NaN for negative arguments. **Returns:** R_D (DLMF
@@ -50,7 +50,7 @@ def rd(x: Real, y: Real, z: Real) -> Result:
 
 
 def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
-    """R_J(x, y, z, p) = (3/2) ∫₀^∞ dt / ((t+p) √((t+x)(t+y)(t+z))), of the third kind.
+    """Return R_J(x, y, z, p) = (3/2) ∫₀^∞ dt / ((t+p) √((t+x)(t+y)(t+z))), of the third kind.
 
     The underscore distinguishes the name from `import rigidjax as rj`. **Arguments:** `x`, `y`, `z`
     ≥ 0, at most one of them 0, and `p` > 0, in one unit. p = 0 gives infinity, p < 0 gives NaN (not
@@ -64,7 +64,7 @@ def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
 
 
 def rc(x: Real, y: Real) -> Result:
-    """R_C(x, y) = ½ ∫₀^∞ dt / ((t+y) √(t+x)) = R_F(x, y, y): arctangents and logarithms.
+    """Return R_C(x, y) = ½ ∫₀^∞ dt / ((t+y) √(t+x)) = R_F(x, y, y): arctangents and logarithms.
 
     **Arguments:** `x` ≥ 0 and `y` ≠ 0 in one unit. y = 0 gives infinity, x < 0 gives NaN.
     **Returns:** R_C (DLMF 19.2.17); for y < 0 the Cauchy principal value (DLMF 19.2.20).
@@ -141,12 +141,12 @@ def _rd_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def _lambda(x: Any, y: Any, z: Any) -> Any:
-    """λ of the duplication theorem (DLMF 19.26.18)."""
+    """Return λ = √x√y + √x√z + √y√z of the duplication theorem (DLMF 19.26.18)."""
     a, b, c = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
     return a * b + b * c + c * a
 
 
 def _domain(value: Any, arguments: Any) -> Any:
-    """Infinity if two arguments are 0, NaN if one is negative or NaN, else the value."""
+    """Return infinity if two arguments are 0, NaN if one is negative or NaN, else `value`."""
     x, y, z = (a == 0 for a in arguments)
     return nan_below_zero(jnp.where((x & y) | (y & z) | (z & x), jnp.inf, value), arguments)

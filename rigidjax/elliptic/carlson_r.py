@@ -29,7 +29,9 @@ _UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def r_integral(powers: tuple[float, ...], arguments: tuple[Result, ...]) -> Result:
-    """∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt for aᵢ ≥ 0 and multiples bᵢ of ½ (`powers`) with Σ bᵢ > 1.
+    """Return ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt, aᵢ the `arguments`, bᵢ the `powers`.
+
+    The aᵢ must be ≥ 0, the bᵢ multiples of ½, and their sum above 1.
 
     It is infinite if the integral diverges at 0, NaN for a negative argument, and accurate to
     round-off for ratios of the aᵢ up to 1e35 (to 1e-13 at 1e60).
@@ -70,7 +72,7 @@ def _r_integral_jvp(powers: Any, primals: Any, tangents: Any) -> tuple[Any, Any]
 
 
 def change(powers: tuple[float, ...], arguments: Any, directions: Any) -> Any:
-    """The derivative of `r_integral` along `directions`."""
+    """Return the derivative of `r_integral` as its `arguments` move along `directions`."""
     tangent = jnp.zeros_like(arguments[0])
     for i, direction in enumerate(directions):
         if powers[i] and not isinstance(direction, SymbolicZero):
@@ -80,19 +82,22 @@ def change(powers: tuple[float, ...], arguments: Any, directions: Any) -> Any:
 
 
 def nan_below_zero(value: Any, arguments: Any) -> Any:
-    """NaN if an argument is negative or NaN, else the value."""
+    """Return NaN if one of `arguments` is negative or NaN, else `value`."""
     good = functools.reduce(jnp.logical_and, (a >= 0 for a in arguments))
     return jnp.where(good, value, jnp.nan)
 
 
 def scale_of(arguments: Any) -> Any:
-    """The largest argument. The integrals are homogeneous: scaled by it, no square overflows."""
+    """Return the largest argument, or 1 if all are 0.
+
+    The integrals are homogeneous: with arguments divided by it no square overflows.
+    """
     largest = functools.reduce(jnp.maximum, arguments)
     return jnp.where(largest > 0, largest, 1)
 
 
 def _divide(value: Any, x: Any, power: float) -> Any:
-    """`value` times x^(−power) for multiples of ½, factor by factor."""
+    """Divide `value` by x^power, `power` a multiple of ½, one factor after the other."""
     whole = math.floor(power)
     if power > whole:
         factor = jax.lax.rsqrt(x)

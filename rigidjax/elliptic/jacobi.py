@@ -23,7 +23,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from rigidjax.elliptic.arguments import Real, Result, common, complementary, exact_complement
 from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, near_one
-from rigidjax.elliptic.legendre import complete, integral, means
+from rigidjax.elliptic.legendre import complete, integral, mean_iterates
 from rigidjax.rotation.stumpff import half_turns, parity
 
 # Below this cn and dn, integrals over sd² depend on their ratio only (to the floor squared).
@@ -31,7 +31,7 @@ _FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
 
 
 def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Result]:
-    """Jacobi's sn(u|m), cn(u|m), dn(u|m).
+    """Return Jacobi's sn(u|m), cn(u|m), dn(u|m).
 
     **Arguments:** `u` real; the error grows as |u| eps. `m` the parameter k² (not the modulus k),
     any real number. `m1` = 1 − m: give it if m is so near 1 that 1 − m loses digits. Values and
@@ -50,7 +50,7 @@ def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Re
 
 
 def am(u: Real, m: Real, m1: Real | None = None) -> Result:
-    """Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad: the inverse of F(φ|m) for m ≤ 1.
+    """Return Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad: the inverse of F(φ|m) for m ≤ 1.
 
     **Arguments:** as `sncndn`. **Returns:** φ (DLMF 22.16.1–3). For m ≤ 1 it grows by π in each
     half period 2K, without jumps; for m > 1 it oscillates within |φ| ≤ arcsin(1/√m).
@@ -65,7 +65,7 @@ def am(u: Real, m: Real, m1: Real | None = None) -> Result:
 
 
 def _functions(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any, Any]:
-    """sn, cn, dn for any real m, and the half turns of the amplitude."""
+    """Return sn, cn, dn for any real m, and the number of half turns in the amplitude."""
     # DLMF 22.17.2–4: m > 1 becomes 1/m, and cn and dn change places.
     above = m1 < 0
     divisor = jnp.where(above, m, 1)
@@ -75,14 +75,14 @@ def _functions(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any, Any]:
     inner_m1 = jnp.where(above, -m1, m1) / divisor
 
     s, c, d = _core(v, inner_m, inner_m1)
-    turns = _turns(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
+    turns = _reduce_argument(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
     return (s / root, jnp.where(above, d, c), jnp.where(above, c, d), jnp.where(above, 0, turns))
 
 
 @jax.custom_jvp
 def _core(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
-    """sn, cn, dn for m ≤ 1, as functions of u and m1; m must be the complement of m1."""
-    turns, angle, rows = _turns(u, m1)
+    """Return sn, cn, dn for m ≤ 1, as functions of u and m1; m must be 1 − m1."""
+    turns, angle, rows = _reduce_argument(u, m1)
     sign = parity(turns)
     theta = jnp.abs(angle)
     # Bulirsch's recursion carries cot²φ: let it not overflow, neither at 0 nor at a half period.
@@ -128,7 +128,7 @@ def _core_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 @jax.custom_jvp
 def _slopes(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
-    """Derivatives of sn, cn, dn with respect to m."""
+    """Return the derivatives of sn, cn, dn with respect to m at a fixed u."""
     return _slopes_from_integral(u, m, m1)
 
 
@@ -160,9 +160,12 @@ def _slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
-    """The derivatives by φ times dn X; X is Carlson's R_D of u reduced by half periods."""
+    """Return the derivatives of sn, cn, dn by m: those by the amplitude φ times dn X.
+
+    X is the integral in the head of this file: Carlson's R_D of u reduced by half periods.
+    """
     s, c, d = _core(u, m, m1)
-    turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
+    turns = _reduce_argument(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = parity(turns)
     # X ~ 1/dn² must not overflow. If cn and dn are minute it depends, but for that factor, on
     # their ratio only (to the floor squared): raise both.
@@ -175,8 +178,11 @@ def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
     return c * d * x, -s * d * x * up, -(0.5 * s * s / d + m * s * c * x) * up
 
 
-def _turns(u: Any, m1: Any) -> tuple[Any, Any, list[tuple[Any, Any]]]:
-    """Half periods n in u, the rest as an angle πr/2K, the means of 1 and √m1."""
-    rows = means(jnp.where(m1 == 0, 1, m1))
+def _reduce_argument(u: Any, m1: Any) -> tuple[Any, Any, list[tuple[Any, Any]]]:
+    """Reduce the argument, u = 2Kn + r.
+
+    Returns n, the angle πr/2K and the arithmetic and geometric means of 1 and √m1.
+    """
+    rows = mean_iterates(jnp.where(m1 == 0, 1, m1))
     turns, angle = half_turns(u * rows[-1][0])
     return jnp.where(m1 == 0, 0, turns), angle, rows

@@ -26,7 +26,10 @@ _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 
 
 def near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
-    """(sn, cn, dn) for 0 ≤ m1 ≤ 0.1, to round-off of 1; tangents of m must be minus those of m1."""
+    """Return sn, cn, dn for 0 ≤ m1 ≤ 0.1, to round-off of 1.
+
+    Tangents of m must be minus those of m1 = 1 − m.
+    """
     root = jnp.sqrt(m)
     fourth = jnp.sqrt(root)
     # DLMF 19.5.5–6, the difference 1 − m^(1/4) written as a quotient.
@@ -60,7 +63,10 @@ def near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
 
 @jax.custom_jvp
 def _power_exp(p: Any, y: Any, n: Any) -> Any:
-    """pⁿ e^y. For n = 1 its second derivative by p is exactly 0; that of exp(y + n ln p) is not."""
+    """Return pⁿ e^y.
+
+    For n = 1 its second derivative by p is exactly 0; that of exp(y + n ln p) is not.
+    """
     return jnp.exp(y + jnp.where(n == 0, 0, n * jnp.log(p)))
 
 

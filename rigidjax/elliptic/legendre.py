@@ -28,7 +28,7 @@ _MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
 
 
 def ellipk(m: Real, m1: Real | None = None) -> Result:
-    """Complete elliptic integral of the first kind, K(m) = ∫₀^{π/2} dθ/√(1 − m sin²θ).
+    """Return the complete elliptic integral of the first kind, K(m) = ∫₀^{π/2} dθ/√(1 − m sin²θ).
 
     **Arguments:** `m` < 1 the parameter k² (not the modulus k), also negative; 1 gives infinity, a
     larger m NaN. `m1` = 1 − m: give it if m is so near 1 that 1 − m loses digits. Value and
@@ -42,7 +42,7 @@ def ellipk(m: Real, m1: Real | None = None) -> Result:
 
 
 def ellipe(m: Real, m1: Real | None = None) -> Result:
-    """Complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
+    """Return the complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
 
     **Arguments:** `m` ≤ 1 the parameter k² (a larger one gives NaN); `m1` as for `ellipk`.
     **Returns:** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms.
@@ -55,7 +55,7 @@ def ellipe(m: Real, m1: Real | None = None) -> Result:
 
 
 def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) -> Result:
-    """Complete elliptic integral of the third kind, ∫₀^{π/2} dθ/((1 − n sin²θ) √(1 − m sin²θ)).
+    """Return the complete integral of the third kind, ∫₀^{π/2} dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
     **Arguments:** `n` < 1 the characteristic (DLMF's α²): 1 gives infinity, a larger n NaN (not the
     principal value); `m` < 1 the parameter k²; `m1` = 1 − m and `n1` = 1 − n as for `ellipk`. The
@@ -70,7 +70,7 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
 
 
 def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
-    """Incomplete elliptic integral of the first kind, F(φ|m) = ∫₀^φ dθ/√(1 − m sin²θ).
+    """Return the incomplete elliptic integral of the first kind, F(φ|m) = ∫₀^φ dθ/√(1 − m sin²θ).
 
     **Arguments:** `phi` the amplitude, rad, any size; `m` the parameter k² with m sin²φ < 1 (else
     NaN); `m1` as for `ellipk`. **Returns:** DLMF 19.25.5 in Carlson's R_F after reduction to |φ| ≤
@@ -84,7 +84,7 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
 
 
 def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
-    """Incomplete elliptic integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ.
+    """Return the incomplete elliptic integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ.
 
     **Arguments:** `phi` the amplitude, rad, any size; `m` ≤ 1 the parameter k² (a larger one gives
     NaN); `m1` as for `ellipk`. **Returns:** DLMF 19.25.9 or 19.25.10 in Carlson's integrals,
@@ -100,7 +100,7 @@ def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
 def ellippiinc(
     n: Real, phi: Real, m: Real, m1: Real | None = None, n1: Real | None = None
 ) -> Result:
-    """Incomplete elliptic integral of the third kind, ∫₀^φ dθ/((1 − n sin²θ) √(1 − m sin²θ)).
+    """Return the incomplete integral of the third kind, ∫₀^φ dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
     **Arguments:** `n` the characteristic with n sin²φ < 1; `phi` the amplitude, rad, any size; `m`
     the parameter k² with m sin²φ < 1 (beyond either bound: NaN); `m1` = 1 − m and `n1` = 1 − n as
@@ -116,7 +116,10 @@ def ellippiinc(
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def integral(orders: tuple[int, int, int], sine: Any, cosine: Any, m1: Any, n1: Any) -> Any:
-    """I_jkl, `orders` (j, k, l), by sine and cosine of |φ| ≤ π/2: no digit is lost near π/2."""
+    """Return I_jkl for `orders` (j, k, l) from the sine and cosine of φ, |φ| ≤ π/2.
+
+    From both, not from φ, so that no digit is lost near π/2.
+    """
     j, k, last = orders
     s, c2 = sine, cosine * cosine
     one, delta2 = jnp.ones_like(s), c2 + m1 * s * s
@@ -157,13 +160,13 @@ def _integral_jvp(orders: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def complete(orders: tuple[int, int, int], m1: Any, n1: Any = None) -> Any:
-    """I_jkl at φ = π/2."""
+    """Return I_jkl, `orders` (j, k, l), at φ = π/2."""
     one = jnp.ones_like(m1)
     return integral(orders, one, jnp.zeros_like(m1), m1, one if n1 is None else n1)
 
 
-def means(m1: Any) -> list[tuple[Any, Any]]:
-    """The pairs (a, b) of arithmetic and geometric means, from (1, √m1) to their common value."""
+def mean_iterates(m1: Any) -> list[tuple[Any, Any]]:
+    """Return the pairs of arithmetic and geometric means from (1, √m1) to their common value."""
     rows = [(jnp.ones_like(m1), jnp.sqrt(m1))]
     for _ in range(_MEAN_STEPS[np.dtype(m1.dtype)]):
         a, b = rows[-1]
@@ -173,7 +176,8 @@ def means(m1: Any) -> list[tuple[Any, Any]]:
 
 @jax.custom_jvp
 def _complete_first(m1: Any) -> Any:
-    a, b = means(m1)[-1]
+    """Return K = π/(2 agm(1, √m1)); infinity for m1 = 0."""
+    a, b = mean_iterates(m1)[-1]
     return jnp.where(m1 == 0, jnp.inf, math.pi / (a + b))
 
 
@@ -184,7 +188,10 @@ def _complete_first_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def _second_kind(s: Any, c2: Any, delta2: Any, m1: Any) -> Any:
-    """E, by DLMF 19.25.10 for 0 ≤ m ≤ 1 and by 19.25.9 for m < 0: every term is positive."""
+    """Return E(φ|m) for |φ| ≤ π/2 from s = sin φ, c2 = cos²φ and delta2 = 1 − m s².
+
+    By DLMF 19.25.10 for 0 ≤ m ≤ 1 and by 19.25.9 for m < 0, where every term is positive.
+    """
     m, one = 1 - m1, jnp.ones_like(s)
     # E(φ|1) = sin φ: at φ = π/2 the terms below have no values of their own.
     end = delta2 == 0
@@ -199,7 +206,10 @@ def _second_kind(s: Any, c2: Any, delta2: Any, m1: Any) -> Any:
 
 
 def _incomplete(orders: tuple[int, int, int], phi: Any, m1: Any, n1: Any = None) -> Any:
-    """I_jkl at any φ: the whole half turns by the complete integral, the rest by its sine."""
+    """Return I_jkl, `orders` (j, k, l), at any amplitude φ.
+
+    Whole half turns come from the complete integral, the rest from its sine and cosine.
+    """
     turns, remainder = half_turns(phi)
     n1 = jnp.ones_like(m1) if n1 is None else n1
     part = integral(orders, jnp.sin(remainder), jnp.cos(remainder), m1, n1)

@@ -20,7 +20,7 @@ from rigidjax.rotation.barrier import barrier, one_kernel
 
 
 class Orbit(NamedTuple):
-    """The constants of a free motion, in principal axes labelled 1, 2, 3 in order."""
+    """Hold the constants of a free motion, in principal axes labelled 1, 2, 3 in order."""
 
     a: Scalar  # the largest or smallest reciprocal moment
     d12: Scalar  # differences of reciprocal moments
@@ -61,7 +61,7 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
 
 
 class Reduced(NamedTuple):
-    """A time minus whole half periods."""
+    """Hold a time that was reduced by whole half periods."""
 
     halves: Scalar  # their number
     rest: Scalar
@@ -69,13 +69,14 @@ class Reduced(NamedTuple):
 
 
 def reduced(u: Scalar, half: Scalar, m: Modulus) -> Reduced:
+    """Reduce the time u by whole half periods `half`."""
     count = jnp.round(u / half)
     rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half)
     return Reduced(count, rest, until_rest(rest, m))
 
 
 def restored(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar]:
-    """S, C, D at the whole time from those at `near`; and the phase of what was left out."""
+    """Return S, C, D at the whole time from `f`, those at `u.near`; and the phase left out."""
     big = jnp.maximum(o.modulus.p, o.modulus.q)
     whole = jnp.where(u.halves == 0, 0.0, u.halves)
     # From then on the momentum rests on the middle axis, S² = 1/max(p, q): a steady spin.
@@ -94,7 +95,7 @@ def restored(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar]:
 
 
 def in_step(f: Elliptic, m: Modulus) -> Elliptic:
-    """The larger of C² and D², computed again from the smaller: D² − C² = (p − q)S².
+    """Compute the larger of C² and D² again from the smaller: D² − C² = (p − q)S².
 
     C and SD cancel near the middle axis, and of the doublings' errors only a common one does, too.
     """
@@ -107,7 +108,7 @@ def in_step(f: Elliptic, m: Modulus) -> Elliptic:
 
 
 def momentum_at(o: Orbit, f: Elliptic) -> Triple:
-    """Body momentum for S, C, D at the time passed, in the orbit's labelling."""
+    """Return the body momentum from S, C, D (`f`) at the same time, in the labelling of `o`."""
     p1, p2, p3 = o.P
     f = in_step(f, o.modulus)
     y1 = p1 * f.C - o.d23 * p2 * p3 * f.S * f.D
@@ -124,13 +125,13 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
 
 @one_kernel
 def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
-    """Body momentum at t, and the quaternion of the turn since t = 0, in principal axes."""
+    """Return the body momentum at t and the quaternion of the turn since 0, in principal axes."""
     u = reduced(0.5 * t, o.half.time, o.modulus)
     return from_functions(o, elliptic(u.near, o.modulus, o.mu, o.turn), u, t)
 
 
 def from_functions(o: Orbit, f: Elliptic, u: Reduced, t: Scalar) -> tuple[Triple, Four]:
-    """Momentum and turn from the elliptic functions at `u.near`."""
+    """Return momentum and turn at time t from `f`, the elliptic functions at `u.near`."""
     f, phase = barrier(restored(o, f, u))
     full = barrier(duplicate(f, o.modulus, o.mu, o.turn))
     _, k2, k3 = barrier(momentum_at(o, f))

@@ -15,11 +15,12 @@ HALF = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
 
 
 def plus(a: Triple, b: Triple) -> Triple:
+    """Add two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def times(m: Six, v: Triple) -> Triple:
-    """A symmetric matrix times a vector."""
+    """Multiply a symmetric matrix by a vector."""
     a, b, c, x, y, z = m
     return (
         a * v[0] + x * v[1] + y * v[2],
@@ -29,7 +30,7 @@ def times(m: Six, v: Triple) -> Triple:
 
 
 def product(m: Six, n: Six) -> Six:
-    """The product of two symmetric matrices that commute, hence symmetric."""
+    """Multiply two symmetric matrices that commute; their product is symmetric."""
     a, b, c, x, y, z = m
     d, e, f, u, v, w = n
     return (
@@ -43,11 +44,13 @@ def product(m: Six, n: Six) -> Six:
 
 
 def determinant(m: Six) -> Scalar:
+    """Return the determinant of a symmetric matrix."""
     a, b, c, x, y, z = m
     return a * b * c + 2.0 * x * y * z - a * z * z - b * y * y - c * x * x
 
 
 def adjugate(m: Six) -> Six:
+    """Return the adjugate of a symmetric matrix: its determinant times its inverse."""
     a, b, c, x, y, z = m
     return (
         b * c - z * z,
@@ -60,7 +63,7 @@ def adjugate(m: Six) -> Six:
 
 
 def half_product(q: Four, v: Triple) -> Four:
-    """½ q ⊗ (0, v)."""
+    """Return ½ q ⊗ (0, v), ⊗ the product of quaternions."""
     w, x, y, z = q
     a, b, c = 0.5 * v[0], 0.5 * v[1], 0.5 * v[2]
     return (
@@ -72,7 +75,7 @@ def half_product(q: Four, v: Triple) -> Four:
 
 
 def turned_back(q: Four, v: Triple) -> Triple:
-    """R(q)ᵀ v − v."""
+    """Return R(q)ᵀ v − v, without a difference of large numbers."""
     w, *axis = q
     first = cross(v, tuple(axis))
     second = cross(first, tuple(axis))

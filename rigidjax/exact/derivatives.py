@@ -54,7 +54,7 @@ _LOOPED = 1000
 
 @jax.custom_jvp
 def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
-    """Π(t) and the quaternion of the turn since 0.
+    """Return Π(t) and the quaternion of the turn since 0.
 
     `moments`: I11 ≤ I22 ≤ I33, I12, I13, I23, the last three zero in value; `momentum` Π(0).
     """
@@ -71,7 +71,7 @@ def _flow_jvp(primals, tangents):
 
 
 class Setting(NamedTuple):
-    """The constants of a free motion: by value, never differentiated."""
+    """Hold the constants of a free motion: by value, never differentiated."""
 
     axes: Mat3
     moments: Triple
@@ -81,7 +81,7 @@ class Setting(NamedTuple):
 
 @one_kernel
 def set_up(tensor: Mat3, omega: Vec3) -> Setting:
-    """Principal axes, and the orbit of the momentum in them."""
+    """Find the principal axes, and the orbit of the momentum in them."""
     moments, axes = principal_frame(tensor)
     momentum = times(moments, into(axes, omega))
     return Setting(axes, moments[:3], momentum, orbit(moments[:3], momentum))
@@ -91,9 +91,9 @@ def set_up(tensor: Mat3, omega: Vec3) -> Setting:
 def motion(
     tensor: Mat3, omega: Vec3, setting: Setting, t: Float[Array, "*n"]
 ) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 4"]]:
-    """Ω(t) and the quaternion of the turn since 0, in body axes, at one time or many."""
+    """Return Ω(t) and the quaternion of the turn since 0, in body axes, at one time or many."""
     del tensor, omega
-    return _each(lambda time: _values(setting, time), t)
+    return _at_each_time(lambda time: _values(setting, time), t)
 
 
 @motion.defjvp
@@ -102,7 +102,7 @@ def _motion_jvp(primals, tangents):
     d_tensor, d_omega, _, d_t = tangents
     # Two matrices, so that the transposed part is short: the rest is compiled once.
     first = _by_body(jnp.concatenate([tensor.ravel(), omega]), setting)
-    out, (rates, thetas) = _each(lambda time: _body_slopes(tensor, omega, setting, time), t)
+    out, (rates, thetas) = _at_each_time(lambda time: _body_slopes(tensor, omega, setting, time), t)
     # Summed, not a product of matrices: on a GPU that is rounded to ten bits in float32.
     change = jnp.sum(first * jnp.concatenate([d_tensor.ravel(), d_omega])[None], axis=-1)
     change = jnp.broadcast_to(change, (*t.shape, 9))
@@ -111,15 +111,17 @@ def _motion_jvp(primals, tangents):
         jnp.stack([jnp.sum(row * change, axis=-1) for row in rows], axis=-1)
         for rows in (rates, thetas)
     )
-    return out, (d_rate, _turning(out[1], theta))
+    return out, (d_rate, _quaternion_change(out[1], theta))
 
 
 @functools.partial(jnp.vectorize, signature="(n),(m)->(n)")
-def _turning(turn: Quat, theta: Vec3) -> Quat:
+def _quaternion_change(turn: Quat, theta: Vec3) -> Quat:
+    """Return the change ½ q ⊗ (0, θ) of the quaternion q = `turn` for a small rotation θ."""
     return jnp.stack(half_product(components(turn), components(theta)))
 
 
-def _each(function, t):
+def _at_each_time(function, t):
+    """Evaluate `function` at the time or at each of the times t."""
     if t.ndim == 0:
         return function(t)
     return jax.lax.map(function, t) if t.size <= _LOOPED else jax.vmap(function)(t)
@@ -127,20 +129,21 @@ def _each(function, t):
 
 @one_kernel
 def _values(s: Setting, t: Scalar) -> tuple[Vec3, Quat]:
+    """Return Ω(t) and the turn since 0 in body axes."""
     momentum, (w, *axis) = momentum_and_turn(s.orbit, t)
     rate = tuple(p / i for p, i in zip(momentum, s.moments, strict=True))
     return jnp.stack(out_of(s.axes, rate)), jnp.stack([w, *out_of(s.axes, tuple(axis))])
 
 
 def _in_axes(tensor: Mat3, omega: Vec3, s: Setting) -> tuple[Six, Triple]:
-    """Moments and momentum as functions of the body; the axes are held fixed."""
+    """Return moments and momentum as functions of `tensor` and Ω(0); the axes are held fixed."""
     moments = in_axes(tensor, s.axes, s.moments)
     return moments, times(moments, into(s.axes, omega))
 
 
 @one_kernel
 def _by_body(body: Float[Array, "12"], s: Setting) -> Float[Array, "9 12"]:
-    """Derivatives of `inputs_of` by the tensor and Ω(0)."""
+    """Return the derivatives of `inputs_of` by `body`: nine entries of the tensor, then Ω(0)."""
     return jax.jacfwd(lambda x: jnp.stack(inputs_of(*_in_axes(x[:9].reshape(3, 3), x[9:], s))))(
         body
     )
@@ -148,6 +151,7 @@ def _by_body(body: Float[Array, "12"], s: Setting) -> Float[Array, "9 12"]:
 
 @one_kernel
 def _body_slopes(tensor: Mat3, omega: Vec3, s: Setting, t: Scalar):
+    """Return Ω(t) and the turn in body axes, and their derivatives by `inputs_of` and t."""
     moments, momentum = _in_axes(tensor, omega, s)
     (out, (w, *axis)), rows = slopes(moments, momentum, t)
     rate = out_of(s.axes, times(reciprocal(moments, momentum)[1], out))
@@ -158,7 +162,7 @@ def _body_slopes(tensor: Mat3, omega: Vec3, s: Setting, t: Scalar):
 
 
 class Slopes(NamedTuple):
-    """Derivatives by the ten of `jacobian_and_integral`: of Π(t), θ and Ω(t), three rows each."""
+    """Hold the derivatives of Π(t), θ and Ω(t) by `inputs_of` and t, three rows of ten each."""
 
     momentum: Triple
     theta: Triple
@@ -167,7 +171,7 @@ class Slopes(NamedTuple):
 
 @one_kernel
 def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Four], Slopes]:
-    """The result of `flow`, and its derivatives."""
+    """Return the result of `flow`, and its derivatives."""
     (out, turn), rows, g = first_order(moments, momentum, t)
     _, k, energy2 = reciprocal(moments, momentum)
     p1, p2, p3 = momentum
@@ -209,7 +213,7 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
 
 
 def inputs_of(moments: Six, momentum: Triple) -> tuple[Scalar, ...]:
-    """d12, d23, k12, k13, k23, Π(0), k33: the variables of all derivatives, besides the time.
+    """Return d12, d23, k12, k13, k23, Π(0), k33: the variables of all derivatives but t.
 
     k33 is the least of K: a rod's thickness moves d12 alone (k11 and d12 by 1/I₁², which cancel).
     """
@@ -219,12 +223,13 @@ def inputs_of(moments: Six, momentum: Triple) -> tuple[Scalar, ...]:
 
 @jax.custom_jvp
 def first_order(moments: Six, momentum: Triple, t: Scalar):
-    """The result of `flow`; the derivatives of Π(t) − Π(0) by `inputs_of` and t; G = ∫ Π Πᵀ dt."""
+    """Return the result of `flow`, d(Π(t) − Π(0)) by `inputs_of` and t, and G = ∫ Π Πᵀ dt."""
     return _first_order(orbit(moments[:3], momentum), moments, momentum, t)
 
 
 @one_kernel
 def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
+    """Return what `first_order` does, for a motion with the constants `o`."""
     u = reduced(0.5 * t, o.half.time, o.modulus)
     at = integrals(u.near, o.modulus, o.mu, o.turn)
     f = at.f._replace(
@@ -247,6 +252,7 @@ def _first_order_jvp(primals, tangents):
 
 
 def _first_order_of_tensor(moments, momentum, t):
+    """Return the derivatives of Π(t) and G in `first_order`, from the tensor form."""
     body, _, _ = reciprocal(moments, momentum)
 
     def of_inputs(x):
@@ -261,7 +267,7 @@ def _first_order_of_tensor(moments, momentum, t):
 
 
 def reciprocal(moments: Six, momentum: Triple):
-    """Differences of K = I⁻¹, K itself and E₂ = Π·KΠ."""
+    """Return the differences of K = I⁻¹, K itself and E₂ = Π·KΠ, twice the energy."""
     i1, i2, i3, i12, i13, i23 = moments
     r = 1.0 / determinant(moments)
     k = tuple(c * r for c in adjugate(moments))

@@ -14,7 +14,7 @@ from rigidjax.motion.equations import AttitudeEquations, EulerEquations
 
 
 class FreeInterpolation(dfx.AbstractLocalInterpolation):
-    """The motion between two steps in closed form."""
+    """Evaluate the motion between two steps in closed form."""
 
     t0: Any
     t1: Any
@@ -31,7 +31,7 @@ class FreeInterpolation(dfx.AbstractLocalInterpolation):
 
 
 class FreeSolver(dfx.AbstractSolver):
-    """A diffrax solver for torque-free spins and attitudes; its step is the closed form.
+    """Solve torque-free spins and attitudes in diffrax; a step is the closed form.
 
     Use it with `diffrax.ODETerm(rigidjax.equations_of_motion(inertia, y0))` of a `Spin` or an
     `Attitude`, with no torque. One step over the whole interval does. Events, dense output and
@@ -77,14 +77,14 @@ class FreeSolver(dfx.AbstractSolver):
 
 
 def field_of(terms: Any) -> tuple[Any, Any]:
-    """The vector field inside a term, and the direction of time that diffrax wraps around it."""
+    """Return the vector field inside a term, and the direction of time diffrax wraps around it."""
     # `vf` and `contr`, all that diffrax promises of a wrapped term, give numbers, not the inertia.
     term = getattr(terms, "term", terms)
     return getattr(term, "vector_field", None), getattr(terms, "direction", 1)
 
 
 def _field(terms: Any) -> EulerEquations:
-    """Euler's equations inside a term."""
+    """Return Euler's equations from inside a term."""
     field, _ = field_of(terms)
     euler = field.euler if isinstance(field, AttitudeEquations) else field
     term = getattr(terms, "term", terms)

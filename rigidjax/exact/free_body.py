@@ -24,7 +24,7 @@ State = TypeVar("State", bound=HasSpin)
 
 
 class FreeBody(eqx.Module):
-    """The whole motion of a free body; call it with a time, or `at` with many.
+    """Hold the whole motion of a free body; call it with a time, or `at` with many.
 
     Its constants are computed once. **Arguments:** as for `free_body`.
 
@@ -52,7 +52,7 @@ class FreeBody(eqx.Module):
         return self.at(_time(t, self.state0.omega))
 
     def at(self, ts: Float[Array, "*n"]) -> HasSpin:
-        """The states at `ts` (n,), s since `state0`: as by `jax.vmap`, quicker to compile.
+        """Return the states at `ts` (n,), s since `state0`: as `jax.vmap` does, compiled sooner.
 
         >>> motion = FreeBody(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([0.0, 0.0, 1.0]))
         >>> motion.at(jnp.array([0.0, 10.0])).omega
@@ -74,7 +74,7 @@ class FreeBody(eqx.Module):
 
 
 class FreeMotion(eqx.Module):
-    """The motion of a free body of any kind: `FreeBody`, and x + v t of a `Rigid`.
+    """Hold the motion of a free body of any kind: `FreeBody`, and x + v t of a `Rigid`.
 
     Call it with a time, or with times (n,), s since `state0`. Times that are too long give NaN.
     """
@@ -98,7 +98,7 @@ class FreeMotion(eqx.Module):
 
 
 def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
-    """State of a torque-free body at any time, in closed form: no solver, no steps.
+    """Return the state of a torque-free body at any time, in closed form: no solver, no steps.
 
     **Arguments:** `inertia` about the centre of mass, any tensor with positive moments, kg m², body
     frame; `state0` a `Spin` (Ω) or `Attitude` (q, Ω): Ω rad/s in the body frame, q unit quaternion
@@ -138,6 +138,7 @@ _jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0).at(t))
 
 
 def _time(t: ScalarLike, omega: Array) -> Scalar:
+    """Check the time: a number in whose dtype the turn of the body has digits."""
     t = _checks.time(t)
     if not _checks.known((t, omega)):
         return t
@@ -153,6 +154,7 @@ def _time(t: ScalarLike, omega: Array) -> Scalar:
 
 
 def _checked(inertia: Inertia, state0: HasSpin) -> Inertia:
+    """Check body and state, and return the body; one that is traced and impossible is NaN."""
     if isinstance(state0, HasPose) or not isinstance(state0, HasSpin):
         raise TypeError(
             f"state0: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
@@ -178,5 +180,6 @@ def _checked(inertia: Inertia, state0: HasSpin) -> Inertia:
 
 @functools.partial(jnp.vectorize, signature="(n),(n)->(n)")
 def _unit_product(q: Quat, other: Quat) -> Quat:
+    """Multiply two quaternions, and give the product unit length."""
     out = jnp.stack(product4(components(q), components(other)))
     return out / jnp.sqrt(jnp.sum(out * out))

@@ -24,7 +24,7 @@ from rigidjax._types import Scalar
 
 
 class Elliptic(NamedTuple):
-    """S, C, D, and the phase ξ as a direction (x, y) ∝ (cos ξ, sin ξ)."""
+    """Hold S, C, D, and the phase ξ as a direction (x, y) ∝ (cos ξ, sin ξ)."""
 
     S: Scalar
     C: Scalar
@@ -34,7 +34,7 @@ class Elliptic(NamedTuple):
 
 
 class Modulus(NamedTuple):
-    """p, q and their difference `gap` = p − q, computed without subtracting them; 1/s²."""
+    """Hold p, q and `gap` = p − q, computed without subtracting them; 1/s²."""
 
     p: Scalar
     q: Scalar
@@ -42,7 +42,7 @@ class Modulus(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """The range and the number of doublings for a dtype."""
+    """Hold the range and the number of doublings for a dtype."""
 
     doublings: int  # from u/2^doublings to u
     agm: int  # steps of the arithmetic–geometric mean
@@ -51,25 +51,28 @@ class Limits(NamedTuple):
 
 
 def limits(dtype) -> Limits:
-    """`doublings` reach the longest quarter period, `ln(4/√floor)`; C⁴ must not underflow."""
+    """Return the limits of a dtype.
+
+    The doublings reach the longest quarter period, `ln(4/√floor)`; C⁴ must not underflow.
+    """
     wide = dtype == jnp.float64
     return Limits(9, 11, 1e-64, 75.0) if wide else Limits(7, 9, 1e-33, 20.0)
 
 
 def is_endless(m: Modulus) -> Bool[Array, ""]:
-    """Whether the motion has no period: the separatrix, a sphere, rest."""
+    """Say whether the motion has no period: the separatrix, a sphere, rest."""
     return jnp.abs(m.gap) <= limits(m.p.dtype).floor * jnp.maximum(m.p, m.q)
 
 
 def until_rest(u: Scalar, m: Modulus) -> Scalar:
-    """A reduced u; on the separatrix none beyond the time it takes to come to rest."""
+    """Return the reduced time u; on the separatrix clip it to the time the motion takes to rest."""
     big = jnp.maximum(m.p, m.q)
     rest = limits(u.dtype).rest / jnp.sqrt(jnp.where(big > 0, big, 1.0))
     return jnp.where(is_endless(m) & (big > 0), jnp.clip(u, -rest, rest), u)
 
 
 def duplicate(f: Elliptic, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
-    """S, C, D and ξ at 2u from those at u; ξ(2u) = 2ξ + arctan(B/A), as a complex product."""
+    """Return S, C, D and ξ at 2u from `f` at u; ξ(2u) = 2ξ + arctan(B/A), a complex product."""
     S, C, D, x, y = f
     s, cc, dd = S * S, C * C, D * D
     ps, qs = m.p * s, m.q * s
@@ -87,7 +90,10 @@ def duplicate(f: Elliptic, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
 
 
 def series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
-    """Taylor series, right to round-off for `√max(p, q) |h| ≤ 0.15` (float32: 0.31)."""
+    """Sum the Taylor series at a time h, to round-off for `√max(p, q) |h| ≤ 0.15`.
+
+    In float32 the bound is 0.31.
+    """
     hh = h * h
     p, q = m.p * hh, m.q * hh
     e, f = p + q, p * q
@@ -112,9 +118,9 @@ def series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
 
 
 def growth(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
-    """∫ S²/(1 + μS²) du = ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)) for a small S.
+    """Return ∫ S²/(1 + μS²) du = ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)) for a small S.
 
-    Its power series in S, by the recurrence of Legendre's polynomials for the roots and one more
+    It is a power series in S, by the recurrence of Legendre's polynomials for the roots and another
     for 1 + μS².
     """
     s = S * S
@@ -129,7 +135,7 @@ def growth(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
 
 
 def elliptic(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
-    """S, C, D at u and the phase `ξ = turn ∫₀ᵘ S²/(1 + μS²) du`.
+    """Return S, C, D at u and the phase `ξ = turn ∫₀ᵘ S²/(1 + μS²) du`.
 
     `0 ≤ mu ≤ √(pq)`; `turn` = κμ times a rate. `u` is reduced: |u| at most a quarter period.
     """
@@ -140,7 +146,7 @@ def elliptic(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
 
 
 class HalfPeriod(NamedTuple):
-    """What half a period gathers."""
+    """Hold what the motion gathers in half a period."""
 
     time: Scalar  # infinite on the separatrix
     phase: Scalar  # ξ
@@ -148,7 +154,7 @@ class HalfPeriod(NamedTuple):
 
 
 def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
-    """The least T > 0 with S(T) = 0, and what S gathers on the way.
+    """Return the least T > 0 with S(T) = 0, and the phase and the mean of S² until then.
 
     With λ² = max(p, q), a₀ = 1, b₀ = √|p − q|/λ: `T = π/(λ agm(a₀, b₀))` (DLMF 19.8.5), and with
     `c₁ = (a₀ − b₀)/2, c_{n+1} = c_n²/(4 a_{n+1})` the mean `⟨S²⟩ = (½ + Σ 2^{n−1} c_n²/w)/λ²`,
@@ -177,7 +183,7 @@ def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
 
 
 def _mean(_: Array, state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-    """A step of the arithmetic–geometric mean and of its sums; `ratio` carries 2^{n−1}."""
+    """Take a step of the arithmetic–geometric mean and of its sums; `ratio` carries 2^{n−1}."""
     a, b, c, ratio, total, point, part, sum_parts = state
     square, product = point * point, a * b
     part = 0.5 * part * (square - product) / (square + product)

@@ -23,7 +23,7 @@ from rigidjax.exact.sigma_form import Differences, invariants
 
 
 class Integrals(NamedTuple):
-    """The elliptic functions at some time, and Y₂ and Y until then."""
+    """Hold the elliptic functions at some time, and the integrals Y₂ and Y until then."""
 
     f: Elliptic
     y2: Scalar
@@ -39,7 +39,9 @@ def jacobian_and_integral(
     whole: Scalar,
     mean: Scalar,
 ) -> tuple[tuple, Six]:
-    """d(Π(t) − Π(0)) by (d12, d23, k12, k13, k23, Π(0), k33, t) as three rows, and G = ∫ Π Πᵀ dt.
+    """Return the derivatives of Π(t) − Π(0) as three rows, and G = ∫ Π Πᵀ dt.
+
+    The columns are the derivatives by d12, d23, k12, k13, k23, Π(0), k33 and t.
 
     Off-diagonal entries must be zero. `before` at half of a time that was reduced by `halves` half
     periods, `whole` in all, its C and D as in `body`; `mean` of S².
@@ -132,7 +134,7 @@ def jacobian_and_integral(
 
 
 def integrals(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
-    """As `elliptic`, with Y₂ and Y."""
+    """Return what `elliptic` does, and the integrals Y₂ and Y from 0 to u."""
     n = limits(u.dtype).doublings
     f = series(u * 2.0**-n, m, mu, turn)
     # S²/D² and S²/C² are S²/(1 + μS²) for μ = −q and −p.
@@ -142,6 +144,7 @@ def integrals(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
 
 
 def twice(g: Integrals, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
+    """Return the elliptic functions, Y₂ and Y at 2u from `g`, their values at u."""
     f, three = g.f, m.gap > 0
     after = duplicate(f, m, mu, turn)
     a, b = f.S / jnp.where(three, f.D, f.C), after.S / jnp.where(three, after.D, after.C)

@@ -18,7 +18,7 @@ from rigidjax.exact.principal_axes import into, principal_frame
 
 
 def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
-    """Time after which the body rates repeat: one rotation about the circulated axis.
+    """Return the time after which the body rates repeat: a rotation about the circulated axis.
 
     This is the time in which the angular momentum circles the axis of the smallest or largest
     moment in the body frame (5.41 days about the long axis for 4179 Toutatis); for a spin about a
@@ -36,11 +36,11 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> bool(abs(body_period(top, jnp.array([1.0, 0.5, 0.0])) - 4 * jnp.pi) < 1e-14)
     True
     """
-    return _both(*_checked(inertia, omega0))[0]
+    return _periods(*_checked(inertia, omega0))[0]
 
 
 def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
-    """Mean time in which the circulated axis turns once about the angular momentum, in space.
+    """Return the mean time in which the circulated axis turns once about the angular momentum.
 
     The axis that the momentum circles in the body turns about the fixed angular momentum; this is
     2π over its mean rate (7.35 days for the long axis of 4179 Toutatis). If no axis is circulated
@@ -57,18 +57,19 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> precession_period(top, jnp.array([1.0, 0.5, 0.0]))  # 2π I₂/|L|
     Array(8.88576588, dtype=float64)
     """
-    return _both(*_checked(inertia, omega0))[1]
+    return _periods(*_checked(inertia, omega0))[1]
 
 
 def _checked(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
+    """Check body and rate; return the tensor and Ω in its dtype."""
     _checks.single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     tensor = validation.possible(inertia, inertia.tensor, None, throw=False).tensor
     return tensor, _checks.floating(omega0, (3,), "omega0").astype(tensor.dtype)
 
 
 @jax.jit
-def _both(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
-    """Both periods, in one program."""
+def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
+    """Return the body period and the precession period, from one program."""
     exponent = exponent_of(omega)
     moments, axes = principal_frame(times_power_of_two(tensor, -exponent_of(tensor)))
     momentum = times(moments, into(axes, times_power_of_two(omega, -exponent)))
@@ -94,7 +95,7 @@ def _both(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
 
 @jax.custom_jvp
 def _precession(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
-    """Angle of the circulated axis about the momentum in one period of the body rates."""
+    """Return the angle of the circulated axis about the momentum in one period of body rates."""
     body, k, _ = reciprocal(moments, momentum)
     v = sigma_form.invariants(body, momentum)
     about_three, h = v.a2 > 0, jnp.sqrt(v.h2)

@@ -15,7 +15,7 @@ _SWEEPS = 6
 
 
 def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
-    """The inertia in its own principal axes, ascending, and those axes as columns (a rotation).
+    """Return the inertia in its principal axes, ascending, and these axes as columns (a rotation).
 
     By Jacobi's method, in which small moments keep their digits; A is held fixed in derivatives.
     """
@@ -26,7 +26,7 @@ def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
 
 @jax.custom_jvp
 def in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
-    """`AᵀIA`: diagonal in value."""
+    """Return `AᵀIA`, A the principal `axes` of I: diagonal in value, full in its derivative."""
     zero = jnp.zeros_like(tensor[0, 0])
     return batched_as((*moments, zero, zero, zero), (tensor, axes, moments))
 
@@ -39,17 +39,18 @@ def _in_axes_jvp(primals, tangents):
 
 
 def into(axes: Mat3, v: Vec3 | Triple) -> Triple:
-    """Components along the columns of `axes`."""
+    """Return the components of `v` along the columns of `axes`."""
     return tuple(axes[0, i] * v[0] + axes[1, i] * v[1] + axes[2, i] * v[2] for i in range(3))
 
 
 def out_of(axes: Mat3, v: Triple) -> Triple:
-    """The inverse of `into`."""
+    """Return the vector with the components `v` along the columns of `axes`: inverse of `into`."""
     return tuple(axes[i, 0] * v[0] + axes[i, 1] * v[1] + axes[i, 2] * v[2] for i in range(3))
 
 
 @one_kernel
 def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
+    """Return the rows of the matrix whose columns are principal axes, and the moments (Jacobi)."""
     one, zero = jnp.ones_like(m[0, 0]), jnp.zeros_like(m[0, 0])
     # Nearly equal moments keep their differences: a shift that is exact by Sterbenz' lemma.
     least = jnp.minimum(jnp.minimum(m[0, 0], m[1, 1]), m[2, 2])
@@ -73,7 +74,7 @@ def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
 
 
 def _polished(a):
-    """A rotation to round-off again after many: A(3 − AᵀA)/2 (Higham 1986)."""
+    """Make a product of many rotations one to round-off again: A(3 − AᵀA)/2 (Higham 1986)."""
     excess = [
         [
             a[0][i] * a[0][j] + a[1][i] * a[1][j] + a[2][i] * a[2][j] - float(i == j)

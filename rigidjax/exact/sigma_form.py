@@ -39,7 +39,7 @@ from rigidjax.exact.jacobi_duplication import Modulus, is_endless, limits, until
 
 
 class Differences(NamedTuple):
-    """K = I⁻¹ without its trace: differences of its diagonal, and its off-diagonal entries."""
+    """Hold K = I⁻¹ without its trace: differences of its diagonal, and off-diagonal entries."""
 
     d12: Scalar
     d13: Scalar
@@ -50,7 +50,7 @@ class Differences(NamedTuple):
 
 
 class Invariants(NamedTuple):
-    """The parts of E − E₂₂ 1. `a1, a2, a3`: a₁h² − E₂, a₂h² − E₂, E₂ − a₃h²."""
+    """Hold the parts of E − E₂₂ 1; `a1, a2, a3` are a₁h² − E₂, a₂h² − E₂, E₂ − a₃h²."""
 
     h2: Scalar
     a1: Scalar
@@ -65,7 +65,7 @@ class Invariants(NamedTuple):
 
 
 class Sigma(NamedTuple):
-    """σ, T, Y at some time; T is scaled so that T₂₂ = 1."""
+    """Hold σ, T, Y at some time; T is scaled so that T₂₂ = 1."""
 
     s: Scalar
     t: Six
@@ -73,6 +73,7 @@ class Sigma(NamedTuple):
 
 
 def invariants(body: Differences, momentum: Triple) -> Invariants:
+    """Return the invariants of a motion from K and Π(0)."""
     d12, d13, d23, k12, k13, k23 = body
     p1, p2, p3 = momentum
     x1, x2, x3 = p1 * p1, p2 * p2, p3 * p3
@@ -97,7 +98,7 @@ def invariants(body: Differences, momentum: Triple) -> Invariants:
 
 
 def start(u: Scalar, v: Invariants) -> Sigma:
-    """σ, T, Y at a small u from their Taylor series."""
+    """Return σ, T, Y at a small u from their Taylor series."""
     q, p, e12, e13, e23 = v.q, v.p, v.e12, v.e13, v.e23
     uu = u * u
     c1 = (p + q) * uu
@@ -128,7 +129,7 @@ def start(u: Scalar, v: Invariants) -> Sigma:
 
 
 def double(f: Sigma, v: Invariants) -> Sigma:
-    """σ, T, Y at 2u."""
+    """Return σ, T, Y at 2u from `f`, their values at u."""
     t1, t2, t3, t12, t13, t23 = f.t
     s = f.s
     ss = s * s
@@ -169,7 +170,7 @@ def double(f: Sigma, v: Invariants) -> Sigma:
 def momentum_at(
     body: Differences, v: Invariants, f: Sigma, momentum: Triple
 ) -> tuple[Triple, Scalar]:
-    """Π after the time of `f`, and the factor W that was divided out."""
+    """Return Π after the time of `f`, `momentum` before it, and the factor W divided out."""
     p1, p2, p3 = momentum
     d12, d13, d23, k12, k13, k23 = body
     u1 = -d23 * p2 * p3 + p2 * (k13 * p1 + k23 * p2) - p3 * (k12 * p1 + k23 * p3)
@@ -195,7 +196,7 @@ def momentum_at(
 
 
 def integral_about(body: Differences, v: Invariants, f: Sigma, k: Triple) -> Six:
-    """∫ Π Πᵀ dt from −u to u about the moment when Π = k, with f at u."""
+    """Return ∫ Π Πᵀ dt from −u to u about the moment when Π = k; `f` is at u."""
     _, w = momentum_at(body, v, f, k)
     alpha = times(adjugate(f.t), k)
     r = 2.0 * f.s / (w * determinant(f.t))
@@ -218,13 +219,16 @@ def integral_about(body: Differences, v: Invariants, f: Sigma, k: Triple) -> Six
 
 
 def sigma_at(u: Scalar, v: Invariants) -> Sigma:
+    """Return σ, T, Y at u: the Taylor series of a small part of u, then doublings."""
     n = limits(u.dtype).doublings + 3
     f = start(u * 2.0**-n, v)
     return jax.lax.fori_loop(0, n, lambda _, g: double(g, v), f)
 
 
 def period(v: Invariants) -> Scalar:
-    """The period of Π: `2π/agm(√(z − x), √(z − y))`, z the largest eigenvalue of E.
+    """Return the period of Π: `2π/agm(√(z − x), √(z − y))`, x, y, z the eigenvalues of E.
+
+    z is the largest.
 
     One step of Newton's from the diagonal entry has the derivatives of z to third order; the other
     two enter through symmetric functions, the first step of the mean.
@@ -252,7 +256,7 @@ def period(v: Invariants) -> Scalar:
 
 
 def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tuple[Triple, Six]:
-    """Π(t) and G = ∫₀ᵗ Π Πᵀ dt."""
+    """Return Π(t) and G = ∫₀ᵗ Π Πᵀ dt."""
     v = invariants(body, momentum)
     m = jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap))
     endless = is_endless(m)
@@ -288,13 +292,16 @@ def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
 
 
 def _scaled(f: Sigma) -> Sigma:
+    """Scale σ and T by one factor so that T₂₂ = 1 in value."""
     r = 1.0 / jax.lax.stop_gradient(f.t[1])
     return Sigma(f.s * r, _scale(f.t, r), f.y)
 
 
 def _scale(m: Six, r) -> Six:
+    """Multiply a symmetric matrix by a number."""
     return tuple(c * r for c in m)
 
 
 def _add_scalar(m: Six, r) -> Six:
+    """Add a number to the diagonal of a symmetric matrix."""
     return (m[0] + r, m[1] + r, m[2] + r, *m[3:])
