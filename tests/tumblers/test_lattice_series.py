@@ -16,7 +16,7 @@ LIGHT = tuple(jnp.asarray(v) for v in (T, Y / SIGMA, 1 / SIGMA))
 def test_its_misfit_is_that_of_dense_least_squares(order):
     pairs = np.array([[7.3, 4.1], [3.2, 9.9], [0.9, 17.2]])
     table = lattice_series.sums(LIGHT, 120.0)
-    found = lattice_series.misfits_of(table, pairs, order)
+    found = lattice_series.lattice_chi2(table, pairs, order)
     for pair, misfit in zip(pairs, found, strict=True):
         columns = [np.ones_like(T)]
         for j in range(3):
