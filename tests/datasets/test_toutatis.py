@@ -41,6 +41,7 @@ def test_periods_and_pole_are_the_published_ones(found):
 def test_every_start_that_reports_success_agrees(found):
     good = [s for s in found.starts if s.converged and s.fits]
     assert len(good) >= 3
+
     # Two vectors of a chart may stand for one body.
     def meaning(x):
         point = found.model.unpack(x)

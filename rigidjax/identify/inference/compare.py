@@ -14,7 +14,7 @@ from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, count_of
 from rigidjax.identify.model.charts import Known, places_of
-from rigidjax.identify.model.free import put
+from rigidjax.identify.model.free import with_steps
 from rigidjax.identify.model.index import index_of
 from rigidjax.identify.model.model import Model, with_parts
 from rigidjax.identify.model.terms import independent, template, whitened
@@ -147,7 +147,7 @@ def _with_shared(model: Model, of_others: Fit) -> Model:
         if slot.shared is not None and fitted.shared is not None:
             x = x.at[slot.shared].set(of_others.x[fitted.shared])
     record = stacking.one(model.records, 0)
-    scene = put(template(model, record), model.slots, model.index.rows(x)[0])
+    scene = with_steps(template(model, record), model.slots, model.index.rows(x)[0])
     sensors = jax.tree.map(lambda leaf: leaf[None] if eqx.is_array(leaf) else leaf, scene.sensors)
     own = [
         slot if slot.each else dataclasses.replace(slot, each=True, prior=slot.spread, spread=None)

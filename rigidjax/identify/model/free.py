@@ -268,7 +268,7 @@ def _tolerance_at(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
     return getattr(tolerance, TOLERANCES.get(path[2].name, ""), None)
 
 
-def put(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"]) -> Scene:
+def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"]) -> Scene:
     """Return the scene with its free numbers moved by the steps in the row of a recording."""
     paths = [slot.path for slot in slots]
     values = []
