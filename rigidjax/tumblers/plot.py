@@ -19,7 +19,7 @@ def light_curve(
     values: Float[ArrayLike, " values"],
     periods: float | Sequence[float] | Float[ArrayLike, " periods"] = (),
     *,
-    model: Float[ArrayLike, " times"] | None = None,
+    model: Float[ArrayLike, " predictions"] | None = None,
     quantity: str = "mag",
     time_unit: str = "h",
     title: str = "",

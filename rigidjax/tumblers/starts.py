@@ -87,7 +87,7 @@ def candidates(
     return out
 
 
-def _turns(side: np.ndarray, bisector: np.ndarray) -> list[tuple[np.ndarray, ...]]:
+def _turns(side: np.ndarray, bisector: np.ndarray) -> list[tuple[Any, ...]]:
     """Return the quaternions that turn the frame of the momentum to the world.
 
     n in the frame of the momentum is the leading eigenvector of the matrix with the six numbers

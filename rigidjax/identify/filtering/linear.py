@@ -126,6 +126,13 @@ class LinearEstimate(eqx.Module):
         return jnp.sqrt(jnp.sum(self.root**2, -1))
 
 
+# The number of axes of each part of a model. A part that changes from step to step, or from time to
+# time, has one more.
+_STEPS = {"transition": 2, "noise": 2, "push": 1}
+_AXES = _STEPS | {"matrix": 2, "deviation": 1, "offset": 1}
+Parts = dict[str, Any]
+
+
 Readings = Float[ArrayLike, "times k"] | Numbers
 Mean = Float[ArrayLike, " n"] | Numbers
 Root = Float[ArrayLike, "n n"] | Numbers
@@ -177,7 +184,7 @@ def linear_smooth(
 
 def _checked_arguments(
     model: LinearModel, readings: Readings, mean: Mean, root: Root, seen: Mask
-) -> tuple["Parts", Array, Array, Array, Array]:
+) -> tuple[Parts, Array, Array, Array, Array]:
     """Return the parts of the model, and the other arguments as checked arrays."""
     _checks.instance(model, LinearModel, "model")
     n, k = model.size, model.deviation.shape[-1]
@@ -202,14 +209,7 @@ def _checked_arguments(
     return parts, readings, mean, root, seen
 
 
-# The number of axes of each part of a model. A part that changes from step to step, or from time to
-# time, has one more.
-_STEPS = {"transition": 2, "noise": 2, "push": 1}
-_AXES = _STEPS | {"matrix": 2, "deviation": 1, "offset": 1}
-Parts = dict[str, Array | None]
-
-
-def _time_varying(parts: Parts) -> dict[str, Array]:
+def _time_varying(parts: Parts) -> Parts:
     """Return the parts that change from step to step, or from time to time."""
     return {n: part for n, part in parts.items() if part is not None and part.ndim > _AXES[n]}
 

@@ -41,7 +41,7 @@ def predicted_root(
     return triangular_root(jnp.concatenate([product(transition, root), noise], 1))
 
 
-def inverse_root(x: Array, least: ScalarLike = 0) -> Array:
+def inverse_root(x: Array, least: ScalarLike = 0.0) -> Array:
     """Return 1/√x where x is above `least`, else zero with zero derivatives."""
     there = x > least
     return jnp.where(there, 1 / jnp.sqrt(jnp.where(there, x, 1)), 0)

@@ -107,7 +107,7 @@ def _require_known(model: Model, motion: PyTree) -> None:
 
 def best_first_rate(
     model: Model,
-    body: Inertia | MassProperties | Mapping[str, Inertia | MassProperties],
+    body: Inertia | MassProperties | Mapping[str, Inertia | MassProperties] | None,
     omega: Vector,
     *,
     max_steps: int = 60,

@@ -145,7 +145,7 @@ def by_recording(rows: Float[Array, "records columns"], model: "Model", function
 
 
 @by_recording.def_jvp
-def _by_recording_jvp(primals: tuple, tangents: tuple) -> tuple[PyTree, PyTree]:
+def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
     """Return value and tangent of `by_recording`."""
     (rows, model, function), (step, *rest) = primals, tangents
     if jax.tree.leaves(rest):
