@@ -133,7 +133,7 @@ class Slot(eqx.Module):
 
     @property
     def columns(self) -> slice:
-        """The columns of the steps in the row of a recording."""
+        """Return the columns of the steps in the row of a recording."""
         return slice(self.column, self.column + int(np.prod(self.shape, dtype=int)))
 
     def move(self, start: Array, step: Array) -> Array:
