@@ -1,1 +1,1 @@
-"""The command line: `command` runs it, `spec` makes a model of its options, `logs` reads."""
+"""The command line: `command` runs it, `spec` makes a model of its options, `logs` reads logs."""

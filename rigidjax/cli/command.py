@@ -1,4 +1,4 @@
-"""`python -m rigidjax`: identify a body from recordings; compare methods."""
+"""The command `python -m rigidjax`, which identifies a body from logs, or compares methods."""
 
 import _thread
 import argparse
@@ -20,41 +20,41 @@ import rigidjax as rj
 from rigidjax import _checks
 from rigidjax.cli import spec
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.layouts import layout_of
+from rigidjax.cli.logs.layouts import imu_columns_of
 from rigidjax.cli.logs.units import TIME_UNITS, unit_in
 from rigidjax.workprecision import command as workprecision
 
-# The options that the demo uses as well; the others describe how to read logs.
-_OF_ALL = ("starts", "checkpoint", "figure", "report", "json", "no_cache")
-# The outputs, and the inputs that must not be overwritten.
-_OUT = ("checkpoint", "figure", "report", "json", "csv", "keep")
+# The options that the demo takes as well; the others describe how to read logs.
+_OF_DEMO = ("starts", "checkpoint", "figure", "report", "json", "no_cache")
+# The options that name a file to write: no two may be the same file, nor one of the logs.
+_OUTPUTS = ("checkpoint", "figure", "report", "json", "csv", "keep")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code.
+    """Run the command line and return its exit code.
 
-    0 success; 1 an untrustworthy fit; 2 bad input, or a file that could not be written; 130
-    interrupted.
+    The code is 0 for success, 1 for a fit that cannot be trusted, 2 for bad input or a file that
+    could not be written, 130 for an interrupt.
 
     **Arguments:** `arguments` those of the command line; `None` for the ones of this process. Only
-    then does the process belong to this command, and its compiled programs are kept for the next
-    run (`--no-cache`).
+    with `None` does the process belong to this command: its compiled programs are then kept for the
+    next run, unless `--no-cache` is given.
     """
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help()
         return 0
-    # A program of its own, not a library: the switch is ours to set here.
+    # A library must not change this setting; but this is a program, and the setting is its own.
     jax.config.update("jax_enable_x64", True)
     if options.command == "identify" and options.demo == bool(options.logs):
         parser.error("identify: give either log FILES or --demo")
     _check_files(options, parser)
     if arguments is None:
-        # A name that the terminal cannot show must not end a run.
+        # Escape characters of a file name that the terminal cannot show: they would end the run.
         for stream in (sys.stdout, sys.stderr):
             stream.reconfigure(errors="backslashreplace")  # pyright: ignore
-        sys.unraisablehook = _once_more
+        sys.unraisablehook = _raise_interrupt_again
     try:
         return _run(options, parser, own=arguments is None)
     except KeyboardInterrupt:
@@ -62,37 +62,41 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
 
 
-def _once_more(lost: Any) -> None:
-    """Raise Ctrl-C once more where Python drops it, as in JAX's callback of the collector."""
-    if lost.exc_type is KeyboardInterrupt:
-        # From another thread, and later: here it would be dropped again.
+def _raise_interrupt_again(dropped: Any) -> None:
+    """Raise a Ctrl-C again that Python dropped, as in JAX's callback of the garbage collector.
+
+    `dropped` holds the exception, as `sys.unraisablehook` gets it.
+    """
+    if dropped.exc_type is KeyboardInterrupt:
+        # Raise it from another thread, a moment later: within this hook it would be dropped again.
         threading.Timer(0.05, _thread.interrupt_main).start()
     else:
-        sys.__unraisablehook__(lost)
+        sys.__unraisablehook__(dropped)
 
 
 def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, own: bool) -> int:
+    """Run the command of the options and return its exit code; `own` if the process is its own."""
     if options.command == "workprecision":
         return workprecision.run(options)
     if options.demo:
         plain = vars(parser.parse_args(["identify", "--demo"]))
-        given = [name for name, value in vars(options).items() if value != plain[name]]
-        odd = sorted(set(given) - set(_OF_ALL))
-        if odd:
-            names = ", ".join("--" + name.replace("_", "-") for name in odd)
+        changed = [name for name, value in vars(options).items() if value != plain[name]]
+        unused = sorted(set(changed) - set(_OF_DEMO))
+        if unused:
+            names = ", ".join("--" + name.replace("_", "-") for name in unused)
             parser.error(f"identify --demo: {names} is for log FILES only")
     if own and options.no_cache:
         jax.config.update("jax_enable_compilation_cache", False)
     elif own:
-        _keep_compiled()
+        _keep_compiled_programs()
     return _demo(options) if options.demo else _logs(options)
 
 
 def _check_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """End with a message where a file cannot be written: now, not after the fit."""
+    """End the program with a message if a file could not be written after the fit."""
     figure = options.figure
     if figure is not None and figure.name and not figure.suffix.strip("."):
-        # As matplotlib does, so that its name is said.
+        # Matplotlib adds this ending: add it here, so that the message names the right file.
         options.figure = figure.with_name(figure.name.rstrip(".") + ".png")
     if figure is not None and not _matplotlib():
         parser.error("--figure: needs matplotlib: pip install 'rigidjax[view]'")
@@ -104,7 +108,7 @@ def _check_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -
     taken = {Path(path).resolve(): "FILE" for path in getattr(options, "logs", ())}
     if len(taken) < len(getattr(options, "logs", ())):
         parser.error("identify: a log is given twice; its readings would count twice")
-    for name in _OUT:
+    for name in _OUTPUTS:
         path = getattr(options, name, None)
         if path is None:
             continue
@@ -115,13 +119,13 @@ def _check_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -
             parser.error(f"--{name}: {path}: {why}")
 
 
-def _keep_compiled() -> None:
-    """Keep compiled programs in the user's cache folder: the next start takes seconds.
+def _keep_compiled_programs() -> None:
+    """Keep compiled programs in the user's cache folder, so that the next start takes seconds.
 
-    Not those of `workprecision`, which measures how long compiling takes.
+    Programs of `workprecision` are not kept: it measures how long they take to compile.
     """
     if jax.__version_info__ < (0, 12):
-        # XLA reports two flags of its own for each program that it loads, 2.6 kB a line, as errors.
+        # XLA reports two of its own flags as errors for each program that it loads, 2.6 kB a line.
         jax.config.update("jax_logging_level", "CRITICAL")
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
@@ -129,26 +133,26 @@ def _keep_compiled() -> None:
         folder = _cache_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         held = folder.stat()
-        # Programs loaded from there are run: nobody else may have put them there. On Windows a
-        # user's folder is the user's own already.
+        # Programs in the folder are run: make sure that nobody else can have put them there. On
+        # Windows a user's folder is the user's own already.
         if hasattr(os, "getuid"):
             if held.st_uid != os.getuid() or held.st_mode & 0o022:
-                told = "is not yours alone: it is not used, and starts are slower; delete it"
-                print(_checks.printable(f"{folder} {told}"), file=sys.stderr)
+                words = "is not yours alone: it is not used, and starts are slower; delete it"
+                print(_checks.printable(f"{folder} {words}"), file=sys.stderr)
                 return
             folder.chmod(0o700)
     except (OSError, RuntimeError):
-        # No home, or one that cannot be written to: a slower start, nothing else.
+        # Without a home that can be written to, the only loss is a slower start.
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def _cache_folder() -> Path:
-    """Return where this platform has a user's caches: XDG, macOS, Windows."""
-    given = os.environ.get("XDG_CACHE_HOME")
-    if given:
-        return Path(given) / "rigidjax"
+    """Return the cache folder of a user on this platform: XDG, macOS or Windows."""
+    xdg_folder = os.environ.get("XDG_CACHE_HOME")
+    if xdg_folder:
+        return Path(xdg_folder) / "rigidjax"
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or Path.home()) / "rigidjax"
     inside = "Library/Caches" if sys.platform == "darwin" else ".cache"
@@ -156,7 +160,10 @@ def _cache_folder() -> Path:
 
 
 class _Parser(argparse.ArgumentParser):
+    """A parser whose messages hold no control characters out of names."""
+
     def error(self, message: str) -> NoReturn:
+        """Print the message, made printable, and end the program with exit code 2."""
         super().error(_checks.printable(message))
 
 
@@ -222,6 +229,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def _parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser = _Parser(
         prog="python -m rigidjax",
         description="Differentiable rigid-body mechanics for JAX: identify inertia from data.",
@@ -247,30 +255,34 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _demo(options: argparse.Namespace) -> int:
+    """Run the demo, the fit of asteroid Toutatis; return the exit code."""
     from rigidjax.datasets import toutatis
 
     print("4179 Toutatis, 17 radar observations, 2 to 18 December 1992")
     print(f"data: {toutatis.CITATION}\n")
-    found = _fit(toutatis.model(), options, 16)
-    if found is None:
+    fit = _fit(toutatis.model(), options, 16)
+    if fit is None:
         return 2
-    more = toutatis.rows(found)
+    more = toutatis.rows(fit)
     print()
-    print(rj.identify.report.table(rj.identify.report.rows(found, "deg/day") + more))
-    print(f"\nrms of the attitudes: {toutatis.rms_degrees(found):.1f} deg")
-    print(toutatis.remarks(found))
-    print(rj.identify.report.verdict(found))
+    print(rj.identify.report.table(rj.identify.report.rows(fit, "deg/day") + more))
+    print(f"\nrms of the attitudes: {toutatis.rms_degrees(fit):.1f} deg")
+    print(toutatis.remarks(fit))
+    print(rj.identify.report.verdict(fit))
     title = "4179 Toutatis, December 1992"
     units = {"time_unit": "day", "rate_unit": "deg/day"}
-    return _write(found, options, title, [toutatis.CITATION], [title], units, more)
+    return _write(fit, options, title, [toutatis.CITATION], [title], units, more)
 
 
 def _channels(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Channel]:
-    """Return the sensors that the options describe."""
+    """Return the sensors that the options describe; `rates` are the names of the rate columns."""
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
         if alone:
-            raise LogError(f"--{alone[0]}: with --sensor, it stands in that itself")
+            raise LogError(
+                f"--{alone[0]}: not together with --sensor, which holds it itself, as in "
+                "--sensor gyro=wx,wy,wz:deg/s:0.1"
+            )
         return [spec.channel(text) for text in options.sensor]
     noise = None if options.noise is None else spec.noises(options.noise, "--noise")
     if options.limit is not None and not options.limit > 0:
@@ -278,20 +290,22 @@ def _channels(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Ch
     return [spec.Channel("gyro", tuple(rates), options.unit, noise, options.limit)]
 
 
-def _read(options: argparse.Namespace) -> tuple[list[Any], list[Any], rj.identify.Model]:
+def _read(
+    options: argparse.Namespace,
+) -> tuple[list[spec.Channel], list[rj.identify.Recording], rj.identify.Model]:
     """Return the sensors, the recordings, and the model that the options describe."""
     if options.columns and options.time:
-        raise LogError("--time: the first of --columns is it already")
+        raise LogError("--time: not together with --columns, whose first name is the time column")
     wheels = [spec.wheel(text) for text in options.wheel]
     if options.model in ("tensor", "principal") and not wheels:
         words = "free motion shows ratios only; a scale needs a --wheel"
         raise LogError(f"--model {options.model}: {words}")
     if "delay" in options.free and not wheels:
-        raise LogError("--free delay: that of a --wheel, and there is none")
+        raise LogError("--free delay: wanted a --wheel, whose delay it is, got none")
     how: dict[str, Any] = dict(window=options.window, wheels=wheels, free=options.free)
     records, of_first = [], None
     for path in options.logs:
-        time, *rates = options.columns or layout_of(path).columns
+        time, *rates = options.columns or imu_columns_of(path).columns
         time = options.time or time
         time_unit = spec.unit_of_time(path, time, options.time_unit)
         channels = [
@@ -307,7 +321,7 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], list[Any], rj.identif
 
 
 def _say_units(path: str, time: str, time_unit: str, channels: Sequence[spec.Channel]) -> None:
-    """Say which units were read from the names of columns."""
+    """Print the units that were read from the names of columns."""
     units = [("time", (time,), time_unit)] + [(one.kind, one.columns, one.unit) for one in channels]
     words = [f"{what} in {unit}" for what, names, unit in units if unit_in(names[0], [unit or ""])]
     if words:
@@ -316,7 +330,7 @@ def _say_units(path: str, time: str, time_unit: str, channels: Sequence[spec.Cha
 
 @contextlib.contextmanager
 def _log_warnings(strict: bool) -> Iterator[None]:
-    """Say warnings of logs in one line each, or raise the first of them where that is wanted."""
+    """Print each warning of a log in one line or, if `strict`, raise the first one."""
     with warnings.catch_warnings():
         warnings.simplefilter("error" if strict else "always", LogWarning)
         usual = warnings.showwarning
@@ -332,6 +346,7 @@ def _log_warnings(strict: bool) -> Iterator[None]:
 
 
 def _logs(options: argparse.Namespace) -> int:
+    """Fit the logs that the options name, and print the report; return the exit code."""
     try:
         with _log_warnings(options.strict):
             channels, records, model = _read(options)
@@ -341,29 +356,34 @@ def _logs(options: argparse.Namespace) -> int:
         return _error(f"{warning} (--strict)")
     for path, record in zip(options.logs, records, strict=True):
         gaps = sum(int((~reading.seen).sum()) for reading in record.readings) + record.dropped
-        told = f", {gaps} gap{'s' if gaps > 1 else ''}" if gaps else ""
+        words = f", {gaps} gap{'s' if gaps > 1 else ''}" if gaps else ""
         count, span = record.t.shape[0] + record.dropped, record.t[-1] - record.t[0]
-        _say(f"{path}: {count} samples over {span:.4g} s{told}")
+        _say(f"{path}: {count} samples over {span:.4g} s{words}")
     print()
-    found = _fit(model, options, 8)
-    if found is None:
+    fit = _fit(model, options, 8)
+    if fit is None:
         return 2
     rate_unit = next((c.unit for c in channels if c.kind == "gyro" and c.unit != "rpm"), "rad/s")
     print()
-    print(rj.identify.report.table(rj.identify.report.rows(found, rate_unit)))
-    for sensor, rms in zip(model.records.sensors, found.rms, strict=True):
+    print(rj.identify.report.table(rj.identify.report.rows(fit, rate_unit)))
+    for sensor, rms in zip(model.records.sensors, fit.rms, strict=True):
         scale = 180 / 3.141592653589793 if sensor.unit == "rad/s" and rate_unit == "deg/s" else 1.0
         unit = rate_unit if sensor.unit == "rad/s" else sensor.unit
         print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
     print()
-    print(rj.identify.report.verdict(found))
+    print(rj.identify.report.verdict(fit))
     names = [_checks.printable(Path(path).name) for path in options.logs]
     title = f"Identification of {', '.join(names[:3])}{' …' if names[3:] else ''}"
-    return _write(found, options, title, names, names, {"rate_unit": rate_unit})
+    return _write(fit, options, title, names, names, {"rate_unit": rate_unit})
 
 
-def _fit(model: rj.identify.Model, options: argparse.Namespace, starts: int) -> Any:
-    """Return the fit, or `None` after an error message."""
+def _fit(
+    model: rj.identify.Model, options: argparse.Namespace, starts: int
+) -> rj.identify.Fit | None:
+    """Return the fit from `starts` starts unless the options say another number.
+
+    Return `None` after an error, which is printed.
+    """
     try:
         return rj.identify.fit(
             model,
@@ -377,7 +397,7 @@ def _fit(model: rj.identify.Model, options: argparse.Namespace, starts: int) -> 
 
 
 def _write(
-    found: Any,
+    fit: rj.identify.Fit,
     options: argparse.Namespace,
     title: str,
     read: list[str],
@@ -385,46 +405,53 @@ def _write(
     units: dict[str, str],
     more: Sequence[tuple[str, float, float, float, str]] = (),
 ) -> int:
-    """Write the outputs that the options ask for, each separately; return the exit code."""
+    """Write the outputs that the options ask for, and return the exit code.
+
+    An output that fails is reported, and the others are still written.
+
+    **Arguments:** `fit`; `options`; `title` of the report; `read` the files that were read; `names`
+    of the recordings; `units` of rates and times; `more` rows of further quantities.
+    """
     report, figure = rj.identify.report, options.figure
     if options.demo and figure is None and _matplotlib():
         figure = Path("toutatis.png")
 
     def page() -> None:
-        figures = _figures(found, names, units) if figure is not None or _matplotlib() else []
+        figures = _figures(fit, names, units) if figure is not None or _matplotlib() else []
         page: dict[str, Any] = {"title": title, "figures": figures, "files": read, "more": more}
-        report.write_html(found, options.report, rate_unit=units["rate_unit"], **page)
+        report.write_html(fit, options.report, rate_unit=units["rate_unit"], **page)
 
-    def drawn() -> None:
-        rj.plot.fit(found, index=0, title=names[0], **units).savefig(figure, dpi=130)
+    def picture() -> None:
+        rj.plot.fit(fit, index=0, title=names[0], **units).savefig(figure, dpi=130)
 
-    numbers = functools.partial(report.write_json, found, options.json, read, more)
+    numbers = functools.partial(report.write_json, fit, options.json, read, more)
     wanted = (
-        ("figure", figure, drawn), ("numbers", options.json, numbers),
+        ("figure", figure, picture), ("numbers", options.json, numbers),
         ("report", options.report, page),
     )  # fmt: skip
-    kept = True
+    all_written = True
     for what, path, make in wanted:
         try:
             if path is not None:
                 make()
                 _say(f"{what}: {path}")
         except Exception as error:
-            # Nothing else is lost.
+            # A fit of an hour must not be lost to one output.
             _error(f"no {what}: {path}: {type(error).__name__}: {error}")
-            kept = False
-    if "interrupted" in found.status:
+            all_written = False
+    if "interrupted" in fit.status:
         _error("interrupted (Ctrl-C): not all starts were made, see the status")
         return 130
-    return 2 if not kept else 0 if found.ok else 1
+    return 2 if not all_written else 0 if fit.ok else 1
 
 
-def _figures(found: Any, names: list[str], units: dict[str, str]) -> list[Any]:
-    figures, fit = [], functools.partial(rj.plot.fit, found, **units)
-    logs = [functools.partial(fit, index=i, title=name) for i, name in enumerate(names[:12])]
+def _figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str]) -> list[Any]:
+    """Return the figures of a report, without those that cannot be drawn."""
+    figures, plot = [], functools.partial(rj.plot.fit, fit, **units)
+    logs = [functools.partial(plot, index=i, title=name) for i, name in enumerate(names[:12])]
     time_unit = units.get("time_unit", "s")
-    left_over = functools.partial(rj.plot.residuals, found, time_unit=time_unit)
-    for make in (*logs, left_over, functools.partial(rj.plot.inertia_ellipsoid, found)):
+    residuals = functools.partial(rj.plot.residuals, fit, time_unit=time_unit)
+    for make in (*logs, residuals, functools.partial(rj.plot.inertia_ellipsoid, fit)):
         try:
             drawn = make()
             figures.append(drawn.flat[0].figure if isinstance(drawn, np.ndarray) else drawn)
@@ -434,7 +461,7 @@ def _figures(found: Any, names: list[str], units: dict[str, str]) -> list[Any]:
 
 
 def _matplotlib() -> bool:
-    """Whether figures can be drawn; without a window."""
+    """Return whether figures can be drawn, and choose a backend without windows."""
     try:
         import matplotlib
     except ModuleNotFoundError:
@@ -445,14 +472,16 @@ def _matplotlib() -> bool:
 
 
 def _say(line: str) -> None:
+    """Print a line, made printable."""
     try:
         print(_checks.printable(line), flush=True)
     except OSError:
-        # The reader has stopped, as `head` does, or a disk is full: files are still to be written.
+        # The reader has stopped, as `head` does, or a disk is full. Go on without output: the files
+        # are still to be written.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _error(what: object) -> int:
-    """Print the error in one line; **returns** the exit code 2."""
+    """Print the error `what` in one line, and return the exit code 2."""
     print(f"error: {_checks.printable(what)}", file=sys.stderr)
     return 2

@@ -1,4 +1,4 @@
-"""From a description in words, as the command line gives it, to recordings and a model."""
+"""The recordings and the model that the words of the command line describe."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ from rigidjax.motion.torques import Damping, Flywheel, Input, Series, Sum, Wheel
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation import euler
 
-# Of the typical size of a moment, kg m².
+# The charts of the body by their words; each is made from the typical size of a moment, kg m².
 MODELS: dict[str, Callable[[float], charts.AbstractBodyChart]] = {
     "ratios": lambda _: charts.Ratios(),
     "principal-ratios": lambda _: charts.PrincipalRatios(),
@@ -35,7 +35,7 @@ MODELS: dict[str, Callable[[float], charts.AbstractBodyChart]] = {
     "principal": charts.Principal,
 }
 LOSSES = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}
-# The units of each kind of sensor, the usual one first; angles have those of "euler".
+# The units of each kind of sensor, the usual one first; "euler" stands for all its sequences.
 SENSOR_UNITS = {
     "gyro": ("rad/s", "deg/s", "rpm"),
     "accelerometer": ("m/s2", "g"),
@@ -47,9 +47,11 @@ _WHEEL_UNITS = ("rad/s", "rpm")
 
 
 class Channel(eqx.Module):
-    """One sensor of a log; noise (of each axis) and full scale in its unit.
+    """One sensor of a log.
 
-    `unit` is `None` where the names of the columns, or else what is usual, shall decide.
+    **Fields:** `kind` of the sensor; `columns` their names; `unit` of the readings, `None` if the
+    names of the columns decide, or else the usual unit; `noise` of each axis and full scale
+    `limit`, in this unit, or `None`.
     """
 
     kind: str
@@ -60,7 +62,10 @@ class Channel(eqx.Module):
 
 
 class WheelColumn(eqx.Module):
-    """A wheel whose speed was logged: column, unit (as in `Channel`), inertia (kg m²), axis."""
+    """A wheel whose speed was logged.
+
+    **Fields:** `column` of the speed; `unit` as in `Channel`; `inertia`, kg m²; `axis` (3,).
+    """
 
     column: str
     unit: str | None
@@ -100,13 +105,16 @@ def channel(text: str) -> Channel:
 
 
 def _units_of_kind(kind: str) -> tuple[str, ...]:
-    """Return the units of a kind of sensor, none for what is no kind."""
+    """Return the units of a kind of sensor; none for a word that is no kind."""
     key = "euler" if kind.startswith("euler-") else kind
     return () if kind == "euler" else SENSOR_UNITS.get(key, ())
 
 
 def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
-    """Return the noise of three axes, from one positive number or three; `LogError` for others."""
+    """Return the noise of three axes, from one positive number or three.
+
+    Raise `LogError` for others; the message begins with `where`.
+    """
     if len(noise) not in (1, 3):
         raise LogError(f"{where}: wanted one noise or three, got {len(noise)}")
     if not all(0 < part < np.inf for part in noise):
@@ -144,45 +152,49 @@ def read_log(
     free: Sequence[str] = (),
     flight: int | None = None,
 ) -> Recording:
-    """Return one recording from a file, with the described sensors; wheel speeds are its inputs.
+    """Return the recording in a file, with the described sensors.
 
-    Its times are counted from the first stamp of the log. An empty cell is a gap.
+    Its times are counted from the first time stamp of the log. An empty cell is a gap.
 
     **Arguments:**
 
-    - `path`: the file; `flight` as in `read_table`;
-    - `channels`, `wheels`: what to read; speeds become inputs, by the names of `input_names`;
-    - `time`, `time_unit`: the time column; its name says the unit if that is `None`, else it is s;
-    - `window`: (from, to), s from the first stamp, or `None` for all;
-    - `free`: some of `bias`, `drag`, `delay`: for `bias` the sensors get one, which a fit can move.
+    - `path`: of the file.
+    - `channels`: the sensors.
+    - `time`: the name of the time column.
+    - `time_unit`: its unit; `None` takes the one in its name, else s.
+    - `window`: (from, to), s from the first time stamp, or `None` for all.
+    - `wheels`: whose speeds become inputs of the recording, by the names of `input_names`.
+    - `free`: some of `bias`, `drag`, `delay`; for `bias` the sensors get a bias, which a fit can
+      move.
+    - `flight`: as in `read_table`.
 
     It **warns** as `read_table`, of rows that are left out because their times do not increase, and
     of times that are plainly in another unit. **Raises** `LogError` as `read_table`, and for rates
     that are all zero.
     """
     unit = unit_of_time(path, time, time_unit)
-    # Two wheels may share a column of their speed.
+    # Two wheels may have their speed in the same column.
     turning = dict.fromkeys(w.column for w in wheels)
     names = [time, *(c for one in channels for c in one.columns), *turning]
     table = read_table(path, names, flight=flight)
-    # Seconds since 1970, or nanoseconds, leave few digits for a step.
+    # Count from the first stamp: seconds since 1970, or nanoseconds, leave few digits for a step.
     t = (table[time] - _first(table[time])) * UNITS[unit]
     kept = kept_rows(path, t, time, window)
-    # A large log is not to be copied.
+    # A slice makes no copy of a large log.
     kept = slice(None) if kept.size == t.size else kept
     readings, rate = [], 0.0
     for one in channels:
         values = np.stack([table[name] for name in one.columns], axis=1)
         factor = UNITS[unit_of_channel(path, one)]
         values *= factor
-        seen = np.isfinite(values).all(axis=1)
+        mask = np.isfinite(values).all(axis=1)
         if one.kind == "gyro":
-            rate = _typical_rate(path, one, values[kept][seen[kept]])
+            rate = _typical_rate(path, one, values[kept][mask[kept]])
         sensor, values = _sensor(one, values, factor, "bias" in free)
-        readings.append((sensor, values[kept], seen[kept]))
+        readings.append((sensor, values[kept], mask[kept]))
     remark_on_step(path, t[kept], unit, rate)
     inputs = _speeds(path, t, table, wheels)
-    # A large log is not to be held twice.
+    # Free the memory of a large log before the recording copies its columns.
     del table
     try:
         return Recording(t[kept], *readings, inputs=inputs)
@@ -191,33 +203,34 @@ def read_log(
 
 
 def _first(t: np.ndarray) -> float:
-    """Return the first time that there is, or zero."""
+    """Return the first time that is not missing, or zero."""
     finite = np.isfinite(t)
     return float(t[np.argmax(finite)]) if finite.any() else 0.0
 
 
 def unit_of_channel(path: str | Path, one: Channel) -> str:
-    """Return the unit that a channel states, its columns name, or that is usual in such a log."""
+    """Return the unit of a channel: its own, that in the names of its columns, or the usual one."""
     allowed = _units_of_kind(one.kind)
     usual = usual_unit(path, one.columns[0]) or allowed[0]
     return unit_of(one.columns, one.unit, usual, allowed, str(path))
 
 
 def unit_of_time(path: str | Path, column: str, stated: str | None) -> str:
-    """Return the unit of times that is stated, that their column names, or that is usual."""
+    """Return the unit of times: the `stated` one, that in the column's name, or the usual one."""
     usual = usual_unit(path, column) or "s"
     return unit_of([column], stated, usual, TIME_UNITS, str(path))
 
 
 def _typical_rate(path: str | Path, one: Channel, rates: np.ndarray) -> float:
-    """Return the median magnitude of rates (n, 3), rad/s; `LogError` if there is none but zero."""
+    """Return the median length of rates (n, 3), rad/s; raise `LogError` if all are zero."""
     names = ", ".join(one.columns)
     if not rates.size:
         raise LogError(f"{path}: no row has a rate in each of the columns {names}")
     if not rates.any():
         raise LogError(
             f"{path}: the rates ({names}) are all zero: a body at rest shows nothing of its "
-            "inertia, or the sensor was off; other columns by --columns, another part by --window"
+            "inertia, or the sensor was off; choose other columns by --columns, another part by "
+            "--window"
         )
     return float(np.median(np.linalg.norm(rates, axis=1)))
 
@@ -225,7 +238,11 @@ def _typical_rate(path: str | Path, one: Channel, rates: np.ndarray) -> float:
 def _sensor(
     one: Channel, values: np.ndarray, factor: float, bias: bool
 ) -> tuple[AbstractSensor, np.ndarray]:
-    """Return the sensor of a channel, whose unit has this factor to SI, and its readings."""
+    """Return the sensor of a channel, and its readings.
+
+    **Arguments:** `values` in SI; `factor` from the unit of the channel to SI; `bias` whether the
+    sensor gets one.
+    """
     zero = [0.0, 0.0, 0.0] if bias else None
     noise = None if one.noise is None else factor * np.array(one.noise)
     limit = None if one.limit is None else one.limit * factor
@@ -248,16 +265,15 @@ def input_names(wheels: Sequence[WheelColumn]) -> list[str]:
 
 
 def _evenly_spaced(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return samples (n,) at even times, with those interpolated whose rows are left out.
+    """Return an even series of samples (n,), in which missing rows are interpolated.
 
-    Times that are not those of an even series, rounded to a thousandth of a step, are returned as
-    they are.
+    Times that are not even to a thousandth of a step are returned unchanged.
     """
     step = np.median(np.diff(t)) if t.size > 1 else np.nan
     place = (t - t[:1]) / step
     if not np.isfinite(step) or place[-1] > 10 * t.size:
         return t, values
-    # A better step than that of two rounded times.
+    # The mean step over the series is more exact than the difference of two rounded times.
     step *= place[-1] / np.round(place[-1])
     place = (t - t[0]) / step
     if np.abs(place - np.round(place)).max() > 1e-3:
@@ -271,7 +287,7 @@ def _speeds(
 ) -> dict[str, Series]:
     """Return the logged speed of each wheel by the name of its input, rad/s."""
     speeds = {}
-    # A speed counts outside the window, too: before a reading and after it.
+    # Keep speeds outside of the window, too: a delayed speed is from before a reading.
     kept = increasing(t) if wheels else slice(None)
     for name, one in zip(input_names(wheels), wheels, strict=True):
         unit = unit_of([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
@@ -284,7 +300,10 @@ def _speeds(
 
 
 def _torque(wheels: Sequence[WheelColumn], free: Sequence[str]) -> Torque | None:
-    """Return the torque of the wheels, and of a linear drag if that is free; `None` for neither."""
+    """Return the torque of the wheels and, if `free` holds "drag", of a linear drag.
+
+    Return `None` without either.
+    """
     delay = 0.0 if "delay" in free else None
     parts: list[Torque] = [
         Flywheel(Wheel(one.inertia, one.axis, Input(name), delay=delay))
@@ -304,11 +323,19 @@ def model_of(
     free: Sequence[str] = (),
     loss: str = "soft-l1",
 ) -> Model:
-    """Return the model of recordings of `read_log`: a drag for all, bias and delay for each.
+    """Return the model of recordings from `read_log`.
 
-    **Arguments:** `recordings`; `chart` one of `MODELS`, the word of the option `--model`;
-    `typical` the typical size of a moment, kg m²; `wheels`, `free` as `read_log` had them; `loss`
-    one of `LOSSES`. **Raises** `LogError` for another word.
+    All recordings share one drag; each has its own bias and delay.
+
+    **Arguments:**
+
+    - `recordings`: of one body.
+    - `chart`: one of `MODELS`, the word of the option `--model`.
+    - `typical`: the typical size of a moment, kg m².
+    - `wheels`, `free`: as for `read_log`.
+    - `loss`: one of `LOSSES`.
+
+    **Raises** `LogError` for another word.
     """
     if chart not in MODELS:
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {chart!r}")
@@ -327,7 +354,10 @@ def model_of(
 def _free(
     sensors: Sequence[AbstractSensor], wheels: Sequence[str], typical: float, free: Sequence[str]
 ) -> list[Free]:
-    """Return the `Free`s of the sensors and of the torque that `_torque` makes of these wheels."""
+    """Return the `Free`s of the sensors and of the torque of `_torque`.
+
+    `wheels` are the names of the inputs of the wheels.
+    """
 
     def of_sensor(index: int, name: str) -> Callable[[Scene], Any]:
         return lambda scene: getattr(scene.sensors[index], name)

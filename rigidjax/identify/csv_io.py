@@ -1,3 +1,3 @@
-"""Give `read_table` its former name, `identify.csv_io.read_table`."""
+"""The former place of `read_table`, kept for programs that import `identify.csv_io.read_table`."""
 
 from rigidjax.cli.logs.table import read_table as read_table

@@ -13,23 +13,26 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax._names import show
-from rigidjax.identify.answer.result import Fit, one_fit
+from rigidjax.identify.answer.result import Fit, require_one_fit
 
 _UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
 Row = tuple[str, float, float, float, str]
 
 
 def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
-    """All results as rows (name, value, low, high, unit), 95 % intervals.
+    """Return all results as rows (name, value, low, high, unit) with their 95 % intervals.
 
-    **Arguments:** `fit`; `rate_unit` of the initial body rate: `rad/s`, `deg/s`, `deg/day`.
+    **Arguments:**
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
-    >>> name, value, low, high, unit = rows(found)[0]
+    - `fit`: a result of `rigidjax.identify.fit`.
+    - `rate_unit`: the unit of the initial body rate: `rad/s`, `deg/s` or `deg/day`.
+
+    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> name, value, low, high, unit = rows(result)[0]
     >>> name, round(value, 1), low < value < high
     ('Ix/Iz', 3.1, True)
     """
-    one_fit(fit)
+    require_one_fit(fit)
     scale = _UNITS[_checks.word(rate_unit, tuple(_UNITS), "rate_unit")]
     bounds = fit.interval(0.95)
     out: list[Row] = []
@@ -45,9 +48,9 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
 
 
 def table(lines: list[Row]) -> str:
-    """Rows as text, rounded by their intervals.
+    """Return rows as a table of text, each number rounded by its interval.
 
-    **Arguments:** `lines` rows of (name, value, low, high, unit), such as `rows` gives; not none.
+    **Arguments:** `lines` one or more rows (name, value, low, high, unit), such as `rows` returns.
 
     >>> print(table([("I1", 1.23456, 1.2, 1.27, "kg m²")]))
                  value  95 % interval
@@ -67,7 +70,7 @@ def table(lines: list[Row]) -> str:
 
 
 def numbers(value: float, low: float, high: float) -> list[str]:
-    """Value, low and high as text, rounded by the interval.
+    """Return value, low and high as text, rounded by the interval.
 
     **Arguments:** `value`; `low` and `high`, the ends of its interval, in the same unit.
 
@@ -85,7 +88,7 @@ def numbers(value: float, low: float, high: float) -> list[str]:
         if not np.isfinite(number):
             return str(number)
         top = _place(size if fixed else number)
-        # Two digits more than the first one of the uncertainty; six in all without an uncertainty.
+        # Show two digits after the first one of the uncertainty, or six digits without one.
         last = _place(2 * min(gap, 8e307)) - 2 if 0 < gap < np.inf else top - 5
         last = min(max(last, top - 12), top - 2)
         return f"{number:.{max(-last, 0)}f}" if fixed else f"{number:.{top - last}e}"
@@ -95,25 +98,25 @@ def numbers(value: float, low: float, high: float) -> list[str]:
 
 
 def _place(number: float) -> int:
-    """The power of ten of the first digit."""
+    """Return the power of ten of the first digit."""
     return int(np.floor(np.log10(abs(number)))) if number else 0
 
 
 def _between(shown: list[str]) -> str:
-    """The interval by `numbers`, in words if there is none."""
+    """Return the interval as text from the result of `numbers`: "not determined" for NaN."""
     return "not determined" if "nan" in shown[1:] else f"{shown[1]} … {shown[2]}"
 
 
 def verdict(fit: Fit) -> str:
-    """The well and the weakly determined quantities, and the agreement of the starts, in words.
+    """Return the answers, the advice, and how well the data determine each quantity, in words.
 
     **Arguments:** `fit` a result of `rigidjax.identify.fit`.
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
-    >>> verdict(found).splitlines()[0]
+    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> verdict(result).splitlines()[0]
     'status: ok'
     """
-    one_fit(fit)
+    require_one_fit(fit)
     good = [start for start in fit.starts if start.converged and start.fits]
     lines = ["status: ok"] if fit.ok else [f"search: {fit.search}", f"model: {fit.explanation}"]
     lines += [str(cause) for cause in fit.causes] + [fit.advice]
@@ -130,22 +133,25 @@ def verdict(fit: Fit) -> str:
 
 
 def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> dict[str, Any]:
-    """All results as plain numbers and text, for JSON; infinity and NaN become `null`.
+    """Return all results as plain numbers and text, for JSON; infinity and NaN become `null`.
 
-    **Arguments:** `fit`; `files` the names of the files that were read; `more` rows of further
-    quantities.
+    **Arguments:**
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
-    >>> as_dict(found)["status"]
+    - `fit`: a result of `rigidjax.identify.fit`.
+    - `files`: the names of the files that were read.
+    - `more`: rows of further quantities, in the form of `rows`.
+
+    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> as_dict(result)["status"]
     'ok'
     """
 
     def plain(number: float) -> float | None:
         return float(number) if np.isfinite(number) else None
 
-    one_fit(fit)
+    require_one_fit(fit)
     bounds = fit.interval(0.95)
-    found = [(one.name, one.value, *bounds[one.name], one.unit) for one in fit.quantities]
+    reported = [(one.name, one.value, *bounds[one.name], one.unit) for one in fit.quantities]
     return {
         "files": list(files),
         "status": fit.status,
@@ -155,7 +161,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
         "advice": fit.advice,
         "quantities": {
             name: {"value": plain(value), "interval_95": [plain(low), plain(high)], "unit": unit}
-            for name, value, low, high, unit in (*found, *more)
+            for name, value, low, high, unit in (*reported, *more)
         },
         "rms": {
             f"{index} {name}": {"value": plain(rms), "axes": list(map(plain, axes)), "unit": unit}
@@ -192,7 +198,10 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
 
 
 def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
-    """Name, rms of each component without readings at full scale, and unit of sensors."""
+    """Return name, rms error of each component, and unit of each sensor.
+
+    Readings at full scale are left out.
+    """
     out = []
     for error, reading in zip(fit.residuals, fit.model.records.readings, strict=True):
         kept = reading.kept
@@ -206,19 +215,20 @@ def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
 def write_json(
     fit: Fit, path: str | Path, files: Sequence[str] = (), more: Sequence[Row] = ()
 ) -> None:
-    """All results as JSON in a file: `as_dict`, written to `path`.
+    """Write all results as JSON to a file: those of `as_dict`.
 
-    **Arguments:** `fit`; `path` of the file, written over; `files` and `more` as for `as_dict`.
+    **Arguments:** `fit`; `path` of the file, which is overwritten; `files` and `more` as for
+    `as_dict`.
 
     >>> import json, tempfile
-    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_json(found, folder + "/fit.json")
+    ...     write_json(result, folder + "/fit.json")
     ...     json.loads(Path(folder, "fit.json").read_text())["status"]
     'ok'
     """
     text = json.dumps(as_dict(fit, files, more), indent=2, ensure_ascii=False, allow_nan=False)
-    # Bytes of a file's name that are no character are written as JSON escapes.
+    # A file name may hold bytes that are no character: write them as escapes, do not fail.
     Path(path).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
@@ -232,20 +242,26 @@ def write_html(
     files: Sequence[str] = (),
     more: Sequence[Row] = (),
 ) -> None:
-    """A self-contained page: status, table, words, errors, starts, figures.
+    """Write a page of HTML without other files: status, table, words, errors, starts, figures.
 
-    **Arguments:** `fit`; `path`; `title`; `figures` of matplotlib, such as those of
-    `rigidjax.plot.fit`; `rate_unit` as for `rows`; `files` the names of the files that were
-    read; `more` rows of further quantities.
+    **Arguments:**
+
+    - `fit`: a result of `rigidjax.identify.fit`.
+    - `path`: of the file, which is overwritten.
+    - `title`: of the page.
+    - `figures`: figures of matplotlib, such as those of `rigidjax.plot.fit`.
+    - `rate_unit`: as for `rows`.
+    - `files`: the names of the files that were read.
+    - `more`: rows of further quantities, in the form of `rows`.
 
     >>> import tempfile
-    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_html(found, folder + "/fit.html")
+    ...     write_html(result, folder + "/fit.html")
     ...     Path(folder, "fit.html").read_text(encoding="utf-8")[:15].lower()
     '<!doctype html>'
     """
-    one_fit(fit)
+    require_one_fit(fit)
     sizes = _cells(
         (name, " ".join(f"{x:.3g}" for x in axes), unit) for name, axes, unit in _rms_of_axes(fit)
     )
@@ -285,12 +301,12 @@ img {{ max-width: 100%; margin: 1rem 0 }}
 
 
 def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str:
-    """Status, table and words as HTML, for a page or a notebook.
+    """Return status, table and words as HTML, for a page or a notebook.
 
     **Arguments:** `fit`; `rate_unit` as for `rows`; `more` rows of further quantities.
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
-    >>> as_html(found).startswith("<p") and "Ix/Iz" in as_html(found)
+    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> as_html(result).startswith("<p") and "Ix/Iz" in as_html(result)
     True
     """
     lines = _cells(
@@ -307,7 +323,7 @@ def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str
 
 
 def _cells(lines: Iterable[tuple[str, ...]]) -> str:
-    """Lines of a table."""
+    """Return the lines of a table as HTML."""
     cells = ("".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in lines)
     return "".join(f"<tr>{line}</tr>" for line in cells)
 

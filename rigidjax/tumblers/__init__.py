@@ -1,4 +1,4 @@
-"""Tumbling bodies as points of light: brightness, light curves, and a body from one light curve."""
+"""Tumbling bodies as points of light: their brightness, and a body from one light curve."""
 
 from rigidjax._names import show
 from rigidjax.tumblers import brightness as brightness, plot as plot

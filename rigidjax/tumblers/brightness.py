@@ -26,13 +26,21 @@ from rigidjax.tumblers.scattering import (
 def ellipsoid(
     semi_axes: Vector, sun: Vector, observer: Vector, scattering: AbstractScattering | None = None
 ) -> Scalar:
-    """Brightness of a triaxial ellipsoid, m²: for a sphere at zero phase π r².
+    """Return the brightness of a triaxial ellipsoid, m²; π r² for a sphere at zero phase.
 
-    **Arguments:** `semi_axes` (3,) along x, y, z, m; `sun`, `observer` (3,) directions from the
-    body to them, body frame, any length; `scattering` the law: `LommelSeeliger()` (also for
-    `None`), `Geometric()`, `Lambert()`. It is differentiable in all numbers, also at zero phase and
-    for a sphere. For many directions use `jax.vmap`. **Raises:** `ValueError` for a semi-axis that
-    is not positive, a direction of length zero, NaN (`equinox` error under `jit`).
+    It is differentiable in all numbers, also at zero phase and for a sphere. For many directions
+    use `jax.vmap`.
+
+    **Arguments:**
+
+    - `semi_axes`: (3,) along x, y, z, m.
+    - `sun`, `observer`: (3,) directions from the body to sun and observer, body frame, of any
+      length.
+    - `scattering`: the scattering law, `LommelSeeliger()` (also for `None`), `Geometric()` or
+      `Lambert()`.
+
+    **Raises:** `ValueError` for a semi-axis that is not positive, a direction of length zero, NaN
+    (`equinox` error under `jit`).
 
     >>> round(float(ellipsoid([3.0, 2.0, 1.0], [0, 0, 1.0], [0, 0, 1.0])) / jnp.pi, 12)
     6.0
@@ -41,7 +49,7 @@ def ellipsoid(
     a = _checks.floating(semi_axes, (3,), "semi_axes", unit="m")
     a = _checks.sign(a, "semi_axes", "three positive lengths, m")
     s, o = direction(sun, "sun").astype(a.dtype), direction(observer, "observer").astype(a.dtype)
-    # The fourth power of the axes is taken: a power of two keeps it in range.
+    # The fourth power of the axes would overflow: scale them by a power of two.
     size = exponent_of(a)
     a = times_power_of_two(a, -size)
     return times_power_of_two(law.of_ellipsoid(jnp.diag(a * a), s, o), 2 * size)
@@ -54,13 +62,15 @@ def mesh(
     observer: Vector,
     scattering: AbstractScattering | None = None,
 ) -> Scalar:
-    """Brightness of a convex body by its faces, m²: `Σ f(μ₀, μ) area` of the lit and visible ones.
+    """Return the brightness of a convex body, m²: `Σ f(μ₀, μ) area` over lit and visible faces.
 
-    For another body it is the brightness without shadows. **Arguments:** `vertices`, `faces` as for
-    `rigidjax.shapes.mesh`; the others as for `ellipsoid`. It is differentiable in the vertices and
-    directions: a face at the edge of the light has the derivative of a dark one. Source:
-    Kaasalainen and Torppa 2001, Icarus 153:24, doi:10.1006/icar.2001.6673. **Raises:** as
-    `ellipsoid`, and as `rigidjax.shapes.mesh` for faces.
+    For a body that is not convex it is the brightness without shadows. It is differentiable in the
+    vertices and directions; a face at the edge of the light has the derivative of a dark one.
+    Source: Kaasalainen and Torppa 2001, Icarus 153:24, doi:10.1006/icar.2001.6673.
+
+    **Arguments:** `vertices`, `faces` as for `rigidjax.shapes.mesh`; `sun`, `observer` and
+    `scattering` as for `ellipsoid`. **Raises:** as `ellipsoid`, and as `rigidjax.shapes.mesh` for
+    faces.
 
     >>> corners = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     >>> sides = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
@@ -76,13 +86,13 @@ def mesh(
     o = direction(observer, "observer").astype(corners.dtype)
     first, second, third = (corners[table[:, k]] for k in range(3))
     double = jnp.cross(second - first, third - first)
-    lit, seen = (double * s[None, :]).sum(axis=1), (double * o[None, :]).sum(axis=1)
+    to_sun, to_observer = (double * s[None, :]).sum(axis=1), (double * o[None, :]).sum(axis=1)
     size = (double * double).sum(axis=1)
-    both = (lit > 0) & (seen > 0) & (size > 0)
-    # Dark faces must not reach the derivative.
-    length = jnp.sqrt(jnp.where(both, size, 1.0))
-    sent = law.per_area(*(jnp.where(both, cosine, length) / length for cosine in (lit, seen)))
-    return jnp.where(both, 0.5 * length * sent, 0.0).sum()
+    bright = (to_sun > 0) & (to_observer > 0) & (size > 0)
+    # Give dark faces harmless numbers: the root of a size of zero would make derivatives NaN.
+    length = jnp.sqrt(jnp.where(bright, size, 1.0))
+    cosines = (jnp.where(bright, one, length) / length for one in (to_sun, to_observer))
+    return jnp.where(bright, 0.5 * length * law.per_area(*cosines), 0.0).sum()
 
 
 __all__ = ["AbstractScattering", "Geometric", "Lambert", "LommelSeeliger", "ellipsoid", "mesh"]

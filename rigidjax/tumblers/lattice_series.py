@@ -1,4 +1,8 @@
-"""χ² of a Fourier series in two frequencies, for very many pairs, from a table of sums."""
+"""χ² of Fourier series in two frequencies, for very many pairs, from a table of sums.
+
+The normal equations of a series contain nothing but sums over times at multiples of the two
+frequencies. These are interpolated in a table: a pair then costs no loop over the readings.
+"""
 
 import functools
 import math
@@ -9,21 +13,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-# Multiples of the first frequency: a brightness squared is of second order in directions.
+# The highest multiple of the first frequency: a squared brightness is of second order in
+# directions.
 FIRST = 2
-# Entries of the table in 1/span, and their number in an interpolation: times are in an interval of
-# length one, so the error is below 1e-8 of the sum of the weights.
+# The table has DENSE entries in 1/span, of which NEAR are used in an interpolation. Times are in an
+# interval of length one: the error is below 1e-8 of the sum of the weights.
 DENSE, NEAR = 16, 8
-# Programs are compiled for tables in multiples of so many, and for so many pairs at a time.
+# Tables have a multiple of ROWS entries, and pairs come FEW or MANY at a time: few programs to
+# compile. A program takes BATCH pairs at once.
 ROWS, BATCH, FEW, MANY = 4096, 32, 256, 2048
-# Side peaks of the spectral window: how many, and how high against its main peak.
+# The largest number of side peaks of the spectral window, and their least height over the main one.
 SIDES, HIGH = 2, 0.3
 
 
 class Sums(NamedTuple):
-    """Sums over times at f = −4/DENSE, −3/DENSE …; x is the time over the span, less ½.
+    """The table of sums over times at the frequencies f = −4/DENSE, −3/DENSE, … in 1/span.
 
-    `window` is Σ w² exp 2πi f x; `data` Σ w z exp 2πi f x; `total` Σ z².
+    **Fields:** `window` Σ w² exp 2πi f x; `data` Σ w z exp 2πi f x; `total` Σ z². Here x are times
+    over the span, less ½, z are values over their noise, and w is one over the noise.
     """
 
     window: Complex[Array, " f"]
@@ -32,7 +39,10 @@ class Sums(NamedTuple):
 
 
 def sums(light: tuple[Array, ...], highest: float) -> Sums:
-    """The table up to a frequency, 1/span; `light` is times over the span, values and weights."""
+    """Return the table up to the frequency `highest`, 1/span.
+
+    `light` holds the times over the span, the values over their noise, and one over the noise.
+    """
     size = math.ceil(highest * DENSE) + 2 * NEAR
     grid = (np.arange(-(-size // ROWS) * ROWS) - NEAR // 2) / DENSE
     x, z, w = light
@@ -42,6 +52,8 @@ def sums(light: tuple[Array, ...], highest: float) -> Sums:
 
 @jax.jit
 def _table(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
+    """Return the sums `window` and `data` at the frequencies `grid`."""
+
     def one(f: Array) -> tuple[Array, Array]:
         angle = 2.0 * math.pi * f * (x - 0.5)
         cos, sin = jnp.cos(angle), jnp.sin(angle)
@@ -54,8 +66,8 @@ def _table(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
     return jax.lax.map(one, grid, batch_size=BATCH)
 
 
-def _at(table: Array, f: Array) -> Array:
-    """The sum at any frequencies: Lagrange's polynomial through the nearest entries."""
+def _interpolate(table: Array, f: Array) -> Array:
+    """Return the sums at frequencies f by Lagrange's polynomial through the nearest entries."""
     place = jnp.abs(f) * DENSE
     first = jnp.floor(place)
     part = place - first
@@ -74,23 +86,27 @@ def _at(table: Array, f: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnums=2)
 def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pairs"]:
-    """χ² of the series of each pair (P, 2), in 1/span: `Σ c_jk exp 2πi (j f₁ + k f₂) t`."""
+    """Return χ² of the best series `Σ c_jk exp 2πi (j f₁ + k f₂) t` of each pair (f₁, f₂).
+
+    The pairs (P, 2) are in 1/span; |j| ≤ 2 and |k| ≤ `order`.
+    """
     js, ks = np.meshgrid(np.arange(-FIRST, FIRST + 1), np.arange(-order, order + 1), indexing="ij")
     js, ks = js.ravel(), ks.ravel()
     dj, dk = js[None, :] - js[:, None] + 2 * FIRST, ks[None, :] - ks[:, None] + 2 * order
 
     def rows(values: Array, pair: Array, first: int, second: int) -> Array:
-        """Sums (2 first + 1, 2 second + 1) of all multiples; half of them are conjugates."""
+        """Return the sums (2 first + 1, 2 second + 1) at all multiples of both frequencies."""
+        # Sums at opposite frequencies are conjugates: interpolate half of them.
         m, n = np.arange(first + 1.0), np.arange(-second, second + 1.0)
         f = jnp.asarray(m[:, None]) * pair[0] + jnp.asarray(n[None, :]) * pair[1]
-        half = _at(values, f)
+        half = _interpolate(values, f)
         return jnp.concatenate([jnp.conj(half[:0:-1, ::-1]), half])
 
     def one(pair: Array) -> Array:
         window = rows(table.window, pair, 2 * FIRST, 2 * order)
         side = jnp.conj(rows(table.data, pair, FIRST, order).ravel())
         gram = window[dj, dk]
-        # Columns that the times do not distinguish.
+        # Keep the matrix definite if the times do not distinguish two columns.
         gram = gram + 1e-7 * window[2 * FIRST, 2 * order] * jnp.eye(js.size, dtype=gram.dtype)
         factor = jax.scipy.linalg.cho_factor(gram, lower=True)
         c = jax.scipy.linalg.cho_solve(factor, side)
@@ -100,34 +116,37 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
 
 
 def remainder(rows: Array, z: Array) -> tuple[Float[Array, ""], Float[Array, " k"]]:
-    """The least |z − cᵀ rows|² of rows (k, T), and c."""
+    """Return the least `|z − cᵀ rows|²` for rows (k, T), and the coefficients c (k,)."""
     gram, side = rows @ rows.T, rows @ z
     gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(side.size, dtype=z.dtype)
     c = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(gram), side)
     return jnp.sum(z * z) - side @ c, c
 
 
-def filled(rows: np.ndarray) -> np.ndarray:
-    """Rows repeated up to one of few lengths: fewer programs to compile."""
+def pad_rows(rows: np.ndarray) -> np.ndarray:
+    """Repeat the first of `rows` up to one of few lengths, so that few programs are compiled."""
     size = FEW if len(rows) <= FEW else -(-len(rows) // MANY) * MANY
     return np.concatenate([rows, np.repeat(rows[:1], size - len(rows), axis=0)])
 
 
-def misfits_of(table: Sums, pairs: np.ndarray, order: int) -> np.ndarray:
-    """`lattice_misfits` of any number of pairs, on the host."""
+def lattice_chi2(table: Sums, pairs: np.ndarray, order: int) -> np.ndarray:
+    """Return `lattice_misfits` of any number of pairs (P, 2), as a NumPy array."""
     out = [np.zeros(0)]
     for first in range(0, len(pairs), MANY):
-        some = pairs[first : first + MANY]
-        found = lattice_misfits(jnp.asarray(filled(some)), table, order)
-        out.append(np.asarray(found)[: len(some)])
+        chunk = pairs[first : first + MANY]
+        misfits = lattice_misfits(jnp.asarray(pad_rows(chunk)), table, order)
+        out.append(np.asarray(misfits)[: len(chunk)])
     return np.concatenate(out)
 
 
 def side_peaks(table: Sums, highest: float) -> np.ndarray:
-    """The highest side peaks of the spectral window, in 1/span: a line moved by one looks alike."""
+    """Return the highest side peaks of the spectral window, in 1/span.
+
+    A line that is moved by a side peak gives nearly the same readings.
+    """
     size = math.ceil(highest * DENSE)
     window = np.abs(np.asarray(table.window))[NEAR // 2 : NEAR // 2 + size]
-    # Away from the main peak, and the highest within 1/span.
+    # A peak is away from the main one, and the highest within 1/span on both sides.
     inner = range(2 * DENSE, size - DENSE)
     peaks = [k for k in inner if window[k] == window[k - DENSE : k + DENSE + 1].max()]
     peaks = sorted((k for k in peaks if window[k] > HIGH * window[0]), key=lambda k: -window[k])

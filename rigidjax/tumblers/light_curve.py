@@ -1,4 +1,4 @@
-"""A tumbling body from its brightness alone: all motions that explain it."""
+"""The fit of a tumbling body to its light curve alone: all motions that explain it."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,38 +17,49 @@ from rigidjax.identify.answer.answers import FAILS, FOUND, LEAVES, NOT_ALONE, NO
 from rigidjax.identify.answer.fit import fit
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data import stacking
+from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.charts import Bodies
 from rigidjax.identify.model.model import Model, require_one
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.identify.uncertainty import covariance as uncertainty
-from rigidjax.identify.uncertainty.quantities import carried, quantities, values_and_slopes
+from rigidjax.identify.uncertainty.quantities import (
+    quantities,
+    standard_deviations,
+    values_and_slopes,
+)
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot
-from rigidjax.tumblers.search import MAGNITUDE, descended, noise_of, relative_flux, starts_of
-from rigidjax.tumblers.sensor import Brightness, half_way
+from rigidjax.tumblers.search import MAGNITUDE, noise_of, relative_flux, search_from, starts_of
+from rigidjax.tumblers.sensor import Brightness, bisector
 from rigidjax.tumblers.two_frequencies import TwoFrequencies, two_frequencies
 
-# Motions are the same if both periods and both ratios of moments differ by less than this, or by
-# less than so many standard deviations.
+# Two motions are the same if both periods and both ratios of moments differ relatively by less than
+# SAME, or by less than REACH standard deviations.
 SAME, REACH = np.array([1e-3, 1e-3, 0.05, 0.05]), 5.0
-# A rival explains the data nearly as well within this log-likelihood: e¹⁰ to one.
+# A rival explains the data nearly as well if its log-likelihood is lower by less than this.
 MARGIN = 10.0
-# A real body is brighter or fainter than its ellipsoid from a side by this standard deviation.
+# The standard deviation by which a real body is brighter or fainter than its ellipsoid.
 SHAPE = 0.04
-# A best χ² above its mean by so many deviations is rejected: with a wrong alias the errors may be
-# hardly larger than the noise, and a fit by itself accepts five.
+# A χ² is rejected if it is above its mean by this many standard deviations. A fit alone accepts
+# five, but the errors of a wrong alias may be hardly larger than the noise.
 CONTENT = 3.0
-# The number of pairs always tried; further pairs need a χ² within this of the best.
+# LEAST pairs of frequencies are always tried; others only if their χ² is less than ABOVE over the
+# best one.
 LEAST, ABOVE = 12, 40.0
 
 
 class Alias(eqx.Module):
-    """A motion found by a search.
+    """A motion that a search found.
 
-    **Fields:** `x` (n,) the free numbers; `cost` half of χ²; `rotation` the body period, s,
-    `precession` the mean precession period, s (`rigidjax.exact.body_period`, `precession_period`);
-    `mode` `"long"` or `"short"`: the circulated axis; `ratios` (2,) the two smaller moments over
-    the largest; `explains` whether it explains the data nearly as well as the best.
+    **Fields:**
+
+    - `x`: (n,) the free numbers.
+    - `cost`: half of χ².
+    - `rotation`: the body period, s (`rigidjax.exact.body_period`).
+    - `precession`: the mean precession period, s (`rigidjax.exact.precession_period`).
+    - `mode`: `"long"` or `"short"`, the axis about which the momentum circulates in the body.
+    - `ratios`: (2,) the two smaller moments over the largest.
+    - `explains`: whether it explains the data nearly as well as the best motion.
     """
 
     x: Float[Array, " n"]
@@ -70,12 +81,16 @@ class Alias(eqx.Module):
 class LightCurve(eqx.Module):
     """The result of `fit_light_curve`.
 
-    **Fields:** `fit` of the best motion, whose covariance allows for a body that is no ellipsoid;
-    `aliases` all motions found, in the order of their misfits; `deviations` (4,) relative standard
-    deviations of the best one's rotation, precession and two ratios; `pairs` their frequencies;
-    `search` and `explanation` the two answers as of a `Fit`. The search is also `not alone` if
-    another alias explains the data nearly as well; the model also `leaves a part` if χ² is three
-    deviations above its mean for the given noise.
+    **Fields:**
+
+    - `fit`: of the best motion; its covariance allows for a body that is no ellipsoid.
+    - `aliases`: all motions that were found, in the order of their misfits.
+    - `deviations`: (4,) the relative standard deviations of rotation, precession and the two ratios
+      of the best motion.
+    - `pairs`: the pairs of frequencies.
+    - `search`, `explanation`: the two answers, as for a `Fit`. The search is `not alone` also if
+      another alias explains the data nearly as well; the model `leaves a part` also if χ² is three
+      standard deviations above its mean for the given noise.
     """
 
     fit: Fit
@@ -87,17 +102,17 @@ class LightCurve(eqx.Module):
 
     @property
     def status(self) -> str:
-        """Both answers in one line; `ok` if both are good and have no reasons."""
+        """Return both answers in one line; `ok` if both are good and have no reasons."""
         return answers.status(self.search, self.explanation)
 
     @property
     def ok(self) -> bool:
-        """Whether the fit is ok, and no other motion explains the data nearly as well."""
+        """Return whether the fit is ok, and no other motion explains the data nearly as well."""
         return self.status == "ok"
 
     @property
     def rivals(self) -> tuple[Alias, ...]:
-        """The other motions that explain the data nearly as well: `rotation`, `precession`, …"""
+        """Return the other motions that explain the data nearly as well."""
         return tuple(alias for alias in self.aliases[1:] if alias.explains)
 
     def __str__(self) -> str:
@@ -115,58 +130,62 @@ def fit_light_curve(
 ) -> LightCurve:
     """Fit the motion of a free tumbler to one light curve, without a guess.
 
-    `two_frequencies` finds pairs of frequencies in the squared flux. Each pair is precession and
-    twice the rotation, in long- and short-axis mode (Kaasalainen 2001), over a grid of bodies and
-    phases. The best starts are fitted with the sensor itself, and the best of these fits are
-    continued to convergence. The result lists all motions found. Motions that differ by a symmetry
-    of the brightness (half turns of the world, see `Brightness`, and of the body about its axes)
-    count as one: periods, moments and mode are the same.
+    `two_frequencies` finds pairs of frequencies in the squared flux. Each pair is taken as the
+    frequencies of precession and of twice the rotation, in long- and short-axis mode (Kaasalainen
+    2001), over a grid of bodies and phases. A few steps of a fit with the sensor itself follow from
+    the best of these starts; the best ends are then continued to convergence. The result lists all
+    motions found. Motions that differ by a symmetry of the brightness (half turns of the world, see
+    `Brightness`, or of the body about its axes) have the same periods, moments and mode, and count
+    as one.
 
     Intervals allow for a real shape by consider parameters (Tapley, Schutz and Born 2004,
-    Statistical Orbit Determination, ch. 6): the brightness has a factor 1 + n·S n, where n is half
-    way between sun and observer, body frame, and the entries of S are independent with deviation 4
-    %.
+    Statistical Orbit Determination, ch. 6): the brightness has a factor 1 + n·S n, where n is the
+    direction half way between sun and observer, body frame, and the entries of S are independent
+    with a standard deviation of 4 %.
 
-    **Arguments:** `model` of one recording with one `Brightness` sensor and no torque; let a
-    `Free` move the sensor's `level` unless it is known. `shortest` period of a line in the
-    spectrum, s, `None` for four times the median distance of the samples; `count` the largest
-    number of pairs of frequencies. Pairs that fit worse are not tried; if more than `count` fit,
-    the search has `not ended`. `tolerance` as of `fit`; `progress` is called with a line of text.
+    **Arguments:**
+
+    - `model`: of one recording with one `Brightness` sensor and no torque; let a `Free` move the
+      `level` of the sensor unless it is known.
+    - `shortest`: the shortest period of a line in the spectrum, s; `None` for four times the median
+      distance of the samples.
+    - `count`: the largest number of pairs of frequencies. If more pairs fit, the search has `not
+      ended`.
+    - `tolerance`: as for `rigidjax.identify.fit`.
+    - `progress`: a function such as `print`, called with lines of text.
 
     Sources: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021; Kaasalainen 2001,
     A&A 376:302, doi:10.1051/0004-6361:20010935. **Raises:** `ValueError` for a model with other
     sensors, several recordings or a torque; `TypeError` under a trace.
     """
-    reading = _only(model)
+    reading = _only_reading(model)
     _checks.whole(count, "count", 1)
     _checks.positive(tolerance, "tolerance")
     say = lambda line: None  # noqa: E731
     if progress is not None:
         say = _checks.function(progress, "progress", "of a line of text, such as print")
     t, flux, noise = relative_flux(model, reading)
-    squares, spread = flux**2, None if noise is None else 2.0 * flux * noise
-    found = two_frequencies(t, squares, spread, shortest=shortest, count=count)
-    # The pairs that fit well enough to be tried.
-    above = ABOVE * max(1.0, float(found.misfits[0]) / found.dof)
-    used = max(LEAST, int((found.misfits <= found.misfits[0] + above).sum()))
-    starts = starts_of(model, reading, t, squares, spread, found, used)
-    say(f"{used} pairs of frequencies, χ² {found.misfits[0]:.6g} of {found.dof}")
+    squares, sigma = flux**2, None if noise is None else 2.0 * flux * noise
+    pairs = two_frequencies(t, squares, sigma, shortest=shortest, count=count)
+    above = ABOVE * max(1.0, float(pairs.misfits[0]) / pairs.dof)
+    used = max(LEAST, int((pairs.misfits <= pairs.misfits[0] + above).sum()))
+    starts = starts_of(model, reading, t, squares, sigma, pairs.frequencies[:used])
+    say(f"{used} pairs of frequencies, χ² {pairs.misfits[0]:.6g} of {pairs.dof}")
     say(f"{len(starts)} starts")
-    sigma = noise_of(model, reading, flux, found)
     whole = stacking.of_few_lengths(model)
-    ends = descended(whole, starts, sigma, tolerance)
+    ends = search_from(whole, starts, noise_of(reading, flux, pairs.scatter), tolerance)
     aliases = _aliases(whole, ends)
     say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
     best = fit(whole, starts=1, initial=aliases[0].x, tolerance=tolerance)
-    told = _told(best, aliases, found, used >= count)
-    # Of the readings as they were given.
+    result = _result(best, aliases, pairs, used >= count)
+    # Return the readings as they were given, without the padding of the search.
     own = eqx.tree_at(lambda m: m.slots, model, best.model.slots)
     linear = best.linear and best.linear.first_times(model.records.t.shape[1])
-    return eqx.tree_at(lambda one: (one.fit.model, one.fit.linear), told, (own, linear))
+    return eqx.tree_at(lambda one: (one.fit.model, one.fit.linear), result, (own, linear))
 
 
-def _only(model: Model) -> Any:
-    """The reading of the only sensor, one light curve of a free body."""
+def _only_reading(model: Model) -> Reading:
+    """Return the reading of the model's only sensor; raise an error for another kind of model."""
     require_one(model)
     if not _checks.known(model):
         words = "got traced ones; call it outside of jax.jit, jax.grad and jax.vmap"
@@ -188,8 +207,11 @@ def _only(model: Model) -> Any:
 
 
 @eqx.filter_jit
-def _read(x: Float[Array, " n"], model: Model) -> tuple[Array, Array]:
-    """Logarithms (4,) of both periods and both ratios, and h²/2T over the middle moment."""
+def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Array]:
+    """Return the logarithms (4,) of both periods and both ratios, and h²/2T over the middle moment.
+
+    h is the momentum and T the kinetic energy: below 1 the motion is in the long-axis mode.
+    """
     body: Any = model.bodies(x)
     inertia = Inertia(tensor_of(body))
     omega = x[model.index.start[0, -3:]] * model.reference.rate[0]
@@ -201,19 +223,21 @@ def _read(x: Float[Array, " n"], model: Model) -> tuple[Array, Array]:
 
 @eqx.filter_jit
 def _slopes(x: Float[Array, " n"], model: Model) -> Float[Array, "4 n"]:
-    return jax.jacfwd(lambda x: _read(x, model)[0])(x)
+    """Return the derivatives of the logarithms of both periods and both ratios."""
+    return jax.jacfwd(lambda x: _periods_and_ratios(x, model)[0])(x)
 
 
 def _alias(model: Model, x: Array, cost: float) -> Alias:
-    numbers, middle = (np.asarray(v) for v in _read(x, model))
+    """Return the motion of the free numbers x as an `Alias`."""
+    numbers, middle = (np.asarray(v) for v in _periods_and_ratios(x, model))
     rotation, precession, *ratios = np.exp(numbers)
     mode = "long" if middle < 1 else "short"
-    found = float(rotation), float(precession), mode, np.array(ratios)
-    return Alias(x, cost, *found, explains=False)
+    motion = float(rotation), float(precession), mode, np.array(ratios)
+    return Alias(x, cost, *motion, explains=False)
 
 
 def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
-    """The different motions, the best first."""
+    """Return the different motions among the `ends` of a search, the best first."""
     out: list[Alias] = []
     for end in sorted(ends, key=lambda one: float(one.cost)):
         if not np.isfinite(float(end.cost)):
@@ -222,18 +246,22 @@ def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
         if not any(_same(alias, other, SAME) for other in out):
             out.append(alias)
     if not out:
-        raise ValueError("fit_light_curve: no start gave a finite misfit")
+        raise ValueError(
+            "fit_light_curve: wanted a start with a finite misfit, got none; are the readings in "
+            "the unit of the sensor?"
+        )
     return out
 
 
 def _same(a: Alias, b: Alias, near: np.ndarray) -> bool:
+    """Return whether two motions are the same: of one mode, and `near` in the four logarithms."""
     one, other = (np.log([m.rotation, m.precession, *m.ratios]) for m in (a, b))
     return a.mode == b.mode and bool((np.abs(one - other) < near).all())
 
 
 @eqx.filter_jit
-def _half_way(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
-    """Directions half way between sun and observer, body frame."""
+def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
+    """Return the directions half way between sun and observer at each time, body frame."""
     point = model.unpack(x)
     body, state0 = point.body, point.state0
     motion, t = exact.FreeBody(Inertia(tensor_of(body)), state0), model.records.t[0]
@@ -241,46 +269,49 @@ def _half_way(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
 
     def at(now: Array) -> Array:
         state: Any = motion(now - t[0])
-        return quaternion.rotate_inverse(state.q, half_way(sensor, now))
+        return quaternion.rotate_inverse(state.q, bisector(sensor, now))
 
     return jax.vmap(at)(t)
 
 
 def _with_shape(best: Fit) -> Fit:
-    """The fit with a covariance that allows for a body that is no ellipsoid."""
+    """Return the fit with a covariance that allows for a body that is no ellipsoid."""
     linear: Any = best.linear
     reading, weight = stacking.one(best.model.records.readings[0], 0), linear.weights[0][0]
     flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
     size = np.full(weight.shape, 1.0 / MAGNITUDE) if reading.sensor.unit == "mag" else flux
-    n = np.asarray(_half_way(best.x, best.model))
+    n = np.asarray(_bisectors(best.x, best.model))
     change = SHAPE / float(best.noises[0][0, 0]) * size[:, None, None] * n[:, :, None] * n[:, None]
     slopes = linear.slopes[0][0, :, 0] * weight[:, None]
     kept = weight > 0
-    shift = uncertainty.of_white(linear).covariance @ slopes[kept].T @ change[kept].reshape(-1, 9)
+    white = uncertainty.white_covariance(linear).covariance
+    shift = white @ slopes[kept].T @ change[kept].reshape(-1, 9)
     covariance, seen = (np.asarray(c) + shift @ shift.T for c in (best.covariance, best.seen))
     null = np.asarray(best.null_directions)
-    found = values_and_slopes(best.model, best.x, best.near)
+    numbers = values_and_slopes(best.model, best.x, best.near)
+    freedom = best.degrees(numbers[1])
     return dataclasses.replace(
         best,
         covariance=jnp.asarray(covariance),
         seen=jnp.asarray(seen),
         covariance_kind=f"sandwich: a shape {SHAPE:.0%} off the ellipsoid; {best.covariance_kind}",
-        quantities=quantities(best.model, found, seen, null, best.limits, best.degrees(found[1])),
+        quantities=quantities(best.model, numbers, seen, null, best.limits, freedom),
     )
 
 
-def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> LightCurve:
+def _result(best: Fit, aliases: list[Alias], pairs: TwoFrequencies, cut: bool) -> LightCurve:
+    """Return the result from the `best` fit and all motions; `cut` if not all pairs were tried."""
     slopes, wider = np.asarray(_slopes(best.derivative_point, best.model)), _with_shape(best)
     own, deviations = (
-        carried(slopes, np.asarray(one.seen), np.asarray(one.null_directions))
+        standard_deviations(slopes, np.asarray(one.seen), np.asarray(one.null_directions))
         for one in (best, wider)
     )
-    # A search that stopped on its way to the same motion is no rival.
+    # A search that stopped on its way to the best motion is no rival.
     near = np.fmax(SAME, REACH * own)
-    # Costs of the search, all with one noise: a fit may have estimated another.
+    # Compare the costs of the search, which have one noise: the fit may have estimated another.
     first = _alias(best.model, best.x, aliases[0].cost)
     others = [alias for alias in aliases if not _same(alias, first, near)]
-    # Misfits count for less if the noise is larger than given.
+    # Misfits count for less if the errors are larger than the noise, or autocorrelated.
     count = int(best.model.records.readings[0].seen.sum())
     margin = MARGIN * max(1.0, 2.0 * first.cost / count) * max(best.correlation, 1.0)
     marked = tuple(
@@ -290,8 +321,8 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
     rivals = sum(alias.explains for alias in marked) - 1
     search, explanation = best.search, best.explanation
     if rivals and search.word != NOT_ENDED and explanation.word != FAILS:
-        some = "another motion explains" if rivals == 1 else f"{rivals} other motions explain"
-        search = Answer(NOT_ALONE, (f"{some} the light curve nearly as well",))
+        who = "another motion explains" if rivals == 1 else f"{rivals} other motions explain"
+        search = Answer(NOT_ALONE, (f"{who} the light curve nearly as well",))
     elif cut and best.ok:
         search = Answer(NOT_ENDED, ("more pairs of frequencies fit than were tried",))
     # Outliers dominate χ² under a robust loss.
@@ -299,4 +330,4 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
     if search == Answer(FOUND) and best.ok and above > CONTENT * np.sqrt(2.0 * best.dof):
         why = "another motion that was not found, or more noise than given"
         explanation = Answer(LEAVES, (f"χ² is {best.chi2:.6g} of {best.dof}: {why}",))
-    return LightCurve(wider, marked, deviations, found, search, explanation)
+    return LightCurve(wider, marked, deviations, pairs, search, explanation)

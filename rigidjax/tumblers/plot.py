@@ -1,4 +1,4 @@
-"""Light curves: against time, and folded with a period."""
+"""Pictures of light curves: against time, and folded with a period."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +10,7 @@ from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax.plot.style import COLOURS, TIMES, plain, several_axes, unit
 
-# Colours of one cycle after another, from the first to the last.
+# The colour map of the cycles, from the first to the last.
 _MAP = "viridis"
 
 
@@ -19,23 +19,31 @@ def light_curve(
     values: Float[ArrayLike, " values"],
     periods: float | Sequence[float] | Float[ArrayLike, " periods"] = (),
     *,
-    model: Any = None,
+    model: Float[ArrayLike, " predictions"] | None = None,
     quantity: str = "mag",
     time_unit: str = "h",
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """A light curve against time, and below it folded with each of some periods.
+    """Draw a light curve against time, and below it folded with each of the periods.
 
-    A body that turns about a principal axis gives one curve if it is folded with its period. A
-    tumbler gives a band, since a second period moves the curve from cycle to cycle; the colour
-    shows the cycle.
+    The light curve of a body that turns about a principal axis, folded with its period, is one
+    curve. That of a tumbler is a band, since a second period moves the curve from cycle to cycle;
+    the colour shows the cycle.
 
-    **Arguments:** `ts` (T,) s; `values` (T,) readings, NaN for a gap; `periods` s, one or several,
-    or none; `model` (T,) the prediction of a motion at `ts`, such as `values − fit.residuals[0][:,
-    0]`, or `None`; `quantity` `mag` (bright is up) or `flux`; `time_unit` `s`, `min`, `h`, `day`;
-    `title`; `ax` one axes and one more for each period, or `None` for new ones. **Returns** the
-    axes (1 + periods,). **Raises** as `rigidjax.plot`.
+    **Arguments:**
+
+    - `ts`: (T,) s.
+    - `values`: (T,) readings, NaN for a gap.
+    - `periods`: s, one, several or none.
+    - `model`: (T,) the prediction of a motion at `ts`, such as
+      `values - fit.residuals[0][:, 0]`, or `None`.
+    - `quantity`: `mag` (bright is up) or `flux`.
+    - `time_unit`: `s`, `min`, `h` or `day`.
+    - `title`: of the picture.
+    - `ax`: one axes and one more for each period, or `None` for new ones.
+
+    **Returns** the axes (1 + periods,). **Raises** as `rigidjax.plot`.
 
     >>> t = np.linspace(0.0, 7200.0, 50)
     >>> light_curve(t, 15 + 0.1 * np.cos(2 * np.pi * t / 3600), 3600.0)[1].get_xlabel()
@@ -60,16 +68,16 @@ def light_curve(
     label = "magnitude" if quantity == "mag" else "flux"
     ax[0].plot(t / seconds, read, ".", color=COLOURS[6], ms=3, label="read")
     if predicted is not None:
-        # No line over a gap: the motion's brightness there is unknown.
+        # Draw no line over a gap, in which the brightness is not known.
         wide = np.append(np.diff(t) > 10 * np.median(np.diff(t)), False)
         line = np.where(wide, np.nan, predicted)
         ax[0].plot(t / seconds, line, color=COLOURS[1], lw=1.0, label="motion")
-        # Beside the picture: a legend inside would cover data.
+        # Put the legend beside the picture: inside it would cover data.
         ax[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     ax[0].set(xlabel=f"time, {time_unit}", ylabel=label)
     for one, period in zip(ax[1:], folds, strict=True):
         turns = (t - t[0]) / period
-        # The start is drawn again after the end, to show that they join.
+        # Draw two periods: the second shows that end and start join.
         both, cycle = np.concatenate([turns % 1.0, turns % 1.0 + 1.0]), np.tile(turns // 1.0, 2)
         if predicted is not None:
             one.plot(both, np.tile(predicted, 2), ".", color=COLOURS[1], ms=1.5, alpha=0.6)

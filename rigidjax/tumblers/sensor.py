@@ -1,4 +1,4 @@
-"""A sensor of a body's brightness: a light curve."""
+"""The sensor of a body's brightness, whose readings are a light curve."""
 
 import math
 from typing import Any, ClassVar
@@ -22,27 +22,36 @@ UNITS = ("flux", "mag")
 
 
 class Brightness(AbstractSensor):
-    """Reads the brightness of an ellipsoid lit by the sun: a light curve.
+    """A sensor of the brightness of an ellipsoid lit by the sun: its readings are a light curve.
 
-    A flux is `level · B/(π (abc)^⅔)`, a magnitude `level − 2.5 log₁₀(B/(π (abc)^⅔))`, with B as
-    `rj.tumblers.brightness.ellipsoid`: a sphere of the same volume at zero phase has the level.
-    Only the ratios of the semi-axes count. Readings (T,) are reduced to unit distances.
+    A flux is `level · B/(π (abc)^⅔)`, a magnitude `level − 2.5 log₁₀(B/(π (abc)^⅔))`, with B the
+    result of `rj.tumblers.brightness.ellipsoid` for the semi-axes a, b, c. The level is therefore
+    the brightness of a sphere of the same volume at zero phase, and only the ratios of the
+    semi-axes count. Readings (T,) are reduced to unit distances.
 
-    **Arguments:** `sun`, `observer` directions from the body to them, world frame, any length:
-    (3,), or a callable Module of time, t → (3,), such as `torques.Linear(times, directions)`;
-    `scattering` the law: `LommelSeeliger()` (also for `None`), `Geometric()`, `Lambert()` of
-    `rj.tumblers.brightness`; `noise` standard deviation in the unit of a reading, `None` to
-    estimate it; `unit` of a reading, `"flux"` or `"mag"`; `level` flux or magnitude as above,
-    `None` for 1 or 0 (it is seldom known: let a `Free` move it); `semi_axes` (3,) along the body's
-    axes, or `None` for the uniform ellipsoid with the body's motion (semi-axes √λ_k of its second
-    moment 𝔖); `offset` s as for `Gyro`.
+    The brightness does not change with some turns of the world, and so does not determine them. For
+    fixed directions these are the half turns about `sun × observer` and, except for `Geometric`,
+    about the sum and the difference of the two directions. A `fit` assumes an ellipsoid;
+    `fit_light_curve` allows for other shapes. Source: as `rigidjax.tumblers.brightness`; for
+    tumblers Kaasalainen 2001, A&A 376:302, doi:10.1051/0004-6361:20010935.
 
-    Some turns of the world do not change the brightness, and it does not determine them: for fixed
-    directions the half turns about `sun × observer`, and, except for `Geometric`, about their sum
-    and difference. A `fit` assumes an ellipsoid; `fit_light_curve` allows for other shapes. Source:
-    as `rigidjax.tumblers.brightness`; for tumblers Kaasalainen 2001, A&A 376:302,
-    doi:10.1051/0004-6361:20010935. **Raises** `ValueError` for a direction of length zero, a noise
-    or semi-axis that is not positive.
+    **Arguments:**
+
+    - `sun`, `observer`: the directions from the body to sun and observer, world frame, of any
+      length: (3,), or a callable Module of time, t → (3,), such as
+      `torques.Linear(times, directions)`.
+    - `scattering`: the law, `LommelSeeliger()` (also for `None`), `Geometric()` or `Lambert()` of
+      `rj.tumblers.brightness`.
+    - `noise`: the standard deviation of a reading, in its unit; `None` to estimate it.
+    - `unit`: of a reading, `"flux"` or `"mag"`.
+    - `level`: the flux or magnitude of the sphere; `None` for 1 or 0. It is seldom known: let a
+      `Free` move it.
+    - `semi_axes`: (3,) along the body's axes; `None` for those of the uniform ellipsoid with the
+      body's motion (√λ_k of its second moment 𝔖).
+    - `offset`: s, as for `Gyro`.
+
+    **Raises** `ValueError` for a direction of length zero, a noise or semi-axis that is not
+    positive.
 
     >>> Brightness([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], noise=0.02, unit="mag").components
     1
@@ -81,10 +90,11 @@ class Brightness(AbstractSensor):
         self.scattering, self.noise = law_of(scattering), base.deviations(1)(noise)
         self.unit = _checks.word(unit, UNITS, "unit")
         usual = 1.0 if unit == "flux" else 0.0
-        found = base.required("level", ())(usual if level is None else level)
+        checked_level = base.required("level", ())(usual if level is None else level)
         if unit == "flux":
-            found = _checks.refuse(found, ~(found > 0), "level: wanted a positive flux")
-        self.level = found
+            words = "level: wanted a positive flux"
+            checked_level = _checks.refuse(checked_level, ~(checked_level > 0), words)
+        self.level = checked_level
         if semi_axes is not None:
             semi_axes = _checks.floating(semi_axes, (3,), "semi_axes").astype(float)
             semi_axes = _checks.sign(semi_axes, "semi_axes", "three positive lengths")
@@ -95,23 +105,27 @@ class Brightness(AbstractSensor):
         return (reading - self.predicted(now))[None]
 
     def predicted(self, now: SensorInput) -> Scalar:
-        """The reading of this state without noise."""
+        """Return the reading of a state without noise."""
         shape = now.body.second_moment
         if self.semi_axes is not None:
             shape = jnp.diag(self.semi_axes * self.semi_axes)
         shape = shape / jnp.trace(shape)
         q = now.state.q
-        sun, observer = (quaternion.rotate_inverse(q, v) for v in sides(self, now.t, q.dtype))
-        seen = self.scattering.of_ellipsoid(shape, sun, observer)
-        relative = seen / (math.pi * jnp.cbrt(determinant(shape)))
+        sun, observer = (quaternion.rotate_inverse(q, v) for v in directions(self, now.t, q.dtype))
+        area = self.scattering.of_ellipsoid(shape, sun, observer)
+        relative = area / (math.pi * jnp.cbrt(determinant(shape)))
         if self.unit == "flux":
             return self.level * relative
-        # A body that hides its lit side is invisible: it is fainter than any reading.
-        some = relative > 1e-12
-        return self.level - 2.5 / math.log(10.0) * jnp.log(jnp.where(some, relative, 1e-12))
+        # A body that hides its lit side has an infinite magnitude: bound it, as fainter than any
+        # reading.
+        visible = relative > 1e-12
+        return self.level - 2.5 / math.log(10.0) * jnp.log(jnp.where(visible, relative, 1e-12))
 
     def typical_rate(self, t: np.ndarray, values: np.ndarray) -> float:
-        """The rough rate of the body, rad/s: half the strongest frequency of 1000 readings."""
+        """Return the rough rate of the body, rad/s: half the strongest frequency of 1000 readings.
+
+        An ellipsoid shows two maxima in a turn.
+        """
         t, values = t[:1000], values[:1000]
         if t.size < 10 or np.ptp(values) == 0:
             return 0.0
@@ -123,6 +137,7 @@ class Brightness(AbstractSensor):
         return 0.5 * float(turns[np.argmax(power)])
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
+        """Return the fluxes that are far below zero, (T,) true where wrong, and why."""
         noise = np.std(values) if self.noise is None else np.asarray(self.noise)[0]
         wrong = values < 0 if self.unit == "flux" else np.zeros(values.shape, bool)
         wrong = wrong & (np.abs(values) > 10 * noise)
@@ -130,23 +145,25 @@ class Brightness(AbstractSensor):
         return wrong, words
 
 
-def sides(sensor: Brightness, t: ScalarLike, dtype: Any = None) -> list[Vec3]:
-    """The unit vectors to sun and observer at `t`, world frame."""
-    away = vector_at(sensor.sun, t, "sun"), vector_at(sensor.observer, t, "observer")
-    return [_unit(v if dtype is None else v.astype(dtype)) for v in away]
+def directions(sensor: Brightness, t: ScalarLike, dtype: Any = None) -> list[Vec3]:
+    """Return the unit vectors to sun and observer at the time `t`, world frame."""
+    vectors = vector_at(sensor.sun, t, "sun"), vector_at(sensor.observer, t, "observer")
+    return [_unit(v if dtype is None else v.astype(dtype)) for v in vectors]
 
 
-def half_way(sensor: Brightness, t: ScalarLike) -> Vec3:
-    """The unit vector half way between sun and observer at `t`, world frame."""
-    sun, observer = sides(sensor, t)
+def bisector(sensor: Brightness, t: ScalarLike) -> Vec3:
+    """Return the unit vector half way between sun and observer at the time `t`, world frame."""
+    sun, observer = directions(sensor, t)
     return _unit(sun + observer)
 
 
 def _unit(v: Vec3) -> Vec3:
+    """Return the unit vector along v."""
     return v / jnp.sqrt(dot(v, v))
 
 
 def _source(source: Any, name: str) -> Any:
+    """Return a direction as a unit vector, or a function of time as it is; else raise an error."""
     if callable(source):
         return _checks.function(source, name, "of time to (3,)")
     shape = _checks.numbers(source, name).shape

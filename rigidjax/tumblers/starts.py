@@ -1,14 +1,15 @@
-"""From two frequencies of a light curve to possible motions: a grid of bodies.
+"""Possible motions with two given frequencies of a light curve, on a grid of bodies.
 
 The squared brightness of an ellipsoid is nearly a quadratic form of the direction n half way
 between sun and observer: `F² ∝ Σ_k M_k (n·r_k)²`, with r_k the body's axes in the world and
 `M = (bc)², (ca)², (ab)²` (exactly at zero phase, for projected areas). For a given body, energy and
-phase it is therefore linear in the six numbers of n nᵀ, in a frame along the angular momentum.
-Least squares finds the direction of the momentum, the initial angle and the level at once; the grid
-covers the shape and the phase of the rotation.
+phase F² is therefore linear in the six numbers of n nᵀ in a frame along the angular momentum. Least
+squares finds the direction of the momentum, the initial angle and the level at once; the grid
+covers the shape of the body and the phase of its rotation.
 """
 
 import math
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -23,15 +24,19 @@ from rigidjax.rotation import quaternion
 from rigidjax.rotation.kernels import product4
 from rigidjax.tumblers.lattice_series import remainder
 
-# Semi-axes of the grid: b/a and c/b; phases in half a rotation.
+# The grid: ratios b/a and c/b of the semi-axes, and the number of phases in half a rotation.
 MIDDLE, SHORT, PHASES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9), (0.5, 0.65, 0.8, 0.93), 12
-# Turns about the direction half way that a start is tried with: brightness hardly sees them.
+# Turns about the direction n that are tried with each start: they hardly change the brightness.
 ABOUT = (0.0, math.pi / 3, 2 * math.pi / 3)
 MODES = ("long", "short")
 
 
 class Candidate(NamedTuple):
-    """A starting motion: `moments` over the largest; `q`, `omega`, principal axes; `misfit` χ²."""
+    """A starting motion.
+
+    **Fields:** `moments` (3,) over the largest; `q` and `omega` the initial attitude and rate of
+    the principal axes; `misfit` χ².
+    """
 
     moments: np.ndarray
     q: np.ndarray
@@ -40,14 +45,23 @@ class Candidate(NamedTuple):
 
 
 def candidates(
-    pair: np.ndarray, mode: str, light: Any, half_way: np.ndarray, areas: Any, count: int
+    pair: np.ndarray,
+    mode: str,
+    light: tuple[Array, Array, Array],
+    bisector: np.ndarray,
+    areas: np.ndarray | None,
+    count: int,
 ) -> list[Candidate]:
-    """The best of the grid whose precession and rotation have these frequencies, in order.
+    """Return the best motions of the grid that have a pair of frequencies, the best first.
 
-    `pair` has the frequencies of the mean precession and of twice the rotation, 1/s; `mode` is the
-    circulated axis; `light` times since the first, squared fluxes and ones over their noise;
-    `half_way` (3,) in the world frame; `areas` M (3,) of a known ellipsoid, or `None`; `count` of
-    bodies.
+    **Arguments:**
+
+    - `pair`: the frequencies of the mean precession and of twice the rotation, 1/s.
+    - `mode`: "long" or "short", the axis about which the momentum circulates.
+    - `light`: times since the first one, squared fluxes, and one over their noise.
+    - `bisector`: (3,) n, world frame.
+    - `areas`: (3,) M of a known ellipsoid, or `None`.
+    - `count`: the number of bodies.
     """
     b, ratio = np.meshgrid(MIDDLE, SHORT, indexing="ij")
     semi_axes = np.stack([np.ones(b.size), b.ravel(), (b * ratio).ravel()], axis=1)
@@ -59,8 +73,8 @@ def candidates(
         forms = np.broadcast_to(areas, forms.shape)
     forms = forms / forms.mean(axis=1, keepdims=True)
     arrays = jnp.asarray(moments), jnp.asarray(forms), jnp.asarray(pair), *light
-    found = _grid(jnp.asarray(mode == "long"), *arrays)
-    misfits, sides, q, omega = (np.asarray(v) for v in found)
+    motions = _grid(jnp.asarray(mode == "long"), *arrays)
+    misfits, sides, q, omega = (np.asarray(v) for v in motions)
     # The best phase of each body.
     phase, least = misfits.argmin(axis=1), misfits.min(axis=1)
     out = []
@@ -68,41 +82,55 @@ def candidates(
         if not np.isfinite(least[k]):
             continue
         at = k, phase[k]
-        placed = (np.array(product4(q0, q[at])) for q0 in _placed(sides[at], half_way))
-        out += [Candidate(moments[k], one, omega[at], float(least[k])) for one in placed]
+        in_world = (np.array(product4(q0, q[at])) for q0 in _turns(sides[at], bisector))
+        out += [Candidate(moments[k], one, omega[at], float(least[k])) for one in in_world]
     return out
 
 
-def _placed(side: np.ndarray, half_way: np.ndarray) -> list[tuple[Any, ...]]:
-    """Turns (4,) from the frame of the momentum to the world, by the best n nᵀ of rank one."""
+def _turns(side: np.ndarray, bisector: np.ndarray) -> list[tuple[Any, ...]]:
+    """Return the quaternions that turn the frame of the momentum to the world.
+
+    n in the frame of the momentum is the leading eigenvector of the matrix with the six numbers
+    `side`; in the world it is the `bisector`.
+    """
     xx, yy, zz, xy, xz, yz = side
     _, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     n = axes[:, -1]
-    first = _turn(n, half_way if n @ half_way >= 0 else -half_way, np)
+    first = _shortest_turn(n, bisector if n @ bisector >= 0 else -bisector, np)
     halves = [0.5 * angle for angle in ABOUT]
-    about = [(np.cos(half), *(np.sin(half) * half_way)) for half in halves]
+    about = [(np.cos(half), *(np.sin(half) * bisector)) for half in halves]
     return [product4(one, first) for one in about]
 
 
-def _turn(u: Any, v: Any, xp: Any) -> Any:
-    """The shortest turn (4,) that takes one unit vector to another, which is not opposite to it."""
+def _shortest_turn(u: Any, v: Any, xp: ModuleType) -> Any:
+    """Return the shortest turn (4,) from the unit vector u to v, which is not opposite to u.
+
+    `xp` is the module of the arrays, `numpy` or `jax.numpy`.
+    """
     q = xp.concatenate([1.0 + (u * v).sum()[None], xp.cross(u, v)])
     return q / xp.sqrt((q * q).sum())
 
 
 def _rate(moments: Array, d: Array) -> Float[Array, "3"]:
-    """The rate of momentum one and h²/2T = d that has no part along the middle axis."""
+    """Return the rate of momentum h = 1 and `h²/2T = d` without a part along the middle axis.
+
+    T is the kinetic energy; the first and the last of the ascending `moments` have the other axes.
+    """
     a, _, c = (1.0 / moments[k] for k in range(3))
     x = jnp.clip((1.0 / d - c) / (a - c), 0.0, 1.0)
     return jnp.stack([jnp.sqrt(x), jnp.zeros_like(x), jnp.sqrt(1.0 - x)]) / moments
 
 
-def _energy(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array, Array]:
-    """A rate whose periods have this ratio, its precession period, and whether there is one."""
+def _rate_of_ratio(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array, Array]:
+    """Return a rate whose precession and rotation period have this `ratio`.
+
+    Its precession period is returned, too, and whether there is such a rate in the mode (`long` for
+    the long axis). The energy is found by bisection.
+    """
     body, pure = Inertia(jnp.diag(moments)), jnp.where(long, moments[0], moments[2])
 
-    def halved(_: Any, tried: tuple[Array, ...]) -> tuple[Array, ...]:
-        low, high, *_ = tried
+    def bisect(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        low, high, *_ = state
         part = 0.5 * (low + high)
         omega = _rate(moments, pure + part * (moments[1] - pure))
         precession = exact.precession_period(body, omega)
@@ -113,9 +141,9 @@ def _energy(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array, Ar
     kind = moments.dtype
     zero = jnp.zeros((), kind)
     ends = jnp.asarray(1e-4, kind), jnp.asarray(1.0 - 1e-7, kind)
-    # What the last try gave goes along: written out after the loop it would be compiled again.
-    tried = (*ends, jnp.zeros_like(moments), zero, zero)
-    _, _, omega, precession, quotient = jax.lax.fori_loop(0, 33, halved, tried)
+    # Carry the results of the last trial along: after the loop they would be compiled again.
+    state = (*ends, jnp.zeros_like(moments), zero, zero)
+    _, _, omega, precession, quotient = jax.lax.fori_loop(0, 33, bisect, state)
     return omega, precession, jnp.abs(quotient - 1.0) < 1e-3
 
 
@@ -123,19 +151,22 @@ def _energy(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array, Ar
 def _grid(
     long: Array, moments: Array, forms: Array, pair: Array, t: Array, squares: Array, weights: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Misfits (S, phases), n nᵀ times the level (…, 6), attitudes (…, 4) and rates (…, 3)."""
+    """Return misfits (S, phases), n nᵀ times the level (…, 6), attitudes and rates of S bodies.
+
+    `moments` and `forms` (S, 3) are those of the bodies; `t`, `squares` and `weights` the light.
+    """
     ratio = 0.5 * pair[1] / pair[0]
 
-    def shape(given: tuple[Array, Array]) -> Any:
-        body, form = given
-        omega, precession, exists = _energy(body, ratio, long)
+    def shape(one: tuple[Array, Array]) -> tuple[Array, ...]:
+        body, form = one
+        omega, precession, exists = _rate_of_ratio(body, ratio, long)
         omega = omega * (precession * pair[0])
         h = body * omega
-        # Its momentum is along z of the world; not opposite, as the parts of `_rate` are positive.
-        q = _turn(h / jnp.sqrt(jnp.sum(h * h)), jnp.eye(3, dtype=h.dtype)[2], jnp)
+        # Turn the momentum to z of the world. It is not opposite to z: no part of it is negative.
+        q = _shortest_turn(h / jnp.sqrt(jnp.sum(h * h)), jnp.eye(3, dtype=h.dtype)[2], jnp)
         motion = exact.FreeBody(Inertia(jnp.diag(body)), Attitude(q, omega))
 
-        def phase(part: Array) -> Any:
+        def phase(part: Array) -> tuple[Array, ...]:
             since = part / pair[1]
 
             def row(q: Array) -> Array:
@@ -144,11 +175,11 @@ def _grid(
                 def entry(i: int, j: int) -> Any:
                     return sum(form[k] * m[i, k] * m[j, k] for k in range(3))
 
-                # Σ M_k r_k r_kᵀ, body axes r in the world.
+                # The entries of Σ M_k r_k r_kᵀ, r_k the body axes in the world.
                 twice = (2 * entry(0, 1), 2 * entry(0, 2), 2 * entry(1, 2))
                 return jnp.stack([entry(0, 0), entry(1, 1), entry(2, 2), *twice])
 
-            # The first state beside the others: by itself the motion would be compiled again.
+            # Compute the first state together with the others: alone it would compile once more.
             states: Any = jax.vmap(motion)(since + jnp.concatenate([jnp.zeros(1, t.dtype), t]))
             rows = jax.vmap(row)(states.q[1:]).T * weights[None, :]
             misfit, n = remainder(rows, squares * weights)

@@ -1,7 +1,6 @@
-"""The two frequencies of a light curve: the Fourier series in both that fits best."""
+"""The two frequencies of a light curve: those whose Fourier series fits best."""
 
 import math
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,42 +13,47 @@ from rigidjax.tumblers.lattice_series import (
     BATCH,
     FIRST,
     Sums,
-    filled,
-    misfits_of,
+    lattice_chi2,
+    pad_rows,
     remainder,
     side_peaks,
     sums,
 )
 
-# Lines through which pairs are laid, and the grid of the first frequency, in 1/span.
+# A pair must explain one of the LINES strongest lines; the first frequency is on a grid of this
+# STEP, 1/span.
 LINES, STEP = 3, 0.1
 # The largest second frequency of the search, over the highest of these lines.
 SECOND = 1.5
-# The number of pairs refined for each returned one.
+# The number of pairs that are refined for each one that is returned.
 TRIED = 2
-# Squares of what is larger may overflow; a spectrum of more lines takes hours.
+# Squares of numbers above LARGEST may overflow; a spectrum of more than MOST lines takes hours.
 LARGEST, MOST = 1e100, 1e5
-# Programs are compiled for times in multiples of so many.
+# Times are padded to a multiple of BLOCK, so that few programs are compiled.
 BLOCK = 256
 # Pairs nearer than this, in 1/span, count as one.
 NEAR = 0.25
-# Pairs whose aliases are tried, in at most so many rounds.
+# The aliases of the SEEDS best pairs are tried, in ROUNDS or fewer.
 SEEDS, ROUNDS = 16, 3
-# A pair and its eight neighbours, in steps.
+# A pair (0, 0) and its eight neighbours, in steps.
 AROUND = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
 
 
 class TwoFrequencies(eqx.Module):
     """The result of `two_frequencies`, in the order of the misfits.
 
-    **Fields:** `frequencies` (n, 2) in 1/s; `misfits` (n,) χ² of each pair's series, and `dof`;
-    `scatter` the standard deviation of the best one's residuals, in the unit of the values; `lines`
-    (m,) the strongest lines of the spectrum, 1/s.
+    **Fields:**
+
+    - `frequencies`: (n, 2) the pairs, 1/s.
+    - `misfits`: (n,) χ² of the series of each pair.
+    - `dof`: their degrees of freedom.
+    - `scatter`: the standard deviation of the residuals of the best pair, in the values' unit.
+    - `lines`: (m,) the strongest lines of the spectrum, 1/s.
 
     >>> t = np.linspace(0.0, 60.0, 300)
     >>> y = 1 + np.cos(2 * np.pi * 0.4 * t) + 0.5 * np.cos(2 * np.pi * 0.7 * t + 1.0)
-    >>> found = two_frequencies(t, y, 0.1)
-    >>> sorted(found.lines[:2].round(2).tolist())
+    >>> pairs = two_frequencies(t, y, 0.1)
+    >>> sorted(pairs.lines[:2].round(2).tolist())
     [0.4, 0.7]
     """
 
@@ -69,19 +73,26 @@ def two_frequencies(
     shortest: float | None = None,
     count: int = 12,
 ) -> TwoFrequencies:
-    """Pairs (f₁, f₂) whose Fourier series fit best: `Σ c_jk exp 2πi (j f₁ + k f₂) t`, |j| ≤ 2.
+    """Find the pairs (f₁, f₂) whose Fourier series `Σ c_jk exp 2πi (j f₁ + k f₂) t` fit best.
 
-    One of the three strongest lines of the spectrum must be j f₁ + k f₂. All pairs along these
-    curves are tried, then the best ones are refined. Then their aliases are tried: one frequency or
-    both moved by a side peak of the spectral window (readings at night have such peaks at one and
-    two a day) or by half of it, halved, doubled, or f₂ moved by f₁. Several pairs give the same set
-    of lines. All pairs that fit are returned, and a fit of the motion decides.
+    The multiples j go from −2 to 2, k from −`order` to `order`. One of the three strongest lines of
+    the spectrum must be j f₁ + k f₂: all pairs with this property are tried on a grid, and the best
+    ones are refined. Then their aliases are tried: one frequency or both moved by a side peak of
+    the spectral window (readings at night have side peaks at one and two a day) or by half of it;
+    halved, doubled; or f₂ moved by f₁. Several pairs give the same set of lines. All pairs that fit
+    are returned: only a fit of the motion decides between them.
 
-    **Arguments:** `t` (T,) increasing times, s, gaps allowed; `values` (T,) fluxes or their
-    squares; `noise` their standard deviation, one or (T,), `None` if it is not known; `order` the
-    largest multiple k of f₂; `shortest` period of a line, s, `None` for four times the median
-    distance of the times; `count` the largest number of pairs. **Returns** `frequencies`,
-    `misfits`, `dof`, `scatter` and `lines` (`TwoFrequencies`).
+    **Arguments:**
+
+    - `t`: (T,) increasing times, s; gaps are allowed.
+    - `values`: (T,) fluxes or their squares.
+    - `noise`: their standard deviation, one number or (T,); `None` if it is not known.
+    - `order`: the largest multiple k of f₂.
+    - `shortest`: the shortest period of a line, s; `None` for four times the median distance of the
+      times.
+    - `count`: the largest number of pairs.
+
+    **Returns** `frequencies`, `misfits`, `dof`, `scatter` and `lines` (`TwoFrequencies`).
 
     Source: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021 (with all |j| and
     |k| up to one order); the linear fit is that of Lomb 1976, doi:10.1007/BF00648343, for many
@@ -89,8 +100,8 @@ def two_frequencies(
 
     >>> t = np.linspace(0.0, 60.0, 300)
     >>> y = 1 + np.cos(2 * np.pi * 0.4 * t) + 0.5 * np.cos(2 * np.pi * 0.7 * t + 1.0)
-    >>> found = two_frequencies(t, y, 0.1)
-    >>> bool(found.misfits[0] < 0.1)
+    >>> pairs = two_frequencies(t, y, 0.1)
+    >>> bool(pairs.misfits[0] < 0.1)
     True
     """
     t, y = _checks.on_host(t, "t"), _checks.on_host(values, "values")
@@ -106,12 +117,12 @@ def two_frequencies(
         raise ValueError("t: wanted increasing times")
     sigma = np.ones(t.shape)
     if noise is not None:
-        given = _checks.on_host(noise, "noise")
-        if given.shape not in ((), t.shape):
-            raise ValueError(f"noise: wanted one number or (T,) as t has, got shape {given.shape}")
-        if not (np.isfinite(given) & (given > 0)).all():
+        sigma = _checks.on_host(noise, "noise")
+        if sigma.shape not in ((), t.shape):
+            raise ValueError(f"noise: wanted one number or (T,) as t has, got shape {sigma.shape}")
+        if not (np.isfinite(sigma) & (sigma > 0)).all():
             raise ValueError("noise: wanted positive standard deviations")
-        sigma = np.broadcast_to(given, t.shape)
+        sigma = np.broadcast_to(sigma, t.shape)
     with np.errstate(over="ignore"):
         worst = max(np.abs(y).max() / sigma.min(), 1 / sigma.min(), sigma.max())
     if worst > LARGEST:
@@ -124,13 +135,13 @@ def two_frequencies(
     if span / least > MOST:
         words = f"{least:.3g} s, and a light curve of {span:.3g} s"
         raise ValueError(f"shortest: {words}: wanted at most {MOST:.0e} periods in it")
-    light = padded((t - t[0]) / span, y / sigma, 1.0 / sigma)
-    lines = strongest(light, span / least, 2 * LINES)
+    light = pad_light((t - t[0]) / span, y / sigma, 1.0 / sigma)
+    lines = strongest_lines(light, span / least, 2 * LINES)
     highest = SECOND * float(lines[:LINES].max())
-    # All multiples of a pair, and what a step of the refinement adds.
+    # The table holds all multiples of a pair, and the steps of the refinement beyond the highest.
     table = sums(light, 2 * (FIRST + order) * (highest + 1.0))
     pairs, misfits = _scan(table, lines, order)
-    pairs, misfits = refined(table, pairs[distinct(pairs, misfits, count * TRIED)], order)
+    pairs, misfits = refine(table, pairs[distinct(pairs, misfits, count * TRIED)], order)
     pairs, misfits = with_aliases(table, pairs, misfits, highest, order)
     keep = distinct(pairs, misfits, count)
     dof = t.size - unknowns
@@ -140,27 +151,30 @@ def two_frequencies(
     return TwoFrequencies(pairs[keep] / span, misfits[keep] * scale, dof, scatter, lines / span)
 
 
-def padded(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array, Array]:
-    """Times over the span, values and ones over the noise, with zeros up to a whole block."""
+def pad_light(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array, Array]:
+    """Return times x, values z and weights w, padded with zeros to a multiple of `BLOCK`."""
     more = -x.size % BLOCK
     return tuple(jnp.asarray(np.pad(v, (0, more))) for v in (x, z, w))  # pyright: ignore
 
 
-def strongest(light: Any, highest: float, count: int) -> np.ndarray:
-    """The strongest lines, in 1/span: each is subtracted before the next is searched."""
+def strongest_lines(light: tuple[Array, Array, Array], highest: float, count: int) -> np.ndarray:
+    """Return the strongest lines up to the frequency `highest`, in 1/span.
+
+    Each line is subtracted from the `light` before the next one is searched.
+    """
     grid = np.arange(0.5, max(highest, 2.0), 0.2)
     x, z, w = (np.asarray(v) for v in light)
-    found = []
+    lines = []
     for _ in range(count):
-        line, curve = (np.asarray(v) for v in _spectrum(jnp.asarray(filled(grid)), x, z, w))
-        found.append(float(line))
+        line, curve = (np.asarray(v) for v in _strongest_line(jnp.asarray(pad_rows(grid)), x, z, w))
+        lines.append(float(line))
         z = z - w * curve
-    return np.array(found)
+    return np.array(lines)
 
 
 @jax.jit
-def _spectrum(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Array, Array]:
-    """The frequency of the strongest line, and its curve with a constant."""
+def _strongest_line(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Array, Array]:
+    """Return the frequency of the strongest line of a `grid`, and its curve with a constant."""
     x, z, w = jnp.asarray(x), jnp.asarray(z), jnp.asarray(w)
 
     def rows(f: Array) -> Array:
@@ -173,7 +187,7 @@ def _spectrum(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Ar
 
 
 def _scan(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs that give one of the lines, and their misfits."""
+    """Return all pairs on a grid that give one of the `lines`, and their misfits."""
     highest = float(lines[:LINES].max())
     grid = np.arange(0.5, 0.8 * highest + 0.5, STEP)
     whole = np.arange(0.5, SECOND * highest, STEP)
@@ -186,11 +200,15 @@ def _scan(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.nd
                 rows.append(np.stack([grid, second], axis=1))
     pairs = np.concatenate(rows)
     pairs = pairs[(pairs[:, 1] > 0.5) & (pairs[:, 1] < SECOND * highest)]
-    return pairs, misfits_of(table, pairs, order)
+    return pairs, lattice_chi2(table, pairs, order)
 
 
 def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
-    """Pairs (M, 2) that may fit the same readings: moved by (half of) side peaks, and related."""
+    """Return the pairs (M, 2) that may fit the same readings as `pairs` (P, 2).
+
+    Their frequencies are moved by the side peaks `peaks` or half of them, halved, doubled, or
+    combined.
+    """
     moves = np.unique(np.concatenate([[0.0], *((p, -p, p / 2, -p / 2) for p in peaks)]))
     first, second = pairs.T[:, :, None]
     moved = [
@@ -199,14 +217,14 @@ def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
     related = ((first / 2, second), (2 * first, second), (first, second / 2), (first, 2 * second))
     related += ((first, second + first), (first, second - first))
     rows = [*moved, *(np.stack(one, axis=-1) for one in related)]
-    # (f₁, −f₂) makes the same lines.
+    # The pair (f₁, −f₂) has the same lines as (f₁, f₂).
     return np.abs(np.concatenate(rows).reshape(-1, 2))
 
 
 def with_aliases(
     table: Sums, pairs: np.ndarray, misfits: np.ndarray, highest: float, order: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The pairs, and aliases of the best of them, in rounds until no better one is found."""
+    """Return the pairs with aliases of the best of them, in rounds until none is better."""
     peaks = side_peaks(table, highest)
     for _ in range(ROUNDS):
         seeds = pairs[distinct(pairs, misfits, SEEDS)]
@@ -214,8 +232,8 @@ def with_aliases(
         more = more[((more > 0.5) & (more < highest)).all(axis=1)]
         if not len(more):
             break
-        best = distinct(more, misfits_of(table, more, order), 2 * SEEDS)
-        more, new = refined(table, more[best], order)
+        best = distinct(more, lattice_chi2(table, more, order), 2 * SEEDS)
+        more, new = refine(table, more[best], order)
         before = misfits.min()
         pairs, misfits = np.concatenate([pairs, more]), np.concatenate([misfits, new])
         if not new.min() < before * (1 - 1e-3):
@@ -224,24 +242,27 @@ def with_aliases(
 
 
 def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
-    """The indices of `count` pairs that differ, in the order of their misfits."""
-    kept: list[int] = []
+    """Return the indices of `count` pairs that differ, in the order of their misfits."""
+    chosen: list[int] = []
     for index in np.argsort(misfits)[:20_000]:
-        if not kept or np.abs(pairs[kept] - pairs[index]).max(axis=1).min() > NEAR:
-            kept.append(int(index))
-        if len(kept) == count:
+        if not chosen or np.abs(pairs[chosen] - pairs[index]).max(axis=1).min() > NEAR:
+            chosen.append(int(index))
+        if len(chosen) == count:
             break
-    return kept
+    return chosen
 
 
-def refined(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Descend from neighbour to neighbour; the steps become shorter if no neighbour is lower."""
+def refine(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Move each pair from neighbour to neighbour down to a minimum; return pairs and misfits.
+
+    The steps become shorter whenever no neighbour is lower.
+    """
     size = np.full(len(pairs), 0.08)
     least = np.full(len(pairs), np.inf)
     for _ in range(9):
-        around = pairs[:, None] + size[:, None, None] * AROUND
-        found = misfits_of(table, around.reshape(-1, 2), order).reshape(len(pairs), -1)
-        best, least = found.argmin(axis=1), found.min(axis=1)
+        neighbours = pairs[:, None] + size[:, None, None] * AROUND
+        misfits = lattice_chi2(table, neighbours.reshape(-1, 2), order).reshape(len(pairs), -1)
+        best, least = misfits.argmin(axis=1), misfits.min(axis=1)
         pairs = pairs + size[:, None] * AROUND[best]
         size = np.where(best == 4, 0.4 * size, size)
     return pairs, least

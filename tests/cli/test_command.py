@@ -93,7 +93,7 @@ def test_programs_are_kept_in_a_folder_of_the_users_own(
         (tmp_path / "rigidjax").mkdir()
         (tmp_path / "rigidjax").chmod(mode)
     monkeypatch.setattr(os, "getuid", lambda: user + owner)
-    command._keep_compiled()
+    command._keep_compiled_programs()
     assert ("jax_compilation_cache_dir" in said) == used
     err = capsys.readouterr().err
     assert (err == "") == used and ("is not yours alone" in err) != used
@@ -206,7 +206,7 @@ def test_ctrl_c_is_not_lost_in_the_garbage_collector(monkeypatch):
         def __del__(self):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(sys, "unraisablehook", command._once_more)
+    monkeypatch.setattr(sys, "unraisablehook", command._raise_interrupt_again)
     # A job in the background is started with Ctrl-C ignored.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     begin = time.monotonic()
@@ -285,15 +285,15 @@ def test_the_time_column_alone_is_named_beside_a_sensor(folder, fitted, capsys):
     assert "log.csv: 40 samples over 1.95 s\n" in capsys.readouterr().out
     options += ["--columns", "stamp", "p", "q", "r"]
     assert main(["identify", "log.csv", *options]) == 2
-    assert "--time: the first of --columns is it already" in capsys.readouterr().err
+    assert "--time: not together with --columns" in capsys.readouterr().err
 
 
 REFUSED = [
-    (["log.csv", "--columns", "t", "wx", "wy", "wx"], "'wx' is named twice"),
-    (["log.csv", "--columns", "t", "t", "wy", "wz"], "'t' is named twice"),
-    (["log.csv", "--sensor", "gyro=wx,wy,wy"], "'wy' is named twice"),
-    (["log.csv", "--sensor", "gyro=wx,wy,wz", "--sensor", "accelerometer=wx,wy,wz"], "'wx' is named twice"),
-    (["log.csv", "--wheel", "wx:1e-6"], "'wx' is named twice"),
+    (["log.csv", "--columns", "t", "wx", "wy", "wx"], "'wx' twice; one column"),
+    (["log.csv", "--columns", "t", "t", "wy", "wz"], "'t' twice; one column"),
+    (["log.csv", "--sensor", "gyro=wx,wy,wy"], "'wy' twice; one column"),
+    (["log.csv", "--sensor", "gyro=wx,wy,wz", "--sensor", "accelerometer=wx,wy,wz"], "'wx' twice; one column"),
+    (["log.csv", "--wheel", "wx:1e-6"], "'wx' twice; one column"),
     (["log.csv", "./log.csv"], "a log is given twice"),
     (["log.csv", "--json", "log.csv"], "--json: log.csv is already the FILE"),
     (["log.csv", "--json", "a", "--report", "./a"], "--json: a is already the report"),
@@ -306,7 +306,7 @@ REFUSED = [
     (["log.csv", "--flight", "2"], "log.csv: flight 2: only a Blackbox log (.bbl, .bfl) has flights"),
     (["log.csv", "--window", "20", "30"], "between 20 and 30 s from the first stamp; the log goes from 0 to 11 s"),
     (["log.csv", "--window", "3", "2"], "window: wanted FROM below TO, got 3 2"),
-    (["log.csv", "--free", "delay"], "--free delay: that of a --wheel, and there is none"),
+    (["log.csv", "--free", "delay"], "--free delay: wanted a --wheel"),
     (["a\x1b[31m.csv"], r"a\x1b[31m.csv: no such file"),
     (["log.csv", "--json", "a\x1b[31m/b"], r"there is no folder a\x1b[31m"),
 ]  # fmt: skip

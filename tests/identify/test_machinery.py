@@ -183,7 +183,7 @@ def test_profile_agrees_with_the_covariance_where_the_misfit_is_quadratic(free_r
     found = identify.fit(problem, starts=1)
     low, high = identify.profile(found, "Ix/Iz")
     np.testing.assert_allclose([low, high], found.interval()["Ix/Iz"], rtol=2e-3)
-    with pytest.raises(ValueError, match=r"no quantity 'mass'; wanted one of Ix/Iz"):
+    with pytest.raises(ValueError, match=r"profile: wanted one of Ix/Iz.*got 'mass'"):
         identify.profile(found, "mass")
 
 
@@ -275,7 +275,7 @@ def test_a_checkpoint_of_other_options_is_refused(short_record, tmp_path):
     again = identify.fit(problem, starts=1, max_steps=20, checkpoint=path)
     np.testing.assert_array_equal(found.x, again.x)
     for other in ({"max_steps": 21}, {"tolerance": 1e-3}):
-        with pytest.raises(ValueError, match="of another model, or of other options"):
+        with pytest.raises(ValueError, match="of this model and these options, got that of others"):
             identify.fit(problem, starts=1, checkpoint=path, **{"max_steps": 20, **other})
 
 
@@ -310,7 +310,9 @@ def test_a_damaged_checkpoint_is_told_in_words(short_record, tmp_path, kind):
     else:
         path.write_bytes(whole[:-8])
     before = path.read_bytes()
-    with pytest.raises(ValueError, match="no checkpoint of a fit, or a damaged one"):
+    with pytest.raises(
+        ValueError, match="wanted the checkpoint of a fit, got another file or a damaged one"
+    ):
         checkpoint.Checkpoint(path, like, "2")
     assert path.read_bytes() == before
 
@@ -319,7 +321,7 @@ def test_a_checkpoint_needs_its_folder_before_the_search_begins(short_record, tm
     problem = identify.Model(short_record, identify.PrincipalRatios())
     with pytest.raises(ValueError, match=r"there is no folder .*absent"):
         identify.fit(problem, starts=1, checkpoint=tmp_path / "absent" / "fit.npz")
-    with pytest.raises(ValueError, match="wanted a file, this is a folder"):
+    with pytest.raises(ValueError, match="wanted a file, got a folder"):
         identify.fit(problem, starts=1, checkpoint=tmp_path)
 
 
@@ -419,7 +421,7 @@ WRONG = [
     (["--model", "tensor"], "free motion shows ratios only; a scale needs a --wheel"),
     (
         ["--window", "5", "6"],
-        "fewer than 4 samples between 5 and 6 s from the first stamp; the log goes from 0 to 1.1 s",
+        "wanted at least 4 samples between 5 and 6 s from the first stamp, got 0; the log goes from 0 to 1.1 s",
     ),
 ]
 

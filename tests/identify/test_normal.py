@@ -113,7 +113,7 @@ def test_a_matrix_that_is_not_positive_has_no_solution():
 
 def jacobian(linear):
     """The weighted Jacobian, row by row, in the columns of all numbers."""
-    rows = [np.diag(linear.firm), linear.extra_slopes]
+    rows = [np.diag(linear.prior_weights), linear.extra_slopes]
     for block, where in zip(linear.dense, linear.places, strict=True):
         wide = np.zeros((len(block), linear.size + 1))
         np.add.at(wide.T, where, block.T)
@@ -138,10 +138,10 @@ def test_the_covariance_is_the_inverse_of_the_information(count):
     linear = linear_at(problem)
     rows = jacobian(linear)
     wanted = np.linalg.pinv(rows) @ np.linalg.pinv(rows).T
-    found = uncertainty.of_white(linear)
+    found = uncertainty.white_covariance(linear)
     size = np.sqrt(np.diag(wanted))
     np.testing.assert_allclose(
-        found.seen / np.outer(size, size), wanted / np.outer(size, size), atol=1e-9
+        found.determined / np.outer(size, size), wanted / np.outer(size, size), atol=1e-9
     )
     assert len(found.null_directions) == 0
 
@@ -149,17 +149,17 @@ def test_the_covariance_is_the_inverse_of_the_information(count):
 @pytest.mark.parametrize("count", [1, 9])
 def test_the_sandwich_is_the_product_of_its_definition(count):
     linear = linear_at(several(9) if count > 1 else near_a_guess())
-    white = uncertainty.of_white(linear)
+    white = uncertainty.white_covariance(linear)
     _, triangles = np.linalg.qr(linear.dense)
     meat = RNG.normal(size=(count, triangles.shape[2], triangles.shape[1]))
     meat = meat @ meat.swapaxes(1, 2)
     # Priors have their own information in the middle.
-    middle = np.diag(linear.firm**2) + linear.extra_slopes.T @ linear.extra_slopes
+    middle = np.diag(linear.prior_weights**2) + linear.extra_slopes.T @ linear.extra_slopes
     for triangle, where, m in zip(triangles, linear.places, meat, strict=True):
         wide = np.zeros((len(triangle), linear.size + 1))
         wide[:, where] = triangle
         middle += wide[:, :-1].T @ m @ wide[:, :-1]
-    wanted = white.seen @ middle @ white.seen
+    wanted = white.determined @ middle @ white.determined
     found = white.root.sandwich(triangles, linear.places, meat)
     size = np.sqrt(np.diag(wanted))
     np.testing.assert_allclose(
@@ -175,7 +175,7 @@ def test_what_is_not_determined_is_found_in_the_shared_numbers_and_in_those_of_o
     slopes = linear.slopes[0].copy()
     slopes[2] = 0.0
     linear = dataclasses.replace(linear, slopes=(slopes,))
-    found = uncertainty.of_white(linear)
+    found = uncertainty.white_covariance(linear)
     rows = jacobian(linear)
     size = np.sqrt(np.sum(rows**2, axis=0))
     # A column of round-off is none.
@@ -185,7 +185,7 @@ def test_what_is_not_determined_is_found_in_the_shared_numbers_and_in_those_of_o
     assert (reach < 1e-7 * np.abs(rows).max()).all()
     # Within the others it is the inverse: H C H = H.
     half = rows / size
-    information, covariance = half.T @ half, found.seen * np.outer(size, size)
+    information, covariance = half.T @ half, found.determined * np.outer(size, size)
     np.testing.assert_allclose(information @ covariance @ information, information, atol=1e-8)
     blind = np.isinf(np.diag(found.covariance))
     third = np.asarray(linear.places[2])[-3:]
@@ -208,7 +208,7 @@ def test_numbers_that_rows_tie_together_stay_in_the_core():
     rows = jacobian(linear)
     wanted = np.linalg.pinv(rows) @ np.linalg.pinv(rows).T
     size = np.sqrt(np.diag(wanted))
-    found = uncertainty.of_white(linear).seen
+    found = uncertainty.white_covariance(linear).determined
     np.testing.assert_allclose(
         found / np.outer(size, size), wanted / np.outer(size, size), atol=1e-7
     )
@@ -224,7 +224,7 @@ def test_fewer_readings_than_numbers_are_told():
         for where, name in ((SKEW, "skew"), (SCALE, "scale"))
     ]
     linear = linear_at(identify.Model(few, identify.Ratios(), free=free))
-    found = uncertainty.of_white(linear)
+    found = uncertainty.white_covariance(linear)
     # Six numbers read and nine of its own in each recording, and five of all.
     assert len(found.null_directions) == linear.size - 54 == 32
 

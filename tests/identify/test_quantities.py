@@ -12,7 +12,11 @@ import scipy.stats
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import report
-from rigidjax.identify.uncertainty.quantities import carried, quantities, values_and_slopes
+from rigidjax.identify.uncertainty.quantities import (
+    quantities,
+    standard_deviations,
+    values_and_slopes,
+)
 
 NONE = np.zeros((0, 2))
 TIMES = np.linspace(0.0, 10.0, 80)
@@ -28,28 +32,32 @@ def test_deviations_of_a_good_covariance():
     # √(gᵀCg), by hand; and of two numbers that differ by 1e-6 of what each is unsure by.
     slopes = np.array([[1.0, 0.0], [1.0, -1.0], [0.0, 0.0]])
     covariance = np.array([[4.0, 1.0], [1.0, 9.0]])
-    np.testing.assert_allclose(carried(slopes, covariance, NONE), [2.0, math.sqrt(11.0), 0.0])
+    np.testing.assert_allclose(
+        standard_deviations(slopes, covariance, NONE), [2.0, math.sqrt(11.0), 0.0]
+    )
     close = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-12]])
-    assert carried(slopes[1], close, NONE) == pytest.approx(1e-6, rel=1e-2)
+    assert standard_deviations(slopes[1], close, NONE) == pytest.approx(1e-6, rel=1e-2)
     # In any units.
     units = np.array([1e-9, 1e6])
     scaled = covariance * np.outer(units, units)
     np.testing.assert_allclose(
-        carried(slopes / units, scaled, NONE), [2.0, math.sqrt(11.0), 0.0], rtol=1e-12
+        standard_deviations(slopes / units, scaled, NONE), [2.0, math.sqrt(11.0), 0.0], rtol=1e-12
     )
     blind = np.array([[0.0, 1.0]])
-    assert carried(slopes, covariance, blind)[1:].tolist() == [np.inf, 0.0]
+    assert standard_deviations(slopes, covariance, blind)[1:].tolist() == [np.inf, 0.0]
 
 
 def test_a_negative_variance_gives_no_interval():
     slopes = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [2.0, 1.0], [0.0, 0.0]])
-    found = carried(slopes, np.diag([1.0, -1.0]), NONE)
+    found = standard_deviations(slopes, np.diag([1.0, -1.0]), NONE)
     np.testing.assert_array_equal(found, [1.0, np.nan, np.nan, np.nan, 0.0])
     # A positive diagonal hides it: the difference of the two has the variance −1.
-    found = carried(np.array([[1.0, 0.0], [1.0, -1.0]]), np.array([[1.0, 1.5], [1.5, 1.0]]), NONE)
+    found = standard_deviations(
+        np.array([[1.0, 0.0], [1.0, -1.0]]), np.array([[1.0, 1.5], [1.5, 1.0]]), NONE
+    )
     assert np.isnan(found).all()
     # What is left of a variance after all digits cancel is none.
-    assert np.isnan(carried(np.array([1.0, -1.0]), np.ones((2, 2)), NONE))
+    assert np.isnan(standard_deviations(np.array([1.0, -1.0]), np.ones((2, 2)), NONE))
 
 
 def test_an_indefinite_information_is_told():

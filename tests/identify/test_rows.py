@@ -8,7 +8,7 @@ import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.search.stages import errors_and_slopes
 from rigidjax.identify.uncertainty import covariance as uncertainty
-from rigidjax.identify.uncertainty.quantities import carried
+from rigidjax.identify.uncertainty.quantities import standard_deviations
 
 TS = jnp.linspace(0.0, 10.0, 80)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -75,7 +75,7 @@ def test_i2_rank_of_degenerate_motions(name):
     truth = problem.start(body, list(omega))
     noise = (jnp.full((1, 3), 0.01),)
     linear = linear_at(problem, truth, noise)
-    spread = uncertainty.spread(linear, uncertainty.correlation_times(linear))
+    spread = uncertainty.covariance_of(linear, uncertainty.correlation_times(linear))
     assert 6 - len(spread.null_directions) == rank
 
 
@@ -85,12 +85,12 @@ def test_i2_nearly_a_pure_spin_is_seen_but_weakly():
     truth = problem.start(BODY, list(omega))
     noise = (jnp.full((1, 3), 1e-6),)
     linear = linear_at(problem, truth, noise)
-    spread = uncertainty.spread(linear, uncertainty.correlation_times(linear))
+    spread = uncertainty.covariance_of(linear, uncertainty.correlation_times(linear))
     assert 6 - len(spread.null_directions) == 5
 
 
 def away(linear):
-    return uncertainty.distance(linear, uncertainty.of_white(linear))
+    return uncertainty.distance_to_minimum(linear, uncertainty.white_covariance(linear))
 
 
 def test_the_distance_to_the_least_misfit_is_what_it_explains():
@@ -245,7 +245,7 @@ def test_i9_a_thin_rod_from_a_poor_start():
     assert low <= 1.0 / 50.3 <= high
 
 
-def test_carried_deviations_are_infinite_where_blind():
+def test_deviations_are_infinite_where_blind():
     seen, null = np.diag([1.0, 0.0]), np.array([[0.0, 1.0]])
-    found = carried(np.array([[2.0, 0.0], [1.0, 1.0]]), seen, null)
+    found = standard_deviations(np.array([[2.0, 0.0], [1.0, 1.0]]), seen, null)
     np.testing.assert_array_equal(found, [2, np.inf])

@@ -18,10 +18,10 @@ from rigidjax.identify.search.least_squares import LMState, Settings
 from rigidjax.identify.search.stages import (
     Attempt,
     Task,
-    beginning,
     fit_in_stages,
     least_squares_from,
     polish,
+    weights_of_beginning,
     whole_record,
 )
 
@@ -128,7 +128,7 @@ def searched(problem, weights, settings):
 
 def test_a_part_of_the_record_is_followed_no_further_than_that(pushed):
     of = pushed(9.0)
-    part, all_of_it = beginning(of, 0.25), whole_record(of)
+    part, all_of_it = weights_of_beginning(of, 0.25), whole_record(of)
     once = Settings(1e-4, 1.0, 0)
     # Beyond the part nothing is computed: what is not finite there does no harm.
     lost = pushed(1.5)

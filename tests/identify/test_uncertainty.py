@@ -11,7 +11,12 @@ import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import report
 from rigidjax.identify.search.stages import errors_and_slopes
-from rigidjax.identify.uncertainty.covariance import correlation_times, inverted, linearise, spread
+from rigidjax.identify.uncertainty.covariance import (
+    correlation_times,
+    covariance_of,
+    covariance_root,
+    linearise,
+)
 
 TOSSES = Path(__file__).parents[3] / "shared" / "data" / "tennis_racket" / "tosses.csv"
 
@@ -47,7 +52,7 @@ def test_the_sandwich_is_that_of_its_definition(toss):
     blocks = errors_and_slopes(found.model, found.x)
     linear = linearise(found.model, found.x, found.noises, blocks)
     times = correlation_times(linear)
-    got = spread(linear, times)
+    got = covariance_of(linear, times)
     slopes = linear.slopes[0][0] * np.sqrt(linear.weights[0][0])[:, None, None]
     inverse = np.linalg.inv(np.einsum("tki,tkj->ij", slopes, slopes))
     apart = np.abs(np.subtract.outer(np.arange(60), np.arange(60)))
@@ -64,19 +69,19 @@ def test_the_sandwich_is_that_of_its_definition(toss):
         candidates.append(inverse @ meat @ inverse)
     best = max(candidates, key=lambda c: np.mean(np.diag(c) / np.diag(inverse)))
     scale = np.sqrt(np.outer(np.diag(best), np.diag(best)))
-    of_spread = np.sqrt(np.outer(np.diag(got.seen), np.diag(got.seen)))
-    np.testing.assert_allclose(got.seen / of_spread, best / scale, atol=1e-9)
-    grown = np.diag(got.seen) / np.diag(best)
+    of_spread = np.sqrt(np.outer(np.diag(got.determined), np.diag(got.determined)))
+    np.testing.assert_allclose(got.determined / of_spread, best / scale, atol=1e-9)
+    grown = np.diag(got.determined) / np.diag(best)
     assert (grown > 1 - 1e-9).all()
 
 
 def test_what_an_information_does_not_show_is_not_made_up():
-    root, null = inverted(np.array([[2.0, 2.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 4.0]]))
+    root, null = covariance_root(np.array([[2.0, 2.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 4.0]]))
     np.testing.assert_allclose((root @ root.T)[2], [0.0, 0.0, 0.25], atol=1e-15)
     np.testing.assert_allclose(np.abs(null), [[0.5**0.5, 0.5**0.5, 0.0]], atol=1e-12)
     units = np.array([1e-6, 1.0, 1e6])
     good = np.array([[2.0, 1.0, 0.0], [1.0, 2.0, 0.5], [0.0, 0.5, 4.0]])
-    root, null = inverted(good * np.outer(units, units))
+    root, null = covariance_root(good * np.outer(units, units))
     wanted = np.linalg.inv(good) / np.outer(units, units)
     np.testing.assert_allclose(root @ root.T, wanted, rtol=1e-12)
     assert null.shape == (0, 3)

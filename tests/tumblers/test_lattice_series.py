@@ -16,7 +16,7 @@ LIGHT = tuple(jnp.asarray(v) for v in (T, Y / SIGMA, 1 / SIGMA))
 def test_its_misfit_is_that_of_dense_least_squares(order):
     pairs = np.array([[7.3, 4.1], [3.2, 9.9], [0.9, 17.2]])
     table = lattice_series.sums(LIGHT, 120.0)
-    found = lattice_series.misfits_of(table, pairs, order)
+    found = lattice_series.lattice_chi2(table, pairs, order)
     for pair, misfit in zip(pairs, found, strict=True):
         columns = [np.ones_like(T)]
         for j in range(3):
@@ -35,7 +35,7 @@ def test_the_table_is_the_sum_between_its_entries():
     turns = np.exp(2j * np.pi * f[:, None] * (T - 0.5))
     for values, weights in ((table.window, SIGMA**-2), (table.data, Y / SIGMA**2)):
         wanted = turns @ weights
-        found = np.asarray(lattice_series._at(values, jnp.asarray(f)))
+        found = np.asarray(lattice_series._interpolate(values, jnp.asarray(f)))
         np.testing.assert_allclose(found, wanted, atol=1e-8 * np.abs(weights).sum())
 
 

@@ -1,1 +1,1 @@
-"""Readers of logs, one format in each module; `table.read_table` chooses among them."""
+"""Readers of logs, one module for each format; `table.read_table` chooses among them."""

@@ -1,4 +1,4 @@
-"""NumPy's and MATLAB's files of arrays."""
+"""The readers of NumPy's and MATLAB's files of arrays."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from rigidjax.cli.logs.columns import Columns
 
 def npz(path: Path, columns: Sequence[str]) -> Columns:
     """Return the names of the arrays in a `.npz` file, and the wanted ones."""
-    # NumPy does not close a file that it opened itself and cannot read.
+    # Open the file here: NumPy does not close a file that it opened and cannot read.
     with path.open("rb") as raw, np.load(raw) as file:
         return file.files, {name: file[name] for name in columns if name in file.files}
 

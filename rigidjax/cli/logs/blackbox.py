@@ -1,7 +1,8 @@
-"""Blackbox logs of flight controllers, whose fields are decoded by orangebox (an extra).
+"""The reader of Blackbox logs of flight controllers; orangebox (an extra) decodes their fields.
 
-The library hands on frames that stand on no I frame (a P frame holds differences), so that the
-order of frames is followed here, as the flight controllers' own decoder does.
+A P frame holds differences from the frames before it, down to an I frame, which stands alone. The
+library returns P frames even if their I frame is missing. The order of frames is therefore checked
+here, as the flight controllers' own decoder does.
 """
 
 import math
@@ -18,9 +19,10 @@ from rigidjax import _checks
 from rigidjax.cli.logs.columns import Columns
 from rigidjax.cli.logs.errors import LogError, warn
 
-# The bounds of the flight controllers' own decoder; times in µs, both counters have 32 bits.
+# The bounds of the flight controllers' own decoder: a frame in bytes, jumps of the iteration and of
+# the time, µs. Both counters have 32 bits.
 _LONGEST_FRAME, _ITERATION_JUMP, _TIME_JUMP, _WRAP = 256, 5_000, 10_000_000, 2**32
-# How many numbers of variable length follow each kind of event.
+# The number of numbers of variable length that follow each kind of event.
 _EVENT_NUMBERS = {0: 1, 14: 2, 15: 1, 30: 2}
 _RESUME, _ADJUSTMENT, _LOG_END = 14, 13, 255
 _END_MARK = b"End of log\0"
@@ -30,10 +32,11 @@ _ERASED = re.compile(rb"[\xff\0]*\Z")
 def blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
     """Return the names of all fields, and the wanted ones, of one flight in a Blackbox log.
 
-    Rates come in deg/s and accelerations in g by the scales in the header, as in the flight
-    controllers' own viewer; other fields as logged. A log without its last mark is read to its end.
-    P frames before the first I frame, and frames from a hurt one to the next I frame, are left out
-    with a warning. **Raises** `LogError` where there are several flights and none is chosen.
+    Rates are in deg/s and accelerations in g, by the scales in the header, as in the flight
+    controllers' own viewer; other fields are as logged. A log without its end mark is read to the
+    end of the file. P frames before the first I frame, and frames from a damaged one to the next I
+    frame, are left out with a warning. **Raises** `LogError` if there are several flights and none
+    is chosen.
     """
     library = _checks.library("orangebox.reader", "blackbox", str(path))
     pointers = library.Reader(str(path)).log_pointers
@@ -45,7 +48,7 @@ def blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> C
             f"--flight 1 to {len(pointers)} (flight= in Python)"
         )
     if flight is not None and not 1 <= flight <= len(pointers):
-        raise LogError(f"{path}: no flight {flight}; it holds {len(pointers)}")
+        raise LogError(f"{path}: wanted a flight from 1 to {len(pointers)}, got {flight}")
     index = flight or 1
     data = path.read_bytes()[pointers[index - 1] : (*pointers, None)[index]]
     log = _Flight(library.Reader(str(path), index), data)
@@ -59,8 +62,8 @@ def blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> C
     log.left_out += int((~keep).sum())
     if log.left_out:
         warn(
-            f"{path}: {log.left_out} of {log.count} frames are left out: they stand on no whole I "
-            "frame (the first one is missing, or a frame is hurt)"
+            f"{path}: {log.left_out} of {log.count} frames are left out: they depend on an I frame "
+            "that is missing, or on a frame that is damaged"
         )
     return log.names, {
         name: log.wrapped(name, np.frombuffer(numbers, float)[keep])
@@ -70,21 +73,22 @@ def blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> C
 
 
 class _Bytes:
-    """Iterate over bytes, as the library's decoders read them; `place` is that of the next one."""
+    """An iterator over bytes, for the library's decoders; `place` is the index of the next byte."""
 
     def __init__(self, data: bytes, place: int):
         self.data, self.place = data, place
 
     def __next__(self) -> int:
         self.place += 1
-        # An `IndexError` says that the data end within a frame.
+        # An `IndexError` tells the caller that the data end within a frame.
         return self.data[self.place - 1]
 
 
 class _Flight:
     """One flight: its header, and its frames in the order of the log.
 
-    `count` is the number of I and P frames met so far, `left_out` that of those not handed on.
+    **Fields**, among others: `names` of all fields; `count` the number of I and P frames met so
+    far; `left_out` the number of those that were left out.
     """
 
     def __init__(self, reader: Any, data: bytes):
@@ -111,10 +115,11 @@ class _Flight:
         return values % _WRAP
 
     def frames(self) -> Iterator[tuple[int, Mapping[str, float]]]:
-        """Yield the group and the fields, by name, of each frame that stands on a whole I frame.
+        """Yield the group and the fields, by name, of each frame that can be decoded.
 
-        The group is that of a P frame, and -1 for an I frame, which stands alone. Fields of slow
-        and GPS frames have the values of the last such frame, NaN before the first.
+        The group counts the I frames; an I frame itself, which depends on no other frame, has the
+        group -1. Fields of slow and GPS frames have the values of the last such frame, NaN before
+        the first.
         """
         order, lost = self.order, 0
         stream, others = _Bytes(self.data, self._header_size()), dict.fromkeys(self.others, np.nan)
@@ -122,7 +127,8 @@ class _Flight:
             kind = self.kinds.get(next(stream))
             begin = stream.place
             if kind is None or (kind != self.kind.EVENT and kind not in self.fields):
-                # A frame without its letter; erased memory at the end of a log is none.
+                # These bytes are a frame that lost its letter. Erased memory at the end of a log
+                # does not count as one.
                 lost, order.is_valid = lost + order.is_valid, False
                 continue
             is_main = kind in (self.kind.INTRA, self.kind.INTER)
@@ -142,7 +148,8 @@ class _Flight:
                 values = ()
             size = stream.place - begin
             if not values or size > _LONGEST_FRAME or not self._is_frame_next(stream.place):
-                # It may have swallowed the letter of the next frame.
+                # The decoder may have read the letter of the next frame: begin again after this
+                # frame's letter.
                 stream.place, order.is_valid = begin, False
                 self.left_out += is_main
             elif not is_main:
@@ -158,14 +165,14 @@ class _Flight:
                 yield -1 if kind == self.kind.INTRA else order.groups, others | fields
 
     def _next_iteration(self) -> int:
-        """Return the iteration after that of the last frame, by the header's intervals."""
+        """Return the iteration that the next frame must have, by the intervals in the header."""
         return self.context.last_iter + 1 + self.context.count_skipped_frames()
 
     def _is_frame_next(self, place: int) -> bool:
-        """Whether the bytes from here on are a frame, a P frame without its letter, or the end.
+        """Return whether at `place` there is a frame, a P frame without its letter, or the end.
 
-        Where they are none, the frame before is probably hurt itself: it has too few bytes or too
-        many. Erased memory is an end.
+        If there is none, the frame before is probably damaged: it has too few bytes or too many.
+        Erased memory is an end.
         """
         if place == len(self.data) or self.data[place] in self.kinds:
             return True
@@ -179,7 +186,7 @@ class _Flight:
         return stream.place == len(self.data) or self.data[stream.place] in self.kinds
 
     def _header_size(self) -> int:
-        """Return where the lines of the header end."""
+        """Return the index of the first byte after the header."""
         place = 0
         while self.data.startswith(b"H ", place):
             place = self.data.index(b"\n", place) + 1
@@ -214,11 +221,16 @@ class _Flight:
 
 
 class _Order:
-    """Follow the iterations and times of I and P frames.
+    """The order of I and P frames by their iterations and times.
 
-    A group is an I frame and the P frames after it; `groups` counts them, `incomplete` are those
-    with too few frames. `time` is that of the last frame, µs, without the jumps of a clock of 32
-    bits. `is_valid` says whether all frames since the last I frame were whole.
+    A group is an I frame and the P frames after it.
+
+    **Fields**, among others:
+
+    - `groups`: the number of groups.
+    - `incomplete`: the groups with too few frames.
+    - `time`: of the last frame, µs, without the jumps of a clock of 32 bits.
+    - `is_valid`: whether all frames since the last I frame were whole.
     """
 
     def __init__(self):
@@ -229,12 +241,16 @@ class _Order:
         self.groups, self.incomplete = 0, list[int]()
 
     def resume(self, numbers: Sequence[int]) -> None:
-        """Go on at the iteration and the time of an event after a pause."""
+        """Continue at the iteration and the time `numbers` of an event after a pause."""
         self.last = self.last_key = tuple(numbers)
         self.is_resumed = True
 
     def accepts(self, values: Sequence[int], is_key: bool, expected: int) -> bool:
-        """Whether a frame of this iteration and time follows the last one; it is the last then."""
+        """Return whether a frame continues the last one, and make it the last one if so.
+
+        **Arguments:** `values` its iteration and time; `is_key` whether it is an I frame;
+        `expected` the iteration that it must have.
+        """
         if is_key:
             if self.is_valid and not self.is_resumed and self._lacks_frames(values, expected):
                 self.incomplete.append(self.groups)
@@ -243,33 +259,37 @@ class _Order:
             self.is_valid = self.is_valid and _continues(self.last, values)
         if self.is_valid:
             if is_key:
-                # A time that is wrong in a P frame must not move those of later groups.
-                ahead = (values[1] - self.key_time) % _WRAP
-                self.key_time = self.key_time + ahead if self.groups else values[1]
+                # Count from the last I frame: a wrong time of a P frame must not move later groups.
+                elapsed = (values[1] - self.key_time) % _WRAP
+                self.key_time = self.key_time + elapsed if self.groups else values[1]
                 self.groups += 1
             self.time = self.key_time + (values[1] - self.key_time) % _WRAP
             self.last = values
         if is_key:
-            # If it does not continue the last I frame, either may be the hurt one: the next I frame
-            # is compared with the later.
+            # Of two I frames that do not continue each other either may be damaged: compare the
+            # next I frame with the later one.
             self.last_key, self.is_resumed = values, False
         return self.is_valid
 
     def _lacks_frames(self, key: Sequence[int], expected: int) -> bool:
-        """Whether an I frame is not the one after the last frame; a greater jump is a pause."""
+        """Return whether frames are missing between the last frame and an I frame, `key`.
+
+        A great jump of the iteration is a pause, in which none are missing.
+        """
         is_earlier = (key[1] - self.last[1]) % _WRAP >= _WRAP // 2
         return is_earlier or 0 < (key[0] - expected) % _WRAP < _ITERATION_JUMP
 
     def incomplete_groups(self) -> list[int]:
-        """Return the groups that lost frames unseen; none if that is so of half the groups.
+        """Return the groups from which frames are missing.
 
-        Then it is the header's interval of frames that is not what the log has.
+        If this is so for half of all groups, return none: then the interval of frames in the header
+        is not that of the log.
         """
         return self.incomplete if 2 * len(self.incomplete) < self.groups else []
 
 
 def _unsigned(stream: _Bytes) -> int:
-    """Read a number of variable length: seven bits a byte, the eighth says that more follow."""
+    """Read a number of variable length: seven bits a byte, the eighth is set if more follow."""
     number, shift = 0, 0
     while shift < 35:
         byte = next(stream)
@@ -281,17 +301,17 @@ def _unsigned(stream: _Bytes) -> int:
 
 
 def _continues(last: Sequence[int], values: Sequence[int]) -> bool:
-    """Whether iteration and time of a frame go on from the last one, and not too far."""
+    """Return whether iteration and time of a frame follow those of the `last` one closely."""
     iteration, time = ((new - old) % _WRAP for old, new in zip(last, values, strict=True))
     return iteration < _ITERATION_JUMP and time < _TIME_JUMP
 
 
 def _scales(headers: Mapping[str, Any]) -> dict[str, float]:
-    """Return the factors of the raw numbers of some fields."""
+    """Return the factors from the raw numbers of rates and accelerations to deg/s and g."""
     factors = {}
     if "gyro_scale" in headers:
         value = headers["gyro_scale"]
-        # Written as the bits of a float, which the parser takes for a whole number.
+        # The header has the bits of a float, which the parser takes for a whole number.
         scale = struct.unpack("f", struct.pack("I", value))[0] if isinstance(value, int) else value
         baseflight = "baseflight" in str(headers.get("Firmware type", "")).lower()
         factors["gyroADC"] = scale * (1e6 * 180 / math.pi if baseflight else 1.0)

@@ -1,6 +1,6 @@
-"""What a reader of a binary log returns."""
+"""The type of the result of a reader of binary logs."""
 
 from typing import Any
 
-# All names, and the arrays of the wanted ones.
+# The names of all columns, and the arrays of the wanted ones.
 Columns = tuple[list[str], dict[str, Any]]

@@ -1,4 +1,4 @@
-"""The binary log of the Crazyflie's µSD card, which has no library, by its own header."""
+"""The reader of the Crazyflie's µSD log: no library reads it, but its header describes it."""
 
 import struct
 from array import array
@@ -15,8 +15,9 @@ FIRST_BYTE = 0xBC
 def crazyflie(path: Path, columns: Sequence[str]) -> Columns:
     """Return the variables of a Crazyflie's µSD log by name (`gyro.x`), and their `timestamp`, µs.
 
-    They are those of the event with most of the wanted names. Source: the format's description in
-    the firmware's documentation, "µSD card deck", versions 1 and 2.
+    A log holds several events, each with variables of its own: the one with most of the wanted
+    names is read. Source: the description of the format in the documentation of the firmware,
+    "µSD card deck", versions 1 and 2.
     """
     data = path.read_bytes()
     version, count = struct.unpack_from("<HH", data, 1)
@@ -34,7 +35,7 @@ def crazyflie(path: Path, columns: Sequence[str]) -> Columns:
         size, at = struct.unpack_from("<H", data, at)[0], at + 2
         names, kinds = ["timestamp"], "I" if version == 1 else "Q"
         for _ in range(size):
-            # A name and the kind of its number, as `gyro.x(f)`.
+            # Each word is a name and the type of its number, such as `gyro.x(f)`.
             word, at = text(at)
             names, kinds = [*names, word[:-3]], kinds + word[-2]
         events[key] = names, struct.Struct("<" + kinds), array("d")
@@ -45,7 +46,7 @@ def crazyflie(path: Path, columns: Sequence[str]) -> Columns:
         at += 2 + form.size
     names, _, rows = max(events.values(), key=lambda e: (len({*columns} & {*e[0]}), len(e[2])))
     table = np.frombuffer(rows, float).reshape(-1, len(names)).T
-    held = dict(zip(names, table, strict=True))
-    held["timestamp"] = held["timestamp"] * (1e3 if version == 1 else 1.0)
+    arrays = dict(zip(names, table, strict=True))
+    arrays["timestamp"] = arrays["timestamp"] * (1e3 if version == 1 else 1.0)
     every = [name for names, *_ in events.values() for name in names]
-    return list(dict.fromkeys(every)), {name: held[name] for name in columns if name in held}
+    return list(dict.fromkeys(every)), {name: arrays[name] for name in columns if name in arrays}

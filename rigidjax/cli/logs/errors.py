@@ -1,4 +1,4 @@
-"""The error of a log that cannot be read, and the warning of one that is not read whole."""
+"""The error for a log that cannot be read, and the warning for one that is not read whole."""
 
 import warnings
 
@@ -6,17 +6,20 @@ from rigidjax import _checks
 
 
 class LogError(ValueError):
-    """A log that cannot be read; the message names the file and, where known, line and column."""
+    """The error for a log that cannot be read.
+
+    The message names the file and, if they are known, the line and the column.
+    """
 
     def __str__(self) -> str:
-        # Names out of a file must not move the cursor of the terminal that shows them.
+        """Return the message without control characters: a name may hold those of a terminal."""
         return _checks.printable(super().__str__())
 
 
 class LogWarning(UserWarning):
-    """A log of which a part is left out, or whose units are doubtful; the command prints it."""
+    """The warning for a log of which a part is left out, or whose units are doubtful."""
 
 
 def warn(words: str) -> None:
-    """Warn with a `LogWarning` of these words."""
+    """Warn by a `LogWarning` with these words."""
     warnings.warn(LogWarning(_checks.printable(words)), stacklevel=3)

@@ -6,22 +6,26 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rigidjax.cli.logs.table import BINARY, kind_of
-from rigidjax.cli.logs.text import opened, read_header
+from rigidjax.cli.logs.text import open_text, read_header
 from rigidjax.cli.logs.units import TIME_UNITS, unit_in
 
 
-class Layout(NamedTuple):
-    """Names of the time and the three rate columns, the unit of the rates, that of the time."""
+class ImuColumns(NamedTuple):
+    """The columns of time and rates of a log.
+
+    **Fields:** `columns` the names of the time and of the three rates; `unit` of the rates;
+    `time_unit`.
+    """
 
     columns: tuple[str, str, str, str]
     unit: str
     time_unit: str
 
 
-USUAL = Layout(("t", "wx", "wy", "wz"), "rad/s", "s")
+USUAL = ImuColumns(("t", "wx", "wy", "wz"), "rad/s", "s")
 
 
-# The units of fields in logs that have no units in their names.
+# The units of fields in binary logs, whose names hold no units.
 _UNITS = {
     ".bbl": {"time": "us", "gyroADC": "deg/s", "accSmooth": "g"},
     ".ulg": {"timestamp": "us"},
@@ -36,23 +40,26 @@ def usual_unit(path: str | Path, name: str) -> str | None:
     return next((units[part] for part in re.split(r"[.\[]", name) if part in units), None)
 
 
-def layout_of(path: str | Path) -> Layout:
-    """Return the layout of a log, else `USUAL`.
+def imu_columns_of(path: str | Path) -> ImuColumns:
+    """Return the columns of time and rates of a log, `USUAL` if they are not known.
 
-    That of a text is read from the units in its names, as phyphox writes them in any language.
+    In a text they are known by the units in their names, as phyphox writes them in any language.
     """
     path = Path(path)
-    # Whoever reads the log says what is wrong with it.
+    # Suppress errors here: the reader of the log raises them with better words.
     with contextlib.suppress(Exception):
         if kind_of(path) in BINARY:
             return _of_binary(path) or USUAL
-        with opened(path) as file:
+        with open_text(path) as file:
             return _of_names(read_header(file).names) or USUAL
     return USUAL
 
 
-def _of_names(names: list[str]) -> Layout | None:
-    """Return the one time and the three rates, about x, y and z, that have units in their names."""
+def _of_names(names: list[str]) -> ImuColumns | None:
+    """Return the one time and the three rates, about x, y and z, that have units in their names.
+
+    Return `None` unless there is exactly one of each.
+    """
     times = {name: unit for name in names if (unit := unit_in(name, ())) in TIME_UNITS}
     rates = {name: unit for name in names if (unit := unit_in(name, ())) in ("rad/s", "deg/s")}
     axes = [[n for n in rates if re.search(rf"\b{axis}\W*[(\[]", n)] for axis in "xyz"]
@@ -60,20 +67,20 @@ def _of_names(names: list[str]) -> Layout | None:
         return None
     (x,), (y,), (z,) = axes
     ((time, time_unit),) = times.items()
-    return Layout((time, x, y, z), str(rates[x]), str(time_unit))
+    return ImuColumns((time, x, y, z), str(rates[x]), str(time_unit))
 
 
-def _of_binary(path: Path) -> Layout | None:
-    """Return the layout of a binary log, or `None` if it has no rates."""
+def _of_binary(path: Path) -> ImuColumns | None:
+    """Return the columns of a binary log, or `None` if it has no rates."""
     columns = _columns_of_binary(path)
     if columns is None:
         return None
     time, x, *_ = columns
-    return Layout(columns, usual_unit(path, x) or "rad/s", usual_unit(path, time) or "s")
+    return ImuColumns(columns, usual_unit(path, x) or "rad/s", usual_unit(path, time) or "s")
 
 
 def _columns_of_binary(path: Path) -> tuple[str, str, str, str] | None:
-    """Return the names of the time and the rates in a binary log."""
+    """Return the names of the time and the rates in a binary log, `None` if it has no rates."""
     kind = kind_of(path)
     if kind in (".bbl", ".bfl"):
         return "time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]"

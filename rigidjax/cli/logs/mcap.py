@@ -1,4 +1,4 @@
-"""MCAP files of JSON and ROS 2 messages, read by mcap (an extra)."""
+"""The reader of MCAP files of JSON and ROS 2 messages, by the library mcap (an extra)."""
 
 import json
 from array import array
@@ -15,19 +15,19 @@ from rigidjax.cli.logs.columns import Columns
 def mcap(path: Path, columns: Sequence[str]) -> Columns:
     """Return the fields of JSON and ROS 2 messages, such as `/imu.angular_velocity.x`.
 
-    `topic.log_time` and `topic.stamp` (of the message's header) are in s from the first message of
-    the file.
+    The times `topic.log_time` and `topic.stamp` (the latter of the header of a message) are in s
+    from the first message of the file.
     """
     make_reader = _checks.library("mcap.reader", "mcap", str(path)).make_reader
     ros = _checks.library("mcap_ros2.decoder", "mcap", str(path)).DecoderFactory
     names: dict[str, None] = {}
-    held: dict[str, array] = {name: array("d") for name in columns}
+    arrays: dict[str, array] = {name: array("d") for name in columns}
     first = None
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[_Json(), ros()])
         for number, (_, channel, message, content) in enumerate(reader.iter_decoded_messages()):
             if not columns and number == _ENOUGH:
-                # Only names are asked for.
+                # No columns are wanted, only names: every topic has been met by now.
                 break
             first = message.log_time if first is None else first
             fields = {"log_time": 1e-9 * (message.log_time - first)} | dict(_numbers_in(content))
@@ -37,24 +37,25 @@ def mcap(path: Path, columns: Sequence[str]) -> Columns:
             for field, number in fields.items():
                 name = f"{channel.topic}.{field}"
                 names[name] = None
-                if name in held:
-                    held[name].append(number)
-    return list(names), {name: np.frombuffer(a, float) for name, a in held.items() if len(a)}
+                if name in arrays:
+                    arrays[name].append(number)
+    return list(names), {name: np.frombuffer(a, float) for name, a in arrays.items() if len(a)}
 
 
-# Messages in which each topic is seen once.
+# The number of messages among which every topic has at least one.
 _ENOUGH = 2000
 
 
 class _Json:
-    """mcap's interface of a decoder, for messages in JSON."""
+    """The decoder of messages in JSON, by mcap's interface."""
 
     def decoder_for(self, encoding: str, schema: Any) -> Callable[[bytes], Any] | None:
+        """Return the decoder of an encoding, `None` for another one than JSON."""
         return json.loads if encoding == "json" else None
 
 
 def _numbers_in(content: Any, name: str = "") -> Iterator[tuple[str, float]]:
-    """Yield the numbers in a message, with the names of their places."""
+    """Yield the numbers in a message, each after the name of its place, such as `.gyro.x`."""
     if isinstance(content, bool | int | float | np.number):
         yield name, float(content)
     elif isinstance(content, list | tuple | np.ndarray):

@@ -1,4 +1,4 @@
-"""Columns of a log by name, whatever its format."""
+"""The columns of a log by name, whatever its format."""
 
 import csv
 import functools
@@ -25,30 +25,33 @@ _READERS = {".npz": npz, ".mat": mat} | BINARY
 def read_table(
     path: str | Path, columns: Sequence[str], *, flight: int | None = None
 ) -> dict[str, np.ndarray]:
-    """Return columns of a log by name.
+    """Read columns of a log by name.
 
-    A log is text with a header, `.npz`, `.mat` (MATLAB up to v7), a Crazyflie's µSD log (without
-    ending, or `.usd`), or with the extra of that name `blackbox` (`.bbl`, `.bfl`), `ulog` of PX4
-    (`.ulg`), `mcap` (JSON and ROS 2). Text is in UTF-8, UTF-16 or Windows's code page 1252, and may
-    be packed (`.gz`). It is separated by commas, semicolons or tabs, whichever splits the header
-    line into most names. Decimals have a point, or between semicolons and tabs a comma. Lines that
-    begin with `#` may stand above the header, which may be the last of them, as `numpy.savetxt`
-    writes it. A text is read line by line; the memory needed is up to three times its numbers.
+    A log is one of these:
+
+    - Text with a header, which may be packed (`.gz`), in UTF-8, UTF-16 or Windows's code page 1252.
+      Cells are separated by commas, semicolons or tabs: the sign that splits the header into most
+      names. Decimals have a point or, between semicolons and tabs, a comma. Lines that begin with
+      `#` may stand above the header; the last of them may be the header itself, as in files of
+      `numpy.savetxt`. Text is read line by line; it needs memory for up to three times its numbers.
+    - `.npz`, `.mat` (MATLAB up to v7), or a Crazyflie's µSD log (without ending, or `.usd`).
+    - With the extra of that name: `blackbox` (`.bbl`, `.bfl`), `ulog` of PX4 (`.ulg`), `mcap` (JSON
+      and ROS 2).
 
     **Arguments:**
 
-    - `path`: the file;
-    - `columns`: the names that are wanted, others are ignored;
-    - `flight`: which flight of a Blackbox log is read, from 1; `None` for the only one.
+    - `path`: of the file.
+    - `columns`: the names of the wanted columns; others are ignored.
+    - `flight`: the number of the flight in a Blackbox log, from 1; `None` for the only one.
 
-    **Returns** name → (T,) numbers in the units of the log, NaN for an empty cell. It **warns** how
-    many frames of a Blackbox log are left out: those before the first I frame, and those from a
-    hurt one to the next I frame.
+    **Returns** name → (T,) numbers in the units of the log, NaN for an empty cell. It **warns** of
+    frames of a Blackbox log that are left out: those before the first I frame, and those from a
+    damaged frame to the next I frame.
 
-    **Raises:** `ValueError`, one line naming file, line and column, for a file that is missing, cut
-    or not of its kind, a missing column or two of its name, a name that is wanted twice, a cell
-    that is not a number, a line with more cells than the header, columns of different lengths, a
-    log of several flights of which none is chosen.
+    **Raises:** `ValueError`, in one line that names file, line and column, for a file that is
+    missing, cut or of another kind; for a column that is missing, there twice, or wanted twice; for
+    a cell that is not a number, a line with more cells than the header, and columns of different
+    lengths; and for a log of several flights of which none is chosen.
 
     >>> read_table("missing.csv", ["t"])
     Traceback (most recent call last):
@@ -60,7 +63,10 @@ def read_table(
         raise TypeError(f"columns: wanted a sequence of names, got {columns!r}")
     twice = [name for name in columns if columns.count(name) > 1]
     if twice:
-        raise LogError(f"columns: {twice[0]!r} is named twice, one column cannot be two readings")
+        raise LogError(
+            f"columns: wanted different names, got {twice[0]!r} twice; one column cannot be two "
+            "readings"
+        )
     if not path.exists():
         raise LogError(f"{path}: no such file")
     if path.is_dir():
@@ -71,16 +77,16 @@ def read_table(
     if path.suffix.lower() == ".gz" and kind_of(path.with_suffix("")) in _READERS:
         raise LogError(f"{path}: only text is read while it is packed; unpack it first: gunzip")
     try:
-        # Line by line: only the numbers of a large file stay in memory.
-        with text.opened(path) as file:
-            return text.rows(path, file, columns)
+        # Read line by line: only the numbers of a large file stay in memory.
+        with text.open_text(path) as file:
+            return text.read_columns(path, file, columns)
     except (OSError, EOFError, UnicodeError, zlib.error, csv.Error) as error:
         why = f"{type(error).__name__}: {error}".splitlines()[0]
         raise LogError(f"{path}: cannot be read as text ({why})") from None
 
 
 def kind_of(path: Path) -> str:
-    """Return the ending of a log, in small letters; `.usd` for a Crazyflie's, which has none."""
+    """Return the ending of a log in small letters; `.usd` for a Crazyflie's log without ending."""
     if path.suffix or not path.is_file():
         return path.suffix.lower()
     with path.open("rb") as file:
@@ -88,13 +94,13 @@ def kind_of(path: Path) -> str:
 
 
 def _require_one_flight(path: Path, flight: int | None) -> None:
-    """Raise `LogError` if a flight is chosen in a log that is none of Blackbox."""
+    """Raise `LogError` if a flight is chosen in a log that is not of Blackbox."""
     if flight is not None:
         raise LogError(f"{path}: flight {flight}: only a Blackbox log (.bbl, .bfl) has flights")
 
 
 def _arrays(path: Path, columns: Sequence[str], flight: int | None) -> dict[str, np.ndarray]:
-    """Read columns of a log that is no text."""
+    """Read columns of a log that is not text."""
     read: Any = _READERS[kind_of(path)]
     if read is blackbox:
         read = functools.partial(blackbox, flight=flight)
@@ -102,7 +108,7 @@ def _arrays(path: Path, columns: Sequence[str], flight: int | None) -> dict[str,
         _require_one_flight(path, flight)
     # The readers raise many kinds of errors for an empty or a cut file.
     try:
-        names, held = read(path, columns)
+        names, arrays = read(path, columns)
     except (LogError, LogWarning):
         raise
     except ModuleNotFoundError as error:
@@ -114,18 +120,18 @@ def _arrays(path: Path, columns: Sequence[str], flight: int | None) -> dict[str,
         ) from None
     out = {}
     for name in columns:
-        if name not in held:
+        if name not in arrays:
             more = f", and {len(names) - 40} more" if len(names) > 40 else ""
             listed = ", ".join(names[:40]) + more
             raise LogError(f"{path}: no array {name!r}; the arrays are {listed}")
-        if np.asarray(held[name]).dtype.kind not in "biuf":
+        if np.asarray(arrays[name]).dtype.kind not in "biuf":
             raise LogError(f"{path}: array {name!r} does not hold real numbers")
-        out[name] = np.asarray(held[name], float).reshape(-1)
-        endless = np.isinf(out[name])
-        if endless.any():
+        out[name] = np.asarray(arrays[name], float).reshape(-1)
+        infinite = np.isinf(out[name])
+        if infinite.any():
             raise LogError(
-                f"{path}: array {name!r}: row {int(np.argmax(endless)) + 1} is infinite; NaN marks "
-                "a gap"
+                f"{path}: array {name!r}: row {int(np.argmax(infinite)) + 1} is infinite; NaN "
+                "marks a gap"
             )
     sizes = {name: array.size for name, array in out.items()}
     if len(set(sizes.values())) > 1:

@@ -1,4 +1,4 @@
-"""Logs in text: a header line, then numbers. Errors name file, line and column."""
+"""The reader of logs in text: a header line, then numbers. Errors name file, line and column."""
 
 import codecs
 import csv
@@ -19,7 +19,7 @@ from rigidjax.cli.logs.errors import LogError
 SEPARATORS = ",;\t"
 
 
-def opened(path: Path) -> io.TextIOWrapper:
+def open_text(path: Path) -> io.TextIOWrapper:
     """Open a log in text, packed (`.gz`) or not, by the encoding that its first bytes show."""
     packed = path.suffix.lower() == ".gz"
     raw: Any = gzip.open(path, "rb") if packed else path.open("rb")
@@ -31,7 +31,11 @@ def opened(path: Path) -> io.TextIOWrapper:
 
 
 def _encoding(begin: bytes) -> str:
-    """Return UTF-16 if its mark or zeros between the letters show it, else UTF-8 or Windows's."""
+    """Return the encoding of a text by its first bytes `begin`.
+
+    A byte-order mark, or zeros between the letters, show UTF-16. Else it is UTF-8 if the bytes are
+    valid in it, or Windows's code page 1252.
+    """
     if begin[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return "utf-16"
     if len(begin) > 1 and 0 in begin[:2]:
@@ -39,13 +43,17 @@ def _encoding(begin: bytes) -> str:
     try:
         codecs.getincrementaldecoder("utf-8")().decode(begin)
     except UnicodeDecodeError:
-        # Which bytes stand for no letter there, the reading says.
+        # Bytes that are no letter in this code page, either, raise an error when they are read.
         return "cp1252"
     return "utf-8-sig"
 
 
 class Header(NamedTuple):
-    """Column names; their separator; the number of their line; the lines read after it."""
+    """The header of a text.
+
+    **Fields:** `names` of the columns; `separator` of cells; `line` the number of its line; `after`
+    the lines that were read after it.
+    """
 
     names: list[str]
     separator: str
@@ -54,9 +62,9 @@ class Header(NamedTuple):
 
 
 def read_header(file: io.TextIOBase) -> Header:
-    """Return the header of a text, read from its beginning: the first line, below comments (`#`).
+    """Read the header of a text from its begin: the first line after comments (`#`).
 
-    It may be the last comment, as `numpy.savetxt` writes it: then numbers follow.
+    If numbers follow the last comment, this comment is the header, as in files of `numpy.savetxt`.
     """
     comments, first, line = "", file.readline(_LONGEST), 1
     while first.startswith("#") or (first and not first.strip()):
@@ -68,19 +76,20 @@ def read_header(file: io.TextIOBase) -> Header:
     return Header(names, separator, line, [])
 
 
-# A file of one endless line is not read for its header; what `csv` takes as one cell.
+# The longest header that is read, the length that `csv` allows for a cell: a file may be one
+# endless line.
 _LONGEST = 131_072
 _NUMBER = re.compile(r"[-+.\d][-+.\deE]*")
 
 
 def _split(first: str) -> tuple[list[str], str]:
-    """Return the names in a line, and what separates them: whichever gives most of them."""
+    """Return the names in a line and their separator, the one that gives most names."""
     separator = max(SEPARATORS, key=first.count)
     return [name.strip() for name in next(csv.reader([first], delimiter=separator), [])], separator
 
 
-def rows(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read the wanted columns of a text, line by line."""
+def read_columns(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    """Read the wanted columns of a text, line by line; `path` is for messages."""
     header, separator, top, after = read_header(file)
     if not any(header):
         raise LogError(f"{path}: line 1: wanted a header with the columns {', '.join(columns)}")
@@ -97,10 +106,11 @@ def rows(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dict[str, n
             )
         if header.count(name) > 1:
             raise LogError(
-                f"{path}: line {top}: {header.count(name)} columns are called {name!r}: which one?"
+                f"{path}: line {top}: wanted one column {name!r}, got {header.count(name)}; rename "
+                "all but one"
             )
     wanted = [(name, header.index(name), array("d")) for name in columns]
-    number_of = _Numbers(separator)
+    number_of = _NumberReader(separator)
     reader = csv.reader(itertools.chain(after, file), delimiter=separator)
     for cells in reader:
         line = reader.line_num + top
@@ -120,14 +130,15 @@ def rows(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dict[str, n
     return {name: np.frombuffer(numbers, float) for name, _, numbers in wanted}
 
 
-class _Numbers:
-    """Read cells as numbers; the first decimal of a file decides between a point and a comma."""
+class _NumberReader:
+    """A reader of cells as numbers: the first decimal decides between a point and a comma."""
 
     def __init__(self, separator: str):
         self.separator = separator
         self.decimal: str | None = None
 
     def __call__(self, cell: str) -> float:
+        """Return the number in a cell, NaN for an empty one; raise `ValueError` for others."""
         if not cell:
             return math.nan
         plain = cell
@@ -135,7 +146,7 @@ class _Numbers:
             plain = self._with_point(cell)
         elif "." in cell:
             self.decimal = "."
-        # Python's own spelling is wider than that of logs: 1_000, other alphabets' digits.
+        # Python reads more than logs may write: refuse 1_000, and the digits of other alphabets.
         try:
             value = float(plain if plain.isascii() and "_" not in plain else "")
         except ValueError:
@@ -146,10 +157,10 @@ class _Numbers:
         return value
 
     def _with_point(self, cell: str) -> str:
-        """Return the cell with a point for its decimal comma."""
+        """Return the cell with a point in place of its decimal comma."""
         if "." in cell or self.decimal == ".":
             raise ValueError(f"{cell!r} is not a number; the decimals above have the other sign")
-        # Between tabs, 1,200 may be a thousand.
+        # Between tabs 1,200 may be a thousand and two hundred.
         if self.decimal is None and self.separator == "\t" and _THOUSANDS.fullmatch(cell):
             raise ValueError(f"{cell!r} is not a number; does its comma mark thousands?")
         if "," in cell:

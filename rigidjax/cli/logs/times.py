@@ -1,4 +1,4 @@
-"""The time column: the rows in a window, and those whose times increase."""
+"""The time column of a log: the rows in a window whose times increase."""
 
 import bisect
 from pathlib import Path
@@ -8,28 +8,29 @@ import numpy as np
 from rigidjax.cli.logs.errors import LogError, warn
 from rigidjax.cli.logs.units import TIME_UNITS, UNITS
 
-# So many rows in a row are no bad stamps, but a clock that was set.
+# This many rows in succession with bad times mean that the clock was set.
 _RESTART = 5
+# The least number of rows of a log.
 _FEWEST = 4
-# Steps, s, within which loggers of moving bodies read.
+# The steps, s, that loggers of moving bodies have, and those beyond which a step is doubtful.
 _USUAL_STEPS = (1e-5, 1.0)
 _ODD_STEPS = (1e-7, 1e3)
-# A longer gap, in steps, is where a clock was set, or the logger was off.
+# A gap of more steps means that the clock was set, or that the logger was off.
 _GAP = 1e5
 
 
 def increasing(t: np.ndarray) -> np.ndarray:
-    """Return which times (T,) to keep, so that they increase and as few as possible are left out.
+    """Return a mask (T,) of times that increase, with as few left out as possible.
 
-    They are a longest increasing subsequence (by patience sorting), so that a repeated, a backward,
-    a far too large and a missing (NaN) time costs its own row only.
+    They are a longest increasing subsequence, found by patience sorting. A time that is repeated,
+    backward, far too large or missing (NaN) therefore costs its own row only.
 
     >>> increasing(np.array([0.0, 1.0, 1.0, 90.0, 2.0, np.nan, 3.0])).tolist()
     [True, True, False, False, True, False, True]
     """
     if (np.diff(t) > 0).all() and np.isfinite(t).all():
         return np.ones(t.shape, bool)
-    # The least last time of an increasing subsequence of each length, and its row.
+    # For each length: the least last time of an increasing subsequence of that length, and its row.
     ends: list[float] = []
     rows: list[int] = []
     before = np.full(t.shape, -1)
@@ -52,18 +53,22 @@ def increasing(t: np.ndarray) -> np.ndarray:
 def kept_rows(
     path: str | Path, t: np.ndarray, name: str, window: tuple[float, float] | None
 ) -> np.ndarray:
-    """Return which rows to use: those in the window whose times increase.
+    """Return the indices of the rows to use: those in the window whose times increase.
 
-    **Arguments:** `path` and `name` of the time column, for messages; `t` (T,) s, from the first
-    stamp; `window` (from, to), s from the first stamp, or `None` for all rows. It **warns** which
-    rows in the window are left out because their time is repeated, backward or missing. **Raises**
-    `LogError` for fewer than four rows, for times of which half do not increase, and where a
-    clock starts again.
+    **Arguments:**
+
+    - `path`, `name`: of the file and the time column, for messages.
+    - `t`: (T,) s, from the first time stamp.
+    - `window`: (from, to), s from the first time stamp, or `None` for all rows.
+
+    It **warns** of rows in the window that are left out because their time is repeated, backward or
+    missing. **Raises** `LogError` for fewer than four rows, for times of which half do not
+    increase, and for a clock that was set back.
     """
     if window is not None and not window[0] < window[1]:
         raise LogError(f"{path}: window: wanted FROM below TO, got {window[0]:g} {window[1]:g}")
     finite = np.isfinite(t)
-    # A row without a time is where the one before it is.
+    # A row without a time is in the window if the row before it is.
     place = np.maximum.accumulate(np.where(finite, np.arange(t.size), 0))
     near = t[place] if t.size else t
     inside = np.ones(t.shape, bool)
@@ -72,8 +77,9 @@ def kept_rows(
         if inside.sum() < _FEWEST:
             least, most = (np.nanmin(t), np.nanmax(t)) if finite.any() else (np.nan, np.nan)
             raise LogError(
-                f"{path}: fewer than {_FEWEST} samples between {window[0]:g} and {window[1]:g} s "
-                f"from the first stamp; the log goes from {least:g} to {most:g} s"
+                f"{path}: wanted at least {_FEWEST} samples between {window[0]:g} and "
+                f"{window[1]:g} s from the first stamp, got {inside.sum()}; the log goes from "
+                f"{least:g} to {most:g} s"
             )
     rows = np.flatnonzero(inside)
     keep = increasing(t[rows])
@@ -98,11 +104,11 @@ def kept_rows(
 def _require_one_clock(
     path: str | Path, t: np.ndarray, name: str, rows: np.ndarray, keep: np.ndarray
 ) -> None:
-    """Raise `LogError` where times that do not go on are a second series that increases."""
+    """Raise `LogError` if bad times are a second increasing series: the clock was set back."""
     bad = np.flatnonzero(~keep)
     for run in np.split(bad, np.flatnonzero(np.diff(bad) > 1) + 1):
         if run.size >= _RESTART and (np.diff(t[rows[run]]) > 0).all():
-            # Left out is the end of the first series or the begin of the second.
+            # The bad rows are either the end of the first series or the begin of the second one.
             first, after = run[0], run[-1] + 1
             row = rows[first if first and t[rows[first]] <= t[rows[first - 1]] else after]
             raise LogError(
@@ -112,10 +118,10 @@ def _require_one_clock(
 
 
 def remark_on_step(path: str | Path, t: np.ndarray, unit: str, rate: float) -> None:
-    """Warn of a time column that is plainly not in its unit.
+    """Warn of a long gap in times, and of times that are plainly not in their unit.
 
-    **Arguments:** `path` for the message; `t` (T,) s; `unit` in which it was read; `rate` a typical
-    angular rate, rad/s, or zero if there is no gyro.
+    **Arguments:** `path` for the message; `t` (T,) s; `unit` in which the times were read; `rate` a
+    typical body rate, rad/s, or zero without a gyro.
     """
     steps = np.diff(t)
     step = float(np.median(steps))
@@ -123,7 +129,7 @@ def remark_on_step(path: str | Path, t: np.ndarray, unit: str, rate: float) -> N
         row = int(np.argmax(steps))
         warn(
             f"{path}: no time between {t[row]:.6g} and {t[row + 1]:.6g} s, other steps are "
-            f"{step:.3g} s; --window chooses a part"
+            f"{step:.3g} s; choose a part by --window"
         )
     turns = step * rate / (2 * np.pi)
     if _ODD_STEPS[0] <= step <= _ODD_STEPS[1] and turns < 1:
@@ -131,5 +137,5 @@ def remark_on_step(path: str | Path, t: np.ndarray, unit: str, rate: float) -> N
     low, high = _USUAL_STEPS
     others = [u for u in TIME_UNITS if low <= step * UNITS[u] / UNITS[unit] <= high and u != unit]
     turned = f", in which the body turns {turns:.3g} times" if turns >= 1 else ""
-    advice = f"; is it in {' or '.join(others)}? say --time-unit" if others else ""
+    advice = f"; is it in {' or '.join(others)}? give --time-unit" if others else ""
     warn(f"{path}: the step between two times is {step:.3g} s{turned}{advice}")

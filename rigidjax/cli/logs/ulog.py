@@ -1,4 +1,4 @@
-"""PX4's ULog, read by pyulog (an extra)."""
+"""The reader of PX4's ULog, by the library pyulog (an extra)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,13 +10,13 @@ from rigidjax.cli.logs.columns import Columns
 def ulog(path: Path, columns: Sequence[str]) -> Columns:
     """Return the fields of a ULog of PX4 as `topic.field`, such as `sensor_combined.gyro_rad[0]`.
 
-    Those of a second instance are `topic#1.field`; times are in µs.
+    The fields of a second instance of a topic are `topic#1.field`; times are in µs.
     """
-    reader, held = _checks.library("pyulog", "ulog", str(path)).ULog, {}
-    # The library does not close a file that it opened itself and cannot read.
+    reader, arrays = _checks.library("pyulog", "ulog", str(path)).ULog, {}
+    # Open the file here: the library does not close a file that it opened and cannot read.
     with path.open("rb") as file:
         topics = reader(file).data_list
     for data in topics:
         topic = data.name + (f"#{data.multi_id}" if data.multi_id else "")
-        held |= {f"{topic}.{name}": values for name, values in data.data.items()}
-    return list(held), {name: held[name] for name in columns if name in held}
+        arrays |= {f"{topic}.{name}": values for name, values in data.data.items()}
+    return list(arrays), {name: arrays[name] for name in columns if name in arrays}

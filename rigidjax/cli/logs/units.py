@@ -1,4 +1,4 @@
-"""Units of columns: their factors to SI, and how loggers write them in names of columns."""
+"""The units of columns: their factors to SI, and their spellings in the names of columns."""
 
 import math
 import re
@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 from rigidjax.cli.logs.errors import LogError, warn
 
-# All units become SI.
+# The factor of each unit to SI.
 UNITS = {
     "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "mm": 1e-3, "m/s2": 1.0, "g": 9.80665,
     "1": 1.0, "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180,
     "rpm": math.pi / 30,
 }  # fmt: skip
 TIME_UNITS = ("s", "ms", "us", "ns")
-# How each unit is written, in small letters; powers without `^`, `**` or raised digits.
+# The spellings of each unit, in small letters; powers without `^`, `**` or raised digits.
 _SPELLINGS = {
     "s": "s sec secs second seconds",
     "ms": "ms msec millisecond milliseconds",
@@ -29,9 +29,9 @@ _SPELLINGS = {
 }
 _UNIT_OF = {word: unit for unit, words in _SPELLINGS.items() for word in words.split()}
 _IN_BRACKETS = re.compile(r"[(\[]([^()\[\]]*)[)\]]\s*$")
-# What is meant as a unit: brackets may as well hold an axis or an index.
+# Words in brackets that are meant as a unit: others are an axis or an index.
 _UNKNOWN = re.compile(r"[/°]|dps|lsb|count|raw", re.IGNORECASE)
-# Signs that are written in several ways.
+# Characters that have several spellings.
 _SIGNS = str.maketrans({
     "²": "2", "⁻": "-", "−": "-", "¹": "1", "µ": "u", "μ": "u", "º": "°", "^": None, "*": None,
     "·": None, "⋅": None, ".": None, " ": None,
@@ -39,10 +39,10 @@ _SIGNS = str.maketrans({
 
 
 def unit_in(name: str, allowed: Sequence[str]) -> str | None:
-    """Return the unit that ends the name of a column, or `None`.
+    """Return the unit at the end of the name of a column, or `None`.
 
-    In brackets it may be any of `UNITS`; without brackets, after a blank, a comma or an underscore,
-    one of `allowed`. A power may be written with `^`, `**` or raised digits.
+    In brackets it may be any of `UNITS`. Without brackets, after a blank, a comma or an underscore,
+    it must be one of `allowed`. A power may be written with `^`, `**` or raised digits.
 
     >>> unit_in("Gyroscope x (°/s)", ["rad/s"]), unit_in("wx_deg/s", ["deg/s"]), unit_in("wx", [])
     ('deg/s', 'deg/s', None)
@@ -56,7 +56,7 @@ def unit_in(name: str, allowed: Sequence[str]) -> str | None:
 
 
 def _plain(word: str) -> str:
-    """Return a unit in the spelling of `_SPELLINGS`: a capital G is no gram, but gauss."""
+    """Return a unit in the spelling of `_SPELLINGS`; a capital G, which is gauss, stays."""
     return word.translate(_SIGNS).lower() if word.strip() != "G" else word
 
 
@@ -65,11 +65,16 @@ def unit_of(
 ) -> str:
     """Return the unit of columns: the one that their names or the user state, else the usual one.
 
-    **Arguments:** `names` of the columns; `stated` the unit that the user states, or `None`;
-    `usual` the unit where neither states one; `allowed` the units that such a column may have;
-    `where` what the error messages begin with. **Raises** `LogError` where names and user, or two
-    names, state different units, or a name states a unit that is not allowed. It **warns** of a
-    unit in brackets that it does not know.
+    **Arguments:**
+
+    - `names`: of the columns.
+    - `stated`: the unit that the user states, or `None`.
+    - `usual`: the unit if neither names nor user state one.
+    - `allowed`: the units that such a column may have.
+    - `where`: the first words of messages.
+
+    **Raises** `LogError` if names and user, or two names, state different units, or if a name
+    states a unit that is not allowed. It **warns** of a unit in brackets that it does not know.
     """
     in_names = {name: unit for name in names if (unit := unit_in(name, allowed))}
     for name, unit in in_names.items():
@@ -81,7 +86,7 @@ def unit_of(
                 f"{where}: column {name!r} is in {unit} by its name, and {stated} is stated: "
                 "which one? state the same unit, or none"
             )
-    # One column for each unit.
+    # Keep one column for each unit, to name it in the message.
     columns = {unit: name for name, unit in in_names.items()}
     if len(columns) > 1:
         (one, first), (other, second) = list(columns.items())[:2]
@@ -90,5 +95,5 @@ def unit_of(
     for name in names:
         brackets = _IN_BRACKETS.search(name)
         if stated is None and brackets and name not in in_names and _UNKNOWN.search(brackets[1]):
-            warn(f"{where}: column {name!r}: no unit that is known; it is read in {unit}")
+            warn(f"{where}: column {name!r}: its unit is not known; it is read in {unit}")
     return unit

@@ -1,4 +1,4 @@
-"""What the intervals of a fit allow for beside random errors, in words."""
+"""Words for the errors, besides random ones, that the intervals of a fit allow for."""
 
 from collections.abc import Sequence
 
@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.uncertainty.considered import Consideration, in_words
+from rigidjax.identify.uncertainty.considered import Consideration, describe_considered
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 from rigidjax.identify.uncertainty.quantities import Quantity
 
-# So many quantities are named in one sentence.
+# The largest number of quantities named in one sentence.
 MOST = 3
 _WAYS = {
     "scale": "an error of 1 % in the scale of one axis",
@@ -26,15 +26,20 @@ def allowance(
     moves: Moves,
     named: Sequence[Quantity],
 ) -> str:
-    """Return what the intervals allow for beside random errors, and what they do not.
+    """Return sentences on the sensor errors that the intervals allow for, and that they do not.
 
-    **Arguments:** `parts` the considered errors; `moves` what usual errors of each sensor without a
-    tolerance would do to the quantities `named` (`considered.unit_moves`).
+    **Arguments:**
+
+    - `model`: the fitted model.
+    - `parts`: the considered errors, those of sensors with a `Tolerance`.
+    - `moves`: for each sensor without a tolerance, how far its usual errors would move the
+      quantities `named` (`considered.unit_moves`).
+    - `named`: the quantities.
     """
     out = []
     sensors = model.records.sensors
     if parts:
-        out.append(f"They allow for {in_words(parts, sensors)}.")
+        out.append(f"They allow for {describe_considered(parts, sensors)}.")
     for index, by_kind in moves:
         clauses = [
             f"{_WAYS[kind]} would move {_listed(named, sizes)}" for kind, sizes in by_kind.items()
@@ -50,7 +55,7 @@ def allowance(
 
 
 def _listed(named: Sequence[Quantity], sizes: Float[np.ndarray, " quantities"]) -> str:
-    """Return the moves of quantities beside the half-widths of their intervals."""
+    """List by how much each quantity would move, with the half-width of its interval."""
     words = []
     for quantity, size in list(zip(named, sizes, strict=True))[:MOST]:
         unit = quantity.value if quantity.positive else 1.0

@@ -2,17 +2,17 @@
 
 import equinox as eqx
 
-# Of the search.
+# The answers on the search.
 FOUND, NOT_ALONE, NOT_ENDED = "found", "not alone", "not ended"
-# Of the model.
+# The answers on the model.
 EXPLAINS, LEAVES, FAILS = "explains the readings", "leaves a part", "does not explain the readings"
 
-# No sensor is worse than its noise by more than this factor.
+# Errors larger than the given noise by more than this factor are no errors of a sensor.
 FAR = 3.0
 
 
 class Answer(eqx.Module):
-    """A `word`, and the `reasons` for it in words; printed as `word (reason; reason)`.
+    """An answer in one `word`, with `reasons` in words; it is printed as `word (reason; reason)`.
 
     >>> print(Answer("not ended", ("max_steps reached",)))
     not ended (max_steps reached)
@@ -26,11 +26,16 @@ class Answer(eqx.Module):
 
 
 class Cause(eqx.Module):
-    """The most likely cause of the errors of a sensor; printed as its words.
+    """The most likely cause of the errors of a sensor; it is printed as its words.
 
-    **Fields:** `name` of the cause; `sensor` whose errors; `share` of their sum of squares that it
-    explains (1 for `misread`, which explains the readings themselves), `None` for a guess; `words`
-    the cause in words; `remedy` the advice.
+    **Fields:**
+
+    - `name`: of the cause.
+    - `sensor`: the class of the sensor that has the errors.
+    - `share`: the share of the sum of squared errors that the cause explains; 1 for `misread`,
+      which explains the readings themselves; `None` for a guess.
+    - `words`: the cause in words.
+    - `remedy`: what to do about it.
 
     >>> print(Cause("drag", "Gyro", 0.9, "a torque against the rate", "add a Damping"))
     a torque against the rate
@@ -47,7 +52,7 @@ class Cause(eqx.Module):
 
 
 def status(search: Answer, model: Answer) -> str:
-    """Both answers in one line: `ok` if both are good and have no reasons."""
+    """Return both answers in one line: `ok` if both are good and have no reasons."""
     if search == Answer(FOUND) and model == Answer(EXPLAINS):
         return "ok"
     return f"search: {search}; model: {model}"
@@ -61,10 +66,15 @@ def advice(
     above: float,
     allowed: str,
 ) -> str:
-    """Return whether the intervals can be trusted, and what to try.
+    """Say whether the intervals can be trusted, and what to try.
 
-    `above` is the size of the errors over the given noise; `allowed` says what the intervals allow
-    for beside random errors, or what a sensor that is off would do.
+    **Arguments:**
+
+    - `search`, `model`: the two answers.
+    - `causes`: the likely causes of the errors.
+    - `kind`: the method of the covariance, in words.
+    - `above`: the size of the errors, in units of the given noise.
+    - `allowed`: the sentences of `allowance`.
     """
     remedies = list(dict.fromkeys(cause.remedy for cause in causes))
     tries = f" Try: {'; '.join(remedies)}." if remedies else ""

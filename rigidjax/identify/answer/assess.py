@@ -1,4 +1,4 @@
-"""The quality of a fit: covariance, status, and whether other starts explain the data as well."""
+"""The quality of a fit: its covariance, its two answers, and the starts that fit as well."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -31,9 +31,9 @@ from rigidjax.identify.search.stages import (
     nominal_count,
 )
 from rigidjax.identify.uncertainty import considered, covariance as uncertainty, flat_limit
-from rigidjax.identify.uncertainty.covariance import Linearised, Times, scatter
+from rigidjax.identify.uncertainty.covariance import CorrelationTimes, Linearised, scatter
 from rigidjax.identify.uncertainty.degrees_of_freedom import freedom_of
-from rigidjax.identify.uncertainty.flat_limit import of_charts
+from rigidjax.identify.uncertainty.flat_limit import unreal_bodies
 from rigidjax.identify.uncertainty.quantities import (
     Quantity,
     charts,
@@ -41,28 +41,30 @@ from rigidjax.identify.uncertainty.quantities import (
     values_and_slopes,
 )
 from rigidjax.identify.uncertainty.stretches import (
-    by_stretches,
+    jackknife,
     remarks as remarks_on,
     stretches_of,
 )
 
-# The false-alarm rate of the test for autocorrelated errors.
+# The false-alarm rate of the test for autocorrelated errors: a fit tests many sensors and channels.
 RARE = 1e-5
-# Lags in the test for whiteness.
+# The number of lags in this test.
 LAGS = 10
-# A model explains too little if its errors exceed this share of the readings' variance.
+# Shares of the variance of the readings. A model fails if its errors exceed HALF of it, or their
+# autocorrelated part a TENTH; errors below a QUARTER are small, if nothing else is wrong.
 HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
 def goodness(
-    model: Model, noise: Noise, linear: Linearised, times: Times, covariance: np.ndarray
+    model: Model, noise: Noise, linear: Linearised, times: CorrelationTimes, covariance: np.ndarray
 ) -> tuple[float, int, Answer, tuple[int, ...]]:
-    """χ² and its degrees of freedom (sensors of given noise), the answer, the sensors left over.
+    """Return χ², its degrees of freedom, the answer on the model, and the unexplained sensors.
 
-    The size of the errors is compared with a given noise (five standard deviations of χ², or of the
-    median of the squares under a robust loss) and with the variance of the readings; Ljung and
-    Box's test (1978, doi:10.1093/biomet/65.2.297) says whether they are white. Readings at full
-    scale take no part. `covariance` (n, n) is that of white errors.
+    χ² counts the sensors whose noise is given. The size of the errors is compared with this noise
+    (by five standard deviations of χ², or of the median of the squares under a robust loss) and
+    with the variance of the readings. Ljung and Box's test (1978, doi:10.1093/biomet/65.2.297) says
+    whether the errors are white. Readings at full scale take no part. `covariance` (n, n) of the
+    free numbers is the one that white errors give. The sensors are returned by index.
     """
     chi2, count, word, free = 0.0, 0, EXPLAINS, linear.size
     words: list[str] = []
@@ -85,7 +87,7 @@ def goodness(
         slope = linear.slopes[index] * root[..., None]
         white = left <= tiny or _white(e * root, kept, slope, own, given)
         late = left > tiny and clock(model, noise, linear, index) is not None
-        # Errors below a given noise cannot hide a missing part of the model.
+        # Errors below a given noise, or small ones, cannot hide a missing part of the model.
         small = given or left <= QUARTER * varies + tiny
         if factor == 1.0 and white and small and not late:
             continue
@@ -95,7 +97,7 @@ def goodness(
             word = FAILS
         word = LEAVES if word == EXPLAINS else word
         sensors.append(index)
-        # An error with as many numbers as a reading has its unit.
+        # Only an error with as many numbers as a reading has the unit of the reading.
         alike = int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
         share = left / varies if varies > tiny and alike else None
         span = None if white else times.longest
@@ -112,7 +114,15 @@ def _in_words(
     share: float | None,
     span: float | None,
 ) -> str:
-    """Size and place of errors in words; `share` of the variance, `span` of samples or `None`."""
+    """Describe the size and the times of the errors of a sensor.
+
+    **Arguments:**
+
+    - `error`, `kept`: (R, T, k) the errors, and which of them count.
+    - `factor`: their size in units of the noise; 1 is not reported.
+    - `share`: their share of the variance of the readings, `None` if there is none.
+    - `span`: the samples over which they are autocorrelated, `None` for white errors.
+    """
     sensor, many = reading.sensor, max(int(kept.any(axis=-1).sum()), 1)
     size = np.sqrt(np.sum(error[kept] ** 2) / many)
     words = [f"the errors of the {type(sensor).__name__} are {size:.3g} {sensor.unit}"]
@@ -122,7 +132,7 @@ def _in_words(
         words.append(f"{factor:.3g} times the noise")
     if span is not None:
         channels = [np.moveaxis(x, -1, 0).reshape(-1, x.shape[1]) for x in (error, kept)]
-        rows = [row[seen] for row, seen in zip(*channels, strict=True)]
+        rows = [row[mask] for row, mask in zip(*channels, strict=True)]
         apart = scatter(rows)
         over = np.sqrt(np.mean(np.concatenate(rows) ** 2) / apart) if apart > 0 else np.inf
         words.append(f"{over:.3g} times their scatter between neighbours")
@@ -131,7 +141,7 @@ def _in_words(
 
 
 def _where(model: Model, error: np.ndarray, kept: np.ndarray) -> str:
-    """The shortest time in which half of the squared errors are."""
+    """Describe the shortest interval of time that holds half of the sum of squared errors."""
     squares = np.sum(np.where(kept, error, 0.0) ** 2, axis=-1)
     row = int(np.argmax(squares.sum(axis=1)))
     count = int(model.counts[row])
@@ -147,19 +157,23 @@ def _where(model: Model, error: np.ndarray, kept: np.ndarray) -> str:
 
 
 def _sizes(reading: Any, error: np.ndarray, kept: np.ndarray) -> tuple[float, float, float]:
-    """Sums of squares: of the errors, of the readings about their mean, and of round-off."""
+    """Return three sums of squares: of errors, of readings about their mean, and of round-off."""
     values = np.asarray(reading.values)[reading.seen]
     varies = float(np.sum((values - values.mean(axis=0)) ** 2))
     return float(np.sum(error[kept] ** 2)), varies, 1e-12 * float(np.sum(values**2))
 
 
 def _median_above(squares: np.ndarray, size: int) -> float:
-    """The same by the median: outliers are expected, and dominate χ²."""
+    """Return the size of whitened errors over that of noise, by the median of their `squares`.
+
+    It is 1 unless the difference is significant. Under a robust loss outliers are expected, and
+    they would dominate χ². `size` is the number of components of an error.
+    """
     if not squares.size:
         return 1.0
     middle = float(np.median(squares))
     half, density = median_of_chi2(size)
-    # The deviation of a sample's median is 1 / (2 f √n), f the density there.
+    # The deviation of the median of n samples is 1 / (2 f √n), f the density at the median.
     wide = 0.5 / (density * np.sqrt(squares.size))
     return float(np.sqrt(middle / half)) if middle > half + 5 * wide else 1.0
 
@@ -167,22 +181,23 @@ def _median_above(squares: np.ndarray, size: int) -> float:
 def _white(
     e: np.ndarray, kept: np.ndarray, slope: np.ndarray, covariance: np.ndarray, given: bool
 ) -> bool:
-    """Whether whitened errors (R, T, k) are white; errors far below a `given` noise are no
-    evidence.
+    """Return whether whitened errors `e` (R, T, k) are white, by Ljung and Box's test.
 
-    Fitted numbers take `slope covariance slopeᵀ` of white errors away, and leave them correlated,
-    which shows in many short recordings (Box and Pierce 1970, doi:10.1080/01621459.1970.10481180).
+    Fitted numbers take the part `slope covariance slopeᵀ` out of white errors and so correlate
+    them, which shows in many short recordings (Box and Pierce 1970,
+    doi:10.1080/01621459.1970.10481180); the test allows for it. If the noise is `given`, errors far
+    below it are no evidence.
     """
     from scipy.special import chdtrc
 
     total, degrees = 0.0, 0
     for channel in range(e.shape[-1]):
         long = kept[..., channel].sum(axis=1) >= 2 * LAGS
-        seen = kept[long, :, channel]
-        x = _gathered(e[long, :, channel, None], seen)[..., 0]
-        j = _gathered(slope[long, :, channel], seen)
-        taken, count = j @ covariance[long], len(seen)
-        size, own = int(seen.sum()), float(np.sum(x * x))
+        mask = kept[long, :, channel]
+        x = _packed_about_mean(e[long, :, channel, None], mask)[..., 0]
+        j = _packed_about_mean(slope[long, :, channel], mask)
+        taken, count = j @ covariance[long], len(mask)
+        size, own = int(mask.sum()), float(np.sum(x * x))
         squares = max(own, float(size)) if given else own
         if not squares > 0:
             continue
@@ -195,23 +210,23 @@ def _white(
     return degrees == 0 or bool(chdtrc(degrees, total) > RARE)
 
 
-def _gathered(rows: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return rows (R, T, m) about their mean: first those of `seen` (R, T), then zeros."""
-    order = np.argsort(~seen, axis=1, kind="stable")
-    shown = np.take_along_axis(seen, order, axis=1)[..., None]
-    moved = np.where(shown, np.take_along_axis(rows, order[..., None], axis=1), 0.0)
-    mean = moved.sum(axis=1, keepdims=True) / shown.sum(axis=1, keepdims=True)
-    return np.where(shown, moved - mean, 0.0)
+def _packed_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return the rows (R, T, m) under the `mask` (R, T), less their mean, first and zeros after."""
+    order = np.argsort(~mask, axis=1, kind="stable")
+    valid = np.take_along_axis(mask, order, axis=1)[..., None]
+    packed = np.where(valid, np.take_along_axis(rows, order[..., None], axis=1), 0.0)
+    mean = packed.sum(axis=1, keepdims=True) / valid.sum(axis=1, keepdims=True)
+    return np.where(valid, packed - mean, 0.0)
 
 
-# A search may end so near to the least misfit, in standard deviations.
+# A search has ended if the least misfit is nearer than this, in standard deviations.
 AT_THE_END = 0.05
 
 
 def _search(
     best_cost: float, done: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
 ) -> Answer:
-    """The end of the search in words; `rivals` are the starts that fit as well elsewhere."""
+    """Return the answer on the search; `rivals` names the starts that fit as well elsewhere."""
     if not np.isfinite(best_cost):
         return Answer(NOT_ENDED, ("no start gave a finite misfit",))
     if not done:
@@ -225,13 +240,13 @@ def _search(
 def _rivals(
     good: Sequence[Start], best_cost: float, margin: float, linear: Linearised, x: Array
 ) -> int:
-    """How many of the starts that fit as well ended elsewhere."""
+    """Count the starts of `good` that ended far from the best point x, by more than a `margin`."""
     count = 0
     for item in good:
         if item.converged and item.cost > best_cost + 0.01 * margin:
             away = item.x - x
-            # In a flat valley readings do not tell two points apart.
-            count += linear.along(np.asarray(away)) > 2 * margin
+            # Two points of a flat valley differ, but give the same readings: they are no rivals.
+            count += linear.squared_change(np.asarray(away)) > 2 * margin
     return count
 
 
@@ -245,36 +260,47 @@ def assess(
     interrupted: Sequence[str],
     remarks: Sequence[str],
 ) -> Fit:
-    """The `Fit` of the best point of all starts, converged or not, with the model `shown`."""
+    """Return the `Fit` of the best point of all starts, whether or not it converged.
+
+    **Arguments:**
+
+    - `model`, `noise`: the model that was fitted, and its noise.
+    - `best`: the best point; `attempts`: the ends of all starts; `best_cost`: the least of their
+      costs.
+    - `shown`: the model that the `Fit` holds, with the readings as they were given.
+    - `interrupted`, `remarks`: reasons for the answer on the search, in words.
+    """
     x = best.x
     near = flat_limit.thickened(model, x)
     thickened = None if near is None else (near, errors_and_slopes(model, near))
     linear = uncertainty.linearise(model, x, noise, best.blocks, thickened)
     times = uncertainty.correlation_times(linear)
-    white = uncertainty.of_white(linear)
+    white = uncertainty.white_covariance(linear)
     stretches = stretches_of(model, linear)
     numbers, of = values_and_slopes(model, x, near), charts(model)
     hidden = np.zeros((0, linear.size))
     if stretches is None:
-        spread = uncertainty.spread(linear, times, white)
+        covariance = uncertainty.covariance_of(linear, times, white)
     else:
-        spread, hidden = by_stretches(stretches, white), stretches.hidden
+        covariance, hidden = jackknife(stretches, white), stretches.hidden
         remarks = (*remarks, *remarks_on(stretches, model, numbers, white))
     remarks = (*remarks, *words_on_delays(model, x))
-    parts = considered.considerations(model, linear, noise, white.seen)
-    spread = _with_considered(spread, parts, model)
+    parts = considered.considerations(model, linear, noise, white.determined)
+    covariance = _with_considered(covariance, parts, model)
     shifts = considered.stacked_shifts(parts, linear.size)
-    freedom = freedom_of(model, linear, times, white.seen, shifts)
-    limits = flat_limit.limits(model, numbers, -white.seen @ linear.slope, [n for n, _ in of])
-    # Steps stay short in a long curved valley, although hardly anything is left to gain.
+    freedom = freedom_of(model, linear, times, white.determined, shifts)
+    limits = flat_limit.limits(model, numbers, -white.determined @ linear.slope, [n for n, _ in of])
+    # In a long curved valley steps stay short, although there is hardly anything left to gain: the
+    # distance to the minimum of the linearised problem says that the search has ended.
     held = [limit.slope for limit in limits if limit.free < 0]
     near_end = AT_THE_END
     if count := nominal_count(model):
         near_end *= float(np.sqrt(2.0 * best_cost / count))
-    done = bool(best.converged) or uncertainty.distance(linear, white, held) < near_end
-    chi2, dof, explanation, left = goodness(model, noise, linear, times, white.seen)
+    done = bool(best.converged) or uncertainty.distance_to_minimum(linear, white, held) < near_end
+    chi2, dof, explanation, left = goodness(model, noise, linear, times, white.determined)
     believable = explanation.word != FAILS
-    # Ten units of log-likelihood, of the noise as estimated; autocorrelated errors count as fewer.
+    # A start fits as well within ten units of log-likelihood, measured in the estimated noise if
+    # some noise is estimated; autocorrelated errors count as fewer.
     guessed = not all(r.known_noise and not nominal(r) for r in model.records.readings)
     unit = 2 * best_cost / model.records.size if guessed else 1.0
     margin = 10.0 * unit * max(times.longest, 1.0)
@@ -286,32 +312,32 @@ def assess(
     rival = f"{rivals} of {len(starts)} starts fit as well elsewhere" if rivals else ""
     if believable and not any(start.fits for start in starts):
         remarks = ("no single start came near the best point", *remarks)
-    unreal = of_charts(of, flat_limit.bodies_of(model, x))
+    unreal = unreal_bodies(of, flat_limit.bodies_of(model, x))
     reasons = (*unreal, *explanation.reasons)
     explanation = Answer(explanation.word, reasons) if best_cost < np.inf else Answer(FAILS)
     quantities = quantities_of(
         model,
         numbers,
-        spread.seen,
-        np.concatenate([spread.null_directions, hidden]),
+        covariance.determined,
+        np.concatenate([covariance.null_directions, hidden]),
         limits,
         freedom.of(numbers[1]),
     )
-    words = _allowance(model, linear, noise, white.seen, parts, quantities, numbers[1])
+    words = _allowance(model, linear, noise, white.determined, parts, quantities, numbers[1])
     return Fit(
         shown,
         x,
-        jnp.asarray(spread.covariance),
-        jnp.asarray(spread.seen),
-        spread.kind,
+        jnp.asarray(covariance.covariance),
+        jnp.asarray(covariance.determined),
+        covariance.kind,
         noise,
         tuple(starts),
         chi2,
         dof,
         times.longest,
         times.independent,
-        jnp.asarray(spread.singular_values),
-        jnp.asarray(spread.null_directions),
+        jnp.asarray(covariance.singular_values),
+        jnp.asarray(covariance.null_directions),
         quantities,
         _search(best_cost, done, rival, interrupted, remarks),
         explanation,
@@ -335,7 +361,7 @@ def _allowance(
     quantities: Sequence[Quantity],
     slopes: np.ndarray,
 ) -> str:
-    """Return what the intervals allow for, of moments and ratios, else of the `Free`s."""
+    """Say what the intervals of the moments and ratios allow for, or of the `Free`s without any."""
     bodies = {log + name for name, chart in charts(model) for log in chart.log_names}
     free = {slot.name for slot in model.slots}
     rows = [i for i, one in enumerate(quantities) if one.name in bodies and one.name != "mass"]
@@ -347,16 +373,16 @@ def _allowance(
 
 
 def _with_considered(
-    spread: uncertainty.Spread, parts: tuple[considered.Consideration, ...], model: Model
-) -> uncertainty.Spread:
-    """Return the covariance with that of considered errors added."""
+    covariance: uncertainty.Covariance, parts: tuple[considered.Consideration, ...], model: Model
+) -> uncertainty.Covariance:
+    """Return the covariance with the part added that the considered errors `parts` make."""
     if not parts:
-        return spread
-    root = considered.stacked_shifts(parts, len(spread.seen))
-    added, words = root @ root.T, considered.in_words(parts, model.records.sensors)
+        return covariance
+    root = considered.stacked_shifts(parts, len(covariance.determined))
+    added, words = root @ root.T, considered.describe_considered(parts, model.records.sensors)
     return dataclasses.replace(
-        spread,
-        covariance=spread.covariance + added,
-        seen=spread.seen + added,
-        kind=f"{spread.kind}; considered: {words}",
+        covariance,
+        covariance=covariance.covariance + added,
+        determined=covariance.determined + added,
+        kind=f"{covariance.kind}; considered: {words}",
     )

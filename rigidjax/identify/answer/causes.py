@@ -1,7 +1,7 @@
 """The most likely cause of the errors of a fit.
 
-Each cause has a direction: the change of the readings with it along the fitted motion. Errors are
-regressed on it together with all free numbers (a score test: Rao 1948,
+Each cause has a direction: the change of the readings that it would make along the fitted motion.
+The errors are regressed on this direction together with all free numbers (a score test: Rao 1948,
 doi:10.1017/S0305004100023987). A cause that the free numbers could absorb therefore explains
 nothing.
 """
@@ -11,6 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from rigidjax.identify.answer.answers import Cause
 from rigidjax.identify.data import stacking
@@ -19,14 +20,15 @@ from rigidjax.identify.data.reference_states import attitudes, rates_of
 from rigidjax.identify.model.charts import as_list, tensor_of
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, in_deviations
-from rigidjax.identify.search.starts import balance, of_rates, tensor_and_margin
-from rigidjax.identify.sensors import Gyro
+from rigidjax.identify.search.starts import balance, depends_on_rate_only, tensor_and_margin
+from rigidjax.identify.sensors import AbstractSensor, Gyro
 from rigidjax.identify.uncertainty.considered import slope_in_time
 from rigidjax.identify.uncertainty.covariance import Linearised
 
-# Corrected rates must leave less than this share of the error as read, and of the whole signal.
+# A correction of the rates counts if it leaves less than the share BETTER of the error of the rates
+# as they were read, and less than the share LITTLE of the whole signal.
 BETTER, LITTLE = 0.5, 0.3
-# As good as the best: these records cannot tell them apart.
+# Corrections that leave at most EQUAL times the least error cannot be told apart.
 EQUAL = 1.1
 _SAME = np.eye(3)
 
@@ -51,16 +53,17 @@ ATTITUDES = {
 
 
 def misread(recordings: Sequence[Recording], torque: Any) -> Cause | None:
-    """Return the mistake in reading the rates of one body, if there is one.
+    """Return the mistake made when the rates of one body were read, `None` if there is none.
 
-    Rates are compared with those between attitudes, or else with Euler's equations for the best
-    body: a correction counts only if that is real. A mirrored axis shows only under a torque.
+    The rates are compared with the rates between attitudes or, without attitudes, with Euler's
+    equations of the best body: there a correction counts only if this body is a real one. A
+    mirrored axis shows only under a torque.
     """
     gyros = readings_of(recordings[0], Gyro)
     if not gyros:
         return None
     turn, scale = (getattr(gyros[0].sensor, name) for name in ("mounting", "scale"))
-    # Given axes and scales that are far from those of the body are no mistake.
+    # A user who gives axes or scales far from those of the body has made no mistake.
     if turn is not None and np.abs(turn).max() >= 0.1:
         return None
     if scale is not None and np.abs(np.asarray(scale) - 1).max() >= 0.1:
@@ -68,41 +71,51 @@ def misread(recordings: Sequence[Recording], torque: Any) -> Cause | None:
     known = [attitudes(recording) for recording in recordings]
     if all(len(t) > 10 for t, _ in known):
         bound = BETTER * _of_attitudes(recordings, known, _SAME)
-        found = {name: _of_attitudes(recordings, known, turn) for name, turn in RATES.items()}
+        ratios = {name: _of_attitudes(recordings, known, turn) for name, turn in RATES.items()}
         for name, change in ATTITUDES.items():
             changed = [(t, change(q)) for t, q in known]
-            found[name] = _of_attitudes(recordings, changed, _SAME)
-    elif of_rates(torque):
+            ratios[name] = _of_attitudes(recordings, changed, _SAME)
+    elif depends_on_rate_only(torque):
         bound, margin = _of_euler(recordings, torque, _SAME)
-        # Sensor errors alone can give numbers of no real body.
+        # Sensor errors alone can make the best body slightly unreal, but not far from real ones.
         bound *= BETTER if margin > -0.8 else EQUAL
-        tried = {name: _of_euler(recordings, torque, turn) for name, turn in RATES.items()}
+        fits = {name: _of_euler(recordings, torque, turn) for name, turn in RATES.items()}
         if torque is not None:
-            tried["the torque with the other sign"] = _of_euler(recordings, torque, _SAME, -1.0)
-        # Any rates are a free motion of a ball.
-        found = {name: left if -0.01 < m < 0.8 else np.inf for name, (left, m) in tried.items()}
+            fits["the torque with the other sign"] = _of_euler(recordings, torque, _SAME, -1.0)
+        # A margin near 1 is that of a ball, to which every constant rate is a free motion.
+        ratios = {name: left if -0.01 < m < 0.8 else np.inf for name, (left, m) in fits.items()}
     else:
         return None
-    least = min(found.values())
+    least = min(ratios.values())
     if not least < min(bound, LITTLE):
         return None
-    words = " or ".join(name for name, left in found.items() if left <= EQUAL * least)
+    words = " or ".join(name for name, left in ratios.items() if left <= EQUAL * least)
     return Cause("misread", "Gyro", 1.0, f"most likely {words}", f"read the log again: {words}")
 
 
 def _of_euler(
     recordings: Sequence[Recording], torque: Any, turn: np.ndarray, sign: float = 1.0
 ) -> tuple[float, float]:
-    """The residual of Euler's equations, and the margin by which the best body is real."""
-    found = [balance(recording, torque, turn) for recording in recordings]
-    matrix, side, momentum = (np.concatenate(part) for part in zip(*found, strict=True))
+    """Return the relative residual of Euler's equations and the best body's margin of being real.
+
+    The rates are multiplied by the matrix `turn`, the torque by `sign`.
+    """
+    balances = [balance(recording, torque, turn) for recording in recordings]
+    matrix, side, momentum = (np.concatenate(part) for part in zip(*balances, strict=True))
     components, margin = tensor_and_margin(matrix, sign * side)
     left = np.linalg.norm(matrix @ components - sign * side)
     return float(left / np.linalg.norm(momentum @ components)), margin
 
 
-def _of_attitudes(recordings: Sequence[Recording], known: Sequence[Any], turn: np.ndarray) -> float:
-    """The relative difference of rates from the rates between attitudes."""
+def _of_attitudes(
+    recordings: Sequence[Recording],
+    known: Sequence[tuple[np.ndarray, np.ndarray]],
+    turn: np.ndarray,
+) -> float:
+    """Return the relative difference between rates, times `turn`, and rates between attitudes.
+
+    `known` holds the times (n,) and the attitudes (n, 4) of each recording.
+    """
     left, size = 0.0, 1e-300
     for recording, (t, q) in zip(recordings, known, strict=True):
         when, wanted = rates_of(t, jnp.asarray(q))
@@ -114,21 +127,26 @@ def _of_attitudes(recordings: Sequence[Recording], known: Sequence[Any], turn: n
     return float(np.sqrt(left / size))
 
 
-# A cause is named if it explains so much of the squared errors, or nearly as much as the best.
+# A cause is named if it explains more than the share ENOUGH of the squared errors, and at least
+# NEARLY of what the best cause explains.
 ENOUGH, NEARLY = 0.7, 0.95
-# A direction is dropped if the free numbers absorb all of it but this part.
+# A direction is dropped if the free numbers absorb it but for this part.
 APART = 0.05
-# Only small changes of axes and scales are causes.
+# The causes that are linear in their size only while it is SMALL.
 LINEAR, SMALL = ("scale", "mounting", "skew"), 0.5
-# What x shows of y, x of z, and y of z.
+# SKEW[i, j, k] = 1 if the axis j reads a part of the component i by the k-th angle of skew.
 SKEW = np.zeros((3, 3, 3))
 SKEW[1, 0, 0] = SKEW[2, 0, 1] = SKEW[2, 1, 2] = 1.0
 
 
 def causes(
-    model: Model, x: Any, noise: Noise, linear: Linearised, which: Sequence[int]
+    model: Model,
+    x: Float[Array, " n"],
+    noise: Noise,
+    linear: Linearised,
+    indices: Sequence[int],
 ) -> tuple[Cause, ...]:
-    """The most likely cause of the errors of each sensor in `which`, if there is one."""
+    """Return the most likely cause of the errors of each sensor in `indices`, if it has one."""
     given = zip(stacking.on_host(model.records, model.counts), model.body_names, strict=True)
     mine = [recording for recording, name in given if name == model.body_names[0]]
     wrong = misread(mine, model.torque)
@@ -137,8 +155,8 @@ def causes(
     if not np.isfinite(linear.dense).all():
         return ()
     free = np.linalg.qr(linear.dense)[0]
-    found = []
-    for index in which:
+    out = []
+    for index in indices:
         sensor: Any = model.records.readings[index].sensor
         cause = clock(model, noise, linear, index)
         if cause is None and _of_three(sensor):
@@ -148,13 +166,14 @@ def causes(
             cause = _largest(sensor, rows, shares)
         if cause is None and hasattr(sensor, "suspect"):
             cause = Cause(sensor.suspect[0], type(sensor).__name__, None, *sensor.suspect[1:])
-        found += [] if cause is None else [cause]
-    return tuple(found)
+        out += [] if cause is None else [cause]
+    return tuple(out)
 
 
 def clock(model: Model, noise: Noise, linear: Linearised, index: int) -> Cause | None:
-    """Time stamps that scatter, by more than the sensor's jitter: each error is along the change of
-    the readings.
+    """Return the cause "clock" if time stamps scatter by more than the jitter of the sensor.
+
+    A late time stamp makes an error along the change of the readings in time, dy/dt.
     """
     sensor, error = model.records.readings[index].sensor, linear.raw[index]
     kept = linear.kept[index].all(axis=-1)
@@ -170,7 +189,7 @@ def clock(model: Model, noise: Noise, linear: Linearised, index: int) -> Cause |
         return None
     along = np.sum(np.sum(error * slope, axis=-1)[moving] ** 2 / moved[moving])
     channels = np.sum(error[kept] ** 2, axis=0)
-    # Random errors of these channels' sizes have so much along this direction.
+    # The share along this direction that random errors of the same sizes have by chance.
     ways = np.mean(slope[moving] ** 2 / moved[moving][:, None], axis=0)
     chance, share = float(ways @ channels / channels.sum()), float(along / channels.sum())
     if not share > chance + 0.5 * (1.0 - chance) + 1.0 / np.sqrt(moving.sum()):
@@ -182,39 +201,48 @@ def clock(model: Model, noise: Noise, linear: Linearised, index: int) -> Cause |
     )  # fmt: skip
 
 
-def _cause(name: str, sensor: Any, share: float, words: str, remedy: str) -> Cause:
+def _cause(name: str, sensor: AbstractSensor, share: float, words: str, remedy: str) -> Cause:
+    """Return a `Cause` whose words say how much of the squared errors it explains."""
     kind = type(sensor).__name__
     explained = f"{100 * share:.0f} % of the squared errors of the {kind}"
     return Cause(name, kind, share, f"most likely {words}: {explained}", remedy)
 
 
-def _largest(sensor: Any, rows: Sequence[tuple], shares: Sequence[tuple]) -> Cause | None:
-    """The cause that explains the most, and other causes that explain about as much."""
-    told = [
+def _largest(
+    sensor: AbstractSensor, rows: Sequence[tuple], shares: Sequence[tuple]
+) -> Cause | None:
+    """Return the cause that explains the most, joined with those that explain nearly as much.
+
+    `rows` are those of `_table`, `shares` the results of `_explained` for them.
+    """
+    candidates = [
         (share, name, words.format(size=", ".join(f"{x:.2g}" for x in size)), remedy)
         for (name, _, words, remedy), (share, size) in zip(rows, shares, strict=True)
         if name not in LINEAR
         or np.abs(size).max() < SMALL
-        # A unit: g read as m/s².
+        # A wrong unit, such as g read as m/s², is a large scale error that all axes share.
         or (name == "scale" and np.ptp(size) < 0.1 * abs(size.mean()))
     ]
-    most = max((share for share, *_ in told), default=0.0)
+    most = max((share for share, *_ in candidates), default=0.0)
     if not most > ENOUGH:
         return None
-    best = [row for share, *row in told if share >= NEARLY * most]
+    best = [row for share, *row in candidates if share >= NEARLY * most]
     names, words, remedies = (" or ".join(column) for column in zip(*best, strict=True))
     return _cause(names, sensor, most, words, remedies)
 
 
-def _of_three(sensor: Any) -> bool:
-    """Whether errors are readings minus predictions along three axes."""
+def _of_three(sensor: AbstractSensor) -> bool:
+    """Return whether errors of the sensor are readings minus predictions along three axes."""
     return sensor.reading_shape == (3,) and sensor.components == 3
 
 
 def _table(
-    model: Model, x: Any, noise: Noise, linear: Linearised, index: int
+    model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearised, index: int
 ) -> tuple[tuple[str, np.ndarray, str, str], ...]:
-    """Name, direction (R, T, 3, c), words and remedy of each cause."""
+    """Return name, direction (R, T, 3, c), words and remedy of each cause for one sensor.
+
+    A cause of c numbers, such as a bias of three, has c directions.
+    """
     reading = model.records.readings[index]
     t, shown = np.asarray(model.records.t), np.asarray(reading.values) - linear.raw[index]
     axes = np.broadcast_to(np.eye(3), (*shown.shape, 3))
@@ -245,9 +273,13 @@ def _table(
 
 
 def _response(
-    model: Model, x: Any, noise: Noise, linear: Linearised, index: int
+    model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearised, index: int
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """The effect of torques (R, T, 3, c) on rates: `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt`, Φ = dΩ/dΩ₀ of the fit."""
+    """Return the function from torques τ (R, T, 3, c) to the changes of the body rate by them.
+
+    The change is `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt` with Φ = dΩ/dΩ₀ along the fitted motion; zero for a sensor
+    that is no `Gyro`.
+    """
     if not isinstance(model.records.readings[index].sensor, Gyro):
         return np.zeros_like
     width = model.index.width
@@ -273,8 +305,11 @@ def _explained(
     free: np.ndarray,
     direction: np.ndarray,
 ) -> tuple[float, np.ndarray]:
-    """The share of a sensor's squared errors that a direction (R, T, k, c) explains beside the
-    orthonormal columns `free` (R, N, m) of the free numbers, and its coefficient.
+    """Return the share of a sensor's squared errors that a direction explains, and its size.
+
+    The `direction` (R, T, k, c) counts only by its part outside of the orthonormal columns `free`
+    (R, N, m), which span what the free numbers can change. The size (c,) is the least-squares
+    coefficient of the direction.
     """
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]
@@ -285,11 +320,12 @@ def _explained(
     columns = [np.zeros((*error.shape, size.size)) for error in errors]
     columns[index] = scaled / size
 
-    def besides(parts: Sequence[np.ndarray], width: int) -> np.ndarray:
+    def outside(parts: Sequence[np.ndarray], width: int) -> np.ndarray:
         x = np.concatenate([part.reshape(len(part), -1, width) for part in parts], axis=1)
         return (x - free @ (free.swapaxes(1, 2) @ x)).reshape(-1, width)
 
-    u, s, v = np.linalg.svd(besides(columns, size.size), full_matrices=False)
-    told = np.where(s > APART, u.T @ besides(errors, 1)[:, 0], 0.0)
+    u, s, v = np.linalg.svd(outside(columns, size.size), full_matrices=False)
+    projection = np.where(s > APART, u.T @ outside(errors, 1)[:, 0], 0.0)
     total = float(np.sum(errors[index] ** 2))
-    return min(float(told @ told) / total, 1.0), v.T @ (told / np.maximum(s, APART)) / size
+    share = min(float(projection @ projection) / total, 1.0)
+    return share, v.T @ (projection / np.maximum(s, APART)) / size

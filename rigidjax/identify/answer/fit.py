@@ -38,16 +38,17 @@ from rigidjax.identify.search.stages import (
 )
 from rigidjax.identify.search.starts import starting_points
 from rigidjax.identify.search.stochastic_gradient import Descent, descend_from
-from rigidjax.identify.uncertainty.covariance import linearise, of_white
+from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 
-# More free numbers that recordings share make the dense normal equations slow.
+# The largest number of free numbers that all recordings share: the normal equations are dense.
 MOST_SHARED = 1000
-# Steps are fine enough if finer ones change no prediction by more of its noise.
+# Integration steps are short enough if shorter ones change predictions by less than this part of
+# the noise.
 _MATTERS = 0.05
-# Rounds of the search for noise, and for the width of the recordings' deviations from a shared
-# number, the latter by expectation and maximisation (Dempster, Laird and Rubin 1977; Laird and Ware
-# 1982, doi:10.2307/2529876); the relative change at which they end; a width below so much of the
-# first one is zero.
+# The noise is estimated in rounds; so is the width of the deviations of the recordings from a
+# shared number, by expectation and maximisation (Dempster, Laird and Rubin 1977; Laird and Ware
+# 1982, doi:10.2307/2529876). They end after _ROUNDS or at a relative change below _SETTLED. A width
+# that falls below _LEAST times its first value is zero.
 _ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
 
 
@@ -71,24 +72,27 @@ def fit(
     - `starts`: the number of starting points (regression first, then scattered ones). Each is
       fitted to a quarter, a half and then the whole of the record.
     - `initial`: (n,) a starting point of your own, tried first.
-    - `key`: random key of the scattered starts; they are always the same unless it is given.
-    - `tolerance`, `max_steps`: Levenberg–Marquardt stops at steps of `tolerance` standard
-      deviations (of each number with all others fixed) with an equally small change of the
-      misfit, or after `max_steps` steps.
-    - `descent`: a `Descent(optimiser, steps=…, batch=…)` of optax first improves each start on a
-      few recordings at a time: for many recordings, when a step of least squares is expensive.
-    - `checkpoint`: a file that keeps the ends of the starts. A second call with the same model and
-      options continues after the last of them, and ends at the same point to the last bit on the
-      same machine and versions.
-    - `progress`: called with a line of text after each start, such as `print`.
+    - `key`: random key of the scattered starts; without a key they are the same at each call.
+    - `tolerance`: Levenberg–Marquardt stops when a step is shorter than `tolerance` standard
+      deviations of each number (with all other numbers fixed), and changes the misfit as little.
+    - `max_steps`: the largest number of its steps.
+    - `descent`: a `Descent(optimiser, steps=…, batch=…)` of optax, which first improves each start
+      on a few recordings at a time. It pays for many recordings, where a step of least squares is
+      expensive.
+    - `checkpoint`: a file in which the end of each start is saved. A second call with the same
+      model and options continues after the last saved one, and ends at the same point to the last
+      bit on the same machine with the same versions.
+    - `progress`: a function such as `print`, called with a line of text after each start.
 
-    **Returns** a `Fit` of the best point reached, with two answers. `fit.search`: `found`, `not
-    alone` (another motion fits as well), or `not ended`. `fit.explanation`: `explains the readings`
-    (the errors are white and of the sensor's size), `leaves a part` (how large, and where), or
-    `does not explain the readings`. `fit.causes` and `fit.advice` say what most likely makes the
-    errors and whether the intervals can be trusted; `fit.status` is both answers in a line, `ok` if
-    all is well. An interrupt (Ctrl-C) ends the search and keeps the best point so far; the status
-    says so.
+    **Returns** a `Fit` of the best point reached. It holds two answers:
+
+    - `fit.search`: `found`, `not alone` (another motion fits as well), or `not ended`.
+    - `fit.explanation`: `explains the readings` (the errors are white and as large as the sensor's
+      noise), `leaves a part` (how large, and at which times), or `does not explain the readings`.
+
+    `fit.status` is both answers in a line, `ok` if all is well. `fit.causes` names what most likely
+    makes the errors, `fit.advice` says whether the intervals can be trusted. An interrupt (Ctrl-C)
+    ends the search and keeps the best point so far; the status says so.
 
     **Raises:** `TypeError` unless `model` is a `Model`, `ValueError` for fewer than one start, more
     than 1000 free numbers that recordings share (`descend` takes any number), a checkpoint that is
@@ -97,9 +101,9 @@ def fit(
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()))
-    >>> found.status, bool(jnp.allclose(found.body.tensor / found.body.tensor[0, 0],
-    ...                                 jnp.diag(jnp.array([1.0, 2.0, 2.5])), atol=1e-6))
+    >>> result = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()))
+    >>> result.status, bool(jnp.allclose(result.body.tensor / result.body.tensor[0, 0],
+    ...                                  jnp.diag(jnp.array([1.0, 2.0, 2.5])), atol=1e-6))
     ('ok', True)
     """
     _checks.instance(model, Model, "fit", wanted="a Model")
@@ -130,7 +134,8 @@ def fit(
         points += starting_points(model, starts - len(points), key)
     points, interrupts, rough = points[:starts], [], []
     if isinstance(padded.integrator, Adaptive):
-        # Another tolerance is no other program: the noise of long steps would slow down the search.
+        # Choose the tolerance before the search: the errors of long steps would slow it down, and
+        # another tolerance compiles no other program.
         first = Attempt(points[0], blocks=errors_and_slopes(padded, points[0]))
         finer = _finer_integrator(first, task, rough)
         task = task if rough else task._replace(model=_with_integrator(padded, finer))
@@ -152,7 +157,7 @@ def fit(
 
 
 def _with_original_readings(given: Model, fitted: Model) -> Model:
-    """Return the model that was fitted, with the readings as they were given, and their jitter."""
+    """Return the `fitted` model with the unpadded readings of the `given` one, and their jitter."""
     records = given.records
     for index, r in enumerate(fitted.records.readings):
         if r.late is not None:
@@ -163,12 +168,13 @@ def _with_original_readings(given: Model, fitted: Model) -> Model:
 
 
 def _cost(attempt: Attempt) -> float:
+    """Return the cost of an attempt, infinity for NaN, so that the least cost is a good one."""
     cost = float(attempt.cost)
     return cost if np.isfinite(cost) else np.inf
 
 
 def _with_noise(best: Attempt, task: Task) -> tuple[Attempt, Task]:
-    """Return the best point together with its noise, if some noise is to be estimated."""
+    """Estimate the unknown noise and the best point in turn; return the point, and the new task."""
     if all(reading.known_noise for reading in task.model.records.readings):
         return best, task
 
@@ -177,7 +183,8 @@ def _with_noise(best: Attempt, task: Task) -> tuple[Attempt, Task]:
         model, noise = estimate_noise(task.model, best.x, blocks, task.noise)
         return task._replace(model=model, noise=noise)
 
-    # Weights, the robust loss, and what the fit takes from few readings depend on the noise.
+    # Repeat it: the weights, the robust loss and the degrees of freedom that the fit takes from few
+    # readings depend on the noise.
     for turn in range(_ROUNDS):
         before, task = task.noise, estimated(best, task)
         pairs = zip(before, task.noise, strict=True)
@@ -195,7 +202,10 @@ def _descended(
     progress: Callable[[str], Any] | None,
     interrupts: list[str],
 ) -> list[Array]:
-    """Return the end of the stochastic descent from each point; `interrupts` says if it was cut."""
+    """Return the end of the stochastic descent from each point.
+
+    After an interrupt (Ctrl-C) a line is added to `interrupts`, and the rest is left out.
+    """
     keys = jax.random.split(jax.random.key(1) if key is None else key, len(points))
     out: list[Array] = []
     for point, own in zip(points, keys, strict=True):
@@ -214,10 +224,13 @@ def _from_each(
     progress: Callable[[str], Any] | None,
     interrupts: list[str],
 ) -> list[Attempt]:
-    """Return the end of the search from each point; `interrupts` says if it was cut."""
+    """Return the end of the search from each point, or of those in the file `checkpoint`.
+
+    After an interrupt (Ctrl-C) a line is added to `interrupts`, and the rest is left out.
+    """
     like, print_of = Attempt(points[0]), ""
     if checkpoint is not None:
-        # The misfits as well: the fingerprint contains only the name of a torque function.
+        # The misfits tell two torque functions of one name apart, which the fingerprint does not.
         costs = [cost_of(task.model, point, task.noise) for point in points]
         print_of = fingerprint(points, task, costs)
     keep = Checkpoint(checkpoint, like, print_of)
@@ -230,7 +243,8 @@ def _from_each(
     try:
         for number, point in enumerate(points[len(keep.done) :], len(keep.done) + 1):
             latest = like
-            # After a start that explains the record, other starts only show whether it is unique.
+            # Once a start explains the record, the others only have to show whether another motion
+            # does so, too: they may end at this misfit.
             ended = [float(one.cost) for one in attempts if bool(one.converged)]
             aim = min(ended, default=np.inf)
             aim = aim if aim <= enough(task.model) else 0.0
@@ -260,20 +274,21 @@ def _with_blocks(best: Attempt, model: Model) -> Attempt:
 
 @eqx.filter_jit
 def _errors_alone(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
-    # Without the derivatives that `errors_and_slopes` computes along: less to compile.
+    """Return the errors of all sensors without derivatives, which takes less time to compile."""
     return all_errors(model, x)
 
 
 def _with_integrator(model: Model, integrator: AbstractIntegrator | None) -> Model:
+    """Return the model with this integrator; `None` keeps the integrator of the model."""
     if integrator is None:
         return model
     return eqx.tree_at(lambda m: m.integrator, model, integrator)
 
 
 def _finer_integrator(best: Attempt, task: Task, rough: list[str]) -> AbstractIntegrator | None:
-    """Return the integrator whose predictions finer steps do not change, `None` if it is in use.
+    """Return the integrator whose predictions shorter steps do not change, `None` for the present.
 
-    If there is none, a line is added to `rough`.
+    If even the shortest steps change them, a line is added to the remarks `rough`.
     """
     model, (errors, _) = task.model, best.blocks
     steps, apart = model.integrator, 0.0
@@ -291,7 +306,8 @@ def _finer_integrator(best: Attempt, task: Task, rough: list[str]) -> AbstractIn
             break
         steps, errors = finer, exact
         if apart <= 8 * _MATTERS:
-            # What is left of it with twice as many steps, or a hundredth of the tolerance.
+            # The errors fall by more than 8 with twice as many steps of a method of order 4, or
+            # with a hundredth of the tolerance: no third comparison is needed.
             break
     else:
         if apart > _MATTERS:
@@ -300,7 +316,10 @@ def _finer_integrator(best: Attempt, task: Task, rough: list[str]) -> AbstractIn
 
 
 def _with_widths(best: Attempt, task: Task) -> tuple[Attempt, Task]:
-    """Return the best point together with the estimated widths, and the task with them."""
+    """Estimate the widths of deviations and the best point in turn; return the point and the task.
+
+    These are the widths of the `Free`s whose deviations between recordings are to be estimated.
+    """
     wanted = [index for index, slot in enumerate(task.model.slots) if slot.estimated]
     if not wanted:
         return best, task
@@ -320,10 +339,11 @@ def _with_widths(best: Attempt, task: Task) -> tuple[Attempt, Task]:
 
 
 def _expected_widths(best: Attempt, task: Task, wanted: list[int]) -> np.ndarray:
-    """Return the root mean square of the deviations of each slot in `wanted`, with their posterior
-    variance (Laplace).
+    """Return the expected root mean square of the deviations of each slot in `wanted`.
+
+    The expectation is over the posterior, which Laplace's method takes as normal.
     """
     linear = linearise(task.model, best.x, task.noise, best.blocks)
-    variance, x = np.diag(of_white(linear).seen), np.asarray(best.x)
+    variance, x = np.diag(white_covariance(linear).determined), np.asarray(best.x)
     places = [np.ravel(task.model.slots[i].own).astype(int) for i in wanted]
     return np.sqrt([np.mean(x[mine] ** 2) + np.mean(variance[mine]) for mine in places])

@@ -21,15 +21,18 @@ from rigidjax.identify.uncertainty.considered import Consideration
 from rigidjax.identify.uncertainty.covariance import Linearised
 from rigidjax.identify.uncertainty.degrees_of_freedom import Freedom, quantile
 from rigidjax.identify.uncertainty.flat_limit import Limit
-from rigidjax.identify.uncertainty.quantities import Quantity, around
+from rigidjax.identify.uncertainty.quantities import Quantity, interval_about
 
 
 class Start(eqx.Module):
-    """The result of one start: the end of the search, and whether it explains the data.
+    """The end of the search from one start.
 
-    **Fields:** `x` (n,) the free numbers at its end; `cost` half of the sum of squares at x;
-    `converged` whether the search converged; `fits` whether it explains the data as well as the
-    best point does.
+    **Fields:**
+
+    - `x`: (n,) the free numbers at the end.
+    - `cost`: half of the sum of squares at x.
+    - `converged`: whether the search converged.
+    - `fits`: whether x explains the data as well as the best point does.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> model = rj.identify.Model(record, rj.identify.PrincipalRatios())
@@ -46,26 +49,37 @@ class Start(eqx.Module):
 class Fit(eqx.Module):
     """The result of `fit`: the best point and its uncertainty.
 
-    **Fields:** `model` that was fitted; `x` (n,) the free numbers at the best point; `covariance`
-    (n, n) of them, infinite for undetermined numbers, `seen` the
-    same within the determined directions, `covariance_kind` its method; `noises` (R, k) for each
-    sensor; `starts` a `Start` each; `chi2` and `dof` of the whitened errors of the sensors whose
-    noise was given; `correlation` the number of samples over which the errors are autocorrelated, 1
-    for white ones, and `independent` the number of independent errors; `singular_values` (n,) of
-    the whitened Jacobian, its columns of length one, with the numbers of one recording alone apart;
-    `null_directions` (k, n) that the data do not determine; `quantities` all reported quantities,
-    by name; `search` the first answer, whose `word` is `found`, `not alone` or `not ended`;
-    `explanation` the second one: `explains the readings`, `leaves a part`, `does not explain the
-    readings`; `left` the indices of the sensors whose errors it does not explain; `limits` the
-    distance of each body from a flat one; `near` the point of the derivatives beside a flat body,
-    else `None`; `freedom` what the degrees of freedom of variances follow from;
-    `linear` errors and derivatives there, which all of these come from; `considered` the errors of
-    sensors that the covariance allows for by their `Tolerance`; `allowance` says so in words, or
-    what a sensor that is off would do to the result; `hidden` (k, n) of a fit of windows the
-    directions that one stretch of them alone shows, whose variance is infinite.
+    **Fields:**
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
-    >>> [quantity.name for quantity in found.quantities[:2]], found.covariance.shape
+    - `model`: the model that was fitted.
+    - `x`: (n,) the free numbers at the best point.
+    - `covariance`: (n, n) of x; infinite for undetermined numbers.
+    - `seen`: (n, n) the part of the covariance within the directions that the data determine.
+    - `covariance_kind`: the method of the covariance, in words.
+    - `noises`: (R, k) for each sensor, the standard deviations of R recordings.
+    - `starts`: a `Start` for each starting point.
+    - `chi2`, `dof`: χ² and its degrees of freedom, of the sensors whose noise was given.
+    - `correlation`: the number of samples over which the errors are autocorrelated; 1 if white.
+    - `independent`: the number of independent errors.
+    - `singular_values`: (n,) of the whitened Jacobian with columns of length one; the numbers of
+      one recording alone are eliminated first.
+    - `null_directions`: (k, n) the directions that the data do not determine.
+    - `quantities`: all reported quantities.
+    - `search`: the first answer; its `word` is `found`, `not alone` or `not ended`.
+    - `explanation`: the second answer; its `word` is `explains the readings`, `leaves a part` or
+      `does not explain the readings`.
+    - `left`: the indices of the sensors whose errors the model does not explain.
+    - `limits`: the distance of each body from a flat one.
+    - `near`: (n,) the point at which derivatives are taken if the body is flat, else `None`.
+    - `freedom`: what the degrees of freedom of variances follow from.
+    - `linear`: errors and derivatives at the best point, from which all of this is computed.
+    - `considered`: the sensor errors that the covariance allows for by a `Tolerance`.
+    - `allowance`: the sentences on what the intervals allow for.
+    - `hidden`: (k, n) the directions that one stretch of windows alone shows, whose variance is
+      infinite; for a fit of windows.
+
+    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> [quantity.name for quantity in result.quantities[:2]], result.covariance.shape
     (['Ix/Iz', 'Iy/Iz'], (8, 8))
     """
 
@@ -96,24 +110,24 @@ class Fit(eqx.Module):
 
     @property
     def status(self) -> str:
-        """Both answers in one line; `ok` if both are good and have no reasons."""
+        """Return both answers in one line; `ok` if both are good and have no reasons."""
         return answers.status(self.search, self.explanation)
 
     @property
     def ok(self) -> bool:
-        """Whether the fit converged, explains the data, and is unique."""
+        """Return whether the fit converged, explains the data, and is unique."""
         return self.status == "ok"
 
     @property
     def derivative_point(self) -> Float[Array, " n"]:
-        """The free numbers where derivatives are taken: x, with a flat body made thicker."""
+        """Return the free numbers at which derivatives are taken: x, or for a flat body `near`."""
         return self.x if self.near is None else self.near
 
     @property
     def causes(self) -> tuple[Cause, ...]:
-        """What most likely makes the errors that are left, where that shows.
+        """Return what most likely makes the errors that the model leaves, if the readings show it.
 
-        Each has `name`, `sensor`, `share`, `words` and `remedy`.
+        Each cause has `name`, `sensor`, `share`, `words` and `remedy`.
         """
         if not self.left or self.linear is None:
             return ()
@@ -121,7 +135,7 @@ class Fit(eqx.Module):
 
     @property
     def advice(self) -> str:
-        """Advice: whether the intervals can be trusted, and what to try."""
+        """Say whether the intervals can be trusted, and what to try."""
         # Outliers dominate χ² under a robust loss.
         above = np.sqrt(self.chi2 / self.dof) if self.model.loss is None else 1.0
         return answers.advice(
@@ -145,60 +159,71 @@ class Fit(eqx.Module):
 
     @property
     def body(self) -> Any:
-        """The body, of `scale` "arbitrary" if its chart has none; for several a dict by name."""
+        """Return the body; several bodies as a dict by name.
+
+        Its `scale` is "arbitrary" if the chart has no scale, such as one of ratios.
+        """
         return self.model.bodies(self.x)
 
     @property
     def state0(self) -> Any:
-        """The state at the first time; with several recordings, one for each (leading axis)."""
+        """Return the state at the first time; of several recordings with a leading axis."""
         return self.model.unpack(self.x).state0
 
     @property
     def values(self) -> dict[str, Array]:
-        """The value of each `Free` by name, in its unit."""
+        """Return the value of each `Free` by name, in its unit."""
         return self.model.values(self.x)
 
     @property
     def spreads(self) -> dict[str, Array]:
-        """The spread of each `Free` that has one, by name, in its unit: given or estimated."""
+        """Return the `spread` of each `Free` with one, given or estimated, by name, in its unit."""
         slots = self.model.slots
         return {s.name: s.spread * s.scale for s in slots if s.spread is not None}
 
     @property
     def noise(self) -> tuple[Float[Array, "*records _"], ...]:
-        """One (k,) standard deviation per sensor, given or estimated; (R, k) of R recordings."""
+        """Return the standard deviations (k,) of each sensor, given or estimated.
+
+        Of R recordings they are (R, k).
+        """
         return tuple(n[0] for n in self.noises) if self.model.count == 1 else self.noises
 
     @property
     def jitter(self) -> tuple[Float[Array, "*records"] | None, ...]:
-        """The deviation of each sensor's time stamps, s, given or estimated; `None` without jitter.
+        """Return the deviation of each sensor's time stamps, s, given or estimated.
 
-        With several recordings (R,).
+        It is `None` for a sensor without jitter, and (R,) of R recordings.
         """
-        first: Any = 0 if self.model.count == 1 else slice(None)
-        sensors = self.model.records.sensors
-        found = (getattr(sensor, "jitter", None) for sensor in sensors)
-        return tuple(None if one is None else one.deviation[first] for one in found)
+        index = 0 if self.model.count == 1 else slice(None)
+        jitters = (getattr(sensor, "jitter", None) for sensor in self.model.records.sensors)
+        return tuple(None if one is None else one.deviation[index] for one in jitters)
 
     @property
     def residuals(self) -> tuple[Float[Array, "*records times _"], ...]:
-        """Reading minus prediction for each sensor, in its unit; zero where masked.
+        """Return reading minus prediction for each sensor, in its unit; zero where masked.
 
-        With several recordings a leading axis.
+        Of several recordings they have a leading axis.
         """
         errors = self._errors
         return tuple(e[0] for e in errors) if self.model.count == 1 else errors
 
     @property
     def _errors(self) -> tuple[Float[Array, "records times _"], ...]:
+        """Return the residuals with the axis of recordings, without the padding of a fit."""
         if self.linear is None:
-            raise ValueError("Fit: it holds no errors; identify.fit makes one that does")
+            raise ValueError(
+                "Fit: wanted one with its errors, as identify.fit returns it, got linear = None"
+            )
         counts = self.model.records.t.shape[1]
         return tuple(jnp.asarray(error[:, :counts]) for error in self.linear.raw)
 
     @property
     def rms(self) -> tuple[float, ...]:
-        """Root mean square length of each sensor's error, in its unit; without full scale."""
+        """Return the root mean square length of each sensor's errors, in its unit.
+
+        Readings at full scale are left out.
+        """
         out = []
         errors = self._errors
         for error, reading in zip(errors, self.model.records.readings, strict=True):
@@ -208,19 +233,27 @@ class Fit(eqx.Module):
         return tuple(out)
 
     def interval(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Intervals of all reported quantities, name → (low, high).
+        """Return the intervals of all reported quantities, name → (low, high).
 
-        The interval of a positive quantity goes through its logarithm. **Arguments:** `level` the
-        probability that an interval holds the true value. **Raises** `ValueError` outside (0, 1).
+        The interval of a positive quantity is that of its logarithm. **Arguments:** `level` the
+        probability that an interval holds the true value. **Raises** `ValueError` for a level
+        outside (0, 1).
         """
         return {quantity.name: quantity.interval(level) for quantity in self.quantities}
 
     def interval_of(
         self, of: Callable[[Unpacked], Any], level: float = 0.95
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Interval (low, high) of any differentiable function of `Unpacked` to an array.
+        """Return the interval (low, high) of a differentiable function of the fit.
 
-        It comes from the covariance and the function's derivative. **Raises** as `interval`.
+        It is computed from the covariance and the derivative of the function.
+
+        **Arguments:**
+
+        - `of`: the function, from `Unpacked` to an array.
+        - `level`: the probability that the interval holds the true value.
+
+        **Raises** as `interval`.
         """
         _checks.function(of, "of", "of `Unpacked` to an array")
         if not _checks.known(self.x):
@@ -240,33 +273,36 @@ class Fit(eqx.Module):
         if self.hidden is not None:
             null = np.concatenate([null, np.asarray(self.hidden)])
         reach = quantile(level, self.degrees(slope))
-        return around(middle, slope, seen, null, reach, self.limits)
+        return interval_about(middle, slope, seen, null, reach, self.limits)
 
     def degrees(self, slope: np.ndarray) -> np.ndarray:
-        """Degrees of freedom of the variances of functions with derivative `slope` (…, n)."""
+        """Return the degrees of freedom of the variances of functions with derivative `slope`.
+
+        The `slope` (…, n) is taken with respect to the free numbers.
+        """
         return np.full(slope.shape[:-1], np.inf) if self.freedom is None else self.freedom.of(slope)
 
     @property
     def undetermined(self) -> tuple[Combination, ...]:
-        """The combinations of numbers that the data do not determine at all, by name.
+        """Return the combinations of numbers that the data do not determine at all.
 
-        The list is empty if they determine all. Each combination has `names`, `changes` and
-        `in_words`.
+        There are none if the data determine all numbers. Each combination has `names`, `changes`
+        and `in_words`.
         """
         return undetermined(self)
 
     @property
     def identifiability(self) -> tuple[str, ...]:
-        """In words: the quantities that the data determine well, weakly, and not at all."""
+        """Say which quantities the data determine well, weakly, and not at all."""
         return identifiability.identifiability(self)
 
 
-def one_fit(found: Any, name: str = "fit") -> Fit:
-    """`found`, if it is one `Fit`, not many in one container; else `TypeError`, `ValueError`."""
-    _checks.instance(found, Fit, name)
-    if np.shape(found.chi2) != ():
+def require_one_fit(fit: Any, name: str = "fit") -> Fit:
+    """Return the `fit`; raise `TypeError` or `ValueError` unless it is one `Fit`, not a batch."""
+    _checks.instance(fit, Fit, name)
+    if np.shape(fit.chi2) != ():
         raise ValueError(
-            f"{name}: wanted one Fit, as identify.fit returns it, got one with a chi2 of shape "
-            f"{np.shape(found.chi2)}; take many one by one"
+            f"{name}: wanted one Fit, as identify.fit returns it, got a batch with a chi2 of shape "
+            f"{np.shape(fit.chi2)}; give its fits one by one"
         )
-    return found
+    return fit

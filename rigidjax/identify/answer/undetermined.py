@@ -35,13 +35,14 @@ if TYPE_CHECKING:
     from rigidjax.identify.answer.result import Fit
 
 
-# A number takes part if it changes by more than this share of the largest change.
+# A number belongs to a combination if it changes by more than this share of the largest change.
 PART = 1e-3
-# A rest of a direction below this share is round-off.
+# In the elimination a row is zero if less than this share of the largest entry is left of it.
 ROUND_OFF = 1e-5
-# Two changes count as the same factor if they differ by less than this share.
+# Two numbers change by the same factor if the factors differ by less than this share.
 EVEN = 0.01
-# So many standard deviations of all readings: less for a hundredth of a number tells nothing of it.
+# Readings change along a direction if a hundredth of the numbers' sizes moves them by more than
+# this, in standard deviations of all readings.
 CHANGED = 0.01
 # The largest number of names written for a combination, and of combinations.
 MOST, SEVERAL = 6, 5
@@ -50,9 +51,14 @@ MOST, SEVERAL = 6, 5
 class Combination(eqx.Module):
     """Numbers that may change together without changing a reading.
 
-    **Fields:** `names`; small `changes` of each: relative if `relative` is true, else in its
-    `units`; `unseen_switch` whether readings change all the same, and only their derivatives do
-    not, as with a time or a state at which a torque switches.
+    **Fields:**
+
+    - `names`: of the numbers.
+    - `changes`: a small change of each.
+    - `units`: the unit of each change.
+    - `relative`: whether a change is relative instead.
+    - `unseen_switch`: whether readings do change, and only their derivatives do not, as for a time
+      or a state at which a torque switches.
 
     >>> Combination(("I1", "I2"), (0.01, 0.01), ("", ""), (True, True)).in_words
     'I1 and I2 rise together: only I1/I2 is determined.'
@@ -68,7 +74,7 @@ class Combination(eqx.Module):
 
     @property
     def in_words(self) -> str:
-        """One sentence, or two."""
+        """Say in a sentence or two what the data do not determine."""
         names, sizes = self.names, np.array(self.changes)
         if self.unseen_switch:
             return (
@@ -100,10 +106,10 @@ TENSOR = dict(zip(Tensor.plain_names, COMPONENTS, strict=True))
 
 
 def undetermined(fit: "Fit") -> tuple[Combination, ...]:
-    """The combinations that the data do not determine at all, each of few numbers.
+    """Return the combinations that the data do not determine at all, each of few numbers.
 
-    Each row has a number that no other has (reduced echelon form); initial attitudes are in the
-    axes, world or body, that need fewer numbers.
+    By the reduced echelon form each combination has a number that no other has. Initial attitudes
+    are counted about the axes of the world or of the body: those that need fewer numbers.
     """
     null = np.asarray(fit.null_directions)
     if not null.size:
@@ -117,31 +123,31 @@ def undetermined(fit: "Fit") -> tuple[Combination, ...]:
         begin = first + 6 * many + other * turns
         rows = np.delete(np.arange(len(names)), slice(begin, begin + turns))
         here, slope = [names[row] for row in rows], slopes[rows]
-        # The free numbers are of order one: a number's largest derivative is its own size.
+        # The free numbers are of order one, so the largest derivative of a number is its size.
         size = np.abs(slope).max(axis=1)
         tensors = size[first : first + 6 * many].reshape(many, 6)
         tensors[:] = tensors.max(axis=1, keepdims=True)
         relative = np.array([one[2] for one in here])
         size = np.where(relative | (size == 0), 1.0, size)
         changes = null @ slope.T / size
-        kept = _kept(fit, [one[0] for one in here], changes)
-        changes = np.where(kept, changes, 0.0)
-        found = _reduced(changes)
-        if best is None or np.count_nonzero(found) < np.count_nonzero(best[0]):
-            best, basis = (found, here, size, values[rows]), changes
+        changes = np.where(_named(fit, [one[0] for one in here], changes), changes, 0.0)
+        echelon = _reduced_echelon_form(changes)
+        if best is None or np.count_nonzero(echelon) < np.count_nonzero(best[0]):
+            best, basis = (echelon, here, size, values[rows]), changes
     assert best is not None and basis is not None
-    # In the order of their first numbers: the order of the directions depends on round-off.
-    found = sorted((row for row in best[0] if row.any()), key=lambda row: np.flatnonzero(row)[0])
-    switches = [_readings_change(fit, np.linalg.lstsq(basis.T, row)[0] @ null) for row in found]
-    both = zip(found, switches, strict=True)
+    # Sort the combinations by their first numbers: the order of directions depends on round-off.
+    rows = sorted((row for row in best[0] if row.any()), key=lambda row: np.flatnonzero(row)[0])
+    switches = [_readings_change(fit, np.linalg.lstsq(basis.T, row)[0] @ null) for row in rows]
+    both = zip(rows, switches, strict=True)
     return tuple(_combination(row, *best[1:], switch) for row, switch in both)
 
 
 def _readings_change(fit: "Fit", direction: np.ndarray) -> bool:
-    """Return whether readings change along a `direction` (n,) in which no derivative sees it.
+    """Return whether readings change along a `direction` (n,) although their derivatives are zero.
 
-    A torque may switch at what moves. The change of even order in the step is left out: derivatives
-    do not see it either, where a number counts by its square.
+    This happens where a torque switches at a time or a state that the direction moves. Only the
+    part of the change that is odd in the step counts: a number that enters by its square has a
+    zero derivative, too, and makes an even change.
     """
     if fit.model.torque is None:
         return False
@@ -161,11 +167,12 @@ def _combination(
     values: np.ndarray,
     switch: bool,
 ) -> Combination:
+    """Return the combination of a `row` (M,) of changes; `names`, `size` and `values` as of all."""
     order = np.flatnonzero(row)
-    # The largest change: a hundredth of the number, or of its size; the first number goes up.
+    # The largest change is a hundredth of the number, or of its size; the first number rises.
     changes = 0.01 * np.sign(row[order[0]]) * row / np.abs(row).max() * size
     relative = np.array([name[2] for name in names])
-    # Numbers with the same factor get a shorter sentence.
+    # Numbers that change by one factor get a shorter sentence.
     shares = np.where(relative, changes, changes / np.where(values == 0, np.inf, values))[order]
     if np.ptp(np.abs(shares)) < EVEN * np.abs(shares).max():
         changes[order] = 0.01 * shares / np.abs(shares).max()
@@ -180,7 +187,7 @@ def _combination(
 
 
 def _names(model: Model) -> list[tuple[str, str, bool]]:
-    """Name, unit, and whether relative, of the numbers of `_slopes`."""
+    """Return name and unit of the numbers of `_slopes`, and whether their changes are relative."""
     out = labels(model)
     for name, chart in charts(model):
         unit = chart.unit.replace("SI", "kg m²")
@@ -199,50 +206,55 @@ def _names(model: Model) -> list[tuple[str, str, bool]]:
 
 @eqx.filter_jit
 def _slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Return derivatives (M, n) of the reported numbers, tensors and initial states at a point of
-    the free numbers, and their values (M,).
+    """Return the derivatives (M, n) and the values (M,) of all numbers that a report may name.
+
+    These are the reported numbers, the tensors of the bodies and the initial states, at a `point`
+    (n,) of the free numbers.
     """
     reference = model.reference
     start = jax.vmap(ReferenceStates.moved)(reference, point[model.index.start])
 
-    def _starts(x: Array) -> list[Array]:
-        now = jax.vmap(ReferenceStates.moved)(reference, x[model.index.start])
-        one, shown = jax.tree.map(lambda leaf: leaf[0], now), []
-        change = parts(one, jax.vmap(minus)(now, start))
-        offset = parts(one, jax.vmap(minus)(now, reference.state))
+    def initial_states(x: Array) -> list[Array]:
+        states = jax.vmap(ReferenceStates.moved)(reference, x[model.index.start])
+        one, numbers = jax.tree.map(lambda leaf: leaf[0], states), []
+        change = parts(one, jax.vmap(minus)(states, start))
+        offset = parts(one, jax.vmap(minus)(states, reference.state))
         if "q" in change:
-            shown += [jax.vmap(quaternion.rotate)(start.q, change["q"]), change["q"]]
-        return [*shown, *(offset[name] for name in ("x", "v") if name in offset)]
+            numbers += [jax.vmap(quaternion.rotate)(start.q, change["q"]), change["q"]]
+        return [*numbers, *(offset[name] for name in ("x", "v") if name in offset)]
 
     def value(x: Array) -> Array:
-        shown = [vector(model, x)]
+        numbers = [vector(model, x)]
         for body in as_list(model.bodies(x)):
             tensor = tensor_of(body)
-            shown.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
+            numbers.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
         if reports_starts(model):
-            shown += _starts(x)
-        return jnp.concatenate([part.reshape(-1) for part in shown])
+            numbers += initial_states(x)
+        return jnp.concatenate([part.reshape(-1) for part in numbers])
 
     return jax.jacfwd(value)(point), value(point)
 
 
-def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
-    """The numbers that name changes (k, M): moments, or the tensor's components if axes turn."""
+def _named(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
+    """Return the mask (M,) of the numbers in which `changes` (k, M) are to be reported.
+
+    A body's tensor is reported by its moments, or by its components if changes turn its axes.
+    """
     rows = as_list(fit.model.bodies(fit.derivative_point))
-    kept = np.ones(len(names), bool)
+    mask = np.ones(len(names), bool)
     for (where, chart), body in zip(charts(fit.model), rows, strict=True):
-        # A chart may report these components, too: the last entries exist for all charts.
+        # A chart may report the components itself; the last entries of the name are ours.
         every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]
         places = [some[-1] for some in every]
-        kept[[i for some in every for i in some]] = False
+        mask[[i for some in every for i in some]] = False
         moments = [names.index(f"{log}{where}") for log in chart.log_names if log != "mass"]
-        if moments and _turns(np.asarray(tensor_of(body)), changes[:, places]):
-            kept[moments], kept[places] = False, True
-    return kept
+        if moments and _turn_axes(np.asarray(tensor_of(body)), changes[:, places]):
+            mask[moments], mask[places] = False, True
+    return mask
 
 
-def _turns(tensor: np.ndarray, changes: np.ndarray) -> bool:
-    """Whether some change (k, 6) of a tensor (3, 3) turns its principal axes."""
+def _turn_axes(tensor: np.ndarray, changes: np.ndarray) -> bool:
+    """Return whether some of the `changes` (k, 6) of a tensor (3, 3) turn its principal axes."""
     steps = np.einsum("mk,kij->mij", changes, BASIS)
     _, axes = np.linalg.eigh(tensor)
     along = np.einsum("ia,kij,jb->kab", axes, steps, axes)
@@ -250,8 +262,8 @@ def _turns(tensor: np.ndarray, changes: np.ndarray) -> bool:
     return bool(np.abs(across).max() > PART * max(np.abs(along).max(), 1e-6))
 
 
-def _reduced(rows: np.ndarray) -> np.ndarray:
-    """The reduced row echelon form of rows (k, M), by complete pivoting; small parts are 0."""
+def _reduced_echelon_form(rows: np.ndarray) -> np.ndarray:
+    """Return the reduced echelon form of `rows` (k, M) by complete pivoting, small parts zero."""
     rows = np.array(rows)
     size, done = np.abs(rows).max(), 0
     while done < len(rows):
@@ -268,7 +280,7 @@ def _reduced(rows: np.ndarray) -> np.ndarray:
 
 
 def identifiability(fit: "Fit") -> tuple[str, ...]:
-    """The quantities that the data determine well, weakly, and not at all."""
+    """Say which quantities the data determine well, weakly, and not at all."""
     lost = fit.explanation.word == FAILS
     if lost or fit.search.word == NOT_ENDED:
         why = "does not explain the data" if lost else "did not end in a minimum"
@@ -276,7 +288,7 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
             f"This fit {why}, so it determines nothing: its numbers and intervals belong to the "
             "best point found, and say nothing about the body."
         ]
-        # A search that did not end may have moved along directions that the data do not determine.
+        # Undetermined directions are the likely reason why a search did not end: name them.
         out += [] if lost else _unseen(fit)
         return (*out, *in_words(fit.model.records.readings))
     out = []
@@ -286,7 +298,7 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         first += len(chart.log_names) + len(chart.plain_names)
     for quantity in moments:
         wide = _half(quantity)
-        # Half-width over value for a narrow interval; a factor for a wide one.
+        # The half-width of the logarithm is relative if narrow, and a factor if wide.
         if not np.isfinite(wide) or wide > 1.5:
             out.append(f"{quantity.name} is not determined by these data.")
         elif wide > 0.05:
@@ -323,11 +335,12 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
 
 
 def _half(quantity: Quantity) -> float:
-    """Half of the 95 % interval, of the logarithm if positive."""
+    """Return half the width of the 95 % interval, of the logarithm of a positive quantity."""
     return float(quantile(0.95, quantity.freedom)) * reported_deviation(quantity)
 
 
 def _rate(rates: Sequence[Quantity], count: int) -> str:
+    """Say how well the initial body rates of `count` recordings are determined."""
     shares = []
     for index in range(count):
         three = rates[3 * index : 3 * index + 3]
@@ -343,21 +356,23 @@ def _rate(rates: Sequence[Quantity], count: int) -> str:
 
 
 def _unseen(fit: "Fit") -> list[str]:
-    found = undetermined(fit)
-    if not found:
+    """List what the data do not determine, a sentence each."""
+    combinations = undetermined(fit)
+    if not combinations:
         return []
     out = []
     if scale_is_unseen(fit):
         out.append("The data determine the inertia only up to scale.")
-    out += [one.in_words for one in found[:SEVERAL]]
-    if len(found) > SEVERAL:
-        out.append(f"{len(found) - SEVERAL} more combinations of numbers are not determined.")
+    out += [one.in_words for one in combinations[:SEVERAL]]
+    if len(combinations) > SEVERAL:
+        more = len(combinations) - SEVERAL
+        out.append(f"{more} more combinations of numbers are not determined.")
     out.append("Intervals of quantities that depend on these are infinite.")
     return out
 
 
 def scale_is_unseen(fit: "Fit") -> bool:
-    """Whether an undetermined direction scales the whole body and changes nothing else."""
+    """Return whether an undetermined direction scales the whole body and changes nothing else."""
     null = np.asarray(fit.null_directions)
     if not len(null) or isinstance(fit.model.chart, Bodies):
         return False
@@ -369,7 +384,10 @@ def scale_is_unseen(fit: "Fit") -> bool:
 
 
 def correlations(fit: "Fit") -> list[str]:
-    """Pairs of reported quantities (moments, not components) whose errors have |ρ| > 0.95."""
+    """List the pairs of reported quantities whose errors correlate by |ρ| > 0.95, a sentence each.
+
+    Components of the tensor are left out: they follow from the moments and axes.
+    """
     slope = np.asarray(value_and_slope(fit.model, fit.derivative_point)[1])[: len(fit.quantities)]
     covariance = slope @ np.asarray(fit.seen) @ slope.T
     deviation = np.array([reported_deviation(quantity) for quantity in fit.quantities])

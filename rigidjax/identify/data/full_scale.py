@@ -1,4 +1,4 @@
-"""Readings at full scale: their detection, their weight as "at least that much", their report."""
+"""Readings at full scale: their detection, and their words in a report."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,15 +9,17 @@ import numpy as np
 
 from rigidjax.identify.data.recording import Recording
 
-# A plateau has so many readings in a row at the largest value.
+# A plateau has at least this many readings in a row at the largest value.
 RUN = 3
-# A record with a larger share than this at its largest value is constant, or was cut.
+# A record with a larger share of its readings at the largest value is constant, not cut off.
 MOST = 0.7
 
 
 def plateau(values: np.ndarray) -> float | None:
-    """The full scale of one channel (T,) if its largest readings are cut off: more readings in a
-    row than the `2 √(2d/a)` at the top of a smooth wave of last digit d, second differences a.
+    """Return the full scale of one channel (T,), `None` unless its largest readings are cut off.
+
+    They are cut off if more readings in a row are equal than at the top of a smooth wave. There
+    2 √(2d/a) readings are equal: d is the last digit of the readings, a their second difference.
     """
     size = np.abs(values)
     top = float(size.max(initial=0.0))
@@ -36,10 +38,10 @@ def plateau(values: np.ndarray) -> float | None:
 
 
 def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
-    """The recordings, with the full scale found in the sensors that have no `limit` yet."""
+    """Return the recordings with the full scale as `limit` of the sensors that have none yet."""
     out = list(recordings)
     for index in range(max(len(r.readings) for r in recordings)):
-        found = {}
+        limits_by_place = {}
         for place, recording in enumerate(recordings):
             for reading in recording.readings[index : index + 1]:
                 sensor: Any = reading.sensor
@@ -47,10 +49,12 @@ def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
                 if plain and getattr(sensor, "limit", 0) is None:
                     values = np.asarray(reading.values)[reading.seen]
                     levels = [plateau(channel) for channel in values.T]
-                    found[place] = np.array([np.inf if one is None else one for one in levels])
-        if not any(np.isfinite(limits).any() for limits in found.values()):
+                    limits_by_place[place] = np.array(
+                        [np.inf if one is None else one for one in levels]
+                    )
+        if not any(np.isfinite(limits).any() for limits in limits_by_place.values()):
             continue
-        for place, limits in found.items():
+        for place, limits in limits_by_place.items():
             out[place] = eqx.tree_at(
                 lambda r, i=index: r.readings[i].sensor.limit,
                 out[place],
@@ -61,7 +65,7 @@ def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def in_words(readings: Sequence[Any]) -> list[str]:
-    """The readings at full scale, for a report."""
+    """List the readings at full scale, a sentence for each sensor that has some."""
     out = []
     for reading in readings:
         count = (reading.seen[..., None] & ~reading.kept).sum(axis=(0, 1))

@@ -15,10 +15,17 @@ from rigidjax.motion.torques import Held
 
 
 class Reading(eqx.Module):
-    """The readings of one sensor: `values` (T, …) and `mask` (T,), true where there is a reading.
+    """The readings of one sensor.
 
-    Inside a `Model` all arrays have a leading axis over recordings. `late` (T, k), of a sensor
-    with jitter, is the error by a time stamp one standard deviation off, as a fit found it.
+    **Fields:**
+
+    - `sensor`: the sensor.
+    - `values`: (T, …) the readings.
+    - `mask`: (T,) true where there is a reading.
+    - `late`: (T, k) for a sensor with jitter: the error that a time stamp makes if it is one
+      standard deviation late, by the last fit; else `None`.
+
+    Inside a `Model` all arrays have a leading axis over recordings.
 
     >>> record = Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]]))
     >>> record.readings[0].values.shape, record.readings[0].mask.tolist()
@@ -37,12 +44,12 @@ class Reading(eqx.Module):
 
     @property
     def seen(self) -> np.ndarray:
-        """The mask as a NumPy array, for work outside `jit`."""
+        """Return the mask as a NumPy array, for work outside of `jit`."""
         return np.asarray(self.mask)
 
     @property
     def kept(self) -> np.ndarray:
-        """The mask (…, T, k) of the channels read and not at full scale, as a NumPy array."""
+        """Return the mask (…, T, k) of the channels that were read and are not at full scale."""
         seen = np.broadcast_to(self.seen[..., None], (*self.mask.shape, self.sensor.components))
         limit = getattr(self.sensor, "limit", None)
         if limit is None:
@@ -50,8 +57,10 @@ class Reading(eqx.Module):
         return seen & (np.abs(self.values) < np.asarray(limit)[..., None, :] * (1 - 1e-6))
 
     def scattered(self, late: Array, deviation: Array) -> "Reading":
-        """The same with another jitter. A search keeps `late`: if errors counted less where a
-        motion changes quickly, it would prefer such a motion.
+        """Return these readings with another jitter: its error `late` and its `deviation`, s.
+
+        A search holds `late` constant. If it did not, errors would count less wherever a motion
+        changes quickly, and the search would prefer such motions.
         """
 
         def parts(reading: Any) -> Any:
@@ -61,29 +70,31 @@ class Reading(eqx.Module):
 
     @property
     def known_noise(self) -> bool:
-        """Whether the size of the errors is known before the fit."""
+        """Return whether the size of the errors is known before the fit."""
         return self.sensor.noise is not None and self.late is None
 
 
 class Recording(eqx.Module):
-    """Times and readings of one motion.
+    """The times and readings of one motion.
 
-    **Arguments:** `t` (T,) increasing times, s; then, for each sensor, a pair `(sensor, values)` or
-    a triple `(sensor, values, mask)`: `values` (T, 3) for a `Gyro`, (T, 4) or (T, 3, 3) for an
-    `AttitudeSensor`, as the sensor's `reading_shape` says; `mask` (T,) true where there is a
-    reading (what it masks may be NaN). A row of `values` or `mask` with a masked entry of a NumPy
-    masked array is not read, and keeps its time; `t` may have none. Otherwise a time at which no
-    sensor read anything is dropped: a reading that `mask` excludes and an absent one are the same.
-    Sensors with their own times share the union of these.
-    `inputs`, by keyword, are what was logged beside the readings, by name: the speed of a wheel,
-    the commands of motors. Each is a function of time such as `rigidjax.torques.Series(times,
-    speeds)`, or samples (T, …) at `t`, each held until the next one. The torque of a `Model` reads
-    an input by its name, `rigidjax.torques.Input("speed")`.
+    **Arguments:**
 
-    **Raises** `TypeError` for traced numbers (the times that are kept depend on them) and for
-    anything but a sensor; `ValueError` for times that do not increase, also after rounding to
-    float32 (where this changes a step by a tenth, it warns), a wrong shape, an unmasked NaN (with
-    its index), or a quaternion that is not unit.
+    - `t`: (T,) increasing times, s. Sensors with times of their own share the union of these.
+    - `readings`: for each sensor a pair `(sensor, values)` or a triple `(sensor, values, mask)`:
+      `values` (T, 3) for a `Gyro`, (T, 4) or (T, 3, 3) for an `AttitudeSensor`, as the sensor's
+      `reading_shape` says; `mask` (T,) true where there is a reading (masked values may be NaN).
+    - `inputs`: what else was logged, by name: the speed of a wheel, the commands of motors. Each is
+      a function of time such as `rigidjax.torques.Series(times, speeds)`, or samples (T, …) at `t`,
+      each held until the next one. The torque of a `Model` reads an input by its name,
+      `rigidjax.torques.Input("speed")`.
+
+    A time at which no sensor read anything is dropped. Of NumPy masked arrays a row of `values` or
+    `mask` with a masked entry is not read either, but keeps its time; `t` may not be masked.
+
+    **Raises:** `TypeError` for traced numbers (they decide which times are kept) and for anything
+    but a sensor; `ValueError` for times that do not increase, also after rounding to float32 (it
+    warns if this changes a step by a tenth), a wrong shape, an unmasked NaN (with its index), or a
+    quaternion that is not of unit length.
 
     >>> Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]])).t.shape
     (2,)
@@ -122,15 +133,16 @@ class Recording(eqx.Module):
         read = np.any([mask for _, _, mask, _ in rows], axis=0)
         if read.sum() < 2:
             raise ValueError("Recording: wanted readings at two times at least; the rest is masked")
-        # The motion starts at the first reading, whatever is hidden before it.
+        # The motion starts at the first reading: rows hidden before the first, or after the last
+        # one, do not keep their time.
         within = np.maximum.accumulate(read) & np.maximum.accumulate(read[::-1])[::-1]
         used = read | (within & np.any([hidden for *_, hidden in rows], axis=0))
         if any(not callable(source) for source in self.inputs.values()):
-            # A sample is held until the next one, whether or not a sensor read anything then.
+            # Each sample is held until the next one, so every time of a sampled input is needed.
             used = np.ones(t.size, bool)
-        # For reports; a fit does not use it.
+        # Only reports use this number, a fit does not.
         self.dropped = int((~used).sum())
-        # A long recording must not be copied more than needed.
+        # A slice makes no copy of a long recording.
         kept = used if self.dropped else slice(None)
         self.t = jnp.asarray(t[kept])
         _require_digits(t[kept], self.t.dtype)
@@ -155,17 +167,17 @@ class Recording(eqx.Module):
 
     @property
     def size(self) -> int:
-        """The number of numbers read."""
+        """Return how many numbers were read."""
         return sum(count_of(reading) for reading in self.readings)
 
     @property
     def sensors(self) -> tuple[AbstractSensor, ...]:
-        """The sensors, in the order of the readings."""
+        """Return the sensors, in the order of the readings."""
         return tuple(reading.sensor for reading in self.readings)
 
 
 def recording_of(t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]) -> Recording:
-    """Return a recording of these parts as they are, such as several with a leading axis."""
+    """Return a recording with these fields, unchecked: `readings` may have a leading axis."""
     record = object.__new__(Recording)
     parts = {"t": t, "readings": readings, "inputs": inputs, "dropped": 0}
     for name, part in parts.items():
@@ -174,16 +186,17 @@ def recording_of(t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]
 
 
 def readings_of(recording: Recording, kind: type) -> list[Any]:
-    """The readings of the sensors of one kind."""
+    """Return the readings of the sensors that are of the class `kind`."""
     return [reading for reading in recording.readings if isinstance(reading.sensor, kind)]
 
 
 def sources_of(recording: Recording) -> dict[str, Any]:
-    """Return the inputs as functions of time: each sample is held for one step of even times."""
+    """Return the inputs as functions of time; samples are held, one for each of the even steps."""
     t, out = recording.t, {}
     for name, source in recording.inputs.items():
         if not callable(source):
-            # Of windows some are before the first time.
+            # The last sample belongs to the last time; windows have more samples than times, some
+            # of them before the start.
             steps = jnp.arange(t.size - len(source), t.size, dtype=t.dtype)
             source = Held(t[0] + (t[1] - t[0]) * steps, source)
         out[name] = source
@@ -191,12 +204,12 @@ def sources_of(recording: Recording) -> dict[str, Any]:
 
 
 def count_of(reading: Reading) -> int:
-    """The number of numbers read: unmasked readings times the components of an error."""
+    """Return how many numbers were read: unmasked readings times the components of an error."""
     return reading.sensor.components * int(reading.seen.sum())
 
 
 def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
-    """Return the inputs by name: functions of time as they are, samples (T, …) as arrays."""
+    """Return the inputs by name: functions of time unchanged, checked samples (T, …) as arrays."""
     _checks.instance(inputs, Mapping, "inputs", wanted="samples or functions of time by name")
     out = {}
     for name, source in inputs.items():
@@ -214,14 +227,17 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
     return out
 
 
-def _require_digits(given: np.ndarray, dtype: Any) -> None:
-    """Raise `ValueError` for times that are no longer apart in this dtype, warn of uneven ones."""
-    # By NumPy: within a trace an array of JAX is not known.
-    steps, held = np.diff(given), np.diff(given.astype(dtype).astype(float))
+def _require_digits(t: np.ndarray, dtype: np.dtype) -> None:
+    """Raise `ValueError` if rounding the times `t` to this dtype makes two of them equal.
+
+    Warn if it changes a step by more than a tenth.
+    """
+    # Use NumPy: within a trace the numbers of a new JAX array are not known.
+    steps, held = np.diff(t), np.diff(t.astype(dtype).astype(float))
     off = np.abs(held / steps - 1)
     index = int(np.argmax(off))
     words = (
-        f"t: {dtype} changes the step of {steps[index]:.3g} s after {given[index]} s to "
+        f"t: {dtype} changes the step of {steps[index]:.3g} s after {t[index]} s to "
         f"{held[index]:.3g} s; {_checks.later_origin(dtype)}"
     )
     if off[index] >= 1:
@@ -233,7 +249,7 @@ def _require_digits(given: np.ndarray, dtype: Any) -> None:
 def _reading(
     t: np.ndarray, sensor: AbstractSensor, values: Any, mask: Any = None
 ) -> tuple[AbstractSensor, np.ndarray, np.ndarray, np.ndarray]:
-    """The sensor, its checked values and mask, and the rows that a masked array hides."""
+    """Return the sensor, its checked values and mask, and the rows that a masked array hides."""
     name = type(sensor).__name__
     if not isinstance(sensor, AbstractSensor):
         raise TypeError(f"Recording: wanted pairs (sensor, values), got {name} for a sensor")
@@ -247,7 +263,7 @@ def _reading(
     rows_hidden = None if no_value is None else no_value.reshape(len(no_value), -1).any(axis=1)
     if rows_hidden is not None:
         values[rows_hidden] = np.nan
-    # Matrices of an attitude, for one, become quaternions.
+    # A sensor may convert its readings: attitude matrices, for example, become quaternions.
     values = getattr(sensor, "readings", lambda values: values)(values)
     wanted = (t.size, *sensor.reading_shape)
     if values.shape != wanted:
@@ -277,7 +293,7 @@ def _reading(
         )
     if not mask.any():
         raise ValueError(f"{name}: every reading is masked")
-    # A masked NaN must not reach a derivative, since 0 · NaN is NaN: any valid reading replaces it.
+    # Replace masked values by a valid reading: a NaN would reach derivatives, since 0 · NaN is NaN.
     if not mask.all():
         shaped = mask.reshape(-1, *(1 for _ in across))
         values = np.where(shaped, values, values[int(np.argmax(mask))])

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from rigidjax import _checks
 from rigidjax.identify.data import stacking
@@ -26,17 +26,19 @@ from rigidjax.motion.manifold import names, plus
 from rigidjax.rotation import quaternion, so3
 from rigidjax.rotation.fitting import nearest
 
-# The turn, rad, between two attitudes that give a rate: large against noise, small enough that the
-# axis hardly moves.
+# The turn, rad, between two attitudes from which a rate is taken: large against noise, but so small
+# that the axis hardly moves.
 _TURN = 0.3
-# A turn is undetermined if two singular values of Σ world bodyᵀ are below this share of the
-# largest.
-_FIRM = 1e-3
+# Directions do not determine an attitude if two singular values of Σ world bodyᵀ are below this
+# share of the largest.
+_DETERMINED = 1e-3
 
 
 def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,), s, and attitudes (n, 4), body → world, that the readings show; n may be 0: of an
-    attitude sensor, or as `rigidjax.so3.wahba` has it from three markers or two directions.
+    """Return times (n,), s, and attitudes (n, 4), body → world, that the readings show.
+
+    They are those of an attitude sensor or, as by `rigidjax.so3.wahba`, of three markers or two
+    directions. Without these n is 0.
     """
     t = np.asarray(recording.t)
     for reading in readings_of(recording, AttitudeSensor):
@@ -45,7 +47,7 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
             back = quaternion.exp(-mounting)
             q = np.asarray(jax.vmap(quaternion.multiply, (0, None))(jnp.asarray(q), back))
         return t[reading.seen], q
-    body, world, seen = [], [], np.ones(t.shape, bool)
+    body, world, mask = [], [], np.ones(t.shape, bool)
     markers = readings_of(recording, Marker)
     if len(markers) >= 3:
         places = np.stack([np.asarray(r.sensor.place) for r in markers])
@@ -53,23 +55,23 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
         size = np.linalg.norm(places - places.mean(axis=0), axis=1).max() or 1.0
         body.append(np.broadcast_to((places - places.mean(axis=0)) / size, there.shape))
         world.append((there - there.mean(axis=1, keepdims=True)) / size)
-        seen = seen & np.all([r.seen for r in markers], axis=0)
+        mask = mask & np.all([r.seen for r in markers], axis=0)
     for reading in readings_of(recording, Direction):
         along, sensor = np.asarray(reading.values), reading.sensor
         if sensor.mounting is not None:
             along = along @ np.asarray(so3.exp(sensor.mounting)).T
         body.append(along[:, None, :])
         world.append(np.broadcast_to(np.asarray(sensor.world), along.shape)[:, None, :])
-        seen = seen & reading.seen
+        mask = mask & reading.seen
     if not body:
         return np.zeros(0), np.zeros((0, 4))
-    rows, sides = np.concatenate(body, axis=1)[seen], np.concatenate(world, axis=1)[seen]
+    rows, sides = np.concatenate(body, axis=1)[mask], np.concatenate(world, axis=1)[mask]
     b = np.einsum("tni,tnj->tij", sides, rows)
     s = np.linalg.svd(b, compute_uv=False)
-    firm = s[:, 1] + np.sign(np.linalg.det(b)) * s[:, 2] > _FIRM * s[:, 0]
-    if not firm.any():
+    known = s[:, 1] + np.sign(np.linalg.det(b)) * s[:, 2] > _DETERMINED * s[:, 0]
+    if not known.any():
         return np.zeros(0), np.zeros((0, 4))
-    return t[seen][firm], np.asarray(_attitudes_of(b[firm]))
+    return t[mask][known], np.asarray(_attitudes_of(b[known]))
 
 
 @jax.jit
@@ -83,27 +85,38 @@ def _attitudes_of(sums: ArrayLike) -> Array:
 
 
 def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,), s, and body rates (n, 3), rad/s: of a gyro, or between attitudes; n may be 0."""
+    """Return times (n,), s, and body rates (n, 3), rad/s, of a gyro, else between attitudes.
+
+    If the readings show neither, n is 0.
+    """
     for reading in readings_of(recording, Gyro):
         return np.asarray(recording.t)[reading.seen], np.asarray(reading.values)[reading.seen]
     return rates_of(*attitudes(recording))
 
 
 def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) and body rates (n, 3) between attitudes (n, 4) at times (n,)."""
+    """Return times (m,) and body rates (m, 3) between attitudes q (n, 4) at times t (n,).
+
+    Each rate is the mean one over about `_TURN`, at the middle of its interval of time.
+    """
     if t.size < 2:
         return np.zeros(0), np.zeros((0, 3))
-    turned = np.concatenate([[0.0], np.cumsum(np.linalg.norm(_turns(q[:-1], q[1:]), axis=1))])
+    steps = np.linalg.norm(_rotation_vectors(q[:-1], q[1:]), axis=1)
+    turned = np.concatenate([[0.0], np.cumsum(steps)])
     first = np.arange(t.size - 1)
     last = np.searchsorted(turned, turned[first] + _TURN, side="right") - 1
     last = np.clip(np.maximum(last, first + 1), 1, t.size - 1)
     gap = t[last] - t[first]
-    return 0.5 * (t[first] + t[last]), np.asarray(_turns(q[first], q[last])) / gap[:, None]
+    turns = np.asarray(_rotation_vectors(q[first], q[last]))
+    return 0.5 * (t[first] + t[last]), turns / gap[:, None]
 
 
 @jax.jit
-def _turns(p: ArrayLike, q: ArrayLike) -> Array:
-    """Rotation vectors (n, 3) from p to q, body axes, the short way, whatever the signs."""
+def _rotation_vectors(p: ArrayLike, q: ArrayLike) -> Array:
+    """Return the shortest rotation vectors (n, 3), body axes, from quaternions p to q (n, 4).
+
+    The signs of the quaternions do not matter.
+    """
 
     def turn(a: Array, b: Array) -> Array:
         return quaternion.log(quaternion.multiply(quaternion.conjugate(a), b))
@@ -112,45 +125,50 @@ def _turns(p: ArrayLike, q: ArrayLike) -> Array:
 
 
 class ReferenceStates(eqx.Module):
-    """The reference state of a recording, and the units of changes from it.
+    """The reference state of a recording, from which the initial state of a fit is counted.
 
-    `units` (n,) is the size of a change of order one, number by number; `rate` the typical body
-    rate, rad/s.
+    **Fields:**
+
+    - `state`: a `Spin`, `Attitude` or `Rigid`.
+    - `rate`: the typical body rate, rad/s.
+    - `units`: (n,) the size of each number of a change of the state: free numbers count in it.
     """
 
-    state: Any
+    state: PyTree
     rate: Float[Array, "*records"]
     units: Float[Array, "*records n"]
 
-    def moved(self, change: Float[Array, " n"]) -> Any:
-        """Return the initial state of one recording, a `change` of order one away.
+    def moved(self, change: Float[Array, " n"]) -> PyTree:
+        """Return the initial state of one recording for the free numbers `change`.
 
-        An empty change is none: the state is known.
+        An empty `change` belongs to a known initial state, which is the reference.
         """
         return plus(self.state, self.units * change) if change.size else self.state
 
 
-def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates:
-    """From the first readings of each recording, for the kind of state in use."""
+def reference_of(recordings: Sequence[Recording], state_type: type) -> ReferenceStates:
+    """Return the reference states, of type `state_type`, from the first readings of recordings."""
     turns = [[*attitudes(r)[1], np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
     places = [_first_place(r) for r in recordings]
     dtype = recordings[0].t.dtype
-    # Arrays, not floats: another recording must not compile again.
+    # Make arrays: with floats each recording would compile a program of its own.
     x, v, length = (jnp.asarray(np.stack(part), dtype) for part in zip(*places, strict=True))
     q, still = jnp.asarray(np.stack(turns), dtype), jnp.zeros_like(x)
     states = {Spin: Spin(still), Attitude: Attitude(q, still), Rigid: Rigid(x, v, q, still)}
     typical = jnp.asarray([_typical_rate(r) for r in recordings], dtype)
     sizes = {"x": length, "v": length * typical, "q": jnp.ones_like(typical), "omega": typical}
-    units = [sizes[name] for name in names(states[rung])]
-    return ReferenceStates(states[rung], typical, jnp.repeat(jnp.stack(units, -1), 3, -1))
+    state = states[state_type]
+    units = [sizes[name] for name in names(state)]
+    return ReferenceStates(state, typical, jnp.repeat(jnp.stack(units, -1), 3, -1))
 
 
 def _typical_rate(recording: Recording) -> float:
+    """Return a typical length of the body rate, rad/s; 1 if the readings show none."""
     _, w = rates(recording)
     if readings_of(recording, Gyro):
         return float(np.sqrt(np.mean(np.sum(w**2, axis=1)))) or 1.0
     rate = float(np.linalg.norm(w[0])) if len(w) else 0.0
-    # Else by the first sensor whose readings show one.
+    # Without rates take the estimate of the first sensor that can make one.
     for reading in recording.readings if rate == 0 else ():
         sensor: Any = reading.sensor
         if hasattr(sensor, "typical_rate"):
@@ -161,8 +179,10 @@ def _typical_rate(recording: Recording) -> float:
 
 
 def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
-    """First position and velocity, m and m/s, and a typical length, m: of the centre of mass, or of
-    the body's frame if only markers were read.
+    """Return the first position, m, the first velocity, m/s, and a typical length, m.
+
+    They are those of the centre of mass, or of the origin of the body frame if only markers were
+    read.
     """
     t, when, x = np.asarray(recording.t), np.zeros(0), np.zeros((0, 3))
     positions, markers = readings_of(recording, Position), readings_of(recording, Marker)
@@ -182,12 +202,15 @@ def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     else:
         v = _first_speed(when, x)
     x = x if when.size else np.zeros((1, 3))
-    # The largest distance from the mean; 1 if the places are all the same.
+    # The length is the largest distance from the mean place, 1 if all places are the same.
     return x[0], v, float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
 
 
 def _from_markers(recording: Recording, markers: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) and places (n, 3), of the first marker alone if all are never seen at once."""
+    """Return times (n,) and the places (n, 3) of the body's origin by its markers.
+
+    If the markers are never all read at once, the first one stands for all.
+    """
     seen = np.all([r.seen for r in markers], axis=0)
     if not seen.any():
         markers, seen = markers[:1], markers[0].seen
@@ -202,16 +225,16 @@ def _from_markers(recording: Recording, markers: Sequence[Any]) -> tuple[np.ndar
 
 
 def _first_speed(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The slope of a line through the first places (n, 3); zero of one place."""
+    """Return the slope (3,) of a line through the first places x (n, 3); zero for one place."""
     few = slice(0, max(2, min(5, t.size)))
     return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
 
 
 def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Places (n, 3) with these distances (n, k) to stations.
+    """Return the places x (n, 3) at the distances d = `lengths` (n, k) from k stations.
 
-    Differences of the equations `|x|² − 2 s·x + |s|² = d²` are linear in x. A component of x that
-    they do not determine is that of the stations' centre.
+    The equations `|x|² − 2 s·x + |s|² = d²`, less their mean over the stations s, are linear in x.
+    A component of x that they do not determine is that of the stations' centre.
     """
     centre = stations.mean(axis=0)
     s = stations - centre
@@ -220,19 +243,24 @@ def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return centre + np.linalg.lstsq(s, sides.T, rcond=1e-9)[0].T
 
 
-def first_rates(records: Recording, counts: Any) -> Float[Array, "records 3"]:
-    """`first_rate` of each of several recordings (a leading axis), also of traced ones."""
+def first_rates(
+    records: Recording, counts: Int[Array | np.ndarray, " records"]
+) -> Float[Array, "records 3"]:
+    """Return `first_rate` of several recordings with a leading axis; zero if they are traced.
+
+    The rates that a gyro reads are returned for traced recordings, too.
+    """
     for reading in readings_of(records, Gyro):
         xp: Any = np if _checks.known(reading) else jnp
         first = xp.argmax(xp.asarray(reading.mask), axis=1)[:, None, None]
         return jnp.asarray(xp.take_along_axis(xp.asarray(reading.values), first, axis=1)[:, 0])
     if not _checks.known(records):
         return jnp.zeros((len(counts), 3), records.t.dtype)
-    found = [first_rate(recording) for recording in stacking.on_host(records, counts)]
-    return jnp.asarray(np.stack(found), records.t.dtype)
+    each = [first_rate(recording) for recording in stacking.on_host(records, counts)]
+    return jnp.asarray(np.stack(each), records.t.dtype)
 
 
 def first_rate(recording: Recording) -> np.ndarray:
-    """The initial body rate (3,), rad/s, of `rates`; zero without any."""
+    """Return the first body rate (3,), rad/s, of `rates`; zero if the readings show none."""
     _, w = rates(recording)
     return w[0] if len(w) else np.zeros(3)

@@ -1,4 +1,4 @@
-"""Several recordings of one body as one tree with a leading axis, so that one program fits them."""
+"""Several recordings in one tree with a leading axis, so that one program fits them all."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from rigidjax import _checks
 from rigidjax.identify.data.recording import Reading, Recording
@@ -15,13 +15,15 @@ from rigidjax.motion.torques import Linear, Series
 
 
 def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
-    """One recording with a leading axis, and the number of times of each: shorter ones are
-    continued with masked readings at their last time, tables of time with their last value.
+    """Return the recordings in one with a leading axis, and the number of times of each.
+
+    Shorter recordings are padded: with masked readings at their last time, and their tables of time
+    with the last value.
     """
     counts = np.array([r.t.shape[0] for r in recordings], np.int32)
     rows = max(_rows(recording, 0) for recording in recordings)
     alike = [lengthened(r, int(counts.max()), rows) for r in recordings]
-    # A law may hold what is no number: a function, a word.
+    # An input may hold things that are no numbers, such as functions: they must be the same.
     numbers, others = zip(*(eqx.partition(r, _is_number) for r in alike), strict=True)
     shapes = [[np.shape(x) for x in jax.tree.leaves(r)] for r in numbers]
     for index, other in enumerate(others):
@@ -35,14 +37,15 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
 
 
 def _is_number(leaf: Any) -> bool:
-    """Whether a leaf is an array or a real number of Python, which recordings need not share."""
+    """Return whether a leaf is an array or a real number of Python, which may be stacked."""
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | complex)
 
 
 def of_few_lengths(model: Any) -> Any:
-    """Return the model with masked readings up to one of four lengths an octave: few programs.
+    """Return the model with its recordings padded by masked readings to one of few lengths.
 
-    Windows, which are many and of one length, stay as they are.
+    There are four such lengths an octave, so that few programs are compiled. Windows are all of one
+    length already, and stay as they are.
     """
     records = model.records
     if model.clusters is not None:
@@ -52,14 +55,14 @@ def of_few_lengths(model: Any) -> Any:
 
 
 def _rows(recording: Recording, axis: int) -> int:
-    """Return the rows of the longest table of time in the inputs and the sensors, 0 without one."""
+    """Count the rows of the longest table of time in the inputs and sensors; 0 without a table."""
     parts = recording.inputs, recording.sensors
     tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))
     return max((int(table.values.shape[axis]) for table in tables), default=0)
 
 
 def _length(count: int) -> int:
-    """The least of these lengths that is not below `count`."""
+    """Return the least multiple of 16, of four an octave, that is not below `count`."""
     if not count:
         return 0
     octaves = np.array([-1, 0]) + np.ceil(4.0 * np.log2(count))
@@ -68,14 +71,15 @@ def _length(count: int) -> int:
 
 
 def _stacked(*leaves: Any) -> Any:
-    # By NumPy if the numbers are known: JAX compiles a program for each shape.
+    """Stack leaves along a new first axis."""
+    # Use NumPy if the numbers are known: JAX would compile a program for each shape.
     if _checks.known(leaves):
         return _constant(np.stack([np.asarray(leaf) for leaf in leaves]))
     return jnp.stack(leaves)
 
 
-def one(records: Any, index: Any) -> Any:
-    """The tree at an index of the leading axis, or at several."""
+def one(records: PyTree, index: int | slice | Int[Array | np.ndarray, "*rows"]) -> PyTree:
+    """Return the tree of arrays at one index of their leading axis, or at several."""
 
     def pick(leaf: Any) -> Any:
         if not eqx.is_array(leaf):
@@ -87,13 +91,13 @@ def one(records: Any, index: Any) -> Any:
 
 
 def _constant(array: np.ndarray | np.generic) -> Array:
-    """Return an array of JAX that is known, also within a trace."""
+    """Return a JAX array whose numbers stay known also within a trace."""
     with jax.ensure_compile_time_eval():
         return jnp.asarray(array)
 
 
-def on_host(records: Recording, counts: Any) -> tuple[Recording, ...]:
-    """The recordings one by one, in NumPy's arrays, so that no JAX operation is needed."""
+def on_host(records: Recording, counts: Int[ArrayLike, " records"]) -> tuple[Recording, ...]:
+    """Return the recordings one by one with NumPy arrays, so that work on them compiles nothing."""
     known = jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, records)
     return tuple(
         cut(jax.tree.map(lambda x, i=i: x[i] if isinstance(x, np.ndarray) else x, known), n)
@@ -102,7 +106,7 @@ def on_host(records: Recording, counts: Any) -> tuple[Recording, ...]:
 
 
 def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
-    """The rows from `begin` to before `end` of a recording: without those that `stack` appended."""
+    """Return the rows of a recording from `begin` to before `end`."""
     if recording.t.shape[0] == end - begin:
         return recording
 
@@ -119,17 +123,20 @@ def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
 
 
 def _is_table(node: Any) -> bool:
+    """Return whether a node of a tree is a table of time."""
     return isinstance(node, Linear | Series)
 
 
 def lengthened(recording: Recording, count: int, rows: int = 0, axis: int = 0) -> Recording:
-    """The recording with masked readings at its last time, up to `count` times, and with tables of
-    `rows`; of several, stacked, with times along `axis` 1.
+    """Return the recording padded to `count` times, and its tables of time to `rows`.
+
+    The padding is masked readings at the last time, and the last value of tables. Times are along
+    `axis`: 0 for one recording, 1 for several with a leading axis.
     """
     missing = count - recording.t.shape[axis]
-    # Sensors that read a moving object may hold tables of time, too.
+    # Not only inputs hold tables of time: so do sensors that read a moving object.
     inputs, sensors = jax.tree.map(
-        lambda node: _table(node, rows, axis) if _is_table(node) else node,
+        lambda node: _lengthened_table(node, rows, axis) if _is_table(node) else node,
         (recording.inputs, recording.sensors),
         is_leaf=_is_table,
     )
@@ -157,7 +164,8 @@ def lengthened(recording: Recording, count: int, rows: int = 0, axis: int = 0) -
     )
 
 
-def _table(table: Any, rows: int, axis: int) -> Any:
+def _lengthened_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
+    """Return a table of time with `rows`, its last value repeated after its last time."""
     missing = rows - table.values.shape[axis]
     if missing <= 0:
         return table
@@ -171,10 +179,13 @@ def _table(table: Any, rows: int, axis: int) -> Any:
     return eqx.tree_at(lambda s: (s.times, s.values), table, (times, values))
 
 
-def _repeat_last(values: Any, count: int, axis: int, last: Any = None) -> Any:
-    # By NumPy where the numbers are known: JAX compiles a program for each shape.
+def _repeat_last(
+    values: ArrayLike, count: int, axis: int, last: float | bool | None = None
+) -> Array:
+    """Append the last entry along `axis`, or the number `last`, `count` times to `values`."""
+    # Use NumPy where the numbers are known: JAX would compile a program for each shape.
     xp: Any = np if _checks.known(values) else jnp
-    values = xp.asarray(values)
-    edge = values[(slice(None),) * axis + (slice(-1, None),)]
+    array = xp.asarray(values)
+    edge = array[(slice(None),) * axis + (slice(-1, None),)]
     more = xp.repeat(edge if last is None else xp.full_like(edge, last), count, axis)
-    return jnp.asarray(xp.concatenate([values, more], axis))
+    return jnp.asarray(xp.concatenate([array, more], axis))

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from rigidjax import _checks
+from rigidjax._types import HasSpin
 from rigidjax.identify.data.recording import Reading, Recording, recording_of
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.sensors.states import StateSensor
@@ -23,10 +24,16 @@ from rigidjax.motion.torques.inputs import delays_of
 
 
 class Horizons(NamedTuple):
-    """Open-loop errors by horizon, of each kind (`x` m, `v` m/s, `q` rad, `omega` rad/s).
+    """The open-loop errors of a model by horizon, the number of steps that it predicts ahead.
 
-    **Fields:** `steps` (L,) how many steps ahead; by kind, each (L,): `mean_absolute` of a
-    component, `mean_norm` the mean length of the vector, `rms` the root of its mean square.
+    Errors are given by kind: `x` m, `v` m/s, `q` rad, `omega` rad/s.
+
+    **Fields:**
+
+    - `steps`: (L,) the horizons.
+    - `mean_absolute`: by kind, (L,) the mean absolute value of a component.
+    - `mean_norm`: by kind, (L,) the mean length of the vector.
+    - `rms`: by kind, (L,) the root of the mean squared length.
 
     >>> t = np.arange(6.0)
     >>> spin = rj.Spin(np.stack([t, 0 * t, 0 * t], 1))
@@ -34,44 +41,50 @@ class Horizons(NamedTuple):
     [1.0, 2.0]
     """
 
-    steps: Any
-    mean_absolute: dict[str, Any]
-    mean_norm: dict[str, Any]
-    rms: dict[str, Any]
+    steps: np.ndarray
+    mean_absolute: dict[str, np.ndarray]
+    mean_norm: dict[str, np.ndarray]
+    rms: dict[str, np.ndarray]
 
 
-def by_horizon(starts: Any, found: Float[Array, "windows steps n"]) -> Horizons:
-    """The means over windows of errors, as changes from the measured states."""
-    by_kind = parts(jax.tree.map(lambda leaf: leaf[0], starts), found)
+def by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"]) -> Horizons:
+    """Average the `errors` of states over windows; `starts` has the type of the states."""
+    by_kind = parts(jax.tree.map(lambda leaf: leaf[0], starts), errors)
     absolute = {k: np.asarray(jnp.mean(jnp.abs(v), (0, 2))) for k, v in by_kind.items()}
     squares = {k: jnp.sum(v * v, 2) for k, v in by_kind.items()}
     norm = {k: np.asarray(jnp.mean(jnp.sqrt(v), 0)) for k, v in squares.items()}
     rms = {k: np.asarray(jnp.sqrt(jnp.mean(v, 0))) for k, v in squares.items()}
-    return Horizons(np.arange(1, found.shape[1] + 1), absolute, norm, rms)
+    return Horizons(np.arange(1, errors.shape[1] + 1), absolute, norm, rms)
 
 
 @jax.jit
-def held_errors(starts: Any, wanted: Any) -> Float[Array, "windows steps n"]:
-    """The errors of a prediction that holds the state at the start."""
+def held_errors(starts: HasSpin, wanted: HasSpin) -> Float[Array, "windows steps n"]:
+    """Return the errors of a prediction that holds each start, against the `wanted` states."""
     return jax.vmap(jax.vmap(minus_small, (None, 0)))(starts, wanted)
 
 
 class Windows(eqx.Module):
-    """Short runs of one length. `windows` makes them; `Windows.joined` joins several.
+    """Windows of a record: short runs of one length, each from a measured start.
 
-    **Fields:** `step` s between samples; `starts` N states; `wanted` the L states that follow each
-    start, with leading axes (N, L); `inputs` by name (N, before + L, *k), row before + i held
-    through step i, if there is no delay; `before` the number of rows before the start; `noise` and
-    `start_deviation` by kind, as `windows` has them.
+    `windows` cuts a record into windows; `Windows.joined` joins those of several records.
 
-    >>> found = windows(np.arange(6.0), Spin(np.ones((6, 3))), length=2, stride=2)
-    >>> found.count, found.length, found.wanted.omega.shape
+    **Fields:**
+
+    - `step`: s, the time between two samples.
+    - `starts`: N states, the starts.
+    - `wanted`: the L measured states that follow each start, with leading axes (N, L).
+    - `inputs`: by name, (N, before + L, *k). Without a delay row before + i is held in step i.
+    - `before`: the number of rows before the start.
+    - `noise`, `start_deviation`: by kind, the arguments `noise` and `starts` of `windows`.
+
+    >>> cut = windows(np.arange(6.0), Spin(np.ones((6, 3))), length=2, stride=2)
+    >>> cut.count, cut.length, cut.wanted.omega.shape
     (2, 2, (2, 2, 3))
     """
 
     step: float = eqx.field(static=True)
-    starts: Any
-    wanted: Any
+    starts: HasSpin
+    wanted: HasSpin
     inputs: dict[str, Array]
     before: int = eqx.field(static=True, default=0)
     noise: dict[str, float] | None = eqx.field(static=True, default=None)
@@ -79,18 +92,19 @@ class Windows(eqx.Module):
 
     @property
     def count(self) -> int:
-        """The number of windows."""
+        """Return the number of windows."""
         return int(self.starts.omega.shape[0])
 
     @property
     def length(self) -> int:
-        """The number of steps of each."""
+        """Return the number of steps of each window."""
         return int(self.wanted.omega.shape[1])
 
     @property
     def scales(self) -> Float[Array, " m"]:
-        """The unit of each number of an error: `noise`, else the rms of a prediction that holds
-        the state at the start.
+        """Return the unit (m,) in which each number of an error counts.
+
+        It is the `noise`, else the rms error of a prediction that holds the start.
         """
         if self.noise is not None:
             return jnp.asarray(np.repeat([self.noise[kind] for kind in names(self.starts)], 3))
@@ -99,9 +113,9 @@ class Windows(eqx.Module):
         return jnp.asarray(np.repeat(np.where(each == 0, 1.0, each), 3))
 
     def records(self) -> Recording:
-        """Return the windows as recordings, with a leading axis, that read the whole state.
+        """Return the windows as recordings, with a leading axis, of a sensor of the whole state.
 
-        The first time of each is its start, which is no reading.
+        The first time of each window is its start, at which nothing is read.
         """
         kind, scales = type(self.starts), np.asarray(self.scales)
         steps = np.arange(self.length + 1, dtype=self.wanted.omega.dtype)
@@ -115,7 +129,7 @@ class Windows(eqx.Module):
         sensor = StateSensor(kind, noise, unknown)  # pyright: ignore[reportCallIssue]
         values = jnp.asarray(np.concatenate(rows, axis=-1))
         reading = Reading(sensor, values, jnp.asarray(mask))
-        # Nothing is read of the input at the last time.
+        # A recording has as many samples as times; the one at the last time is not used.
         inputs = {name: np.asarray(rows) for name, rows in self.inputs.items()}
         inputs = {
             name: jnp.asarray(np.concatenate([rows, rows[:, -1:]], axis=1))
@@ -124,15 +138,12 @@ class Windows(eqx.Module):
         return recording_of(jnp.asarray(t), (reading,), inputs)
 
     def held(self) -> Horizons:
-        """The errors of a prediction that holds the state at the start: what a model must beat.
-
-        `mean_absolute` and `rms` after so many `steps`.
-        """
+        """Return the errors of a prediction that holds each start: a model must beat them."""
         return by_horizon(self.starts, held_errors(self.starts, self.wanted))
 
     @staticmethod
     def joined(*parts: "Windows") -> "Windows":
-        """The windows of several records, of one step and one length.
+        """Join the windows of several records, all of one step and one length.
 
         **Raises:** `ValueError` for none, or for steps, lengths or inputs that differ.
         """
@@ -178,13 +189,25 @@ def windows(
 ) -> Windows:
     """Cut a record of measured states into windows of `length` steps, one every `stride` samples.
 
-    **Arguments:** `t` (T,) s, evenly spaced but for gaps; `states` a `Spin`, `Attitude` or `Rigid`
-    with a leading axis (T,); `inputs` by name (T, *k), each held until the next sample, for the
-    `rigidjax.torques.Input`s of a torque; `before` the number of input samples kept before each
-    start, for a torque that delays them (`rigidjax.torques.Delayed`) or has states of its own, such
-    as `Lagged`: these follow the inputs up to the start, with the body held there. No window, with
-    the samples before it, goes across a gap. **Raises:** `ValueError` for shapes that do not agree,
-    NaN, uneven times, a record without a window of this length; `TypeError` for other states.
+    **Arguments:**
+
+    - `t`: (T,) s, evenly spaced but for gaps. No window reaches across a gap, nor do the samples
+      before it.
+    - `states`: a `Spin`, `Attitude` or `Rigid` with a leading axis (T,).
+    - `inputs`: by name, (T, *k) samples, each held until the next one, for the
+      `rigidjax.torques.Input`s of a torque.
+    - `length`: the number of steps of a window.
+    - `stride`: the number of samples from one start to the next.
+    - `before`: the number of input samples kept before each start, for a torque that delays inputs
+      (`rigidjax.torques.Delayed`) or has states of its own, such as `Lagged`. These states follow
+      the inputs up to the start, while the body is held at the start.
+    - `noise`: by kind, the standard deviation of a component of the measured states; `None` for an
+      unknown one.
+    - `starts`: by kind, the standard deviation of a component of the start, infinite for a free
+      one; `None` takes the measured starts as exact. It needs `noise`.
+
+    **Raises:** `ValueError` for shapes that do not agree, NaN, uneven times, or a record without a
+    window of this length; `TypeError` for other states.
 
     >>> t = np.arange(6.0)
     >>> windows(t, Spin(np.ones((6, 3))), length=2, stride=2).count
@@ -241,7 +264,7 @@ def windows(
 def _by_kind(
     numbers: Any, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
 ) -> dict[str, float]:
-    """Return the checked numbers of a mapping with these keys."""
+    """Return the numbers of a mapping whose keys are `kinds`, each one checked by `check`."""
     _checks.instance(numbers, Mapping, name, wanted="numbers by kind")
     if set(numbers) != set(kinds):
         raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(numbers)}")
@@ -249,6 +272,7 @@ def _by_kind(
 
 
 def _deviation(value: Any, name: str) -> float:
+    """Return the deviation of a start; raise `ValueError` unless it is positive, maybe infinite."""
     number = _checks.number(value, name)
     if not number > 0:
         raise ValueError(
@@ -259,7 +283,7 @@ def _deviation(value: Any, name: str) -> float:
 
 
 def _require_rows(times: np.ndarray, states: Any, inputs: Mapping[str, Any]) -> None:
-    """Raise `ValueError` for states and inputs that are not a row of numbers for each time."""
+    """Raise `ValueError` unless states and inputs are finite, with one row for each time."""
     rows = dict(zip(names(states), jax.tree.leaves(states), strict=True))
     rows |= {f"inputs[{k!r}]": v for k, v in inputs.items()}
     for name, value in rows.items():
@@ -284,7 +308,7 @@ def _require_rows(times: np.ndarray, states: Any, inputs: Mapping[str, Any]) -> 
 
 
 def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
-    """The time between samples, s, and the samples without a gap after them."""
+    """Return the time between samples, s, and a mask (T − 1,) of the steps that are no gaps."""
     gaps = np.diff(times)
     h = float(np.median(gaps))
     even = np.abs(gaps - h) <= 1e-3 * h
@@ -311,10 +335,13 @@ def require_windows(windows: Any) -> None:
 
 
 def mistakes_of_delays(law: Any, known: float, length: float) -> list[str]:
-    """Return the mistake of each delay that reads an input beyond those of a window, in words.
+    """Describe each delay of a torque that reads an input outside of the samples of a window.
 
-    **Arguments:** `known` s, the time before a window from which its inputs are known; `length` s
-    of a window.
+    **Arguments:**
+
+    - `law`: the torque.
+    - `known`: s, for how long before a window its inputs are known.
+    - `length`: s, of a window.
     """
     out = []
     for name, delay in delays_of(law):
@@ -335,9 +362,10 @@ def mistakes_of_delays(law: Any, known: float, length: float) -> list[str]:
 def starts_of_windows(
     windows: Windows, stretches: int
 ) -> tuple[ReferenceStates, Float[Array, "windows m"] | None, Int[Array, " windows"]]:
-    """Return the starts of windows as a reference, their weights, and the stretch of each window.
+    """Return the starts as reference states, their weights, and the stretch of each window.
 
-    The weight is one over the deviation of a start, in steps of order one; `None` for known starts.
+    A weight is the unit of a start's free number over its deviation; `None` for known starts. The
+    windows are divided into as many as `stretches` stretches of neighbours.
     """
     count, scales = windows.count, np.asarray(windows.scales)
     dtype = windows.wanted.omega.dtype

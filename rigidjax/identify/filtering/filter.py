@@ -1,7 +1,7 @@
 """The extended Kalman filter on the manifold, in square-root form, and its first belief."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin, Scalar, ScalarLike
@@ -35,12 +35,18 @@ from rigidjax.motion.manifold import names, plus
 
 
 class Belief(eqx.Module):
-    """An estimate of the state at a time, and the root S of its covariance `S Sᵀ`.
+    """An estimate of the state at a time, and a root S of the covariance `S Sᵀ` of its errors.
 
-    **Fields:** `t` s; `x` the `Extended` state, `root` (n, n), with the rows in its order: for a
-    `Spin` the errors of Ω; for an `Attitude` δθ (body frame, rad) and Ω; for a `Rigid` x, v, δθ, Ω;
-    then 3 for each `CorrelatedTorque`, then the walks. After `filter` all fields have a leading
-    time axis. `first_belief` makes the first one.
+    `first_belief` makes the first one; in the result of `filter` all fields have a leading time
+    axis.
+
+    **Fields:**
+
+    - `t`: s.
+    - `x`: the `Extended` state.
+    - `root`: S (n, n). Its rows are the errors of Ω for a `Spin`; of δθ (body frame, rad) and Ω for
+      an `Attitude`; of x, v, δθ and Ω for a `Rigid`; then three for each `CorrelatedTorque`, then
+      those of the walks.
     """
 
     t: Float[Array, "*times"]
@@ -49,27 +55,27 @@ class Belief(eqx.Module):
 
     @property
     def state(self) -> Any:
-        """The `Spin`, `Attitude` or `Rigid`."""
+        """Return the `Spin`, `Attitude` or `Rigid`."""
         return self.x.motion
 
     @property
     def torques(self) -> tuple[Float[Array, "*times 3"], ...]:
-        """Each `CorrelatedTorque`, N m, body frame."""
+        """Return the value of each `CorrelatedTorque`, N m, body frame."""
         return self.x.torques
 
     @property
     def walks(self) -> tuple[Array, ...]:
-        """The value of each `Walk`."""
+        """Return the value of each `Walk`."""
         return self.x.walks
 
     @property
     def covariance(self) -> Float[Array, "*times n n"]:
-        """The covariance of the errors."""
+        """Return the covariance of the errors."""
         return self.root @ jnp.swapaxes(self.root, -1, -2)
 
     @property
     def deviation(self) -> Float[Array, "*times n"]:
-        """The standard deviations of the errors."""
+        """Return the standard deviations of the errors."""
         return jnp.sqrt(jnp.sum(self.root**2, axis=-1))
 
 
@@ -91,15 +97,15 @@ def first_belief(
     **Arguments:**
 
     - `model`: a `Model` of one recording.
-    - `x`: (n,) its free numbers, such as `fit(model).x`; for `None` the body must be known, and the
-      initial state is what the first readings show.
-    - `state`: the initial state, of the kind that is followed; `None` takes that of x.
-    - `rate`, `attitude`, `position`, `velocity`: standard deviations of the initial state, one
-      number or three, zero for known values: of Ω, rad/s, for each kind of state; rad for an
-      `Attitude` and a `Rigid`; m and m/s for a `Rigid`.
+    - `x`: (n,) its free numbers, such as `fit(model).x`. With `None` the body must be known, and
+      the initial state is the one that the first readings show.
+    - `state`: the initial state, a `Spin`, `Attitude` or `Rigid`; `None` takes that of x.
+    - `rate`: the standard deviation of Ω, rad/s, one number or three, zero if it is known.
+    - `attitude`: likewise, rad, for an `Attitude` or a `Rigid`.
+    - `position`, `velocity`: likewise, m and m/s, for a `Rigid`.
 
     **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing or below zero,
-    and if neither x nor `state` is there and the readings show no initial attitude.
+    and for neither x nor `state` if the readings show no initial attitude.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 2.0, 2.5))
@@ -110,7 +116,7 @@ def first_belief(
     scene, record = scene_at(model, x)
     start: Any = scene.start if state is None else state
     if state is None and x is None:
-        _require_shown(record, start)
+        _require_shown_attitude(record, start)
     _checks.single(start, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
     start = on_the_group(start)
     deviations = {"attitude": attitude, "rate": rate, "position": position, "velocity": velocity}
@@ -135,7 +141,10 @@ def belief_at(
     scene: Scene,
     drifts: Sequence[Drift],
 ) -> Belief:
-    """Return the belief of a state with these standard deviations, in the dtype of the state."""
+    """Return the belief in a state with the standard `deviations`, in the dtype of the state.
+
+    The rest of the belief comes from the scene: its correlated torques, and its `drifts`.
+    """
     dtype = state.omega.dtype
     coloured = coloured_parts(scene.process)
     walks = tuple(value.astype(dtype) for value in drifting_values(scene, drifts))
@@ -145,8 +154,8 @@ def belief_at(
     return Belief(t, Extended(state, tuple(jnp.zeros(3, dtype) for _ in coloured), walks), root)
 
 
-def _require_shown(recording: Recording, state: Any) -> None:
-    """Raise an error if the readings do not show the initial attitude of the state."""
+def _require_shown_attitude(recording: Recording, state: HasSpin | None) -> None:
+    """Raise an error if the state has an attitude that the readings do not show."""
     if not _checks.known(recording):
         raise TypeError("state: wanted a state; a traced recording shows none")
     if isinstance(state, HasAttitude) and not len(attitudes(recording)[1]):
@@ -157,7 +166,7 @@ def _require_shown(recording: Recording, state: Any) -> None:
 
 
 def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recording]:
-    """Return the scene of the only recording of a model, and the recording.
+    """Return the scene of a model's only recording at the free numbers x, and the recording.
 
     The torque of the scene reads the inputs of the recording.
     """
@@ -181,6 +190,7 @@ def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recordi
 
 @eqx.filter_jit
 def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
+    """Return the scene of the first recording, its inputs bound to the torque."""
     row = model.index.rows(x)[0]
     record, reference, which = stacking.one((model.records, model.reference, model.which), 0)
     scene = scene_of(model, row, record, reference, which)
@@ -188,23 +198,32 @@ def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
 
 
 class Grid(NamedTuple):
-    """Times `t` (N,) s; the next row of the recording, and if it is `real`; where each row is."""
+    """The times of the steps of a filter: those of the recording, and some between.
+
+    **Fields:**
+
+    - `t`: (N,) s.
+    - `source`: (N,) the row of the recording at or after each time.
+    - `real`: (N,) whether the time is that of the row, so that its readings count.
+    - `rows`: (T,) the index in `t` of each row of the recording.
+    """
 
     t: Float[Array, " n"]
     source: Int[Array, " n"]
     real: Bool[Array, " n"]
     rows: Int[Array, " t"]
 
-    def of_rows(self, kept: Any) -> Any:
-        """Of the values at all times those at the recording's; to pick all would be a copy."""
+    def at_rows(self, values: PyTree[Array]) -> PyTree[Array]:
+        """Return the `values` at the times of the recording, from those at all times."""
+        # If there are no other times, to pick all values would only copy them.
         same = self.rows.size == self.t.size
-        return kept if same else jax.tree.map(lambda leaf: leaf[self.rows], kept)
+        return values if same else jax.tree.map(lambda leaf: leaf[self.rows], values)
 
 
 def grid_of(
     process: Process | None, recording: Recording, first: Belief, substeps: int | None
 ) -> Grid:
-    """Return the times of the steps."""
+    """Return the times of the steps from the `first` belief through the recording."""
     xp = _checks.namespace((recording.t, first.t))
     t, t0 = xp.asarray(recording.t), xp.asarray(first.t)
     if xp is np:
@@ -226,8 +245,8 @@ def grid_of(
 class FilterInput(NamedTuple):
     """The checked arguments of a filter: `checked_input` makes them.
 
-    **Fields:** the `scene`; the `drifts` of the model; the `recording`; the `first` belief; the
-    `grid` of the steps.
+    **Fields:** `scene` with its torque bound to inputs; `drifts` of the model; `recording`; `first`
+    the belief before it; `grid` the times of the steps.
     """
 
     scene: Scene
@@ -237,7 +256,8 @@ class FilterInput(NamedTuple):
     grid: Grid
 
 
-# A filter is lost if no reading was within so many deviations for so long, s, and so many readings.
+# A filter is lost if for LOST_AFTER seconds, and for LOST_READINGS in a row, no reading was within
+# LOST_BEYOND standard deviations of its prediction.
 LOST_AFTER, LOST_READINGS, LOST_BEYOND = 1.0, 3, 6.0
 WORDS = (
     "followed",
@@ -249,10 +269,13 @@ WORDS = (
 class Filtered(eqx.Module):
     """The result of `filter`.
 
-    **Fields:** `belief` a `Belief` at each time of the recording, after its readings; `readings`,
-    for each sensor, a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all
-    readings; `status` 0 followed, 1 lost, 2 stopped (`words` says it); `lost_at` s, NaN unless
-    lost.
+    **Fields:**
+
+    - `belief`: a `Belief` at each time of the recording, after its readings.
+    - `readings`: for each sensor a `Read`: `innovation`, `variance` and `seen`, (T, k).
+    - `log_likelihood`: of all readings.
+    - `status`: 0 followed, 1 lost, 2 stopped; `words` is the same in words.
+    - `lost_at`: s, NaN unless the filter was lost.
     """
 
     belief: Belief
@@ -263,25 +286,25 @@ class Filtered(eqx.Module):
 
     @property
     def t(self) -> Float[Array, " times"]:
-        """The times of the recording, s."""
+        """Return the times of the recording, s."""
         return self.belief.t
 
     @property
     def states(self) -> Any:
-        """The estimates, with a leading time axis."""
+        """Return the estimated states, with a leading time axis."""
         return self.belief.state
 
     @property
     def words(self) -> str:
-        """The status in words."""
+        """Return the status in words."""
         return WORDS[int(self.status)]
 
     @property
     def nis(self) -> tuple[Float[Array, " times"], ...]:
-        """Normalised innovations squared of each sensor, and how many numbers each holds.
+        """Return the normalised innovations squared of each sensor at each time.
 
-        They follow χ² with as many degrees of freedom if the model is right (Bar-Shalom, Li and
-        Kirubarajan, Estimation (2001), §5.4).
+        If the model is right they follow χ², with as many degrees of freedom as numbers were read
+        (Bar-Shalom, Li and Kirubarajan, Estimation (2001), §5.4).
         """
         return tuple(
             jnp.sum(jnp.where(r.seen, r.innovation**2 / r.variance, 0), -1) for r in self.readings
@@ -298,21 +321,22 @@ def filter(
 ) -> Filtered:
     """Return attitude, rate, unknown torque and sensor errors from the readings up to each time.
 
-    The multiplicative extended Kalman filter: the estimate is a state on the group, its error a
-    rotation vector and numbers (Lefferts, Markley and Shuster 1982, doi:10.2514/3.56190). Between
-    readings both follow the equations of motion, by the classical method of order 4. The covariance
-    is kept as a root, updated by Potter's formula for each number read.
+    This is the multiplicative extended Kalman filter: the estimate is a state on the group, its
+    error a rotation vector and other numbers (Lefferts, Markley and Shuster 1982,
+    doi:10.2514/3.56190). Between readings the estimate and its covariance follow the equations of
+    motion, by the classical method of order 4. The covariance is kept as a root, which Potter's
+    formula updates for each number read.
 
     **Arguments:**
 
-    - `model`: a `Model` of one recording, whose sensors have their noise. Masked readings are gaps,
-      channels at their full scale are left out, a sensor's `offset` is a delay.
+    - `model`: a `Model` of one recording, whose sensors have their noise. Masked readings and
+      channels at full scale are left out; a sensor's `offset` is allowed for.
     - `first`: the belief before the first reading, of `first_belief`.
     - `x`: (n,) the free numbers of the model, such as `fit(model).x`: body, torques and sensors are
       those of the scene at x. `None` for a model whose body is known.
     - `substeps`: the number of fixed steps from one time to the next; `None` chooses them by the
       rate if the numbers are known, else one.
-    - `throw`: with `False` no event of the run raises an error; see `status`.
+    - `throw`: `False` raises no error for what happens during the run; look at `status`.
 
     **Returns** `belief`, `readings`, `log_likelihood`, `status` and `lost_at` (`Filtered`). It may
     be jitted, differentiated, and batched over `first`, `x`, and readings that `equinox.tree_at`
@@ -334,7 +358,7 @@ def filter(
 
 
 def raise_if_lost(run: Any) -> Any:
-    """Return a run of a filter; raise an error in words if it is lost or stopped."""
+    """Return the run of a filter; raise `ValueError` if it was lost or stopped."""
     status = run.status
     at = f" (at {float(run.lost_at):g} s)" if _checks.known(run.lost_at) else ""
     advice = (
@@ -353,10 +377,12 @@ def log_likelihood(
 ) -> Scalar:
     """Return the logarithm of the density of all readings, the unknown torques integrated out.
 
-    `Σ log N(ν; 0, s)` over innovations (Schweppe 1965, doi:10.1109/TIT.1965.1053737): maximise it
-    over moments, a density, a noise, an initial state. It is differentiable in forward and reverse
-    mode. **Arguments:** `model`, `first`, `x`, `substeps` as those of `filter`; **raises** the
-    errors of `filter`.
+    It is `Σ log N(ν; 0, s)` over innovations ν of variance s (Schweppe 1965,
+    doi:10.1109/TIT.1965.1053737). Maximise it over moments, the density of a torque, a noise, or an
+    initial state: it is differentiable in forward and reverse mode.
+
+    **Arguments:** `model`, `first`, `x`, `substeps` as for `filter`. **Raises** the errors of
+    `filter`.
 
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(1.0), [[1.0, 0, 0]] * 2))
     >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 1.0, 1.0))
@@ -376,20 +402,19 @@ def step(
     seen: Sequence[Any] | None = None,
     x: Float[Array, " n"] | None = None,
 ) -> Belief:
-    """Return the belief at the time t, after the readings then: for use while the body moves.
+    """Return the belief at the time t, after the readings at t: a filter while the body moves.
 
-    This is one step of the classical method: the time between readings must be short against a
-    turn.
+    It makes one step of the classical method of order 4: the body may turn only little from one
+    reading to the next.
 
     **Arguments:**
 
-    - `model`: a `Model` of one recording, whose body, torque and sensors are used, and not its
-      readings.
-    - `belief`: of `first_belief` or the last `step`.
-    - `t`: s, not before the belief.
+    - `model`: a `Model` of one recording. Its body, torque and sensors are used, its readings not.
+    - `belief`: the result of `first_belief` or of the last `step`.
+    - `t`: s, not before the time of the belief.
     - `readings`: one of each sensor, in the order of the recording.
-    - `seen`: a truth value for each sensor, false where there is no reading and the number counts
-      for nothing; `None` for all true.
+    - `seen`: a truth value for each sensor; false if there is no reading, and its number does not
+      count. `None` for all true.
     - `x`: (n,) the free numbers of the model; `None` for a model whose body is known.
 
     **Returns** the `Belief` at t. **Raises:** `ValueError` for a t before the belief, another
@@ -432,28 +457,36 @@ def step(
 
 @eqx.filter_jit
 def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) -> Belief:
-    # A unit vector in the place of a missing reading keeps derivatives finite.
+    """Return the belief after one step, as one program."""
+    # Replace missing readings by a unit vector: derivatives at a zero quaternion are NaN.
     units = (jnp.eye(1, v.size, dtype=v.dtype).reshape(v.shape) for v in stop.values)
     values = tuple(map(jnp.where, stop.masks, stop.values, units))
     values = tuple(value.astype(belief.root.dtype) for value in values)
     dynamics = dynamics_of(scene, drifts, belief.x)
-    return _one(dynamics, belief, stop._replace(values=values))[0]
+    return _predict_and_update(dynamics, belief, stop._replace(values=values))[0]
 
 
-def _one(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, Read]:
+def _predict_and_update(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, Read]:
+    """Return the belief at a stop, after its readings, and what was read."""
     dtype = belief.root.dtype
-    # Times may have more digits than the state: after a thousand seconds seven are too few.
+    # Subtract times before they are rounded to the dtype of the state: after a thousand seconds the
+    # seven digits of float32 are too few.
     since = (stop.t - belief.t).astype(dtype)
     x, grown, noise = dynamics.predict(belief.t.astype(dtype), since, belief.x)
-    root = roots.predicted(grown, belief.root, noise)
-    matrix, error, deviation, seen = steps.linearised(dynamics, stop, x)
+    root = roots.predicted_root(grown, belief.root, noise)
+    matrix, error, deviation, seen = steps.linearise_readings(dynamics, stop, x)
     e = jnp.zeros_like(root[0])
-    e, root, innovation, variance = roots.absorb_all(e, root, matrix, error, deviation**2, seen)
+    e, root, innovation, variance = roots.update(e, root, matrix, error, deviation**2, seen)
     return Belief(stop.t, plus(x, e), steps.reset(x, e, root)), Read(innovation, variance, seen)
 
 
-def scan_filter(run: FilterInput, keep: Any) -> tuple[Dynamics, Stops, Any]:
-    """Run the filter over all stops by `lax.scan`, and return what `keep(belief, read)` kept."""
+def scan_filter(
+    run: FilterInput, keep: Callable[[Belief, Read], PyTree[Array]]
+) -> tuple[Dynamics, Stops, PyTree[Array]]:
+    """Run the filter over all stops by `lax.scan`.
+
+    Returns its equations, its stops, and the results of `keep(belief, read)` at each stop.
+    """
     scene, drifts, recording, first, grid = run
     dtype = first.root.dtype
     dynamics = dynamics_of(scene, drifts, first.x)
@@ -462,18 +495,19 @@ def scan_filter(run: FilterInput, keep: Any) -> tuple[Dynamics, Stops, Any]:
     stops = Stops(grid.t, values, masks)
 
     def body(belief: Belief, stop: Stops) -> tuple[Belief, Any]:
-        belief, read = _one(dynamics, belief, stop)
+        belief, read = _predict_and_update(dynamics, belief, stop)
         return belief, keep(belief, read)
 
-    # A reverse pass computes a step again: a step holds some thousand numbers.
+    # Let a reverse pass compute each step again: to store a step takes some thousand numbers.
     body = jax.checkpoint(body)  # pyright: ignore[reportPrivateImportUsage]
     return dynamics, stops, lax.scan(body, first, stops)[1]
 
 
 @eqx.filter_jit
 def _filter(run: FilterInput) -> Filtered:
+    """Return the result of `filter` from its checked arguments, as one program."""
     both = scan_filter(run, lambda belief, read: (belief, read))[2]
-    beliefs, read = run.grid.of_rows(both)
+    beliefs, read = run.grid.at_rows(both)
     reads = steps.by_sensor(run.scene.sensors, read)
     total = roots.terms(*read).log_density
     return Filtered(beliefs, reads, total, *status_of(beliefs, reads, run.first.t))
@@ -481,10 +515,12 @@ def _filter(run: FilterInput) -> Filtered:
 
 @eqx.filter_jit
 def _log_likelihood(run: FilterInput) -> Scalar:
+    """Return the result of `log_likelihood` from its checked arguments, as one program."""
     return roots.terms(*scan_filter(run, lambda _, read: read)[2]).log_density
 
 
 def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Array, Array]:
+    """Return the status of a run that starts at `t0`, and the time at which it was lost or NaN."""
     t, times = beliefs.t, jnp.arange(beliefs.t.shape[0])
     lost = jnp.zeros(t.shape, bool)
     for read in reads:

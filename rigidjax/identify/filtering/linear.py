@@ -1,4 +1,4 @@
-"""Any linear model with normal noise: the Kalman filter and smoother, in square-root form."""
+"""The Kalman filter and smoother of any linear model with normal noise, in square-root form."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -7,22 +7,34 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from rigidjax import _checks
-from rigidjax._types import Scalar
+from rigidjax._types import Numbers, Scalar
 from rigidjax.identify.filtering import roots
+
+# An array or nested lists of numbers, with a leading axis or without.
+Parameter = Float[ArrayLike, "..."] | Numbers
 
 
 class LinearModel(eqx.Module):
-    """`x' = F x + d + G u`, `y = H x + c + r v`: u and v of unit variance, independent.
+    """A linear model, `x' = F x + d + G u` and `y = H x + c + r v`.
 
-    **Arguments:** `transition` F (n, n); `noise` G (n, m), a root of the covariance that is added;
-    `matrix` H (k, n); `deviation` r (k,) of the noise of each number read; then, `None` for zero,
-    `push` d (n,) and `offset` c (k,). Each may have a leading axis: F, G, d over the steps between
-    T times (T − 1), H, r, c over the times (T). Make correlated noise independent first: divide y,
-    H, c by the Cholesky factor of its covariance. **Raises:** `ValueError` for shapes that do not
-    fit, and a deviation that is not positive.
+    u and v are normal, independent and of unit variance.
+
+    **Arguments:**
+
+    - `transition`: F (n, n).
+    - `noise`: G (n, m), a root of the covariance that a step adds.
+    - `matrix`: H (k, n).
+    - `deviation`: r (k,), of the noise of each number read.
+    - `push`: d (n,), or `None` for zero.
+    - `offset`: c (k,), or `None` for zero.
+
+    Each may have a leading axis: F, G and d over the T − 1 steps between T times, H, r and c over
+    the times. Make correlated noise independent first: divide y, H and c by the Cholesky factor of
+    its covariance. **Raises:** `ValueError` for shapes that do not fit, and for a deviation that is
+    not positive.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
     >>> walk.size
@@ -38,22 +50,22 @@ class LinearModel(eqx.Module):
 
     def __init__(
         self,
-        transition: Any,
-        noise: Any,
-        matrix: Any,
-        deviation: Any,
+        transition: Parameter,
+        noise: Parameter,
+        matrix: Parameter,
+        deviation: Parameter,
         *,
-        push: Any = None,
-        offset: Any = None,
+        push: Parameter | None = None,
+        offset: Parameter | None = None,
     ):
         self.transition = _checks.numbers(transition, "transition")
         self.noise, self.matrix = _checks.numbers(noise, "noise"), _checks.numbers(matrix, "matrix")
-        spread = _checks.numbers(deviation, "deviation")
+        sigma = _checks.numbers(deviation, "deviation")
         words = (
             "deviation: wanted positive standard deviations; a measurement without noise is "
             "singular: leave the numbers that it fixes out of the state"
         )
-        self.deviation = _checks.refuse(spread, ~(spread > 0).all(), words)
+        self.deviation = _checks.refuse(sigma, ~(sigma > 0).all(), words)
         self.push = None if push is None else _checks.numbers(push, "push")
         self.offset = None if offset is None else _checks.numbers(offset, "offset")
         if self.transition.ndim < 2:
@@ -78,16 +90,21 @@ class LinearModel(eqx.Module):
 
     @property
     def size(self) -> int:
-        """The number of numbers in the state."""
+        """Return the number of numbers in the state."""
         return self.transition.shape[-1]
 
 
 class LinearEstimate(eqx.Module):
     """The means of a state at each time, and roots of its covariances.
 
-    **Fields:** `mean` (T, n), `root` (T, n, n), `innovation`, `variance` (T, k) of each number read
-    given those before it, and `log_likelihood` of all; of a smoother `kicks` (T − 1, m), the means
-    of the noise u, and `kick_covariance` (T − 1, m, m), else `None`.
+    **Fields:**
+
+    - `mean`: (T, n).
+    - `root`: (T, n, n).
+    - `innovation`, `variance`: (T, k) of each number read, given the numbers read before it.
+    - `log_likelihood`: of all numbers read.
+    - `kicks`: (T − 1, m) the means of the noise u, of a smoother; else `None`.
+    - `kick_covariance`: (T − 1, m, m) their covariances, of a smoother; else `None`.
     """
 
     mean: Float[Array, "times n"]
@@ -100,52 +117,75 @@ class LinearEstimate(eqx.Module):
 
     @property
     def covariance(self) -> Float[Array, "times n n"]:
-        """The covariances."""
+        """Return the covariances."""
         return self.root @ jnp.swapaxes(self.root, -1, -2)
 
     @property
     def deviation(self) -> Float[Array, "times n"]:
-        """The standard deviations."""
+        """Return the standard deviations."""
         return jnp.sqrt(jnp.sum(self.root**2, -1))
 
 
-def linear_filter(
-    model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any = None
-) -> LinearEstimate:
-    """The Kalman filter of a `LinearModel`: the state at each time from the readings so far.
+# The number of axes of each part of a model. A part that changes from step to step, or from time to
+# time, has one more.
+_STEPS = {"transition": 2, "noise": 2, "push": 1}
+_AXES = _STEPS | {"matrix": 2, "deviation": 1, "offset": 1}
+Parts = dict[str, Any]
 
-    **Arguments:** `model`; `readings` y (T, k); `mean` (n,) and `root` (n, n), a root of the
-    covariance, at the first time before its reading; `seen` (T, k) which numbers count, `None` all.
+
+Readings = Float[ArrayLike, "times k"] | Numbers
+Mean = Float[ArrayLike, " n"] | Numbers
+Root = Float[ArrayLike, "n n"] | Numbers
+Mask = Bool[ArrayLike, "times k"] | Numbers | None
+
+
+def linear_filter(
+    model: LinearModel, readings: Readings, mean: Mean, root: Root, seen: Mask = None
+) -> LinearEstimate:
+    """Return the state of a `LinearModel` at each time from the readings so far (Kalman filter).
+
+    **Arguments:**
+
+    - `model`: a `LinearModel`.
+    - `readings`: y (T, k).
+    - `mean`: (n,) the mean of the state at the first time, before its reading.
+    - `root`: (n, n) a root of its covariance.
+    - `seen`: (T, k) true for the numbers that count; `None` for all.
+
     **Returns** `mean`, `root`, `innovation`, `variance` and `log_likelihood` (`LinearEstimate`).
-    **Raises:** `ValueError` for shapes that do not fit, NaN that is not masked.
+    **Raises:** `ValueError` for shapes that do not fit, and for NaN that is not masked.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
-    >>> found = linear_filter(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
-    >>> found.mean[0].tolist(), found.innovation[0].tolist()
+    >>> estimate = linear_filter(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
+    >>> estimate.mean[0].tolist(), estimate.innovation[0].tolist()
     ([0.5], [1.0])
     """
-    return solved(*_given(model, readings, mean, root, seen), back=False)
+    return solve(*_checked_arguments(model, readings, mean, root, seen), smooth=False)
 
 
 def linear_smooth(
-    model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any = None
+    model: LinearModel, readings: Readings, mean: Mean, root: Root, seen: Mask = None
 ) -> LinearEstimate:
-    """The state at each time, and the noise of each step, from all readings.
+    """Return the state at each time, and the noise of each step, from all readings.
 
-    Rauch, Tung and Striebel 1965, doi:10.2514/3.3166, on roots of the covariances.
+    It is the smoother of Rauch, Tung and Striebel (1965, doi:10.2514/3.3166) on roots of the
+    covariances.
 
     **Arguments**, **returns** and **raises** as `linear_filter`, with `kicks`, the noise u of each
     step, and `kick_covariance`.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
-    >>> found = linear_smooth(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
-    >>> bool(found.mean[0, 0] > 0.5), found.kicks.shape
+    >>> estimate = linear_smooth(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
+    >>> bool(estimate.mean[0, 0] > 0.5), estimate.kicks.shape
     (True, (2, 1))
     """
-    return solved(*_given(model, readings, mean, root, seen), back=True)
+    return solve(*_checked_arguments(model, readings, mean, root, seen), smooth=True)
 
 
-def _given(model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any) -> tuple:
+def _checked_arguments(
+    model: LinearModel, readings: Readings, mean: Mean, root: Root, seen: Mask
+) -> tuple[Parts, Array, Array, Array, Array]:
+    """Return the parts of the model, and the other arguments as checked arrays."""
     _checks.instance(model, LinearModel, "model")
     n, k = model.size, model.deviation.shape[-1]
     readings = _checks.rows(readings, (k,), "readings")
@@ -162,110 +202,124 @@ def _given(model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any) -
     words = "readings: contains NaN or infinity; mask it by `seen` if it is a gap"
     readings = jnp.where(seen, _checks.refuse(readings, bad.any(), words), 0)
     parts = {name: getattr(model, name) for name in _AXES}
-    for name, part in _moving(parts).items():
+    for name, part in _time_varying(parts).items():
         wanted = times - 1 if name in _STEPS else times
         if part.shape[0] != wanted:
             raise ValueError(f"{name}: wanted {wanted} rows for {times} times, got {part.shape[0]}")
     return parts, readings, mean, root, seen
 
 
-# The axes of each part of a model; one more if it changes from step to step, or time to time.
-_STEPS = {"transition": 2, "noise": 2, "push": 1}
-_AXES = _STEPS | {"matrix": 2, "deviation": 1, "offset": 1}
-Parts = dict[str, Any]
-
-
-def _moving(parts: Parts) -> Parts:
-    """The parts that change."""
+def _time_varying(parts: Parts) -> Parts:
+    """Return the parts that change from step to step, or from time to time."""
     return {n: part for n, part in parts.items() if part is not None and part.ndim > _AXES[n]}
 
 
-@partial(jax.jit, static_argnames="back")
-def solved(
-    parts: Parts, readings: Array, mean: Array, root: Array, seen: Array, *, back: bool
+@partial(jax.jit, static_argnames="smooth")
+def solve(
+    parts: Parts, readings: Array, mean: Array, root: Array, seen: Array, *, smooth: bool
 ) -> LinearEstimate:
-    """The filter forward, and with `back` the smoother's pass; `parts` are a `LinearModel`'s."""
-    steps = {name: part for name, part in _moving(parts).items() if name in _STEPS}
-    times = {name: part for name, part in _moving(parts).items() if name not in _STEPS}
+    """Return the estimate of the Kalman filter or, with `smooth`, of the smoother.
 
-    def read(row: tuple, mean: Array, root: Array) -> roots.Absorbed:
+    `parts` are the fields of a `LinearModel` by name; the other arguments are those of
+    `linear_filter`.
+    """
+    steps = {name: part for name, part in _time_varying(parts).items() if name in _STEPS}
+    times = {name: part for name, part in _time_varying(parts).items() if name not in _STEPS}
+
+    def read(row: tuple, mean: Array, root: Array) -> roots.Update:
         times, y, seen = row
-        now = parts | times
+        now: dict[str, Any] = parts | times
         error = y if now["offset"] is None else y - now["offset"]
-        return roots.absorb_all(mean, root, now["matrix"], error, now["deviation"] ** 2, seen)
+        return roots.update(mean, root, now["matrix"], error, now["deviation"] ** 2, seen)
 
-    def body(carry: tuple[Array, Array], now: Any) -> tuple[Any, Any]:
+    def body(carry: tuple[Array, Array], now: tuple[Parts, tuple]) -> tuple[Any, Any]:
         (mean, root), (steps, row) = carry, now
-        grown, noise, push = ((parts | steps)[name] for name in ("transition", "noise", "push"))
-        predicted = jnp.sum(grown * mean[None], 1)
+        of_step: dict[str, Any] = parts | steps
+        transition, noise, push = (of_step[name] for name in ("transition", "noise", "push"))
+        predicted = jnp.sum(transition * mean[None], 1)
         if push is not None:
             predicted = predicted + push
-        kept = joint(grown, noise, root) if back else None
-        before = roots.predicted(grown, root, noise) if kept is None else kept.predicted
-        passed = read(row, predicted, before)
-        return (passed.step, passed.root), (passed, predicted, kept)
+        joint = joint_roots(transition, noise, root) if smooth else None
+        before = roots.predicted_root(transition, root, noise) if joint is None else joint.predicted
+        update = read(row, predicted, before)
+        return (update.step, update.root), (update, predicted, joint)
 
     rows = times, readings, seen
     now, later = (jax.tree.map(lambda leaf, at=at: leaf[at], rows) for at in (0, slice(1, None)))
     first = read(now, mean, root)
-    _, (rest, predicted, kept) = lax.scan(body, (first.step, first.root), (steps, later))
-    passed = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
-    means, spread, innovation, variance = passed
+    _, (rest, predicted, joint) = lax.scan(body, (first.step, first.root), (steps, later))
+    updates = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+    means, all_roots, innovation, variance = updates
     total, kicks = roots.terms(innovation, variance, seen).log_density, (None, None)
-    if back:
-        end = means[-1], spread[-1]
-        means, spread, *kicks = smoothed(kept, means[:-1], predicted, parts["noise"], end)
-    return LinearEstimate(means, spread, innovation, variance, total, *kicks)
+    if smooth:
+        end, noise = (means[-1], all_roots[-1]), parts["noise"]
+        means, all_roots, *kicks = backward_pass(joint, means[:-1], predicted, noise, end)
+    return LinearEstimate(means, all_roots, innovation, variance, total, *kicks)
 
 
 class Joint(NamedTuple):
-    """The values of a forward step that the backward pass needs: see `joint`."""
+    """The values of a forward step that the backward pass needs, made by `joint_roots`.
+
+    **Fields:** `predicted` a root of the covariance of the predicted state; `gain` of the smoother;
+    `rest` a root of the covariance before the step, given the state after it.
+    """
 
     predicted: Float[Array, "n n"]
     gain: Float[Array, "n n"]
     rest: Float[Array, "n n"]
 
 
-def joint(grown: Array, noise: Array, root: Array) -> Joint:
-    """Roots of the predicted and the conditional covariance, and the smoother's gain, from the
-    triangle of `[[F S, G], [S, 0]]`: Park and Kailath 1995, doi:10.1080/00207179508921582.
+def joint_roots(transition: Array, noise: Array, root: Array) -> Joint:
+    """Return the `Joint` of a step from the triangular root of `[[F S, G], [S, 0]]`.
+
+    F is the `transition`, G the `noise`, S the `root` before the step (Park and Kailath 1995,
+    doi:10.1080/00207179508921582).
     """
     n, m = noise.shape
-    upper = jnp.concatenate([roots.product(grown, root), noise], 1)
+    upper = jnp.concatenate([roots.product(transition, root), noise], 1)
     whole = jnp.concatenate([upper, jnp.pad(root, ((0, 0), (0, m)))])
-    # A triangle of 2n needs as many columns.
-    whole = roots.triangular(jnp.pad(whole, ((0, 0), (0, max(0, n - m)))))
+    # A triangle of 2n rows needs as many columns.
+    whole = roots.triangular_root(jnp.pad(whole, ((0, 0), (0, max(0, n - m)))))
     predicted, cross = whole[:n, :n], whole[n:, :n]
     return Joint(predicted, roots.divide_right(cross, predicted), whole[n:, n:])
 
 
-def smoothed(
-    kept: Joint, mean: Array, predicted: Array, noise: Array, end: tuple[Array, Array]
+def backward_pass(
+    joint: Joint, mean: Array, predicted: Array, noise: Array, end: tuple[Array, Array]
 ) -> tuple[Array, Array, Array, Array]:
-    """Means and roots at all times, and means and covariances of the unit noise of all steps.
+    """Return the smoothed means and roots, and means and covariances of the noise of all steps.
 
-    The pass back (Rauch, Tung, Striebel 1965), and of the noise (m, m) with `Z = L⁻¹ G`, L the
-    predicted root: `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ`, S the smoothed root after the step.
+    It is the pass back of Rauch, Tung and Striebel (1965). The covariance (m, m) of the unit noise
+    of a step is `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ` with `Z = L⁻¹ G`, L the predicted root and S the
+    smoothed root after the step.
+
+    **Arguments:**
+
+    - `joint`: of all steps.
+    - `mean`: (T − 1, n) the filtered means before each step.
+    - `predicted`: (T − 1, n) the predicted means after it.
+    - `noise`: G, of all steps or of each.
+    - `end`: mean and root at the last time.
     """
 
     def kick(noise: Array, lower: Array, off: Array, root: Array) -> tuple[Array, Array]:
         m = noise.shape[1]
         both = roots.divide(lower, jnp.concatenate([noise, off[:, None], root], 1))
-        whitened, mean, spread = both[:, :m], both[:, m], both[:, m + 1 :]
+        whitened, mean, scaled_root = both[:, :m], both[:, m], both[:, m + 1 :]
         mean = jnp.sum(whitened * mean[:, None], 0)
         left = jnp.eye(m, dtype=noise.dtype) - roots.product(whitened.T, whitened)
-        known = roots.product(whitened.T, spread)
+        known = roots.product(whitened.T, scaled_root)
         return mean, left + roots.product(known, known.T)
 
-    def back(later: tuple[Array, Array], now: Any) -> tuple[Any, Any]:
-        kept, mean, predicted, moving = now
+    def step_back(later: tuple[Array, Array], now: tuple) -> tuple[Any, Any]:
+        joint, mean, predicted, own_noise = now
         off, root = later[0] - predicted, later[1]
-        kicks = kick(noise if moving is None else moving, kept.predicted, off, root)
-        mean = mean + jnp.sum(kept.gain * off[None], 1)
-        out = mean, roots.predicted(kept.gain, root, kept.rest)
+        kicks = kick(noise if own_noise is None else own_noise, joint.predicted, off, root)
+        mean = mean + jnp.sum(joint.gain * off[None], 1)
+        out = mean, roots.predicted_root(joint.gain, root, joint.rest)
         return out, (*out, *kicks)
 
-    moving = noise if noise.ndim > 2 else None
-    _, before = lax.scan(back, end, (kept, mean, predicted, moving), reverse=True)
-    means, spread = (jnp.concatenate([a, b[None]]) for a, b in zip(before, end, strict=False))
-    return means, spread, *before[2:]
+    own_noise = noise if noise.ndim > 2 else None
+    _, before = lax.scan(step_back, end, (joint, mean, predicted, own_noise), reverse=True)
+    means, all_roots = (jnp.concatenate([a, b[None]]) for a, b in zip(before, end, strict=False))
+    return means, all_roots, *before[2:]

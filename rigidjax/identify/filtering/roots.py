@@ -1,4 +1,4 @@
-"""Covariances by their square roots: P = S Sᵀ, which round-off cannot make indefinite."""
+"""Covariances P by their roots S: round-off cannot make `P = S Sᵀ` indefinite."""
 
 import math
 from typing import Any, NamedTuple
@@ -7,54 +7,61 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from rigidjax._types import Scalar
+from rigidjax._types import Scalar, ScalarLike
 
 
-def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
-    """The lower triangular root L of `a aᵀ`, its diagonal ≥ 0.
+def triangular_root(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
+    """Return the lower triangular root L of `a aᵀ` whose diagonal is not negative.
 
-    By the modified Gram–Schmidt process on the rows, whose triangular factor is as good as
-    Householder's (Björck 1967, doi:10.1007/BF01934122). A row that depends on earlier rows, to a
-    few units of round-off, leaves a zero on the diagonal. Its derivatives are zero, whereas those
-    of `jnp.linalg.qr` are NaN: a state known without error has such rows.
+    It is computed by the modified Gram–Schmidt process on the rows, whose triangular factor is as
+    good as Householder's (Björck 1967, doi:10.1007/BF01934122). A row that depends on earlier rows,
+    to a few units of round-off, gets a zero on the diagonal with zero derivatives; those of
+    `jnp.linalg.qr` are NaN. A state that is known without error has such rows.
     """
     n = a.shape[0]
     below = jnp.arange(n)
     least = (4 * float(jnp.finfo(a.dtype).eps)) ** 2 * jnp.sum(a * a, 1)
 
-    def take(a: Array, k: Array) -> tuple[Array, Array]:
+    def gram_schmidt_step(a: Array, k: Array) -> tuple[Array, Array]:
         row = lax.dynamic_index_in_dim(a, k, keepdims=False)
         unit = row * inverse_root(jnp.sum(row * row), least[k])
         column = jnp.where(below >= k, jnp.sum(a * unit[None], 1), 0)
         return a - column[:, None] * unit[None], column
 
-    return lax.scan(take, a, below)[1].T
+    return lax.scan(gram_schmidt_step, a, below)[1].T
 
 
-def predicted(
-    grown: Float[Array, "k n"], root: Float[Array, "n n"], noise: Float[Array, "k m"]
+def predicted_root(
+    transition: Float[Array, "k n"], root: Float[Array, "n n"], noise: Float[Array, "k m"]
 ) -> Float[Array, "k k"]:
-    """The triangular root of `F P Fᵀ + G Gᵀ`, of F, a root of P, and G."""
-    return triangular(jnp.concatenate([product(grown, root), noise], 1))
+    """Return the triangular root of the predicted covariance, `F P Fᵀ + G Gᵀ`.
+
+    F is the `transition`, G the `noise`, and P the covariance of this `root`.
+    """
+    return triangular_root(jnp.concatenate([product(transition, root), noise], 1))
 
 
-def inverse_root(x: Array, least: Any = 0) -> Array:
-    """1/√x if x is above `least`, else zero with zero derivatives."""
+def inverse_root(x: Array, least: ScalarLike = 0.0) -> Array:
+    """Return 1/√x where x is above `least`, else zero with zero derivatives."""
     there = x > least
     return jnp.where(there, 1 / jnp.sqrt(jnp.where(there, x, 1)), 0)
 
 
 def product(a: Float[Array, "n m"], b: Float[Array, "m k"]) -> Float[Array, "n k"]:
-    """`a b`, in full precision and cheap for a few rows."""
+    """Return the matrix product `a b`, in full precision, and cheap for a few rows."""
     return jnp.sum(a[:, :, None] * b[None], 1)
 
 
-class Absorbed(NamedTuple):
-    """The update by the numbers read: the mean's step, the new root, and each innovation.
+class Update(NamedTuple):
+    """The update of an estimate by the numbers read.
 
-    **Fields:** `step` (n,); `root` (n, n); `innovation` ν, the reading minus its prediction from
-    all readings before; `variance` s of ν; a masked number has 0 and 1, so that it counts for
-    nothing.
+    **Fields:**
+
+    - `step`: (n,) the new mean of the errors.
+    - `root`: (n, n) the new root of their covariance.
+    - `innovation`: ν, each number read minus its prediction from all numbers read before.
+    - `variance`: s of ν. A masked number has the innovation 0 and the variance 1, and so does not
+      count.
     """
 
     step: Float[Array, " n"]
@@ -63,18 +70,20 @@ class Absorbed(NamedTuple):
     variance: Float[Array, "*k"]
 
 
-def absorb_all(
+def update(
     step: Float[Array, " n"],
     root: Float[Array, "n n"],
     matrix: Float[Array, "k n"],
     error: Float[Array, " k"],
     variance: Float[Array, " k"],
     seen: Bool[Array, " k"],
-) -> Absorbed:
-    """Potter's update by k numbers `error = row · e + noise`, one by one, of an e of mean `step`.
+) -> Update:
+    """Update mean and root of errors e by k numbers `error = h · e + noise`, one after the other.
 
-    `s = |Sᵀh|² + r`, `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh`: Potter, in Battin, Astronautical
-    Guidance (1964), §9.6; Bierman, Factorization Methods (1977), §II.4.
+    Potter's formula for a row h of `matrix` and the `variance` r of its noise: `s = |Sᵀh|² + r`,
+    `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh` (Battin, Astronautical Guidance (1964), §9.6;
+    Bierman, Factorization Methods (1977), §II.4). `step` is the mean of e, `root` the S before, and
+    numbers that are not `seen` do not count.
     """
 
     def absorb(now: tuple[Array, Array], number: tuple) -> tuple[Any, Any]:
@@ -90,12 +99,14 @@ def absorb_all(
 
     numbers = (matrix, error, variance, seen)
     (step, root), (innovation, total) = lax.scan(absorb, (step, root), numbers)
-    return Absorbed(step, root, innovation, total)
+    return Update(step, root, innovation, total)
 
 
 class Terms(NamedTuple):
-    """Each number read, normal given the earlier ones: its `error` in standard deviations, and
-    `log_variance`, the logarithm of 2π times its variance; both zero where masked.
+    """The terms of a log-density: each number read is normal, given the earlier ones.
+
+    **Fields:** `error` of each number in standard deviations; `log_variance` the logarithm of 2π
+    times its variance; both are zero for masked numbers.
     """
 
     error: Float[Array, "*n"]
@@ -103,29 +114,29 @@ class Terms(NamedTuple):
 
     @property
     def log_density(self) -> Scalar:
-        """The sum of the logarithms of the normal densities."""
+        """Return the sum of the logarithms of the normal densities."""
         return -0.5 * jnp.sum(self.error**2 + self.log_variance)
 
 
 def terms(innovation: Array, variance: Array, seen: Array) -> Terms:
-    """The terms of innovations."""
+    """Return the terms of innovations with these variances, zero where not `seen`."""
     error = jnp.where(seen, innovation * lax.rsqrt(variance), 0)
     return Terms(error, jnp.where(seen, jnp.log(2 * math.pi * variance), 0))
 
 
 def divide(lower: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """`lower⁻¹ right` by substitution; zero where the diagonal is zero."""
+    """Return `lower⁻¹ right` by forward substitution; a row is zero where the diagonal is."""
 
-    def take(right: Array, k: Array) -> tuple[Array, Array]:
+    def forward_substitution_step(right: Array, k: Array) -> tuple[Array, Array]:
         column = lax.dynamic_index_in_dim(lower, k, 1, keepdims=False)
         there = column[k] > 0
         row = right[k] * jnp.where(there, 1 / jnp.where(there, column[k], 1), 0)
         return right - column[:, None] * row[None], row
 
-    return lax.scan(take, right, jnp.arange(lower.shape[0]))[1]
+    return lax.scan(forward_substitution_step, right, jnp.arange(lower.shape[0]))[1]
 
 
 def divide_right(left: Float[Array, "m n"], lower: Float[Array, "n n"]) -> Float[Array, "m n"]:
-    """`left lower⁻¹`; zero where the diagonal is zero."""
+    """Return `left lower⁻¹`; a column is zero where the diagonal is."""
     turned = divide(lower[::-1, ::-1].T, left[:, ::-1].T)
     return turned.T[:, ::-1]

@@ -20,7 +20,7 @@ from rigidjax.identify.filtering.filter import (
     scan_filter,
     status_of,
 )
-from rigidjax.identify.filtering.linear import LinearEstimate, solved
+from rigidjax.identify.filtering.linear import LinearEstimate, solve
 from rigidjax.identify.filtering.steps import Dynamics, Extended, Read, Stops
 from rigidjax.identify.model.model import Model
 from rigidjax.motion.manifold import minus, plus
@@ -29,8 +29,8 @@ from rigidjax.motion.manifold import minus, plus
 class Push(NamedTuple):
     """The estimate of a white torque, averaged over the step that ends at each time.
 
-    **Fields:** `mean`, `deviation` (N, 3) N m, body frame; the deviation is large for short steps,
-    since white noise has no value at a time.
+    **Fields:** `mean` and `deviation` (N, 3) N m, body frame. The deviation is large for short
+    steps, since white noise has no value at one time.
     """
 
     mean: Float[Array, "stops 3"]
@@ -40,12 +40,17 @@ class Push(NamedTuple):
 class Smoothed(eqx.Module):
     """The result of `smooth`.
 
-    **Fields:** `belief` a `Belief` at each stop: the times of the recording and, where these are
-    far apart, some between; `rows` (T,) which of them are of the recording; `pushes` a `Push` for
-    each `RandomTorque` (a `CorrelatedTorque` is in `belief.torques`); `readings` a `Read` for each
-    sensor, of the last linearisation, (N, k); `log_likelihood` of all readings, by Laplace's method
-    about this motion; `change` how far the last iteration moved it, in standard deviations at most;
-    `iterations`; `status`, `lost_at` as of `Filtered`.
+    **Fields:**
+
+    - `belief`: a `Belief` at each of N stops: the times of the recording and, where these are far
+      apart, some between.
+    - `rows`: (T,) the indices of the recorded times among the stops.
+    - `pushes`: a `Push` for each `RandomTorque`; a `CorrelatedTorque` is in `belief.torques`.
+    - `readings`: a `Read` (N, k) for each sensor, of the last linearisation.
+    - `log_likelihood`: of all readings, by Laplace's method about this motion.
+    - `change`: the largest change by the last iteration, in standard deviations.
+    - `iterations`: their number.
+    - `status`, `lost_at`: those of the `Filtered` from which the iteration starts.
     """
 
     belief: Belief
@@ -60,17 +65,17 @@ class Smoothed(eqx.Module):
 
     @property
     def words(self) -> str:
-        """The status in words."""
+        """Return the status in words."""
         return WORDS[int(self.status)]
 
     @property
     def t(self) -> Float[Array, " stops"]:
-        """The times of all stops, s."""
+        """Return the times of all stops, s."""
         return self.belief.t
 
     @property
     def states(self) -> Any:
-        """The most probable states at the times of the recording, with a leading time axis."""
+        """Return the most probable states at the recorded times, with a leading time axis."""
         return jax.tree.map(lambda leaf: leaf[self.rows], self.belief.state)
 
 
@@ -86,16 +91,16 @@ def smooth(
 ) -> Smoothed:
     """Return attitude, rate, unknown torque and sensor errors from all readings.
 
-    The motion of largest posterior density, by Gauss and Newton's method: each iteration linearises
-    dynamics and sensors about the last motion, at first that of `filter`, and solves the linear
-    problem exactly by a Kalman filter and the pass of Rauch, Tung and Striebel (Bell 1994,
-    doi:10.1137/0804035).
+    They are those of the motion of largest posterior density, found by the Gauss–Newton method.
+    Each iteration linearises dynamics and sensors about the last motion, the first one about the
+    motion of `filter`. It solves the linear problem exactly, by a Kalman filter and the pass back
+    of Rauch, Tung and Striebel (Bell 1994, doi:10.1137/0804035).
 
     **Arguments:** `model`, `first`, `x`, `substeps` and `throw` of `filter`, and
 
     - `iterations`: the largest number of iterations.
-    - `tolerance`: the iteration ends when no number moved by more than this part of its standard
-      deviation (the error that remains is about the square of that).
+    - `tolerance`: the iteration ends when no number moves by more than this part of its standard
+      deviation. The error that remains is about the square of this part.
 
     **Returns** `belief`, `rows`, `pushes`, `readings`, `log_likelihood`, `change`, `iterations`,
     `status` and `lost_at` (`Smoothed`). It may be jitted, differentiated in forward mode, and
@@ -124,50 +129,58 @@ def smooth(
 
 @eqx.filter_jit
 def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
+    """Return the result of `smooth` from its checked arguments, as one program."""
     sensors, first, grid = run.scene.sensors, run.first, run.grid
     dynamics, stops, kept = scan_filter(run, lambda belief, read: (belief, read))
-    beliefs, read = grid.of_rows(kept)
+    beliefs, read = grid.at_rows(kept)
     status, lost_at = status_of(beliefs, steps.by_sensor(sensors, read), first.t)
     path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, kept[0].x)
 
-    def more(state: tuple) -> Array:
+    def is_running(state: tuple) -> Array:
         return (state[3] < iterations) & (state[2] > tolerance)
 
-    def again(state: tuple) -> tuple:
-        path, found, _, count = state
-        out = _iterate(dynamics, first, stops, path, found.kicks[:, : dynamics.kicks])
+    def iterate(state: tuple) -> tuple:
+        path, estimate, _, count = state
+        out = _iterate(dynamics, first, stops, path, estimate.kicks[:, : dynamics.kicks])
         return *out, count + 1
 
     still = jnp.zeros((stops.t.shape[0], dynamics.kicks), first.root.dtype)
-    # Nothing is solved yet: one copy of an iteration is compiled, not two.
+    # Start the loop from a blank estimate: a first iteration before it would be compiled, too.
     blank = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
         jax.eval_shape(lambda: _iterate(dynamics, first, stops, path, still)[1]),
     )
     far = jnp.asarray(jnp.inf, first.root.dtype)
-    path, found, change, count = lax.while_loop(more, again, (path, blank, far, jnp.asarray(0)))
+    path, estimate, change, count = lax.while_loop(
+        is_running, iterate, (path, blank, far, jnp.asarray(0))
+    )
     h = jnp.diff(stops.t, prepend=first.t).astype(first.root.dtype)
     pushes = []
     for index, root in enumerate(dynamics.white):
         mine = slice(6 * index, 6 * index + 3)
         size = roots.inverse_root(h)[:, None] * root[None]
-        variance = jnp.diagonal(found.kick_covariance, axis1=1, axis2=2)[:, mine]
-        pushes.append(Push(size * found.kicks[:, mine], size * jnp.sqrt(variance)))
-    belief = Belief(stops.t, jax.tree.map(lambda leaf: leaf[1:], path), found.root[1:])
-    reads = steps.by_sensor(sensors, Read(found.innovation[1:], found.variance[1:], kept[1].seen))
+        variance = jnp.diagonal(estimate.kick_covariance, axis1=1, axis2=2)[:, mine]
+        pushes.append(Push(size * estimate.kicks[:, mine], size * jnp.sqrt(variance)))
+    belief = Belief(stops.t, jax.tree.map(lambda leaf: leaf[1:], path), estimate.root[1:])
+    last_read = Read(estimate.innovation[1:], estimate.variance[1:], kept[1].seen)
+    reads = steps.by_sensor(sensors, last_read)
     status = jnp.where(jnp.isfinite(change), status, 2)
-    total = found.log_likelihood
+    total = estimate.log_likelihood
     return Smoothed(belief, grid.rows, tuple(pushes), reads, total, change, count, status, lost_at)
 
 
 def _iterate(
     dynamics: Dynamics, first: Belief, stops: Stops, path: Extended, kicks: Array
 ) -> tuple[Extended, LinearEstimate, Scalar]:
-    """One linearisation about `path` and the `kicks` between its times, and its exact solution."""
+    """Linearise about the states `path` and the `kicks` between them, and solve exactly.
+
+    Returns the new states, the estimate of their changes, and the largest change in standard
+    deviations.
+    """
     dtype = first.root.dtype
 
-    def about(now: tuple) -> tuple:
-        """The step to a stop, and its readings, about the path."""
+    def linearise(now: tuple) -> tuple:
+        """Linearise the step to a stop, and its readings, about the path."""
         t0, stop, x, y, kick = now
         after, grown, noise = dynamics.predict(
             t0.astype(dtype), (stop.t - t0).astype(dtype), x, kick
@@ -175,18 +188,18 @@ def _iterate(
         off = minus(after, y)
         grown, noise = (steps.reset(y, off, part, back=True) for part in (grown, noise))
         push = off - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
-        return (grown, noise, push), steps.linearised(dynamics, stop, y)
+        return (grown, noise, push), steps.linearise_readings(dynamics, stop, y)
 
     before = jnp.concatenate([first.t[None], stops.t[:-1]])
     x0, earlier, later = (
         jax.tree.map(lambda leaf, at=at: leaf[at], path) for at in (0, slice(-1), slice(1, None))
     )
-    moves, rows = lax.map(about, (before, stops, earlier, later, kicks))
-    # Nothing is read at the first time.
+    moves, rows = lax.map(linearise, (before, stops, earlier, later, kicks))
+    # The first time is that of the first belief, at which nothing is read.
     matrix, error, deviation, seen = (jnp.pad(a, [(1, 0)] + [(0, 0)] * (a.ndim - 1)) for a in rows)
     parts = dict(zip(("transition", "noise", "push"), moves, strict=True))
     parts |= {"matrix": matrix, "deviation": deviation, "offset": None}
     off = minus(x0, first.x)
-    found = solved(parts, error, -off, steps.reset(x0, off, first.root), seen, back=True)
-    change = jnp.max(jnp.abs(found.mean) * roots.inverse_root(jnp.sum(found.root**2, -1)))
-    return jax.vmap(plus)(path, found.mean), found, change
+    out = solve(parts, error, -off, steps.reset(x0, off, first.root), seen, smooth=True)
+    change = jnp.max(jnp.abs(out.mean) * roots.inverse_root(jnp.sum(out.root**2, -1)))
+    return jax.vmap(plus)(path, out.mean), out, change

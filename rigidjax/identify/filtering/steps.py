@@ -1,4 +1,4 @@
-"""The state equations of a filter (motion, torques, sensor errors), and random motions by them."""
+"""The equations of the state that a filter follows, and random motions under them."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.scipy.linalg import block_diag
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt32
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin, Mat3, Scalar
@@ -29,6 +29,7 @@ from rigidjax.identify.model.scene import (
 )
 from rigidjax.identify.model.walks import Drift
 from rigidjax.identify.sensors import AbstractSensor, Gyro, SensorInput
+from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.manifold import coordinates, dimension, tangent, turns
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
@@ -42,9 +43,11 @@ from rigidjax.solve.tableaus import KUTTA4
 
 
 class Extended(eqx.Module):
-    """The state that a filter follows: `motion`, `torques` the value (3,) of each
-    `CorrelatedTorque`, N m, body frame, and `walks` those of each `Walk`. Its errors are changes as
-    `motion.manifold` counts them, in this order.
+    """The state that a filter follows.
+
+    **Fields:** `motion` a `Spin`, `Attitude` or `Rigid`; `torques` the value (3,) of each
+    `CorrelatedTorque`, N m, body frame; `walks` the value of each `Walk`. Errors of the state are
+    changes of these in this order, as `motion.manifold` counts them.
     """
 
     motion: Any
@@ -74,12 +77,17 @@ def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
 
 
 class Dynamics(eqx.Module):
-    """The equations of a filter, for one dtype and kind of state: `dynamics_of` makes them.
+    """The equations of a filter, for one dtype and type of state: `dynamics_of` makes them.
 
-    **Fields:** `scene`, whose body is that of the equations; `field` the equations of motion under
-    the known torque; `inverse` of the inertia; `white` the roots of the densities of each
-    `RandomTorque`; `coloured` those of each `CorrelatedTorque`, and its time; `drifts` the roots of
-    the densities of the walks, and `paths` to their numbers in the scene.
+    **Fields:**
+
+    - `scene`: its body is that of the equations of motion.
+    - `field`: the equations of motion under the known torque.
+    - `inverse`: of the inertia tensor.
+    - `white`: the root of the density of each `RandomTorque`.
+    - `coloured`: the root of the density of each `CorrelatedTorque`, and its correlation time, s.
+    - `drifts`: the root of the density of each walk.
+    - `paths`: the path of each walk's numbers in the scene.
     """
 
     scene: Scene
@@ -91,28 +99,28 @@ class Dynamics(eqx.Module):
     paths: tuple[tuple[Any, ...], ...] = eqx.field(static=True)
 
     def sensors_at(self, walks: Sequence[Array]) -> tuple[AbstractSensor, ...]:
-        """Return the sensors with these values of the walks."""
+        """Return the sensors of the scene with the values `walks` of their drifting numbers."""
         return with_leaves(self.scene, self.paths, walks).sensors
 
     @property
     def kicks(self) -> int:
-        """The number of unit normal numbers in one step of motion and torques."""
+        """Return how many unit normal numbers drive one step of motion and torques."""
         return 6 * (len(self.white) + len(self.coloured))
 
-    def pushed(self, change: Any, torques: Sequence[Array]) -> Any:
-        """A rate of change of the motion, with torques beside those of its equations."""
+    def with_torques(self, change: PyTree, torques: Sequence[Array]) -> PyTree:
+        """Return the rate of change of a motion with these `torques` added to its equations'."""
         if not torques:
             return change
         spin = change.omega + jnp.sum(self.inverse * sum(torques[1:], torques[0])[None], 1)
         return eqx.tree_at(lambda s: s.omega, change, spin)
 
     def advance(self, t: Scalar, h: Scalar, x: Extended, kicks: Array) -> Extended:
-        """`x` a time `h` later, under noise; `kicks` (kicks,) of unit variance.
+        """Return the state a time `h` after x, driven by the unit normal numbers `kicks`.
 
         White noise within the step is replaced by its first two Legendre polynomials,
-        `√(density/h) (k₀ + √3 (1 − 2s/h) k₁)`, which give its effect on rate and angle their exact
-        joint covariance for a body at rest (Foster, Lyons and Oberhauser 2020,
-        doi:10.1137/19M1261912); the step is the classical one of order 4.
+        `√(density/h) (k₀ + √3 (1 − 2s/h) k₁)` at a time s after the start. For a body at rest they
+        give rate and angle their exact joint covariance (Foster, Lyons and Oberhauser 2020,
+        doi:10.1137/19M1261912). The step is one of the classical method of order 4.
         """
         safe = jnp.where(h > 0, h, 1)
         pairs = kicks.reshape(-1, 2, 3) * roots.inverse_root(h)
@@ -126,7 +134,8 @@ class Dynamics(eqx.Module):
             white = [r * push(pair, share) for r, pair in zip(self.white, pairs, strict=False)]
             later = zip(self.coloured, pairs[len(self.white) :], torques, strict=True)
             slopes = tuple((r * push(pair, share) - tau) / time for (r, time), pair, tau in later)
-            return self.pushed(self.field(t + since, motion, None), [*white, *torques]), slopes
+            change = self.field(t + since, motion, None)
+            return self.with_torques(change, [*white, *torques]), slopes
 
         motion, torques = advance(KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques))
         if isinstance(motion, HasAttitude):
@@ -136,8 +145,11 @@ class Dynamics(eqx.Module):
     def predict(
         self, t: Scalar, h: Scalar, x: Extended, kicks: Array | None = None
     ) -> tuple[Extended, Float[Array, "n n"], Float[Array, "n m"]]:
-        """`x` a time `h` later, F (n, n) of its errors, and the root G (n, m) of the noise, about
-        `kicks`; drifts of walks come last in G.
+        """Return the state a time `h` after x, and the matrices F and G of its errors.
+
+        F (n, n) carries the errors of x over the step; G (n, m) is a root of the covariance that
+        the noise adds, the drifts of walks in its last columns. Both are linearised about `kicks`,
+        zero for `None`.
         """
         kicks = jnp.zeros(self.kicks, x.motion.omega.dtype) if kicks is None else kicks
         after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
@@ -162,7 +174,7 @@ class Dynamics(eqx.Module):
 def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: Extended) -> Dynamics:
     """Return the equations of a filter from a scene whose torque reads no `Input`.
 
-    `x` has the kind and the dtype of the state.
+    The state `x` gives their dtype and the type of the state.
     """
     dtype = x.motion.omega.dtype
     body: Any = body_of_equations(in_precision(scene.body, dtype), type(x.motion))
@@ -193,11 +205,11 @@ def coloured_parts(process: Process | None) -> tuple[CorrelatedTorque, ...]:
 def reset(
     x: Extended, e: Float[Array, " n"], root: Float[Array, "n m"], *, back: bool = False
 ) -> Float[Array, "n m"]:
-    """The root of the errors about `x ⊕ e`, from the `root` of the errors about x.
+    """Return the root of the errors about `x ⊕ e`, from the `root` of the errors about x.
 
-    `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, to second order in the turn e: Mueller, Hehn and D'Andrea
-    2017, doi:10.2514/1.G000848. With `back` it multiplies by `J_r(e)⁻¹`, to third order: this is
-    how `log(exp(e) exp(δ))` moves with δ.
+    Errors δ of a turn e become `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, here to second order in e
+    (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848). With `back` the root is multiplied by
+    `J_r(e)⁻¹`, to third order, which is the derivative of `log(exp(e) exp(δ))` by δ.
     """
     first, second = (0.5, 1 / 12) if back else (-0.5, 1 / 6)
     across = jax.vmap(cross, (None, 1), 1)
@@ -210,18 +222,23 @@ def reset(
 
 
 class Stops(NamedTuple):
-    """The times of the filter's steps, and the readings then."""
+    """The times of the steps of a filter, s, and the readings at these times.
+
+    **Fields:** `t`; `values` and `masks` of each sensor. A step takes one row of each.
+    """
 
     t: Array
     values: tuple[Array, ...]
     masks: tuple[Array, ...]
 
 
-def linearised(
+def linearise_readings(
     dynamics: Dynamics, stop: Stops, x: Extended
 ) -> tuple[Float[Array, "k n"], Float[Array, " k"], Float[Array, " k"], Bool[Array, " k"]]:
-    """All numbers read at one time about the state x: the matrix of their predictions, their
-    errors, the deviations of these, and which are seen.
+    """Linearise all k numbers read at one time about the state x.
+
+    Returns the derivatives (k, n) of their predictions, their errors (k,), the standard deviations
+    of the errors, and a mask of those that are seen.
     """
     dtype = x.motion.omega.dtype
     t = stop.t.astype(dtype)
@@ -231,32 +248,34 @@ def linearised(
         sensor = in_precision(dynamics.scene.sensors[index], dtype)
 
         def error(y: Extended, index: int = index, value: Array = value) -> Array:
-            seeing = in_precision(dynamics.sensors_at(y.walks)[index], dtype)
+            drifted = in_precision(dynamics.sensors_at(y.walks)[index], dtype)
 
-            def field(t: Any, state: Any, args: Any = None) -> Any:
-                return dynamics.pushed(dynamics.field(t, state, args), y.torques)
+            def field(t: Array, state: PyTree, args: Any = None) -> PyTree:
+                return dynamics.with_torques(dynamics.field(t, state, args), y.torques)
 
             motion, when = y.motion, t
-            offset = getattr(seeing, "offset", None)
+            offset = getattr(drifted, "offset", None)
             if offset is not None:
                 motion, when = shifted(field, t, motion, offset), t + offset
-            return seeing.error(SensorInput(when, motion, dynamics.scene.body, field), value)
+            return drifted.error(SensorInput(when, motion, dynamics.scene.body, field), value)
 
-        found, push = jax.linearize(error, x)
+        value_of_error, push = jax.linearize(error, x)
         matrix = -jax.vmap(push, out_axes=1)(basis)
-        seen = jnp.broadcast_to(mask, found.shape)
+        seen = jnp.broadcast_to(mask, value_of_error.shape)
         limit = getattr(sensor, "limit", None)
         if limit is not None:
             seen = seen & (jnp.abs(value) < limit * (1 - 1e-6))
         assert sensor.noise is not None
-        out.append((matrix, found, sensor.noise, seen))
+        out.append((matrix, value_of_error, sensor.noise, seen))
     matrix, errors, noise, seen = (jnp.concatenate(parts) for parts in zip(*out, strict=True))
     return matrix, errors, noise, seen
 
 
 class Read(NamedTuple):
-    """Of one sensor each `innovation`, the reading minus its prediction from all numbers read
-    before, its `variance`, and whether it was `seen`.
+    """The numbers that a filter read of one sensor.
+
+    **Fields:** `innovation` each number minus its prediction from all numbers read before;
+    `variance` of the innovation; `seen` whether the number was read.
     """
 
     innovation: Float[Array, "*times k"]
@@ -265,12 +284,12 @@ class Read(NamedTuple):
 
 
 def by_sensor(sensors: Sequence[AbstractSensor], read: Read) -> tuple[Read, ...]:
-    """Return the `Read` of each sensor, from that of all numbers in a row."""
+    """Split the `Read` of all numbers in a row into one of each sensor."""
     ends = np.cumsum([sensor.components for sensor in sensors])[:-1]
     return tuple(Read(*own) for own in zip(*(jnp.split(a, ends, -1) for a in read), strict=True))
 
 
-# The longest step as a fraction of a torque's correlation time.
+# The longest step, as a fraction of the correlation time of a torque.
 MEMORY_A_STEP = 0.25
 
 
@@ -283,8 +302,8 @@ def steps_of(
 ) -> np.ndarray:
     """Return the number of fixed steps from each of the times `ts` to the next.
 
-    It is `substeps`, or for `None` chosen by the rate of the `state` and of gyros, and by the
-    correlation times of the process; one if these numbers are not known.
+    It is `substeps` if given. Else it is chosen by the body rate, of the `state` and of gyros, and
+    by the correlation times of the process; it is one if these are traced.
     """
     if substeps is not None:
         return np.full(ts.shape[0] - 1, _checks.whole(substeps, "substeps", 1))
@@ -314,10 +333,10 @@ class Sampled(eqx.Module):
 
 
 def sample(
-    key: Any,
+    key: PRNGKeyArray | UInt32[Array, "2"],
     body: Inertia | MassProperties,
-    state0: Any,
-    ts: Any,
+    state0: Spin | Attitude | Rigid,
+    ts: Float[ArrayLike, " times"] | Sequence[float],
     *,
     process: Process,
     torque: Torque | None = None,
@@ -326,9 +345,9 @@ def sample(
     """Draw one motion that a random torque could make.
 
     Each step draws the integral and the first moment of the white noise, and follows the equations
-    of motion under the polynomial with these moments by the classical method of order 4: of order
-    1.5, and exact for a body at rest (Foster, Lyons and Oberhauser 2020, doi:10.1137/19M1261912). A
-    `CorrelatedTorque` starts from its stationary distribution.
+    of motion under the polynomial with these moments by the classical method of order 4. The whole
+    is of order 1.5, and exact for a body at rest (Foster, Lyons and Oberhauser 2020,
+    doi:10.1137/19M1261912). A `CorrelatedTorque` starts from its stationary distribution.
 
     **Arguments:**
 
@@ -370,7 +389,10 @@ def sample(
 
 
 @eqx.filter_jit
-def _sample(key: PRNGKeyArray, scene: Scene, ts: Array, pieces: int) -> Sampled:
+def _sample(
+    key: PRNGKeyArray | UInt32[Array, "2"], scene: Scene, ts: Array, pieces: int
+) -> Sampled:
+    """Return the result of `sample` by `pieces` steps between two times, as one program."""
     state0: Any = scene.start
     dtype, coloured = state0.omega.dtype, coloured_parts(scene.process)
     first, later = jax.random.split(key)
@@ -384,7 +406,7 @@ def _sample(key: PRNGKeyArray, scene: Scene, ts: Array, pieces: int) -> Sampled:
 
     def span(x: Extended, now: tuple[Array, Array, Array]) -> tuple[Extended, Extended]:
         left, right, one = now
-        # Times may have more digits than the state.
+        # Subtract times before they are rounded to the dtype of the state.
         h = ((right - left) / pieces).astype(dtype)
         left = left.astype(dtype)
         kicks = jax.random.normal(one, (pieces, dynamics.kicks), dtype)

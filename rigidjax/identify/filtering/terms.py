@@ -1,4 +1,4 @@
-"""The terms of a log-density: of every number read, given those before it."""
+"""The terms of a log-density: every number read is normal, given the numbers read before it."""
 
 import dataclasses
 import math
@@ -10,12 +10,14 @@ from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
 from rigidjax.identify.data.recording import Recording
+from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.filtering import roots
 from rigidjax.identify.filtering.filter import FilterInput, belief_at, grid_of, scan_filter
 from rigidjax.identify.filtering.roots import Terms
 from rigidjax.identify.filtering.steps import require_sensors
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.normal import normal_of
+from rigidjax.identify.model.scene import Scene
 from rigidjax.identify.model.terms import (
     Which,
     blocks,
@@ -31,12 +33,15 @@ from rigidjax.motion.manifold import dimension
 
 
 def terms_of_one(
-    model: Model, row: Array, record: Recording, reference: Any, which: Which
+    model: Model, row: Array, record: Recording, reference: ReferenceStates, which: Which
 ) -> Terms:
     """Return the terms of the readings of one recording.
 
-    They are normal about the motion; if a torque or sensor errors are unknown, the filter
-    integrates them out, and the readings are normal about its predictions.
+    Readings are normal about the motion. If a torque or a sensor error is unknown, the filter
+    integrates it out, and readings are normal about the predictions of the filter.
+
+    **Arguments:** `row` the free numbers of the recording; `record`, `reference` and `which` its
+    readings, its reference state and the index of its body.
     """
     scene = scene_of(model, row, record, reference, which)
     if scene.process is None and not model.walks:
@@ -52,8 +57,8 @@ def terms_of_one(
     return jax.tree.map(jnp.ravel, roots.terms(*read))
 
 
-def _terms_of_motion(model: Model, scene: Any, record: Recording) -> Terms:
-    """Return the terms of one recording without an unknown torque: normal about the motion."""
+def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
+    """Return the terms of one recording whose readings are normal about the motion of a scene."""
     errors = errors_of_scene(model, scene, record)
     scaled, log_variance = [], []
     for reading, sensor, error in zip(record.readings, scene.sensors, errors, strict=True):
@@ -62,7 +67,7 @@ def _terms_of_motion(model: Model, scene: Any, record: Recording) -> Terms:
             reading.values, reading.mask, error, noise, limit, reading.late
         )
         scaled.append(one)
-        # What a channel at its limit counts is a probability, not a density.
+        # A channel at its limit counts by a probability, which has no logarithm of a variance.
         seen = reading.mask[:, None] & ~full
         logs = jnp.log(2 * math.pi * noise**2)[None]
         log_variance.append(jnp.where(seen, logs if wider is None else logs + wider, 0))
@@ -72,7 +77,10 @@ def _terms_of_motion(model: Model, scene: Any, record: Recording) -> Terms:
 
 
 def terms(model: Model, x: Float[Array, " n"]) -> Terms:
-    """Return the terms (R, N) of all readings; derivatives in x go recording by recording."""
+    """Return the terms (R, N) of all readings of a model at the free numbers x.
+
+    Derivatives by x are computed recording by recording, in forward mode.
+    """
     return by_recording(model.index.rows(x), model, terms_of_one)
 
 
@@ -82,7 +90,11 @@ def log_density(model: Model, x: Float[Array, " n"]) -> Scalar:
 
 
 class Curvature(NamedTuple):
-    """The cost, minus a log-density; Fisher's information `gram`; the gradient `slope`."""
+    """The second-order model of a posterior at a point.
+
+    **Fields:** `cost`, minus the logarithm of its density; `gram`, Fisher's information; `slope`,
+    the gradient of the cost.
+    """
 
     cost: Scalar
     gram: Float[Array, "n n"]
@@ -90,13 +102,14 @@ class Curvature(NamedTuple):
 
 
 def curvature(model: Model, x: Float[Array, " n"]) -> Curvature:
-    """Return cost, gradient and Fisher's information of normal errors whose variances x moves, too.
+    """Return cost, gradient and Fisher's information of the posterior at x.
 
-    The information is `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta
-    and Mehra 1974, doi:10.1109/TAC.1974.1100714, for the filter), and that of the priors.
+    The free numbers move the variances of normal errors, too. The information is that of the priors
+    plus `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta and Mehra 1974,
+    doi:10.1109/TAC.1974.1100714, for the filter).
     """
     value, slopes = blocks(model, x, terms_of_one)
-    # d(ν/√s) = dν/√s − ½ ν/√s d(log s).
+    # dν/√s from the derivative of ν/√s: d(ν/√s) = dν/√s − ½ ν/√s d(log s).
     moved = slopes.error + 0.5 * value.error[..., None] * slopes.log_variance
     both = jnp.concatenate([moved, 0.5**0.5 * slopes.log_variance], axis=1)
     places, size = model.index.places, model.size

@@ -21,11 +21,11 @@ from rigidjax.identify.model.free import Slot
 from rigidjax.identify.model.index import index_of
 from rigidjax.identify.model.model import Model, Unpacked, scenes_of, unpacked, with_parts
 from rigidjax.identify.model.scene import Process, Scene, require_process
-from rigidjax.identify.model.terms import template
-from rigidjax.identify.uncertainty.covariance import of_white
+from rigidjax.identify.model.terms import Noise, template
+from rigidjax.identify.uncertainty.covariance import white_covariance
 from rigidjax.motion.torques.composite import parts_of
 
-# The advice if a fit without the torque ended far from the body.
+# The advice for a density with a process: a fit without this torque may end far from the body.
 _GUESS = (
     ", or begin from a first guess, fit(model, starts=1, max_steps=1): the torque may be too "
     "strong for a fit without it"
@@ -33,37 +33,45 @@ _GUESS = (
 
 
 class LogDensity(eqx.Module):
-    """The logarithm of the posterior density of a fitted model, of one vector x.
+    """The logarithm of the posterior density of a fitted model, a function of one vector x.
 
-    Call it with x (n,), real numbers without bounds: the free numbers of `model`, which is the
-    fitted one with the logarithms of factors of the noises that the fit estimates, and of the
-    numbers of the process, as shared `Free`s. `unpack(x)` gives body, states and values, `x0` is
-    the fit. `covariance` is Laplace's, for a sampler's start and mass matrix; it is smaller than
-    the fit's if errors are autocorrelated.
+    Call it with x (n,), real numbers without bounds. These are the free numbers of the fitted model
+    and, as additional shared `Free`s, the logarithms of factors: of each noise that the fit
+    estimates, and of each number of the process. `unpack(x)` returns the body, the states and the
+    values that x represents.
 
     With a process or `Walk`s the filter integrates the unknown torque and the drifts out. Without
-    them the readings are independent and normal about the motion: this is too narrow if errors are
-    autocorrelated; keep fewer readings then, or give a process. A sensor's jitter is that of the
-    fit. Priors are the model's: `Free`s with a prior, an `Entropic` one; the prior of all other
-    numbers is flat in x.
+    them the readings are independent and normal about the motion. If errors are autocorrelated,
+    this density is too narrow: keep fewer readings, or give a process. The jitter of a sensor is
+    that of the fit. The priors are those of the model (of its `Free`s, or an `Entropic` one); the
+    prior of all other numbers is flat in x.
 
     **Arguments:**
 
-    - `fit`: of `identify.fit`; with a process a first guess is enough, `fit(model, starts=1,
-      max_steps=1)`.
+    - `fit`: a result of `identify.fit`. With a process a first guess is enough,
+      `fit(model, starts=1, max_steps=1)`.
     - `process`: a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of them; `None` takes that of the
       model.
     - `deviation`: the standard deviation of the normal prior of the logarithms of the densities and
-      times of the process about its values, `None` for a known process. The density scales with the
-      square of a moment if only ratios of moments are determined, as by a gyro alone: compare
-      `density / moment**2`, and give the prior in the fit's own unit of inertia (`fit.body`).
+      times of the process, about their values in the process; `None` for a known process. If only
+      ratios of moments are determined, as by a gyro alone, the density of a torque scales with the
+      square of a moment: compare `density / moment**2`, and give the process in the unit of inertia
+      of the fit (`fit.body`).
+
+    **Fields:**
+
+    - `model`: the fitted model with the additional `Free`s.
+    - `x0`: (n,) the x of the fit.
+    - `covariance`: (n, n) of x by Laplace's method, for the start and the mass matrix of a sampler.
+      If errors are autocorrelated it is smaller than that of the fit.
 
     **Raises:** `ValueError` for a robust loss, which is no density, and for directions that neither
     data nor a prior determine.
 
     For numpyro: `numpyro.infer.MCMC(NUTS(potential_fn=lambda x: -density(x)), …)`; for blackjax:
     `blackjax.nuts(density, …)`, or `identify.posterior`. Gradients are computed recording by
-    recording in forward mode, also under `jax.grad`; compile it by `equinox.filter_jit(density)`.
+    recording in forward mode, also under `jax.grad`. Compile the density by
+    `equinox.filter_jit(density)`.
 
     >>> record, chart = rj.datasets.toutatis.recording(), rj.identify.PrincipalRatios()
     >>> density = LogDensity(rj.identify.fit(rj.identify.Model(record, chart)))
@@ -88,7 +96,10 @@ class LogDensity(eqx.Module):
         if process is not None:
             require_process(process)
         if model.loss is not None:
-            raise ValueError("fit: its model has a robust loss, which is no density; fit without")
+            raise ValueError(
+                "fit: wanted a model without a robust loss, which is no density, got "
+                f"{type(model.loss).__name__}; fit with loss=None"
+            )
         if not np.isfinite(np.asarray(fit.covariance)).all():
             what = " ".join(one.in_words for one in fit.undetermined)
             hint = "" if process is None else _GUESS
@@ -117,7 +128,7 @@ class LogDensity(eqx.Module):
 
     @property
     def size(self) -> int:
-        """The number of numbers in x."""
+        """Return the number of numbers in x."""
         return self.x0.size
 
     def __call__(self, x: Float[Array, " n"]) -> Scalar:
@@ -140,20 +151,21 @@ class LogDensity(eqx.Module):
 def of_draws(
     function: Callable[[Unpacked], Any], density: LogDensity, x: Float[Array, "m n"]
 ) -> Any:
-    """Return `function(point)` of each draw; compiled once for densities of one form."""
+    """Return `function(point)` of each draw x (m, n), as one program for densities of one form."""
     return jax.vmap(lambda one: function(density.unpack(one)))(x)
 
 
 def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
-    """Return a factor for the noise of each sensor that has none, one in each group of recordings,
-    and the variances of the logarithms of these factors.
+    """Return the slots of factors of unknown noises, and the variances of their logarithms.
+
+    There is a slot for each sensor without noise, with a factor for each group of recordings.
     """
     groups, slots, variances = np.asarray(model.noise_groups), [], []
     for index, reading in enumerate(model.records.readings):
         if reading.sensor.noise is not None:
             continue
         rows = np.bincount(groups, np.asarray(reading.seen.sum(axis=1)))
-        # The logarithm of a standard deviation is known to 1/√(2n).
+        # The logarithm of a standard deviation has the variance 1/(2n) for n numbers read.
         variances.append(0.5 / np.maximum(rows * reading.sensor.components, 1))
         path = _path_of(model, lambda s, index=index: s.sensors[index].noise)
         name = f"noise of {type(reading.sensor).__name__} {index}"
@@ -162,12 +174,15 @@ def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
     return slots, variances
 
 
-def _process_slots(process: Any, prior: Array) -> list[Slot]:
-    """Return a factor for each number of a process, its logarithm with the deviation `prior`."""
+def _process_slots(process: Process | None, prior: Array) -> list[Slot]:
+    """Return the slots of factors of all numbers of a process.
+
+    The prior of the logarithm of each factor has the standard deviation `prior`.
+    """
     scene, slots = Scene(None, None, process, (), None), []
     several, number = len(parts_of(process)) > 1, -1
     for path, leaf in jax.tree.leaves_with_path(scene):
-        # Each part begins with its density.
+        # The first number of each part of a process is its density: it begins a new part.
         number += path[-1].name == "density"
         name = f"{path[-1].name} {number}" if several else path[-1].name
         slots.append(_factor(path, name, (1,) * jnp.ndim(leaf), "", (), None, prior))
@@ -183,13 +198,13 @@ def _factor(
     groups: Array | None,
     prior: Array | None = None,
 ) -> Slot:
-    """Return the slot whose step is the logarithm of a factor of a leaf."""
+    """Return the slot of a factor of the leaf at `path`, whose step is the factor's logarithm."""
     one = jnp.ones(())
     return Slot(path, name, unit, False, True, shape, labels, groups, one, prior, None)
 
 
 def _path_of(model: Model, where: Callable[[Scene], Any]) -> tuple[Any, ...]:
-    """Return the path of a leaf of a scene that may be `None` there."""
+    """Return the path of the leaf of a scene that `where` picks, even if the leaf is `None`."""
     scene = template(model, model.records)
     marked = eqx.tree_at(where, scene, 0.0, is_leaf=lambda node: node is None)
     pairs = jax.tree.leaves_with_path(eqx.tree_at(where, marked, _MARK))
@@ -200,10 +215,11 @@ _MARK = object()
 
 
 def _with_slots(
-    model: Model, noises: Any, process: Any, slots: list[Slot]
+    model: Model, noises: Noise, process: Process | None, slots: list[Slot]
 ) -> tuple[Model, np.ndarray]:
-    """Return the model with known noises, a process and more shared slots; and the places of its
-    old free numbers among the new ones.
+    """Return the model with these noises, this process and additional shared slots.
+
+    The second result (n,) holds the places of the old free numbers among the new ones.
     """
     bodies = places_of(model.chart, model.which, model.count)
     kinds = model.index.start.shape[1] // 3
@@ -226,15 +242,18 @@ def _with_slots(
 
 
 def _covariance_of_white_errors(fit: Fit, follows_the_motion: bool) -> np.ndarray:
-    """Return the covariance of the fit, for white errors if these were not."""
+    """Return the covariance of a fit for white errors, as far as the density assumes them.
+
+    Without a process (`follows_the_motion`) the density assumes white errors about the motion.
+    """
     covariance = np.asarray(fit.covariance)
     if fit.considered and fit.linear is not None:
-        covariance = of_white(fit.linear).covariance
+        covariance = white_covariance(fit.linear).covariance
     elif fit.covariance_kind.startswith("sandwich"):
-        # The density assumes white errors: it is narrower than the fit's intervals. The sandwich
-        # covariance of many recordings may be singular: no scale for a search.
+        # The sandwich covariance of a fit is wider than a density of white errors. Of many
+        # recordings it may be singular, too: it then gives a search no scale.
         size = np.sqrt(np.diagonal(covariance))
         definite = np.linalg.eigvalsh(covariance / np.outer(size, size)).min() > 1e-10
         if (follows_the_motion or not definite) and fit.linear is not None:
-            covariance = of_white(fit.linear).covariance
+            covariance = white_covariance(fit.linear).covariance
     return covariance

@@ -1,58 +1,65 @@
-"""Experiment design: the expected uncertainty of a planned motion, and the best motion."""
+"""Experiment design: the uncertainty to expect of a planned motion, and the best motion."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import Scalar, Vec3
+from rigidjax._types import Scalar, Vec3, Vector
+from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.model.model import Model, require_numbers, require_one
 from rigidjax.identify.model.normal import normal_of
 from rigidjax.identify.model.terms import blocks, changes, in_deviations
 from rigidjax.identify.uncertainty import flat_limit
-from rigidjax.identify.uncertainty.covariance import inverted
+from rigidjax.identify.uncertainty.covariance import covariance_root
 from rigidjax.identify.uncertainty.quantities import Quantity, quantities, values_and_slopes
 
 
 def expected(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, ...]:
-    """Return the report to expect of a fit of such recordings, with its standard deviations.
+    """Return the quantities that a fit of planned recordings would report, with deviations.
 
-    **Arguments:** `model` whose recordings give times and sensors with known noise (the readings
-    themselves do not matter); `x` (n,) the free numbers of the motion that is planned, as
-    `Model.start` gives them. **Returns** the quantities of `Fit.quantities` (`name`, `value`,
-    `deviation` in the same `unit`) with the standard deviations of the Cramér–Rao bound, infinite
-    where the motion would show nothing. **Raises:** `ValueError` for a sensor whose noise is not
-    given, or numbers that are not finite.
+    **Arguments:**
+
+    - `model`: its recordings give the times and the sensors, with known noise; the readings do not
+      matter.
+    - `x`: (n,) the free numbers of the planned motion, as `Model.start` returns them.
+
+    **Returns** the quantities of `Fit.quantities` (`name`, `value`, `deviation` in the same
+    `unit`). Their standard deviations are those of the Cramér–Rao bound, infinite for a quantity
+    that the motion does not show. **Raises:** `ValueError` for a sensor whose noise is not given,
+    or numbers that are not finite.
 
     >>> model = rj.datasets.toutatis.model()
     >>> plan = model.start(rj.Inertia.from_principal(3.1, 3.2, 1.0))
     >>> bool(expected(model, plan)[0].deviation < 1.0)
     True
     """
-    _on_host(model, x)
+    _require_known(model, x)
     _require_noise(model, x)
     near = flat_limit.thickened(model, x)
     information = np.asarray(_fisher(model, x if near is None else near))
     if not np.isfinite(information).all():
         raise ValueError(
-            "expected: Fisher's information has NaN or infinity in it: model holds NaN in its "
-            "recordings, or the motion of these numbers is beyond the dtype"
+            "expected: wanted a finite Fisher information, got NaN or infinity; the recordings of "
+            "model hold NaN, or the motion of x overflows"
         )
-    found = values_and_slopes(model, x, near)
-    half, null = inverted(information)
-    return quantities(model, found, half @ half.T, null)
+    half, null = covariance_root(information)
+    return quantities(model, values_and_slopes(model, x, near), half @ half.T, null)
 
 
 def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
     """Return Fisher's information (n, n) of the free numbers: `Jᵀ Σ⁻¹ J` of the predictions.
 
-    **Arguments:** `model` with known noises; `x` (n,) the free numbers of the motion. It is
-    differentiable in x, for a design by gradients. **Raises** `ValueError` for a sensor without
-    noise.
+    J are the derivatives of the predictions by x, Σ is the covariance of the noise. The result is
+    differentiable in x, for a design by gradients.
+
+    **Arguments:** `model` with known noises; `x` (n,) the free numbers of the motion. **Raises**
+    `ValueError` for a sensor without noise.
 
     >>> model = rj.datasets.toutatis.model()
     >>> fisher(model, model.start()).shape
@@ -64,6 +71,7 @@ def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
 
 @eqx.filter_jit
 def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """Return the result of `fisher` without its checks, as one program."""
     sensors = model.records.sensors
     noises: list[Any] = [sensor.noise for sensor in sensors]
     _, slopes = blocks(model, x)
@@ -88,41 +96,54 @@ def _require_noise(model: Model, x: Float[Array, " n"]) -> None:
             raise ValueError(f"design: wanted a {type(sensor).__name__} with known jitter, in s")
 
 
-def _on_host(model: Model, motion: Any) -> None:
+def _require_known(model: Model, motion: PyTree) -> None:
+    """Raise `TypeError` for a model or a motion of traced numbers."""
     if not _checks.known((model, motion)):
         raise TypeError(
-            "model, x, body, omega: wanted known numbers, got traced ones; this works "
-            "on the host: call it outside of jax.jit, and differentiate fisher"
+            "model, x, body, omega: wanted known numbers, got traced ones; call it outside of "
+            "jax.jit, jax.grad and jax.vmap, or differentiate identify.fisher"
         )
 
 
 def best_first_rate(
-    model: Model, body: Any, omega: Any, *, max_steps: int = 60
+    model: Model,
+    body: Inertia | MassProperties | Mapping[str, Inertia | MassProperties] | None,
+    omega: Vector,
+    *,
+    max_steps: int = 60,
 ) -> tuple[Vec3, tuple[Quantity, ...]]:
-    """The direction of the initial rate that determines the body best; its length is kept.
+    """Return the initial rate, of the length of `omega`, that determines the body best.
 
-    It minimises the mean logarithm of the standard deviations of the body's free numbers
-    (D-optimality, other numbers free as well), by BFGS of optimistix near `omega`: try several.
-    **Arguments:** `model`, `body` as for `Model.start`; `omega` (3,) rad/s, body frame, where
-    the search starts and how fast the body can be thrown; `max_steps`. **Returns** the rate (3,)
-    and what to expect from it (`expected`). **Raises:** as `fisher`.
+    Its direction minimises the mean logarithm of the standard deviations of the body's free numbers
+    (D-optimality; the other numbers are free as well). BFGS of optimistix finds a minimum near
+    `omega`: try several.
+
+    **Arguments:**
+
+    - `model`, `body`: as for `Model.start`.
+    - `omega`: (3,) rad/s, body frame: the direction from which the search starts, and the length of
+      the rate, that is how fast the body can be thrown.
+    - `max_steps`: the largest number of steps of the search.
+
+    **Returns** the rate (3,), and the result of `expected` for it. **Raises:** as `fisher`.
     """
     require_one(model)
     max_steps = _checks.whole(max_steps, "max_steps", 1)
-    _on_host(model, (body, omega))
+    _require_known(model, (body, omega))
     _require_noise(model, model.start(body, omega))
     start = _checks.floating(omega, (3,), "omega").astype(model.records.t.dtype)
     size = jnp.sqrt(jnp.sum(start**2))
-    found = _search(model, body, start / size, size, max_steps)
-    rate = size * found / jnp.sqrt(jnp.sum(found**2))
+    best = _best_direction(model, body, start / size, size, max_steps)
+    rate = size * best / jnp.sqrt(jnp.sum(best**2))
     return rate, expected(model, model.start(body, rate))
 
 
 @eqx.filter_jit
-def _search(model: Model, body: Any, start: Array, size: Array, max_steps: int) -> Array:
+def _best_direction(model: Model, body: PyTree, start: Array, size: Array, max_steps: int) -> Array:
+    """Return the direction (3,) near `start` of the least uncertainty, for a rate of `size`."""
     minimise: Any = optx.minimise
     out = minimise(
-        _doubt,
+        _log_uncertainty,
         optx.BFGS(rtol=1e-4, atol=1e-4),
         start,
         (model, body, size),
@@ -133,13 +154,16 @@ def _search(model: Model, body: Any, start: Array, size: Array, max_steps: int) 
     return out.value
 
 
-def _doubt(direction: Array, args: Any) -> Scalar:
-    """½ log det of the body's covariance over its size, plus a penalty on the length."""
+def _log_uncertainty(direction: Array, args: tuple[Model, PyTree, Array]) -> Scalar:
+    """Return the mean log standard deviation of the body's n numbers for a direction of the rate.
+
+    It is ½ log det of their covariance over n. A penalty keeps the length of `direction` near 1.
+    """
     model, body, size = args
     length = jnp.sqrt(jnp.sum(direction**2))
     information = fisher(model, model.start(body, size * direction / length))
     n = model.index.bodies
-    # The body's information with the other numbers free: Schur's complement.
+    # Schur's complement: the information on the body if the other numbers are free, too.
     mine, across, rest = information[:n, :n], information[:n, n:], information[n:, n:]
     scale = jnp.sqrt(jnp.diagonal(rest))
     rest = rest / (scale[:, None] * scale[None, :]) + 1e-12 * jnp.eye(rest.shape[0])

@@ -1,7 +1,7 @@
 """The maximum of a posterior density with weighted draws, and draws by samplers of other libraries.
 
-The information at the maximum alone gives intervals that are too narrow on short records: it fixes
-the torque's density at its most probable value, which is below its mean.
+Draws are needed because intervals from the information at the maximum are too narrow on short
+records: they fix the density of a torque at its most probable value, which is below its mean.
 """
 
 from collections.abc import Callable
@@ -24,30 +24,37 @@ from rigidjax.identify.model.model import Unpacked
 from rigidjax.identify.model.normal import Normal
 from rigidjax.identify.search.least_squares import Settings, minimise
 from rigidjax.identify.search.stages import is_order_one
-from rigidjax.identify.uncertainty.quantities import around
+from rigidjax.identify.uncertainty.quantities import interval_about
 from rigidjax.motion.torques.composite import parts_of
 
-# A sampler: key, log-density of z, a first z (n,) → draws (samples, n).
+# A sampler: a function of a key, a log-density of z, and a first z (n,) to draws (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 
-# For `_checks.library`.
+# The arguments of `_checks.library`: the module, the extra that installs it, the function.
 _BLACKJAX = ("blackjax", "posterior", "posterior")
 
-# The weight of the first mass matrix, in draws: it is good already if Laplace's method is.
-_WORTH = 50.0
+# The weight of the first mass matrix, in draws. It counts, since Laplace's method made it.
+_FIRST_WEIGHT = 50.0
 
-# So many recordings keep a core busy: gradients of four chains at once take as long as one by one.
+# From this many recordings on a gradient keeps a core busy: gradients of four chains at once then
+# take as long as one after another.
 _FULL = 8
 
 
 class Nuts(eqx.Module):
-    """The no-U-turn sampler of blackjax, its step and mass matrix adapted first.
+    """The no-U-turn sampler of blackjax, with a warm-up that adapts its step and mass matrix.
 
-    **Arguments:** `samples` kept, `warmup` before them, of each chain; `acceptance` the mean
-    acceptance probability of a trajectory's points, which sets the step: 0.8 is careful, 0.65 takes
-    half as many gradients where the density is nearly normal. It needs blackjax: `pip install
-    rigidjax[posterior]`. Hoffman and Gelman 2014, JMLR 15:1593. **Raises:** `ValueError` for
-    numbers below 1 and an `acceptance` that is not between 0 and 1.
+    It needs blackjax: `pip install rigidjax[posterior]`. Source: Hoffman and Gelman 2014, JMLR
+    15:1593.
+
+    **Arguments:**
+
+    - `samples`: the number of draws of each chain.
+    - `warmup`: the number of draws before them, which are thrown away.
+    - `acceptance`: the mean acceptance probability of the points of a trajectory, which sets the
+      step. 0.8 is careful; 0.65 takes half as many gradients if the density is nearly normal.
+
+    **Raises:** `ValueError` for numbers below 1 and an `acceptance` that is not between 0 and 1.
 
     >>> Nuts(samples=500).samples
     500
@@ -63,13 +70,13 @@ class Nuts(eqx.Module):
         _checks.fraction(self.acceptance, "acceptance")
 
     def __call__(self, key: Any, density: Callable[[Array], Array], start: Array) -> Array:
-        """Draws (samples, n) of one chain."""
+        """Return the draws (samples, n) of one chain that begins at `start` (n,)."""
         blackjax = _checks.library(*_BLACKJAX)
         adaptation = blackjax.adaptation
-        # The warm-up of `blackjax.window_adaptation` in one loop with the draws: in a loop of its
-        # own the density is compiled once more, which takes longer than to draw.
+        # Do the warm-up of `blackjax.window_adaptation` in one loop with the draws. In a loop of
+        # its own it compiles the density once more, which takes longer than the draws.
         begin, tune, settle = adaptation.step_size.dual_averaging_adaptation(self.acceptance)
-        metric = adaptation.mass_matrix.mass_matrix_adaptation(True, _WORTH)
+        metric = adaptation.mass_matrix.mass_matrix_adaptation(True, _FIRST_WEIGHT)
         metric_begin, metric_add, metric_end = metric
         kernel = blackjax.nuts.build_kernel()
 
@@ -79,8 +86,8 @@ class Nuts(eqx.Module):
             scale = lax.cond(slow, lambda: metric_add(scale, state.position), lambda: scale)
 
             def end() -> tuple:
-                again = begin(settle(steps))
-                return again, metric_end(scale), jnp.exp(again.log_step_size)
+                restarted = begin(settle(steps))
+                return restarted, metric_end(scale), jnp.exp(restarted.log_step_size)
 
             return lax.cond(ends, end, lambda: (steps, scale, jnp.exp(steps.log_step_size)))
 
@@ -109,10 +116,14 @@ class Nuts(eqx.Module):
 class Posterior(eqx.Module):
     """The result of `posterior`.
 
-    **Fields:** `density`; `x` (chains, samples, n) draws of the vector that it takes. `points` are
-    their bodies, states and values, `of(function)` any function of each. `rhat` (n,) is below 1.01
-    if the chains agree, and `ess` (n,) is the number of independent draws, as in Gelman et al.,
-    Bayesian Data Analysis (2013), §11.4, 11.5.
+    **Fields:**
+
+    - `density`: the `LogDensity`.
+    - `x`: (chains, samples, n) the draws of its argument.
+
+    `points` are the bodies, states and values of the draws, `of(function)` any function of them.
+    `rhat` (n,) is below 1.01 if the chains agree, `ess` (n,) is the number of independent draws
+    (Gelman et al., Bayesian Data Analysis (2013), §11.4, 11.5).
     """
 
     density: LogDensity
@@ -120,33 +131,33 @@ class Posterior(eqx.Module):
 
     @property
     def rhat(self) -> Float[Array, " n"]:
-        """Potential scale reduction between the chains, near 1 if they agree (blackjax)."""
+        """Return the potential scale reduction of the chains, near 1 if they agree (blackjax)."""
         return _checks.library(*_BLACKJAX).diagnostics.potential_scale_reduction(self.x)
 
     @property
     def ess(self) -> Float[Array, " n"]:
-        """The effective number of independent draws (blackjax)."""
+        """Return the effective number of independent draws (blackjax)."""
         return _checks.library(*_BLACKJAX).diagnostics.effective_sample_size(self.x)
 
     @property
     def points(self) -> Unpacked:
-        """The bodies, states and values of the draws, with leading axes of chains and samples."""
-        return self.of(_itself)
+        """Return bodies, states and values of the draws, with axes of chains and samples first."""
+        return self.of(_identity)
 
     def of(self, function: Callable[[Unpacked], Any]) -> Any:
-        """`function(point)` of each draw, with leading axes of chains and samples.
+        """Return `function(point)` of each draw, with leading axes of chains and samples.
 
-        Such as `drawn.of(lambda point: point.body.moments)`. **Raises** `TypeError` if it is no
-        function.
+        An example is `drawn.of(lambda point: point.body.moments)`. **Raises** `TypeError` for
+        anything but a `function`.
         """
         _checks.function(function, "function", "of `Unpacked`, such as lambda point: point.body")
-        found = of_draws(function, self.density, self.x.reshape(-1, self.x.shape[-1]))
-        return jax.tree.map(lambda leaf: leaf.reshape(*self.x.shape[:2], *leaf.shape[1:]), found)
+        rows = of_draws(function, self.density, self.x.reshape(-1, self.x.shape[-1]))
+        return jax.tree.map(lambda leaf: leaf.reshape(*self.x.shape[:2], *leaf.shape[1:]), rows)
 
     def to_arviz(self) -> Any:
-        """The draws for ArviZ: body, values, initial states, process.
+        """Return the draws for ArviZ: body, values, initial states and process.
 
-        **Raises:** `ImportError` without arviz (it needs Python 3.12).
+        **Raises:** `ImportError` without arviz, which needs Python 3.12.
         """
         arviz = _checks.library("arviz", "posterior", "to_arviz (Python 3.12)")
         points = self.points
@@ -162,20 +173,27 @@ class Posterior(eqx.Module):
         return arviz.from_dict({"posterior": {k: jnp.asarray(v) for k, v in out.items()}})
 
 
-def _itself(point: Unpacked) -> Unpacked:
+def _identity(point: Unpacked) -> Unpacked:
+    """Return the point: one function for all calls, so that none compiles again."""
     return point
 
 
 def posterior(
     density: LogDensity, key: Any, *, sampler: Sampler | None = None, chains: int = 4
 ) -> Posterior:
-    """Draws of body, initial states, all `Free`s, noise and process, given all readings.
+    """Draw body, initial states, all `Free`s, noise and process, given all readings.
 
-    **Arguments:** `density` a `LogDensity`; `key` of `jax.random`; `sampler` a function of a key, a
-    log-density and a first vector to draws (samples, n), `Nuts()` unless given; its numbers have
-    the identity as covariance by Laplace's method, and it starts from a draw of that. `chains` run
-    together under `vmap`, or one after another with eight recordings and more. **Returns** a
-    `Posterior`. **Raises** `ImportError` if blackjax is missing.
+    **Arguments:**
+
+    - `density`: a `LogDensity`.
+    - `key`: of `jax.random`.
+    - `sampler`: a function of a key, a log-density and a first vector to draws (samples, n);
+      `Nuts()` unless given. The vectors are scaled: by Laplace's method their covariance is the
+      identity. The first one is drawn from this distribution, at half the width.
+    - `chains`: their number. They run together under `vmap`, or one after another for eight
+      recordings and more.
+
+    **Returns** a `Posterior`. **Raises** `ImportError` if blackjax is missing.
 
     >>> import jax
     >>> record, chart = rj.datasets.toutatis.recording(), rj.identify.PrincipalRatios()
@@ -199,35 +217,48 @@ def posterior(
 
 @eqx.filter_jit
 def _draw(density: LogDensity, root: Array, keys: Array, sampler: Any) -> Array:
-    def of(z: Array) -> Array:
+    """Return the draws (chains, samples, n) of one chain for each of the `keys`, as one program.
+
+    Chains are sampled in the vector z with `x = x0 + root z`.
+    """
+
+    def unscaled(z: Array) -> Array:
         return density.x0 + jnp.sum(root * z[None], 1)
 
-    def chain(key: Any) -> Array:
+    def chain(key: Array) -> Array:
         first, later = jax.random.split(key)
         start = 0.5 * jax.random.normal(first, density.x0.shape, density.x0.dtype)
-        return jax.vmap(of)(sampler(later, lambda z: density(of(z)), start))
+        return jax.vmap(unscaled)(sampler(later, lambda z: density(unscaled(z)), start))
 
-    # One after another no chain waits for the longest step of the others.
+    # Chains that run together wait for the longest trajectory among them in each step.
     if density.model.count >= _FULL:
         return lax.map(chain, keys)
     return jax.vmap(chain)(keys)
 
 
-# Steps of so many standard deviations end the search; its damping at the start.
+# The search ends at a step of _SMALL standard deviations; _DAMPING is its damping at the start.
 _SMALL, _DAMPING = 1e-3, 1e-2
-# Draws come from Student's t, wider than Laplace's method, so that tails get their weight.
+# Draws come from Student's t with _FREEDOM degrees, _WIDER than Laplace's normal distribution: of a
+# narrow one a few draws in the tails would get all the weight.
 _FREEDOM, _WIDER = 6.0, 1.2
-# Fewer independent draws cannot give the ends of an interval.
+# The least number of independent draws that gives the ends of an interval.
 _LEAST = 100.0
 
 
 class Refit(eqx.Module):
     """The result of `refit`.
 
-    **Fields:** `density`; `x` (n,) where it is largest, `log_density` there; `covariance` (n, n) of
-    x, the inverse of Fisher's information there; `converged`; `draws` (m, n) and their `weights`
-    (m,), which add up to 1, represent the posterior density. `effective` is the number of
-    independent draws that they are worth.
+    **Fields:**
+
+    - `density`: the `LogDensity`.
+    - `x`: (n,) the point at which it is largest.
+    - `log_density`: at x.
+    - `covariance`: (n, n) of x, the inverse of Fisher's information at x.
+    - `converged`: whether the search converged.
+    - `draws`, `weights`: (m, n) and (m,); together they represent the posterior density. The
+      weights add up to 1.
+
+    `effective` is the number of independent draws that the weighted draws are worth.
     """
 
     density: LogDensity
@@ -240,24 +271,30 @@ class Refit(eqx.Module):
 
     @property
     def point(self) -> Unpacked:
-        """The body, initial states, values, noise and process that the vector x stands for."""
+        """Return the body, initial states, values, noise and process that x represents."""
         return self.density.unpack(self.x)
 
     @property
     def effective(self) -> Scalar:
-        """The number of independent draws that the weighted ones are worth, 1/Σw² (Kish 1965)."""
+        """Return the number of independent draws that the weighted draws are worth, 1/Σw².
+
+        Source: Kish, Survey Sampling (1965).
+        """
         return 1.0 / jnp.sum(self.weights**2)
 
     def interval_of(
         self, of: Callable[[Unpacked], Any], level: float = 0.95
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Interval (low, high) of any function of `Unpacked` to an array, with equal tails.
+        """Return the interval (low, high), with equal tails, of a function of the posterior.
 
-        It comes from the weighted draws. If these are worth fewer than 100 independent ones
-        (`effective`), it comes from the covariance and the derivative of the function, which must
-        then be differentiable: take the logarithm of a positive quantity. That interval is too
-        narrow on short records. **Raises** `ValueError` for a level outside (0, 1), and if too few
-        draws are independent and x is not the maximum either.
+        It is computed from the weighted draws. If these are worth fewer than 100 independent ones
+        (`effective`), it is computed from the covariance and the derivative of the function, which
+        must then be differentiable: take the logarithm of a positive quantity. Such an interval is
+        too narrow on short records.
+
+        **Arguments:** `of` the function, from `Unpacked` to an array; `level` the probability that
+        the interval holds the true value. **Raises** `ValueError` for a level outside (0, 1), and
+        if too few draws are independent and the search did not converge either.
         """
         level = _checks.fraction(level, "level", "a probability between 0 and 1")
         _checks.function(of, "of", "of `Unpacked` to an array")
@@ -285,33 +322,41 @@ class Refit(eqx.Module):
 
         centre, slope = (np.asarray(a) for a in (value(self.x), jax.jacfwd(value)(self.x)))
         null, reach = np.zeros((0, self.x.size)), NormalDist().inv_cdf(0.5 + 0.5 * level)
-        return around(centre, slope, np.asarray(self.covariance), null, reach)
+        return interval_about(centre, slope, np.asarray(self.covariance), null, reach)
 
 
 def refit(
     density: LogDensity, *, max_steps: int = 200, draws: int = 1000, key: Any = None
 ) -> Refit:
-    """The maximum of the posterior density, and weighted draws around it for intervals.
+    """Find the maximum of a posterior density, and draw around it for intervals.
 
-    A fit that allows for an unknown torque, the process of its model: `refit(LogDensity(fit))`
-    finds body, initial states, all `Free`s, and the torque's density, starting from `fit`, by
-    Fisher's scoring: Levenberg–Marquardt with the expected information of the innovations as the
-    normal matrix (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714). The draws come from a wide
-    Student's t about that point, weighted by the density over that of the t (importance sampling:
-    Geweke 1989, doi:10.2307/1913710). Draws of more than some dozen numbers are worth little
-    (`effective`); intervals then come from the information, which is enough if each recording is
-    long. `identify.posterior` draws from any density.
+    It is a fit that allows for an unknown torque, the process of the model:
+    `refit(LogDensity(fit))` finds the body, the initial states, all `Free`s and the density of the
+    torque, starting from `fit`. The search is Fisher's scoring: Levenberg–Marquardt steps with the
+    expected information of the innovations as the normal matrix (Gupta and Mehra 1974,
+    doi:10.1109/TAC.1974.1100714).
 
-    **Arguments:** `density` a `LogDensity`; `max_steps` at most; `draws` how many; `key` of
-    `jax.random` for them, by default always the same. **Returns** a `Refit`; `converged` is false
-    if it ended early, or if some combination of the numbers changes neither readings nor priors:
-    `weights` are then NaN.
+    The draws come from a wide Student's t distribution about the maximum; their weight is the
+    density over that of the t distribution (importance sampling: Geweke 1989,
+    doi:10.2307/1913710). For more than some dozen numbers such draws are worth little
+    (`effective`). Intervals then come from the information, which is good enough if each recording
+    is long; or draw by `identify.posterior`, from any density.
+
+    **Arguments:**
+
+    - `density`: a `LogDensity`.
+    - `max_steps`: the largest number of steps of the search.
+    - `draws`: the number of draws.
+    - `key`: of `jax.random` for the draws; without a key they are the same at each call.
+
+    **Returns** a `Refit`. Its `converged` is false if the search ended early, or if some
+    combination of the numbers changes neither readings nor priors; `weights` are then NaN.
 
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()))
-    >>> best = refit(rj.identify.LogDensity(found))
+    >>> first = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()))
+    >>> best = refit(rj.identify.LogDensity(first))
     >>> bool(jnp.allclose(best.point.state0.omega, jnp.array([1.0, 0.1, 1.0]), atol=1e-3))
     True
     >>> low, high = best.interval_of(lambda point: point.state0.omega)
@@ -326,12 +371,14 @@ def refit(
 
 @eqx.filter_jit
 def _refit(density: LogDensity, settings: Settings, key: Any, count: int) -> Refit:
-    def evaluated(x: Array) -> Any:
+    """Return the result of `refit` with `count` draws, as one program."""
+
+    def evaluate(x: Array) -> tuple[None, Array, Normal, Array]:
         cost, gram, slope = curvature(density.model, x)
         return None, cost, Normal(gram), slope
 
     order_one = is_order_one(density.model, density.x0.dtype)
-    end = minimise(evaluated, density.x0, order_one, settings, None)
+    end = minimise(evaluate, density.x0, order_one, settings, None)
     covariance = jnp.linalg.inv(end.normal.core)
     draws, weights = _weighted(density, end.point, covariance, key, count)
     converged = end.converged & jnp.isfinite(weights).all()
@@ -341,7 +388,7 @@ def _refit(density: LogDensity, settings: Settings, key: Any, count: int) -> Ref
 def _weighted(
     density: LogDensity, top: Array, covariance: Array, key: Any, count: int
 ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-    """Draws of Student's t about the maximum, and their weights."""
+    """Return `count` draws of Student's t about the maximum `top`, and their weights."""
     size, kind = top.size, top.dtype
     normal, square = jax.random.split(key)
     z = jax.random.normal(normal, (count, size), kind)
@@ -349,8 +396,8 @@ def _weighted(
     z = z / jnp.sqrt(shrunk)
     root = _WIDER * jnp.linalg.cholesky(covariance)
     draws = top[None] + z @ root.T
-    found = lax.map(density, draws)
-    taken = -0.5 * (_FREEDOM + size) * jnp.log1p(jnp.sum(z * z, 1) / _FREEDOM)
-    # A point so far out that the density is no number there has none.
-    logs = jnp.where(jnp.isfinite(found), found - taken, -jnp.inf)
+    wanted = lax.map(density, draws)
+    drawn_from = -0.5 * (_FREEDOM + size) * jnp.log1p(jnp.sum(z * z, 1) / _FREEDOM)
+    # A draw so far out that the density is NaN gets no weight.
+    logs = jnp.where(jnp.isfinite(wanted), wanted - drawn_from, -jnp.inf)
     return draws, jax.nn.softmax(logs)

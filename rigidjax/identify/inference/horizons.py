@@ -1,4 +1,4 @@
-"""The errors of a fitted model on windows, by how far ahead it predicts."""
+"""The errors of a fitted model on windows, by the number of steps that it predicts ahead."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax.identify.answer.result import Fit, one_fit
+from rigidjax.identify.answer.result import Fit, require_one_fit
 from rigidjax.identify.data.windows import (
     Horizons,
     Windows,
@@ -24,10 +24,12 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
     """Return the open-loop errors of a fitted model on windows, at every horizon.
 
     The model runs from the measured start of each window with the fitted body and shared numbers.
-    **Arguments:** `fit` of a `Model` of windows; `windows` those, or others with the same kind of
-    state and inputs. **Returns** `steps`, `mean_absolute`, `mean_norm` and `rms` by kind
-    (`Horizons`); `windows.held()` is what it must beat. **Raises:** `TypeError` for a fit of other
-    recordings, `ValueError` for a `Free` with a value of each window and for missing inputs.
+
+    **Arguments:** `fit` of a `Model` of windows; `windows` the same ones, or others with the same
+    kind of state and inputs. **Returns** `steps`, and by kind `mean_absolute`, `mean_norm` and
+    `rms` (`Horizons`); a good model has smaller errors than `windows.held()`. **Raises:**
+    `TypeError` for a fit of other recordings than windows, `ValueError` for a `Free` with a value
+    for each window and for missing inputs.
 
     >>> t = np.linspace(0.0, 1.0, 11)
     >>> spin = rj.Spin(np.stack([0 * t, 0 * t, np.exp(-0.5 * t)], 1))
@@ -35,28 +37,31 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
     >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 1.0, 1.0))
     >>> drag = rj.identify.Free(lambda s: s.torque.coefficient, "drag")
     >>> law = rj.torques.Damping(0.1 * jnp.ones(3))
-    >>> found = rj.identify.fit(rj.identify.Model(cut, body, torque=law, free=[drag]))
-    >>> bool(predict_windows(found, cut).rms["omega"].max() < 1e-6)
+    >>> result = rj.identify.fit(rj.identify.Model(cut, body, torque=law, free=[drag]))
+    >>> bool(predict_windows(result, cut).rms["omega"].max() < 1e-6)
     True
     """
-    one_fit(fit)
+    require_one_fit(fit)
     require_windows(windows)
     model = fit.model
     if model.clusters is None:
         raise TypeError("predict_windows: wanted a fit of windows, got one of recordings")
     if any(slot.own is not None for slot in model.slots):
-        raise ValueError("predict_windows: a Free has a value of each window; others have none")
+        raise ValueError(
+            "predict_windows: wanted a fit whose numbers all windows share, got a Free with a "
+            "value for each window, which other windows do not have"
+        )
     _checks.instance(windows.starts, type(model.reference.state), "windows.starts")
     require_inputs_of_windows(model.torque, windows)
-    there, x = _on_windows(model, fit.x, windows)
-    errors = _errors(there, x)[0]
+    model_on_windows, x = _on_windows(model, fit.x, windows)
+    errors = _errors(model_on_windows, x)[0]
     return by_horizon(windows.starts, errors[:, 1:])
 
 
 def _on_windows(
     model: Model, x: Float[Array, " n"], windows: Windows
 ) -> tuple[Model, Float[Array, " m"]]:
-    """Return the model on other windows with known starts, and its shared free numbers."""
+    """Return the model of these windows with known starts, and its shared free numbers."""
     reference, _, clusters = starts_of_windows(windows, 1)
     which = None
     bodies = places_of(model.chart, which, windows.count)
@@ -77,4 +82,5 @@ def _on_windows(
 
 @eqx.filter_jit
 def _errors(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
+    """Return the errors of all sensors, as one program."""
     return all_errors(model, x)

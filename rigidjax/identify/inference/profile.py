@@ -1,7 +1,7 @@
 """Profile intervals: the range of a quantity in which the best misfit grows little."""
 
 import functools
-from typing import Any
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,19 +9,23 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rigidjax._types import Scalar
-from rigidjax.identify.answer.result import Fit, one_fit
+from rigidjax.identify.answer.result import Fit, require_one_fit
 from rigidjax.identify.data import stacking
 from rigidjax.identify.model.model import AbstractPull, Model
 from rigidjax.identify.search.stages import Attempt, Task, cost_of, polish
 from rigidjax.identify.uncertainty import quantities
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
-# The width of a pull, in standard deviations: a stiff one makes the search slow.
+# The width of a pull, in standard deviations of the quantity: a narrower one slows the search down.
 PULL = 0.3
 
 
 class Pull(AbstractPull):
-    """The residual that pulls a quantity (number `index`) to a `target`, of deviation `width`."""
+    """A residual that pulls a reported quantity to a target.
+
+    **Fields:** `index` the number of the quantity; `target`; `width` the standard deviation of the
+    residual.
+    """
 
     index: Int[Array, ""]
     target: Scalar
@@ -33,27 +37,33 @@ class Pull(AbstractPull):
 
 
 def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
-    """The profile interval (low, high) of one reported quantity.
+    """Return the profile interval (low, high) of one reported quantity.
 
-    The other numbers are fitted again with the quantity at other values; at the ends twice the
-    misfit has grown by the square of the quantile, `t²`, times the samples over which errors are
-    autocorrelated. Trust it if the misfit is not quadratic (a weakly determined quantity, or one
-    near a boundary). **Arguments:** `fit`; `name` as in `fit.interval()`; `level` the probability.
-    **Returns** the interval, infinite or 0 on a side where the misfit never grows that far within a
-    factor of 1e3 (or 1e3 standard deviations).
+    The quantity is held at other values, and the other numbers are fitted again. At the ends of the
+    interval twice the misfit has grown by the squared quantile t², times the samples over which
+    errors are autocorrelated. This interval is better than that of `fit.interval()` if the misfit
+    is not quadratic: for a weakly determined quantity, or one near a boundary. Source: Raue et al.
+    2009, doi:10.1093/bioinformatics/btp358.
 
-    **Raises:** `ValueError` for a name that is not reported, a level outside (0, 1). Source: Raue
-    et al. 2009, doi:10.1093/bioinformatics/btp358.
+    **Arguments:**
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
-    >>> low, high = profile(found, "Ix/Iz")
+    - `fit`: a result of `identify.fit`.
+    - `name`: of the quantity, as in `fit.interval()`.
+    - `level`: the probability that the interval holds the true value.
+
+    **Returns** the interval. An end is infinite, or 0 for a positive quantity, if the misfit does
+    not grow enough within a factor of 1e3 (or 1e3 times the value). **Raises:** `ValueError` for a
+    name that is not reported, and for a level outside (0, 1).
+
+    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> low, high = profile(result, "Ix/Iz")
     >>> low < 3.1 < high
     True
     """
-    one_fit(fit)
+    require_one_fit(fit)
     names = [quantity.name for quantity in fit.quantities]
     if not isinstance(name, str) or name not in names:
-        raise ValueError(f"profile: no quantity {name!r}; wanted one of {', '.join(names)}")
+        raise ValueError(f"profile: wanted one of {', '.join(names)}, got {name!r}")
     index = names.index(name)
     quantity = fit.quantities[index]
     reach = float(quantile(level, quantity.freedom))
@@ -71,7 +81,8 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
 
         @functools.cache
         def pulled(steps: float, side: float = side) -> tuple[float, float]:
-            # A weak pull: its best point has the least misfit of its own value, wherever that is.
+            # The pull is weak, so the quantity ends between the target and its best value. That is
+            # no error: the point has the least misfit of all points with its value.
             nonlocal point
             size = middle + side * steps * deviation, PULL * deviation
             target, width = (jnp.asarray(x, kind) for x in size)
@@ -91,7 +102,14 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
 _value = eqx.filter_jit(quantities.vector)
 
 
-def _end(pulled: Any, reach: float, most: float, side: float) -> float:
+def _end(
+    pulled: Callable[[float], tuple[float, float]], reach: float, most: float, side: float
+) -> float:
+    """Return the value of the quantity at which the misfit has grown enough.
+
+    **Arguments:** `pulled` a function from the distance of the target to the excess of the misfit
+    and the value; `reach` the first distance; `most` the largest; `side` the sign of infinity.
+    """
     from scipy.optimize import brentq
 
     inner, outer = 0.0, reach

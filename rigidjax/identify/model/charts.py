@@ -1,4 +1,4 @@
-"""Unconstrained numbers ↔ the body, for a fit. Every point is a real body."""
+"""Charts of the body for a fit: they map unconstrained numbers to bodies, all of them real ones."""
 
 import abc
 from collections.abc import Mapping, Sequence
@@ -28,10 +28,17 @@ for _k, (_i, _j) in enumerate(COMPONENTS):
 
 
 class AbstractBodyChart(eqx.Module):
-    """A chart of bodies: `size` numbers → an `Inertia` or `MassProperties`, and back.
+    """A chart of bodies: it maps `size` numbers to an `Inertia` or `MassProperties`, and back.
 
-    `log_names`, `unit` and `logs(body)` describe the positive quantities that are reported, through
-    their logarithms; `plain_names` and `plain(body)` quantities of either sign, none unless given.
+    To make a chart of your own, write a subclass with the methods `body`, `vector` and `logs` and
+    these members:
+
+    - `size`: the number of its numbers.
+    - `log_names`: the names of the positive quantities that are reported; `logs(body)` returns
+      their logarithms.
+    - `plain_names`: the names of reported quantities of either sign, which `plain(body)` returns;
+      none unless given.
+    - `unit`: of the reported quantities.
 
     >>> class Spheres(AbstractBodyChart):  # one number: the logarithm of the moment
     ...     size, unit, log_names = 1, "kg m²", ("I",)
@@ -49,39 +56,42 @@ class AbstractBodyChart(eqx.Module):
     log_names: eqx.AbstractVar[tuple[str, ...]]
     plain_names: ClassVar[tuple[str, ...]] = ()
     unit: ClassVar[str] = ""
-    # Of the bodies that `Model` hands out; within a fit a torque on them is no mistake.
+    # The scale of the bodies that a user gets from `Model`. Within a fit bodies have none: a torque
+    # on a body of arbitrary scale would be refused there.
     scale: ClassVar[str | None] = None
 
     @abc.abstractmethod
     def body(self, vector: Numbers) -> Inertia | MassProperties:
-        """The body of these numbers."""
+        """Return the body of the numbers `vector`."""
 
     @abc.abstractmethod
     def vector(self, body: Any) -> Numbers:
-        """The numbers of a body with this `Inertia`, the initial guess of a fit."""
+        """Return the numbers of a `body`, such as the initial guess of a fit."""
 
     def bend(self, vector: Numbers, slope: Numbers) -> Rows:
-        """Rows whose squares are the second derivative of a misfit from the chart's curvature.
+        """Return rows B whose BᵀB is the part of a misfit's second derivative from the curvature.
 
-        They matter if a body may be flat (`rigidjax.body.parameters.flat_bend`); else there are
-        none. **Arguments:** `slope` the misfit's derivative in the chart's numbers.
+        The chart's curvature matters if a body may be flat (`rigidjax.body.parameters.flat_bend`);
+        without rows it is left out. **Arguments:** `vector` the numbers; `slope` the derivative of
+        the misfit by them.
         """
         return jnp.zeros((0, self.size), vector.dtype)
 
     @abc.abstractmethod
     def logs(self, body: Any) -> Float[Array, " logs"]:
-        """Logarithms of the positive quantities that are reported."""
+        """Return the logarithms of the positive quantities that are reported."""
 
     def plain(self, body: Any) -> Float[Array, " plain"]:
-        """The other quantities that are reported."""
+        """Return the reported quantities of either sign."""
         return jnp.zeros(0)
 
 
 class Ratios(AbstractBodyChart):
-    """The whole inertia tensor up to scale: two ratios of moments and the principal axes.
+    """The chart of the inertia tensor up to scale: two ratios of moments and the principal axes.
 
-    Five numbers: the root of the second moment 𝔖, its scale fixed (`rigidjax.body.parameters`), so
-    that a flat body is an ordinary point. For free motion, which cannot show the scale.
+    It is for free motion, which cannot show the scale. Its five numbers are those of a root of the
+    second moment 𝔖 of fixed scale (`rigidjax.body.parameters`), so that a flat body is an ordinary
+    point.
 
     >>> Ratios().logs(Ratios().body(jnp.zeros(5)))
     Array([0., 0.], dtype=float64)
@@ -106,10 +116,10 @@ class Ratios(AbstractBodyChart):
 
 
 class PrincipalRatios(AbstractBodyChart):
-    """Two ratios of moments, where the body axes are known to be principal.
+    """The chart of two ratios of moments, if the body axes are known to be principal.
 
-    Two numbers: the roots of the second moments along the axes, λ1, λ2, λ3, their scale fixed
-    (notes, eqs 72, 76–78), so that every pair of numbers obeys the triangle inequalities.
+    Its two numbers are those of the roots of the second moments λ1, λ2, λ3 along the axes, of fixed
+    scale (notes, eqs 72, 76–78), so that every pair of numbers obeys the triangle inequalities.
 
     >>> PrincipalRatios().body(jnp.zeros(2)).moments.sum().round(12)  # Tr I = 2, as of `Ratios`
     Array(2., dtype=float64)
@@ -134,6 +144,7 @@ class PrincipalRatios(AbstractBodyChart):
 
 
 def _typical(value: Any) -> Array:
+    """Return the rough size of the moments as an array; raise an error unless it is positive."""
     if isinstance(value, Inertia | MassProperties):
         raise TypeError(
             "typical: wanted the rough size of the moments, one number, kg m², got "
@@ -145,12 +156,13 @@ def _typical(value: Any) -> Array:
 
 
 class Tensor(AbstractBodyChart):
-    """The whole inertia tensor with its scale, which a known torque or internal momentum shows.
+    """The chart of the inertia tensor with its scale, which a known torque or momentum shows.
 
-    Six numbers: the logarithm of the size of 𝔖 in units of `typical`, and its shape (as `Ratios`).
+    Its six numbers are the logarithm of the size of 𝔖 in units of `typical`, and the five numbers
+    of `Ratios`.
 
-    **Arguments:** `typical` kg m², the rough size of the moments, where a fit starts. **Raises**
-    `ValueError` if it is not positive.
+    **Arguments:** `typical` kg m², the rough size of the moments, with which a fit starts.
+    **Raises** `ValueError` if it is not positive.
 
     >>> Tensor(1e-3).body(jnp.zeros(6)).tensor[0, 0]
     Array(0.001, dtype=float64)
@@ -179,9 +191,10 @@ class Tensor(AbstractBodyChart):
 
 
 class Principal(AbstractBodyChart):
-    """Three principal moments with their scale, where the body axes are known to be principal.
+    """The chart of three moments with their scale, if the body axes are known to be principal.
 
-    Three numbers: the logarithm of the size in units of `typical`, and as `PrincipalRatios`.
+    Its three numbers are the logarithm of the size of 𝔖 in units of `typical`, and the two numbers
+    of `PrincipalRatios`.
 
     **Arguments:** as for `Tensor`.
 
@@ -208,15 +221,21 @@ class Principal(AbstractBodyChart):
 
 
 class Mass(AbstractBodyChart):
-    """Mass, centre of mass and inertia: all ten numbers, if forces show them, or some of them.
+    """The chart of mass, centre of mass and inertia: all ten numbers, or some of them.
 
-    **Arguments:** `guess` a `MassProperties` of about the right size, with the true values of all
-    numbers that are not free, where the chart of `rigidjax.body.parameters.pack` starts; `free` the
-    parts that a fit may move: `"mass"` (the second moment keeps its ratio to the mass unless the
-    inertia is free, too), `"inertia"` about the centre of mass, `"com"`: `["inertia"]` for a body
-    that was weighed and balanced, `["mass"]` for a load of known shape, `["com"]` for a centre that
-    moved. **Raises:** `TypeError` for a guess of another type; `ValueError` for another word, or
-    none.
+    Forces must show them. The numbers are changes from the `guess` in the chart of
+    `rigidjax.body.parameters.pack`.
+
+    **Arguments:**
+
+    - `guess`: a `MassProperties` of about the right size, with the true values of all numbers that
+      are not free.
+    - `free`: the parts that a fit may move: `"mass"` (the second moment keeps its ratio to the mass
+      unless the inertia is free, too), `"inertia"` about the centre of mass, `"com"`. Examples are
+      `["inertia"]` for a body that was weighed and balanced, `["mass"]` for a load of known shape,
+      `["com"]` for a centre that moved.
+
+    **Raises:** `TypeError` for a guess of another type; `ValueError` for another word, or none.
 
     >>> box = rj.shapes.box(2.0, [1.0, 1.0, 1.0])
     >>> float(Mass(box).body(jnp.zeros(10)).mass), Mass(box, ["inertia"]).log_names
@@ -247,11 +266,12 @@ class Mass(AbstractBodyChart):
 
     @property
     def _places(self) -> list[int]:
+        """Return the places of the free numbers among the ten of `pack`."""
         return sorted(place for name in self.free for place in _PARTS[name])
 
     @property
     def _length(self) -> Array:
-        # The centre in units of the body's own size: every number is of order one.
+        """Return the size of the body, m: the centre counts in it, as a number of order one."""
         return jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
 
     def body(self, vector: Numbers) -> MassProperties:
@@ -278,16 +298,16 @@ class Mass(AbstractBodyChart):
 
     def logs(self, body: MassProperties) -> Float[Array, " logs"]:
         mass, moments = body.mass[None], body.inertia.moments
-        kept = [mass] if "mass" in self.free else []
-        kept += [moments] if "inertia" in self.free else []
-        return jnp.log(jnp.concatenate(kept)) if kept else jnp.zeros(0, mass.dtype)
+        parts = [mass] if "mass" in self.free else []
+        parts += [moments] if "inertia" in self.free else []
+        return jnp.log(jnp.concatenate(parts)) if parts else jnp.zeros(0, mass.dtype)
 
     def plain(self, body: MassProperties) -> Float[Array, " plain"]:
         return body.com if "com" in self.free else jnp.zeros(0, body.com.dtype)
 
 
 class Known(AbstractBodyChart):
-    """A known body: only states, torques and sensors are fitted.
+    """The chart of a known body: a fit moves only states, torques and sensors.
 
     **Arguments:** `known` an `Inertia` or `MassProperties`.
 
@@ -313,13 +333,17 @@ class Known(AbstractBodyChart):
 
 
 def _padded(x: Float[Array, "*rows n"], before: int, after: int) -> Float[Array, "*rows m"]:
-    """The same numbers with zeros before and after them."""
+    """Return x with zeros `before` and `after` it along the last axis."""
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(before, after)])
 
 
 class Bodies(eqx.Module):
-    """The charts of several bodies, by name; their numbers follow one another. Charts of the same
-    kind are kept stacked, so that one program serves all recordings.
+    """The charts of several bodies; their numbers follow one another.
+
+    Charts of one form are stacked, so that one program serves all recordings.
+
+    **Fields:** `names` and `charts` of the bodies; `kinds` the stacked charts, one for each form;
+    for each body `kind_of` the index of its form, and `row_of` its row in the stacked chart.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -351,33 +375,34 @@ class Bodies(eqx.Module):
 
     @property
     def size(self) -> int:
-        """The number of free numbers of all bodies."""
+        """Return the number of free numbers of all bodies."""
         return sum(chart.size for chart in self.charts)
 
     def all(self, vector: Float[Array, " numbers"]) -> dict[str, Any]:
-        """Every body by its name."""
+        """Return every body by its name."""
         rows = zip(self.names, self.charts, numbers_of(self, vector), strict=True)
         return {name: scaled(chart, numbers) for name, chart, numbers in rows}
 
-    def body(self, vector: Numbers, which: Int[Array, ""]) -> Any:
-        """The body at the index `which`, from its numbers, padded with zeros."""
+    def body(self, vector: Numbers, which: Int[Array, ""]) -> Inertia | MassProperties:
+        """Return the body at the index `which` from its numbers `vector`, padded with zeros."""
         kind, row = jnp.asarray(self.kind_of)[which], jnp.asarray(self.row_of)[which]
-        found: Any = None
+        chosen: Any = None
         for index, alike in enumerate(self.kinds):
             here = jnp.where(kind == index, row, 0)
             chart = jax.tree.map(lambda leaf, at=here: leaf[at], alike)
             body = chart.body(vector[: chart.size])
             leaves, form = jax.tree.flatten(body)
-            if found is not None:
-                # The body of a `Known` may have a scale of its own, which is no number.
-                both = zip(leaves, jax.tree.leaves(found), strict=True)
+            if chosen is not None:
+                # Choose leaf by leaf: the trees may differ, since the body of a `Known` may have a
+                # scale, which is no number.
+                both = zip(leaves, jax.tree.leaves(chosen), strict=True)
                 body = jax.tree.unflatten(form, [jnp.where(kind == index, *pair) for pair in both])
-            found = body
-        return found
+            chosen = body
+        return chosen
 
 
 def scaled(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
-    """The body of a chart as a user gets it: it says if its scale is arbitrary."""
+    """Return the body of a chart as a user gets it, with the scale of the chart."""
     body = chart.body(vector)
     if chart.scale is None or isinstance(body, MassProperties):
         return body
@@ -389,7 +414,8 @@ def places_of(
 ) -> Int[np.ndarray, "records numbers"]:
     """Return the places of the numbers of each recording's body among those of all bodies.
 
-    Rows of smaller charts are filled with −1. `which` (R,) is the index of each recording's body.
+    **Arguments:** `body` the chart or charts; `which` (R,) the index of each recording's body,
+    `None` for one body; `count` R. The rows of smaller charts are filled with −1.
     """
     if not isinstance(body, Bodies):
         return np.broadcast_to(np.arange(body.size), (count, body.size))
@@ -402,9 +428,9 @@ def places_of(
 def body_of_recording(
     body: AbstractBodyChart | Bodies, vector: Numbers, which: Int[Array, ""] | None
 ) -> Inertia | MassProperties:
-    """Return the body of one recording from the row that begins with its numbers.
+    """Return the body of one recording from a row `vector` that begins with its numbers.
 
-    `which` is its index among several bodies, `None` of one.
+    `which` is its index among several bodies, `None` for one body.
     """
     if not isinstance(body, Bodies):
         return body.body(vector[: body.size])
@@ -412,23 +438,23 @@ def body_of_recording(
     return body.body(vector, which)
 
 
-def charts_of(body: Any) -> tuple[Any, ...]:
-    """Return the charts of a model's body or bodies."""
+def charts_of(body: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...]:
+    """Return the charts of one body or of several."""
     return body.charts if isinstance(body, Bodies) else (body,)
 
 
-def numbers_of(body: Any, vector: Any) -> list[Any]:
-    """Return the numbers of each chart of a model's body or bodies."""
+def numbers_of(body: AbstractBodyChart | Bodies, vector: Any) -> list[Any]:
+    """Split the numbers `vector` of one body or of several into those of each chart."""
     sizes = [chart.size for chart in charts_of(body)]
     return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
 
 
 def as_list(bodies: Any) -> list[Any]:
-    """Return the bodies of `Model.bodies`, of one or of several."""
+    """Return the result of `Model.bodies`, one body or a dict of several, as a list."""
     return list(bodies.values()) if isinstance(bodies, dict) else [bodies]
 
 
 def has_mass(chart: AbstractBodyChart) -> bool:
-    """Whether the chart's bodies have a mass."""
+    """Return whether the bodies of a chart have a mass."""
     sample: Any = eqx.filter_eval_shape(chart.body, jnp.zeros(chart.size))
     return isinstance(sample, MassProperties)

@@ -1,4 +1,4 @@
-"""Free numbers inside a scene: which leaf each moves, and how."""
+"""Free numbers inside a scene: the leaf that each one moves, and how it moves the leaf."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,36 +7,37 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from rigidjax import _checks
+from rigidjax._types import Scalar
 from rigidjax.identify.model.scene import Scene
 
 
 class Free(eqx.Module):
-    """A number or array inside the torque or the sensors of a scene that the fit may move.
+    """A free number: a number or array in the torque or the sensors of a scene that a fit moves.
 
     **Arguments:**
 
-    - `where`: picks it from a `Scene`: `lambda s: s.sensors[0].bias`, or
-      `lambda s: s.torque.coefficient`. The starting value is the one that is there.
-    - `name`: for reports.
-    - `scale`: its natural size: a step of one in the fit is one `scale`, in its unit.
-    - `each`: `False` for one value for all recordings, `True` for one for each, `"body"` for one
-      for each body, or a sequence of labels, one for each recording: recordings with the same label
-      share a value.
-    - `positive`: the fit moves its logarithm, so that it keeps its sign.
-    - `prior`: a standard deviation around the starting value (a Gaussian prior, in its unit;
+    - `where`: a function that picks the number from a `Scene`, such as
+      `lambda s: s.sensors[0].bias` or `lambda s: s.torque.coefficient`. The value in the scene is
+      the starting value.
+    - `name`: its name in reports.
+    - `scale`: its natural size, in its unit; the fit counts in this size.
+    - `each`: `False` for one value for all recordings; `True` for a value for each; `"body"` for a
+      value for each body; or a sequence of labels, one for each recording: recordings with the same
+      label share a value.
+    - `positive`: whether the fit moves the logarithm of the number, so that its sign is kept.
+    - `prior`: the standard deviation of a normal prior about the starting value (in its unit;
       relative for `positive`), or `None`.
-    - `spread`: each recording deviates from the shared value by a number of its own, with this
-      standard deviation (in its unit; relative for `positive`), or `"estimated"` from the
-      deviations of three recordings or more, with one `scale` as first guess; `None` for no
-      deviations.
-    - `unit`: for reports; `None` takes the unit of a bias, a delay or a clock offset, a mounting or
-      tilt, and a place.
+    - `spread`: the standard deviation by which recordings deviate from the shared value, each by a
+      number of its own (in its unit; relative for `positive`); `"estimated"` to estimate it from
+      three recordings or more, with one `scale` as first guess; `None` for no deviations.
+    - `unit`: its unit in reports; `None` finds the unit of a bias, delay, clock offset, mounting,
+      tilt or place.
 
-    **Raises** `ValueError` for a scale, prior or spread that is not positive, and for a spread if
-    each recording has its own value already.
+    **Raises** `ValueError` for a scale, prior or spread that is not positive, and for a spread
+    together with `each=True`.
 
     >>> Free(lambda s: s.sensors[0].bias, "gyro bias", scale=0.01, spread=0.02).name
     'gyro bias'
@@ -77,12 +78,14 @@ class Free(eqx.Module):
             spread = _checks.positive(spread, f"{here}: spread", wanted)
         self.spread = spread
         if each is True and spread is not None:
-            wanted = "spread is about a shared value, each=True has none; give prior"
-            raise ValueError(f"{here}: {wanted}")
+            raise ValueError(
+                f"{here}: wanted no spread with each=True, which has no shared value to deviate "
+                "from; give a prior, or each=False"
+            )
 
 
 def checked_labels(each: Any, name: str) -> bool | str | tuple[Any, ...]:
-    """Return `each` if it is valid. **Raises** `TypeError`, `ValueError` for other values."""
+    """Return `each` of a `Free` if it is valid, labels as a tuple; else raise an error."""
     if isinstance(each, bool):
         return each
     if isinstance(each, str):
@@ -92,15 +95,24 @@ def checked_labels(each: Any, name: str) -> bool | str | tuple[Any, ...]:
 
 
 class Slot(eqx.Module):
-    """A `Free` whose leaf in the scene is known.
+    """A `Free` whose leaf in the scene has been found.
 
-    `path` is the way to the leaf in the scene, `shape` that of a step (the shape of the leaf, or
-    one that broadcasts to it); `labels` the names of groups that share a
-    value, `groups` (R,) the group of each recording, `None` for one value for all. `prior` and
-    `spread` are in steps of one `scale`. `shared` (groups, *shape) are the places of the shared
-    steps among all free numbers, `own` (R, *shape) those of each recording's step or deviation;
-    `column` is the first column of the steps in the row of a recording. No function is kept: a
-    second model does not compile again.
+    It holds no function, so that a second model does not compile again. A *step* is the change of
+    the leaf in units of `scale`.
+
+    **Fields:**
+
+    - `path`: of the leaf in the scene.
+    - `name`, `unit`, `positive`, `scale`: those of the `Free`.
+    - `each`: whether each recording has a value of its own.
+    - `shape`: of a step; it is that of the leaf, or broadcasts to it.
+    - `labels`: of the groups of recordings that share a value.
+    - `groups`: (R,) the group of each recording, `None` for one value for all.
+    - `prior`, `spread`: in units of `scale`, or `None`.
+    - `estimated`: whether the spread is estimated.
+    - `column`: of the first step in the row of a recording.
+    - `shared`: (groups, *shape) the places of the shared steps among all free numbers.
+    - `own`: (R, *shape) the places of each recording's own step, or of its deviation.
     """
 
     path: tuple[Any, ...] = eqx.field(static=True)
@@ -121,7 +133,7 @@ class Slot(eqx.Module):
 
     @property
     def columns(self) -> slice:
-        """The columns of the steps in the row of a recording."""
+        """Return the columns of the steps in the row of a recording."""
         return slice(self.column, self.column + int(np.prod(self.shape, dtype=int)))
 
     def move(self, start: Array, step: Array) -> Array:
@@ -142,7 +154,8 @@ def group_of_each(
 ) -> tuple[Int[Array, " records"], tuple[str, ...]]:
     """Return the index of each recording's group, and the labels of the groups.
 
-    The groups are the `bodies` of the recordings, or the labels in `each`.
+    The groups are the bodies of the recordings for `each` "body", else the labels in `each`.
+    `bodies` (R,) names the body of each recording.
     """
     row = list(bodies) if isinstance(each, str) else list(each)
     if len(row) != len(bodies):
@@ -169,8 +182,10 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
             raise ValueError(f"{here}: wanted a positive starting value, got {value}")
         estimated = isinstance(item.spread, str)
         if estimated and len(bodies) < 3:
-            wanted = "a spread is estimated from three recordings or more"
-            raise ValueError(f"{here}: {wanted}, got {len(bodies)}; give it")
+            raise ValueError(
+                f"{here}: wanted three recordings or more to estimate a spread, got {len(bodies)}; "
+                "give the spread as a number"
+            )
         spread = item.scale if isinstance(item.spread, str) else item.spread
         prior = _tolerance_at(scene, path) if item.prior is None else item.prior
         prior, spread = (
@@ -200,9 +215,13 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
 
 
 def leaf_at(
-    where: Callable[[Any], Any], tree: Any, name: str, what: str
+    where: Callable[[Any], Any], tree: PyTree, name: str, what: str
 ) -> tuple[tuple[Any, ...], Any]:
-    """Return the path of the leaf that `where` picks, and the leaf: an array of numbers."""
+    """Return the path of the leaf of a tree that `where` picks, and the leaf, an array of numbers.
+
+    `name` and `what` are words for errors: the object that has `where`, and the one that needs a
+    starting value.
+    """
     pairs, structure = jax.tree.flatten_with_path(tree)
     paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
     try:
@@ -237,19 +256,19 @@ def _unit_of(scene: Scene, path: tuple[Any, ...]) -> str:
     return getattr(holder, "unit", "")
 
 
-# The tolerance of a sensor that is about one of its members.
+# The tolerance that belongs to each member of a sensor.
 TOLERANCES = {"scale": "scale", "skew": "cross_axis", "bias": "bias", "offset": "clock"}
 
 
-def _tolerance_at(scene: Scene, path: tuple[Any, ...]) -> Any:
-    """Return the tolerance of the sensor for the member at `path`, `None` if it has none."""
+def _tolerance_at(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
+    """Return the tolerance of a sensor for its member at `path`; `None` without a tolerance."""
     if len(path) != 3 or getattr(path[0], "name", "") != "sensors":
         return None
     tolerance = getattr(scene.sensors[path[1].idx], "tolerance", None)
     return getattr(tolerance, TOLERANCES.get(path[2].name, ""), None)
 
 
-def put(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"]) -> Scene:
+def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"]) -> Scene:
     """Return the scene with its free numbers moved by the steps in the row of a recording."""
     paths = [slot.path for slot in slots]
     values = []
@@ -266,7 +285,7 @@ def leaves_at(scene: Scene, paths: Sequence[tuple[Any, ...]]) -> tuple[Array, ..
 
 
 def with_leaves(scene: Scene, paths: Sequence[tuple[Any, ...]], values: Sequence[Array]) -> Scene:
-    """Return the scene with other leaves at these paths."""
+    """Return the scene with the leaves at `paths` replaced by `values`."""
     pairs, structure = jax.tree.flatten_with_path(scene)
     leaves = dict(pairs) | dict(zip(paths, values, strict=True))
     return jax.tree.unflatten(structure, [leaves[path] for path, _ in pairs])

@@ -1,4 +1,4 @@
-"""The places of a recording's numbers among all free numbers: the only index of a model."""
+"""The index of a model: the place of each recording's numbers among all free numbers."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,14 +12,24 @@ from rigidjax.identify.model.free import Slot
 
 
 class Index(eqx.Module):
-    """The places of a recording's numbers among the n free numbers x of a model.
+    """The places of each recording's numbers among the n free numbers x of a model.
 
-    x holds the numbers of the bodies, the shared steps of the slots, then what one recording has
-    alone: its initial state, kind by kind, and its own steps. The row of a recording holds the
-    numbers of its body, the step of each slot, and its initial state (`start`, from column
-    `first`). A slot with deviations has one step in the row and two numbers in x, which add up:
-    `places` has a second column for it, and `columns` says which column of the row each column of
-    `places` adds to. `size` n is the place of a column without a number: charts may differ in size.
+    x holds the numbers of the bodies, then the shared steps of the slots, then the numbers that one
+    recording has alone: its initial state, part by part, and its own steps. The row of a recording
+    holds the numbers of its body, the step of each slot, and its initial state. A slot with
+    deviations has one step in the row, which is the sum of two numbers of x.
+
+    **Fields:**
+
+    - `places`: (R, columns) the place in x of each column of the rows. A slot with deviations has a
+      second column at the end. A column without a number has the place n: charts differ in size.
+    - `start`: (R, k) the places of the initial states.
+    - `columns`: the column of the row to which each column of `places` is added.
+    - `alone`: the columns of the numbers that one recording has alone.
+    - `width`: the number of columns of a row.
+    - `bodies`: the number of the numbers of all bodies.
+    - `first`: the first column of the initial state.
+    - `size`: n.
     """
 
     places: Int[Array, "records columns"]
@@ -32,7 +42,7 @@ class Index(eqx.Module):
     size: int = eqx.field(static=True)
 
     def rows(self, x: Float[Array, " n"]) -> Float[Array, "records row"]:
-        """Return the row of each recording."""
+        """Return the row of each recording for the free numbers x."""
         wide = jnp.append(x, jnp.zeros(1, x.dtype))[self.places]
         twice = np.asarray(self.columns[self.width :], int)
         if not twice.size:
@@ -46,11 +56,14 @@ def index_of(
     slots: Sequence[Slot],
     kinds: int,
 ) -> tuple[Index, tuple[Slot, ...]]:
-    """Return the index, and the slots with their places.
+    """Return the index of a model, and its slots with their places.
 
-    **Arguments:** `bodies` (R, K) the places of the numbers of each recording's body, −1 for none;
-    `size` the number of the numbers of all bodies; `kinds` how many kinds of three numbers an
-    initial state has.
+    **Arguments:**
+
+    - `bodies`: (R, K) the places of the numbers of each recording's body, −1 for none.
+    - `size`: the number of the numbers of all bodies.
+    - `slots`: the free numbers in scenes.
+    - `kinds`: the number of parts of an initial state, each of three numbers.
     """
     count, end = len(bodies), size
 
@@ -98,4 +111,5 @@ def index_of(
 
 
 def _placed(slot: Slot, column: int, shared: Array | None, own: Array | None) -> Slot:
+    """Return the slot with its column and its places."""
     return dataclasses.replace(slot, column=column, shared=shared, own=own)

@@ -1,4 +1,4 @@
-"""The model of a fit: from free numbers to the scene of each recording."""
+"""The model of a fit: it maps free numbers to the scene of each recording."""
 
 import abc
 import dataclasses
@@ -55,15 +55,15 @@ from rigidjax.motion.torques.base import AbstractForce, Torque, require_law
 from rigidjax.motion.torques.composite import parts_of
 from rigidjax.motion.torques.inputs import delays_of, inputs_of
 
-# The turn, rad, in a step of the filter, by the classical method of order 4: its error is 5e-8 of
-# the turn.
+# The largest turn, rad, in a step of the filter: the classical method of order 4 then has an error
+# of 5e-8 of the turn.
 TURN_OF_A_FILTER_STEP = 0.05
-# Even steps differ by no more than this part of the first.
+# Times are even if their steps differ by no more than this part of the first one.
 EVEN = 1e-3
 
 
 class AbstractPull(eqx.Module):
-    """Residuals of a fit beside those of readings and priors."""
+    """Residuals that pull the numbers of a fit, besides those of readings and priors."""
 
     @abc.abstractmethod
     def __call__(self, model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
@@ -73,13 +73,17 @@ class AbstractPull(eqx.Module):
 class Unpacked(eqx.Module):
     """The quantities that the free numbers of a model represent.
 
-    **Fields:** `x` (n,) the free numbers; `body`, of several bodies a dict by name; `state0` the
-    initial state, of several recordings with a leading axis; `values` of the `Free`s by name, in
-    their units; `noise` (R, k) of each sensor, in its unit, and `process`, the random torque of a
-    density, or `None`.
+    **Fields:**
 
-    >>> found = rj.identify.fit(rj.datasets.toutatis.model())
-    >>> low, high = found.interval_of(lambda point: point.state0.omega)  # a function of `Unpacked`
+    - `x`: (n,) the free numbers.
+    - `body`: the body; several bodies as a dict by name.
+    - `state0`: the initial state; of several recordings with a leading axis.
+    - `values`: the values of the `Free`s by name, in their units.
+    - `noise`: (R, k) of each sensor, in its unit, or `None`.
+    - `process`: the random torque of a density, or `None`.
+
+    >>> result = rj.identify.fit(rj.datasets.toutatis.model())
+    >>> low, high = result.interval_of(lambda point: point.state0.omega)  # a function of `Unpacked`
     >>> bool((low < high).all())
     True
     """
@@ -93,44 +97,45 @@ class Unpacked(eqx.Module):
 
 
 class Model(eqx.Module):
-    """The recordings of one body or several, and what is free in them: n numbers x → scenes.
+    """The recordings of one body or several, and the n numbers x that are free in their scenes.
 
     **Arguments:**
 
     - `recording`: one `Recording`, or a sequence of them with the same sensors: each has its own
-      initial state, all share the body. Or `Windows` of a record of measured states: each is a
+      initial state, and all share the body. Or `Windows` of a record of measured states: each is a
       short recording whose start is known, or free about the measured one.
     - `chart`: the chart of the body: `Ratios()` (the full tensor up to scale), `PrincipalRatios()`
-      (body axes known to be principal), `Tensor()`, `Principal()` (with the scale), `Mass(guess)`
-      (all ten numbers), `Known(body)`. For several bodies give recordings and charts by the bodies'
-      names, as in
+      (if the body axes are known to be principal), `Tensor()` or `Principal()` (the same with the
+      scale), `Mass(guess)` (all ten numbers), or `Known(body)`. For several bodies give recordings
+      and charts by the names of the bodies, as in
       `Model({"proof": [a, b], "box": [c]}, {"proof": Known(body), "box": Tensor(1e-3)})`.
     - `torque`: the torque on the body in every recording, or `None`. It reads the inputs of a
       recording by name: `rigidjax.torques.Input("speed")`.
     - `process`: an unknown torque as noise, a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of
-      them. `filter`, `smooth` and `LogDensity` integrate it out; `fit` follows its mean, zero.
-    - `walks`: errors of the sensors that drift, a sequence of `Walk(where, deviation, density)`,
-      for the same functions; `fit` takes them as constant.
-    - `free`: what else is free, a sequence of `Free(where, name, …)`: one value for all, for each
-      body, group or recording.
-    - `loss`: the weight of an outlier: `SoftL1()`, `Huber()`, or `None` for plain least squares.
-    - `prior`: `Entropic(guess, weight)`, a prior around a roughly known body, or `None`.
-    - `integrator`: `FixedSteps(n)` or `Adaptive(rtol, atol)` for a forced motion; `None` chooses by
+      them. `filter`, `smooth` and `LogDensity` integrate it out; `fit` takes its mean, zero.
+    - `walks`: sensor errors that drift, a sequence of `Walk(where, deviation, density)`. `filter`,
+      `smooth` and `LogDensity` follow them; `fit` takes them as constant.
+    - `free`: other free numbers, a sequence of `Free(where, name, …)`: one value for all, or one
+      for each body, group or recording.
+    - `loss`: a robust loss, `SoftL1()` or `Huber()`; `None` for plain least squares.
+    - `prior`: `Entropic(guess, weight)`, a prior about a roughly known body, or `None`.
+    - `integrator`: of a forced motion, `FixedSteps(n)` or `Adaptive(rtol, atol)`; `None` chooses by
       the sampling. `Adaptive()` is quicker if the torque is smooth and the body turns by 0.1 rad or
-      more between readings, and slow if the torque reads a noisy log. A free body is followed by
-      the closed form. Windows, and recordings whose inputs are samples, are followed by one step of
-      order 4 from each time to the next, with the samples held.
-    - `stretches` of windows in a row: deviations come from leaving out one after the other; a
-      stretch should be longer than the errors of the model last.
-    - `noise_each`: an estimated noise is one figure for all recordings (`False`), for each
-      (`True`), for each body (`"body"`), or for recordings with the same label (a sequence).
+      more between readings, but slow if the torque reads a noisy log. The motion of a free body is
+      computed by the closed form. Windows, and recordings whose inputs are samples, take one step
+      of order 4 from each time to the next, with the samples held.
+    - `stretches`: the number of stretches into which windows are divided. Deviations come from
+      leaving out one stretch after the other; a stretch should be longer than the errors of the
+      model last.
+    - `noise_each`: whether an estimated noise is one number for all recordings (`False`), for each
+      (`True`), for each body (`"body"`), or for the recordings with the same label (a sequence).
 
-    The model finds channels that were cut off at full scale; their readings there count as "at
+    The model finds channels that were cut off at full scale. A reading at full scale counts as "at
     least that much", as with a sensor's `limit`.
 
-    The motion starts at the first time of each recording. Its state is the smallest that sensors
-    and torque need: `Spin`, `Attitude`, `Rigid`. **Raises:** `TypeError` for arguments of another
-    type; `ValueError` if they do not fit together.
+    The motion starts at the first time of each recording. Its state is the smallest one that
+    sensors and torque need: `Spin`, `Attitude` or `Rigid`. **Raises:** `TypeError` for arguments of
+    another type; `ValueError` if they do not fit together.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> model = rj.identify.Model(record, rj.identify.Ratios())
@@ -227,23 +232,23 @@ class Model(eqx.Module):
         elif integrator is None and torque is not None:
             integrator = integrator_for(turn)
         self.integrator = integrator
-        # Without a number of steps: NaN in a recording is refused in words where it is used.
+        # A NaN in a recording gives no number of steps: take one, and let later checks refuse it.
         steps = turn / TURN_OF_A_FILTER_STEP
         self.filter_steps = math.ceil(steps) if 1.0 < steps < math.inf else 1
 
     @property
     def size(self) -> int:
-        """The number of free numbers."""
+        """Return the number of free numbers."""
         return self.index.size
 
     @property
     def count(self) -> int:
-        """The number of recordings."""
+        """Return the number of recordings."""
         return int(self.records.t.shape[0])
 
     @property
     def recordings(self) -> tuple[Recording, ...]:
-        """The recordings, one by one."""
+        """Return the recordings, one by one."""
         return tuple(
             stacking.cut(stacking.one(self.records, index), count)
             for index, count in enumerate(np.asarray(self.counts).tolist())
@@ -251,31 +256,39 @@ class Model(eqx.Module):
 
     @property
     def recording(self) -> Recording:
-        """The only recording, or the first."""
+        """Return the only recording, or the first one."""
         return self.recordings[0]
 
     @property
     def typical_rate(self) -> Scalar:
-        """The size of the body rate in the first recording, rad/s: the unit of its free numbers."""
+        """Return the typical body rate of the first recording, rad/s.
+
+        It is the unit of the free numbers of the initial rate.
+        """
         return self.reference.rate[0]
 
     def start(self, body: Any = None, omega: Any = None) -> Float[Array, " n"]:
-        """Return free numbers where a fit may start, or of a motion that is planned.
+        """Return free numbers with which a fit may start, or those of a planned motion.
 
-        **Arguments:** `body` an `Inertia` or `MassProperties`, a sphere for `None`; of several
-        bodies a dict of those that are known about. `omega` (3,) initial rate, rad/s, body frame,
-        of all recordings; for `None` the first readings of a gyro, or the turn between attitudes (0
-        where these are traced). What else is free stays as the scenes give it. **Raises:**
-        `ValueError` for a body that the chart does not hold, or a wrong shape.
+        Numbers of `Free`s have their starting values.
+
+        **Arguments:**
+
+        - `body`: an `Inertia` or `MassProperties`, a sphere for `None`; for several bodies a dict
+          of those that are roughly known.
+        - `omega`: (3,) the initial rate in all recordings, rad/s, body frame. With `None` it is the
+          first reading of a gyro, or the rate between attitudes (0 if these are traced).
+
+        **Raises:** `ValueError` for a body that the chart does not hold, or a wrong shape.
         """
         require_one(self)
         if isinstance(self.chart, Bodies):
-            some = dict(body) if isinstance(body, Mapping) else {}
+            by_name = dict(body) if isinstance(body, Mapping) else {}
             names, charts = self.chart.names, self.chart.charts
-            if not isinstance(body, Mapping | None) or set(some) - set(names):
+            if not isinstance(body, Mapping | None) or set(by_name) - set(names):
                 raise ValueError(f"body: wanted bodies by name, of {', '.join(names)}, or None")
             vector = jnp.concatenate(
-                [_numbers(chart, some.get(n)) for n, chart in zip(names, charts, strict=True)]
+                [_numbers(chart, by_name.get(n)) for n, chart in zip(names, charts, strict=True)]
             )
         else:
             vector = _numbers(self.chart, body)
@@ -293,7 +306,8 @@ class Model(eqx.Module):
         rest = self.size - vector.size - spin.size
         own = sum(s.own.size for s in self.slots if s.own is not None)
         zeros = xp.zeros(rest - own, kind), xp.zeros(own, kind)
-        # The initial rates come last of what each recording has alone, but for its own steps.
+        # The order is that of `Index`: bodies and shared steps, initial states with the rates last,
+        # own steps.
         parts = [xp.asarray(vector, kind), zeros[0], spin.reshape(-1), zeros[1]]
         return jnp.asarray(xp.concatenate(parts))
 
@@ -312,22 +326,22 @@ class Model(eqx.Module):
         return scaled(self.chart, numbers)
 
     def scenes(self, x: Float[Array, " n"]) -> Scene:
-        """Return the scene of each recording, with a leading axis."""
+        """Return the scene of each recording at the free numbers x, with a leading axis."""
         return scenes_of(self, require_numbers(self, x))
 
     def values(self, x: Float[Array, " n"]) -> dict[str, Array]:
-        """Return the value of each `Free`, by name, in its unit.
+        """Return the value of each `Free` at the free numbers x, by name, in its unit.
 
-        The shape is (R, …) with one value for each recording, (groups, …) with one for each group.
-        A `Free` with a `spread` gives the shared value, and each recording's value under "its name,
-        own".
+        The shape is (R, …) for a value for each recording, (groups, …) for one for each group. A
+        `Free` named "drag" with a `spread` has the shared value under "drag", and the values of all
+        recordings under "drag, own".
         """
         return values_of(self, require_numbers(self, x))
 
     def motion(self, x: Float[Array, " n"]) -> Any:
-        """Return the states at the recording's times, with a leading time axis.
+        """Return the states at the times of the recording, with a leading time axis.
 
-        With several recordings another axis leads.
+        Several recordings have an axis of their own before it.
         """
         x = require_numbers(self, x)
 
@@ -339,17 +353,21 @@ class Model(eqx.Module):
         return stacking.one(states, 0) if self.count == 1 else states
 
     def errors(self, x: Float[Array, " n"]) -> tuple[Float[Array, "*records times _"], ...]:
-        """Return reading minus prediction for each sensor, in its unit; zero where masked."""
+        """Return reading minus prediction for each sensor at the free numbers x, in its unit.
+
+        It is zero for a masked reading.
+        """
         x = require_numbers(self, x)
         out = all_errors(self, x)
         return tuple(e[0] for e in out) if self.count == 1 else out
 
 
 class _Data(NamedTuple):
-    """What a model takes from its recordings or windows.
+    """The parts of a model that come from its recordings or windows.
 
-    `sensors` are those of one recording; `kinds` is how many kinds of three numbers an initial
-    state has that is free; `widest` the longest time between two samples, s.
+    **Fields**, besides those of `Model`: `sensors` of one recording; `kinds` the number of parts,
+    of three numbers each, of an initial state that is free; `widest` the longest time between two
+    samples, s.
     """
 
     records: Recording
@@ -364,8 +382,8 @@ class _Data(NamedTuple):
 
 
 def _data_of_recordings(recordings: list[Recording], torque: Any, charts: Any) -> _Data:
-    """Return the data of recordings: each starts in a free state."""
-    _are_recordings(recordings)
+    """Return the data of recordings, each of which starts in a free state."""
+    _require_recordings(recordings)
     recordings = with_limits(recordings)
     _require_inputs(torque, [recording.inputs for recording in recordings])
     for number, one in enumerate(recordings):
@@ -373,7 +391,7 @@ def _data_of_recordings(recordings: list[Recording], torque: Any, charts: Any) -
     records, counts = stacking.stack(recordings)
     sensors = recordings[0].sensors
     state_kind = _state_kind(sensors, torque, charts)
-    # The readings are known: so are these numbers, within a trace of the torque, too.
+    # The readings are known, even if the torque is traced: keep these numbers known, too.
     with jax.ensure_compile_time_eval():
         reference = reference_of(recordings, state_kind)
     kinds = dimension(stacking.one(reference.state, 0)) // 3
@@ -382,7 +400,7 @@ def _data_of_recordings(recordings: list[Recording], torque: Any, charts: Any) -
 
 
 def _data_of_windows(windows: Windows, torque: Any, charts: Any, stretches: int) -> _Data:
-    """Return the data of windows: each starts in a measured state, known or free about it."""
+    """Return the data of windows: each starts in its measured state, or in a free one about it."""
     require_inputs_of_windows(torque, windows)
     records = windows.records()
     counts = np.full(windows.count, windows.length + 1, np.int32)
@@ -419,19 +437,19 @@ def _require_own_names(slots: Sequence[Slot], charts: Any) -> None:
     taken = {name for one in charts_of(charts) for name in (*one.log_names, *one.plain_names)}
     for slot in slots:
         if slot.name in taken | {"Ωx", "Ωy", "Ωz"}:
-            wanted = "a quantity of the body has this name; give another"
-            raise ValueError(f"Free {slot.name!r}: {wanted}")
+            words = "a quantity of the body has this name; give another"
+            raise ValueError(f"Free {slot.name!r}: {words}")
 
 
 def unpacked(model: Model, x: Float[Array, " n"]) -> Unpacked:
-    """Return `Model.unpack` without a check of x."""
+    """Return the result of `Model.unpack`, without a check of x."""
     starts = jax.vmap(ReferenceStates.moved)(model.reference, x[model.index.start])
     state0 = stacking.one(starts, 0) if model.count == 1 else starts
     return Unpacked(x, model.bodies(x), state0, values_of(model, x))
 
 
 def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
-    """Return `Model.scenes` without a check of x."""
+    """Return the result of `Model.scenes`, without a check of x."""
 
     def of_one(row: Array, *rest: Any) -> Scene:
         return scene_of(model, row, *rest)
@@ -441,7 +459,7 @@ def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
 
 
 def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
-    """Return `Model.values` without a check of x."""
+    """Return the result of `Model.values`, without a check of x."""
     rows, out = model.index.rows(x), {}
     starts = starting_values(model)
     for slot, start in zip(model.slots, starts, strict=True):
@@ -462,7 +480,7 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
 
 
 def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
-    """Return the value at which each slot starts in each recording."""
+    """Return the starting value of each slot in each recording."""
     leaves, out = dict(jax.tree.leaves_with_path(template(model, model.records))), []
     for slot in model.slots:
         leaf = jnp.asarray(leaves[slot.path])
@@ -472,14 +490,14 @@ def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
 
 
 def require_one(model: Any) -> Model:
-    """Return `model`, if it is one `Model`; else raise `TypeError` or `ValueError`."""
+    """Return `model`; raise `TypeError` or `ValueError` unless it is one `Model`, not a batch."""
     _checks.instance(model, Model, "model")
     records, rate = model.records, model.reference.rate
     shapes = {records.t.shape, *(reading.mask.shape for reading in records.readings)}
     if len(shapes) > 1 or records.t.ndim != 2 or rate.shape != records.t.shape[:1]:
         raise ValueError(
             "model: wanted one, as Model(recording, …) makes it, got times and masks of shapes "
-            f"{sorted(shapes)}; take many one by one"
+            f"{sorted(shapes)}; give many one by one"
         )
     _checks.numbers(records.t, "model")
     if _checks.known(rate):
@@ -488,7 +506,7 @@ def require_one(model: Any) -> Model:
 
 
 def require_numbers(model: Model, x: Any) -> Float[Array, " n"]:
-    """Return x, if these are free numbers of this model; else raise `TypeError`, `ValueError`."""
+    """Return the free numbers x; raise an error unless they are numbers of this model."""
     require_one(model)
     hint = "model.start(body) makes them"
     numbers = _checks.numbers(x, "x")
@@ -507,7 +525,7 @@ def require_numbers(model: Model, x: Any) -> Float[Array, " n"]:
 
 
 def with_parts(model: Model, **parts: Any) -> Model:
-    """Return the model with these fields in the place of its own, as they are.
+    """Return the model with the fields `parts` replaced, unchecked.
 
     `dataclasses.replace` would call `Model(…)`, and `equinox.tree_at` cannot replace a tuple
     without leaves.
@@ -522,25 +540,25 @@ def _require_states(windows: Windows, kind: type) -> None:
     """Raise `TypeError` if the torque needs more than the measured states have."""
     if not isinstance(windows.starts, kind):
         raise TypeError(
-            f"windows: the torque acts on {kind.__name__}, and the measured states are "
+            f"windows: wanted measured states of type {kind.__name__}, which the torque needs, got "
             f"{type(windows.starts).__name__}"
         )
 
 
 def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) -> None:
     """Raise `ValueError` if the torque reads an input that a recording lacks."""
-    for number, some in enumerate(inputs):
-        missing = [name for name in inputs_of(torque) if name not in some]
+    for number, of_one in enumerate(inputs):
+        missing = [name for name in inputs_of(torque) if name not in of_one]
         if missing:
             raise ValueError(
                 f"torque: it reads {', '.join(map(repr, missing))}, and recording {number} has "
-                f"{', '.join(map(repr, some)) or 'no inputs'}; give "
+                f"{', '.join(map(repr, of_one)) or 'no inputs'}; give "
                 "Recording(…, inputs={name: samples or a function of time})"
             )
 
 
 def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
-    """Raise `ValueError` if windows lack an input of the torque, or what a delay reads of it."""
+    """Raise `ValueError` if windows lack an input of the torque, or samples that a delay reads."""
     missing = [name for name in inputs_of(torque) if name not in windows.inputs]
     if missing:
         have = ", ".join(map(repr, windows.inputs)) or "none"
@@ -554,7 +572,7 @@ def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
 
 
 def words_on_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
-    """Return the mistakes of delays at the free numbers x, in words; none of other recordings."""
+    """Describe the delays that at the free numbers x read beyond their windows; none otherwise."""
     if model.clusters is None or not delays_of(model.torque):
         return []
     t, rows = np.asarray(model.records.t)[0], max(len(a[0]) for a in model.records.inputs.values())
@@ -565,17 +583,20 @@ def words_on_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
 
 @eqx.filter_jit
 def _scenes(model: Model, x: Float[Array, " n"]) -> Scene:
-    # As one program: outside of a trace each operation of JAX costs as much as a run of 100 steps.
+    """Return the result of `scenes_of` by one program.
+
+    Outside of a trace each operation of JAX takes as long as a run of 100 steps.
+    """
     return scenes_of(model, x)
 
 
 def _samples_read(torque: Torque | None, recording: Recording) -> list[str]:
-    """Return the names of the inputs that the torque reads and that are samples."""
+    """Return the names of the inputs that are samples and that the torque reads."""
     return [name for name in inputs_of(torque) if not callable(recording.inputs[name])]
 
 
 def _require_even_times(torque: Torque | None, recording: Recording, number: int) -> None:
-    """Raise `ValueError` for samples as inputs at uneven times."""
+    """Raise `ValueError` for inputs that are samples at uneven times."""
     names, steps = _samples_read(torque, recording), np.diff(np.asarray(recording.t, float))
     if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
         raise ValueError(
@@ -586,7 +607,7 @@ def _require_even_times(torque: Torque | None, recording: Recording, number: int
 
 
 def _require_held_steps(integrator: Any) -> None:
-    """Raise `ValueError` for steps through which samples are not held."""
+    """Raise `ValueError` for an integrator that does not hold samples in its steps."""
     if integrator is not None and not isinstance(integrator, HeldSteps):
         raise ValueError(
             "integrator: samples as inputs are held through one step from each time to the next; "
@@ -596,7 +617,7 @@ def _require_held_steps(integrator: Any) -> None:
 
 
 def _by_body(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
-    """Return the recordings in a row, the chart or charts, and the body's name for each one."""
+    """Return all recordings, the chart or charts, and the name of the body of each recording."""
     if isinstance(recording, Mapping) or isinstance(body, Mapping):
         if not (isinstance(recording, Mapping) and isinstance(body, Mapping)):
             raise TypeError(
@@ -612,12 +633,12 @@ def _by_body(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str
             _checks.instance(chart, AbstractBodyChart, "body", wanted="a chart such as Tensor()")
         rows, of = [], []
         for name in body:
-            found = recording[name]
-            some = [found] if isinstance(found, Recording) else list(found)
-            if not some:
-                raise ValueError(f"Model: no recording of {name!r}")
-            rows += some
-            of += [name] * len(some)
+            of_body = recording[name]
+            of_body = [of_body] if isinstance(of_body, Recording) else list(of_body)
+            if not of_body:
+                raise ValueError(f"Model: wanted a recording of {name!r}, got none")
+            rows += of_body
+            of += [name] * len(of_body)
         return rows, Bodies(body), tuple(of)
     if isinstance(recording, Recording):
         return [recording], body, ("",)
@@ -625,7 +646,8 @@ def _by_body(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str
     return rows, body, ("",) * len(rows)
 
 
-def _are_recordings(recordings: Sequence[Any]) -> None:
+def _require_recordings(recordings: Sequence[Any]) -> None:
+    """Raise an error unless these are known recordings, at least one, each without a batch."""
     if not recordings:
         raise ValueError("Model: wanted at least one Recording, got an empty sequence")
     for item in recordings:
@@ -645,7 +667,7 @@ def _are_recordings(recordings: Sequence[Any]) -> None:
 
 
 def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
-    """Return the chart's numbers of a guess, or its default start."""
+    """Return the numbers of a body in a chart; zeros, the start of the chart, for `None`."""
     if body is None:
         return _zeros(chart.size)
     body = validation.single(body, (Inertia, MassProperties), "body")
@@ -663,17 +685,20 @@ def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
 
 
 def _zeros(*shape: int) -> Array:
-    """Return zeros by NumPy: JAX compiles a program for each shape."""
+    """Return zeros, made by NumPy: JAX would compile a program for each shape."""
     return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
 
 
 def _state_kind(sensors: Any, torque: Any, body: AbstractBodyChart | Bodies) -> type:
-    """Return the smallest kind of state that sensors and torque need."""
-    felt = [sensor.feels for sensor in sensors]
+    """Return the smallest type of state that sensors and torque need.
+
+    Raise `ValueError` if the body needs a mass and has none.
+    """
+    needed = [sensor.feels for sensor in sensors]
     if torque is not None:
-        felt.append(getattr(torque, "feels", HasAttitude))
+        needed.append(getattr(torque, "feels", HasAttitude))
     forced = any(isinstance(part, AbstractForce) for part in parts_of(torque))
-    if HasPose in felt or forced:
+    if HasPose in needed or forced:
         for chart in charts_of(body):
             if not has_mass(chart):
                 raise ValueError(
@@ -682,4 +707,4 @@ def _state_kind(sensors: Any, torque: Any, body: AbstractBodyChart | Bodies) -> 
                     f"{type(chart).__name__}"
                 )
         return Rigid
-    return Attitude if HasAttitude in felt else Spin
+    return Attitude if HasAttitude in needed else Spin

@@ -1,4 +1,4 @@
-"""Normal equations; the numbers of one recording alone go out of them by their Schur complement."""
+"""Normal equations, from which the numbers of one recording alone are eliminated (Schur)."""
 
 from collections.abc import Sequence
 
@@ -10,8 +10,10 @@ from jaxtyping import Array, Float, Int
 
 
 class Alone(eqx.Module):
-    """The part of a normal matrix with numbers that one recording alone has, at the places `at` of
-    all: `own` among themselves, `sides` with those in the core.
+    """The part of a normal matrix that belongs to numbers which one recording has alone.
+
+    **Fields:** `own` (R, k, k) the blocks of these numbers; `sides` (R, k, s) their blocks with the
+    numbers of the core; `at` (R, k) their places among all numbers.
     """
 
     own: Float[Array, "records k k"]
@@ -20,8 +22,10 @@ class Alone(eqx.Module):
 
 
 class Normal(eqx.Module):
-    """A normal matrix of n numbers: `core` (s, s) of the first ones, which recordings share, and
-    what is `alone`; for `None` all n numbers are in the core.
+    """A normal matrix of n numbers.
+
+    **Fields:** `core` (s, s) the block of the first s numbers, which recordings share; `alone` the
+    rest, or `None` if all n numbers are in the core.
     """
 
     core: Float[Array, "s s"]
@@ -29,12 +33,12 @@ class Normal(eqx.Module):
 
     @property
     def diagonal(self) -> Float[Array, " n"]:
-        """Its diagonal."""
+        """Return the diagonal."""
         own = self.alone and jnp.diagonal(self.alone.own, axis1=1, axis2=2)
         return self._joined(jnp.diagonal(self.core), own)
 
     def plus(self, diagonal: Float[Array, " n"]) -> "Normal":
-        """The matrix with these numbers added to its diagonal."""
+        """Return the matrix with the numbers `diagonal` added to its diagonal."""
         shared, own = self._split(diagonal)
         core, alone = self.core + jnp.diag(shared), self.alone
         if alone is None:
@@ -42,12 +46,15 @@ class Normal(eqx.Module):
         return Normal(core, Alone(alone.own + jax.vmap(jnp.diag)(own), alone.sides, alone.at))
 
     def wider(self, rows: Float[Array, "m n"]) -> "Normal":
-        """The matrix of these residuals, too, that only numbers in the core change."""
+        """Return the matrix with residuals of derivative `rows` added.
+
+        These residuals may change only with numbers of the core.
+        """
         rows = rows[:, : self.core.shape[0]]
         return Normal(self.core + rows.T @ rows, self.alone)
 
     def scaled(self, unit: Float[Array, " n"]) -> "Normal":
-        """The matrix of numbers in these units."""
+        """Return the matrix of the numbers counted in the units `unit`."""
         shared, own = self._split(unit)
         core, alone = self.core * (shared[:, None] * shared[None, :]), self.alone
         if alone is None:
@@ -62,11 +69,11 @@ class Normal(eqx.Module):
         if alone is None:
             return first
         first = first + jnp.einsum("rks,rk->s", alone.sides, own)
-        beside = jnp.einsum("rks,s->rk", alone.sides, shared)
-        return self._joined(first, jnp.einsum("rkl,rl->rk", alone.own, own) + beside)
+        from_core = jnp.einsum("rks,s->rk", alone.sides, shared)
+        return self._joined(first, jnp.einsum("rkl,rl->rk", alone.own, own) + from_core)
 
     def solve(self, side: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
-        """The x with `matrix @ x = side`; NaN unless the matrix is positive definite."""
+        """Return the x with `matrix @ x = side`; NaN unless the matrix is positive definite."""
         alone, count = self.alone, self.core.shape[0]
         if alone is None:
             return _solve(self.core, side)
@@ -78,9 +85,11 @@ class Normal(eqx.Module):
         return self._joined(first, last).reshape(side.shape)
 
     def _split(self, x: Array) -> tuple[Array, Array]:
+        """Return the rows of x (n, …) of the core, and those (R, k, …) of one recording alone."""
         return (x, x) if self.alone is None else (x[: self.core.shape[0]], x[self.alone.at])
 
     def _joined(self, shared: Array, own: Array | None) -> Array:
+        """Return all rows (n, …) from those of the core and of one recording alone."""
         if self.alone is None:
             return shared
         first, at = shared.shape[0], self.alone.at
@@ -89,15 +98,22 @@ class Normal(eqx.Module):
 
 
 def _solve(matrix: Array, side: Array) -> Array:
+    """Solve `matrix x = side` by Cholesky's decomposition."""
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), side)
 
 
 def normal_of(
     blocks: Sequence[Array], where: Array, size: int, own: np.ndarray | None = None
 ) -> Normal:
-    """Σ JᵀJ of blocks (R, T, j, m), their columns at the places `where` (R, m) of `size` numbers.
+    """Return the normal matrix Σ JᵀJ of the blocks J (R, T, j, m) of all sensors.
 
-    The columns `own` are of one recording alone, and go out of the core; for `None` all are in it.
+    **Arguments:**
+
+    - `blocks`: J of each sensor.
+    - `where`: (R, m) the places of their columns among all numbers.
+    - `size`: the number of all numbers.
+    - `own`: the columns of the numbers that one recording has alone; `None` puts all numbers into
+      the core.
     """
     count, columns = where.shape
     alone = np.zeros(0, int) if own is None else own
@@ -105,7 +121,7 @@ def normal_of(
     squares = jnp.zeros((count, columns, columns), blocks[0].dtype)
     for rows in blocks:
         squares = squares + jnp.einsum("rtki,rtkj->rij", rows, rows)
-    # A column of no number has the last place.
+    # A column without a number goes to an additional last row, which is dropped.
     last = size - count * alone.size
     at = jnp.minimum(where[:, rest], last)
     core = jnp.zeros((last + 1, last + 1), squares.dtype)

@@ -1,4 +1,4 @@
-"""From a body and an initial state to the states at a recording's times, and to readings."""
+"""The states of a body at the times of a recording, and the readings of sensors along them."""
 
 import abc
 import math
@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
@@ -31,20 +31,24 @@ from rigidjax.solve.fixed_loop import first_row, first_rows, step
 from rigidjax.solve.steppers import cheapest, stepper_of
 from rigidjax.solve.tableaus import KUTTA4
 
-# The turn in a step, rad: the error of a fifth-order method is then 1e-9 a radian. A method of
-# order 4 has it in steps shorter by the second factor, at two thirds of the cost.
+# The turn in a step, rad, at which a method of order 5 has an error of 1e-9 a radian, and the turn
+# at which a method of order 4 has this error, at two thirds of the cost a step.
 TURN_A_STEP, TURN_OF_ORDER_4 = 0.1, 0.02
 # More fixed steps than this between two samples cost more than adaptive steps.
 FINEST = 32
-# The least relative tolerance at which steps are compared, and the part of one to the next.
+# The least relative tolerance to which adaptive steps are refined, and the factor of a refinement.
 _LEAST, _CLOSER = 2.5e-14, 1e-2
+
+
+Body = Inertia | MassProperties
+State = Spin | Attitude | Rigid
 
 
 class AbstractIntegrator(eqx.Module):
     """The integrator of a forced motion inside a fit, differentiable in forward mode.
 
-    At its end a fit compares the predictions with those of `finer` steps, and goes on with these if
-    a prediction changes by more than a twentieth of its noise.
+    At its end a fit compares its predictions with those of shorter steps (`finer`). If a prediction
+    changes by more than a twentieth of its noise, the fit goes on with the shorter steps.
 
     >>> class Halves(AbstractIntegrator):  # two equal steps from one sample to the next
     ...     def states(self, body, state0, ts, torque):
@@ -54,25 +58,29 @@ class AbstractIntegrator(eqx.Module):
     """
 
     @abc.abstractmethod
-    def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        """The states at `ts`, with a leading time axis.
+    def states(
+        self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
+    ) -> PyTree:
+        """Return the states at `ts` from `state0` at the first time, with a leading time axis.
 
-        They are a `motion.Coupled` if a torque has states of its own and a sensor needs them.
+        They are a `motion.Coupled` if the torque has states of its own.
         """
 
     def finer(self) -> "AbstractIntegrator | None":
-        """Shorter steps that a fit compares its own with; `None` if there are none."""
+        """Return an integrator of shorter steps, for comparison; `None` if there is none."""
         return None
 
 
 class FixedSteps(AbstractIntegrator):
-    """The same number of fixed steps between any two samples.
+    """The integrator that makes the same number of fixed steps between any two samples.
 
-    It is the cheapest if samples are close together, as in logs of 100 Hz and more.
+    It is the cheapest one if samples are close together, as in logs of 100 Hz and more.
 
-    **Arguments:** `substeps` the number of steps between two samples; `solver` the method, one of
-    `rigidjax.solvers`: Tsitouras's of order 5 unless given; `last` the number of the last time
-    that is needed, `None` for all.
+    **Arguments:**
+
+    - `substeps`: the number of steps between two samples.
+    - `solver`: the method, one of `rigidjax.solvers`; Tsitouras's of order 5 unless given.
+    - `last`: the index of the last time that is needed, `None` for all.
 
     >>> FixedSteps(2).substeps
     2
@@ -86,7 +94,9 @@ class FixedSteps(AbstractIntegrator):
         _checks.whole(self.substeps, "substeps", 1)
         _checks.instance(self.solver, AbstractExplicit, "solver", wanted="one of rigidjax.solvers")
 
-    def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
+    def states(
+        self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
+    ) -> PyTree:
         y0 = started(body, state0, torque, ts[0])
         field = equations_of_motion(body, y0, torque)
         return fixed(in_a_loop(self.solver), field, ts, y0, self.substeps, self.last)
@@ -98,14 +108,15 @@ class FixedSteps(AbstractIntegrator):
 
 
 def _tolerance(name: str) -> Callable[[ScalarLike], Array]:
+    """Return a converter of a field to an array, so that another value compiles no new program."""
     return lambda value: jnp.asarray(_checks.number(value, name), jnp.result_type(float))
 
 
 class Adaptive(AbstractIntegrator):
-    """Steps chosen by the tolerances, through `rigidjax.simulate`.
+    """The integrator that chooses its steps by tolerances, through `rigidjax.simulate`.
 
-    **Arguments:** `rtol`, `atol` as there. In float32 `rtol` is at least 1.2e-5. Another tolerance
-    does not compile again.
+    **Arguments:** `rtol`, `atol` as for `rigidjax.simulate`. In float32 `rtol` is at least 1.2e-5.
+    Another tolerance does not compile again.
 
     >>> float(Adaptive().rtol)
     1e-09
@@ -118,14 +129,17 @@ class Adaptive(AbstractIntegrator):
         _checks.positive(self.rtol, "rtol")
         _checks.not_negative(self.atol, "atol")
 
-    def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        # A solver refuses repeated times, the tail of a shorter record: they grow by round-off.
+    def states(
+        self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
+    ) -> PyTree:
+        # The padding of a shorter record repeats its last time, which a solver refuses: let these
+        # times grow a little.
         first = jnp.zeros(1, bool)
-        again = jnp.cumsum(jnp.concatenate([first, jnp.diff(ts) <= 0]).astype(ts.dtype))
+        repeats = jnp.cumsum(jnp.concatenate([first, jnp.diff(ts) <= 0]).astype(ts.dtype))
         out = simulate(
             body,
             state0,
-            ts + 1e-9 * (ts[-1] - ts[0]) * again,
+            ts + 1e-9 * (ts[-1] - ts[0]) * repeats,
             torque,
             rtol=jnp.maximum(self.rtol.astype(ts.dtype), 100 * jnp.finfo(ts.dtype).eps),
             atol=self.atol,
@@ -151,12 +165,12 @@ def integrator_for(turn: float) -> AbstractIntegrator:
 
 def states_at(
     integrator: AbstractIntegrator | None,
-    body: Inertia | MassProperties,
-    state0: Any,
+    body: Body,
+    state0: State,
     ts: Float[Array, " times"],
     torque: Torque | None,
-) -> Any:
-    """The states at `ts` from `state0` at `ts[0]`: the closed form for a free body."""
+) -> PyTree:
+    """Return the states at `ts` from `state0` at `ts[0]`: by the closed form for a free body."""
     if torque is not None:
         assert integrator is not None
         return integrator.states(body, state0, ts, torque)
@@ -164,32 +178,36 @@ def states_at(
 
 
 class HeldSteps(AbstractIntegrator):
-    """One step of order 4 from one sample to the next, with the inputs held through it.
+    """The integrator that makes a step of order 4 between samples, and holds the inputs in it.
 
-    Samples are evenly spaced. A delayed input changes inside a step, which is split there. `last`
-    is the number of the last time that is needed, `None` for all.
+    Samples are evenly spaced. A delayed input changes inside a step, which is then split at the
+    change.
+
+    **Arguments:** `last` the index of the last time that is needed, `None` for all.
 
     >>> HeldSteps().last
     """
 
     last: Int[Array, ""] | None = eqx.field(default=None, repr=False)
 
-    def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
+    def states(
+        self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
+    ) -> PyTree:
         return self.driven(body, state0, ts, torque, {})
 
     def driven(
         self,
-        body: Any,
-        state0: Any,
+        body: Body,
+        state0: State,
         ts: Float[Array, " times"],
         torque: Torque,
         inputs: dict[str, Array],
-    ) -> Any:
-        """Return the states at `ts` (T,); `inputs` by name (before + T, *k).
+    ) -> PyTree:
+        """Return the states at `ts` (T,) under a torque that is driven by `inputs`.
 
-        Row before + i is held through the step from time i, the last one beyond the last time. A
-        torque's own states follow the rows before the first time, with the body held at its initial
-        state.
+        The inputs are arrays (before + T, *k) by name. Row before + i is held in the step from time
+        i, and the last row beyond the last time. A torque's own states follow the rows before the
+        first time, while the body is held at its initial state.
         """
         count, size = ts.shape[0] - 1, (ts[1] - ts[0]).astype(state0.omega.dtype)
         before = max((len(rows) - ts.shape[0] for rows in inputs.values()), default=0)
@@ -197,11 +215,11 @@ class HeldSteps(AbstractIntegrator):
         field = equations_of_motion(body, start, torque)
         stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
 
-        def one(y: Any, i: Array) -> tuple[Any, Any]:
+        def one(y: PyTree, i: Array) -> tuple[PyTree, PyTree]:
             y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
             return y, stepper.state(y)
 
-        def warm_up(y: Any, i: Array) -> tuple[Any, None]:
+        def warm_up(y: PyTree, i: Array) -> tuple[PyTree, None]:
             # The torque's own states follow the inputs; the body keeps its initial state.
             y, _ = one(y, i)
             return split(Coupled(start.motion, stepper.state(y).own)), None
@@ -214,25 +232,41 @@ class HeldSteps(AbstractIntegrator):
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, later)
 
 
-def shifted(field: Callable[..., Any], t: Array, state: Any, offset: Array) -> Any:
-    """The state `offset` s later or earlier: four steps of the classical method of order 4."""
+def shifted(field: Callable[..., Any], t: Array, state: PyTree, offset: Array) -> PyTree:
+    """Return the state at t + `offset`, s, by four steps of the classical method of order 4."""
     h = offset / 4.0
     for index in range(4):
         state = advance(KUTTA4, lambda t, y: field(t, y, None), t + index * h, h, state)
     return state
 
 
-def body_of_equations(body: Any, rung: type) -> Any:
-    """The body of the equations of motion: a body at a fixed point needs no mass."""
-    return body.inertia if isinstance(body, MassProperties) and rung is not Rigid else body
+def body_of_equations(body: Body, state_type: type) -> Body:
+    """Return the body of the equations of motion of a state of this type.
+
+    Only the equations of a `Rigid` need the mass; the others take the inertia alone.
+    """
+    return body.inertia if isinstance(body, MassProperties) and state_type is not Rigid else body
 
 
 def sensor_inputs(
-    sensor: Any, body: Any, torque: Any, ts: Array, state0: Any, states: Any, late: Any = None
-) -> tuple[Array, Any, Callable[[Array, Any], SensorInput]]:
-    """The times that a sensor shows at `ts` (T,), by its clock, and `late` s later, one number or
-    (T,); the states then; its input at one time. `states` are `Coupled` if a torque has states of
-    its own.
+    sensor: AbstractSensor,
+    body: Body,
+    torque: Torque | None,
+    ts: Array,
+    state0: State,
+    states: PyTree,
+    late: Array | None = None,
+) -> tuple[Array, PyTree, Callable[[Array, PyTree], SensorInput]]:
+    """Return the times and states that a sensor reads, and a function to its input at one time.
+
+    **Arguments:**
+
+    - `sensor`: it reads at t + `offset`, if its clock is behind.
+    - `body`, `torque`: of the motion.
+    - `ts`: (T,) the times of the readings.
+    - `state0`, `states`: the initial state, and the states at `ts`; `Coupled` if a torque has
+      states of its own.
+    - `late`: s, a further delay, one number or (T,).
     """
     turned = body_of_equations(body, type(state0))
     field = equations_of_motion(turned, state0, torque)
@@ -248,34 +282,38 @@ def sensor_inputs(
             axes = (0, 0, 0 if jnp.ndim(offset) else None)
             states = jax.vmap(partial(shifted, whole), axes)(ts, states, offset)
 
-    def now(t: Array, state: Any) -> SensorInput:
+    def input_at(t: Array, state: PyTree) -> SensorInput:
         if not isinstance(state, Coupled):
             return SensorInput(t, state, body, field)
         return SensorInput(t, state.motion, body, freeze(field, state.own), state.own)
 
-    return times, states, now
+    return times, states, input_at
 
 
 def errors_along(
-    sensor: Any, values: Array, times: Array, states: Any, now: Callable[[Array, Any], SensorInput]
+    sensor: AbstractSensor,
+    values: Array,
+    times: Array,
+    states: PyTree,
+    input_at: Callable[[Array, PyTree], SensorInput],
 ) -> Float[Array, "times k"]:
-    """The errors of readings `values` (T, …) along a motion, as `sensor_inputs` gives it."""
+    """Return the errors of readings `values` (T, …); the other arguments are of `sensor_inputs`."""
 
-    def error(t: Array, state: Any, value: Array) -> Array:
-        return _error_of(sensor, now(t, state), value)
+    def error(t: Array, state: PyTree, value: Array) -> Array:
+        return _error_of(sensor, input_at(t, state), value)
 
     lowpass = getattr(sensor, "lowpass", None)
     if lowpass is None:
         return jax.vmap(error)(times, states, values)
-    # The error of a zero reading is the prediction with the opposite sign.
+    # The error of a zero reading is minus the prediction, which the filter then smooths.
     return values + lowpass(times, jax.vmap(error)(times, states, jnp.zeros_like(values)))
 
 
-def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:
-    """The checked result of a sensor's `error`, which a user may have written."""
+def _error_of(sensor: AbstractSensor, now: SensorInput, value: Array) -> Array:
+    """Return the error of a reading, checked: a user may have written the method `error`."""
     name = type(sensor).__name__
     try:
-        found = sensor.error(now, value)
+        error = sensor.error(now, value)
     except AttributeError as wrong:
         if type(now.state).__name__ not in str(wrong):
             raise
@@ -284,12 +322,12 @@ def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:
             "than that: set feels = rj.motion.HasAttitude, or rj.motion.HasPose"
         ) from wrong
     wanted = (sensor.components,)
-    if jnp.shape(found) != wanted:
+    if jnp.shape(error) != wanted:
         raise ValueError(
             f"{name}.error: wanted reading minus prediction of shape {wanted}, as components = "
-            f"{sensor.components} says, got {jnp.shape(found)}"
+            f"{sensor.components} says, got {jnp.shape(error)}"
         )
-    return found
+    return error
 
 
 def simulate_readings(
@@ -301,17 +339,21 @@ def simulate_readings(
     *,
     key: Any = None,
 ) -> Any:
-    """The readings of a sensor along a known motion, with noise: data to test a fit.
+    """Return the readings of a sensor along a known motion, with noise: data to test a fit.
 
-    The motion comes from `rigidjax.simulate`; bias, scale, mounting, clock offset, low-pass filter
-    and full scale from the sensor. It may be differentiated, jitted and batched.
+    `rigidjax.simulate` computes the motion. Bias, scale, mounting, clock offset, low-pass filter
+    and full scale are those of the sensor. The function may be differentiated, jitted and batched.
 
-    **Arguments:** `sensor` an `AbstractSensor`, or a sequence of them along one motion; `body`,
-    `state0`, `ts` (T,) s, `torque` as for `rigidjax.simulate`; `MassProperties` are allowed for all
-    states (a sensor's `place` is then in their frame). `key` of `jax.random`: normal noise of the
-    sensor's standard deviation `noise` is added, and times scatter by its `jitter`; `None` for
-    readings without either. **Returns** readings (T, …) by the sensor's `reading_shape`, in its
-    unit, for `Recording(ts, (sensor, readings), torque=torque)`; for a sequence a tuple of them.
+    **Arguments:**
+
+    - `sensor`: an `AbstractSensor`, or a sequence of them along one motion.
+    - `body`, `state0`, `ts` (T,) s, `torque`: as for `rigidjax.simulate`. `MassProperties` are
+      allowed for all states; a sensor's `place` is then in their frame.
+    - `key`: of `jax.random`, to add normal noise of the sensor's `noise`, and to scatter the times
+      by its `jitter`; `None` for readings without either.
+
+    **Returns** readings (T, …) by the sensor's `reading_shape`, in its unit, for
+    `Recording(ts, (sensor, readings))`; for a sequence of sensors a tuple of them.
 
     **Raises:** `TypeError` for anything but a sensor, and for a state without the parts that the
     sensor reads; `ValueError` for a key if the sensor's noise is `None`, and for a sensor of your
@@ -331,14 +373,14 @@ def simulate_readings(
     if not sensors:
         raise ValueError("sensor: wanted a sensor or several, got none")
     for one in sensors:
-        _fits(one, state0, key)
+        _require_sensor(one, state0, key)
     start: Any = state0
     sol = simulate(body_of_equations(body, type(state0)), start, ts, torque)
     states = sol.ys if sol.own is None else Coupled(sol.ys, sol.own)
     count = len(sensors)
     keys = [None] * count if key is None else jax.random.split(_checks.key(key), count)
-    given = body, torque, sol.ts, start, states
-    out = tuple(_readings(one, *given, key=own) for one, own in zip(sensors, keys, strict=True))
+    motion = body, torque, sol.ts, start, states
+    out = tuple(_readings(one, *motion, key=own) for one, own in zip(sensors, keys, strict=True))
     return out if several else out[0]
 
 
@@ -348,33 +390,34 @@ def _readings(
     body: Inertia | MassProperties,
     torque: Torque | None,
     ts: Array,
-    state0: Any,
-    states: Any,
+    state0: State,
+    states: PyTree,
     *,
     key: Any,
 ) -> Float[Array, "times ..."]:
+    """Return the readings of one sensor along a motion, as one program."""
     jitter, late = getattr(sensor, "jitter", None), None
     if key is not None and jitter is not None:
         key, own = jax.random.split(key)
         late = jitter.deviation * jax.random.normal(own, ts.shape, ts.dtype)
-    times, states, now = sensor_inputs(sensor, body, torque, ts, state0, states, late)
+    times, states, input_at = sensor_inputs(sensor, body, torque, ts, state0, states, late)
     error = jnp.zeros((ts.shape[0], sensor.components), ts.dtype)
     if key is not None:
         assert sensor.noise is not None
         error = sensor.noise[None] * jax.random.normal(key, error.shape, ts.dtype)
     reading = getattr(sensor, "reading_of", None)
     if reading is not None:
-        values = jax.vmap(lambda t, y, e: reading(now(t, y), e))(times, states, error)
+        values = jax.vmap(lambda t, y, e: reading(input_at(t, y), e))(times, states, error)
     else:
         nothing = jnp.zeros((ts.shape[0], *sensor.reading_shape), ts.dtype)
-        missed = errors_along(sensor, nothing, times, states, now)
+        missed = errors_along(sensor, nothing, times, states, input_at)
         values = (error - missed).reshape(ts.shape[0], *sensor.reading_shape)
     limit = getattr(sensor, "limit", None)
     return values if limit is None else jnp.clip(values, -limit[None], limit[None])
 
 
-def _fits(sensor: Any, state0: Any, key: Any) -> None:
-    """Refuse anything but a sensor, and a sensor that needs more than the state has."""
+def _require_sensor(sensor: Any, state0: State, key: Any) -> None:
+    """Raise an error for anything but a sensor that can read this state, with noise for a key."""
     name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
     _checks.instance(sensor, AbstractSensor, "sensor", wanted=wanted)
     if not isinstance(state0, sensor.feels):

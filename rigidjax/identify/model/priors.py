@@ -1,4 +1,4 @@
-"""Losses: the weight of an outlier."""
+"""Robust losses, which give outliers less weight, and a prior of the body."""
 
 import abc
 from functools import partial
@@ -14,9 +14,9 @@ from rigidjax.body.inertia import Inertia, MassProperties
 
 
 class AbstractLoss(eqx.Module):
-    """`ρ(s)` of the squared length s of a sensor's error in units of its noise.
+    """A robust loss ρ(s), a function of the squared length s of an error in units of its noise.
 
-    A reading counts as a whole: the loss does not depend on the frame.
+    A reading counts as a whole, so that the loss does not depend on the frame.
 
     >>> class Squares(AbstractLoss):  # no outliers: ρ(s) = s
     ...     def shrink(self, error):
@@ -29,22 +29,24 @@ class AbstractLoss(eqx.Module):
 
     @abc.abstractmethod
     def shrink(self, error: Float[Array, " k"]) -> Float[Array, " k"]:
-        """The error scaled so that its square is ρ(s), for least squares."""
+        """Return the error scaled so that its square is ρ(s), for least squares."""
 
     @abc.abstractmethod
     def weight(self, error: Float[Array, " k"]) -> Scalar:
-        """dρ/ds, the weight of the reading in the normal equations: 1 for a small error."""
+        """Return dρ/ds, the weight of the reading in the normal equations: 1 for a small error."""
 
 
 _scale = partial(_checks.positive, name="scale")
 
 
 class SoftL1(AbstractLoss):
-    """Quadratic for ordinary errors, linear for large ones: `ρ(s) = 2c²(√(1 + s/c²) − 1)`.
+    """A loss that is quadratic for ordinary errors, linear for large ones.
 
-    **Arguments:** `scale` c, where quadratic turns to linear, in standard deviations. **Raises:**
-    `ValueError` where it is not positive. Source: Charbonnier et al. 1997, doi:10.1109/83.551699
-    (as `soft_l1` in SciPy).
+    It is `ρ(s) = 2c²(√(1 + s/c²) − 1)`, SciPy's `soft_l1` (Charbonnier et al. 1997,
+    doi:10.1109/83.551699).
+
+    **Arguments:** `scale` c, the error at which it turns from quadratic to linear, in standard
+    deviations. **Raises:** `ValueError` for a scale that is not positive.
 
     >>> bool(jnp.linalg.norm(SoftL1(3.0).shrink(jnp.array([300.0, 0, 0]))) < 45)
     True
@@ -61,10 +63,12 @@ class SoftL1(AbstractLoss):
 
 
 class Huber(AbstractLoss):
-    """Quadratic up to c, linear beyond: `ρ(s) = s` for s ≤ c², else `2c√s − c²`.
+    """A loss that is quadratic up to an error c and linear beyond it.
 
-    **Arguments:** `scale` c, in standard deviations. **Raises:** `ValueError` where it is not
-    positive. Source: Huber 1964, doi:10.1214/aoms/1177703732.
+    It is `ρ(s) = s` for s ≤ c², else `2c√s − c²` (Huber 1964, doi:10.1214/aoms/1177703732).
+
+    **Arguments:** `scale` c, in standard deviations. **Raises:** `ValueError` for a scale that is
+    not positive.
 
     >>> Huber(3.0).weight(jnp.array([6.0, 0.0, 0.0]))
     Array(0.5, dtype=float64)
@@ -84,16 +88,18 @@ class Huber(AbstractLoss):
 
 
 def _weight(value: float) -> Scalar:
+    """Return the weight of a prior as an array; raise `ValueError` unless it is positive."""
     return jnp.asarray(_checks.positive(value, "weight"), jnp.result_type(float))
 
 
 class Entropic(eqx.Module):
     """The entropic prior `w D(body, guess)`, D the log-determinant divergence of two bodies.
 
-    D is `rigidjax.body.divergence` for a `Mass` chart, the same of 𝔖 alone for an inertia, and of
-    the shapes for a chart without a scale; a sum of squares: with `L₀⁻¹ J L₀⁻ᵀ = C Cᵀ`, `D =
-    Σ_{i>j} c_ij² + Σ_i (c_ii² − 1 − 2 log c_ii)`. A weight w has the effect of w/2 readings drawn
-    from the guess.
+    For a `Mass` chart D is `rigidjax.body.divergence`, the divergence of the pseudo-inertias J. For
+    other charts the second moments 𝔖 take the place of J; for a chart without a scale they are
+    divided by their traces. D is a sum of squares: with `J₀ = L₀ L₀ᵀ` of the guess and
+    `L₀⁻¹ J L₀⁻ᵀ = C Cᵀ`, `D = Σ_{i>j} c_ij² + Σ_i (c_ii² − 1 − 2 log c_ii)`. A weight w has the
+    effect of w/2 readings drawn from the guess.
 
     **Arguments:** `guess` an `Inertia`, or `MassProperties` for a `Mass` chart; `weight` w > 0.
     Source: Lee, Wensing and Park 2020, doi:10.1109/TRO.2019.2926491 (the divergence).
@@ -110,7 +116,7 @@ class Entropic(eqx.Module):
         validation.single(self.guess, (Inertia, MassProperties), "guess")
 
     def residuals(self, body: Inertia | MassProperties, scaled: bool = True) -> Float[Array, " n"]:
-        """Numbers whose squares add up to `2 w D`; `scaled` false compares shapes alone."""
+        """Return numbers whose squares add up to `2 w D`; `scaled` false compares shapes alone."""
         if isinstance(body, MassProperties) and isinstance(self.guess, MassProperties):
             here, there = _pseudo_inertia(body), _pseudo_inertia(self.guess)
         else:
@@ -127,7 +133,7 @@ class Entropic(eqx.Module):
 
 
 def _root(c: Float[Array, " n"]) -> Float[Array, " n"]:
-    """`√(c² − 1 − 2 log c)` with the sign of c − 1: smooth through c = 1."""
+    """Return `√(c² − 1 − 2 log c)` with the sign of c − 1, which is smooth through c = 1."""
     x = c - 1.0
     near = jnp.abs(x) < 1e-2
     # (x + 1)² − 1 − 2 log(1 + x) = 2 x² (1 − x/3 + x²/4 − x³/5 + …)
@@ -138,6 +144,7 @@ def _root(c: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def _pseudo_inertia(body: MassProperties) -> Float[Array, "4 4"]:
+    """Return the pseudo-inertia J: the second moments ∫ r̃ r̃ᵀ dm of r̃ = (r, 1)."""
     m, c = body.mass, body.com
     upper = body.second_moment + m * c[:, None] * c[None, :]
     side = (m * c)[:, None]

@@ -1,4 +1,4 @@
-"""The scene of a recording: all that its readings depend on."""
+"""The scene of a recording: everything that its readings depend on."""
 
 from typing import Any
 
@@ -17,14 +17,18 @@ Process = RandomTorque | CorrelatedTorque | Sum
 
 
 class Scene(eqx.Module):
-    """All that the readings of one recording depend on.
+    """The scene of a recording: everything that its readings depend on.
 
-    `Free(where, …)` picks a number of it: `lambda s: s.torque.coefficient`, or
-    `lambda s: s.sensors[0].bias`.
+    `Model.scenes(x)` makes the scenes of the free numbers x. A `Free(where, …)` picks a number of a
+    scene, such as `lambda s: s.torque.coefficient` or `lambda s: s.sensors[0].bias`.
 
-    **Fields:** `body`; `torque` on it, or `None`; `process`, the unknown torque on it as noise, or
-    `None` for none; `sensors` in the order of the readings; `start`, the state at the first time of
-    the recording. `Model.scenes(x)` makes them of free numbers.
+    **Fields:**
+
+    - `body`: the body.
+    - `torque`: the known torque on it, or `None`.
+    - `process`: the unknown torque on it, as noise, or `None`.
+    - `sensors`: in the order of the readings.
+    - `start`: the state at the first time of the recording.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> model = rj.identify.Model(record, rj.identify.PrincipalRatios())
@@ -40,14 +44,14 @@ class Scene(eqx.Module):
 
 
 def require_process(process: Any) -> None:
-    """Raise `TypeError` for anything but unknown torques."""
+    """Raise `TypeError` unless `process` is an unknown torque or a `Sum` of them."""
     wanted = "a RandomTorque, a CorrelatedTorque or a Sum of them"
     for part in parts_of(process) or (process,):
         _checks.instance(part, (RandomTorque, CorrelatedTorque), "process", wanted=wanted)
 
 
 def require_known_torque(torque: Torque | None) -> None:
-    """Raise `TypeError` for a torque with unknown parts."""
+    """Raise `TypeError` for a torque with unknown parts: these belong to the process."""
     for part in parts_of(torque):
         if isinstance(part, RandomTorque | CorrelatedTorque):
             raise TypeError(

@@ -7,13 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording, sources_of
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.model.charts import Bodies, body_of_recording
-from rigidjax.identify.model.free import put
+from rigidjax.identify.model.free import with_steps
 from rigidjax.identify.model.predict import (
     HeldSteps,
     body_of_equations,
@@ -29,10 +29,10 @@ from rigidjax.rotation.barrier import batched_as
 if TYPE_CHECKING:
     from rigidjax.identify.model.model import Model
 
-# The row of a recording's free numbers; the index of its body, `None` of one body.
+# The row of a recording's free numbers; the index of its body, `None` for one body.
 Row = Float[Array, " columns"]
 Which = Array | None
-# One (R, k) for each sensor: R recordings, k components.
+# The standard deviations (R, k) of each sensor, of R recordings and k components.
 Noise = tuple[Float[Array, "records _"], ...]
 
 
@@ -45,7 +45,7 @@ def scene_of(
     model: "Model", row: Row, record: Recording, reference: ReferenceStates, which: Which
 ) -> Scene:
     """Return the scene of one recording from the row of its free numbers."""
-    scene = put(template(model, record), model.slots, row)
+    scene = with_steps(template(model, record), model.slots, row)
     body = body_of_recording(model.chart, row, which)
     start = reference.moved(row[model.index.first :])
     return Scene(body, scene.torque, scene.process, scene.sensors, start)
@@ -80,7 +80,12 @@ def errors_of_one(
 ) -> tuple[Array, ...]:
     """Return the errors (T, k) of each sensor in one recording, in its unit; zero where masked.
 
-    All clocks are `late` s more behind.
+    **Arguments:**
+
+    - `row`: the free numbers of the recording.
+    - `record`, `reference`: its readings, and its reference state.
+    - `which`: the index of its body.
+    - `late`: s, by which all clocks are behind, in addition to their offsets.
     """
     scene = scene_of(model, row, record, reference, which)
     return errors_of_scene(model, scene, record, late)
@@ -101,17 +106,17 @@ def errors_of_scene(
 def over_records(function: Any, model: "Model", *rows: Any) -> Any:
     """Return `function(*rows, record, reference, which)` of every recording.
 
-    On a CPU one after another: XLA makes one kernel of a loop over a few dozen numbers, and scalars
-    within an inner loop run at half the speed.
+    On a CPU the recordings follow one after another: XLA makes one kernel of a loop over a few
+    dozen numbers, whereas batched scalars in the inner loop run at half the speed.
     """
     trees = *rows, model.records, model.reference, model.which
     arrays, rest = eqx.partition(trees, eqx.is_array)
 
-    def of_one(some: Any) -> Any:
-        return function(*eqx.combine(some, rest))
+    def of_one(part: PyTree[Array]) -> PyTree:
+        return function(*eqx.combine(part, rest))
 
     if model.count == 1:
-        # Without the outer loop it compiles to a smaller program.
+        # One recording needs no loop: the program is smaller.
         return jax.tree.map(lambda leaf: leaf[None], of_one(stacking.one(arrays, 0)))
     if jax.default_backend() == "cpu":
         return lax.map(of_one, arrays, batch_size=1)
@@ -119,7 +124,10 @@ def over_records(function: Any, model: "Model", *rows: Any) -> Any:
 
 
 def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
-    """Return the errors (R, T, k) of each sensor; derivatives in x go recording by recording."""
+    """Return the errors (R, T, k) of each sensor at the free numbers x.
+
+    Derivatives by x are computed recording by recording, in forward mode.
+    """
     return by_recording(model.index.rows(x), model, errors_of_one)
 
 
@@ -127,7 +135,7 @@ def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
 def by_recording(rows: Float[Array, "records columns"], model: "Model", function: Any) -> Any:
     """Return `function(model, row, record, reference, which)` of every recording.
 
-    Its derivatives, in the rows alone, are those of `blocks`.
+    Only derivatives by the rows are defined; they are those of `blocks`.
     """
 
     def of_one(row: Row, *rest: Any) -> Any:
@@ -137,7 +145,8 @@ def by_recording(rows: Float[Array, "records columns"], model: "Model", function
 
 
 @by_recording.def_jvp
-def _by_recording_jvp(primals: Any, tangents: Any) -> Any:
+def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
+    """Return value and tangent of `by_recording`."""
     (rows, model, function), (step, *rest) = primals, tangents
     if jax.tree.leaves(rest):
         raise TypeError(
@@ -150,8 +159,10 @@ def _by_recording_jvp(primals: Any, tangents: Any) -> Any:
 
 
 def blocks(model: "Model", x: Float[Array, " n"], function: Any = errors_of_one) -> tuple[Any, Any]:
-    """Return `function` of every recording, and its derivatives (R, …, m) in the columns of
-    `model.index`. No other place differentiates readings by free numbers.
+    """Return `function` of every recording, and its derivatives (R, …, m) by the free numbers.
+
+    The m derivatives are in the columns of `model.index`. No other place differentiates readings by
+    free numbers.
     """
     out, slopes = _with_slopes(model, model.index.rows(x), function)
     columns = jnp.asarray(model.index.columns, jnp.int32)
@@ -160,9 +171,13 @@ def blocks(model: "Model", x: Float[Array, " n"], function: Any = errors_of_one)
     return out, slopes
 
 
-def _with_slopes(model: "Model", rows: Array, function: Any) -> tuple[Any, Any]:
-    def of_one(row: Row, *rest: Any) -> Any:
-        # A dozen numbers and one long loop: forward mode is cheaper to compile and to run.
+def _with_slopes(
+    model: "Model", rows: Array, function: Callable[..., PyTree[Array]]
+) -> tuple[PyTree[Array], PyTree[Array]]:
+    """Return `function` of every recording, and its derivatives by the columns of the rows."""
+
+    def of_one(row: Row, *rest: PyTree) -> tuple[PyTree, PyTree]:
+        # For a dozen numbers and one long loop forward mode is cheaper to compile and to run.
         slopes, out = with_jacobian(lambda row: function(model, row, *rest), row)
         return out, slopes
 
@@ -171,7 +186,7 @@ def _with_slopes(model: "Model", rows: Array, function: Any) -> tuple[Any, Any]:
 
 @eqx.filter_jit
 def changes(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
-    """Return the time derivative (R, T, k) of the errors of each sensor."""
+    """Return the derivative (R, T, k) of the errors of each sensor by a delay of its clock."""
 
     def of_one(row: Row, *rest: Any) -> Any:
         now = jnp.zeros((), model.records.t.dtype)
@@ -183,15 +198,15 @@ def changes(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, "..."],
 def with_jacobian(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tuple[Any, Any]:
     """Return the derivative (…, n) of a function at x, in forward mode, and its value (…)."""
 
-    def twice(x: Array) -> tuple[Any, Any]:
+    def value_and_aux(x: Array) -> tuple[PyTree, PyTree]:
         value = function(x)
         return value, value
 
-    return jax.jacfwd(twice, has_aux=True)(x)
+    return jax.jacfwd(value_and_aux, has_aux=True)(x)
 
 
 def whitened(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """Return errors in standard deviations, (R, T, k) for each sensor: see `standardised`."""
+    """Return the errors (R, T, k) of each sensor in standard deviations, by `standardised`."""
     out = []
     for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
         limit = getattr(reading.sensor, "limit", None)
@@ -203,9 +218,10 @@ def whitened(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, 
 def independent(
     e: Float[Array, "*rows k"], v: Float[Array, "*rows k"]
 ) -> tuple[Float[Array, "*rows k"], Float[Array, "*rows k"]]:
-    """Return errors e of covariance `1 + v vᵀ` made independent, of variance one: `L⁻¹ e`, L the
-    factor of Cholesky; and the logarithms of its squared diagonal, the variance of each error given
-    those before it.
+    """Make errors e (…, k) of covariance `1 + v vᵀ` independent and of variance one.
+
+    Returns `L⁻¹ e`, L the Cholesky factor of the covariance, and the logarithms of the squared
+    diagonal of L: the variances of each error, given those before it.
     """
     along, total = jnp.cumsum(v * e, axis=-1), 1.0 + jnp.cumsum(v * v, axis=-1)
     none = jnp.zeros_like(total[..., :1])
@@ -215,8 +231,10 @@ def independent(
 
 
 def in_deviations(x: Any, sigma: Array, late: Array | None) -> Float[Array, "..."]:
-    """Return changes (R, T, k, n) of a sensor's errors in standard deviations, as `standardised`
-    counts them.
+    """Return changes x (R, T, k, n) of a sensor's errors in standard deviations.
+
+    They are scaled as `standardised` scales the errors, with the noise `sigma` (R, k) and the error
+    `late` (R, T, k) by a time stamp.
     """
     x = x / sigma[:, None, :, None]
     if late is None:
@@ -232,12 +250,20 @@ def standardised(
     limit: Float[Array, " k"] | None,
     late: Float[Array, "times k"] | None,
 ) -> tuple[Float[Array, "times k"], Bool[Array, "times k"], Float[Array, "times k"] | None]:
-    """Return errors in standard deviations, the mask of saturated channels, and the logarithm of
-    what `late` multiplies the variances by, `None` without it.
+    """Return errors of one sensor in standard deviations, and a mask of saturated channels.
 
-    A saturated channel says "at least that much", and counts as `√(−2 log Φ(z))`, z the
-    prediction's excess over the limit (Tobin 1958, doi:10.2307/1907382). `late` is the error by a
-    time stamp one standard deviation off.
+    The third result is the logarithm of the factor by which jitter multiplies each variance; `None`
+    without jitter. A saturated channel says "at least that much", and counts as `√(−2 log Φ(z))`, z
+    the excess of the prediction over the limit (Tobin 1958, doi:10.2307/1907382).
+
+    **Arguments:**
+
+    - `values`, `mask`: the readings, and where there are any.
+    - `error`: (T, k) in the unit of the sensor.
+    - `sigma`: (k,) the noise.
+    - `limit`: (k,) the full scale, or `None`.
+    - `late`: (T, k) the error that a time stamp makes if it is one standard deviation late, or
+      `None`.
     """
     scaled, wider = error / sigma[None], None
     full = jnp.zeros(scaled.shape, bool)
@@ -245,14 +271,14 @@ def standardised(
         full = (jnp.abs(values) >= limit[None] * (1 - 1e-6)) & mask[:, None]
     if late is not None:
         v = late / sigma[None]
-        # A channel at full scale hardly shows the time.
+        # The reading of a channel at full scale does not tell the error of its time stamp.
         white, wider = independent(scaled, jnp.where(full, 0.0, v))
         scaled = jnp.where(full, scaled / jnp.sqrt(1.0 + v * v), white)
     if limit is None:
         return scaled, full, wider
     side = jnp.sign(values)
     z = jnp.where(full, -side * scaled, 0.0)
-    # The term vanishes beyond five standard deviations, and the root has no derivative there.
+    # Beyond five standard deviations the term is zero: its root has no derivative at zero.
     root = jnp.sqrt(-2.0 * jax.scipy.special.log_ndtr(jnp.minimum(z, 5.0)))
     return jnp.where(full, -side * jnp.where(z < 5.0, root, 0.0), scaled), full, wider
 
@@ -260,7 +286,10 @@ def standardised(
 def reading_residuals(
     model: "Model", errors: tuple, noise: Noise, weights: Float[Array, "records times"]
 ) -> tuple[Array, ...]:
-    """Return the residuals (R, T, k) of the readings of each sensor, for least squares."""
+    """Return the residuals (R, T, k) of the readings of each sensor, for least squares.
+
+    They are whitened, shrunk by the robust loss, and multiplied by the `weights`.
+    """
     out = []
     for scaled in whitened(model, errors, noise):
         if model.loss is not None:
@@ -270,14 +299,17 @@ def reading_residuals(
 
 
 def with_rows(of: Callable[[tuple], tuple], errors: tuple, slopes: tuple) -> tuple[tuple, tuple]:
-    """Return `of(errors)`, and its derivatives (R, T, k, n) from those of the errors, `slopes`."""
-    # Each residual depends on the errors of its reading alone: a product of small matrices.
+    """Return `of(errors)`, and its derivatives (R, T, k, n) from the `slopes` of the errors."""
+    # Each residual depends on the errors of its own reading alone, so this is cheap.
     value, push = jax.linearize(of, errors)
     return value, jax.vmap(push, in_axes=-1, out_axes=-1)(slopes)
 
 
 def prior_weights(model: "Model") -> Float[Array, " n"]:
-    """Return one over the deviation of each free number about zero, zero without a prior."""
+    """Return one over the standard deviation of the prior of each free number about zero.
+
+    It is zero for a number without a prior.
+    """
     weights = jnp.zeros(model.index.size, model.records.t.dtype)
     for slot in model.slots:
         about = (slot.shared, slot.prior), (slot.own, slot.prior if slot.each else slot.spread)
@@ -290,7 +322,7 @@ def prior_weights(model: "Model") -> Float[Array, " n"]:
 
 
 def extra_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-    """Return residuals of several numbers at once: of the prior of the body, and of a pull."""
+    """Return the residuals that depend on several numbers: of the body's prior, and of a pull."""
     out = [jnp.zeros(0, x.dtype)]
     if model.prior is not None:
         assert not isinstance(model.chart, Bodies)
@@ -302,13 +334,14 @@ def extra_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]
 
 
 def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """Return all residuals that are no readings: n of the priors, then `extra_residuals`."""
+    """Return all residuals that are not of readings: n of the priors, then `extra_residuals`."""
     return jnp.concatenate([prior_weights(model) * x, extra_residuals(model, x)])
 
 
 def weights_of(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """Return the weight (R, T) of each reading in the normal equations, of the loss; zero where
-    masked.
+    """Return the weight (R, T) of each reading in the normal equations.
+
+    The robust loss gives the weight; it is zero for a masked reading.
     """
     masks = [reading.mask for reading in model.records.readings]
     if model.loss is None:

@@ -1,4 +1,4 @@
-"""Errors of the sensors that drift while a recording is made, and that the filter follows."""
+"""Sensor errors that drift during a recording, which the filter follows."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -17,11 +17,11 @@ class Walk(eqx.Module):
 
     **Arguments:**
 
-    - `where`: picks it from a `Scene`, as a `Free` does: `lambda s: s.sensors[0].bias`. Its value
-      there is the initial value.
-    - `deviation`: the standard deviation of the initial value, one number or one for each
-      component, in its unit.
-    - `density`: the density of the drift, unit²/s, one number or one for each component: zero for a
+    - `where`: a function that picks the error from a `Scene`, such as
+      `lambda s: s.sensors[0].bias`. The value in the scene is the initial value.
+    - `deviation`: the standard deviation of the initial value, in its unit, one number or one for
+      each component.
+    - `density`: the density of the drift, unit²/s, one number or one for each component; zero for a
       constant error.
 
     **Raises** `ValueError` for a deviation or density below zero.
@@ -42,10 +42,12 @@ class Walk(eqx.Module):
 
 
 class Drift(eqx.Module):
-    """A `Walk` whose leaf in the scene is known.
+    """A `Walk` whose leaf in the scene has been found.
 
-    `path` is the way to the leaf in the scene; `deviation` and `density` have the shape of the
-    leaf. No function is kept: a second model does not compile again.
+    It holds no function, so that a second model does not compile again.
+
+    **Fields:** `path` of the leaf in the scene; `deviation` and `density` of the `Walk`, in the
+    shape of the leaf.
     """
 
     path: tuple[Any, ...] = eqx.field(static=True)
@@ -64,7 +66,7 @@ def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]
         if path[0].name != "sensors":
             raise ValueError(
                 f"Walk: wanted a number of a sensor, such as s.sensors[0].bias, got one of the "
-                f"{path[0].name}; a torque that is not known is a process"
+                f"{path[0].name}; give an unknown torque as process="
             )
         if any(drift.path == path for drift in drifts):
             raise ValueError("Walk: another Walk moves the same numbers")
@@ -91,7 +93,10 @@ def not_negative(value: Any, name: str) -> Array:
 
 
 def in_shape(value: Any, shape: tuple[int, ...], name: str) -> Array:
-    """Return one number, or numbers of this shape, in this shape; none is below zero."""
+    """Return one number, or numbers of this `shape`, as an array of this shape.
+
+    Raise `ValueError` for another shape, or for a number below zero.
+    """
     numbers = not_negative(value, name)
     if numbers.shape not in ((), shape):
         raise ValueError(f"{name}: wanted one number or shape {shape}, got {numbers.shape}")

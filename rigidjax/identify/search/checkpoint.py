@@ -1,4 +1,4 @@
-"""The state of a search in a file, so that a killed search can continue."""
+"""The checkpoint file of a fit, from which a killed search can continue."""
 
 import contextlib
 import dataclasses
@@ -19,12 +19,12 @@ from rigidjax.identify.search.stages import Attempt
 
 
 def without_arrays(attempt: Attempt) -> Attempt:
-    """Return an attempt without its errors and derivatives, which need memory."""
+    """Return the attempt without its errors and derivatives, which take memory."""
     return attempt if attempt.blocks is None else dataclasses.replace(attempt, blocks=None)
 
 
 def report_progress(progress: Callable[[str], Any] | None, line: str) -> None:
-    """Call `progress`, if there is one; an output that cannot be written does not end a fit."""
+    """Call `progress` with a line, unless it is `None`; warn if the line cannot be written."""
     if progress is None:
         return
     try:
@@ -37,39 +37,47 @@ def report_progress(progress: Callable[[str], Any] | None, line: str) -> None:
 
 
 def require_folder(path: str | Path) -> None:
-    """Raise `ValueError` unless a file can be at `path`: before the search, not after a start."""
+    """Raise `ValueError` unless a file can be written at `path`.
+
+    It is called before a search, which would otherwise fail after its first start.
+    """
     path = Path(path)
     if not path.parent.is_dir():
         raise ValueError(f"checkpoint {path}: there is no folder {path.parent}")
     if path.is_dir():
-        raise ValueError(f"checkpoint {path}: wanted a file, this is a folder")
+        raise ValueError(f"checkpoint {path}: wanted a file, got a folder")
 
 
 def fingerprint(*trees: Any) -> str:
-    """Return a hash of numbers and structure, the same in every process.
+    """Return a hash of the numbers and the structure of trees, the same in every process.
 
     A function counts by its name.
     """
     leaves, structure = jax.tree.flatten(trees)
-    words, found = [repr(structure)], hashlib.sha256()
+    words, digest = [repr(structure)], hashlib.sha256()
     for leaf in leaves:
         if not eqx.is_array_like(leaf):
             words.append(repr(leaf))
             continue
         array = np.asarray(leaf)
         words.append(f"{array.dtype} {array.shape}")
-        found.update(array.tobytes())
-    # An address in memory differs between processes.
-    found.update(re.sub("0x[0-9a-f]+", "", "\n".join(words)).encode())
-    return found.hexdigest()
+        digest.update(array.tobytes())
+    # Leave out addresses in memory, which differ between processes.
+    digest.update(re.sub("0x[0-9a-f]+", "", "\n".join(words)).encode())
+    return digest.hexdigest()
 
 
 class Checkpoint:
-    """The ends of the starts of a long search so far, on disk after every start.
+    """The ends of the starts of a search so far, saved to a file after every start.
 
-    `like` is a `Attempt` of the right shapes, `print_of` the `fingerprint` of all that the search
-    depends on. A file of another model raises `ValueError`, and is not overwritten. What cannot
-    be written is said by a warning.
+    **Arguments:**
+
+    - `path`: of the file, `None` for no file.
+    - `like`: an `Attempt` with the shapes of those in the file.
+    - `print_of`: the `fingerprint` of everything that the search depends on.
+
+    The file of another model raises `ValueError`, and is not overwritten. A file that cannot be
+    written makes a warning.
     """
 
     def __init__(self, path: str | Path | None, like: Attempt, print_of: str):
@@ -80,11 +88,11 @@ class Checkpoint:
             self._read(self.path)
 
     def save(self, done: Sequence[Attempt]) -> None:
-        """Write the finished starts, replacing the file at once."""
+        """Save the finished starts `done`, replacing the file in one step."""
         if self.path is None:
             return
         head = dict(print_of=self.print_of, done=len(done))
-        # A name of its own: another program may write to the same checkpoint.
+        # The temporary file has a unique name: another program may write to the same checkpoint.
         part = self.path.with_name(f"{self.path.name}.{uuid.uuid4().hex}.part")
         try:
             with part.open("xb") as file:
@@ -102,6 +110,7 @@ class Checkpoint:
                 part.unlink(missing_ok=True)
 
     def _read(self, path: Path) -> None:
+        """Read the finished starts; raise `ValueError` for a file that is not of this search."""
         try:
             with path.open("rb") as file:
                 head = json.loads(file.readline())
@@ -111,10 +120,11 @@ class Checkpoint:
                     self.done = eqx.tree_deserialise_leaves(file, like)
         except Exception as error:
             raise ValueError(
-                f"{path}: no checkpoint of a fit, or a damaged one ({type(error).__name__}); "
-                "delete it, or name another file"
+                f"{path}: wanted the checkpoint of a fit, got another file or a damaged one "
+                f"({type(error).__name__}); delete it, or name another file"
             ) from None
         if not same:
             raise ValueError(
-                f"{path}: the checkpoint of another model, or of other options; name another file"
+                f"{path}: wanted the checkpoint of this model and these options, got that of "
+                "others; name another file"
             )

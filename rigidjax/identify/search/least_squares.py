@@ -1,4 +1,4 @@
-"""Levenberg and Marquardt's search on any normal equations."""
+"""The search of Levenberg and Marquardt, on any normal equations."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,47 +8,61 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from rigidjax.identify.model.normal import Normal
 
-# Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
-# long as Gauss and Newton's.
+# The damping of the first step, in units of the diagonal of the normal equations (Marquardt's): a
+# damping of one makes a step half as long as a Gauss–Newton step.
 CAREFUL, BOLD = 1.0, 1e-3
-# Numbers scaled to order one go no further than this in a step.
+# The largest change in a step of a number that is scaled to order one.
 LONGEST = 2.0
-# A step with damping below this counts as one of Gauss and Newton.
+# A step with less damping counts as a Gauss–Newton step.
 FREE = 1e-2
-# The least ratio of actual to predicted gain of a step that supports its model.
+# The least ratio of actual to predicted gain of a step that supports the quadratic model.
 FAIR = 0.25
-# A problem counts as linear if the ratio of actual to predicted gain is so near to one.
+# The problem counts as linear if the ratio of actual to predicted gain is as near to one as this.
 LINEAR = 0.05
-# Steps that a search may still be away from where another one ended; its pace is by how much the
-# logarithm of the misfit falls in a step, of the last ones half as much each as the one after it.
+# A search ends if at its pace it needs more than PATIENCE steps to the cost at which another search
+# ended. The pace is the fall of the logarithm of the misfit in a step: an average over the steps in
+# which each counts half as much as the next one.
 PATIENCE, FIRST_PACE = 25.0, 4.0
-# Damping beyond which nothing moves.
+# With more damping than this nothing moves.
 STUCK = 1e12
-# The cost has noise, as that of adaptive steps has, if the second of two refused steps rises by
-# more of its predicted gain than the first did, by ten times of it at least, and that gain is
-# a small part of the cost. Shorter steps of a smooth cost rise by less and less of it.
+# The cost is taken as noisy, like that of adaptive integration, if two steps in succession are
+# refused, the second one raises the cost by NOISY times its predicted gain or more, and by a larger
+# multiple than the first one, and this gain is less than LITTLE of the cost. Of a smooth cost
+# shorter steps raise it by smaller and smaller multiples.
 NOISY, LITTLE = 10.0, 1e-4
-# Errors of unknown size count as no smaller than this part of their unit: the rest is round-off.
+# The errors of sensors of unknown noise count as at least this part of their unit: below it they
+# are round-off.
 EXACT = 1e-6
 
 
-def _float(value: Any) -> np.ndarray:
-    # NumPy's: outside of a trace each conversion of JAX costs as much as a run of 100 steps.
+def _float(value: ArrayLike) -> np.ndarray:
+    """Return a setting as a NumPy array.
+
+    Outside of a trace each conversion by JAX takes as long as a run of 100 steps.
+    """
     return np.asarray(value, jnp.result_type(float))
 
 
 class Settings(eqx.Module):
-    """The settings of a search, as arrays: another value does not compile again.
+    """The settings of a search, as arrays, so that another value does not compile again.
 
-    Steps of `tolerance` standard deviations (of each number alone) end it, and more than `steps`;
-    if it would need more than `PATIENCE` steps at its pace to an `aim` of another search; at a cost
-    of `near`; if a step of about the predicted gain gains less than `level` of what a fit gains
-    from noise. Zero for none. If the size of the errors is unknown, `count` is their number, and a
-    standard deviation is that by their mean square; zero if it is one.
+    **Arguments**; zero switches each of the last four off:
+
+    - `tolerance`: the search has converged at a step shorter than this, in standard deviations of
+      each number with all others fixed.
+    - `damping`: of the first step.
+    - `steps`: the largest number of steps.
+    - `aim`: a cost that another search reached; this search ends if at its pace it would need more
+      than `PATIENCE` steps to it.
+    - `near`: the search ends at this cost.
+    - `count`: for errors of unknown size their number; their mean square then gives the standard
+      deviation, which is one otherwise.
+    - `level`: the search ends if a step of about the predicted gain gains less than this part of
+      what a fit gains from noise alone.
     """
 
     tolerance: Any = eqx.field(converter=_float)
@@ -63,11 +77,20 @@ class Settings(eqx.Module):
 class LMState(eqx.Module):
     """The state of a search by Levenberg and Marquardt.
 
-    `first` is the cost at the start; `point` the best so far, with `cost`, `normal` and `slope`
-    there; `trial` the next point, `hoped` its predicted gain; `pace` by how much the logarithm of
-    the cost falls in a step; `taken` the number of evaluations; `kept` the values kept from the
-    last one, and `kept_at_best` whether that was at the best point; `rise` the rise of the cost at
-    the last trial over its predicted gain, zero if the trial was better.
+    **Fields:**
+
+    - `first`: the cost at the start.
+    - `point`: the best point so far.
+    - `cost`, `normal`, `slope`: cost, normal matrix and gradient at the best point.
+    - `trial`, `hoped`: the next point, and its predicted gain.
+    - `damping`: of the step to the next point.
+    - `pace`: the mean fall of the logarithm of the cost in a step.
+    - `taken`: the number of evaluations.
+    - `done`, `converged`: whether the search has ended, and whether it converged.
+    - `kept`, `kept_at_best`: the values kept from the last evaluation, and whether it was at the
+      best point.
+    - `rise`: the rise of the cost at the last trial over its predicted gain; zero if the trial was
+      better.
     """
 
     first: Float[Array, ""]
@@ -88,7 +111,7 @@ class LMState(eqx.Module):
 
 
 def minimise(
-    evaluated: Callable[[Array], tuple[Any, Array, Normal, Array]],
+    evaluate: Callable[[Array], tuple[PyTree, Array, Normal, Array]],
     start: Float[Array, " n"],
     order_one: Float[Array, " n"],
     settings: Settings,
@@ -96,17 +119,24 @@ def minimise(
     empty: Normal | None = None,
     gain_of_noise: Callable[[Any, Normal], Array] | None = None,
 ) -> LMState:
-    """Return the end of at most `settings.steps` steps down from `start`.
+    """Minimise a cost from `start`, and return the last state of the search.
 
-    With no steps, `start` alone is evaluated.
+    Source: Marquardt 1963, doi:10.1137/0111030; the damping follows the ratio of actual to
+    predicted gain as in Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares
+    problems, section 3.2.
 
-    **Arguments:** `evaluated` point → values to keep, cost, normal matrix, gradient: of half a sum
-    of squares, or minus a log-density with Fisher's information (scoring); `order_one` (n,) one for
-    numbers of order one, which no step moves far, else zero; `nothing` zeros like the kept values,
-    `empty` like the normal matrix, if that has more than a core; `gain_of_noise` gives the gain of
-    a fit from noise (see `Settings.level`), from the kept values and the normal matrix.
-    Source: Marquardt 1963, doi:10.1137/0111030; damping by the ratio of actual to predicted gain:
-    Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares problems, section 3.2.
+    **Arguments:**
+
+    - `evaluate`: a function from a point to values to keep, cost, normal matrix and gradient. The
+      cost is half a sum of squares, or minus a log-density with Fisher's information as the normal
+      matrix (scoring).
+    - `start`: (n,) the first point; with no steps it alone is evaluated.
+    - `order_one`: (n,) one for numbers of order one, which no step moves far, else zero.
+    - `settings`: the settings.
+    - `nothing`: zeros of the shapes of the kept values.
+    - `empty`: zeros of the shapes of the normal matrix, if it has more than a core.
+    - `gain_of_noise`: a function from the kept values and the normal matrix to the gain of a fit
+      from noise alone (see `Settings`), or `None`.
     """
     number, kind = start.size, start.dtype
     begun = LMState(
@@ -128,12 +158,12 @@ def minimise(
     )
 
     def step(now: LMState) -> LMState:
-        return _after(now, evaluated(now.trial), order_one, settings, gain_of_noise)
+        return _next_state(now, evaluate(now.trial), order_one, settings, gain_of_noise)
 
     return lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
 
 
-def _after(
+def _next_state(
     now: LMState,
     trial: tuple[Any, Array, Normal, Array],
     order_one: Array,
@@ -148,7 +178,7 @@ def _after(
     better = finite & ((cost < now.cost) | first)
     ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
     grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > FAIR, 0.5, 2.0))
-    # Damping only makes steps short if the misfit falls as that of the linear problem.
+    # If the misfit falls like that of a linear problem, damping only makes steps shorter.
     linear = (jnp.abs(ratio - 1.0) < LINEAR) & (now.damping > FREE)
     grown = jnp.where(linear, 0.01, grown)
     damping = now.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
@@ -165,14 +195,14 @@ def _after(
         (now.trial, cost, normal, slope),
         (now.point, now.cost, now.normal, now.slope),
     )
-    move, root = _damped(normal, slope, order_one, damping)
+    move, root = _damped_step(normal, slope, order_one, damping)
     sound = jnp.isfinite(move).all()
     move = jnp.where(sound, move, 0.0)
     hoped = -(slope @ move) - 0.5 * move @ (normal @ move)
     size = jnp.sqrt(2.0 * jnp.maximum(cost, 0.0) / jnp.maximum(settings.count, 1.0))
     unit = jnp.where(settings.count > 0, jnp.maximum(size, EXACT), 1.0)
     small = (jnp.max(jnp.abs(move) * root) < settings.tolerance * unit) & (damping <= FREE)
-    # Round-off refuses every step at the minimum itself.
+    # At the minimum itself every step is refused, by round-off: stop if nothing can be gained.
     bottom = hoped <= 1e-14 * jnp.abs(cost)
     ended = small if gain_of_noise is None else small | flat
     converged = sound & (ended | noisy | (bottom & ~better & ~first))
@@ -200,13 +230,15 @@ def _after(
     )
 
 
-def _damped(normal: Normal, slope: Array, order_one: Array, damping: Array) -> tuple[Array, Array]:
-    """The step (n,), and the root of the diagonal of the normal matrix (n,)."""
-    felt = normal.diagonal
-    felt = jnp.maximum(felt, jnp.maximum(1e-12 * jnp.max(felt), 1e-300))
-    # Columns of length one: the factor of Cholesky loses no digits to units.
-    root = jnp.sqrt(felt)
-    damped = damping * jnp.maximum(felt, order_one) / root**2
+def _damped_step(
+    normal: Normal, slope: Array, order_one: Array, damping: Array
+) -> tuple[Array, Array]:
+    """Return the damped step (n,), and the root (n,) of the diagonal of the normal matrix."""
+    diagonal = normal.diagonal
+    diagonal = jnp.maximum(diagonal, jnp.maximum(1e-12 * jnp.max(diagonal), 1e-300))
+    # Scale columns to length one, so that Cholesky's factor loses no digits to units.
+    root = jnp.sqrt(diagonal)
+    damped = damping * jnp.maximum(diagonal, order_one) / root**2
     move = -normal.scaled(1.0 / root).plus(damped).solve(slope / root) / root
     far = jnp.max(jnp.abs(move) * order_one)
     return move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300)), root

@@ -1,4 +1,4 @@
-"""The size of errors, estimated from those of a fit: noise of sensors, jitter of their clocks."""
+"""The noise of sensors and the jitter of their clocks, estimated from the errors of a fit."""
 
 from typing import Any, cast
 
@@ -10,20 +10,26 @@ from jaxtyping import Array
 
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, changes, weights_of
-from rigidjax.identify.uncertainty.covariance import linearise, of_white
+from rigidjax.identify.uncertainty.covariance import Blocks, linearise, white_covariance
 from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
 
-# Rounds of the search for two variances.
+# The largest number of rounds in the estimate of noise and jitter together.
 ROUNDS = 500
 
 
-def estimate_noise(model: Model, x: Array, blocks: Any, noise: Noise) -> tuple[Model, Noise]:
-    """Noise (R, k) of each sensor: as given, or the scatter of its errors, one figure for
-    all channels and the recordings of a group. The model with the jitter of its sensors likewise.
+def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tuple[Model, Noise]:
+    """Return the model with the estimated jitter of its sensors, and their estimated noise.
 
-    Fitted numbers take a part of the errors away, of few readings a large one: each sensor's is its
-    leverage at this noise, as by restricted maximum likelihood. **Arguments:** `x` (n,) the free
-    numbers; `blocks` the errors and derivatives there, as `terms.blocks` gives them.
+    The noise (R, k) of each sensor is as given, or else the scatter of its errors: one number for
+    all channels and all recordings of a group. Fitted numbers take a part of the errors away, a
+    large one of few readings. This part is the leverage of the sensor at the present `noise`, as in
+    restricted maximum likelihood.
+
+    **Arguments:**
+
+    - `x`: (n,) the free numbers of the `model`.
+    - `blocks`: the errors and derivatives at x, as `terms.blocks` returns them.
+    - `noise`: the present estimate.
     """
     errors = blocks[0]
     weights = weights_of(model, errors, noise)
@@ -33,7 +39,7 @@ def estimate_noise(model: Model, x: Array, blocks: Any, noise: Noise) -> tuple[M
     for index, (reading, error, sigma, weight, share) in enumerate(
         zip(readings, errors, noise, weights, shares, strict=True)
     ):
-        # The error of a reading at full scale is no noise.
+        # A reading at full scale has an error that is no noise.
         sensor, kept = cast(Any, reading.sensor), reading.kept
         known = sensor.noise is not None
         if known:
@@ -45,7 +51,7 @@ def estimate_noise(model: Model, x: Array, blocks: Any, noise: Noise) -> tuple[M
                 variance = parts / np.maximum(np.bincount(groups, kept.sum(axis=(1, 2))), 1)
             else:
                 variance = _by_median(squares, kept, groups)
-            # Data without noise must not divide by zero: the least noise is round-off.
+            # Noise is at least round-off: errors of perfect data are divided by it.
             floor = 1e-15 * float(np.abs(np.asarray(reading.values)).max() + 1e-300)
             each = np.maximum(np.sqrt(variance / share), floor)[groups]
             each = np.broadcast_to(each[:, None], sigma.shape)
@@ -67,14 +73,14 @@ def estimate_noise(model: Model, x: Array, blocks: Any, noise: Noise) -> tuple[M
 
 
 def first_noise(model: Model) -> Noise:
-    """Return the noise of each sensor, a tenth of its signal where it is to be estimated."""
+    """Return the noise of each sensor, a tenth of its signal if the noise is to be estimated."""
     out = []
     for reading in model.records.readings:
         sensor = reading.sensor
         if reading.known_noise:
             out.append(sensor.noise)
         else:
-            # What counts is that no channel drowns another.
+            # The size matters little, as long as no sensor outweighs another.
             values = reading.values.reshape(*reading.mask.shape, -1)
             size = jnp.sqrt(jnp.mean(jnp.sum(values**2, axis=-1)) + 1e-300)
             out.append(jnp.full((model.count, sensor.components), 0.1) * size)
@@ -82,9 +88,11 @@ def first_noise(model: Model) -> Noise:
 
 
 def _by_median(squares: np.ndarray, kept: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """The variance of each group by the median of whole readings: outliers do not change it.
+    """Return the variance of each group by the median over readings, which outliers do not change.
 
-    Weights of a loss would make it too small without outliers, and too large with many.
+    An estimate with the weights of the loss would be too small without outliers, and too large with
+    many. **Arguments:** `squares` (R, T) the squared lengths of errors; `kept` (R, T, k) the
+    channels that count; `groups` (R,) of the recordings.
     """
     half, _ = median_of_chi2(kept.shape[-1])
     whole = kept.all(axis=-1)
@@ -93,7 +101,7 @@ def _by_median(squares: np.ndarray, kept: np.ndarray, groups: np.ndarray) -> np.
 
 
 def median_of_chi2(size: int) -> tuple[float, float]:
-    """The median of χ² with `size` degrees of freedom, and the density there."""
+    """Return the median of χ² with `size` degrees of freedom, and the density at the median."""
     from scipy.special import chdtri, gammaln
 
     median = float(chdtri(size, 0.5))
@@ -102,17 +110,17 @@ def median_of_chi2(size: int) -> tuple[float, float]:
     return median, float(density)
 
 
-def _shares(model: Model, x: Array, blocks: Any, noise: Noise) -> list[np.ndarray]:
-    """The share of its errors that fitted numbers leave each sensor and group of recordings."""
+def _shares(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[np.ndarray]:
+    """Return for each sensor and group the share of squared errors that fitted numbers leave."""
     groups, readings = np.asarray(model.noise_groups), model.records.readings
     sizes = [np.bincount(groups, one.kept.sum(axis=(1, 2))) for one in readings]
     held = model.prior, model.pull, *((slot.prior, slot.spread) for slot in model.slots)
     if len(readings) * sizes[0].size == 1 and not jax.tree.leaves(held):
-        # All numbers come from the readings of one noise.
+        # Without priors, and with one noise, all numbers are taken from these readings.
         taken = [np.array([x.size])]
     else:
         linear = linearise(model, x, noise, blocks)
-        taken = leverages(linear, linear.information, of_white(linear).seen)
+        taken = leverages(linear, linear.information, white_covariance(linear).determined)
         taken = [np.bincount(groups, each) for each in taken]
     return [np.maximum(1.0 - n / np.maximum(m, 1), 0.1) for n, m in zip(taken, sizes, strict=True)]
 
@@ -125,18 +133,26 @@ def _jitter(
     known: bool,
     tau: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The most likely σ and τ (R,) of errors e (R, T, k) of covariances `σ² + τ² u uᵀ`, alike in a
-    group, `count` (R, T) channels seen; a `known` σ is 1, a known τ is given. In turn τ² by
-    Fisher's scoring of the squares along u, whose mean is `σ² + τ² |u|²`, and σ² by expectation and
-    maximisation.
+    """Return the most likely σ and τ (R,) of errors of covariance `σ² + τ² u uᵀ`.
+
+    They are found in turn: τ² by Fisher's scoring of the squares along u, whose mean is
+    `σ² + τ² |u|²`, and σ² by expectation and maximisation.
+
+    **Arguments:**
+
+    - `e`: (R, T, k) the errors; `u`: (R, T, k) the change of the prediction in time.
+    - `count`: (R, T) the number of channels that were read.
+    - `groups`: (R,) the groups of recordings, which share σ and τ.
+    - `known`: whether σ is known; it is then 1.
+    - `tau`: a known τ, else `None`.
     """
     size, total = np.sum(u**2, axis=-1), np.sum(e**2, axis=-1)
-    seen = total > 0
+    is_read = total > 0
     dot = np.sum(e * u, axis=-1)
     along = dot**2 / np.maximum(size, 1e-300)
 
     def ratio(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        x, y = (np.bincount(groups, np.sum(each * seen, axis=1)) for each in (x, y))
+        x, y = (np.bincount(groups, np.sum(each * is_read, axis=1)) for each in (x, y))
         return (x / np.maximum(y, 1e-300))[groups][:, None]
 
     p, q = np.ones((len(e), 1)), np.zeros((len(e), 1)) if tau is None else tau[:, None] ** 2

@@ -1,4 +1,4 @@
-"""The least misfit from one start: Levenberg and Marquardt's search over growing records."""
+"""The least misfit from one start: a Levenberg–Marquardt search over growing parts of records."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,7 +11,7 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float
 
-from rigidjax.identify.data.recording import count_of
+from rigidjax.identify.data.recording import Reading, count_of
 from rigidjax.identify.model import terms
 from rigidjax.identify.model.charts import charts_of, numbers_of
 from rigidjax.identify.model.model import Model
@@ -20,24 +20,25 @@ from rigidjax.identify.model.predict import FixedSteps, HeldSteps
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
 
-# The beginning of the record is fitted first: a long record has many wrong minima (the phase slips
-# by whole turns), a short one has not.
+# The parts of a record that are fitted one after the other. A long record has many wrong minima, in
+# which the phase slips by whole turns; a short one has none.
 HORIZONS = (0.25, 0.5, 1.0)
-# From so many recordings on, numbers of one recording alone go out of the normal equations.
+# From this many recordings on the numbers of one recording alone are eliminated.
 MANY = 16
-# Steps between two checks of the keyboard.
+# The number of steps in one program. An interrupt is noticed between two programs.
 STRIDE = 25
-# A stride that lowers the misfit by less than this share is at the minimum.
+# The search is at the minimum if a stride lowers the misfit by less than this share.
 SETTLED = 1e-7
 # A fit to a part of the record may raise the misfit of the whole by at most this factor.
 WILD = 100.0
-# A search over windows ends if a step gains less than this part of the gain of a fit from noise
-# alone: about 0.05 standard deviations from the least misfit. A rough one need not come so near.
+# A search over windows ends if a step gains less than LEVEL of the gain of a fit from noise alone:
+# about 0.05 standard deviations from the least misfit. A rough search ends at ROUGH of it.
 LEVEL, ROUGH = 0.05**2, 1.0
-# The first searches over windows use a ninth and a third of their steps, if these are so many, and
-# take so few steps down.
+# The first searches over windows use a ninth and a third of their length, if this is SHORTEST steps
+# or longer, and make FEW steps of the search.
 PARTS, SHORTEST, FEW = (9, 3), 5, 10
-# Samples after the last one with weight: a low-pass filter looks ahead.
+# The motion is followed for this many samples after the last one with weight, since a low-pass
+# filter takes its slopes from later samples.
 _BEYOND = 2
 
 
@@ -53,8 +54,12 @@ class Kept(NamedTuple):
 class Attempt(eqx.Module):
     """The end of the search from one start.
 
-    `x` (n,) are the free numbers there, `cost` is half the sum of squares, `blocks` the errors and
-    their derivatives there (`terms.blocks`), if known.
+    **Fields:**
+
+    - `x`: (n,) the free numbers.
+    - `cost`: half the sum of squares at x.
+    - `converged`: whether the search converged.
+    - `blocks`: the errors and their derivatives at x (`terms.blocks`), `None` if not known.
     """
 
     x: Float[Array, " n"]
@@ -64,7 +69,11 @@ class Attempt(eqx.Module):
 
 
 class Task(NamedTuple):
-    """What is fitted, with which noise, how closely, and in how many steps at most."""
+    """The task of a search.
+
+    **Fields:** `model` to be fitted; `noise` of its sensors; `tolerance`, in standard deviations;
+    `max_steps` of the search.
+    """
 
     model: Model
     noise: Noise
@@ -73,7 +82,7 @@ class Task(NamedTuple):
 
     @property
     def stride(self) -> int:
-        """Steps before the next look at the keyboard."""
+        """Return the number of steps before the next look at the keyboard."""
         return min(STRIDE, self.max_steps)
 
 
@@ -85,12 +94,15 @@ def least_squares_from(
     weights: Float[Array, "records times"],
     settings: Settings,
 ) -> LMState:
-    """Return the state of `minimise` for the free numbers of a model.
+    """Return the last state of a least-squares search over the free numbers of a model.
 
-    Its normal equations are added up recording by recording.
+    The normal equations are added up recording by recording.
+
+    **Arguments:** `x` (n,) the start; `noise` of the sensors; `weights` (R, T) of the readings,
+    zero for those that are not fitted; `settings` of the search.
     """
     number, kind, places = model.size, x.dtype, model.index.places
-    model = _as_far_as(model, weights)
+    model = _until_last_weight(model, weights)
     prior = terms.prior_weights(model)
     alone = np.asarray(model.index.alone, int) if model.count >= MANY else None
 
@@ -153,23 +165,27 @@ def _gain_of_noise(model: Model, kept: Kept, normal: Normal) -> Float[Array, ""]
 
 
 def is_order_one(model: Model, kind: Any) -> Float[Array, " n"]:
-    """Return one for numbers scaled to order one, zero for those of a `Free`: their unit is a
-    user's.
+    """Return one for free numbers that are of order one, and zero for those of a `Free`.
+
+    The unit of a `Free` is chosen by a user.
     """
     ones = jnp.zeros(model.size, kind).at[: model.index.bodies].set(1.0)
     return ones.at[model.index.start].set(1.0)
 
 
 def _bends(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
-    """Return the rows (m, n) of the Jacobian from the curvature of the charts of bodies."""
+    """Return the rows (m, n) that the curvature of the bodies' charts adds to the Jacobian.
+
+    `slope` (n,) is the gradient of the cost (`AbstractBodyChart.bend`).
+    """
     count = model.index.bodies
     parts = (charts_of(model.chart), *(numbers_of(model.chart, y[:count]) for y in (x, slope)))
     rows = block_diag(*(chart.bend(*mine) for chart, *mine in zip(*parts, strict=True)))
     return jnp.pad(rows, ((0, 0), (0, slope.size - rows.shape[1])))
 
 
-def _as_far_as(model: Model, weights: Float[Array, "records times"]) -> Model:
-    """Return the model, with its motion followed to the last time with weight."""
+def _until_last_weight(model: Model, weights: Float[Array, "records times"]) -> Model:
+    """Return the model with its motion followed only to the last time that has a weight."""
     steps = model.integrator
     if not isinstance(steps, FixedSteps | HeldSteps):
         return model
@@ -191,13 +207,13 @@ def _nothing(model: Model, kind: Any) -> Kept:
 
 
 def whole_record(model: Model) -> Float[Array, "records times"]:
-    """Return weights that show all of each record."""
-    # By NumPy: outside of a trace each operation of JAX costs as much as a run of 100 steps.
+    """Return the weights (R, T) of a fit to the whole of each record: ones."""
+    # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
     return jnp.asarray(np.ones(model.records.t.shape, model.records.t.dtype))
 
 
-def beginning(model: Model, part: float) -> Float[Array, "records times"]:
-    """Return weights that show this part of each record, from its beginning."""
+def weights_of_beginning(model: Model, part: float) -> Float[Array, "records times"]:
+    """Return the weights (R, T) of a fit to the first `part` of each record: one, else zero."""
     t = np.asarray(model.records.t)
     since, length = t - t[:, :1], t[:, -1:] - t[:, :1]
     return jnp.asarray((since <= part * length).astype(t.dtype))
@@ -218,13 +234,14 @@ def _search(
     steps: int | None = None,
     level: float = LEVEL,
 ) -> LMState:
-    """Return the end of a stride of `steps` from x (see `Settings`)."""
+    """Return the last state after a stride of `steps` from x; `Settings` names the arguments."""
     steps, count = task.stride if steps is None else steps, nominal_count(task.model)
     settings = Settings(task.tolerance, damping, steps, aim, near, count, level)
     return least_squares_from(task.model, x, task.noise, weights, settings)
 
 
-def _at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
+def _evaluate_at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
+    """Return the state of a search at x without a step, by the program of the search."""
     return least_squares_from(model, x, noise, whole_record(model), Settings(0.0, 1.0, 0))
 
 
@@ -232,12 +249,12 @@ def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Any:
     """Return errors and derivatives (`terms.blocks`), by the program of the search."""
     kind, sensors = model.records.t.dtype, model.records.sensors
     ones = (np.ones((model.count, sensor.components), kind) for sensor in sensors)
-    return _at(model, x, tuple(map(jnp.asarray, ones))).kept.blocks
+    return _evaluate_at(model, x, tuple(map(jnp.asarray, ones))).kept.blocks
 
 
 def cost_of(model: Model, x: Float[Array, " n"], noise: Noise) -> float:
-    """Return the misfit over the whole of the records."""
-    return float(_at(model, x, noise).cost)
+    """Return the misfit at x over the whole of the records."""
+    return float(_evaluate_at(model, x, noise).cost)
 
 
 def polish(
@@ -248,28 +265,35 @@ def polish(
     aim: float = 0.0,
     watch: Callable[[Attempt], None] = lambda attempt: None,
 ) -> Attempt:
-    """Return the end of strides over the whole of the records, until one more changes nothing.
+    """Search over the whole of the records, stride by stride, until a stride changes nothing.
 
-    Large damping alone can look like convergence, so that each stride after the first begins with
-    little. `damping` is that of the first; a search that does not lead to `aim` ends early; `watch`
-    is called after each stride.
+    Large damping alone can look like convergence: each stride after the first one therefore begins
+    with little.
+
+    **Arguments:**
+
+    - `begin`: the first point.
+    - `task`: the task.
+    - `damping`: that of the first stride.
+    - `aim`: the cost that another start reached; a search that does not lead to it ends early.
+    - `watch`: a function that is called after each stride.
     """
     attempt, weights = begin, whole_record(task.model)
     for first in range(0, task.max_steps, STRIDE):
         before = float(attempt.cost)
         end = _search(attempt.x, task, weights, BOLD if first else damping, aim)
         if not np.isfinite(float(end.cost)):
-            # The residuals are no longer finite: go back to the point before this stride.
+            # The misfit is not finite any more: go back to the point before this stride.
             attempt = Attempt(attempt.x, cost_of(task.model, attempt.x, task.noise))
             watch(attempt)
             break
         attempt = _attempt(end)
-        # Round-off refuses every step at the minimum: the test is whether the point moved. One or
-        # two steps alone, of a small `max_steps`, are also refused where they are too long.
+        # At the minimum every step is refused, by round-off: test whether the misfit still falls.
+        # One or two steps alone, of a small `max_steps`, are also refused where they are too long.
         stands = before - float(attempt.cost) < SETTLED * (1.0 + abs(before))
         stands = stands and task.stride == STRIDE
         settled = bool(attempt.converged) or stands
-        # The same gain again would not reach the aim.
+        # The search is hopeless if the misfit would not reach the aim by falling as much again.
         hopeless = aim > 0 and not settled and float(attempt.cost) ** 2 > aim * before
         attempt = dataclasses.replace(attempt, converged=settled)
         watch(attempt)
@@ -287,9 +311,15 @@ def fit_in_stages(
 ) -> Attempt:
     """Return the end of the search from one start.
 
-    The whole record is fitted at once if that explains it; else its beginning, more of it, and all
-    of it (`HORIZONS`). The search ends early if it does not lead to `aim`. `watch` is called with
-    what is reached over the whole of the records.
+    The whole record is fitted first. If that does not explain it, its beginning is fitted, then
+    more of it, and then all of it (`HORIZONS`).
+
+    **Arguments:**
+
+    - `x`: (n,) the start.
+    - `task`: the task.
+    - `aim`: the cost that another start reached; a search that does not lead to it ends early.
+    - `watch`: a function that is called with each point reached over the whole of the records.
     """
     model, noise, *_ = task
     if model.clusters is not None:
@@ -302,37 +332,39 @@ def fit_in_stages(
     level = float(end.first)
     for part in HORIZONS[:-1]:
         # A part of the record need not be fitted to convergence.
-        end = _search(x, task, beginning(model, part), CAREFUL, aim * part, aim * part)
-        # A point that explains a part alone may be wrong beyond it, such as a negative drag.
+        weights = weights_of_beginning(model, part)
+        end = _search(x, task, weights, CAREFUL, aim * part, aim * part)
+        # A point that explains only a part may be far off later: a drag of the wrong sign, say.
         after = cost_of(model, end.point, noise)
         if after < WILD * max(level, 1e-300):
             x, level = end.point, after
         if aim * part > 0 and not bool(end.converged) and float(end.cost) > WILD * aim * part:
-            # It does not even explain this part, which another start explains.
+            # This start does not even explain the part, which another start explains: give it up.
             attempt = Attempt(x, level)
             watch(attempt)
             return attempt
     attempt = polish(Attempt(x), task, damping=CAREFUL, aim=aim, watch=watch)
     if not float(at_once.cost) < (1.0 - SETTLED) * float(attempt.cost):
         return attempt
-    # A beginning may lead away from the least misfit of the whole.
+    # The fit to the beginning may have led away from the least misfit of the whole.
     return at_once if bool(at_once.converged) else polish(at_once, task, aim=aim, watch=watch)
 
 
 def _fit_windows(
     x: Float[Array, " n"], task: Task, aim: float, watch: Callable[[Attempt], None]
 ) -> Attempt:
-    """Return the end of the search over windows: first over a ninth and a third of their steps.
+    """Return the end of the search over windows.
 
-    A long run from a poor guess diverges.
+    The first searches are over a ninth and a third of each window: with poor numbers a long run
+    diverges.
     """
     model, begin = task.model, x
     length = model.records.t.shape[1] - 1
     for part in PARTS:
         steps = length // part
         if steps >= SHORTEST:
-            seen = beginning(model, (steps + 0.5) / length)
-            end = _search(begin, task, seen, BOLD, steps=FEW, level=ROUGH)
+            weights = weights_of_beginning(model, (steps + 0.5) / length)
+            end = _search(begin, task, weights, BOLD, steps=FEW, level=ROUGH)
             begin = end.point if np.isfinite(float(end.cost)) else begin
     attempt = polish(Attempt(begin), task, aim=aim, watch=watch)
     if begin is not x and not float(attempt.cost) <= cost_of(model, x, task.noise):
@@ -340,20 +372,21 @@ def _fit_windows(
     return attempt
 
 
-def nominal(reading: Any) -> bool:
-    """Return whether the noise of a reading is only the unit of its errors."""
+def nominal(reading: Reading) -> bool:
+    """Return whether the noise of a reading is no more than the unit of its errors."""
     return getattr(reading.sensor, "nominal", False)
 
 
 def nominal_count(model: Model) -> int:
-    """Return the number of errors of unknown size; 0 if a noise gives the size of any."""
+    """Return the number of errors if the size of none is known by a noise, else 0."""
     readings = model.records.readings
     return sum(map(count_of, readings)) if all(map(nominal, readings)) else 0
 
 
 def enough(model: Model) -> float:
-    """Return a misfit that only the true motion reaches: twice the mean of χ², or 1 % of the
-    signal.
+    """Return a misfit that only the true motion reaches.
+
+    It is twice the mean of half χ² for sensors of known noise, and 1 % of the signal for others.
     """
     return sum(
         (1.0 if reading.known_noise and not nominal(reading) else 0.01) * count_of(reading)

@@ -1,4 +1,4 @@
-"""The starts of a fit: a linear regression if the data allow it, and scattered points around it."""
+"""The starting points of a fit: a linear regression if the data allow it, and scattered points."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
@@ -22,24 +22,24 @@ from rigidjax.motion.torques.states import has_states
 
 
 def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[Float[Array, " n"]]:
-    """Return `count` starting points: the regression first, then scattered ones.
+    """Return `count` starting points (n,) of a fit: the regression first, then scattered ones.
 
-    These scatter around the regression or over the whole chart, their rates by a tenth. A `Free`
-    starts at its given value.
+    The others scatter about the regression or over the whole chart of the body, and their initial
+    rates by a tenth. A `Free` starts at its given value.
     """
     recordings = stacking.on_host(model.records, model.counts) if model.index.bodies else ()
     if isinstance(model.chart, Bodies):
         rows = list(zip(recordings, model.body_names, strict=True))
-        found = {
+        bodies_by_name = {
             name: regress_inertia(tuple(record for record, of in rows if of == name), model.torque)
             for name in model.chart.names
         }
-        regressed = {name: body for name, body in found.items() if body is not None} or None
+        regressed = {n: body for n, body in bodies_by_name.items() if body is not None} or None
     else:
         regressed = regress_inertia(recordings, model.torque) if recordings else None
     start = model.start(regressed)
     bodies, spins = slice(model.index.bodies), np.asarray(model.index.start)[:, -3:]
-    # NumPy's generator: that of JAX takes seconds to compile.
+    # Use NumPy's generator: that of JAX takes seconds to compile.
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)
     out = []
     # Without a free body and free initial rates there is nothing to scatter.
@@ -54,22 +54,22 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
 
 
 def regress_inertia(recordings: tuple[Recording, ...], torque: Any) -> Inertia | None:
-    """Return the inertia from a regression on Euler's equations in integral form.
+    """Return the inertia by a regression on Euler's equations in integral form.
 
-    `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. With a torque they are found
-    by least squares, without one as the smallest right singular vector (up to scale). The result
-    is moved to the nearest real body. It is `None` if samples are too far apart, or the torque
-    needs more than a rate.
+    `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. With a torque τ they are
+    found by least squares; without one they are the right singular vector of the smallest singular
+    value, up to scale. The result is moved to the nearest real body. It is `None` if samples are
+    too far apart, or if the torque depends on more than time and rate.
     """
-    found = []
+    balances = []
     for recording in recordings:
         t, w = rates(recording)
         if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
             return None
-        if not of_rates(torque):
+        if not depends_on_rate_only(torque):
             return None
-        found.append(balance(recording, torque, np.eye(3)))
-    matrix, side, _ = (np.concatenate(part) for part in zip(*found, strict=True))
+        balances.append(balance(recording, torque, np.eye(3)))
+    matrix, side, _ = (np.concatenate(part) for part in zip(*balances, strict=True))
     components, _ = tensor_and_margin(matrix, side)
     if not components[:3].sum() > 0:
         return None
@@ -81,9 +81,10 @@ def regress_inertia(recordings: tuple[Recording, ...], torque: Any) -> Inertia |
 
 
 def tensor_and_margin(matrix: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, float]:
-    """The components (6,) of a tensor by least squares, of trace one if all sides are zero.
+    """Return the components (6,) of a tensor by least squares, and its margin of being real.
 
-    And the smallest eigenvalue of its second moment over the largest: positive for a real body.
+    If all sides are zero, the tensor has the trace one. The margin is the smallest eigenvalue of
+    the second moment over the largest: it is positive for a real body.
     """
     if np.abs(side).max() > 0:
         components = np.linalg.lstsq(matrix, side, rcond=None)[0]
@@ -96,17 +97,18 @@ def tensor_and_margin(matrix: np.ndarray, side: np.ndarray) -> tuple[np.ndarray,
     return components, float(values[0] / max(np.abs(values).max(), 1e-300))
 
 
-def of_rates(torque: Any) -> bool:
-    """Whether there is no torque, or it depends on time and rate alone."""
+def depends_on_rate_only(torque: Torque | None) -> bool:
+    """Return whether a torque depends on time and rate alone; true for no torque."""
     return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
 
 
 def balance(
-    recording: Recording, torque: Any, turn: np.ndarray
+    recording: Recording, torque: Torque | None, turn: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Euler's equations integrated over a recording, of rates turned by `turn`.
+    """Return Euler's equations integrated over a recording, of rates times the matrix `turn`.
 
-    These are rows (n, 6), right sides (n,), and rows of the momentum itself.
+    They are linear equations for the six components of the inertia: rows (n, 6) and right sides
+    (n,). The third result are the rows of the momentum alone.
     """
     t, w = rates(recording)
     w, pushed = w @ turn.T, np.zeros((t.size, 3))
@@ -119,14 +121,16 @@ def balance(
     total, impulse = momenta + integral[:, :-1], integral[:, -1:]
 
     def about_the_mean(x: np.ndarray) -> np.ndarray:
-        # A conserved momentum is constant: compare it with its mean over the record.
-        some = (x - x.mean(axis=0))[:: max(1, t.size // 60)]
-        return some.transpose(0, 2, 1).reshape(-1, x.shape[1])
+        # The integral of the equations is a constant: compare each sample with the mean over the
+        # record. Sixty samples are enough.
+        samples = (x - x.mean(axis=0))[:: max(1, t.size // 60)]
+        return samples.transpose(0, 2, 1).reshape(-1, x.shape[1])
 
     return about_the_mean(total), about_the_mean(impulse)[:, 0], about_the_mean(momenta)
 
 
 @eqx.filter_jit
-def _torques(torque: Torque, t: Any, w: Any) -> Any:
+def _torques(torque: Torque, t: ArrayLike, w: ArrayLike) -> Array:
+    """Return the torques (n, 3) at times t (n,) and rates w (n, 3)."""
     body = Inertia(jnp.eye(3))
     return jax.vmap(lambda time, omega: evaluate(torque, time, Spin(omega), body))(t, w)

@@ -1,4 +1,4 @@
-"""Stochastic descent by optax, for more recordings than one step of least squares can use."""
+"""Stochastic gradient descent by optax, for more recordings than a least-squares step can use."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from rigidjax import _checks
 from rigidjax.identify.data import stacking
@@ -25,19 +25,26 @@ from rigidjax.identify.search.noise import first_noise
 if TYPE_CHECKING:
     import optax
 
-# Steps between two checks of the keyboard and of the misfit, which may become NaN.
+# The number of steps in one program. An interrupt, or a misfit that is NaN, is noticed between two
+# programs.
 STRIDE = 50
 
 
 class Descent(eqx.Module):
-    """The first descent of a fit, on a few recordings at a time.
+    """The options of a stochastic gradient descent, which takes a few recordings at a time.
 
-    Each step draws `batch` recordings without replacement, differentiates their misfit and hands
-    its gradient by all free numbers to `optimiser`. The free numbers are unconstrained and of order
-    one: a learning rate is a share of order one. **Arguments:** `optimiser` any
-    `optax.GradientTransformation`; `steps` their number; `batch`. **Raises:** `TypeError` for
-    anything but an optimiser, `ValueError` for counts below one. Source: Robbins and Monro 1951,
-    doi:10.1214/aoms/1177729586.
+    Each step draws `batch` recordings without replacement, and gives the gradient of their misfit
+    by all free numbers to the optimiser (Robbins and Monro 1951, doi:10.1214/aoms/1177729586). The
+    free numbers are unconstrained and of order one, so that a learning rate of 0.01 moves each by
+    about a hundredth of its size.
+
+    **Arguments:**
+
+    - `optimiser`: any `optax.GradientTransformation`.
+    - `steps`: the number of steps.
+    - `batch`: the number of recordings in a step.
+
+    **Raises:** `TypeError` for anything but an optimiser, `ValueError` for counts below one.
 
     >>> import optax
     >>> rj.identify.Descent(optax.adam(1e-2), steps=200, batch=4).batch
@@ -67,20 +74,22 @@ def descend(
 ) -> Float[Array, " n"]:
     """Fit the free numbers of a model by stochastic gradient descent alone.
 
-    It is for many numbers, such as the weights of a network in the torque, where the dense matrices
-    of `fit` are too large; it gives no intervals. **Arguments:**
+    It is for many numbers, such as the weights of a network in the torque, for which the dense
+    matrices of `fit` are too large. It gives no intervals.
 
-    - `model`: the readings and the free numbers; a sensor without noise counts by a tenth of its
-      signal.
+    **Arguments:**
+
+    - `model`: the readings and the free numbers. A sensor without noise counts with a noise of a
+      tenth of its signal.
     - `descent`: optimiser, steps and batch.
     - `initial`: (n,) the free numbers to begin with, `model.start()` unless given.
-    - `key`: random key of the batches, always the same unless given.
-    - `progress`: called with a line of text after every 50 steps, such as `print`.
+    - `key`: random key of the batches; without a key they are the same at each call.
+    - `progress`: a function such as `print`, called with a line of text after every 50 steps.
 
-    **Returns** the free numbers (n,) after the last step, or before the first one whose misfit is
-    not finite: `model.unpack(x)`, `model.scenes(x)` say what they are. An interrupt (Ctrl-C)
-    returns the numbers reached. **Raises:** `ValueError` for a batch of more recordings than there
-    are.
+    **Returns** the free numbers x (n,) after the last step, or before the first step whose misfit
+    is not finite; `model.unpack(x)` returns the body and the values, `model.scenes(x)` the scenes.
+    After an interrupt (Ctrl-C) the numbers reached so far are returned. **Raises:** `ValueError`
+    for a batch of more recordings than there are.
 
     >>> import optax
     >>> ts = jnp.linspace(0.0, 3.0, 31)
@@ -108,30 +117,30 @@ def descend_from(
     start: Float[Array, " n"],
     model: Model,
     noise: Noise,
-    how: Descent,
+    descent: Descent,
     key: PRNGKeyArray,
     progress: Callable[[str], Any] | None = None,
 ) -> tuple[Float[Array, " n"], bool]:
-    """Return the end of the steps, or the last point before a NaN, and whether all steps were made.
+    """Return the last point of a descent, and whether it ended without an interrupt (Ctrl-C).
 
-    An interrupt (Ctrl-C) ends the steps early.
+    The point is the last one before a misfit that is not finite.
     """
-    if how.batch > model.count:
+    if descent.batch > model.count:
         raise ValueError(
-            f"Descent: wanted a batch of at most {model.count} recordings, got {how.batch}"
+            f"Descent: wanted a batch of at most {model.count} recordings, got {descent.batch}"
         )
-    init: Any = how.optimiser.init
+    init: Any = descent.optimiser.init
     x, memory = start, init(start)
     try:
-        for first in range(0, how.steps, STRIDE):
+        for first in range(0, descent.steps, STRIDE):
             key, own = jax.random.split(key)
-            keys = jax.random.split(own, min(STRIDE, how.steps - first))
-            after, memory, costs = _stride(x, memory, model, noise, how, keys)
+            keys = jax.random.split(own, min(STRIDE, descent.steps - first))
+            after, memory, costs = _make_steps(x, memory, model, noise, descent, keys)
             if not np.isfinite(np.asarray(costs)).all():
                 break
             x = after
             done = first + keys.shape[0]
-            line = f"descent {done}/{how.steps}: misfit {float(costs.mean()):.6g}"
+            line = f"descent {done}/{descent.steps}: misfit {float(costs.mean()):.6g}"
             report_progress(progress, line)
     except KeyboardInterrupt:
         return x, False
@@ -139,15 +148,17 @@ def descend_from(
 
 
 @eqx.filter_jit
-def _stride(
-    x: Float[Array, " n"], memory: Any, model: Model, noise: Noise, how: Descent, keys: Array
-) -> tuple[Float[Array, " n"], Any, Float[Array, " steps"]]:
-    def step(carry: Any, key: Array) -> Any:
+def _make_steps(
+    x: Float[Array, " n"], memory: PyTree, model: Model, noise: Noise, descent: Descent, keys: Array
+) -> tuple[Float[Array, " n"], PyTree, Float[Array, " steps"]]:
+    """Return point, memory of the optimiser and misfits after one step for each of the `keys`."""
+
+    def step(carry: tuple, key: Array) -> tuple[tuple, Array]:
         x, memory = carry
-        update: Any = how.optimiser.update
-        rows = jax.random.choice(key, model.count, (how.batch,), replace=False)
+        update: Any = descent.optimiser.update
+        rows = jax.random.choice(key, model.count, (descent.batch,), replace=False)
         cost, slope = jax.value_and_grad(misfit_of)(x, model, noise, rows)
-        # optax counts its steps in integers, which strict promotion forbids to meet floats.
+        # optax multiplies its integer count of steps with floats: allow it under strict promotion.
         with jax.numpy_dtype_promotion("standard"):
             move, memory = update(slope, memory, x)
         return (x + move, memory), cost
@@ -157,7 +168,10 @@ def _stride(
 
 
 def misfit_of(x: Float[Array, " n"], model: Model, noise: Noise, rows: Array) -> Float[Array, ""]:
-    """Return the misfit of the recordings `rows` times the number of batches; priors count once."""
+    """Return the misfit of the recordings `rows`, scaled up to all recordings, and of the priors.
+
+    Its mean over batches is the misfit of the whole model.
+    """
     few, sizes = chosen_recordings(model, rows), stacking.one(noise, rows)
     weights = jnp.ones_like(few.records.t)
     residuals = reading_residuals(few, all_errors(few, x), sizes, weights)
@@ -166,9 +180,9 @@ def misfit_of(x: Float[Array, " n"], model: Model, noise: Noise, rows: Array) ->
 
 
 def chosen_recordings(model: Model, rows: Array) -> Model:
-    """Return the model of the recordings `rows` (traced indices), with the same free numbers.
+    """Return the model of the recordings `rows` alone, with all free numbers.
 
-    The recordings keep their padding.
+    The indices may be traced; the recordings keep their padding.
     """
     parts = lambda m: (m.records, m.reference, m.which, m.index.places, m.index.start)  # noqa: E731
     return eqx.tree_at(

@@ -1,4 +1,4 @@
-"""Sensors of a recording."""
+"""The sensors of a recording: each predicts its readings from a motion."""
 
 from rigidjax._names import show
 from rigidjax.identify.sensors.attitude import (

@@ -18,17 +18,22 @@ from rigidjax.rotation.linalg3 import cross, dot
 
 
 class AttitudeSensor(ClockedSensor):
-    """Reads the attitude as a quaternion (w, x, y, z), body → world; q and −q read the same.
+    """A sensor of the attitude as a quaternion (w, x, y, z), body → world; q and −q are the same.
 
-    The error is the rotation vector, in the sensor's axes, that takes the predicted attitude to the
-    reading, `log((q exp(mounting))⁻¹ q_read)`: its length is the angle between them. Readings
-    are quaternions (T, 4) or rotation matrices (T, 3, 3); of Euler angles (T, 3) in degrees
-    `jax.vmap(lambda a: rj.euler.to_quaternion(a, "ZYX"))(jnp.deg2rad(angles))` makes them.
+    The error is the rotation vector, in the sensor's axes, from the predicted attitude to the
+    reading, `log((q exp(mounting))⁻¹ q_read)`: its length is the angle between them. Readings are
+    quaternions (T, 4) or rotation matrices (T, 3, 3). Euler angles (T, 3) in degrees become
+    quaternions by `jax.vmap(lambda a: rj.euler.to_quaternion(a, "ZYX"))(jnp.deg2rad(angles))`.
 
-    **Arguments:** `noise` standard deviation of each component of that vector, rad, one number or
-    (3,); `None` estimates it; `mounting` (3,) rotation vector from the body's axes to the sensor's,
-    rad, or `None`; `offset` s, `jitter` as for `Gyro`. **Raises** `ValueError` for a noise that is
-    not positive, a wrong shape, NaN; the recording for a matrix that is no rotation.
+    **Arguments:**
+
+    - `noise`: the standard deviation of each component of the rotation vector, rad, one number or
+      (3,); `None` estimates it.
+    - `mounting`: (3,) the rotation vector from the body's axes to the sensor's, rad, or `None`.
+    - `offset`, `jitter`: s, as for `Gyro`.
+
+    **Raises** `ValueError` for a noise that is not positive, a wrong shape, NaN; a `Recording`
+    raises it for a matrix that is no rotation.
 
     >>> AttitudeSensor(noise=0.01).reading_shape
     (4,)
@@ -46,22 +51,24 @@ class AttitudeSensor(ClockedSensor):
         return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
 
     def reading_of(self, now: SensorInput, error: Vec3) -> Float[Array, "4"]:
-        """The reading (4,) whose error (3,) rad is this one."""
+        """Return the reading (4,) that has the `error` (3,), rad."""
         q = _mounted(now.state.q, self.mounting)
         return quaternion.multiply(q, quaternion.exp(error))
 
     def readings(self, values: np.ndarray) -> np.ndarray:
-        """Readings (T, 4), also of matrices (T, 3, 3)."""
+        """Return readings (T, 4), from quaternions (T, 4) or matrices (T, 3, 3)."""
         return _quaternions(values) if values.shape[1:] == (3, 3) else values
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
+        """Return the rows that are no unit quaternions, (T,) true where wrong, and why."""
         wanted = "wanted (w, x, y, z) with the scalar first"
         return _not_unit(values), f"the quaternion at index {{index}} is not unit; {wanted}"
 
 
 def _quaternions(matrices: np.ndarray) -> np.ndarray:
-    seen = np.isfinite(matrices).all(axis=(1, 2))
-    filled = np.where(seen[:, None, None], matrices, np.eye(3))
+    """Return the quaternions (T, 4) of rotation matrices (T, 3, 3); NaN for a matrix with NaN."""
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    filled = np.where(finite[:, None, None], matrices, np.eye(3))
     off = np.abs(filled @ filled.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     wrong = (off > 1e-6) | (np.linalg.det(filled) < 0)
     if wrong.any():
@@ -71,15 +78,16 @@ def _quaternions(matrices: np.ndarray) -> np.ndarray:
             f"{off[index]:.2g}, det = {np.linalg.det(filled[index]):.3g}"
         )
     out = np.asarray(jax.vmap(quaternion.from_matrix)(jnp.asarray(filled)))
-    return np.where(seen[:, None], out, np.nan)
+    return np.where(finite[:, None], out, np.nan)
 
 
 def _mounted(q: Array, mounting: Vec3 | None) -> Array:
-    """The attitude of a sensor's axes."""
+    """Return the attitude of a sensor's axes on a body of attitude q."""
     return q if mounting is None else quaternion.multiply(q, quaternion.exp(mounting))
 
 
 def _unit(world: Any) -> Vec3:
+    """Return the unit vector along `world`; raise `ValueError` for a length of zero."""
     vector = base.required("world")(world)
     length = jnp.sqrt(dot(vector, vector))
     words = "world: wanted a direction, got a vector of length zero"
@@ -87,15 +95,19 @@ def _unit(world: Any) -> Vec3:
 
 
 class Direction(ClockedSensor):
-    """Reads the direction, in its own axes, of an object with a known direction in the world.
+    """A sensor of the direction, in its own axes, of an object with a known direction in the world.
 
-    Examples: a sun sensor, a star, the vertical. The error is the chord from the prediction to the
-    reading, taken in the plane across the reading (two numbers, rad for small errors, 2 at most).
+    Examples are a sun sensor, a tracker of one star, a sensor of the vertical. The error is the
+    chord from the prediction to the reading, in the plane across the reading: two numbers, rad for
+    small errors, of length 2 at most. Readings (T, 3) are unit vectors.
 
-    **Arguments:** `world` (3,) the direction in the world frame, any length; `noise` rad across the
-    line of sight, one number or (2,), `None` to estimate it; `mounting`, `offset`, `jitter` as for
-    `AttitudeSensor`. Readings (T, 3) are unit vectors. **Raises** `ValueError` for a direction of
-    length zero, a noise that is not positive, NaN.
+    **Arguments:**
+
+    - `world`: (3,) the direction in the world frame, of any length.
+    - `noise`: rad across the line of sight, one number or (2,), `None` to estimate it.
+    - `mounting`, `offset`, `jitter`: as for `AttitudeSensor`.
+
+    **Raises** `ValueError` for a direction of length zero, a noise that is not positive, NaN.
 
     >>> Direction([0.0, 0.0, 2.0], noise=0.01).world
     Array([0., 0., 1.], dtype=float64)
@@ -110,40 +122,43 @@ class Direction(ClockedSensor):
     mounting: Vec3 | None = eqx.field(converter=base.optional("mounting"), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "2"]:
-        seen = self._seen(now)
-        # Two axes across the reading, which is data: no derivative passes through them.
+        predicted = self._predict(now)
+        # The axes across the reading are data: no derivative passes through them. Axes across the
+        # prediction would jump as the motion changes.
         first, second = _across(reading)
-        # sin θ / cos ½θ = 2 sin ½θ, the chord; guarded where the two are opposite.
-        half = jnp.sqrt(jnp.maximum(0.5 * (1.0 + dot(seen, reading)), 1e-12))
-        return -jnp.stack([dot(first, seen), dot(second, seen)]) / half
+        # The chord is sin θ / cos ½θ = 2 sin ½θ; the bound guards opposite directions.
+        half = jnp.sqrt(jnp.maximum(0.5 * (1.0 + dot(predicted, reading)), 1e-12))
+        return -jnp.stack([dot(first, predicted), dot(second, predicted)]) / half
 
     def reading_of(self, now: SensorInput, error: Float[Array, "2"]) -> Vec3:
-        """A reading (3,) with an error of the same length as this one (2,), and equal for small
-        errors.
+        """Return a reading (3,) whose error has the length of `error` (2,).
 
-        The two axes across the prediction are the axes across the reading, turned by the angle
-        between.
+        The components are the same to first order: here they are taken along axes across the
+        prediction, which are turned from those across the reading by the angle between the two.
         """
-        seen = self._seen(now)
-        first, second = _across(seen)
+        predicted = self._predict(now)
+        first, second = _across(predicted)
         # |error| is a chord: cos θ = 1 − ½ |error|², sin θ = |error| cos ½θ.
         square = jnp.minimum(error[0] * error[0] + error[1] * error[1], 4.0)
         half = jnp.sqrt(1.0 - 0.25 * square)
-        return (1.0 - 0.5 * square) * seen + half * (error[0] * first + error[1] * second)
+        return (1.0 - 0.5 * square) * predicted + half * (error[0] * first + error[1] * second)
 
-    def _seen(self, now: SensorInput) -> Vec3:
+    def _predict(self, now: SensorInput) -> Vec3:
+        """Return the predicted direction (3,) in the sensor's axes."""
         return quaternion.rotate_inverse(_mounted(now.state.q, self.mounting), self.world)
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
+        """Return the rows that are no unit vectors, (T,) true where wrong, and why."""
         return _not_unit(values), "the direction at index {index} is not of length 1"
 
 
 def _not_unit(rows: np.ndarray) -> np.ndarray:
+    """Return whether each row is longer or shorter than 1."""
     return np.abs(np.linalg.norm(rows, axis=1) - 1) > 1e-6
 
 
 def _across(line: Vec3) -> tuple[Vec3, Vec3]:
-    """Two unit vectors orthogonal to a unit vector and to each other."""
+    """Return two unit vectors that are orthogonal to the unit vector `line` and to each other."""
     least = jnp.eye(3, dtype=line.dtype)[jnp.argmin(jnp.abs(line))]
     first = cross(line, least)
     first = first / jnp.sqrt(dot(first, first))
@@ -151,12 +166,17 @@ def _across(line: Vec3) -> tuple[Vec3, Vec3]:
 
 
 class Marker(ClockedSensor):
-    """Reads the position, in the world, of a point fixed in the body: `x + R r`, m.
+    """A marker: its position in the world is read, `x + R r`, m; the point is fixed in the body.
 
-    **Arguments:** `place` (3,) the point, m, body frame; `noise` m, one number or (3,), `None` to
-    estimate it; `origin` (3,) m, world frame: the fixed point of a body on a pivot; `None` for a
-    body that moves (`Rigid`, with `MassProperties`; `place` is then in their frame); `offset` s as
-    for `Gyro`. **Raises** `ValueError` as `Gyro`.
+    **Arguments:**
+
+    - `place`: (3,) r, the point, m, body frame; that of the `MassProperties` if the body moves.
+    - `noise`: m, one number or (3,), `None` to estimate it.
+    - `origin`: (3,) m, world frame, the fixed point of a body on a pivot; `None` for a body that
+      moves (`Rigid`, with `MassProperties`).
+    - `offset`, `jitter`: s, as for `Gyro`.
+
+    **Raises** `ValueError` as `Gyro`.
 
     >>> body = rj.MassProperties(1.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([2.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
@@ -165,7 +185,7 @@ class Marker(ClockedSensor):
     [0.25, 0.0, 0.0]
     """
 
-    # A body on a pivot need not move.
+    # The place of a body on a pivot is known: only its attitude is needed.
     feels: ClassVar[Any] = property(lambda self: HasPose if self.origin is None else HasAttitude)
     unit: ClassVar[str] = "m"
     place: Vec3 = eqx.field(converter=base.required("place"), default=None)
@@ -180,10 +200,17 @@ class Marker(ClockedSensor):
 
 
 class Position(ClockedSensor):
-    """Reads the centre of mass, in the world: `x + bias`, m. Use `Marker` for another point.
+    """A sensor of the centre of mass of a `Rigid`, in the world: `x + bias`, m.
 
-    **Arguments:** `noise` m, one number or (3,), `None` to estimate it; `bias` (3,) m, world frame,
-    or `None`; `offset` s, `jitter` as for `Gyro`. For a `Rigid`. **Raises** `ValueError` as `Gyro`.
+    Use `Marker` for another point.
+
+    **Arguments:**
+
+    - `noise`: m, one number or (3,), `None` to estimate it.
+    - `bias`: (3,) m, world frame, or `None`.
+    - `offset`, `jitter`: s, as for `Gyro`.
+
+    **Raises** `ValueError` as `Gyro`.
 
     >>> Position(noise=0.01).unit
     'm'
@@ -196,20 +223,27 @@ class Position(ClockedSensor):
     bias: Vec3 | None = eqx.field(converter=base.optional("bias"), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
-        place = now.state.x
-        return reading - (place if self.bias is None else place + self.bias)
+        x = now.state.x
+        return reading - (x if self.bias is None else x + self.bias)
 
 
 class Velocity(ClockedSensor):
-    """Reads the velocity of a point of the body: `v + R (Ω × r)`, in the world or in its own axes.
+    """A sensor of the velocity of a point of a `Rigid`: `v + R (Ω × r)`, in world or sensor axes.
 
-    **Arguments:** `noise` m/s, one number or (3,), `None` to estimate it; `place` (3,) the point,
-    m, in the frame of the `MassProperties` (r is the vector to it from the centre of mass); `None`
-    for the centre of mass itself; `mounting` (3,) rotation vector that turns the body's axes onto
-    the sensor's, rad, for a sensor on the body, such as a Doppler log (zeros for the body's axes);
-    `None` for the world's axes, as in satellite navigation; `bias` (3,) m/s or `None`; `offset` s,
-    `jitter` as for `Gyro`. For a `Rigid`. **Raises** `ValueError` as `Gyro`. Source: Landau and
-    Lifshitz, Mechanics, eq 31.2.
+    Source: Landau and Lifshitz, Mechanics, eq 31.2.
+
+    **Arguments:**
+
+    - `noise`: m/s, one number or (3,), `None` to estimate it.
+    - `place`: (3,) the point, m, in the frame of the `MassProperties`; r is the vector to it from
+      the centre of mass. `None` for the centre of mass.
+    - `mounting`: (3,) the rotation vector from the body's axes to the sensor's, rad, for a sensor
+      on the body, such as a Doppler log; zeros for the body's axes. `None` for the world's axes, as
+      in satellite navigation.
+    - `bias`: (3,) m/s, or `None`.
+    - `offset`, `jitter`: s, as for `Gyro`.
+
+    **Raises** `ValueError` as `Gyro`.
 
     >>> Velocity(noise=0.1, mounting=[0.0, 0.0, 0.0]).unit
     'm/s'
@@ -225,22 +259,30 @@ class Velocity(ClockedSensor):
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         state = now.state
-        seen = state.v
+        velocity = state.v
         if self.place is not None:
             arm = now.lever(self.place)
-            seen = seen + quaternion.rotate(state.q, cross(state.omega, arm))
+            velocity = velocity + quaternion.rotate(state.q, cross(state.omega, arm))
         if self.mounting is not None:
-            seen = quaternion.rotate_inverse(_mounted(state.q, self.mounting), seen)
-        return reading - (seen if self.bias is None else seen + self.bias)
+            velocity = quaternion.rotate_inverse(_mounted(state.q, self.mounting), velocity)
+        return reading - (velocity if self.bias is None else velocity + self.bias)
 
 
 class Range(ClockedSensor):
-    """Reads the distance from a station to a point of the body: `|x + R r − s| + bias`, m.
+    """A sensor of the distance of a point of a `Rigid` from a station: `|x + R r − s| + bias`, m.
 
-    **Arguments:** `station` s (3,) m, world frame; `noise` m, `None` to estimate it; `place` (3,)
-    the point, m, in the frame of the `MassProperties`; `None` for the centre of mass; `bias` m, or
-    `None`; `offset` s, `jitter` as for `Gyro`. Readings (T,). For a `Rigid`. **Raises**
-    `ValueError` as `Gyro`, and for a reading below zero.
+    Readings are (T,).
+
+    **Arguments:**
+
+    - `station`: s (3,) m, world frame.
+    - `noise`: m, `None` to estimate it.
+    - `place`: (3,) the point, m, in the frame of the `MassProperties`; `None` for the centre of
+      mass.
+    - `bias`: m, or `None`.
+    - `offset`, `jitter`: s, as for `Gyro`.
+
+    **Raises** `ValueError` as `Gyro`, and for a reading below zero.
 
     >>> Range([0.0, 0.0, 100.0], noise=0.05).reading_shape
     ()
@@ -261,13 +303,14 @@ class Range(ClockedSensor):
         line = state.x - self.station
         if self.place is not None:
             line = line + quaternion.rotate(state.q, now.lever(self.place))
-        # There is no direction at the station itself, and no derivative: it is set to 0.
+        # At the station itself the distance has no derivative; it is set to 0.
         square = dot(line, line)
         length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
-        found = length if self.bias is None else length + self.bias
-        return (reading - found)[None]
+        predicted = length if self.bias is None else length + self.bias
+        return (reading - predicted)[None]
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
+        """Return the distances below zero, (T,) true where wrong, and why; none with a bias."""
         if self.bias is not None:
             return np.zeros(values.shape, bool), ""
         return values < 0, "the distance at index {index} is below zero"

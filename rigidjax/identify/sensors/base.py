@@ -1,4 +1,4 @@
-"""The base class of sensors: the prediction of a motion at one time, and the error of a reading."""
+"""The base class of sensors, and the motion at one time from which a sensor predicts."""
 
 import abc
 import dataclasses
@@ -17,10 +17,14 @@ from rigidjax.body.inertia import MassProperties
 class SensorInput(eqx.Module):
     """The input of a sensor: a motion at one time.
 
-    **Fields:** `t` s; `state` of the kind that the model needs; `body` the `Inertia` or
-    `MassProperties`; `field` the equations of motion `f(t, state, args)`, with the states of its
-    laws put in as they are at `t`; `own` those states, as `Solution.own` orders them: for
-    a sensor of one's own that reads a wheel or a motor.
+    **Fields:**
+
+    - `t`: s.
+    - `state`: a `Spin`, `Attitude` or `Rigid`.
+    - `body`: the `Inertia` or `MassProperties`.
+    - `field`: the equations of motion `f(t, state, args)`. Torques with states of their own, such
+      as wheels, are held at their states at `t`.
+    - `own`: these states, in the order of `Solution.own`, for a sensor of a wheel or a motor.
 
     >>> body, state = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
     >>> now = SensorInput(jnp.asarray(0.0), state, body, rj.equations_of_motion(body, state, None))
@@ -36,29 +40,40 @@ class SensorInput(eqx.Module):
 
     @property
     def rate(self) -> Any:
-        """The derivative of the state in time: `.omega` is dΩ/dt, `.v` the acceleration."""
+        """Return the time derivative of the state: `.omega` is dΩ/dt, `.v` the acceleration."""
         return self.field(self.t, self.state, None)
 
     def lever(self, place: Vec3) -> Vec3:
-        """From the reference point of the state to a `place` (3,) in the body frame, m."""
+        """Return the vector (3,), m, from the reference point of the state to a `place`.
+
+        The `place` (3,) is in the body frame.
+        """
         return place - self.body.com if isinstance(self.body, MassProperties) else place
 
 
 class AbstractSensor(eqx.Module):
     """A sensor: the shape of its readings, the state it needs, and the error of a reading.
 
-    Subclass it for your own sensor: set `reading_shape`, `feels` (`HasSpin`, `HasAttitude` or
-    `HasPose`), the number of `components` of the error and its `unit`, `noise` (k,) the standard
-    deviation of each component, or `None` to estimate it; and write `error`.
+    To make a sensor of your own, write a subclass with the method `error` and these members:
 
-    Optional members: `offset`, s: the sensor's clock is behind, its reading at t belongs to t +
-    offset; `limit` (k,): the full scale of a channel, in the unit of the error; `lowpass` a
-    `LowPass`, if the error is reading minus prediction; a method `refusal(values)`: the rows that
-    cannot be readings, (T,) true where wrong, and why; a method `typical_rate(t, values)`: the
-    rough rate of the body, rad/s, from the unmasked readings, if no other sensor shows it; a method
-    `reading_of(now, error)`, the reading with this error, for `simulate_readings`, if the error is
-    not reading minus prediction; `suspect`: name, words and remedy of the cause that a fit names
-    for its errors if it finds no other.
+    - `reading_shape`: the shape of one reading.
+    - `feels`: the state that it needs, `HasSpin`, `HasAttitude` or `HasPose`.
+    - `components`, `unit`: the number of components k of an error, and its unit.
+    - `noise`: (k,) the standard deviation of each component, or `None` to estimate it.
+
+    Optional members:
+
+    - `offset`: s, if the sensor's clock is behind: the reading at t belongs to t + offset.
+    - `limit`: (k,) the full scale of each channel, in the unit of the error.
+    - `lowpass`: a `LowPass`, if the error is reading minus prediction.
+    - `refusal(values)`: a method that returns the rows that cannot be readings, (T,) true where
+      wrong, and why.
+    - `typical_rate(t, values)`: a method that returns the rough rate of the body, rad/s, from the
+      unmasked readings, if no other sensor shows it.
+    - `reading_of(now, error)`: a method that returns the reading with this error, for
+      `simulate_readings`, if the error is not reading minus prediction.
+    - `suspect`: name, words and remedy of the cause that a fit names for the errors of this sensor
+      if it finds no other cause.
 
     >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s
     ...     reading_shape, components, unit = (), 1, "rad/s"
@@ -77,11 +92,14 @@ class AbstractSensor(eqx.Module):
 
     @abc.abstractmethod
     def error(self, now: SensorInput, reading: Array) -> Float[Array, " k"]:
-        """Reading minus prediction (k,), in the sensor's unit."""
+        """Return reading minus prediction (k,), in the sensor's unit."""
 
 
 def required(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]:
-    """A converter to finite numbers, which a fit may move, for `equinox.field(converter=…)`."""
+    """Return a converter of a field to finite numbers of this shape, for `eqx.field`.
+
+    The numbers are an array, so that a fit may move them.
+    """
 
     def converted(value: Any) -> Array:
         if value is None:
@@ -92,18 +110,24 @@ def required(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]
 
 
 def optional(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array | None]:
-    """The same for a field that may be `None`."""
+    """Return the converter of `required` for a field that may be `None`."""
     converted = required(name, shape)
     return lambda value: None if value is None else converted(value)
 
 
 def deviations(size: int = 3) -> Callable[[Any], Array | None]:
-    """A converter of one number or `size` numbers to standard deviations (size,); `None` stays."""
+    """Return a converter of one number, or `size` numbers, to standard deviations (size,).
+
+    `None` stays `None`.
+    """
     return lambda value: positive(value, "noise", "a positive standard deviation", size)
 
 
 def positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
-    """One number or `size` as (size,) positive numbers; `None` stays."""
+    """Return one number, or `size` numbers, as an array (size,) of positive numbers.
+
+    `None` stays `None`; `name` and `wanted` are words of the error that is raised for others.
+    """
     if value is None:
         return None
     numbers = _checks.numbers(value, name).astype(jnp.result_type(float))
@@ -115,27 +139,31 @@ def positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
 
 
 class Jitter(eqx.Module):
-    """The standard deviation of time stamps, s: as given, or to be `estimated`."""
+    """The scatter of time stamps.
+
+    **Fields:** `deviation` the standard deviation, s; `estimated` whether the fit estimates it.
+    """
 
     deviation: Scalar
     estimated: bool = eqx.field(static=True)
 
 
-def jitter_of(given: Any) -> Jitter | None:
-    """The jitter of a positive number, s, or of `"estimated"`; `None` stays."""
-    if given is None or isinstance(given, Jitter):
-        return given
+def jitter_of(jitter: Any) -> Jitter | None:
+    """Return the `Jitter` of a positive number, s, or of `"estimated"`; `None` stays `None`."""
+    if jitter is None or isinstance(jitter, Jitter):
+        return jitter
     wanted = 'a positive number of seconds or "estimated"'
-    if isinstance(given, str):
-        if given != "estimated":
-            raise ValueError(f"jitter: wanted {wanted}, got {given!r}")
+    if isinstance(jitter, str):
+        if jitter != "estimated":
+            raise ValueError(f"jitter: wanted {wanted}, got {jitter!r}")
         return Jitter(jnp.zeros(()), True)
-    return Jitter(jnp.asarray(_checks.positive(given, "jitter", wanted)), False)
+    return Jitter(jnp.asarray(_checks.positive(jitter, "jitter", wanted)), False)
 
 
 class ClockedSensor(AbstractSensor):
-    """A sensor whose clock may be behind, and whose time stamps may scatter (`jitter`); it reads a
-    vector (3,) unless it says otherwise.
+    """A sensor whose clock may be behind by an `offset`, and whose time stamps may have `jitter`.
+
+    It reads a vector (3,), unless a subclass sets another shape.
     """
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)

@@ -1,6 +1,7 @@
-"""A low-pass filter of readings before they were logged."""
+"""The low-pass filter that readings passed before they were logged."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 from types import NoneType
 from typing import Any
@@ -9,14 +10,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 
-# Samples before a gap of so many usual intervals are ignored after it.
+# An interval of more than _GAP usual ones is a gap, after which the filter starts anew.
 _GAP = 3.0
-# Third powers of numbers and intervals must stay within float32, too.
+# The third powers of numbers and intervals must be finite in float32, too.
 _LARGEST = 1e12
 _ROOT = math.sqrt(2.0)
 
@@ -24,16 +25,18 @@ _ROOT = math.sqrt(2.0)
 class LowPass(eqx.Module):
     """A low-pass filter of first or second order (Butterworth), as in the chips of gyros.
 
-    Give it to a sensor (`Gyro(0.01, lowpass=LowPass(40.0))`): then the predictions go through the
-    same filter as the readings; else a fit mistakes its lag for an offset of the clock.
+    Give it to a sensor (`Gyro(0.01, lowpass=LowPass(40.0))`), and the predictions pass the same
+    filter as the readings; without it a fit mistakes the lag of the filter for an offset of the
+    clock.
 
-    `ẏ = w(u − y)`, or `ÿ + √2 w ẏ + w² y = w² u`, with w = 2π · cutoff; solved exactly, from sample
-    to sample, for a cubic between samples of u. Before the first sample u is the cubic through the
-    first four, before a sample after a gap of more than three intervals a straight line.
+    The filter is `ẏ = w(u − y)`, or `ÿ + √2 w ẏ + w² y = w² u`, with w = 2π · cutoff. It is solved
+    exactly from sample to sample, for an input u that is a cubic between samples. Before the first
+    sample u is the cubic through the first four samples; before the first sample after a gap of
+    more than three intervals it is a straight line.
 
     **Arguments:** `cutoff` Hz, the frequency of gain 1/√2 (a `Free` may move it); `order` 1 or 2.
-    **Raises** `ValueError` for a cutoff that is not positive, another order. Source: Butterworth
-    1930, Experimental Wireless 7:536.
+    **Raises** `ValueError` for a cutoff that is not positive, and for another order. Source:
+    Butterworth 1930, Experimental Wireless 7:536.
 
     >>> slow = LowPass(0.5)(jnp.arange(4.0), jnp.ones((4, 1)))
     >>> bool(jnp.allclose(slow, 1.0))
@@ -54,7 +57,7 @@ class LowPass(eqx.Module):
     def __call__(
         self, t: Float[Array, " times"], values: Float[Array, "times k"]
     ) -> Float[Array, "times k"]:
-        """The filtered samples.
+        """Return the filtered samples.
 
         **Arguments:** `t` (T,) increasing times, s; `values` (T, k), of any unit. **Raises**
         `ValueError` for times that do not increase, NaN, and numbers whose cubes overflow, if they
@@ -66,37 +69,40 @@ class LowPass(eqx.Module):
         t = _checks.floating(t, values.shape[:1], "t", hint="a time for each row of values")
         t = t.astype(values.dtype)
         if _checks.known((t, values)):
-            _within(np.asarray(t, float), np.asarray(values, float))
+            _require_in_range(np.asarray(t, float), np.asarray(values, float))
         if values.shape[0] < 2:
             return values
         w = 2 * math.pi * self.cutoff.astype(values.dtype)
         gaps = jnp.diff(t)
-        # A shorter record is continued at its last time; those samples are not looked at.
+        # The padding of a shorter record repeats its last time: give it usual intervals. Its
+        # samples are masked, so that their values do not matter.
         beyond = gaps <= 0
         usual = jnp.nanmedian(jnp.where(beyond, jnp.nan, gaps))
         gaps = jnp.where(beyond, usual, gaps)
         fresh = gaps > _GAP * usual
         before, after = _slopes(gaps, jnp.diff(values, axis=0), fresh, beyond)
-        # On each interval u = u₀ + b s + c s² + d s³.
+        # On each interval u = u₀ + b s + c s² + d s³, s from its begin.
         h = gaps[:, None]
         chord = jnp.diff(values, axis=0) / h
         c, d = (3 * chord - 2 * before - after) / h, (before + after - 2 * chord) / h**2
         ends = (before, 2 * c, 6 * d), (after, 2 * c + 6 * d * h, 6 * d)
-        y0, y1 = _own(self.order, w, values[:-1], ends[0]), _own(self.order, w, values[1:], ends[1])
+        particular = partial(_particular_solution, self.order, w)
+        y0, y1 = particular(values[:-1], ends[0]), particular(values[1:], ends[1])
         begin = y0[0]
         if gaps.size > 2:
-            first = _own(self.order, w, values[:1], _begin(gaps, chord))[0]
+            first = particular(values[:1], _first_derivatives(gaps, chord))[0]
             begin = jnp.where(jnp.any(fresh[:3]), begin, first)
-        return _along(begin, y0, y1, partial(_decay, self.order, w), gaps, fresh)
+        return _solve(begin, y0, y1, partial(_propagator, self.order, w), gaps, fresh)
 
 
-def lowpass_of(given: Any) -> LowPass | None:
-    """`given` if it is a `LowPass` or `None`. **Raises** `TypeError` for others."""
+def lowpass_of(lowpass: Any) -> LowPass | None:
+    """Return `lowpass` if it is a `LowPass` or `None`; raise `TypeError` for others."""
     wanted = "LowPass(cutoff in Hz) or None"
-    return _checks.instance(given, (LowPass, NoneType), "lowpass", wanted=wanted)
+    return _checks.instance(lowpass, (LowPass, NoneType), "lowpass", wanted=wanted)
 
 
-def _within(t: np.ndarray, values: np.ndarray) -> None:
+def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
+    """Raise `ValueError` for numbers whose cubes overflow, and for times that do not increase."""
     if not np.isfinite(values).all() or np.abs(values).max(initial=0.0) > _LARGEST:
         raise ValueError(f"values: wanted finite numbers up to {_LARGEST:g}, got NaN or more")
     if not (np.isfinite(t).all() and np.abs(t).max(initial=0.0) <= _LARGEST):
@@ -106,19 +112,22 @@ def _within(t: np.ndarray, values: np.ndarray) -> None:
 
 
 def _slopes(gaps: Array, steps: Array, fresh: Array, beyond: Array) -> tuple[Array, Array]:
-    """du/dt at both ends of each interval, of the nearest parabola; of the chord beside a gap."""
+    """Return du/dt at the begin and at the end of each interval.
+
+    They are those of the parabola through three samples, and of a straight line next to a gap.
+    """
     h, chord = gaps[:, None], steps / gaps[:, None]
     apart = (fresh[1:] | fresh[:-1])[:, None]
     bend = jnp.where(apart, 0.0, jnp.diff(chord, axis=0) / (h[1:] + h[:-1]))
-    # The last interval has no next one.
+    # The last interval of a record has no next one: take the parabola before it.
     bend = jnp.where(beyond[1:, None], jnp.roll(bend, 1, axis=0), bend)
     begin = jnp.concatenate([bend[:1] * h[:1], bend * h[1:]]) if bend.shape[0] else 0.0 * chord
     end = jnp.concatenate([bend * h[:-1], bend[-1:] * h[-1:]]) if bend.shape[0] else 0.0 * chord
     return chord - begin, chord + end
 
 
-def _begin(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
-    """The derivatives at the first sample of the cubic through the first four."""
+def _first_derivatives(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
+    """Return three derivatives at the first sample, of the cubic through the first four samples."""
     a, b = gaps[0], gaps[0] + gaps[1]
     one = (chord[1] - chord[0]) / b
     two = ((chord[2] - chord[1]) / (gaps[1] + gaps[2]) - one) / (b + gaps[2])
@@ -126,17 +135,22 @@ def _begin(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
     return rate[None], 2 * (one - two * (a + b))[None], 6 * two[None]
 
 
-def _own(order: int, w: Array, u: Array, du: Any) -> Array:
-    """The answer to the cubic itself, of value u and derivatives du: y, and ẏ/w of order 2."""
-    # By 1/(1 + x) = 1 − x + x² − x³ … and 1/(1 + √2 x + x²) = 1 − √2 x + x² + 0 x³ …
+def _particular_solution(
+    order: int, w: Array, u: Array, du: tuple[ArrayLike, ArrayLike, ArrayLike]
+) -> Array:
+    """Return the cubic that solves the filter's equation: y, and ẏ/w of a filter of order 2.
+
+    The input is a cubic of value u and derivatives `du`.
+    """
+    # With x = (d/dt)/w: 1/(1 + x) = 1 − x + x² − x³ …, 1/(1 + √2 x + x²) = 1 − √2 x + x² + 0 x³ …
     if order == 1:
         return (u - du[0] / w + du[1] / w**2 - du[2] / w**3)[..., None]
     y = u - _ROOT * du[0] / w + du[1] / w**2
     return jnp.stack([y, (du[0] - _ROOT * du[1] / w + du[2] / w**2) / w], axis=-1)
 
 
-def _decay(order: int, w: Array, h: Array) -> Array:
-    """The share of a difference from that answer which is left after a time h."""
+def _propagator(order: int, w: Array, h: Array) -> Array:
+    """Return the matrix that carries a difference from the particular solution over a time h."""
     if order == 1:
         return jnp.exp(-w * h)[None, None]
     a = w * h / _ROOT
@@ -144,13 +158,25 @@ def _decay(order: int, w: Array, h: Array) -> Array:
     return e * jnp.stack([jnp.stack([c + s, _ROOT * s]), jnp.stack([-_ROOT * s, c - s])])
 
 
-def _along(begin: Array, y0: Array, y1: Array, decay: Any, gaps: Array, fresh: Array) -> Array:
-    """From interval to interval: the difference from the cubic's own answer carries over."""
+def _solve(
+    begin: Array,
+    y0: Array,
+    y1: Array,
+    propagator: Callable[[Array], Array],
+    gaps: Array,
+    fresh: Array,
+) -> Array:
+    """Return the filtered samples, solved from interval to interval.
 
-    def step(state: Array, row: Any) -> tuple[Array, Array]:
+    **Arguments:** `begin` the first state; `y0`, `y1` the particular solutions at begin and end of
+    each interval; `propagator` a function of its length; `gaps` the lengths; `fresh` true for a
+    gap, after which the state is the particular solution of the next interval.
+    """
+
+    def step(state: Array, row: tuple[Array, ...]) -> tuple[Array, Array]:
         own0, own1, following, h, gap = row
-        carried = own1 + (state - own0) @ decay(h).T
-        state = jnp.where(gap, following, carried)
+        after = own1 + (state - own0) @ propagator(h).T
+        state = jnp.where(gap, following, after)
         return state, state[:, 0]
 
     following = jnp.concatenate([y0[1:], y1[-1:]])

@@ -1,4 +1,4 @@
-"""A sensor that reads the whole state: what a window of measured states is compared with."""
+"""The sensor of a whole state, for windows of measured states."""
 
 from typing import ClassVar
 
@@ -13,20 +13,21 @@ from rigidjax.motion.manifold import minus_small
 
 _FEELS = {Spin: HasSpin, Attitude: HasAttitude, Rigid: HasPose}
 _SIZES = {Spin: (3, 3), Attitude: (7, 6), Rigid: (13, 12)}
-# Where the numbers of one part of a state end.
+# The index in a reading at which each part of the state but the first begins.
 _CUTS = {Spin: (), Attitude: (4,), Rigid: (3, 6, 10)}
 
 
 class StateSensor(AbstractSensor):
-    """Reads a whole state: its numbers in a row, (3,) Ω, (7,) q and Ω, or (13,) x, v, q and Ω.
+    """A sensor that reads a whole state as a row of numbers: (3,) Ω, (7,) q, Ω, (13,) x, v, q, Ω.
 
-    The error is the change from the predicted state to the one that was read, as
-    `motion.manifold` counts it: three numbers for each part, of q the rotation vector (body frame,
-    rad).
+    The error is the change from the predicted state to the one that was read, as `motion.manifold`
+    counts it: three numbers for each part, for q a rotation vector (body frame, rad).
 
-    **Arguments:** `kind` the class of the state, `Spin`, `Attitude` or `Rigid`; `noise` (k,)
-    standard deviations of the k numbers of the error; `nominal` whether these are no measure of the
-    errors, but only their units.
+    **Arguments:**
+
+    - `kind`: the class of the state, `Spin`, `Attitude` or `Rigid`.
+    - `noise`: (k,) the standard deviations of the k numbers of the error.
+    - `nominal`: whether these are no more than units, and the errors are estimated.
 
     >>> StateSensor(rj.Attitude, jnp.ones(6), False).reading_shape
     (7,)
@@ -39,17 +40,17 @@ class StateSensor(AbstractSensor):
 
     @property
     def reading_shape(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The shape of a reading."""
+        """Return the shape of a reading."""
         return (_SIZES[self.kind][0],)
 
     @property
     def components(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The number of numbers of an error."""
+        """Return the number of components of an error."""
         return _SIZES[self.kind][1]
 
     @property
     def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The smallest state that has what is read."""
+        """Return the protocol of the smallest state that has the parts that are read."""
         return _FEELS[self.kind]
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, " k"]:

@@ -11,6 +11,7 @@ from rigidjax._types import Scalar
 
 
 def _deviation(value: Any) -> Scalar | None:
+    """Return a positive standard deviation as an array; `None` stays `None`."""
     if value is None:
         return None
     wanted = "a positive standard deviation"
@@ -18,17 +19,21 @@ def _deviation(value: Any) -> Scalar | None:
 
 
 class Tolerance(eqx.Module):
-    """How far a sensor that reads a vector may be off, as its data sheet or a calibration says.
+    """The errors that a sensor of vectors may have, as its data sheet or a calibration says.
 
-    No residual of a free motion shows such an error: it is the motion of another body. A fit does
-    not estimate these numbers. It considers them: their effect on each fitted number is added to
-    its covariance (Schmidt 1966; Bierman, Factorization Methods for Discrete Sequential Estimation
-    (1977), ch. VIII). A `Free` that moves the same number estimates it; the tolerance is then its
-    prior, unless it has one.
+    The residuals of a free motion do not show such an error: the readings look like the motion of
+    another body. A fit does not estimate the errors but considers them: it adds their effect on
+    each fitted number to its covariance (Schmidt 1966; Bierman, Factorization Methods for Discrete
+    Sequential Estimation (1977), ch. VIII). A `Free` that moves the same number estimates it; the
+    tolerance is then its prior, unless the `Free` has a prior of its own.
 
-    **Arguments:** standard deviations, `None` for an error that is not considered: `scale` of each
-    channel, relative; `cross_axis` the share of each channel that another one reads, rad for a
-    small angle; `bias` of each channel, in the sensor's unit; `clock` s, the offset of its clock.
+    **Arguments**, each a standard deviation, or `None` for an error that is not considered:
+
+    - `scale`: of each channel, relative.
+    - `cross_axis`: the share of each channel that another one reads, rad for a small angle.
+    - `bias`: of each channel, in the sensor's unit.
+    - `clock`: the offset of its clock, s.
+
     **Raises** `ValueError` for a number that is not positive.
 
     >>> gyro = rj.identify.Gyro(0.02, tolerance=Tolerance(scale=0.01, cross_axis=0.01))

@@ -1,11 +1,11 @@
-"""Considered numbers: what a sensor may be off, in the covariance but not in the search.
+"""Considered errors: errors of a sensor that the covariance allows for, and no fit estimates.
 
 Schmidt 1966, Application of state-space methods to navigation problems; Bierman 1977,
 Factorization Methods for Discrete Sequential Estimation, ch. VIII; Tapley, Schutz and Born 2004,
 Statistical Orbit Determination, ch. 6.
 """
 
-from typing import Any
+from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
@@ -14,12 +14,14 @@ from jaxtyping import Float
 from rigidjax.identify.model.free import TOLERANCES
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, in_deviations
+from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.identify.sensors.vectors import VectorSensor
 from rigidjax.identify.uncertainty.covariance import Linearised
 
-# What a sensor of unknown tolerance is asked for in a report: 1 % of scale, 1° between axes.
+# The errors whose effect a report states for a sensor of unknown tolerance: 1 % of scale, 1°
+# between axes.
 USUAL = {"scale": 0.01, "cross_axis": float(np.radians(1.0))}
-# The member of the sensor that each tolerance is about.
+# The member of a sensor that each tolerance belongs to.
 MEMBERS = {tolerance: member for member, tolerance in TOLERANCES.items()}
 _OFF_DIAGONAL = [(i, j) for i in range(3) for j in range(3) if i != j]
 
@@ -27,18 +29,22 @@ _OFF_DIAGONAL = [(i, j) for i in range(3) for j in range(3) if i != j]
 class Consideration(eqx.Module):
     """An error that a sensor may have, and its effect on a fit.
 
-    `sensor` is the number of the sensor, `kind` a field of `Tolerance`, `deviation` its standard
-    deviation. `shifts` (n, c) are the changes of the n free numbers by an error of one standard
-    deviation in each of its c ways, which are independent: three channels of a scale, six pairs of
-    axes, three biases, one clock.
+    **Fields:**
+
+    - `sensor`: the number of the sensor.
+    - `kind`: the name of the error, a field of `Tolerance`.
+    - `deviation`: its standard deviation.
+    - `shifts`: (n, c) the changes of the n free numbers by an error of one standard deviation in
+      each of its c independent components: three scales, six pairs of axes, three biases, or one
+      clock.
 
     >>> t = jnp.linspace(0.0, 2.0, 41)
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> rates = rj.simulate(body, rj.Spin([1.0, 2.0, 3.0]), t).ys.omega
     >>> gyro = rj.identify.Gyro(0.01, tolerance=rj.identify.Tolerance(scale=0.01))
     >>> record = rj.identify.Recording(t, (gyro, rates))
-    >>> found = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()), starts=1)
-    >>> [(part.kind, part.deviation, part.shifts.shape) for part in found.considered]
+    >>> result = rj.identify.fit(rj.identify.Model(record, rj.identify.PrincipalRatios()), starts=1)
+    >>> [(part.kind, part.deviation, part.shifts.shape) for part in result.considered]
     [('scale', 0.01, (5, 3))]
     """
 
@@ -51,9 +57,9 @@ class Consideration(eqx.Module):
 def considerations(
     model: Model, linear: Linearised, noise: Noise, covariance: np.ndarray
 ) -> tuple[Consideration, ...]:
-    """Return the effect of the tolerances of all sensors, but of what a `Free` moves.
+    """Return the considered errors of all sensors: those with a tolerance that no `Free` moves.
 
-    `covariance` (n, n) is that of white errors within the determined directions.
+    `covariance` (n, n) is the one for white errors, within the determined directions.
     """
     out = []
     for index, sensor in enumerate(model.records.sensors):
@@ -62,7 +68,7 @@ def considerations(
             width = getattr(tolerance, kind, None)
             if width is None or is_free(model, index, member):
                 continue
-            # Recordings of one sensor have one tolerance: the largest.
+            # Recordings may give one sensor several tolerances: the largest counts.
             deviation = float(np.max(np.asarray(width)))
             shifts = deviation * shifts_of(model, linear, noise, covariance, index, kind)
             out.append(Consideration(index, kind, deviation, shifts))
@@ -70,10 +76,10 @@ def considerations(
 
 
 def is_free(model: Model, index: int, member: str) -> bool:
-    """Return whether a `Free` moves this member of the sensor number `index`."""
-    ways = [tuple(getattr(key, "name", getattr(key, "idx", None)) for key in slot.path)
+    """Return whether a `Free` moves the `member` of the sensor number `index`."""
+    paths = [tuple(getattr(key, "name", getattr(key, "idx", None)) for key in slot.path)
             for slot in model.slots]  # fmt: skip
-    return ("sensors", index, member) in ways
+    return ("sensors", index, member) in paths
 
 
 def shifts_of(
@@ -84,9 +90,10 @@ def shifts_of(
     index: int,
     kind: str,
 ) -> Float[np.ndarray, "n ways"]:
-    """Return the change of the free numbers by a unit error of a sensor, in each of its ways.
+    """Return the changes (n, c) of the free numbers by unit errors of a sensor, of one kind.
 
-    Readings that are off by D c move the least squares by `−H⁻¹ Jᵀ W D c`.
+    An error of c components moves the readings by D, (R, T, k, c), and thereby the least squares
+    by `−H⁻¹ Jᵀ W D`, with `H⁻¹` the `covariance`.
     """
     direction = _directions(model, linear, index, kind)
     late = model.records.readings[index].late
@@ -102,7 +109,7 @@ def shifts_of(
 def _directions(
     model: Model, linear: Linearised, index: int, kind: str
 ) -> Float[np.ndarray, "records times 3 ways"]:
-    """Return the changes of the readings of a sensor by a unit error, in each of its ways."""
+    """Return the changes of the readings of a sensor by unit errors of one kind."""
     reading = model.records.readings[index]
     shown = np.asarray(reading.values) - linear.raw[index]
     eye = np.eye(3)
@@ -123,7 +130,8 @@ def slope_in_time(
     t, counts = np.asarray(model.records.t)[..., None], np.asarray(model.counts)
     gap = np.diff(t, axis=1)
     slope = np.diff(shown, axis=1) / np.where(gap > 0, gap, 1.0)
-    # The parabola through three samples, as numpy.gradient's: each slope by the other gap.
+    # The slope of the parabola through three samples, as in numpy.gradient: each difference is
+    # weighted by the other gap.
     before, after = gap[:, :-1], gap[:, 1:]
     whole = np.where(before + after > 0, before + after, 1.0)
     middle = (after * slope[:, :-1] + before * slope[:, 1:]) / whole
@@ -135,14 +143,15 @@ def slope_in_time(
 
 
 def stacked_shifts(parts: tuple[Consideration, ...], size: int) -> Float[np.ndarray, "n ways"]:
-    """Return the shifts of n = `size` free numbers by all considered errors: a root of the
-    covariance that these add.
+    """Return the shifts of the n = `size` free numbers by all considered errors, in columns.
+
+    The matrix is a root of the covariance that these errors add.
     """
     return np.concatenate([np.zeros((size, 0)), *(part.shifts for part in parts)], axis=1)
 
 
-def in_words(parts: tuple[Consideration, ...], sensors: Any) -> str:
-    """Return what is considered, for a report: "a Gyro off by 1 % of scale, 0.5° between axes"."""
+def describe_considered(parts: tuple[Consideration, ...], sensors: Sequence[AbstractSensor]) -> str:
+    """Describe the considered errors: "a Gyro off by 1 % of scale, 0.5° between axes"."""
     units = {"scale": "{:.3g} % of scale", "cross_axis": "{:.3g}° between axes",
              "bias": "a bias of {:.3g} {unit}", "clock": "a clock offset of {:.3g} s"}  # fmt: skip
     sizes = {"scale": 100.0, "cross_axis": float(np.degrees(1.0)), "bias": 1.0, "clock": 1.0}
@@ -166,10 +175,10 @@ def unit_moves(
     covariance: np.ndarray,
     slopes: Float[np.ndarray, "quantities n"],
 ) -> list[tuple[int, dict[str, Float[np.ndarray, " quantities"]]]]:
-    """Return how far usual errors of each sensor without a tolerance would move some quantities.
+    """Return how far `USUAL` errors of each sensor without a tolerance would move quantities.
 
-    For each such sensor its number, and by kind (`USUAL`) the largest change of each quantity, of
-    derivative `slopes`, by an error in one of its ways.
+    The quantities have the derivatives `slopes`. For each such sensor the result holds its number,
+    and by kind of error the largest change of each quantity by one component of the error.
     """
     out = []
     for index, sensor in enumerate(model.records.sensors):

@@ -7,21 +7,26 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.uncertainty.covariance import Linearised, Times
+from rigidjax.identify.uncertainty.covariance import CorrelationTimes, Linearised
 
-# From so many degrees on, a 95 % interval is at most 1.3 % wider than with infinitely many.
+# With more degrees of freedom a 95 % interval is at most 1.3 % wider than with infinitely many.
 PLENTY = 100.0
 
 
 class Freedom(eqx.Module):
-    """What the degrees of freedom of a variance follow from.
+    """The numbers from which the degrees of freedom of any variance of a fit are computed.
 
-    `covariance` (n, n) of the numbers for white errors; `places` (R, m) of those of a recording;
-    `groups` (R,) of recordings with a common noise; of each sensor `blocks` (R, m, m), the
-    information of its readings, and `left` (G,), its independent errors less what the fit takes,
-    infinite for a given noise; `widths` of each width that is estimated the places of its
-    deviations, its square, and its degrees; `considered` (n, c) the shifts of the numbers by
-    considered errors, whose variances are known.
+    **Fields:**
+
+    - `covariance`: (n, n) of the free numbers, for white errors.
+    - `places`: (R, m) the places among them of the numbers of each recording.
+    - `groups`: (R,) the group of each recording; the recordings of a group share their noise.
+    - `blocks`: of each sensor, (R, m, m), the information in its readings.
+    - `left`: of each sensor, (G,), its independent errors less those that the fit takes; infinite
+      for a given noise.
+    - `widths`: of each estimated width the places of its deviations, its square, and its degrees of
+      freedom.
+    - `considered`: (n, c) the shifts of the numbers by considered errors, of known variances.
     """
 
     covariance: np.ndarray
@@ -33,10 +38,10 @@ class Freedom(eqx.Module):
     considered: np.ndarray
 
     def of(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom of the variances of functions of derivative `slope` (…, n).
+        """Return the degrees of freedom of the variances of functions with derivative `slope`.
 
-        The variance of considered errors is known: of a sum of both the degrees grow with the
-        square of the whole over the estimated part.
+        The `slope` (…, n) is taken with respect to the free numbers. Considered errors add a known
+        variance: the degrees grow with the square of the whole variance over its estimated part.
         """
         estimated = np.sum((slope @ self.covariance) * slope, axis=-1)
         known = np.sum((slope @ self.considered) ** 2, axis=-1)
@@ -44,10 +49,11 @@ class Freedom(eqx.Module):
         return np.asarray(self.of_estimated(slope) * grown)
 
     def of_estimated(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom of the part of a variance that noise and widths make.
+        """Return the degrees of freedom of the part of each variance that noise and widths make.
 
-        Each noise and each width counts by its share of the variance; where all noises have
-        `PLENTY`, the least counts for all. Source: Satterthwaite 1946, doi:10.2307/3002019.
+        They follow from the share of each noise and each width in the variance (Satterthwaite
+        1946, doi:10.2307/3002019). If every noise has more than `PLENTY` degrees of freedom, the
+        shares of the noises are not computed: the smallest degrees are used for all of them.
         """
         along = slope @ self.covariance
         variance = np.maximum(np.sum(along * slope, axis=-1), 1e-300)
@@ -72,16 +78,21 @@ class Freedom(eqx.Module):
 def freedom_of(
     model: Model,
     linear: Linearised,
-    times: Times,
+    times: CorrelationTimes,
     covariance: np.ndarray,
     considered: np.ndarray,
 ) -> Freedom:
-    """Return the `Freedom` of a fit; `covariance` is that of white errors, `considered` (n, c) the
-    shifts of the numbers by considered errors.
+    """Return the `Freedom` of a fit.
+
+    **Arguments:**
+
+    - `model`, `linear`, `times`: the model, its linearisation, the correlation times of its errors.
+    - `covariance`: (n, n) of the free numbers, for white errors.
+    - `considered`: (n, c) the shifts of these numbers by considered errors.
     """
     groups, left, blocks = np.asarray(model.noise_groups), [], linear.information
     if model.clusters is not None:
-        # Variances come from the scatter between stretches alone.
+        # The variances of a fit of windows come from the scatter between its stretches alone.
         degrees = np.array([max(float(np.max(np.asarray(model.clusters))), 1.0)])
         none = np.zeros_like(groups)
         return Freedom(covariance, linear.places, none, blocks[:1], (degrees,), (), considered)
@@ -89,9 +100,9 @@ def freedom_of(
     for sensor, kept, spans, lost in zip(
         model.records.sensors, linear.kept, times.spans, taken, strict=True
     ):
-        found = np.bincount(groups, np.sum(kept.sum(axis=1) / np.asarray(spans), axis=1) - lost)
+        counts = np.bincount(groups, np.sum(kept.sum(axis=1) / np.asarray(spans), axis=1) - lost)
         given = cast(Any, sensor).noise is not None and times.longest <= 1.5
-        left.append(np.full(found.shape, np.inf) if given else np.maximum(found, 1.0))
+        left.append(np.full(counts.shape, np.inf) if given else np.maximum(counts, 1.0))
     widths = []
     for slot in model.slots:
         if slot.estimated:
@@ -106,15 +117,16 @@ def freedom_of(
 def leverages(
     linear: Linearised, information: tuple[np.ndarray, ...], covariance: np.ndarray
 ) -> list[np.ndarray]:
-    """How many free numbers (R,) the readings of each sensor determine, of each recording."""
+    """Return how many free numbers the readings of each sensor determine, (R,) by recording."""
     known = linear.blocks(covariance)
     return [np.sum(block * known, axis=(1, 2)) for block in information]
 
 
 def quantile(level: float, freedom: np.ndarray | float) -> np.ndarray:
-    """Half-width of an interval in standard deviations: Student's, Gauss' for infinite freedom.
+    """Return the half-width of an interval of probability `level`, in standard deviations.
 
-    **Raises** `ValueError` for a `level` outside (0, 1).
+    It is the quantile of Student's distribution with `freedom` degrees, the normal one for infinite
+    degrees. **Raises** `ValueError` for a `level` outside (0, 1).
     """
     level = _checks.fraction(level, "level", "a level between 0 and 1")
     from scipy.special import ndtri, stdtrit

@@ -1,4 +1,4 @@
-"""Flat bodies, I1 + I2 = I3: the limit of real bodies, with derivatives and intervals near it."""
+"""Flat bodies, I1 + I2 = I3: derivatives and intervals at this limit of real bodies."""
 
 from typing import Any
 
@@ -12,16 +12,21 @@ from rigidjax.body.symmetric3 import swap_trace
 from rigidjax.identify.model.charts import AbstractBodyChart, as_list, charts_of, numbers_of
 from rigidjax.identify.model.model import Model
 
-# Derivatives are taken where the least second moment is at least this share of the trace.
+# Derivatives are taken at a body whose least second moment is at least this share of the trace.
 THIN = 1e-4
 # The quantile of a one-sided bound of 95 %.
 ONE_SIDED = 1.645
 
 
 class Limit(eqx.Module):
-    """The distance of a body from a flat one: `flatness = (I1 + I2 − I3) / I3` at the best point,
-    `free` its value in the linear model, which may be negative, `slope` (n,) its derivative;
-    `where` is the suffix of the names of the body's quantities.
+    """The distance of a body from a flat one, `(I1 + I2 − I3) / I3`, called its flatness.
+
+    **Fields:**
+
+    - `where`: the suffix of the names of the body's quantities.
+    - `flatness`: its value at the best point.
+    - `free`: its value at the minimum of the linear model, which may be negative.
+    - `slope`: (n,) its derivative.
     """
 
     where: str
@@ -30,28 +35,33 @@ class Limit(eqx.Module):
     slope: np.ndarray
 
     def deviation(self, covariance: np.ndarray) -> float:
-        """The standard deviation of the flatness; NaN where there is none."""
+        """Return the standard deviation of the flatness; NaN if its variance is negative."""
         with np.errstate(invalid="ignore"):
             return float(np.sqrt(self.slope @ covariance @ self.slope))
 
     def bound(self, covariance: np.ndarray) -> float:
-        """The flatness is at most this (95 %, one-sided)."""
+        """Return the one-sided 95 % upper bound of the flatness."""
         wide = self.deviation(covariance)
         return self.free + float(np.hypot(ONE_SIDED * wide, min(self.free, 0.0)))
 
     def is_near(self, covariance: np.ndarray, reach: float) -> bool:
-        """Whether a flat body is within `reach` standard deviations."""
+        """Return whether a flat body is within `reach` standard deviations."""
         return bool(self.free < reach * self.deviation(covariance))
 
 
-def ends(
+def interval_ends(
     reach: np.ndarray | float, correlation: np.ndarray | float, away: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The ends of an interval from its middle, in standard deviations, cut at a flat body.
+    """Return the ends of an interval that ends at a flat body, in standard deviations.
 
-    They follow from the likelihood ratio of two Gaussian numbers, one of them not negative:
-    `m²(y) = min over z ≥ 0`. **Arguments:** `reach` the quantile; `correlation` of the number y
-    with the flatness z; `away` the free flatness over its standard deviation.
+    They are counted from the best value. They follow from the likelihood ratio of two normal
+    numbers, of which the flatness z is not negative: `m²(y) = min over z ≥ 0 of m²(y, z)`.
+
+    **Arguments:**
+
+    - `reach`: the quantile of the interval.
+    - `correlation`: of the number y with the flatness z.
+    - `away`: the flatness at the minimum of the linear model, over its standard deviation.
     """
     rho = np.clip(np.asarray(correlation), -1.0, 1.0)
     past = min(away, 0.0)
@@ -67,10 +77,10 @@ def ends(
 
 
 def thickened(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
-    """Return the free numbers x with flat bodies a little thicker; `None` if no body is flat.
+    """Return the free numbers x with each flat body made thicker; `None` if no body is flat.
 
-    The chart has a derivative of zero at a flat body; the information about the tensor itself is
-    regular there and hardly changes over such a small thickness.
+    The derivative of a chart is zero at a flat body. The information on the tensor itself is
+    regular there, and hardly differs between a flat body and one of so small a thickness.
     """
     thick = list(map(_thicker, charts_of(model.chart), bodies_of(model, x)))
     if all(one is None for one in thick):
@@ -83,13 +93,16 @@ def thickened(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
 @eqx.filter_jit
 def bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
     """Return the bodies of a fit, in the order of their charts."""
-    # As one program: outside of a trace each operation of JAX costs as much as a run of 100 steps.
+    # Compile one program: outside of a trace each operation of JAX takes as long as 100 steps.
     return as_list(model.bodies(x))
 
 
 def _thicker(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
-    """The chart's numbers of a thicker body, if it is flat and the chart is one of ours."""
-    # By NumPy, for an operation of JAX outside of a trace costs as much as a run of 100 steps.
+    """Return the numbers of a thicker body in the chart; `None` for a body that is not flat.
+
+    It is `None` for a chart by a user, too, of which the limit is not known.
+    """
+    # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
     if isinstance(body, MassProperties):
         second = np.asarray(body.second_moment)
     else:
@@ -108,20 +121,21 @@ def _thicker(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array 
 
 
 def _has_limit(chart: AbstractBodyChart) -> bool:
+    """Return whether the chart is one of ours that moves moments of inertia."""
     return type(chart).__module__ == AbstractBodyChart.__module__ and any(
         name != "mass" for name in chart.log_names
     )
 
 
 def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
-    """Return (I1 + I2 − I3) / I3 of each body; 1 of one whose moments are not free."""
+    """Return (I1 + I2 − I3) / I3 of each body; 1 for a body whose moments are not free."""
     out = []
     bodies = as_list(model.bodies(x))
     for chart, body in zip(charts_of(model.chart), bodies, strict=True):
         if not _has_limit(chart):
             out.append(jnp.ones((), x.dtype))
             continue
-        # Up to scale, as they are reported: two ratios, or three moments after a mass.
+        # The last logarithms are three moments, or two ratios to the third.
         logs = chart.logs(body)[-3:]
         logs = logs if logs.size == 3 else jnp.append(logs, 0.0)
         low, middle, high = jnp.sort(jnp.exp(logs - jnp.max(logs)))
@@ -131,24 +145,29 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
 
 
 def limits(
-    model: Model, found: tuple[np.ndarray, np.ndarray], step: np.ndarray, names: list[str]
+    model: Model, numbers: tuple[np.ndarray, np.ndarray], step: np.ndarray, names: list[str]
 ) -> tuple[Limit, ...]:
-    """The limit of each body whose moments are free.
+    """Return the limit of each body whose moments are free.
 
-    `found` are numbers and derivatives, the flatness of each body last; `step` (n,) leads to the
-    least misfit of the linear model; `names` are the suffixes of the bodies' quantities.
+    **Arguments:**
+
+    - `model`: the model.
+    - `numbers`: the reported numbers and their derivatives, the flatness of each body last, as
+      `quantities.values_and_slopes` returns them.
+    - `step`: (n,) the step of the free numbers to the minimum of the linear model.
+    - `names`: the suffix of the names of each body's quantities.
     """
-    rows = zip(names, *(part[-len(names) :] for part in found), strict=True)
-    kept = [_has_limit(chart) for chart in charts_of(model.chart)]
+    rows = zip(names, *(part[-len(names) :] for part in numbers), strict=True)
+    have_limits = [_has_limit(chart) for chart in charts_of(model.chart)]
     return tuple(
         Limit(name, float(value), float(value + min(slope @ step, 0.0)), slope)
-        for (name, value, slope), one in zip(rows, kept, strict=True)
-        if one
+        for (name, value, slope), has_limit in zip(rows, have_limits, strict=True)
+        if has_limit
     )
 
 
-def unreal(body: Any) -> str | None:
-    """The error in a body's numbers, in words; `None` for a real body."""
+def why_unreal(body: Any) -> str | None:
+    """Say why no real body has the numbers of `body`; return `None` for a real body."""
     try:
         if isinstance(body, MassProperties):
             MassProperties(body.mass, body.com, body.second_moment)
@@ -159,10 +178,10 @@ def unreal(body: Any) -> str | None:
     return None
 
 
-def of_charts(charts: list[tuple[str, AbstractBodyChart]], bodies: list[Any]) -> list[str]:
-    """`unreal` for the bodies of charts by users: every point of our charts is a real body."""
+def unreal_bodies(charts: list[tuple[str, AbstractBodyChart]], bodies: list[Any]) -> list[str]:
+    """List why bodies are not real; only charts by users can have points that are no real body."""
     ours = AbstractBodyChart.__module__
     theirs = [
         (n, b) for (n, c), b in zip(charts, bodies, strict=True) if type(c).__module__ != ours
     ]
-    return [wrong + name for name, body in theirs if (wrong := unreal(body))]
+    return [wrong + name for name, body in theirs if (wrong := why_unreal(body))]

@@ -14,18 +14,24 @@ from rigidjax.identify.model.model import Model, values_of
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
-# An interval wider than this factor says nothing about a positive number.
+# A positive number that is not known to this factor gets the interval from 0 to infinity.
 FARTHEST = 1e3
 
 
 class Quantity(eqx.Module):
-    """A number with a name: its value, and its standard deviation in the same `unit`.
+    """A reported quantity: a number with a name, a standard deviation and a unit.
 
-    The errors of a `positive` one are those of its logarithm: `deviation` is the value times the
-    standard deviation of the logarithm, and an interval reaches farther up than down. `cuts` are
-    its correlation with the flatness of each body, and the flatness in standard deviations
-    (`rigidjax.identify.flat_limit`); `most` is an upper limit for all bodies; `freedom` the degrees
-    of freedom of its variance, infinite if all noise is given.
+    **Fields:**
+
+    - `name`, `value`, `unit`: of the number.
+    - `deviation`: its standard deviation, in the same unit.
+    - `positive`: whether it is positive. Its errors are then those of its logarithm: `deviation` is
+      the value times the standard deviation of the logarithm, and an interval reaches farther up
+      than down.
+    - `cuts`: for each body its correlation with the body's flatness, and the flatness in standard
+      deviations, at which intervals end.
+    - `most`: the largest value that any body can have.
+    - `freedom`: the degrees of freedom of its variance; infinite if all noise is given.
 
     >>> mass = Quantity("mass", 2.0, 0.02, "kg", True)
     >>> low, high = mass.interval(0.95)
@@ -43,11 +49,11 @@ class Quantity(eqx.Module):
     freedom: float = np.inf
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Low and high of the interval; through the logarithm if positive.
+        """Return the low and the high end of the interval, by the logarithm of a positive number.
 
-        An end is nearer if the body there would be past flat. The ends are 0 and infinity for a
-        positive number that is not known to a factor of 1e3. **Arguments:** `level` the probability
-        that it holds the true value. **Raises** `ValueError` outside (0, 1).
+        An interval ends where the body would be flat. The ends are 0 and infinity for a positive
+        number that is not known to a factor of 1e3. **Arguments:** `level` the probability that the
+        interval holds the true value. **Raises** `ValueError` for a level outside (0, 1).
         """
         reach = float(quantile(level, self.freedom))
         wide = reported_deviation(self)
@@ -60,24 +66,28 @@ class Quantity(eqx.Module):
 
 
 def reported_deviation(quantity: Quantity) -> float:
-    """The standard deviation of what `vector` holds: of the logarithm if positive."""
+    """Return the standard deviation of a quantity, of the logarithm of a positive one."""
     if not quantity.positive:
         return quantity.deviation
     return quantity.deviation / quantity.value if quantity.value else np.inf
 
 
 def cut_ends(reach: np.ndarray | float, cuts: Sequence[tuple[Any, float]]) -> tuple[Any, Any]:
-    """The ends of an interval in standard deviations, for each limit that cuts it."""
+    """Return the ends of an interval in standard deviations, cut at each limit.
+
+    **Arguments:** `reach` its half-width without limits; `cuts` for each limit the correlation with
+    it and the distance to it.
+    """
     low: Any = -reach
     high: Any = reach
     for correlation, away in cuts:
-        least, most = flat_limit.ends(reach, correlation, away)
+        least, most = flat_limit.interval_ends(reach, correlation, away)
         low, high = np.maximum(low, least), np.minimum(high, most)
     return low, high
 
 
 def labels(model: Model) -> list[tuple[str, str, bool]]:
-    """Name, unit and whether positive, in the order of `vector`."""
+    """Return name, unit and whether positive, of the quantities in the order of `vector`."""
     out = []
     for name, chart in charts(model):
         out += [(f"{log}{name}", chart.unit, True) for log in chart.log_names]
@@ -87,7 +97,7 @@ def labels(model: Model) -> list[tuple[str, str, bool]]:
         out += [(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]
     for slot in model.slots:
         shape = slot.shape
-        parts = [""] if not shape else [f" {_place(i)}" for i in np.ndindex(shape)]
+        parts = [""] if not shape else [f" {_component(i)}" for i in np.ndindex(shape)]
         ends = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
         ends = ends if slot.spread is None else [*ends, *(f", own{where}" for where in names)]
         called = [f"{slot.name}{part}{end}" for end in ends for part in parts]
@@ -96,19 +106,22 @@ def labels(model: Model) -> list[tuple[str, str, bool]]:
 
 
 def reports_starts(model: Model) -> bool:
-    """Return whether initial states are reported: those of windows are measured, and many."""
+    """Return whether initial states are reported: not those of windows, which are many."""
     return model.clusters is None
 
 
 def charts(model: Model) -> list[tuple[str, AbstractBodyChart]]:
-    """The chart of each body, and the suffix of the names of its quantities."""
+    """Return the chart of each body, after the suffix of the names of its quantities."""
     if not isinstance(model.chart, Bodies):
         return [("", model.chart)]
     return [(f" [{n}]", c) for n, c in zip(model.chart.names, model.chart.charts, strict=True)]
 
 
 def recording_names(model: Model) -> list[str]:
-    """The suffix of the names of a recording's quantities: its number in its body's list."""
+    """Return the suffix of the names of each recording's quantities.
+
+    It is empty for one recording, else the number of the recording among those of its body.
+    """
     if model.count == 1:
         return [""]
     out: list[str] = []
@@ -118,12 +131,13 @@ def recording_names(model: Model) -> list[str]:
     return out
 
 
-def _place(index: tuple[int, ...]) -> str:
+def _component(index: tuple[int, ...]) -> str:
+    """Return the name of a component of an array: x, y or z of a vector, else its index."""
     return "xyz"[index[0]] if len(index) == 1 and index[0] < 3 else str(index)
 
 
 def vector(model: Model, x: Float[Array, " n"]) -> Array:
-    """Return the reported quantities, with logarithms of the positive ones."""
+    """Return the reported quantities as a vector, with the logarithms of positive ones."""
     parts, bodies = [jnp.zeros(0, x.dtype)], as_list(model.bodies(x))
     for (_, chart), body in zip(charts(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
@@ -153,7 +167,7 @@ def values_and_slopes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the reported quantities and the flatness of each body, with their derivatives.
 
-    These are taken at x, or at the point `near` if x is at a flat body.
+    Derivatives are taken at x or, if a body is flat at x, at the point `near`.
     """
     values, slopes = (np.asarray(part) for part in value_and_slope(model, x))
     if near is not None:
@@ -163,28 +177,35 @@ def values_and_slopes(
 
 def quantities(
     model: Model,
-    found: tuple[np.ndarray, np.ndarray],
+    numbers: tuple[np.ndarray, np.ndarray],
     covariance: np.ndarray,
     null: np.ndarray,
     limits: tuple[flat_limit.Limit, ...] = (),
     freedom: np.ndarray | float = np.inf,
 ) -> tuple[Quantity, ...]:
-    """Every reported quantity with its standard deviation, of `values_and_slopes`; `covariance`
-    within the determined directions, `null` (k, n) the others; `limits` cut the intervals;
-    `freedom` of the variances.
+    """Return every reported quantity with its standard deviation.
+
+    **Arguments:**
+
+    - `model`: the model.
+    - `numbers`: values and derivatives, as `values_and_slopes` returns them.
+    - `covariance`: (n, n) of the free numbers within the determined directions.
+    - `null`: (k, n) the other directions.
+    - `limits`: the flat bodies at which intervals end.
+    - `freedom`: the degrees of freedom of the variances.
     """
     names = labels(model)
-    values, slope = (part[: len(names)] for part in found)
-    deviations = carried(slope, covariance, null)
+    values, slope = (part[: len(names)] for part in numbers)
+    deviations = standard_deviations(slope, covariance, null)
     cuts = cuts_of(slope, covariance, deviations, limits)
-    freedom = np.broadcast_to(freedom, found[0].shape)
-    # A number that changes with no fitted number is not determined.
+    freedom = np.broadcast_to(freedom, numbers[0].shape)
+    # A quantity that changes with no free number, such as a known one, is not determined.
     deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
     out = []
     for index, (name, unit, positive) in enumerate(names):
         value, deviation = values[index], deviations[index]
         shown = float(np.exp(value)) if positive else float(value)
-        # A number is not known better than its round-off.
+        # No number is known better than its round-off.
         least = np.finfo(float).eps * (1.0 if positive else abs(shown))
         most = 1.0 if name.startswith(Ratios.log_names) else np.inf
         mine = tuple((float(rho[index]), away) for rho, away in cuts)
@@ -194,7 +215,7 @@ def quantities(
     return tuple(out)
 
 
-def around(
+def interval_about(
     middle: np.ndarray,
     slope: np.ndarray,
     covariance: np.ndarray,
@@ -202,8 +223,12 @@ def around(
     reach: np.ndarray | float,
     limits: tuple[flat_limit.Limit, ...] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The interval of functions of value `middle` and derivative `slope`; else as `quantities`."""
-    wide = carried(slope, covariance, null)
+    """Return the interval (low, high) of functions of value `middle` and derivative `slope`.
+
+    **Arguments:** `reach` the half-width in standard deviations; `covariance`, `null` and `limits`
+    as for `quantities`.
+    """
+    wide = standard_deviations(slope, covariance, null)
     low, high = cut_ends(reach, cuts_of(slope, covariance, wide, limits))
     return np.asarray(middle + low * wide), np.asarray(middle + high * wide)
 
@@ -214,7 +239,11 @@ def cuts_of(
     deviations: np.ndarray,
     limits: tuple[flat_limit.Limit, ...],
 ) -> list[tuple[np.ndarray, float]]:
-    """The correlations of functions with each limit, and the distance from it."""
+    """Return the correlations of functions with the flatness of each body, and the flatness.
+
+    The flatness is in standard deviations. The functions have the derivative `slope` and the
+    standard deviations `deviations`.
+    """
     out = []
     for limit in limits:
         wide = limit.deviation(covariance)
@@ -225,33 +254,38 @@ def cuts_of(
     return out
 
 
-def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
-    """Standard deviations of functions with this derivative (…, n); all intervals use them.
+def standard_deviations(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
+    """Return the standard deviations of functions with derivative `slope` (…, n).
 
-    Infinite along a direction of `null` (k, n); NaN along one of negative variance or round-off, or
-    of a number with a correlation beyond one.
+    A deviation is infinite if the function changes along a direction of `null` (k, n). It is NaN if
+    its variance is negative or round-off, or if it depends on a number whose correlation with
+    another one is beyond one. All intervals use these deviations.
     """
     if not np.isfinite(covariance).all():
         return np.full(slope.shape[:-1], np.nan)
     size = np.abs(slope).max(axis=-1, initial=1e-300)
-    touched = np.abs(slope @ null.T).max(axis=-1, initial=0.0) > 1e-6 * size
+    undetermined = np.abs(slope @ null.T).max(axis=-1, initial=0.0) > 1e-6 * size
     unit = np.sqrt(np.abs(np.diag(covariance)))
     unit = np.where(unit > 0, unit, 1.0)
     rows, scaled = (slope * unit).reshape(-1, unit.size), covariance / np.outer(unit, unit)
-    beyond, found = np.abs(scaled).max(axis=0, initial=0.0) > 1.0 + 1e-6, np.zeros(len(rows))
-    # Functions of the same few numbers, such as the state of one recording, at once.
+    beyond, out = np.abs(scaled).max(axis=0, initial=0.0) > 1.0 + 1e-6, np.zeros(len(rows))
+    # Take functions of the same few numbers together, such as those of one recording's state: an
+    # eigendecomposition of the whole covariance for each function would be slow.
     alike: dict[bytes, list[int]] = {}
     for index, row in enumerate(rows):
         alike.setdefault((row != 0).tobytes(), []).append(index)
     for key, mine in alike.items():
-        some = np.frombuffer(key, bool)
-        own = _deviations(rows[mine][:, some], scaled[np.ix_(some, some)])
-        found[mine] = np.nan if beyond[some].any() else own
-    return np.where(touched, np.inf, found.reshape(slope.shape[:-1]))
+        used = np.frombuffer(key, bool)
+        deviations = _deviations(rows[mine][:, used], scaled[np.ix_(used, used)])
+        out[mine] = np.nan if beyond[used].any() else deviations
+    return np.where(undetermined, np.inf, out.reshape(slope.shape[:-1]))
 
 
 def _deviations(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Standard deviations (m,) of functions with this derivative (m, n), NaN as in `carried`."""
+    """Return the standard deviations (m,) of functions with derivative `slope` (m, n).
+
+    They are NaN as in `standard_deviations`.
+    """
     values, axes = np.linalg.eigh(covariance)
     along = slope @ axes
     length = np.linalg.norm(along, axis=-1)

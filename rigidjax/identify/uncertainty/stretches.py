@@ -1,8 +1,9 @@
-"""Deviations of a fit of windows, by leaving out one stretch of them after the other (jackknife).
+"""The covariance of a fit of windows, by leaving out one stretch of windows at a time (jackknife).
 
-Errors of a model last longer than a window, and windows may overlap: they are no independent draws.
-One step of Gauss and Newton's from the best point without each stretch: Miller 1974,
-doi:10.1093/biomet/61.1.1; of neighbours in one block: Künsch 1989, doi:10.1214/aos/1176347265.
+Windows are no independent draws: the errors of a model last longer than a window, and windows may
+overlap. Neighbours therefore form stretches, which are left out as a whole (Künsch 1989,
+doi:10.1214/aos/1176347265); the fit without a stretch is one Gauss–Newton step from the best point
+(Miller 1974, doi:10.1093/biomet/61.1.1).
 """
 
 import dataclasses
@@ -12,18 +13,28 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.uncertainty.covariance import Linearised, Spread, blinded, inverted
+from rigidjax.identify.uncertainty.covariance import (
+    Covariance,
+    Linearised,
+    covariance_root,
+    infinite_along,
+)
 from rigidjax.identify.uncertainty.quantities import labels
 
-# A number hangs on one stretch, of so many at least, if that makes this part of its variance.
+# A number hangs on one stretch, of FEWEST or more, if this stretch makes the part HANGS of its
+# variance.
 HANGS, FEWEST = 0.85, 6
 
 
 class Stretches(eqx.Module):
-    """The steps (C, s) of the s shared numbers if one of C stretches of windows is left out.
+    """The changes of a fit if one of its C stretches of windows is left out.
 
-    `places` (s,) are the places of the shared numbers among all n; `null` of each stretch the
-    directions (k, n) that the others do not show; all of them if there is one stretch.
+    **Fields:**
+
+    - `steps`: (C, s) the changes of the s shared numbers without each stretch.
+    - `places`: (s,) the places of the shared numbers among all n.
+    - `null`: for each stretch the directions (k, n) that the other stretches do not show; all
+      directions if there is one stretch.
     """
 
     steps: Float[np.ndarray, "stretches s"]
@@ -32,14 +43,14 @@ class Stretches(eqx.Module):
 
     @property
     def hidden(self) -> Float[np.ndarray, "k n"]:
-        """The directions whose scatter between stretches is not known."""
+        """Return the directions whose scatter between stretches is not known."""
         return np.concatenate(self.null)
 
 
 def stretches_of(model: Model, linear: Linearised) -> Stretches | None:
-    """Return the steps of a fit of windows; `None` for other recordings.
+    """Return the `Stretches` of a fit of windows; `None` for other recordings.
 
-    The numbers of one window alone are eliminated window by window.
+    The numbers of one window alone are eliminated window by window (Schur complement).
     """
     if model.clusters is None:
         return None
@@ -56,56 +67,65 @@ def stretches_of(model: Model, linear: Linearised) -> Stretches | None:
     slope = np.einsum("rns,rn->rs", rest, e)
     if alone.size:
         at = linear.places[:, alone]
-        held = linear.firm[at]
+        held = linear.prior_weights[at]
         inner = own.swapaxes(1, 2) @ own + held[:, :, None] ** 2 * np.eye(alone.size)
         sides = own.swapaxes(1, 2) @ rest
-        pull = np.einsum("rnk,rn->rk", own, e) + held * linear.pulls[at]
+        pull = np.einsum("rnk,rn->rk", own, e) + held * linear.prior_residuals[at]
         both = np.linalg.solve(inner, np.concatenate([sides, pull[..., None]], axis=2))
         gram = gram - sides.swapaxes(1, 2) @ both[..., :-1]
         slope = slope - np.einsum("rks,rk->rs", sides, both[..., -1])
-    # Groups of windows may have values of their own: a column is then a number of each group.
+    # A number may differ between groups of windows: its column then has a place for each group.
     places, columns = np.unique(linear.places[:, shared], return_inverse=True)
     columns = columns.reshape(len(gram), shared.size)
     grams, slopes = np.zeros((count, places.size, places.size)), np.zeros((count, places.size))
     np.add.at(grams, (clusters[:, None, None], columns[:, :, None], columns[:, None, :]), gram)
     np.add.at(slopes, (clusters[:, None], columns), slope)
-    known = np.diag(linear.firm[places] ** 2)
+    known = np.diag(linear.prior_weights[places] ** 2)
     steps, null = np.zeros_like(slopes), []
     for k in range(count):
-        # The sum of the others: a difference would leave round-off where they show nothing.
+        # Add up the other stretches. To subtract one from the whole would leave round-off in the
+        # directions that the others do not show.
         rest = np.delete(grams, k, axis=0).sum(axis=0) + known
         blind = np.eye(places.size)
         if rest.any():
-            half, blind = inverted(rest)
+            half, blind = covariance_root(rest)
             steps[k] = half @ (half.T @ slopes[k])
         null.append(np.zeros((len(blind), linear.size)))
         null[-1][:, places] = blind
     return Stretches(steps, places, tuple(null))
 
 
-def by_stretches(stretches: Stretches, white: Spread) -> Spread:
-    """Return the covariance of the shared numbers by the scatter of the steps."""
+def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
+    """Return the covariance of the shared numbers by the scatter of the steps.
+
+    `white` is the covariance for white errors, which is kept for the numbers of one window alone.
+    """
     count, places = len(stretches.steps), stretches.places
-    covariance = np.array(white.seen)
-    # What the starts of windows have in common with the shared numbers is not known in this way.
+    covariance = np.array(white.determined)
+    # The scatter of the shared numbers does not tell their covariance with the starts of windows.
     covariance[places], covariance[:, places] = 0.0, 0.0
     square = (count - 1) / count * stretches.steps.T @ stretches.steps
     covariance[np.ix_(places, places)] = square
-    shown = blinded(covariance, np.concatenate([white.null_directions, stretches.hidden]))
+    null = np.concatenate([white.null_directions, stretches.hidden])
+    shown = infinite_along(null, covariance)
     kind = f"jackknife: one of {count} stretches of windows left out"
-    return dataclasses.replace(white, covariance=shown, seen=covariance, kind=kind)
+    return dataclasses.replace(white, covariance=shown, determined=covariance, kind=kind)
 
 
 def remarks(
     stretches: Stretches,
     model: Model,
     numbers: tuple[np.ndarray, np.ndarray],
-    white: Spread,
+    white: Covariance,
 ) -> list[str]:
     """Return a remark on each reported quantity that one stretch decides.
 
-    **Arguments:** `numbers` the reported quantities and their derivatives, as
-    `quantities.values_and_slopes` gives them; `white` the covariance for white errors.
+    **Arguments:**
+
+    - `stretches`, `model`: the stretches of a fit, and its model.
+    - `numbers`: the reported quantities and their derivatives, as `quantities.values_and_slopes`
+      returns them.
+    - `white`: the covariance for white errors.
     """
     count, names = len(stretches.steps), labels(model)
     if count == 1:
@@ -114,8 +134,8 @@ def remarks(
     steps = stretches.steps @ slopes[:, stretches.places].T
     squares = steps**2
     hanging = squares.max(axis=0) > HANGS * np.maximum(squares.sum(axis=0), 1e-300)
-    unseen = _touched(slopes, white.null_directions)
-    alone = np.stack([_touched(slopes, null) & ~unseen for null in stretches.null])
+    unseen = _changes_along(white.null_directions, slopes)
+    alone = np.stack([_changes_along(null, slopes) & ~unseen for null in stretches.null])
     edges = -(-np.arange(count + 1) * model.count // count)
     out = []
     for index, (name, _, positive) in enumerate(names):
@@ -131,9 +151,9 @@ def remarks(
     return out
 
 
-def _touched(
-    slopes: Float[np.ndarray, "q n"], null: Float[np.ndarray, "k n"]
+def _changes_along(
+    null: Float[np.ndarray, "k n"], slopes: Float[np.ndarray, "q n"]
 ) -> Bool[np.ndarray, " q"]:
-    """Return whether each quantity changes along one of these directions."""
+    """Return whether each quantity, of derivative `slopes`, changes along a direction of `null`."""
     size = np.abs(slopes).max(axis=-1, initial=1e-300)
     return np.abs(slopes @ null.T).max(axis=-1, initial=0.0) > 1e-6 * size

@@ -10,7 +10,7 @@ import pytest
 
 from rigidjax.cli.command import main
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.layouts import layout_of, usual_unit
+from rigidjax.cli.logs.layouts import imu_columns_of, usual_unit
 from rigidjax.identify import read_table
 
 
@@ -56,7 +56,7 @@ ROWS = [(1000 * i, 100 - i, -7 * i, 3000, 2048) for i in range(50)]
 def test_blackbox_rates_come_in_degrees_a_second(tmp_path, end):
     path = tmp_path / "FLIGHT.BBL"
     path.write_bytes(blackbox_log(ROWS, end=end))
-    layout = layout_of(path)
+    layout = imu_columns_of(path)
     assert (layout.unit, layout.time_unit) == ("deg/s", "us")
     table = read_table(path, [*layout.columns, "accSmooth[0]"])
     # Without its last mark the last frame of a log cannot be told from half a frame.
@@ -165,7 +165,7 @@ def test_differences_are_summed(tmp_path):
 @pytest.mark.parametrize("first", [1, 2, 5, 11])
 def test_nothing_before_the_first_i_frame(first, tmp_path):
     begin = -(-first // INTERVAL) * INTERVAL
-    words = rf"flight.bbl: {begin - first} of {50 - first} frames are left out: they stand on no"
+    words = rf"flight.bbl: {begin - first} of {50 - first} frames are left out: they depend on an"
     with pytest.warns(LogWarning, match=words):
         table = read(tmp_path, HEADER + b"".join(frames(first, 50)) + END)
     np.testing.assert_array_equal(table, content(range(begin, 50)))
@@ -304,7 +304,7 @@ def test_of_several_flights_one_is_chosen(tmp_path, capsys):
     assert main(["identify", str(tmp_path / "flight.bbl")]) == 2
     assert "choose one: --flight 1 to 2 (flight= in Python)\n" in capsys.readouterr().err
     for flight in (0, 3, -1):
-        with pytest.raises(LogError, match=f"no flight {flight}; it holds 2"):
+        with pytest.raises(LogError, match=f"wanted a flight from 1 to 2, got {flight}"):
             read(tmp_path, two_flights(), flight=flight)
 
 

@@ -13,7 +13,7 @@ from scipy.io import savemat
 import rigidjax as rj
 from rigidjax.cli.command import main
 from rigidjax.cli.logs.errors import LogError
-from rigidjax.cli.logs.layouts import layout_of
+from rigidjax.cli.logs.layouts import imu_columns_of
 
 GOOD = "t,wx,wy,wz\n" + "\n".join(
     f"{0.1 * k:.1f},{np.cos(k):.6f},{np.sin(k):.6f},1.0" for k in range(12)
@@ -47,7 +47,7 @@ WRONG = {
     "time without end": (_swap(4, "-inf,1,1,1"), "line 4: column 't': -inf is not a finite number"),
     "surplus cell": (_swap(5, "0.3,1,1,1,7"), "line 5: 5 cells, but the header names 4 columns"),
     "a decimal comma": (_swap(4, '0.2,"1,5",1,1'), "line 4: column 'wx': '1,5' is not a number; a decimal comma?"),
-    "a wanted name twice": (GOOD.replace("wy,wz", "wy,wz,wx", 1), "line 1: 2 columns are called 'wx': which one?"),
+    "a wanted name twice": (GOOD.replace("wy,wz", "wy,wz,wx", 1), "line 1: wanted one column 'wx', got 2"),
     "blanks": (GOOD.replace(",", " "), "line 1: no column 't'; the columns are t wx wy wz (names and numbers are separated by commas, semicolons or tabs)"),
     "a quote without end": (_swap(5, '0.3,"1,1,1' + 200_000 * "1"), "cannot be read as text (Error: field larger than field limit"),
     "too short": ("t,wx,wy,wz\n0,1,1,1\n1,1,1,1\n", "wanted at least 4 samples, got 2"),
@@ -187,7 +187,7 @@ def test_a_layout_has_the_units_in_its_names(unit, time_unit, tmp_path):
     path = tmp_path / "log.csv"
     names = [f"Zeit ({time_unit})", "Betrag", *(f"Gyroskop {axis} ({unit})" for axis in "zyx")]
     path.write_text(";".join(names) + "\n")
-    layout = layout_of(path)
+    layout = imu_columns_of(path)
     assert layout.columns == (names[0], names[4], names[3], names[2])
     assert layout.unit == unit.replace("°", "deg") and layout.time_unit == time_unit
 
@@ -196,14 +196,14 @@ def test_a_header_that_is_a_comment_is_known_as_that_of_phyphox(tmp_path):
     names = ["Time (s)", *(f"Gyroscope {axis} (rad/s)" for axis in "xyz")]
     path = tmp_path / "log.csv"
     path.write_text("# export\n# " + ",".join(names) + "\n0,,1,\n1,2,3,4\n")
-    assert layout_of(path).columns == tuple(names)
+    assert imu_columns_of(path).columns == tuple(names)
     np.testing.assert_array_equal(rj.identify.read_table(path, names[:2])[names[1]], [np.nan, 2.0])
 
 
 def test_a_name_that_is_wanted_twice_is_refused(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text(GOOD)
-    with pytest.raises(LogError, match="'wx' is named twice"):
+    with pytest.raises(LogError, match="wanted different names, got 'wx' twice"):
         rj.identify.read_table(path, ("t", "wx", "wy", "wx"))
 
 

@@ -58,7 +58,7 @@ def test_units_that_disagree_are_refused():
 
 def test_a_unit_that_is_not_known_is_told_unless_one_is_stated():
     with pytest.warns(
-        LogWarning, match=r"'x \(mdps\)': no unit that is known; it is read in rad/s"
+        LogWarning, match=r"'x \(mdps\)': its unit is not known; it is read in rad/s"
     ):
         assert unit_of(["x (mdps)"], None, "rad/s", RATES, "log") == "rad/s"
     with warnings.catch_warnings():

@@ -79,15 +79,15 @@ def test_against_dense_linear_algebra(changing):
 def test_roots_of_a_covariance_that_is_singular():
     row = jnp.array([1.0, 2.0, 2.0])
     a = jnp.stack([row, 2 * row, jnp.array([0.0, 1.0, 0.0]), jnp.zeros(3)])
-    root = roots.triangular(a)
+    root = roots.triangular_root(a)
     np.testing.assert_allclose(root @ root.T, a @ a.T, atol=1e-14)
-    assert np.isfinite(jax.jacfwd(roots.triangular)(a)).all()
+    assert np.isfinite(jax.jacfwd(roots.triangular_root)(a)).all()
 
 
 def test_a_million_to_one_in_single_precision():
     # Where the covariance itself loses its sign: P = diag(1, 1) read to 1e-6 along (1, 1).
     one = jnp.ones(1, jnp.float32)
-    found = roots.absorb_all(
+    found = roots.update(
         jnp.zeros(2, jnp.float32),
         jnp.eye(2, dtype=jnp.float32),
         jnp.ones((1, 2), jnp.float32),
