@@ -14,10 +14,18 @@ Vec3 = Float[Array, "3"]
 Mat3 = Float[Array, "3 3"]
 Quat = Float[Array, "4"]
 
+
+@runtime_checkable
+class Rotation(Protocol):
+    """What SciPy's `Rotation` has: an active rotation, whose quaternions are scalar last there."""
+
+    def as_quat(self) -> Any: ...
+
+
 ScalarLike = Float[ArrayLike, ""]
 Vec3Like = Float[ArrayLike, "3"]
 Mat3Like = Float[ArrayLike, "3 3"]
-QuatLike = Float[ArrayLike, "4"]
+QuatLike = Float[ArrayLike, "4"] | Rotation
 
 # Constructors take an array, or nested lists of numbers.
 Numbers = Sequence[Any]
@@ -25,7 +33,7 @@ Vector = Vec3Like | Numbers
 Matrix = Mat3Like | Numbers
 Quaternion = QuatLike | Numbers
 Vectors = Float[ArrayLike, "*batch 3"] | Numbers
-Quaternions = Float[ArrayLike, "*batch 4"] | Numbers
+Quaternions = Float[ArrayLike, "*batch 4"] | Rotation | Numbers
 Matrices = Float[ArrayLike, "*batch 3 3"] | Numbers
 Scalars = Float[ArrayLike, "*batch"] | Numbers | float
 

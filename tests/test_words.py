@@ -7,8 +7,21 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "rigidjax"
 # The rooms that have been read: more are added as they are.
-ROOMS = ("rotation", "body", "frames", "lagrangian", "orbits", "motion", "plot", "datasets", "workprecision")
-FILES = [*PACKAGE.glob("*.py"), *(path for room in ROOMS for path in (PACKAGE / room).rglob("*.py"))]
+ROOMS = (
+    "rotation",
+    "body",
+    "frames",
+    "lagrangian",
+    "orbits",
+    "motion",
+    "plot",
+    "datasets",
+    "workprecision",
+)
+FILES = [
+    *PACKAGE.glob("*.py"),
+    *(path for room in ROOMS for path in (PACKAGE / room).rglob("*.py")),
+]
 VERBS = frozenset(
     """
     Add Apply Attract Check Compare Compute Convert Copy Define Delay Derive Describe Draw Evaluate Find Follow Give
@@ -24,7 +37,11 @@ def docstrings(path):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             text = ast.get_docstring(node)
             if text is not None:
-                yield getattr(node, "name", "module"), text.split()[0].rstrip(",:"), text.split("\n\n")[0]
+                yield (
+                    getattr(node, "name", "module"),
+                    text.split()[0].rstrip(",:"),
+                    text.split("\n\n")[0],
+                )
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))

@@ -53,21 +53,35 @@ def frames():
     save(figure, "frames.png")
 
 
+def draw_flip(inertia, sol, name):
+    """Draw the polhode of a motion, and beside it its body rates against time."""
+    figure = plt.figure(figsize=(8.4, 4.2), layout="constrained")
+    ax = figure.add_subplot(1, 2, 1, projection="3d")
+    rj.plot.polhode(inertia, sol.ys, ax=ax, title="the polhode")
+    # Below the label of the axis, which reaches into the corner of a picture in three dimensions.
+    ax.get_legend().set_bbox_to_anchor((0.5, -0.12))
+    ax = figure.add_subplot(1, 2, 2)
+    for index, colour in enumerate(rj.plot.COLOURS[:3]):
+        ax.plot(sol.ts, sol.ys.omega[:, index], color=colour, label=f"$\\Omega_{'xyz'[index]}$")
+    ax.set(xlabel="time, s", ylabel="body rate, rad/s", title="the flip about the middle axis")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize=9, frameon=False)
+    ax.grid(alpha=0.3)
+    save(figure, name)
+
+
 def flip():
     """README's simulation."""
     body = rj.shapes.box(1.0, [0.30, 0.20, 0.08])
     start = rj.Attitude(q=[1.0, 0, 0, 0], omega=[0.02, 6.0, 0.02])
     sol = rj.simulate(body.inertia, start, jnp.linspace(0.0, 9.0, 301))
-    figure = plt.figure(figsize=(8.4, 4.2), layout="constrained")
-    ax = figure.add_subplot(1, 2, 1, projection="3d")
-    rj.plot.polhode(body.inertia, sol.ys, ax=ax, title="the polhode")
-    ax = figure.add_subplot(1, 2, 2)
-    for index, colour in enumerate(rj.plot.COLOURS[:3]):
-        ax.plot(sol.ts, sol.ys.omega[:, index], color=colour, label=f"Ω{'₁₂₃'[index]}")
-    ax.set(xlabel="time, s", ylabel="body rate, rad/s", title="the flip about the middle axis")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize=8, frameon=False)
-    ax.grid(alpha=0.3)
-    save(figure, "flip.png")
+    draw_flip(body.inertia, sol, "flip.png")
+
+
+def start():
+    """The simulation of Getting started."""
+    body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
+    first = rj.Attitude(q=[1.0, 0, 0, 0], omega=[0.01, 1.0, 0.0])
+    draw_flip(body, rj.simulate(body, first, jnp.linspace(0.0, 30.0, 301)), "start.png")
 
 
 def fit():
@@ -84,5 +98,5 @@ def fit():
 
 
 if __name__ == "__main__":
-    for draw in (frames, flip, fit):
+    for draw in (frames, flip, start, fit):
         draw()

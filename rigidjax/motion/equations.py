@@ -42,8 +42,8 @@ class Attitude(eqx.Module):
     """Hold the state of a body that turns: attitude and body rate.
 
     **Arguments:** `q` (4,) unit quaternion (w, x, y, z), **scalar first**, body → world (the `M` of
-    the notes, eq 8); `omega` (3,) Ω in the body frame, rad/s. `simulate` and
-    `rigidjax.exact.free_body` check that `q` is a unit quaternion.
+    the notes, eq 8), or a `Rotation` of SciPy; `omega` (3,) Ω in the body frame, rad/s. `simulate`
+    and `rigidjax.exact.free_body` check that `q` is a unit quaternion.
 
     >>> Attitude([1.0, 0, 0, 0], [0.0, 0, 1]).q.shape
     (4,)
@@ -65,7 +65,7 @@ class Rigid(eqx.Module):
 
     **Arguments:** `x` (3,) position of the centre of mass, m, world frame (the `X` of the notes, eq
     1); `v` (3,) its velocity, m/s, world frame; `q` (4,) unit quaternion (w, x, y, z), scalar
-    first, body → world; `omega` (3,) Ω in the body frame, rad/s.
+    first, body → world, or a `Rotation` of SciPy; `omega` (3,) Ω in the body frame, rad/s.
 
     >>> Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1]).v.shape
     (3,)

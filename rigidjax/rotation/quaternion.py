@@ -21,7 +21,17 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
 from rigidjax._names import show
-from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, ScalarLike, Vec3, Vec3Like
+from rigidjax._types import (
+    Mat3,
+    Mat3Like,
+    Quat,
+    QuatLike,
+    Rotation,
+    Scalar,
+    ScalarLike,
+    Vec3,
+    Vec3Like,
+)
 from rigidjax.rotation.kernels import (
     hat_polynomial,
     is_noncanonical,
@@ -109,12 +119,15 @@ def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
     return _turn(-w, u, components(_checks.floating(y, (3,), "y")))
 
 
-def check(q: Float[ArrayLike, "*batch 4"], *, name: str = "q") -> Float[Array, "*batch 4"]:
+def check(
+    q: Float[ArrayLike, "*batch 4"] | Rotation, *, name: str = "q"
+) -> Float[Array, "*batch 4"]:
     """Normalise a quaternion from outside, or refuse it.
 
-    **Arguments:** `q` (..., 4), scalar first; `name` its name in messages. **Returns:** the
-    quaternion, with length 1 to round-off. **Raises:** `ValueError` (under `jit`
-    `equinox.error_if`) for NaN, zero, and a length off by more than 1e-6 (float32: 1e-3).
+    **Arguments:** `q` (..., 4), scalar first, or a `Rotation` of SciPy; `name` its name in
+    messages. **Returns:** the quaternion, with length 1 to round-off. **Raises:** `ValueError`
+    (under `jit` `equinox.error_if`) for NaN, zero, and a length off by more than 1e-6 (float32:
+    1e-3).
 
     >>> check(jnp.array([1.0, 0.0, 0.0, 1e-9])).tolist()[0]
     1.0
@@ -122,12 +135,17 @@ def check(q: Float[ArrayLike, "*batch 4"], *, name: str = "q") -> Float[Array, "
     return unit_quaternion(_checks.floating(q, (4,), name, hint=_HINT, batched=True), name)
 
 
-def from_xyzw(xyzw: QuatLike) -> Quat:
+def from_xyzw(xyzw: Float[ArrayLike, "4"]) -> Quat:
     """Return (w, x, y, z) of scalar-last components `xyzw` (4,) (SciPy, ROS, glTF).
+
+    **Raises:** `TypeError` for a `Rotation` of SciPy: every function takes it as it is.
 
     >>> from_xyzw(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [1.0, 0.0, 0.0, 0.0]
     """
+    if _checks.is_rotation(xyzw):
+        words = "xyzw: wanted components (x, y, z, w), got a Rotation"
+        raise TypeError(f"{words}; pass it as the attitude itself, or give its .as_quat()")
     return jnp.roll(_checks.floating(xyzw, (4,), "xyzw"), 1)
 
 

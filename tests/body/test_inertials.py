@@ -108,7 +108,10 @@ LINK = """<link name="{name}"><inertial>
 </inertial></link>"""
 BAD = {
     "tool": (dict(mass="0", moment="0.01"), "wanted a positive mass, got 0"),
-    "camera": (dict(mass="0.1", moment="0.09"), "wanted moments of a body, I1 ≥ 0 and I1 + I2 ≥ I3, got 0.02, 0.02, 0.09"),
+    "camera": (
+        dict(mass="0.1", moment="0.09"),
+        "wanted moments of a body, I1 ≥ 0 and I1 + I2 ≥ I3, got 0.02, 0.02, 0.09",
+    ),
     "cover": (dict(mass="1e-3 kg", moment="0.01"), "value: wanted numbers, got '1e-3 kg'"),
     "plate": (dict(mass="0.1", moment="nan"), "ixx: wanted 1 finite numbers, got 'nan'"),
 }

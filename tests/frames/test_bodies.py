@@ -147,7 +147,9 @@ def test_frames_of_trajectories_compose():
 @pytest.mark.usefixtures("unhooked")
 def test_a_force_on_what_only_turns_is_refused():
     law = BodyInFrame(FRAME, rj.torques.UniformGravity([0.0, 0, -9.8]))
-    with pytest.raises(TypeError, match="UniformGravity returns a force: wanted a Rigid state, got Attitude"):
+    with pytest.raises(
+        TypeError, match="UniformGravity returns a force: wanted a Rigid state, got Attitude"
+    ):
         law(0.0, ATTITUDE, BODY)
 
 

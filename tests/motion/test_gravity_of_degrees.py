@@ -168,7 +168,10 @@ def test_a_delay_takes_spin_from_the_body():
         (lambda: torques.Chebyshev(0.0, -1.0, TABLE), "step: wanted a positive length, s, got -1"),
         (lambda: torques.Chebyshev(0.0, 1.0, TABLE * np.nan), "coefficients: contains NaN"),
         (lambda: torques.Tide([1.0], 0.0, 1.0, UP), r"response: wanted shape \(\)"),
-        (lambda: torques.ChangingInertia(torques.Tide), "wanted an object, got the class Tide; make"),
+        (
+            lambda: torques.ChangingInertia(torques.Tide),
+            "wanted an object, got the class Tide; make",
+        ),
     ],
 )
 def test_mistakes_are_told_in_words(make, words):

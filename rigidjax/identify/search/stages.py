@@ -106,7 +106,7 @@ def least_squares_from(
     prior = terms.prior_weights(model)
     alone = np.asarray(model.index.alone, int) if model.count >= MANY else None
 
-    def evaluated(x: Array) -> tuple[Any, Array, Normal, Array]:
+    def evaluate(x: Array) -> tuple[Kept, Array, Normal, Array]:
         errors, slopes = terms.blocks(model, x)
         residuals, rows = terms.with_rows(
             lambda e: terms.reading_residuals(model, e, noise, weights), errors, slopes
@@ -132,8 +132,8 @@ def least_squares_from(
     windows = model.clusters is not None
     by_noise = partial(_gain_of_noise, model) if windows else None
     order_one = is_order_one(model, kind)
-    end = minimise(evaluated, x, order_one, settings, nothing, empty, by_noise)
-    # A wild step can end in NaN: the start is then the better point.
+    end = minimise(evaluate, x, order_one, settings, nothing, empty, by_noise)
+    # A cost that is never finite, not even at the start, leaves the start as the best point.
     lost = ~jnp.isfinite(end.cost)
     return dataclasses.replace(
         end,
@@ -152,16 +152,16 @@ def _gain_of_noise(model: Model, kept: Kept, normal: Normal) -> Float[Array, ""]
     the least cost, so that its gradient is left out.
     """
     assert model.clusters is not None
-    # There are no more stretches than windows.
+    # Make a row for each window: the number of stretches, which is smaller, is not known in a trace.
     slopes = jnp.zeros((model.count, model.size), normal.core.dtype)
     slopes = slopes.at[model.clusters[:, None], model.index.places].add(kept.pulls, mode="drop")
     starts = jnp.asarray(model.index.start).reshape(-1)
     slopes = slopes.at[:, starts].set(0.0)
-    felt = normal.diagonal
-    root = jnp.sqrt(jnp.maximum(felt, 1e-12 * jnp.max(felt)))
-    firm = normal.scaled(1.0 / root).plus(jnp.full_like(root, 1e-12))
+    diagonal = normal.diagonal
+    root = jnp.sqrt(jnp.maximum(diagonal, 1e-12 * jnp.max(diagonal)))
+    definite = normal.scaled(1.0 / root).plus(jnp.full_like(root, 1e-12))
     scaled = slopes / root[None, :]
-    return 0.5 * jnp.sum(scaled * firm.solve(scaled.T).T)
+    return 0.5 * jnp.sum(scaled * definite.solve(scaled.T).T)
 
 
 def is_order_one(model: Model, kind: Any) -> Float[Array, " n"]:
@@ -245,8 +245,8 @@ def _evaluate_at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
     return least_squares_from(model, x, noise, whole_record(model), Settings(0.0, 1.0, 0))
 
 
-def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Any:
-    """Return errors and derivatives (`terms.blocks`), by the program of the search."""
+def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Blocks:
+    """Return errors and derivatives at x (`terms.blocks`), by the program of the search."""
     kind, sensors = model.records.t.dtype, model.records.sensors
     ones = (np.ones((model.count, sensor.components), kind) for sensor in sensors)
     return _evaluate_at(model, x, tuple(map(jnp.asarray, ones))).kept.blocks
