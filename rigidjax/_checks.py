@@ -131,9 +131,6 @@ def without_mask(value: Any, name: str) -> Any:
 
 
 def _in_si(value: Any, name: str, wanted: str = "") -> Any:
-<<<<<<< HEAD
-    """Return quantities of astropy or pint as numbers in SI, and other values unchanged."""
-=======
     """Return the numbers of quantities of astropy or pint in SI, and those of SciPy's `Rotation`.
 
     A `Rotation` becomes its quaternion (w, x, y, z). Other values are returned as they are.
@@ -141,7 +138,6 @@ def _in_si(value: Any, name: str, wanted: str = "") -> Any:
     if is_rotation(value):
         # Written out, since `as_quat(scalar_first=True)` needs SciPy 1.14.
         return value.as_quat()[..., [3, 0, 1, 2]]
->>>>>>> c306e344c0e0a90e4fd639ea9c2dbadd9a0dc054
     value = without_mask(value, name)
     if isinstance(value, (list, tuple)):
         items = [_in_si(item, name, wanted) for item in value]

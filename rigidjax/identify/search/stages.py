@@ -152,7 +152,7 @@ def _gain_of_noise(model: Model, kept: Kept, normal: Normal) -> Float[Array, ""]
     the least cost, so that its gradient is left out.
     """
     assert model.clusters is not None
-    # Make a row for each window: the number of stretches, which is smaller, is not known in a trace.
+    # Make a row for each window: the number of stretches, which is smaller, is not known here.
     slopes = jnp.zeros((model.count, model.size), normal.core.dtype)
     slopes = slopes.at[model.clusters[:, None], model.index.places].add(kept.pulls, mode="drop")
     starts = jnp.asarray(model.index.start).reshape(-1)
@@ -245,7 +245,7 @@ def _evaluate_at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
     return least_squares_from(model, x, noise, whole_record(model), Settings(0.0, 1.0, 0))
 
 
-def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Blocks:
+def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> terms.Blocks:
     """Return errors and derivatives at x (`terms.blocks`), by the program of the search."""
     kind, sensors = model.records.t.dtype, model.records.sensors
     ones = (np.ones((model.count, sensor.components), kind) for sensor in sensors)
