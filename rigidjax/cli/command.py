@@ -363,7 +363,8 @@ def _logs(options: argparse.Namespace) -> int:
     fit = _fit(model, options, 8)
     if fit is None:
         return 2
-    rate_unit = next((c.unit for c in channels if c.kind == "gyro" and c.unit != "rpm"), "rad/s")
+    of_gyros = (c.unit for c in channels if c.kind == "gyro" and c.unit != "rpm")
+    rate_unit = next(of_gyros, None) or "rad/s"
     print()
     print(rj.identify.report.table(rj.identify.report.rows(fit, rate_unit)))
     for sensor, rms in zip(model.records.sensors, fit.rms, strict=True):

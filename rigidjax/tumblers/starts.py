@@ -130,7 +130,7 @@ def _rate_of_ratio(moments: Array, ratio: Array, long: Array) -> tuple[Array, Ar
     body, pure = Inertia(jnp.diag(moments)), jnp.where(long, moments[0], moments[2])
 
     def bisect(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        low, high, *_ = state
+        low, high = state[:2]
         part = 0.5 * (low + high)
         omega = _rate(moments, pure + part * (moments[1] - pure))
         precession = exact.precession_period(body, omega)

@@ -62,7 +62,8 @@ def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
     errors = errors_of_scene(model, scene, record)
     scaled, log_variance = [], []
     for reading, sensor, error in zip(record.readings, scene.sensors, errors, strict=True):
-        limit, noise = getattr(sensor, "limit", None), sensor.noise
+        limit: Any = getattr(sensor, "limit", None)
+        noise: Any = sensor.noise
         one, full, wider = standardised(
             reading.values, reading.mask, error, noise, limit, reading.late
         )

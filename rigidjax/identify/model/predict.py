@@ -4,7 +4,7 @@ import abc
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import diffrax as dfx
 import equinox as eqx
@@ -138,7 +138,7 @@ class Adaptive(AbstractIntegrator):
         repeats = jnp.cumsum(jnp.concatenate([first, jnp.diff(ts) <= 0]).astype(ts.dtype))
         out = simulate(
             body,
-            state0,
+            cast(Any, state0),
             ts + 1e-9 * (ts[-1] - ts[0]) * repeats,
             torque,
             rtol=jnp.maximum(self.rtol.astype(ts.dtype), 100 * jnp.finfo(ts.dtype).eps),

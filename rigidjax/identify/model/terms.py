@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 # The row of a recording's free numbers; the index of its body, `None` for one body.
 Row = Float[Array, " columns"]
 Which = Array | None
+# The errors (R, T, k) of each sensor, and their derivatives (R, T, k, m) by the m numbers of a row.
+Blocks = tuple[tuple[Array, ...], tuple[Array, ...]]
 # The standard deviations (R, k) of each sensor, of R recordings and k components.
 Noise = tuple[Float[Array, "records _"], ...]
 
@@ -53,6 +55,7 @@ def scene_of(
 
 def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[Any, Any]:
     """Return the states at the times of a recording, and the torque with its inputs."""
+    assert scene.body is not None and scene.start is not None
     body: Any = body_of_equations(scene.body, model.state_kind)
     functions = {name: source for name, source in record.inputs.items() if callable(source)}
     if isinstance(model.integrator, HeldSteps) and scene.torque is not None:
@@ -96,6 +99,7 @@ def errors_of_scene(
 ) -> tuple[Array, ...]:
     """Return the errors of `errors_of_one` from the scene of the recording."""
     states, torque = motion_of_scene(model, scene, record)
+    assert scene.body is not None and scene.start is not None
     out, motion = [], (scene.body, torque, record.t, scene.start, states)
     for reading, sensor in zip(record.readings, scene.sensors, strict=True):
         errors = errors_along(sensor, reading.values, *sensor_inputs(sensor, *motion, late))

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, changes, weights_of
-from rigidjax.identify.uncertainty.covariance import Blocks, linearise, white_covariance
+from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
 
 # The largest number of rounds in the estimate of noise and jitter together.

@@ -17,7 +17,7 @@ from rigidjax.identify.model.charts import charts_of, numbers_of
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.normal import Normal, normal_of
 from rigidjax.identify.model.predict import FixedSteps, HeldSteps
-from rigidjax.identify.model.terms import Noise
+from rigidjax.identify.model.terms import Blocks, Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
 
 # The parts of a record that are fitted one after the other. A long record has many wrong minima, in
@@ -43,11 +43,13 @@ _BEYOND = 2
 
 
 class Kept(NamedTuple):
-    """What a search keeps of the last evaluation: `blocks` the errors of all readings and their
-    derivatives (`terms.blocks`), `pulls` (R, m) the part of each recording in the gradient.
+    """The values that a search keeps of the last evaluation.
+
+    **Fields:** `blocks` the errors of all readings and their derivatives (`terms.blocks`); `pulls`
+    (R, m) the part of each of R recordings in the gradient.
     """
 
-    blocks: Any
+    blocks: Blocks
     pulls: Float[Array, "records m"]
 
 
@@ -245,7 +247,7 @@ def _evaluate_at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
     return least_squares_from(model, x, noise, whole_record(model), Settings(0.0, 1.0, 0))
 
 
-def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> terms.Blocks:
+def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Blocks:
     """Return errors and derivatives at x (`terms.blocks`), by the program of the search."""
     kind, sensors = model.records.t.dtype, model.records.sensors
     ones = (np.ones((model.count, sensor.components), kind) for sensor in sensors)

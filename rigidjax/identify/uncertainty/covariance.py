@@ -11,6 +11,7 @@ from jaxtyping import Array, PyTree
 
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import (
+    Blocks,
     Noise,
     extra_residuals,
     prior_weights,
@@ -25,10 +26,6 @@ BLIND = 1e-8
 # Columns of the Jacobian are scaled to length one, but not those shorter than this share of the
 # longest: they may be round-off.
 WEAKEST = 1e-6
-
-
-# The errors (R, T, k) of each sensor, and their derivatives (R, T, k, m).
-Blocks = tuple[tuple[Array, ...], tuple[Array, ...]]
 
 
 class Linearised(eqx.Module):
