@@ -173,7 +173,7 @@ def _search_from_each(
             rows = (e[1:] - e[:1]) / DIFFERENCE
             return (), 0.5 * jnp.sum(e[0] ** 2), Normal(rows @ rows.T), rows @ e[0]
 
-        steps = jnp.where(jnp.less(number, count), settings.steps, 0)
+        steps = jnp.where(number < jnp.asarray(count), settings.steps, 0)
         mine = eqx.tree_at(lambda s: s.steps, settings, steps)
         end = minimise(evaluate, start, jnp.ones_like(start), mine, ())
         return Attempt(end.point, end.cost, end.converged)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.terms import Noise, changes, weights_of
+from rigidjax.identify.model.terms import Blocks, Noise, changes, weights_of
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
 
