@@ -156,10 +156,12 @@ def _real(bodies: Inertia | MassProperties) -> Any:
     tensor = tensor_of(bodies)
     if not _checks.known(tensor):
         return validation.real_or_nan(bodies)
-    index = first_impossible(tensor.reshape(-1, 3, 3))
+    # By NumPy: within a trace, a known tensor that JAX reshapes is no longer known.
+    tensors = np.asarray(tensor).reshape(-1, 3, 3)
+    index = first_impossible(tensors)
     if index is not None:
         try:
-            Inertia(tensor.reshape(-1, 3, 3)[index]).invertible()
+            Inertia(tensors[index]).invertible()
         except ValueError as error:
             raise ValueError(f"bodies: {error}; this is body {index}") from None
     return bodies

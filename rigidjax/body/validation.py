@@ -123,7 +123,7 @@ def possible(
     return eqx.branched_error_if(body, bad.any(), jnp.where(light.any(), 0, which), words)
 
 
-def first_impossible(tensors: Float[Array, "n 3 3"]) -> int | None:
+def first_impossible(tensors: Float[Array, "n 3 3"] | Float[np.ndarray, "n 3 3"]) -> int | None:
     """Return the index of the first of these known tensors that no body has, or `None`.
 
     A tensor with a NaN is skipped: in a batch of bodies it gets a status of its own.

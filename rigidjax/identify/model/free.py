@@ -236,7 +236,8 @@ def leaf_at(
     if not isinstance(index, int):
         one = name.split()[0]
         raise ValueError(f"{name}: wanted one array, got {type(index).__name__}; one {one} each")
-    if not eqx.is_inexact_array_like(leaves[index]):
+    # Of a traced leaf `equinox.is_inexact_array_like` raises: it has a `__jax_array__` of `None`.
+    if not (eqx.is_inexact_array(leaves[index]) or isinstance(leaves[index], float)):
         raise ValueError(f"{name}: wanted numbers, got {type(leaves[index]).__name__}")
     return paths[index], leaves[index]
 

@@ -31,9 +31,10 @@ STRIDE = 25
 SETTLED = 1e-7
 # A fit to a part of the record may raise the misfit of the whole by at most this factor.
 WILD = 100.0
-# A search over windows ends if a step gains less than LEVEL of the gain of a fit from noise alone:
-# about 0.05 standard deviations from the least misfit. A rough search ends at ROUGH of it.
-LEVEL, ROUGH = 0.05**2, 1.0
+# A search over windows ends about so many tolerances from the least misfit, 0.05 standard deviations
+# by default: if a step gains less than the square of it, as a part of the gain of a fit from noise
+# alone. A rough search ends at ROUGH of that gain.
+TOLERANCES, ROUGH = 500.0, 1.0
 # The first searches over windows use a ninth and a third of their length, if this is SHORTEST steps
 # or longer, and make FEW steps of the search.
 PARTS, SHORTEST, FEW = (9, 3), 5, 10
@@ -234,10 +235,11 @@ def _search(
     aim: float = 0.0,
     near: float = 0.0,
     steps: int | None = None,
-    level: float = LEVEL,
+    level: float | None = None,
 ) -> LMState:
     """Return the last state after a stride of `steps` from x; `Settings` names the arguments."""
     steps, count = task.stride if steps is None else steps, nominal_count(task.model)
+    level = (TOLERANCES * task.tolerance) ** 2 if level is None else level
     settings = Settings(task.tolerance, damping, steps, aim, near, count, level)
     return least_squares_from(task.model, x, task.noise, weights, settings)
 
