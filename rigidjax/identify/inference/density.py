@@ -19,7 +19,14 @@ from rigidjax.identify.filtering.terms import log_density
 from rigidjax.identify.model.charts import places_of
 from rigidjax.identify.model.free import Slot
 from rigidjax.identify.model.index import index_of
-from rigidjax.identify.model.model import Model, Unpacked, scenes_of, unpacked, with_parts
+from rigidjax.identify.model.model import (
+    Model,
+    Unpacked,
+    filter_steps_of,
+    scenes_of,
+    unpacked,
+    with_parts,
+)
 from rigidjax.identify.model.scene import Process, Scene, require_process
 from rigidjax.identify.model.terms import Noise, template
 from rigidjax.identify.uncertainty.covariance import white_covariance
@@ -237,7 +244,10 @@ def _with_slots(
         list(noises),
         is_leaf=lambda node: node is None,
     )
-    new_model = with_parts(model, records=records, process=process, slots=placed, index=index)
+    steps = model.filter_steps if process is None else filter_steps_of(model)
+    new_model = with_parts(
+        model, records=records, process=process, slots=placed, index=index, filter_steps=steps
+    )
     return new_model, places
 
 

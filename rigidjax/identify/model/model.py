@@ -232,9 +232,9 @@ class Model(eqx.Module):
         elif integrator is None and torque is not None:
             integrator = integrator_for(turn)
         self.integrator = integrator
-        # A NaN in a recording gives no number of steps: take one, and let later checks refuse it.
-        steps = turn / TURN_OF_A_FILTER_STEP
-        self.filter_steps = math.ceil(steps) if 1.0 < steps < math.inf else 1
+        # Without a filter the number would only make recordings of other gaps compile again.
+        filtered = process is not None or self.walks
+        self.filter_steps = filter_steps_of(self) if filtered else 1
 
     @property
     def size(self) -> int:
@@ -487,6 +487,15 @@ def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
         of_each = slot.path[0].name == "sensors"
         out.append(leaf if of_each else jnp.broadcast_to(leaf, (model.count, *leaf.shape)))
     return out
+
+
+def filter_steps_of(model: Model) -> int:
+    """Return the number of steps of a filter in the widest gap between two times."""
+    widest = np.max(np.diff(np.asarray(model.records.t), axis=1), initial=0.0)
+    turn = 1.5 * float(widest) * float(np.max(np.asarray(model.reference.rate)))
+    # A NaN in a recording gives no number of steps: take one, and let later checks refuse it.
+    steps = turn / TURN_OF_A_FILTER_STEP
+    return math.ceil(steps) if 1.0 < steps < math.inf else 1
 
 
 def require_one(model: Any) -> Model:

@@ -31,8 +31,8 @@ STRIDE = 25
 SETTLED = 1e-7
 # A fit to a part of the record may raise the misfit of the whole by at most this factor.
 WILD = 100.0
-# A search over windows ends about so many tolerances from the least misfit, 0.05 standard deviations
-# by default: if a step gains less than the square of it, as a part of the gain of a fit from noise
+# A search over windows ends about so many tolerances from the least misfit (0.05 deviations by
+# default): if a step gains less than the square of it, as a part of the gain of a fit from noise
 # alone. A rough search ends at ROUGH of that gain.
 TOLERANCES, ROUGH = 500.0, 1.0
 # The first searches over windows use a ninth and a third of their length, if this is SHORTEST steps

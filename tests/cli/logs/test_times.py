@@ -120,8 +120,8 @@ def test_a_log_without_times_is_refused():
     [
         (2e7, "s", 0.0, "the step between two times is 2e+07 s; is it in ns? give --time-unit"),
         (5e3, "s", 0.0, "is 5e+03 s; is it in us? give --time-unit"),
-        (4.0, "s", 3.0, "is 4 s, in which the body turns 1.91 times; is it in ms? say"),
-        (4e-12, "ns", 0.0, "the step between two times is 4e-12 s; is it in s? say"),
+        (4.0, "s", 3.0, "is 4 s, in which the body turns 1.91 times; is it in ms? give"),
+        (4e-12, "ns", 0.0, "the step between two times is 4e-12 s; is it in s? give"),
         (3e5, "s", 0.0, "is 3e+05 s; is it in us or ns? give --time-unit"),
     ],
 )
