@@ -161,7 +161,7 @@ MISTAKES = [
     (lambda r: dict(chart={"box": identify.Tensor(1.0)}), ValueError, r"recordings of \['box', 'rod'\]"),
     (lambda r: dict(free=[identify.Free(lambda s: s.sensors[0].bias, "b", each=["a"])]), ValueError, "one label for each of 4 recordings, got 1"),
     (lambda r: dict(noise_each=3), TypeError, "noise_each: wanted True, False, .body., or a sequence of labels"),
-    (lambda r: dict(recording=r | {"rod": []}), ValueError, "no recording of 'rod'"),
+    (lambda r: dict(recording=r | {"rod": []}), ValueError, "wanted a recording of 'rod', got none"),
     (lambda r: dict(prior=identify.Entropic(BODIES["box"], 1.0)), ValueError, "a prior is about one body"),
 ]  # fmt: skip
 
@@ -177,7 +177,7 @@ def test_mistakes_are_named(records, change, kind, words):
 
 @pytest.mark.usefixtures("unhooked")
 def test_a_spread_needs_a_shared_value():
-    with pytest.raises(ValueError, match="each=True has none; give prior"):
+    with pytest.raises(ValueError, match="wanted no spread with each=True"):
         identify.Free(lambda s: s.sensors[0].bias, "b", each=True, spread=0.1)
     with pytest.raises(ValueError, match=r"each: wanted .*body.*got .*throw"):
         identify.Free(lambda s: s.sensors[0].bias, "b", each="throw")
