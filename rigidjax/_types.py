@@ -17,7 +17,7 @@ Quat = Float[Array, "4"]
 
 @runtime_checkable
 class Rotation(Protocol):
-    """What SciPy's `Rotation` has: an active rotation, whose quaternions are scalar last there."""
+    """Describe the `Rotation` of SciPy: an active rotation, with scalar-last quaternions."""
 
     def as_quat(self) -> Any: ...
 
