@@ -18,8 +18,9 @@ from rigidjax.motion.coupled import started
 from rigidjax.motion.torques import bind
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.fixed_loop import first_row, march, piece_length
+from rigidjax.solve.fixed_loop import first_row, march
 from rigidjax.solve.magnus import Magnus4
+from rigidjax.solve.pieces import piece_length
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.steppers import stepper_of
 
@@ -116,8 +117,8 @@ def rollout(
     - `inputs`: the inputs of the torque, by the names of its `rigidjax.torques.Input`s: arrays (N,
       num_steps, *k) whose row i is held exactly through step i of that body; rows of a
       `rigidjax.torques.Delayed` input come later.
-    - `chunk`: the number of bodies computed at a time; `None` fills the first cache, 128 in
-      float64. It changes results in the last digits at most, as do:
+    - `chunk`: the number of bodies computed at a time; `None` fills the first cache, 64 in
+      float64, and on a GPU takes all. It changes results in the last digits at most, as do:
     - `devices`: `None` for one, `"all"` of this process, or a sequence of them; N is cut into
       equal shares.
 

@@ -12,10 +12,12 @@ from jax import lax
 from jax.sharding import AxisType, Mesh, PartitionSpec as P
 
 from rigidjax import _checks
+from rigidjax.rotation.barrier import platform
 
 AXIS = "bodies"
-# Bytes of one number of every body in a chunk: the arrays of a step then stay in the first cache.
-_ROW = 1024
+# Bytes of one number of every body in a chunk: the arrays of a step then stay in the first cache,
+# of 32 KB on many cores.
+_ROW = 512
 # JAX's names of what XLA calls prefer_vector_width; only for the outermost jit, only on CPU.
 _WIDE = {"xla_cpu_prefer_vector_width": 512}
 
@@ -30,7 +32,7 @@ def compiler_options() -> dict[str, Any]:
     >>> bool(jax.jit(lambda x: x + 1, compiler_options=compiler_options())(1.0) == 2)
     True
     """
-    return dict(_WIDE) if jax.default_backend() == "cpu" else {}
+    return dict(_WIDE) if platform() == "cpu" else {}
 
 
 class Compiled:
@@ -74,7 +76,7 @@ def chunk_of(chunk: int | None, dtype: Any, count: int) -> int:
     """The number of bodies computed at a time: a full cache on CPU, all of them elsewhere."""
     if chunk is None:
         small = _ROW // np.dtype(dtype).itemsize
-        chunk = small if jax.default_backend() == "cpu" else count
+        chunk = small if platform() == "cpu" else count
     if not isinstance(chunk, int) or chunk < 1:
         raise ValueError(f"chunk: wanted a positive number of bodies, got {chunk!r}")
     return min(chunk, count)
@@ -89,7 +91,12 @@ def over_bodies(
     """
     count = jax.tree.leaves(each)[0].shape[0]
     parts = 1 if mesh is None else mesh.devices.size
-    chunk = min(chunk, -(-count // parts))
+    share = -(-count // parts)
+    chunk = min(chunk, share)
+    if chunk == share and platform() != "cpu":
+        # XLA gives each thread of a GPU two or four elements of an array of even length: the
+        # numbers of as many bodies then do not fit its registers.
+        chunk += 1 - chunk % 2
     room = -(-count // (chunk * parts)) * chunk * parts
 
     def some(shared: Any, each: Any) -> Any:

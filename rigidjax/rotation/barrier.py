@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array
 
 Tree = TypeVar("Tree")
@@ -19,6 +20,17 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _DROPPED = jax.__version_info__ < (0, 11)
 
 
+def platform() -> str:
+    """The kind of device that computes, such as "cpu": that of `jax.default_device`, if it is set.
+
+    `jax.default_backend` does not look at it.
+    """
+    device: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    if device is None:
+        return jax.default_backend()
+    return device if isinstance(device, str) else device.platform
+
+
 def barrier(tree: Tree) -> Tree:
     """Return the numbers of `tree` unchanged, such that XLA computes them once for all their uses.
 
@@ -26,7 +38,7 @@ def barrier(tree: Tree) -> Tree:
 
     On a GPU each barrier ends a kernel, which costs more than what is computed twice.
     """
-    if jax.default_backend() != "cpu":
+    if platform() != "cpu" or not any(isinstance(a, Tracer) for a in jax.tree.leaves(tree)):
         return tree
     if not _DROPPED:
         return lax.optimization_barrier(tree)

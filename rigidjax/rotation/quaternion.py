@@ -32,6 +32,7 @@ from rigidjax._types import (
     Vec3,
     Vec3Like,
 )
+from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import (
     hat_polynomial,
     is_noncanonical,
@@ -297,10 +298,11 @@ def from_matrix(matrix: Mat3Like) -> Quat:
 
 
 def _turn(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
-    """Return the vector y turned by the quaternion (w, u): y + 2w u×y + 2 u×(u×y)."""
-    t = [2 * part for part in cross_components(u, y)]
-    again = cross_components(u, t)
-    return jnp.stack([y[i] + (w * t[i] + again[i]) for i in range(3)])
+    """Return the vector y turned by the quaternion (w, u): y + 2 (w u×y + u×(u×y))."""
+    across = cross_components(u, y)
+    again = cross_components(u, across)
+    # Each component is computed once: else the torque repeats all of them for each of its own.
+    return jnp.stack(barrier([y[i] + 2 * (w * across[i] + again[i]) for i in range(3)]))
 
 
 __all__ = [

@@ -15,6 +15,8 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jaxtyping import Array
 
+from rigidjax.rotation.barrier import platform
+
 Arrays = list[Any]
 
 # Bodies that go through a loop together on CPU: few, so that their numbers stay in the first cache.
@@ -138,7 +140,7 @@ def _in_blocks(program: Program, layout: Layout, number: int, *args: Any) -> Arr
     """A program of `number` constants and of bodies, so many of them at a time."""
     constants, each = list(args[:number]), list(args[number:])
     count = each[0].shape[-1] if layout.bodies else 1
-    if jax.default_backend() != "cpu" or count <= BLOCK:
+    if platform() != "cpu" or count <= BLOCK:
         return program(layout, constants, each)
     number = -(-count // BLOCK)
     size = -(-count // number)

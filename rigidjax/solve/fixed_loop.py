@@ -5,7 +5,6 @@ at saved times is also the method's own.
 """
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,9 +14,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax.motion.torques.inputs import Row, delays_of
+from rigidjax.rotation.barrier import platform
 from rigidjax.solve.equal_steps import Rolled
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.magnus import Magnus4
+from rigidjax.solve.pieces import in_pieces, piece_length
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.steppers import AnyStepper, stepper_of
 
@@ -143,6 +144,8 @@ def march(
 
     In reverse mode the states at the starts of √count pieces are kept, and those in one piece.
     """
+    if platform() != "cpu":
+        return in_pieces(lambda y, i: step(stepper, h, t0, i, y, inputs), first, count, y)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def one(y: Any, i: Array) -> tuple[Any, None]:
@@ -160,10 +163,3 @@ def march(
     else:
         y = some(y, first, length)
     return some(y, first + pieces * length, left) if left else y
-
-
-def piece_length(count: int) -> int:
-    """About √count steps; a divisor of count where there is one near, for less to compile."""
-    root = math.isqrt(count - 1) + 1
-    near = [d for d in range(root, min(2 * root, count) + 1) if count % d == 0]
-    return near[0] if near else root

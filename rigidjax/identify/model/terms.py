@@ -24,7 +24,7 @@ from rigidjax.identify.model.predict import (
 from rigidjax.identify.model.scene import Scene
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import Input, bind
-from rigidjax.rotation.barrier import batched_as
+from rigidjax.rotation.barrier import batched_as, platform
 
 if TYPE_CHECKING:
     from rigidjax.identify.model.model import Model
@@ -122,7 +122,7 @@ def over_records(function: Any, model: "Model", *rows: Any) -> Any:
     if model.count == 1:
         # One recording needs no loop: the program is smaller.
         return jax.tree.map(lambda leaf: leaf[None], of_one(stacking.one(arrays, 0)))
-    if jax.default_backend() == "cpu":
+    if platform() == "cpu":
         return lax.map(of_one, arrays, batch_size=1)
     return jax.vmap(of_one)(arrays)
 
