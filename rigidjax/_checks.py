@@ -241,8 +241,45 @@ def bare(error: RuntimeError) -> RuntimeError:
     return type(error)(found[1]) if found else error
 
 
+# From so many rows on one compiled pass is quicker than NumPy, and they stay on their device.
+_MANY = 4096
+
+
+def first_bad(faults: Callable[[Any, Any], Any], rows: Any) -> Any:
+    """Return the index of the first of these known rows (n, …) that has a fault, −1 if none has.
+
+    `faults(xp, rows)` is (n,), true where there is one, by the functions of `xp`, which is NumPy or
+    `jax.numpy`. Define it once: for many rows it is compiled, and nobody waits for the index here.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        if rows.shape[0] > _MANY:
+            # Also within a trace, in which the index would not be known.
+            with jax.ensure_compile_time_eval():
+                return _compiled_first(faults, rows)
+        return _first(np, faults(np, np.asarray(rows)))
+
+
+def _first(xp: Any, bad: Any) -> Any:
+    return xp.where(bad.any(), xp.argmax(bad), -1)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _compiled_first(faults: Callable[[Any, Any], Any], rows: Array) -> Array:
+    return _first(jnp, faults(jnp, rows))
+
+
+def _not_finite(xp: Any, rows: Any) -> Any:
+    return ~xp.isfinite(rows).reshape(rows.shape[0], -1).all(axis=1)
+
+
 def finite(value: Numbers, name: str) -> Numbers:
     """Return `value`, or refuse it if it contains a NaN or an infinity."""
+    if isinstance(value, jax.Array) and known(value) and value.ndim and value.shape[0] > _MANY:
+        row = int(first_bad(_not_finite, value))
+        if row < 0:
+            return value
+        place = row, *(int(i) for i in np.argwhere(~np.isfinite(np.asarray(value)[row]))[0])
+        raise ValueError(f"{name}: contains NaN or infinity at index {place}")
     xp = namespace(value)
     bad = ~xp.isfinite(value)
     where = ""

@@ -160,7 +160,9 @@ def rollout(
     numbers = (batch.shared, (batch.each, driven), start, h, begin)
     steps = solver, count, every, save_every is not None and reduce is None
     among = chunk_of(chunk, batch.dtype, batch.many), mesh_of(devices)
-    return _compiled(steps, among, reduce, batch.rest, numbers)
+    out = _compiled(steps, among, reduce, batch.rest, numbers)
+    batch.require()
+    return out
 
 
 def _run(steps: Any, among: Any, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:

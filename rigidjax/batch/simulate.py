@@ -118,7 +118,7 @@ def simulate(
         ts = _checks.time(t0, "t0").astype(h.dtype) + ts
         taken = jnp.full(batch.many, count, jnp.int32)
         own = ys.own if isinstance(ys, Coupled) else None
-        return Batch(ts, motion_of(ys), _statuses(batch, ys), taken, own)
+        return Batch(ts, motion_of(ys), _statuses(batch._replace(looks=()), ys), taken, own)
     if inputs is not None:
         raise ValueError(
             "simulate: inputs are for Steps(size, number); with times put torques.Held(times, "
@@ -135,7 +135,9 @@ def simulate(
     how = dict(solver=solver, rtol=rtol, atol=atol, max_steps=max_steps, adjoint=adjoint)
     among = chunk_of(chunk, batch.dtype, batch.many), mesh_of(devices)
     numbers = (batch.shared, batch.each, ts)
-    return Batch(ts, *_compiled(how, among, batch.rest, numbers))
+    out = Batch(ts, *_compiled(how, among, batch.rest, numbers))
+    batch.require()
+    return out
 
 
 def _run(how: dict[str, Any], among: Any, rest: Any, numbers: Any) -> Any:

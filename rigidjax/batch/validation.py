@@ -1,5 +1,6 @@
 """Checks of a batch before anything runs: shapes, types, and known numbers."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,6 +28,17 @@ class BodyBatch(NamedTuple):
     rest: Any  # the leaves that are no arrays
     many: int
     dtype: Any
+    looks: tuple[tuple[Any, Callable[[int], None]], ...] = ()
+
+    def require(self) -> None:
+        """Raise for the first body with a known number that is wrong.
+
+        To be called after the work was started: a device then looks at the bodies while the host
+        prepares the rest, and nobody waits.
+        """
+        for index, refuse in self.looks:
+            if (i := int(index)) >= 0:
+                refuse(i)
 
 
 def one_of(shared: Any, each: Any, rest: Any) -> tuple[Any, Any, Any]:
@@ -36,7 +48,7 @@ def one_of(shared: Any, each: Any, rest: Any) -> tuple[Any, Any, Any]:
 
 
 def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyBatch:
-    """The batch; an error names the first body with a known number that is wrong."""
+    """The batch, whose `require` names the first body with a known number that is wrong."""
     if not isinstance(states0, Spin | Attitude | Rigid):
         raise TypeError(
             f"states0: wanted Spin, Attitude or Rigid, got {type(states0).__name__}; for points in "
@@ -67,9 +79,9 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
             f"{tensor.shape}"
         )
     # Before the states' precision: in a finer one, the rounding of a plate looks like a fault.
-    bodies = _real(bodies)
+    bodies, looks = _real(bodies)
     if isinstance(states0, HasAttitude):
-        _unit(states0.q)
+        looks += _unit(states0.q)
     bodies = jax.tree.map(lambda a: a if a.dtype == dtype else a.astype(dtype), bodies)
     own = tensor.ndim == 3
     if own and tensor.shape[0] == 1 and count > 1:
@@ -86,7 +98,11 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
     row = (lambda a: a[0]) if isinstance(bodies, MassProperties) else shape
     validation.require_fit(*eqx.combine(shared, jax.tree.map(row, each), rest))
     validation.warn_of_scale(bodies, torque)
-    return BodyBatch(shared, each, rest, count, dtype)
+    batch = BodyBatch(shared, each, rest, count, dtype, tuple(looks))
+    if all(isinstance(index, np.ndarray | np.integer) for index, _ in looks):
+        # Of few bodies at once, before anything is compiled.
+        batch.require()
+    return batch
 
 
 def driven_by(inputs: Any, torque: Any, states0: Any, count: int, h: Array) -> Any:
@@ -151,33 +167,40 @@ def _selected(torque: Any, pick: Any) -> Any:
     return jax.tree.unflatten(structure, [i in found for i in range(len(leaves))])
 
 
-def _real(bodies: Inertia | MassProperties) -> Any:
-    """The bodies; an error names the first known one that no mass has, traced ones become NaN."""
+def _real(bodies: Inertia | MassProperties) -> tuple[Any, list[Any]]:
+    """The bodies, traced ones that no mass has as NaN; and the first of known ones."""
     tensor = tensor_of(bodies)
     if not _checks.known(tensor):
-        return validation.real_or_nan(bodies)
-    # By NumPy: within a trace, a known tensor that JAX reshapes is no longer known.
-    tensors = np.asarray(tensor).reshape(-1, 3, 3)
-    index = first_impossible(tensors)
-    if index is not None:
+        return validation.real_or_nan(bodies), []
+    # Within a trace, a known tensor that JAX reshapes is no longer known.
+    with jax.ensure_compile_time_eval():
+        tensors = tensor.reshape(-1, 3, 3)
+
+    def refuse(i: int) -> None:
         try:
-            Inertia(tensors[index]).invertible()
+            Inertia(np.asarray(tensors)[i]).invertible()
         except ValueError as error:
-            raise ValueError(f"bodies: {error}; this is body {index}") from None
-    return bodies
+            raise ValueError(f"bodies: {error}; this is body {i}") from None
+
+    return bodies, [(first_impossible(tensors), refuse)]
 
 
-def _unit(q: Array) -> None:
+def _unit(q: Array) -> list[Any]:
     if not _checks.known(q):
-        return
-    far = np.abs(np.sqrt(np.sum(np.square(np.asarray(q)), axis=-1)) - 1)
-    bad = far > tolerance(q.dtype)
-    if bad.any():
-        i = int(np.argmax(bad))
+        return []
+
+    def refuse(i: int) -> None:
+        far = abs(np.linalg.norm(np.asarray(q)[i]) - 1)
         raise ValueError(
-            f"q: wanted unit quaternions (w, x, y, z), got length {1 + far[i]:.6g} or less of body "
+            f"q: wanted unit quaternions (w, x, y, z), got length {1 + far:.6g} or less of body "
             f"{i}; normalise with rigidjax.quaternion.normalise, and mind that the scalar is first"
         )
+
+    return [(_checks.first_bad(_not_unit, q), refuse)]
+
+
+def _not_unit(xp: Any, q: Any) -> Any:
+    return xp.abs(xp.sqrt(xp.sum(xp.square(q), axis=-1)) - 1) > tolerance(q.dtype)
 
 
 def step_of(step_size: Any, num_steps: Any, dtype: Any) -> tuple[Array, int]:

@@ -5,7 +5,6 @@ exception that shows the numbers, traced values with `equinox.error_if`, without
 units of round-off are tolerated: plates, rods and points lie on the boundary and pass.
 """
 
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -123,28 +122,17 @@ def possible(
     return eqx.branched_error_if(body, bad.any(), jnp.where(light.any(), 0, which), words)
 
 
-def first_impossible(tensors: Float[Array, "n 3 3"] | Float[np.ndarray, "n 3 3"]) -> int | None:
-    """Return the index of the first of these known tensors that no body has, or `None`.
+def first_impossible(tensors: Float[Array, "n 3 3"]) -> Any:
+    """Return the index of the first of these known tensors that no body has, −1 if all are real.
 
     A tensor with a NaN is skipped: in a batch of bodies it gets a status of its own.
     """
-    many = tensors.shape[0] > _MANY
-    with np.errstate(invalid="ignore", over="ignore"):
-        bad, index = (_compiled_first if many else functools.partial(_first, np))(tensors)
-    return int(index) if bad else None
+    return _checks.first_bad(_impossible, tensors)
 
 
-# For more bodies one compiled pass is quicker than NumPy, and the bodies stay on their device.
-_MANY = 4096
-
-
-def _first(xp: Any, tensors: Any) -> tuple[Any, Any]:
+def _impossible(xp: Any, tensors: Any) -> Any:
     flat, broken, skew = _faults(xp, tensors, thin=False)
-    bad = (flat | broken | skew) & ~xp.isnan(xp.asarray(tensors)).any(axis=(-1, -2))
-    return bad.any(), xp.argmax(bad)
-
-
-_compiled_first = jax.jit(functools.partial(_first, jnp))
+    return (flat | broken | skew) & ~xp.isnan(xp.asarray(tensors)).any(axis=(-1, -2))
 
 
 _MASS = "mass: wanted a positive mass (kg), got zero, a negative one or NaN"
