@@ -129,6 +129,7 @@ def verdict(fit: Fit) -> str:
             size = " or ".join(f"{1e3 * each:.3g}" for each in np.unique(np.asarray(tau)))
             lines.append(f"time stamps of the {type(sensor).__name__} scatter by {size} ms")
     lines += [f"- {line}" for line in fit.identifiability]
+    lines += [fit.place] if fit.place else []
     return "\n".join(lines)
 
 

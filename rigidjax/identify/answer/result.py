@@ -77,6 +77,7 @@ class Fit(eqx.Module):
     - `allowance`: the sentences on what the intervals allow for.
     - `hidden`: (k, n) the directions that one stretch of windows alone shows, whose variance is
       infinite; for a fit of windows.
+    - `place`: where it was computed, in words, if that is not JAX's default device.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> [quantity.name for quantity in result.quantities[:2]], result.covariance.shape
@@ -107,6 +108,7 @@ class Fit(eqx.Module):
     considered: tuple[Consideration, ...] = ()
     allowance: str = ""
     hidden: Float[Array, "hidden n"] | None = None
+    place: str = ""
 
     @property
     def status(self) -> str:
