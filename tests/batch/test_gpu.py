@@ -1,0 +1,149 @@
+"""What runs on a GPU, on a CPU: steps in pieces, places of bodies, checks of many rows, fits."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from batch.bench_gpu import main, written
+from batch.test_rollout import batch, far
+
+import rigidjax as rj
+from rigidjax import _checks
+from rigidjax.batch import sharding
+from rigidjax.identify.answer import fit as fits
+from rigidjax.rotation.barrier import platform
+from rigidjax.solve import fixed_loop, pieces
+
+CHANGES = jnp.asarray([1.0, -0.5, 0.25])
+
+
+def steps_of(size, start, h, count, run):
+    """`count` steps of a small system with a constant of whole numbers, from number 2 on."""
+    order = jnp.asarray([2, 0, 1])
+
+    def step(y, i):
+        a, b = y
+        t = i.astype(h.dtype) * h
+        return a + h * jnp.sin(size * size * b) * CHANGES[order], b * (1 - h * a[0]) + h * t
+
+    return run(step, jnp.asarray(2, jnp.int32), count, start)
+
+
+def plain(step, first, count, y):
+    return jax.lax.scan(
+        lambda y, i: (step(y, i), None), y, first + jnp.arange(count, dtype=first.dtype)
+    )[0]
+
+
+START = jnp.asarray([0.3, -0.2, 0.5]), jnp.asarray(0.7)
+
+
+@pytest.mark.parametrize("count", [12, 7, 1], ids=["pieces", "pieces and a rest", "one"])
+@pytest.mark.parametrize("most", [1, 8])
+def test_steps_in_pieces(monkeypatch, count, most):
+    """Values, and derivatives in both modes, of one and of a batch: those of a plain loop."""
+    monkeypatch.setattr(pieces, "_MOST", most)
+
+    def all_of(run):
+        def last(size, start, h):
+            a, b = steps_of(size, start, h, count, run)
+            return jnp.sum(a * a) * b
+
+        at = jnp.asarray(0.8), START, jnp.asarray(0.1)
+        sizes = jnp.asarray([0.8, 0.1])
+        return (
+            last(*at),
+            jax.grad(last, (0, 1, 2))(*at),
+            jax.grad(last, 1)(*at),
+            jax.jacfwd(last, (0, 2))(*at),
+            jax.vmap(jax.grad(last, (0, 1)), (0, None, None))(sizes, *at[1:]),
+            jax.jacfwd(jax.grad(last, (0, 2)))(*at),
+        )
+
+    here, there = jax.jit(lambda: (all_of(plain), all_of(pieces.in_pieces)))()
+    for a, b in zip(jax.tree.leaves(here), jax.tree.leaves(there), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-13, atol=1e-14)
+
+
+def test_reverse_over_reverse_is_refused():
+    def last(size):
+        return steps_of(size, START, jnp.asarray(0.1), 3, pieces.in_pieces)[1]
+
+    with pytest.raises(TypeError, match="forward over reverse"):
+        jax.grad(jax.grad(last))(jnp.asarray(0.8))
+
+
+def test_a_gpu_takes_steps_in_pieces(monkeypatch):
+    """A rollout with that loop; with its barriers, without which XLA compiles for minutes on a CPU."""
+    taken = []
+
+    def in_pieces(*args):
+        taken.append(args[2])
+        return pieces.in_pieces(*args)
+
+    bodies, states = batch(2)
+    law = rj.torques.Damping([0.1, 0.2, 0.3])
+    here = rj.batch.rollout(bodies, states, 0.1, 5, law)
+    monkeypatch.setattr(fixed_loop, "platform", lambda: "gpu")
+    monkeypatch.setattr(fixed_loop, "in_pieces", in_pieces)
+    monkeypatch.setattr(pieces, "_MOST", 1)
+    # Another number of steps a piece of results, so that no trace of the first call is taken.
+    there = rj.batch.rollout(bodies, states, 0.1, 5, law, save_every=5)
+    assert taken == [5]
+    assert far(here, jax.tree.map(lambda a: a[:, 0], there)) < 1e-15
+
+
+def test_bodies_of_an_odd_number(monkeypatch):
+    sizes, real = [], jax.lax.map
+
+    def mapped(f, a, batch_size):
+        sizes.append(batch_size)
+        return real(f, a, batch_size=batch_size)
+
+    monkeypatch.setattr(sharding, "platform", lambda: "gpu")
+    monkeypatch.setattr(sharding.lax, "map", mapped)
+    there = sharding.over_bodies(lambda s, x: s * x, jnp.asarray(2.0), jnp.arange(4.0), 4, None)
+    np.testing.assert_array_equal(there, 2 * np.arange(4.0))
+    assert sizes == [5]
+
+
+def test_many_rows_are_checked_where_they_are():
+    """The same words as for a few; the first of several is named."""
+    count = 5000
+    q = jnp.tile(jnp.eye(4)[0], (count, 1))
+    bodies = rj.Inertia(jnp.tile(jnp.diag(jnp.array([1.0, 1.3, 1.7])), (count, 1, 1)))
+    start = rj.Attitude(q, jnp.ones((count, 3)))
+    bad = q.at[4321].mul(2.0).at[4999].mul(3.0)
+    with pytest.raises(ValueError, match="got length 2 or less of body 4321"):
+        rj.batch.rollout(bodies, rj.Attitude(bad, start.omega), 0.1, 1)
+    tensor = bodies.tensor.at[17, 0, 0].set(-1.0)
+    with pytest.raises(ValueError, match="this is body 17"):
+        rj.batch.rollout(rj.Inertia(tensor), start, 0.1, 1)
+    for rows in (jnp.ones((count, 3)), jnp.ones((5, 3))):
+        assert _checks.finite(rows, "rows") is rows
+        with pytest.raises(ValueError, match=r"rows: contains NaN or infinity at index \(4, 1\)"):
+            _checks.finite(rows.at[4, 1].set(jnp.nan), "rows")
+
+
+def test_a_small_fit_on_a_machine_with_a_gpu(monkeypatch):
+    """It runs on the CPU and says so, unless a device was chosen."""
+    ts = jnp.linspace(0.0, 2.0, 9)
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), jnp.ones((9, 3))))
+    model = rj.identify.Model(record, rj.identify.PrincipalRatios())
+    cpu = jax.devices("cpu")[0]
+    assert fits._quicker_place(model) is None
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert platform() == "gpu"
+    assert fits._quicker_place(model) == cpu
+    with jax.default_device(cpu):
+        assert platform() == "cpu"
+        assert fits._quicker_place(model) is None
+    monkeypatch.setattr(fits, "_FEW", 10)
+    assert fits._quicker_place(model) is None
+
+
+def test_the_benchmark_in_small():
+    table = main(["--small"])
+    assert len(table.rows) == 25
+    page = written("a\n<!-- bench_gpu -->\nold\n<!-- /bench_gpu -->\nb\n", "new")
+    assert page == "a\n<!-- bench_gpu -->\n\nnew\n<!-- /bench_gpu -->\nb\n"
