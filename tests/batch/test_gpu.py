@@ -38,10 +38,12 @@ def plain(step, first, count, y):
 START = jnp.asarray([0.3, -0.2, 0.5]), jnp.asarray(0.7)
 
 
-@pytest.mark.parametrize("count", [12, 7, 1], ids=["pieces", "pieces and a rest", "one"])
-@pytest.mark.parametrize("most", [1, 8])
+@pytest.mark.parametrize(("count", "most"), [(7, 4), (12, 1), (1, 4)], ids=["rest", "whole", "one"])
 def test_steps_in_pieces(monkeypatch, count, most):
-    """Values, and derivatives in both modes, of one and of a batch: those of a plain loop."""
+    """Values, and derivatives in both modes, of one and of a batch: those of a plain loop.
+
+    In pieces and a rest, in whole pieces of one step a turn, and one step.
+    """
     monkeypatch.setattr(pieces, "_MOST", most)
 
     def all_of(run):

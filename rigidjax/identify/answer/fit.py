@@ -42,7 +42,8 @@ from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 
 # The largest number of free numbers that all recordings share: the normal equations are dense.
 MOST_SHARED = 1000
-# On a GPU a model of fewer numbers takes ten times as long as on a CPU, which starts programs sooner.
+# On a GPU a model of fewer numbers takes ten times as long as on a CPU, which starts each program
+# sooner.
 _FEW = 100_000
 # Integration steps are short enough if shorter ones change predictions by less than this part of
 # the noise.
