@@ -121,6 +121,9 @@ def test_many_rows_are_checked_where_they_are():
     tensor = bodies.tensor.at[17, 0, 0].set(-1.0)
     with pytest.raises(ValueError, match="this is body 17"):
         rj.batch.rollout(rj.Inertia(tensor), start, 0.1, 1)
+    # Known numbers within a trace of others.
+    with pytest.raises(ValueError, match="of body 4321"):
+        jax.jit(lambda h: rj.batch.rollout(bodies, rj.Attitude(bad, start.omega), h, 1))(0.1)
     for rows in (jnp.ones((count, 3)), jnp.ones((5, 3))):
         assert _checks.finite(rows, "rows") is rows
         with pytest.raises(ValueError, match=r"rows: contains NaN or infinity at index \(4, 1\)"):
