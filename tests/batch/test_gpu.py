@@ -38,6 +38,7 @@ def plain(step, first, count, y):
 START = jnp.asarray([0.3, -0.2, 0.5]), jnp.asarray(0.7)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize(("count", "most"), [(7, 4), (12, 1), (1, 4)], ids=["rest", "whole", "one"])
 def test_steps_in_pieces(monkeypatch, count, most):
     """Values, and derivatives in both modes, of one and of a batch: those of a plain loop.
