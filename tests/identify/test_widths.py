@@ -53,7 +53,9 @@ def test_a_given_spread_stays_and_mistakes_are_named():
     problem = identify.Model(records, identify.PrincipalRatios(), free=[given])
     assert not problem.slots[0].estimated
     estimated = identify.Free(bias, "bias", spread="estimated")
-    with pytest.raises(ValueError, match="wanted three recordings or more to estimate a spread, got 2"):
+    with pytest.raises(
+        ValueError, match="wanted three recordings or more to estimate a spread, got 2"
+    ):
         identify.Model(records[:2], identify.PrincipalRatios(), free=[estimated])
     for wrong in ("guessed", -1.0):
         with pytest.raises((TypeError, ValueError), match="Free 'bias': spread: wanted"):
