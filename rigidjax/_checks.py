@@ -274,8 +274,9 @@ def _not_finite(xp: Any, rows: Any) -> Any:
 
 def finite(value: Numbers, name: str) -> Numbers:
     """Return `value`, or refuse it if it contains a NaN or an infinity."""
-    if isinstance(value, jax.Array) and known(value) and value.ndim and value.shape[0] > _MANY:
-        row = int(first_bad(_not_finite, value))
+    rows: Any = value
+    if isinstance(rows, jax.Array) and known(rows) and rows.ndim and rows.shape[0] > _MANY:
+        row = int(first_bad(_not_finite, rows))
         if row < 0:
             return value
         place = row, *(int(i) for i in np.argwhere(~np.isfinite(np.asarray(value)[row]))[0])

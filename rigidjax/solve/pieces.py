@@ -6,9 +6,10 @@ that: it is as slow as it is long, while JAX's transpose of a loop has as many s
 the loop itself. On a CPU neither gains anything.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -33,7 +34,8 @@ def piece_length(count: int) -> int:
     return near[0] if near else root
 
 
-class _Program(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class _Program:
     """`count` steps `call(constants, y, i)`, on lists of arrays, `turn` of them in a kernel."""
 
     call: Callable[[Arrays, Arrays, Array], Arrays]
@@ -87,7 +89,11 @@ class _Program(NamedTuple):
         rows, last = starts
         if left:
             sums = piece(sums, last, first + self.count - left, left)
-        whole = lambda sums, at: (piece(sums, *at, length), None)  # noqa: E731
+
+        def whole(sums: tuple[Arrays, Arrays], at: tuple[Arrays, Array]) -> tuple[Any, None]:
+            starts, begin = at
+            return piece(sums, starts, begin, length), None
+
         return lax.scan(whole, sums, (rows, firsts), reverse=True)[0]
 
     def pieces(self, first: Array) -> tuple[Array, int, int]:
