@@ -21,7 +21,7 @@ _DROPPED = jax.__version_info__ < (0, 11)
 
 
 def platform() -> str:
-    """The kind of device that computes, such as "cpu": that of `jax.default_device`, if it is set.
+    """Return the kind of device that computes, such as "cpu": of `jax.default_device`, if set.
 
     `jax.default_backend` does not look at it.
     """
