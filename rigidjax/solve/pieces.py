@@ -28,7 +28,7 @@ _LONG, _MOST = 2800, 8
 
 
 def piece_length(count: int) -> int:
-    """About √count steps; a divisor of count where there is one near, for less to compile."""
+    """Return about √count steps: a divisor of count if one is near, for less to compile."""
     root = math.isqrt(count - 1) + 1
     near = [d for d in range(root, min(2 * root, count) + 1) if count % d == 0]
     return near[0] if near else root
@@ -36,7 +36,7 @@ def piece_length(count: int) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class _Program:
-    """`count` steps `call(constants, y, i)`, on lists of arrays, `turn` of them in a kernel."""
+    """Run `count` steps `call(constants, y, i)` on lists of arrays, `turn` in a kernel."""
 
     call: Callable[[Arrays, Arrays, Array], Arrays]
     count: int
@@ -45,7 +45,7 @@ class _Program:
     def some(
         self, constants: Arrays, y: Arrays, first: Array, many: int, keep: bool = False
     ) -> tuple[Arrays, Any]:
-        """The end of so many steps from number `first` on, and, to `keep` them, all starts."""
+        """Return the end of `many` steps from number `first` on, and all their starts if `keep`."""
 
         def one(y: Arrays, i: Array) -> tuple[Arrays, Any]:
             return self.call(constants, y, i), y if keep else None
@@ -53,7 +53,7 @@ class _Program:
         return lax.scan(one, y, first + jnp.arange(many, dtype=jnp.int32), unroll=self.turn)
 
     def forward(self, constants: Arrays, first: Array, y: Arrays) -> tuple[Arrays, Any]:
-        """The end, and the starts of all pieces: those of one length, and the start of the rest."""
+        """Return the end, and the starts: of pieces of one length, of the steps left over."""
         firsts, length, left = self.pieces(first)
 
         def piece(y: Arrays, begin: Array) -> tuple[Arrays, Arrays]:
@@ -68,7 +68,7 @@ class _Program:
     def back(
         self, constants: Arrays, moving: Sequence[bool], first: Array, starts: Any, bar: Arrays
     ) -> tuple[Arrays, Arrays]:
-        """The cotangents of those constants that are `moving`, and of the start."""
+        """Return the cotangents of the constants that are `moving`, and of the start."""
         firsts, length, left = self.pieces(first)
         chosen = [c for c, m in zip(constants, moving, strict=True) if m]
 
@@ -97,14 +97,14 @@ class _Program:
         return lax.scan(whole, sums, (rows, firsts), reverse=True)[0]
 
     def pieces(self, first: Array) -> tuple[Array, int, int]:
-        """The number of the first step of each piece; their length; how many steps are left."""
+        """Return the first step of each piece, their length, and the number of steps left."""
         length = piece_length(self.count)
         many, left = divmod(self.count, length)
         return first + length * jnp.arange(many, dtype=jnp.int32), length, left
 
 
 def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: Any) -> Any:
-    """The end of `count` steps `y = step(y, i)` from number `first` on.
+    """Return the end of `count` steps `y = step(y, i)` from number `first` on.
 
     In reverse mode the states at the starts of √count pieces are kept, and those in one piece.
     Second derivatives are forward over reverse.
@@ -155,6 +155,6 @@ def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: An
 
 
 def _with(all_: Sequence[Any], which: Sequence[bool], some: Sequence[Any]) -> list[Any]:
-    """All arrays, those of `which` replaced by `some`."""
+    """Return all arrays, with those that `which` selects replaced by `some`."""
     rest = iter(some)
     return [next(rest) if w else a for a, w in zip(all_, which, strict=True)]

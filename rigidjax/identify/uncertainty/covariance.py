@@ -286,7 +286,7 @@ def white_covariance(linear: Linearised) -> Covariance:
     # Recordings without numbers of their own, such as windows with known starts, have nothing to
     # eliminate: a loop over a thousand of them took most of the time.
     all_shared = ~np.isin(np.arange(len(triangles)), owner)
-    none = np.zeros(0, int), np.zeros((0, 0)), np.zeros((0, shared.size))
+    no_own = np.zeros(0, int), np.zeros((0, 0)), np.zeros((0, shared.size))
     rest, own, values, null = (
         [ties, _rows_of_shared(linear, triangles, size, all_shared, shared)],
         [],
@@ -295,7 +295,7 @@ def white_covariance(linear: Linearised) -> Covariance:
     )
     for record, (triangle, columns) in enumerate(zip(triangles, linear.places, strict=True)):
         if all_shared[record]:
-            own.append(none)
+            own.append(no_own)
             continue
         mine = np.flatnonzero(owner == record)
         wide, held = np.zeros((len(triangle), n + 1)), np.zeros((mine.size, n))
