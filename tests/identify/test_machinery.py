@@ -240,7 +240,7 @@ def test_a_fit_killed_after_any_start_ends_at_the_same_bits(short_record, tmp_pa
         # Nothing is done twice.
         assert saved == list(range(last + 1, 5))
     other = identify.Model(short_record, identify.PrincipalRatios(), loss=identify.Huber(0.5))
-    with pytest.raises(ValueError, match="the checkpoint of another model"):
+    with pytest.raises(ValueError, match="wanted the checkpoint of this model"):
         identify.fit(other, starts=4, checkpoint=path)
 
 

@@ -16,6 +16,8 @@ from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
 # A positive number that is not known to this factor gets the interval from 0 to infinity.
 FARTHEST = 1e3
+# A correlation nearer to one than this is one.
+ROUND_OFF = 1e-13
 
 
 class Quantity(eqx.Module):
@@ -250,6 +252,9 @@ def cuts_of(
         if np.isfinite(wide) and wide > 0:
             with np.errstate(invalid="ignore", divide="ignore"):
                 rho = slope @ (covariance @ limit.slope) / (deviations * wide)
+            # The flatness itself has a correlation of one but for round-off, of which the square
+            # root √(1 − ρ²) would be 1e-8.
+            rho = np.where(np.abs(rho) > 1.0 - ROUND_OFF, np.sign(rho), rho)
             out.append((np.where(np.isfinite(rho), rho, 0.0), limit.free / wide))
     return out
 
