@@ -120,7 +120,9 @@ def normal_of(
     rest = np.setdiff1d(np.arange(columns), alone)
     squares = jnp.zeros((count, columns, columns), blocks[0].dtype)
     for rows in blocks:
-        squares = squares + jnp.einsum("rtki,rtkj->rij", rows, rows)
+        # A product of matrices takes a fifth of the time of an `einsum` over two axes (on a CPU).
+        flat = rows.reshape(count, -1, columns)
+        squares = squares + flat.swapaxes(1, 2) @ flat
     # A column without a number goes to an additional last row, which is dropped.
     last = size - count * alone.size
     at = jnp.minimum(where[:, rest], last)

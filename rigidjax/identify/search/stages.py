@@ -117,7 +117,9 @@ def least_squares_from(
         total, pulls = jnp.zeros((), kind), jnp.zeros(places.shape, kind)
         for e, row in zip(residuals, rows, strict=True):
             total = total + jnp.sum(e**2)
-            pulls = pulls + jnp.einsum("rtki,rtk->ri", row, e)
+            # As in `normal_of`, a product of matrices is several times as fast as an `einsum`.
+            flat = row.reshape(model.count, -1, places.shape[1])
+            pulls = pulls + (e.reshape(model.count, 1, -1) @ flat)[:, 0]
         slope = jnp.zeros(number + 1, kind).at[places].add(pulls)
         normal = normal_of(rows, places, number, alone).plus(prior**2)
         total, slope = total + jnp.sum((prior * x) ** 2), slope[:-1] + prior**2 * x

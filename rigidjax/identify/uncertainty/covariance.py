@@ -88,7 +88,7 @@ class Linearised(eqx.Module):
     def rows(self) -> list[np.ndarray]:
         """Return the weighted slopes (R, T k, m) of each sensor, a row for each error."""
         return [
-            (slope * np.sqrt(weight)[..., None, None]).reshape(len(slope), -1, slope.shape[-1])
+            _flat(slope * np.sqrt(weight)[..., None, None])
             for slope, weight in zip(self.slopes, self.weights, strict=True)
         ]
 
@@ -120,10 +120,15 @@ class Linearised(eqx.Module):
     def scores(self) -> np.ndarray:
         """Return the part (R, m) of each recording in the gradient of the misfit."""
         total: Any = sum(
-            np.einsum("rtk,rtkm,rt->rm", error, slope, weight)
+            ((error * weight[..., None]).reshape(len(error), 1, -1) @ _flat(slope))[:, 0]
             for error, slope, weight in zip(self.errors, self.slopes, self.weights, strict=True)
         )
         return total
+
+
+def _flat(slopes: np.ndarray) -> np.ndarray:
+    """Return slopes (R, T, k, m) as rows (R, T k, m), one for each error."""
+    return slopes.reshape(len(slopes), -1, slopes.shape[-1])
 
 
 @eqx.filter_jit
