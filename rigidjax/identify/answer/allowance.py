@@ -3,15 +3,22 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from rigidjax.identify.model.model import Model
-from rigidjax.identify.uncertainty.considered import Consideration, describe_considered
+from rigidjax.identify.model.model import Model, values_of
+from rigidjax.identify.uncertainty.considered import (
+    Consideration,
+    describe_considered,
+    slot_of,
+)
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 from rigidjax.identify.uncertainty.quantities import Quantity
 
 # The largest number of quantities named in one sentence.
 MOST = 3
+# A free bias is remarkable if it exceeds this share of the root mean square of the readings: the
+# bias of a gyro is a hundredth of the rates that are worth a fit.
+REMARKABLE = 0.2
 _WAYS = {
     "scale": "an error of 1 % in the scale of one axis",
     "cross_axis": "an axis that leans by 1°",
@@ -51,6 +58,29 @@ def allowance(
         )
     if not out:
         out.append("They do not allow for a sensor that is off.")
+    return " ".join(out)
+
+
+def describe_large_biases(model: Model, x: Float[Array, " n"]) -> str:
+    """Say which free biases without a prior are as large as readings; empty if none is.
+
+    Such a bias takes up what the model of the motion lacks: that of a pendulum's gyro came out as
+    1.6 rad/s. `x` (n,) are the fitted numbers.
+    """
+    out, values = [], values_of(model, x)
+    for index, reading in enumerate(model.records.readings):
+        slot, sensor = slot_of(model, index, "bias"), reading.sensor
+        if slot is None or slot.prior is not None:
+            continue
+        largest = float(np.abs(np.asarray(values[slot.name])).max())
+        rows = np.asarray(reading.values)[reading.seen]
+        size = float(np.sqrt(np.mean(np.sum(rows.reshape(len(rows), -1) ** 2, axis=1))))
+        if largest > REMARKABLE * size:
+            out.append(
+                f"{slot.name!r}, a bias without a prior, came out as {largest:.2g} {sensor.unit}, "
+                f"{100 * largest / size:.0f} % of the readings: it may stand for a part of the "
+                f"motion that the model lacks. Give what is known of it, such as Free(…, prior=…)."
+            )
     return " ".join(out)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rigidjax import _show
-from rigidjax.identify.answer.allowance import allowance
+from rigidjax.identify.answer.allowance import allowance, describe_large_biases
 from rigidjax.identify.answer.answers import (
     EXPLAINS,
     FAILS,
@@ -324,6 +324,7 @@ def assess(
         freedom.of(numbers[1]),
     )
     words = _allowance(model, linear, noise, white.determined, parts, quantities, numbers[1])
+    words = f"{words} {describe_large_biases(model, x)}".rstrip()
     return Fit(
         shown,
         x,

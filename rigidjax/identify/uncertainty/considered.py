@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from rigidjax.identify.model.free import TOLERANCES
+from rigidjax.identify.model.free import TOLERANCES, Slot
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, in_deviations
 from rigidjax.identify.sensors import AbstractSensor
@@ -66,7 +66,7 @@ def considerations(
         tolerance = getattr(sensor, "tolerance", None)
         for kind, member in MEMBERS.items():
             width = getattr(tolerance, kind, None)
-            if width is None or is_free(model, index, member):
+            if width is None or slot_of(model, index, member) is not None:
                 continue
             # Recordings may give one sensor several tolerances: the largest counts.
             deviation = float(np.max(np.asarray(width)))
@@ -75,11 +75,13 @@ def considerations(
     return tuple(out)
 
 
-def is_free(model: Model, index: int, member: str) -> bool:
-    """Return whether a `Free` moves the `member` of the sensor number `index`."""
-    paths = [tuple(getattr(key, "name", getattr(key, "idx", None)) for key in slot.path)
-            for slot in model.slots]  # fmt: skip
-    return ("sensors", index, member) in paths
+def slot_of(model: Model, index: int, member: str) -> Slot | None:
+    """Return the slot that moves the `member` of the sensor number `index`, `None` if none does."""
+    for slot in model.slots:
+        path = tuple(getattr(key, "name", getattr(key, "idx", None)) for key in slot.path)
+        if path == ("sensors", index, member):
+            return slot
+    return None
 
 
 def shifts_of(
@@ -186,7 +188,7 @@ def unit_moves(
             continue
         moves = {}
         for kind, size in USUAL.items():
-            if not is_free(model, index, MEMBERS[kind]):
+            if slot_of(model, index, MEMBERS[kind]) is None:
                 shifts = size * shifts_of(model, linear, noise, covariance, index, kind)
                 moves[kind] = np.abs(slopes @ shifts).max(axis=1)
         if moves:

@@ -128,3 +128,16 @@ def test_intervals_hold_with_a_scale_off_by_one_percent(axis):
 def test_mistakes_are_named(value):
     with pytest.raises(ValueError, match="tolerance: wanted a positive standard deviation"):
         identify.Tolerance(scale=value)
+
+
+def test_a_large_bias_without_a_prior_is_told():
+    """A gyro whose every reading is 2 rad/s off: a fit may find this, and a person should hear it."""
+    off = np.array([0.0, 0.0, 2.0])
+    free = identify.Free(lambda s: s.sensors[0].bias, "gyro bias")
+    large, small = (
+        fitted(RATES + size * off, free=(free,), bias=np.zeros(3)).advice for size in (1.0, 0.01)
+    )
+    assert "'gyro bias', a bias without a prior, came out as 2 rad/s" in large
+    assert "without a prior" not in small
+    known = identify.Free(lambda s: s.sensors[0].bias, "gyro bias", prior=2.0)
+    assert "without a prior" not in fitted(RATES + off, free=(known,), bias=np.zeros(3)).advice
