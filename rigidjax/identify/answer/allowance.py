@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from rigidjax.identify.model.model import Model, values_of
+from rigidjax.identify.model.model import Model
 from rigidjax.identify.uncertainty.considered import (
     Consideration,
     describe_considered,
@@ -61,18 +61,21 @@ def allowance(
     return " ".join(out)
 
 
-def describe_large_biases(model: Model, x: Float[Array, " n"]) -> str:
+def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
     """Say which free biases without a prior are as large as readings; empty if none is.
 
     Such a bias takes up what the model of the motion lacks: that of a pendulum's gyro came out as
-    1.6 rad/s. `x` (n,) are the fitted numbers.
+    1.6 rad/s. `quantities` are those of the fit.
     """
-    out, values = [], values_of(model, x)
+    out = []
     for index, reading in enumerate(model.records.readings):
         slot, sensor = slot_of(model, index, "bias"), reading.sensor
         if slot is None or slot.prior is not None:
             continue
-        largest = float(np.abs(np.asarray(values[slot.name])).max())
+        largest = max(
+            (abs(one.value) for one in quantities if f"{one.name} ".startswith(f"{slot.name} ")),
+            default=0.0,
+        )
         rows = np.asarray(reading.values)[reading.seen]
         size = float(np.sqrt(np.mean(np.sum(rows.reshape(len(rows), -1) ** 2, axis=1))))
         if largest > REMARKABLE * size:

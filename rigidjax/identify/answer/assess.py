@@ -324,7 +324,7 @@ def assess(
         freedom.of(numbers[1]),
     )
     words = _allowance(model, linear, noise, white.determined, parts, quantities, numbers[1])
-    words = f"{words} {describe_large_biases(model, x)}".rstrip()
+    words = f"{words} {describe_large_biases(model, quantities)}".rstrip()
     return Fit(
         shown,
         x,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -234,7 +235,9 @@ def independent(
     return (e - v * along / before) * jnp.sqrt(before / total), jnp.log(total / before)
 
 
-def in_deviations(x: Any, sigma: Array, late: Array | None) -> Float[Array, "..."]:
+def in_deviations(
+    x: Any, sigma: Array | np.ndarray, late: Array | None
+) -> Float[Array, "..."] | Float[np.ndarray, "..."]:
     """Return changes x (R, T, k, n) of a sensor's errors in standard deviations.
 
     They are scaled as `standardised` scales the errors, with the noise `sigma` (R, k) and the error

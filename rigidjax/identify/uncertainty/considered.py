@@ -99,7 +99,8 @@ def shifts_of(
     """
     direction = _directions(model, linear, index, kind)
     late = model.records.readings[index].late
-    scaled = np.asarray(in_deviations(direction, noise[index], late))
+    # In NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
+    scaled = np.asarray(in_deviations(direction, np.asarray(noise[index]), late))
     pulls = np.einsum(
         "rtkm,rt,rtkc->rmc", linear.slopes[index], linear.weights[index], scaled, optimize=True
     )
