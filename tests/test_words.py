@@ -17,6 +17,7 @@ ROOMS = (
     "plot",
     "datasets",
     "workprecision",
+    "batch",
 )
 FILES = [
     *PACKAGE.glob("*.py"),
@@ -24,9 +25,9 @@ FILES = [
 ]
 VERBS = frozenset(
     """
-    Add Apply Attract Check Compare Compute Convert Copy Define Delay Derive Describe Draw Evaluate Find Follow Give
-    Handle Hold Import Integrate Interpolate Make Measure Name Normalise Prepare Present Print Provide Raise Read Refuse Return
-    Reverse Run Scale Set Share Show Solve Sort Store Sum Turn Wrap Write Yield
+    Add Apply Attract Call Check Compare Compute Connect Convert Copy Define Delay Derive Describe Draw Evaluate Find Follow Give
+    Handle Hold Import Integrate Interpolate Make Map Measure Name Normalise Prepare Present Print Provide Raise Read Refuse Return
+    Reverse Run Scale Set Share Show Simulate Solve Sort Store Sum Take Turn Wrap Write Yield
     """.split()
 )
 

@@ -1,14 +1,17 @@
-"""Many bodies: on one device, on several, on several hosts.
+"""Simulate many bodies on one device, on several devices or on several hosts.
 
-    rollout     fixed steps; last states, thinned states, or reduced on the way
-    simulate    closed form, adaptive steps, or `Steps`, with a status for each body
+    rollout     fixed steps; returns the last states, every k-th state, or a value reduced from them
+    simulate    closed form, adaptive steps, or `Steps`; returns a status for each body
     distributed several processes: `connect`, `share`, `gather`, `total`
 
-Bodies are cut along their first axis among processes (`distributed.share`), then among the devices
-of each (`devices="all"`), then into chunks, one of which is computed at a time. Shared numbers are
-copied to all. Sums of a fit or of `reduce=` are added by `distributed.total`; each process writes
-its states (`distributed.save`), or `gather`s all. Shuffle bodies with adaptive steps before
-`share`. When a process ends all end within `patience`; shares written before are recovered.
+Bodies are divided along their first axis among processes (`distributed.share`), then among the
+devices of each process (`devices="all"`), then into chunks, which a device computes one after
+another. Numbers that all bodies share are copied to every device. `distributed.total` adds the sums
+that each process has computed, such as those of a fit or of `reduce=`. Each process writes its own
+states (`distributed.save`), or `distributed.gather` sends all states to every process. Shuffle
+bodies with adaptive steps before `share`, so that no process gets all of the slow ones. When one
+process ends, the others end within `patience` seconds; `distributed.recover` reads the shares that
+were written until then.
 """
 
 from rigidjax._names import show

@@ -1,6 +1,6 @@
-"""Several hosts: each works on its own share of the bodies; only results are sent.
+"""Share the bodies among several hosts, of which each computes its own; only results are sent.
 
-The results of a share are the same bits as on one process alone.
+A share has the same results, to the last bit, as if one process had computed all bodies.
 """
 
 import os
@@ -8,26 +8,30 @@ import tempfile
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
+from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
 from rigidjax._names import show
 
 
 def connect(address: str, processes: int, process: int, *, patience: int = 20) -> None:
-    """Join the other processes; call it before anything else of JAX.
+    """Connect this process with the others; call it before any other function of JAX.
 
-    **Arguments:** `address` "host:port" of process 0; `processes` their number; `process` the index
-    of this one, from 0; `patience` s after which a process without an answer counts as dead: every
-    process then ends, with a message and a non-zero exit code.
+    **Arguments:**
 
-    **Raises:** `ValueError` for an index out of range; `RuntimeError` if JAX is in use already or
-    the others do not answer.
+    - `address`: "host:port" of process 0.
+    - `processes`: the number of processes.
+    - `process`: the index of this process, from 0.
+    - `patience`: seconds after which a process that does not answer counts as dead; every other
+      process then ends, with a message and a non-zero exit code.
+
+    **Raises:** `ValueError` for an index out of range; `RuntimeError` if JAX is in use already, or
+    if the other processes do not answer.
 
     >>> connect("localhost:1234", 2, 2)
     Traceback (most recent call last):
@@ -43,17 +47,18 @@ def connect(address: str, processes: int, process: int, *, patience: int = 20) -
     )  # fmt: skip
 
 
-def share(tree: Any) -> Any:
-    """This process's rows of a tree of arrays, ⌈N / processes⌉ or fewer.
+def share(tree: PyTree) -> PyTree:
+    """Return the rows of this process, ⌈N / processes⌉ or one fewer, of a tree of arrays.
 
-    **Arguments:** `tree` of arrays with a leading axis of bodies; leave out what all bodies share.
+    **Arguments:** `tree` of arrays with a leading axis of N bodies; leave out the numbers that all
+    bodies share.
 
     **Raises:** `ValueError` for fewer bodies than processes.
 
     >>> share(jnp.arange(5)).shape
     (5,)
     """
-    many, here = jax.process_count(), jax.process_index()
+    processes, process = jax.process_count(), jax.process_index()
     leaves = jax.tree.leaves(tree)
     if not all(np.ndim(leaf) > 0 and hasattr(leaf, "shape") for leaf in leaves):
         raise TypeError("share: wanted a tree of arrays with a leading axis of bodies")
@@ -61,27 +66,29 @@ def share(tree: Any) -> Any:
     if len(counts) != 1:
         raise ValueError(f"share: wanted one number of bodies, got {sorted(counts)}")
     count = counts.pop()
-    if count < many:
-        raise ValueError(f"share: {count} bodies for {many} processes; start fewer processes")
-    edges = [count * i // many for i in range(many + 1)]
-    return jax.tree.map(lambda leaf: leaf[edges[here] : edges[here + 1]], tree)
+    if count < processes:
+        raise ValueError(f"share: {count} bodies for {processes} processes; start fewer processes")
+    edges = [count * i // processes for i in range(processes + 1)]
+    return jax.tree.map(lambda leaf: leaf[edges[process] : edges[process + 1]], tree)
 
 
-def gather(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
-    """All processes' rows, on every process, in order.
+def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyTree:
+    """Return the rows of all processes, in order, on every process.
 
-    **Arguments:** `tree` arrays with this process's rows, as from `share`; `checkpoint` a folder to
-    `save` them to first. **Returns** the tree with the rows of all, in host memory.
+    **Arguments:** `tree` of arrays with the rows of this process, as from `share`; `checkpoint` a
+    folder to which `save` first writes the rows of this process. **Returns** the tree with the rows
+    of all processes, in host memory.
 
-    **Raises:** `TypeError` for traced arrays; `RuntimeError` if another process has ended. This
-    process should end then: JAX's arrays are of no use any more.
+    **Raises:** `TypeError` for traced arrays; `RuntimeError` if another process has ended. End this
+    process, too, in this case: the arrays of JAX cannot be used any more.
 
     >>> gather(jnp.arange(3)).tolist()
     [0, 1, 2]
     """
 
-    def rows_of_all(leaf: Any) -> np.ndarray:
-        # Shares differ by a row at most: fill up, send, cut.
+    def rows_of_all(leaf: np.ndarray) -> np.ndarray:
+        # Shares differ by one row at most, but only arrays of one shape can be sent: each is filled
+        # to the longest share, and the fill is cut off after it was sent.
         rows = np.asarray(leaf)
         counts = np.asarray(multihost_utils.process_allgather(jnp.asarray(rows.shape[0])))
         most = int(counts.max())
@@ -89,13 +96,14 @@ def gather(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
         sent = np.asarray(multihost_utils.process_allgather(jnp.asarray(filled)))
         return np.concatenate([part[:n] for part, n in zip(sent, counts, strict=True)])
 
-    return _together(rows_of_all, _known(tree, "gather"), checkpoint)
+    return _send_arrays(rows_of_all, _on_host(tree, "gather"), checkpoint)
 
 
-def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
-    """The sum over all processes, on every process, with the same bits.
+def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyTree:
+    """Return the sum of each array over all processes: the same bits on every process.
 
-    **Arguments:** `tree` arrays, the same shapes everywhere; `checkpoint` as for `gather`.
+    **Arguments:** `tree` of arrays, which have the same shapes on every process; `checkpoint` as
+    for `gather`.
 
     **Raises:** as `gather`.
 
@@ -103,13 +111,13 @@ def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     [1.0, 1.0]
     """
     add = lambda leaf: multihost_utils.process_allgather(jnp.asarray(leaf)).sum(axis=0)  # noqa: E731
-    return _together(add, _known(tree, "total"), checkpoint)
+    return _send_arrays(add, _on_host(tree, "total"), checkpoint)
 
 
-def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
-    """Write this process's rows, a `tree` of arrays, to `folder/share-<process>.npz`, or nothing.
+def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
+    """Write the rows of this process, a `tree` of arrays, to `folder/share-<process>.npz`.
 
-    **Returns** the path of the file.
+    The file appears only when it is complete. **Returns** its path.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -117,9 +125,7 @@ def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
     'share-0.npz'
     """
     folder = _checks.path(folder, "folder")
-    leaves: dict[str, Any] = {
-        f"leaf{i}": leaf for i, leaf in enumerate(jax.tree.leaves(_known(tree, "save")))
-    }
+    leaves = {f"leaf{i}": leaf for i, leaf in enumerate(jax.tree.leaves(_on_host(tree, "save")))}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"share-{jax.process_index()}.npz"
     handle, name = tempfile.mkstemp(dir=folder, suffix=".part")
@@ -133,11 +139,14 @@ def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
     return path
 
 
-def recover(like: Any, folder: str | os.PathLike[str]) -> list[Any]:
-    """The rows that `save` wrote, process by process; `like` a tree of the same structure.
+def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
+    """Return the trees that `save` wrote to `folder`, one for each process, in order.
 
-    **Raises:** `FileNotFoundError` for a folder without shares; `ValueError` for a file that is not
-    from `save`, is cut short, or has another number of arrays than `like`.
+    **Arguments:** `like` a tree of the structure of those trees; its arrays are not read. `folder`
+    the folder given to `save`.
+
+    **Raises:** `FileNotFoundError` for a folder without shares; `ValueError` for a file that `save`
+    did not write, that is cut short, or that has another number of arrays than `like`.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -150,55 +159,62 @@ def recover(like: Any, folder: str | os.PathLike[str]) -> list[Any]:
     if not paths:
         raise FileNotFoundError(f"recover: no share-*.npz in {folder}")
     structure = jax.tree.structure(like)
-    found = []
+    trees = []
     for path in paths:
         try:
             with path.open("rb") as raw, np.load(raw) as file:
                 leaves = [file[f"leaf{i}"] for i in range(len(file.files))]
         except Exception as error:
-            # An empty file raises EOFError; a cut one BadZipFile, or zlib.error.
-            raise ValueError(f"recover: {path} is no file of save, or is cut short") from error
+            # An empty file raises EOFError, one that is cut short BadZipFile or zlib.error.
+            raise ValueError(f"recover: {path} was not written by save, or is cut short") from error
         if len(leaves) != structure.num_leaves:
             raise ValueError(
                 f"recover: like has {structure.num_leaves} arrays, {path} holds {len(leaves)}"
             )
-        found.append(jax.tree.unflatten(structure, leaves))
-    return found
+        trees.append(jax.tree.unflatten(structure, leaves))
+    return trees
 
 
-def _known(tree: Any, name: str) -> Any:
-    """The tree in host memory."""
+def _on_host(tree: PyTree, name: str) -> PyTree:
+    """Return the tree in host memory; refuse a traced tree, with the `name` of the function."""
     if not _checks.known(tree):
         raise TypeError(
-            f"{name}: wanted a tree of known arrays, got one that is traced; this sends between "
-            "processes: call it outside of jax.jit, jax.grad and jax.vmap"
+            f"{name}: wanted a tree of known arrays, got one that is traced; {name} sends arrays "
+            "between processes: call it outside of jax.jit, jax.grad and jax.vmap"
         )
     return jax.tree.map(np.asarray, tree)
 
 
-def _together(send: Callable[[Any], Any], tree: Any, checkpoint: Any) -> Any:
-    """`send` of every array, after the tree has been written to the `checkpoint`."""
+def _send_arrays(
+    send: Callable[[np.ndarray], np.ndarray | Array],
+    tree: PyTree,
+    checkpoint: str | os.PathLike[str] | None,
+) -> PyTree:
+    """Return `send(array)` for every array of the tree; first write the tree to `checkpoint`."""
     if checkpoint is not None:
         try:
             save(tree, checkpoint)
         except OSError as error:
-            # The rows are still to be sent.
-            words = f"this process's share is not in {checkpoint} ({error.strerror or error})"
-            warnings.warn(f"gather, total: {words}; it is sent all the same", stacklevel=3)
+            # A full disk is no reason to lose the rows: they can still be sent.
+            warnings.warn(
+                f"gather, total: the share of this process could not be written to {checkpoint} "
+                f"({error.strerror or error}); it is sent nevertheless",
+                stacklevel=3,
+            )
             checkpoint = None
     if jax.process_count() == 1:
         return tree
     try:
         return jax.tree.map(send, tree)
     except Exception as error:
-        kept = (
+        advice = (
             f"this process's share is in {Path(checkpoint) / f'share-{jax.process_index()}.npz'}"
             if checkpoint is not None
             else "give checkpoint= a folder to keep each share"
         )
         raise RuntimeError(
             f"process {jax.process_index()} of {jax.process_count()}: another process did not "
-            f"answer, it has most likely ended; {kept}; end this process and start them all again"
+            f"answer, it has most likely ended; {advice}; end this process and start all again"
         ) from error
 
 

@@ -1,8 +1,8 @@
-"""Many bodies in chunks that fit the cache, and in shares for devices, whatever is computed."""
+"""Map a function of one body over many: in shares for devices, in chunks that fit the cache."""
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import equinox as eqx
 import jax
@@ -10,24 +10,28 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import AxisType, Mesh, PartitionSpec as P
+from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
 from rigidjax.rotation.barrier import platform
 
 AXIS = "bodies"
-# Bytes of one number of every body in a chunk: the arrays of a step then stay in the first cache,
-# of 32 KB on many cores.
+# No device: JAX's default one.
+Devices = Literal["all"] | Sequence[jax.Device] | None
+# Bytes of an array with one number for each body of a chunk. The arrays of a step then stay in the
+# first-level cache, which holds 32 KB on many cores.
 _ROW = 512
-# JAX's names of what XLA calls prefer_vector_width; only for the outermost jit, only on CPU.
+# JAX takes this option of XLA only at the outermost jit, and it exists only on CPU.
 _WIDE = {"xla_cpu_prefer_vector_width": 512}
 
 
 def compiler_options() -> dict[str, Any]:
-    """Options for `jax.jit(f, compiler_options=…)` around code that calls `rigidjax.batch`.
+    """Return options for `jax.jit(f, compiler_options=…)` around calls of `rigidjax.batch`.
 
-    They enable 512-bit vectors on CPU: 1.5 to 2 times the speed on cores with AVX-512. `rollout`
-    and `simulate` use them outside of any transformation. JAX takes options only at the outermost
-    `jit`: give them there if it is your own. They are empty unless the backend is CPU.
+    The options enable 512-bit vectors on CPU, which give 1.5 to 2 times the speed on cores with
+    AVX-512; on other backends there are none. `rollout` and `simulate` use them by themselves if
+    they are called outside of any transformation. JAX takes options only at the outermost `jit`: if
+    that is your own, give them there.
 
     >>> bool(jax.jit(lambda x: x + 1, compiler_options=compiler_options())(1.0) == 2)
     True
@@ -36,24 +40,28 @@ def compiler_options() -> dict[str, Any]:
 
 
 class Compiled:
-    """A function compiled with `compiler_options`; without, if its last argument is traced."""
+    """Call a compiled function; it has the `compiler_options` if its last argument is known.
+
+    Where that argument is traced, the call stands within another `jit`, where JAX takes no options.
+    """
 
     def __init__(self, function: Callable[..., Any]):
         self.function = function
-        self._within = eqx.filter_jit(function)
+        self._without_options = eqx.filter_jit(function)
 
     @functools.cached_property
-    def _alone(self) -> Callable[..., Any]:
-        # Made when first called: asking which backend there is starts it.
-        options, jitted = compiler_options(), cast(Any, eqx.filter_jit)
-        return jitted(self.function, compiler_options=options) if options else self._within
+    def _with_options(self) -> Callable[..., Any]:
+        # Made at the first call, since the question which backend there is starts the backend.
+        options, jit = compiler_options(), cast(Any, eqx.filter_jit)
+        return jit(self.function, compiler_options=options) if options else self._without_options
 
     def __call__(self, *args: Any) -> Any:
-        return (self._alone if _checks.known(args[-1]) else self._within)(*args)
+        known = _checks.known(args[-1])
+        return (self._with_options if known else self._without_options)(*args)
 
 
-def mesh_of(devices: Any) -> Mesh | None:
-    """A mesh of one axis over `devices`, as for `rollout`; `None` for JAX's default device."""
+def mesh_of(devices: Devices) -> Mesh | None:
+    """Return a mesh of one axis over `devices` (see `rollout`); `None` for the default device."""
     if devices is None:
         return None
     if devices == "all":
@@ -65,15 +73,19 @@ def mesh_of(devices: Any) -> Mesh | None:
     foreign = [d for d in devices if getattr(d, "process_index", None) != jax.process_index()]
     if foreign:
         raise ValueError(
-            f"devices: {foreign[0]} is not of this process; each process works on its own share of "
-            "the bodies (rigidjax.batch.distributed)"
+            f"devices: {foreign[0]} belongs to another process; each process computes its share of "
+            "the bodies on its own devices (rigidjax.batch.distributed)"
         )
-    # Auto: under Explicit the types of arrays inside would carry the sharding, and lax.map refuses.
+    # Axes are Auto: with Explicit axes the types of arrays carry the sharding, which `lax.map` does
+    # not accept.
     return Mesh(np.array(devices), (AXIS,), axis_types=(AxisType.Auto,))
 
 
-def chunk_of(chunk: int | None, dtype: Any, count: int) -> int:
-    """The number of bodies computed at a time: a full cache on CPU, all of them elsewhere."""
+def chunk_of(chunk: int | None, dtype: np.dtype, count: int) -> int:
+    """Return the number of bodies that are computed at a time, out of `count`.
+
+    This is `chunk`; for `None` as many as fill the cache on CPU, and all on other backends.
+    """
     if chunk is None:
         small = _ROW // np.dtype(dtype).itemsize
         chunk = small if platform() == "cpu" else count
@@ -82,40 +94,47 @@ def chunk_of(chunk: int | None, dtype: Any, count: int) -> int:
     return min(chunk, count)
 
 
-def over_bodies(
-    one: Callable[[Any, Any], Any], shared: Any, each: Any, chunk: int, mesh: Mesh | None
-) -> Any:
-    """`one(shared, a body's part of each)` for all bodies, stacked along a new first axis.
+def map_bodies(
+    function: Callable[[Any, Any], Any],
+    shared: PyTree,
+    per_body: PyTree,
+    chunk: int,
+    mesh: Mesh | None,
+) -> PyTree:
+    """Return `function(shared, row)` for the row of each body, stacked along a new first axis.
 
-    Arrays of `each` have a leading axis of bodies. Devices exchange nothing.
+    Arrays of `per_body` have a leading axis of bodies. `chunk` bodies are computed at a time on
+    each device of `mesh`. Devices exchange nothing.
     """
-    count = jax.tree.leaves(each)[0].shape[0]
+    count = jax.tree.leaves(per_body)[0].shape[0]
     parts = 1 if mesh is None else mesh.devices.size
     share = -(-count // parts)
     chunk = min(chunk, share)
     if chunk == share and platform() != "cpu":
-        # XLA gives each thread of a GPU two or four elements of an array of even length: the
-        # numbers of as many bodies then do not fit its registers.
+        # XLA gives each thread of a GPU two or four elements of an array of even length, and the
+        # numbers of two or four bodies do not fit into the registers of a thread.
         chunk += 1 - chunk % 2
     room = -(-count // (chunk * parts)) * chunk * parts
 
-    def some(shared: Any, each: Any) -> Any:
-        def alone(row: Any) -> Any:
-            # Fences, so that each chunk gets the same program, to the last bit.
-            return lax.optimization_barrier(one(*lax.optimization_barrier((shared, row))))
+    def map_share(shared: PyTree, rows: PyTree) -> PyTree:
+        def call(row: PyTree) -> PyTree:
+            # With these barriers XLA makes the same program of each chunk, so that a body has the
+            # same results, to the last bit, in every chunk.
+            return lax.optimization_barrier(function(*lax.optimization_barrier((shared, row))))
 
-        return lax.map(alone, each, batch_size=chunk)
+        return lax.map(call, rows, batch_size=chunk)
 
-    def padded(a: Any) -> Any:
-        # The last body again in the empty places.
+    def pad(a: Array) -> Array:
+        # The empty places repeat the last body.
         return a if room == count else jnp.concatenate([a, jnp.repeat(a[-1:], room - count, 0)])
 
-    filled = jax.tree.map(padded, each)
+    rows = jax.tree.map(pad, per_body)
     if mesh is None:
-        out = some(shared, filled)
+        out = map_share(shared, rows)
     else:
-        # check_vma: a loop's carry that starts as a constant is not of the varying type it ends as.
+        # With check_vma=True a loop is refused if its carry starts as a constant, which all devices
+        # share, and ends with values that differ between devices.
         out = jax.shard_map(
-            some, mesh=mesh, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False
-        )(shared, filled)
+            map_share, mesh=mesh, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False
+        )(shared, rows)
     return jax.tree.map(lambda a: a[:count], out)

@@ -1,54 +1,73 @@
-"""Checks of a batch before anything runs: shapes, types, and known numbers."""
+"""Check a batch before anything runs: its shapes, types and known numbers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude
+from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
 from rigidjax.body.validation import first_impossible
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.rotation.validation import tolerance
 from rigidjax.solve import validation
 
+# Which arrays of a torque have a row for each body: 0, a function that picks them, or a tree of 0
+# and `None`.
+TorqueAxes = int | Callable[[Any], Any] | PyTree
+# The index of the first wrong body, −1 if there is none, and the function that refuses this body.
+Check = tuple[Any, Callable[[int], None]]
+
 
 class BodyBatch(NamedTuple):
-    """A batch `(body, state0, torque)`, split into three trees."""
+    """Hold a batch `(body, state0, torque)`, split into three trees with `None` elsewhere."""
 
-    shared: Any  # the arrays that all bodies share, `None` elsewhere
-    each: Any  # the arrays of each body
-    rest: Any  # the leaves that are no arrays
-    many: int
-    dtype: Any
-    looks: tuple[tuple[Any, Callable[[int], None]], ...] = ()
+    shared: PyTree  # the arrays that all bodies share
+    per_body: PyTree  # the arrays with a row for each body
+    constants: PyTree  # the leaves that are no arrays
+    num_bodies: int
+    dtype: np.dtype
+    checks: tuple[Check, ...] = ()
 
     def require(self) -> None:
-        """Raise for the first body with a known number that is wrong.
+        """Raise an error for the first body with a known number that is wrong.
 
-        To be called after the work was started: a device then looks at the bodies while the host
-        prepares the rest, and nobody waits.
+        Call this after the computation was started: the device then checks the bodies while the
+        host prepares the rest, and neither waits for the other.
         """
-        for index, refuse in self.looks:
+        for index, refuse in self.checks:
             if (i := int(index)) >= 0:
                 refuse(i)
 
 
-def one_of(shared: Any, each: Any, rest: Any) -> tuple[Any, Any, Any]:
-    """A single body, its state and its torque; a state that is invalid becomes NaN."""
-    body, state0, torque = eqx.combine(shared, each, rest)
+def one_body(shared: PyTree, row: PyTree, constants: PyTree) -> tuple[Any, Any, Any]:
+    """Return one body, its state and its torque, from `row`, its part of `BodyBatch.per_body`.
+
+    A state that is invalid becomes NaN.
+    """
+    body, state0, torque = eqx.combine(shared, row, constants)
     return body, on_the_group(validation.start(state0, False)), torque
 
 
-def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyBatch:
-    """The batch, whose `require` names the first body with a known number that is wrong."""
+def check_batch(
+    bodies: Inertia | MassProperties,
+    states0: Spin | Attitude | Rigid,
+    torque: Torque | None,
+    torque_axes: TorqueAxes,
+) -> BodyBatch:
+    """Return the batch of these arguments of `rollout`; refuse wrong types and shapes.
+
+    The numbers of many bodies are checked later, by its `require`.
+    """
     if not isinstance(states0, Spin | Attitude | Rigid):
         raise TypeError(
             f"states0: wanted Spin, Attitude or Rigid, got {type(states0).__name__}; for points in "
@@ -56,15 +75,16 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
         )
     if states0.omega.ndim != 2 or not states0.omega.shape[0]:
         raise ValueError(
-            f"states0: wanted one row a body, omega of shape (N, 3), got {states0.omega.shape}"
+            "states0: wanted one row for each body, omega of shape (N, 3), got "
+            f"{states0.omega.shape}"
             + ("; for one body use rigidjax.simulate" if states0.omega.ndim == 1 else "")
         )
     count = states0.omega.shape[0]
     for path, leaf in jax.tree.leaves_with_path(states0):
         if leaf.shape[0] != count or leaf.ndim != 2:
             raise ValueError(
-                f"states0: {count} rows of omega, but {str(path[-1]).lstrip('.')} of shape "
-                f"{leaf.shape}"
+                f"states0: wanted {count} rows as in omega, got {str(path[-1]).lstrip('.')} of "
+                f"shape {leaf.shape}"
             )
     dtype = validation.one_dtype(states0, "states0")
     _checks.numbers(states0.omega, "states0")
@@ -75,64 +95,74 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
     tensor = tensor_of(bodies)
     if tensor.ndim not in (2, 3) or (tensor.ndim == 3 and tensor.shape[0] not in (1, count)):
         raise ValueError(
-            f"bodies: wanted one body, or {count} as the states, of shape ({count}, 3, 3), got "
-            f"{tensor.shape}"
+            f"bodies: wanted one body (3, 3), or one for each of the {count} states, ({count}, 3, "
+            f"3), got shape {tensor.shape}"
         )
-    # Before the states' precision: in a finer one, the rounding of a plate looks like a fault.
-    bodies, looks = _real(bodies)
+    # The tensors are checked before they get the precision of the states: in a higher precision the
+    # rounding of a flat body looks like an inertia that no mass has.
+    bodies, checks = _check_inertia(bodies)
     if isinstance(states0, HasAttitude):
-        looks += _unit(states0.q)
+        checks += _check_unit(states0.q)
     bodies = jax.tree.map(lambda a: a if a.dtype == dtype else a.astype(dtype), bodies)
     own = tensor.ndim == 3
     if own and tensor.shape[0] == 1 and count > 1:
         bodies, own = jax.tree.map(lambda leaf: leaf[0], bodies), False
-    arrays, rest = eqx.partition((bodies, states0, torque), eqx.is_array)
+    arrays, constants = eqx.partition((bodies, states0, torque), eqx.is_array)
     axes = (
         jax.tree.map(lambda _: own, arrays[0]),
         jax.tree.map(lambda _: True, arrays[1]),
-        _own_torque(arrays[2], torque_axes, count),
+        _has_row_for_each_body(arrays[2], torque_axes, count),
     )
-    each, shared = eqx.partition(arrays, axes)
-    # Shapes are enough for an Inertia; taking a row costs as much as many steps.
+    per_body, shared = eqx.partition(arrays, axes)
+    # For an Inertia the shape of a row is enough, and to take the row costs as much as many steps.
     shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
     row = (lambda a: a[0]) if isinstance(bodies, MassProperties) else shape
-    validation.require_fit(*eqx.combine(shared, jax.tree.map(row, each), rest))
+    validation.require_fit(*eqx.combine(shared, jax.tree.map(row, per_body), constants))
     validation.warn_of_scale(bodies, torque)
-    batch = BodyBatch(shared, each, rest, count, dtype, tuple(looks))
-    if all(isinstance(index, np.ndarray | np.integer) for index, _ in looks):
-        # Of few bodies at once, before anything is compiled.
+    batch = BodyBatch(shared, per_body, constants, count, dtype, tuple(checks))
+    if all(isinstance(index, np.ndarray | np.integer) for index, _ in checks):
+        # Few bodies have been checked on the host: raise before anything is compiled.
         batch.require()
     return batch
 
 
-def driven_by(inputs: Any, torque: Any, states0: Any, count: int, h: Array) -> Any:
-    """The inputs of each body, by name (N, steps, *k), in the precision of the states."""
+def inputs_of_bodies(
+    inputs: Mapping[str, ArrayLike] | None,
+    torque: Torque | None,
+    states0: Spin | Attitude | Rigid,
+    count: int,
+    h: Array,
+) -> dict[str, Array] | None:
+    """Return the `inputs` of each body, by name (N, steps, *k), in the precision of the states.
+
+    Refuse inputs that do not fit the torque, the bodies or the `count` steps of `h` seconds.
+    """
     for name, delay in delays_of(torque):
         if _checks.known((delay, h)):
             longest, whole = np.abs(np.asarray(delay)).max(), count * float(h)
             if longest >= whole:
                 raise ValueError(
-                    f"inputs[{name!r}]: a delay of {longest:.6g} s, and a run of {whole:.6g} s: "
-                    "none of it would be seen"
+                    f"inputs[{name!r}]: its delay of {longest:.6g} s is not shorter than the run "
+                    f"of {whole:.6g} s, so that no sample would be used"
                 )
     wanted = (*states0.omega.shape[:1], count)
-    found = {}
+    samples = {}
     for name, value in require_inputs(torque, inputs).items():
         rows = _checks.numbers(value, f"inputs[{name!r}]")
         if rows.shape[:2] != wanted:
             raise ValueError(
-                f"inputs[{name!r}]: wanted (N, num_steps, *k) = {wanted} and more, got shape "
+                f"inputs[{name!r}]: wanted shape (N, num_steps, *k) that begins with {wanted}, got "
                 f"{rows.shape}"
             )
         rows = _checks.finite(rows.astype(states0.omega.dtype), f"inputs[{name!r}]")
-        found[name] = jnp.asarray(rows)
-    return found or None
+        samples[name] = jnp.asarray(rows)
+    return samples or None
 
 
-def _own_torque(torque: Any, axes: Any, count: int) -> Any:
-    """The arrays of the torque with a row for each body."""
+def _has_row_for_each_body(torque: Torque | None, axes: TorqueAxes, count: int) -> PyTree:
+    """Return a tree of booleans: whether each array of the torque has a row for each body."""
     if callable(axes) and not isinstance(axes, eqx.Module):
-        prefix = _selected(torque, axes)
+        prefix = _is_picked(torque, axes)
     else:
         for axis in jax.tree.leaves(axes):
             if not isinstance(axis, int) or axis != 0:
@@ -146,33 +176,40 @@ def _own_torque(torque: Any, axes: Any, count: int) -> Any:
         if leaf.ndim == 0 or leaf.shape[0] != count:
             raise ValueError(
                 f"torque_axes: wanted {count} rows in torque{jax.tree_util.keystr(path)}, got "
-                f"shape {leaf.shape}; make one law a body with jax.vmap"
+                f"shape {leaf.shape}; to make a torque with one row for each body, call its "
+                "constructor under jax.vmap"
             )
     return prefix
 
 
-def _selected(torque: Any, pick: Any) -> Any:
-    """True for each array that `pick(law)` gives, alone, in a tuple, or in a part of the torque."""
+def _is_picked(torque: Torque | None, pick: Callable[[Any], Any]) -> PyTree:
+    """Return a tree of booleans: whether `pick(torque)` contains each array of the torque.
+
+    `pick` may return one array, a tuple of arrays, or a part of the torque, with all its arrays.
+    """
     leaves, structure = jax.tree.flatten(torque)
     numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
     try:
-        found = jax.tree.leaves(pick(numbered))
+        picked = jax.tree.leaves(pick(numbered))
     except (AttributeError, IndexError, KeyError, TypeError) as error:
-        raise ValueError(f"torque_axes: nothing is there ({error})") from None
-    if not found or not all(type(index) is int for index in found):
+        raise ValueError(f"torque_axes: the torque has no such part ({error})") from None
+    if not picked or not all(type(index) is int for index in picked):
         raise ValueError(
             "torque_axes: wanted a function that picks arrays of the law, or parts of it, such as "
-            f"lambda law: law.parts[0], got {found or 'none'}"
+            f"lambda law: law.parts[0], got {picked or 'none'}"
         )
-    return jax.tree.unflatten(structure, [i in found for i in range(len(leaves))])
+    return jax.tree.unflatten(structure, [i in picked for i in range(len(leaves))])
 
 
-def _real(bodies: Inertia | MassProperties) -> tuple[Any, list[Any]]:
-    """The bodies, traced ones that no mass has as NaN; and the first of known ones."""
+def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
+    """Return the bodies and the check that finds the first whose inertia no mass has.
+
+    Only known bodies can be refused. Traced ones with such an inertia become NaN.
+    """
     tensor = tensor_of(bodies)
     if not _checks.known(tensor):
         return validation.real_or_nan(bodies), []
-    # Within a trace, a known tensor that JAX reshapes is no longer known.
+    # Within a trace, a known tensor would be traced once JAX has reshaped it.
     with jax.ensure_compile_time_eval():
         tensors = tensor.reshape(-1, 3, 3)
 
@@ -185,30 +222,31 @@ def _real(bodies: Inertia | MassProperties) -> tuple[Any, list[Any]]:
     return bodies, [(first_impossible(tensors), refuse)]
 
 
-def _unit(q: Array) -> list[Any]:
+def _check_unit(q: Array) -> list[Check]:
+    """Return the check that finds the first known quaternion which is not unit."""
     if not _checks.known(q):
         return []
 
     def refuse(i: int) -> None:
-        far = abs(np.linalg.norm(np.asarray(q)[i]) - 1)
+        length = np.linalg.norm(np.asarray(q)[i])
         raise ValueError(
-            f"q: wanted unit quaternions (w, x, y, z), got length {1 + far:.6g} or less of body "
-            f"{i}; normalise with rigidjax.quaternion.normalise, and mind that the scalar is first"
+            f"q: wanted unit quaternions (w, x, y, z), got length {length:.6g} for body {i}; "
+            "normalise with rigidjax.quaternion.normalise, and mind that the scalar is first"
         )
 
     return [(_checks.first_bad(_not_unit, q), refuse)]
 
 
-def _not_unit(xp: Any, q: Any) -> Any:
+def _not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
     return xp.abs(xp.sqrt(xp.sum(xp.square(q), axis=-1)) - 1) > tolerance(q.dtype)
 
 
-def step_of(step_size: Any, num_steps: Any, dtype: Any) -> tuple[Array, int]:
-    """The step, s, and the number of steps."""
+def step_of(step_size: ScalarLike, num_steps: int, dtype: np.dtype) -> tuple[Array, int]:
+    """Return the step, s, and the number of steps, both checked."""
     h = _checks.floating(step_size, (), "step_size").astype(dtype)
     if _checks.known(h) and not 0 < float(h) < np.inf:
         raise ValueError(
             f"step_size: wanted a positive step, s, got {step_size}; to go back in time negate Ω "
-            "and the torque's time"
+            "and the time of the torque"
         )
     return h, _checks.whole(num_steps, "num_steps", 1)

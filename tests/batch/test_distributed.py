@@ -20,7 +20,7 @@ def test_a_damaged_share_is_named(tmp_path, cut):
     path = distributed.save(np.arange(3.0), tmp_path)
     assert distributed.recover(np.zeros(3), tmp_path)[0].tolist() == [0.0, 1.0, 2.0]
     path.write_bytes(path.read_bytes()[:cut])
-    with pytest.raises(ValueError, match=r"recover: .*share-0.npz is no file of save"):
+    with pytest.raises(ValueError, match=r"recover: .*share-0.npz was not written by save"):
         distributed.recover(np.zeros(3), tmp_path)
 
 
@@ -36,7 +36,7 @@ def test_a_share_of_another_tree_is_named(tmp_path):
 def test_a_share_that_cannot_be_written_is_sent_all_the_same(tmp_path, name):
     taken = tmp_path / "file"
     taken.write_text("no folder")
-    with pytest.warns(UserWarning, match=f"this process's share is not in {taken}"):
+    with pytest.warns(UserWarning, match=f"share of this process could not be written to {taken}"):
         found = getattr(distributed, name)(np.arange(3.0), taken)
     assert found.tolist() == [0.0, 1.0, 2.0]
 

@@ -105,7 +105,7 @@ def test_bodies_of_an_odd_number(monkeypatch):
 
     monkeypatch.setattr(sharding, "platform", lambda: "gpu")
     monkeypatch.setattr(sharding.lax, "map", mapped)
-    there = sharding.over_bodies(lambda s, x: s * x, jnp.asarray(2.0), jnp.arange(4.0), 4, None)
+    there = sharding.map_bodies(lambda s, x: s * x, jnp.asarray(2.0), jnp.arange(4.0), 4, None)
     np.testing.assert_array_equal(there, 2 * np.arange(4.0))
     assert sizes == [5]
 
@@ -117,13 +117,13 @@ def test_many_rows_are_checked_where_they_are():
     bodies = rj.Inertia(jnp.tile(jnp.diag(jnp.array([1.0, 1.3, 1.7])), (count, 1, 1)))
     start = rj.Attitude(q, jnp.ones((count, 3)))
     bad = q.at[4321].mul(2.0).at[4999].mul(3.0)
-    with pytest.raises(ValueError, match="got length 2 or less of body 4321"):
+    with pytest.raises(ValueError, match="got length 2 for body 4321"):
         rj.batch.rollout(bodies, rj.Attitude(bad, start.omega), 0.1, 1)
     tensor = bodies.tensor.at[17, 0, 0].set(-1.0)
     with pytest.raises(ValueError, match="this is body 17"):
         rj.batch.rollout(rj.Inertia(tensor), start, 0.1, 1)
     # Known numbers within a trace of others.
-    with pytest.raises(ValueError, match="of body 4321"):
+    with pytest.raises(ValueError, match="for body 4321"):
         jax.jit(lambda h: rj.batch.rollout(bodies, rj.Attitude(bad, start.omega), h, 1))(0.1)
     for rows in (jnp.ones((count, 3)), jnp.ones((5, 3))):
         assert _checks.finite(rows, "rows") is rows

@@ -9,7 +9,7 @@ import pytest
 from once import once
 
 import rigidjax as rj
-from rigidjax.batch.sharding import over_bodies
+from rigidjax.batch.sharding import map_bodies
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.solve import fixed
 
@@ -273,17 +273,17 @@ def test_words(unhooked):
     half = jax.tree.map(lambda a: a.astype(jnp.float16), states)
     with pytest.raises(TypeError, match="states0: wanted float32 or float64, got float16"):
         run(bodies, half, 0.1, 4)
-    with pytest.raises(ValueError, match="wanted one body, or 3 as the states"):
+    with pytest.raises(ValueError, match=r"wanted one body \(3, 3\), or one for each of the 3 states"):
         run(batch(2)[0], states, 0.1, 4)
     with pytest.raises(ValueError, match="positive step"):
         run(bodies, states, -0.1, 4)
     with pytest.raises(TypeError, match="whole number"):
         run(bodies, states, 0.1, 4.0)
-    with pytest.raises(ValueError, match=r"whole part of num_steps = 10"):
+    with pytest.raises(ValueError, match=r"a divisor of num_steps = 10"):
         run(bodies, states, 0.1, 10, save_every=3)
     with pytest.raises(ValueError, match=r"moments that are not negative.*this is body 1"):
         run(rj.Inertia(bodies.tensor.at[1, 0, 0].set(-1.0)), states, 0.1, 4)
-    with pytest.raises(ValueError, match="of body 2"):
+    with pytest.raises(ValueError, match="length 2 for body 2"):
         run(bodies, rj.Attitude(states.q.at[2].mul(2.0), states.omega), 0.1, 4)
     with pytest.raises(TypeError, match="depends on the attitude"):
         run(bodies, states, 0.1, 4, TOP, solver=rj.solvers.Magnus4())
@@ -305,7 +305,7 @@ def test_words(unhooked):
 
 def test_chunks_cover_all():
     each = jnp.arange(7.0)
-    found = over_bodies(lambda s, x: s * x, jnp.asarray(2.0), each, 3, None)
+    found = map_bodies(lambda s, x: s * x, jnp.asarray(2.0), each, 3, None)
     assert np.array_equal(found, 2 * np.arange(7.0))
 
 
