@@ -273,7 +273,9 @@ def test_words(unhooked):
     half = jax.tree.map(lambda a: a.astype(jnp.float16), states)
     with pytest.raises(TypeError, match="states0: wanted float32 or float64, got float16"):
         run(bodies, half, 0.1, 4)
-    with pytest.raises(ValueError, match=r"wanted one body \(3, 3\), or one for each of the 3 states"):
+    with pytest.raises(
+        ValueError, match=r"wanted one body \(3, 3\), or one for each of the 3 states"
+    ):
         run(batch(2)[0], states, 0.1, 4)
     with pytest.raises(ValueError, match="positive step"):
         run(bodies, states, -0.1, 4)
