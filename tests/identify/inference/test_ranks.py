@@ -87,7 +87,9 @@ def density_of(read, process):
 
 
 def numbers(point):
-    out = {"body": point.x[:2], "rate": point.state0.omega, **point.values}
+    out = {"body": point.x[:2], "rate": point.state0.omega}
+    if "bias" in point.values:
+        out["bias"] = point.values["bias"]
     if point.process is not None:
         out["process"] = jnp.log(point.process.density / LAW.density)[:1]
     return out
