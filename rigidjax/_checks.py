@@ -57,7 +57,7 @@ def floating(
     if found != shape:
         many = array.ndim > len(shape) and array.shape[array.ndim - len(shape) :] == shape
         advice = hint or ("functions take one body; batch with jax.vmap" if many else "")
-        raise ValueError(f"{name}: wanted shape {shape}, got {array.shape}{_and(advice)}")
+        raise ValueError(f"{name}: wanted shape {shape}, got {array.shape}{_with_hint(advice)}")
     return array
 
 
@@ -66,11 +66,11 @@ def rows(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Ar
     array = numbers(value, name)
     if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
         wanted = ", ".join(map(str, ("n", *shape))) + ("," if not shape else "")
-        raise ValueError(f"{name}: wanted shape ({wanted}), got {array.shape}{_and(hint)}")
+        raise ValueError(f"{name}: wanted shape ({wanted}), got {array.shape}{_with_hint(hint)}")
     return array
 
 
-def _and(hint: str) -> str:
+def _with_hint(hint: str) -> str:
     return f"; {hint}" if hint else ""
 
 
@@ -101,7 +101,7 @@ def numbers(value: Any, name: str, unit: str = "") -> Array:
     return array
 
 
-def unmasked(value: Any) -> tuple[Any, np.ndarray | None]:
+def data_and_mask(value: Any) -> tuple[Any, np.ndarray | None]:
     """Return the data of a masked array and its mask, true where an entry has no value.
 
     The mask is `None` if no entry is masked, and for a value that is no masked array, which is
@@ -120,7 +120,7 @@ def without_mask(value: Any, name: str) -> Any:
 
     The number under a mask is often a wild reading.
     """
-    value, mask = unmasked(value)
+    value, mask = data_and_mask(value)
     if mask is not None:
         raise ValueError(
             f"{name}: wanted numbers, got a masked array with {int(mask.sum())} of {mask.size} "
@@ -233,7 +233,7 @@ def refuse(value: Any, bad: Bool[ArrayLike, "..."], message: str) -> Any:
     return eqx.error_if(value, bad, message)
 
 
-def bare(error: RuntimeError) -> RuntimeError:
+def own_sentence(error: RuntimeError) -> RuntimeError:
     r"""Return an equal error with its own sentence alone, without the long text that Equinox
     adds.
     """
@@ -256,16 +256,16 @@ def first_bad(faults: Callable[[Any, Any], Any], rows: Any) -> Any:
             # Also within a trace, in which the index would not be known.
             with jax.ensure_compile_time_eval():
                 return _compiled_first(faults, rows)
-        return _first(np, faults(np, np.asarray(rows)))
+        return _first_true(np, faults(np, np.asarray(rows)))
 
 
-def _first(xp: Any, bad: Any) -> Any:
+def _first_true(xp: Any, bad: Any) -> Any:
     return xp.where(bad.any(), xp.argmax(bad), -1)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _compiled_first(faults: Callable[[Any, Any], Any], rows: Array) -> Array:
-    return _first(jnp, faults(jnp, rows))
+    return _first_true(jnp, faults(jnp, rows))
 
 
 def _not_finite(xp: Any, rows: Any) -> Any:
@@ -289,7 +289,7 @@ def finite(value: Numbers, name: str) -> Numbers:
     return refuse(value, bad.any(), f"{name}: contains NaN or infinity{where}")
 
 
-def given(value: Any, shape: tuple[int, ...], name: str, **how: Any) -> Array:
+def finite_floating(value: Any, shape: tuple[int, ...], name: str, **how: Any) -> Array:
     """Return `value` as `floating` does; its numbers must be finite if they are known."""
     array = floating(value, shape, name, **how)
     return finite(array, name) if known(array) else array
@@ -303,7 +303,7 @@ def scalars(**named: Any) -> list[Array]:
 
 def time(value: Any, name: str = "t") -> Array:
     """Return a time, which is one number; it must be finite if it is known."""
-    return given(value, (), name)
+    return finite_floating(value, (), name)
 
 
 def sign(value: Array, name: str, wanted: str, *, zero: bool = False) -> Array:
@@ -333,7 +333,7 @@ def instance(
     # inertia.
     own = [name for name in ("ys", "inertia") if isinstance(getattr(value, name, None), kinds)]
     hint = hint or (f"give its .{own[0]}" if own else "")
-    raise TypeError(f"{name}: wanted {wanted}, got {kind(value)}{_and(hint)}")
+    raise TypeError(f"{name}: wanted {wanted}, got {kind(value)}{_with_hint(hint)}")
 
 
 # The shape of each field of one body or one state, by the name of the field.
@@ -368,13 +368,13 @@ def function(value: Any, name: str, of: str, *, hint: str = "") -> Any:
     found = kind(value)
     if callable(value) and not isinstance(value, type):
         listed = re.match(r"\w*\(([^()]*)\)", of)
-        if listed is None or _takes(value, len(listed[1].split(","))):
+        if listed is None or _accepts(value, len(listed[1].split(","))):
             return value
         found = f"one with other arguments: {inspect.signature(value)}"
-    raise TypeError(f"{name}: wanted a function {of}, got {found}{_and(hint)}")
+    raise TypeError(f"{name}: wanted a function {of}, got {found}{_with_hint(hint)}")
 
 
-def _takes(value: Any, count: int) -> bool:
+def _accepts(value: Any, count: int) -> bool:
     """Return whether the function `value` can be called with `count` arguments."""
     try:
         inspect.signature(value).bind(*[None] * count)
@@ -387,7 +387,7 @@ def _takes(value: Any, count: int) -> bool:
 def whole(value: Any, name: str, least: int) -> int:
     """Return `value` as a Python integer of at least `least`, known before anything is compiled."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"{name}: wanted a whole number of Python, got {_shown(value)}")
+        raise TypeError(f"{name}: wanted a whole number of Python, got {_describe(value)}")
     if value < least:
         raise ValueError(f"{name}: wanted a whole number of at least {least}, got {value}")
     return int(value)
@@ -445,7 +445,7 @@ def path(value: Any, name: str = "path") -> Path:
     """Return the path of a file from its name, `value`."""
     named = isinstance(value, str | os.PathLike) and isinstance(os.fspath(value), str)
     if not named or value == "":
-        raise TypeError(f"{name}: wanted the name of a file, got {_shown(value)}")
+        raise TypeError(f"{name}: wanted the name of a file, got {_describe(value)}")
     return Path(value)
 
 
@@ -464,10 +464,10 @@ def word(value: Any, options: Sequence[str], name: str) -> str:
     """Return `value` if it is one of `options`."""
     if isinstance(value, str) and value in options:
         return value
-    raise ValueError(f"{name}: wanted one of {', '.join(options)}, got {_shown(value)}")
+    raise ValueError(f"{name}: wanted one of {', '.join(options)}, got {_describe(value)}")
 
 
-def _shown(value: Any) -> str:
+def _describe(value: Any) -> str:
     return repr(value) if isinstance(value, int | float | str) else type(value).__name__
 
 
@@ -503,7 +503,7 @@ def float_type(value: Any, name: str = "dtype") -> Any:
     except (TypeError, ValueError):
         kind = None
     if kind not in (np.float32, np.float64):
-        raise TypeError(f"{name}: wanted float32 or float64, got {_shown(value)}")
+        raise TypeError(f"{name}: wanted float32 or float64, got {_describe(value)}")
     return kind
 
 

@@ -16,16 +16,16 @@ def numbers(self: Any) -> str:
     """Return `Name(field=numbers, …)`; a traced or large array is shown by its shape."""
     fields = [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.repr]
     fields = [(name, value) for name, value in fields if value is not None]
-    parts = ", ".join(f"{name}={shown(value)}" for name, value in fields)
+    parts = ", ".join(f"{name}={as_text(value)}" for name, value in fields)
     return f"{type(self).__name__}({parts})"
 
 
-def shown(value: Any) -> str:
+def as_text(value: Any) -> str:
     """Return the numbers of an array, or its shape if it is traced or has many."""
     known = isinstance(value, (jax.Array, np.ndarray)) and not isinstance(value, Tracer)
     if not known or value.size > MOST:
         return eqx.tree_pformat(value)
-    return _nested(np.asarray(value).tolist())
+    return _nested_as_text(np.asarray(value).tolist())
 
 
 def time(t: Any, span: Any, digits: int = 6) -> str:
@@ -37,7 +37,7 @@ def time(t: Any, span: Any, digits: int = 6) -> str:
     return f"{t:.{digits + max(0, int(np.ceil(more)))}g}"
 
 
-def _nested(value: Any) -> str:
+def _nested_as_text(value: Any) -> str:
     if isinstance(value, list):
-        return f"[{', '.join(map(_nested, value))}]"
+        return f"[{', '.join(map(_nested_as_text, value))}]"
     return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -97,7 +97,7 @@ def test_masked_entries_are_refused_in_words(door, unhooked):
 def test_an_array_without_masked_entries_is_an_array():
     whole = np.ma.masked_array(RATES, np.zeros(RATES.shape, bool))
     np.testing.assert_array_equal(rj.Spin(whole).omega, RATES)
-    data, mask = _checks.unmasked(whole)
+    data, mask = _checks.data_and_mask(whole)
     assert mask is None and type(data) is np.ndarray
 
 

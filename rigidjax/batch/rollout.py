@@ -15,7 +15,7 @@ from rigidjax.batch.sharding import Compiled, Devices, chunk_of, map_bodies, mes
 from rigidjax.batch.validation import TorqueAxes, check_batch, inputs_of_bodies, one_body, step_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.coupled import started
+from rigidjax.motion.coupled import with_own_states
 from rigidjax.motion.torques import bind
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import equations_of_motion
@@ -190,7 +190,7 @@ def _take_steps(
         shared, initial, h, t0 = of_all
         own, inputs = row
         body, state0, torque = one_body(shared, own, constants)
-        state0 = started(body, state0, bind(torque, first_row(torque, h, inputs)), t0)
+        state0 = with_own_states(body, state0, bind(torque, first_row(torque, h, inputs)), t0)
         field = equations_of_motion(body, state0, torque)
         stepper = stepper_of(solver, field, state0, count)
 

@@ -19,7 +19,7 @@ from rigidjax.batch.sharding import Compiled, Devices, chunk_of, map_bodies, mes
 from rigidjax.batch.validation import BodyBatch, TorqueAxes, check_batch, one_body, step_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.coupled import Coupled, motion_of, started
+from rigidjax.motion.coupled import Coupled, motion_of, with_own_states
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
 from rigidjax.solve.adaptive_loop import NONFINITE, finite, of_body
@@ -174,7 +174,7 @@ def _simulate_bodies(
     def initial_speed(row: PyTree) -> Array:
         # |Ω| + √|dΩ/dt| at the start, rad/s: the number of steps grows with it.
         body, state0, torque = one_body(shared, row, constants)
-        y0 = started(body, state0, torque, ts[0])
+        y0 = with_own_states(body, state0, torque, ts[0])
         slope = motion_of(equations_of_motion(body, y0, torque)(ts[0], y0, None))
         rate, change = jnp.sum(state0.omega**2), jnp.sum(slope.omega**2)
         return lax.stop_gradient(jnp.sqrt(rate) + jnp.sqrt(jnp.sqrt(change)))

@@ -88,7 +88,7 @@ def kinetic_energy_of_matrix_rate(second_moment: Matrix, matrix_rate: Matrix) ->
     Array(1., dtype=float64)
     """
     s = _checks.floating(second_moment, (3, 3), "second_moment")
-    s = validation.symmetric(s, "second_moment")
+    s = validation.check_symmetric(s, "second_moment")
     rate = _checks.floating(matrix_rate, (3, 3), "matrix_rate")
     return 0.5 * jnp.sum(product(rate, s) * rate)
 

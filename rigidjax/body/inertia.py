@@ -113,7 +113,7 @@ class Inertia(eqx.Module):
     @property
     def moments(self) -> Vec3:
         """Return the principal moments I1 ≤ I2 ≤ I3, (3,), kg m²."""
-        return eigensystem(validation.symmetric(self.tensor, "inertia tensor"))[0]
+        return eigensystem(validation.check_symmetric(self.tensor, "inertia tensor"))[0]
 
     def principal(self) -> tuple[Vec3, Quat]:
         """Return the principal moments, ascending, and the rotation principal axes → body axes.
@@ -159,7 +159,7 @@ class Inertia(eqx.Module):
         """Return `self`. **Raises:** `ValueError` if a moment is zero: Euler's equations divide by
         the moments.
         """
-        return validation.possible(self, self.tensor, None, throw=True)
+        return validation.check_body(self, self.tensor, None, throw=True)
 
     def __add__(self, other: "Inertia") -> "Inertia":
         """Return the inertia of two bodies that turn as one about one point, in common axes."""
@@ -222,7 +222,7 @@ class MassProperties(eqx.Module):
 
     def invertible(self) -> "MassProperties":
         """Return `self`. **Raises:** `ValueError` if a moment about the centre of mass is zero."""
-        return validation.possible(self, self.inertia.tensor, self.mass, throw=True)
+        return validation.check_body(self, self.inertia.tensor, self.mass, throw=True)
 
     def second_moment_about(self, point: Vector) -> Mat3:
         """Return 𝔖 about another point, (3, 3), kg m², body axes: `𝔖 + m d dᵀ`, `d = c − point`.
@@ -279,7 +279,7 @@ class MassProperties(eqx.Module):
         """
         if not isinstance(other, MassProperties):
             return NotImplemented
-        return _joined(self, other.mass, other.com, other.second_moment)
+        return _add_mass(self, other.mass, other.com, other.second_moment)
 
     def __radd__(self, other: int) -> "MassProperties":
         """Return `self` for 0, with which `sum(parts)` starts."""
@@ -296,7 +296,7 @@ class MassProperties(eqx.Module):
         """
         if not isinstance(other, MassProperties):
             return NotImplemented
-        return _joined(self, -other.mass, other.com, -other.second_moment)
+        return _add_mass(self, -other.mass, other.com, -other.second_moment)
 
 
 def tensor_of(body: Inertia | MassProperties) -> Float[Array, "*batch 3 3"]:
@@ -318,7 +318,7 @@ def with_tensor(body: Body, tensor: Mat3) -> Body:
     return eqx.tree_at(lambda b: b.second_moment, body, swap_trace_back(tensor))
 
 
-def _joined(body, mass, com, second_moment):
+def _add_mass(body, mass, com, second_moment):
     total = body.mass + mass
     d = com - body.com
     # Start at the centre of the heavier part: a light and distant part moves it little, so that

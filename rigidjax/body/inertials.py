@@ -37,7 +37,7 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     ValueError: missing.urdf: no such file
     """
     path = _checks.path(path)
-    root, nodes = _opened(path)
+    root, nodes = _open_file(path)
     read = _from_urdf if root.tag == "robot" else _from_mujoco
     bodies: dict[str, MassProperties] = {}
     faults = []
@@ -113,7 +113,7 @@ def write_inertials(
     _checks.instance(bodies, Mapping, "bodies", wanted="a dict of name → MassProperties")
     if not bodies:
         raise ValueError("bodies: wanted at least one name → MassProperties, got none")
-    root, nodes = _opened(source)
+    root, nodes = _open_file(source)
     write = _to_urdf if root.tag == "robot" else _to_mujoco
     for name, body in bodies.items():
         _checks.single(body, MassProperties, f"bodies[{name!r}]")
@@ -127,7 +127,7 @@ def write_inertials(
     Tree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
 
-def _opened(path: Path) -> tuple[Tree.Element, dict[str, Tree.Element]]:
+def _open_file(path: Path) -> tuple[Tree.Element, dict[str, Tree.Element]]:
     """Return the file's root, `robot` or `mujoco`, and its links or bodies by name."""
     if not path.exists():
         raise ValueError(f"{path}: no such file")

@@ -53,7 +53,7 @@ def mesh(
     centre = jax.lax.stop_gradient(corners.mean(axis=0))
     six, (a, b, c) = _tetrahedra(corners - centre[None, :], faces)
     com = (six[:, None] * (a + b + c)).sum(axis=0) / (4.0 * six.sum())
-    volume = _outward(six.sum() / 6.0, corners, faces)
+    volume = _require_outward(six.sum() / 6.0, corners, faces)
     # The second moments are summed about the centre of mass itself, so that no large term is
     # subtracted afterwards.
     six, (a, b, c) = _tetrahedra(corners - (centre + com)[None, :], faces)
@@ -105,7 +105,7 @@ def _tetrahedra(corners: Array, faces: Array) -> tuple[Array, list[Array]]:
     return (a * jnp.cross(b, c)).sum(axis=1), rows
 
 
-def _outward(volume, corners, faces):
+def _require_outward(volume, corners, faces):
     """Return the volume; refuse one that is negative (inside out) or zero to round-off."""
     # A mesh is flat to round-off if its thickness is the last digit of its length.
     a, b, c = (jax.lax.stop_gradient(corners[faces[:, k]]) for k in range(3))

@@ -122,7 +122,7 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
     i = real_moments(_checks.floating(moments, (3,), "moments"))
     s = 0.5 * jnp.stack([(i[1] - i[0]) + i[2], (i[2] - i[1]) + i[0], (i[0] - i[2]) + i[1]])
     total = _not_a_point(s[0] + s[1] + s[2])
-    root = jnp.sqrt(jnp.maximum(_share(s, total), 0.0))
+    root = jnp.sqrt(jnp.maximum(_quotient(s, total), 0.0))
     size = _hold(0.5 * jnp.log(total / 3.0), jnp.expm1)
     return jnp.stack([size, *(3.0 * root[:2] / (root[0] + root[1] + root[2]) - 1.0)])
 
@@ -205,7 +205,7 @@ def _root_of(shape: Float[Array, "5"]) -> Mat3:
 def _factors(s: Mat3) -> Float[Array, "6"]:
     """Return (ρ, d1, d2, s12, s23, s13) of 𝔖 = 3 e^{2ρ} (1 + V)² / Tr (1 + V)²."""
     total = _not_a_point(s[0, 0] + s[1, 1] + s[2, 2])
-    root = _root(_share(real_second_moment(s), total))
+    root = _root(_quotient(real_second_moment(s), total))
     v = 3.0 * root / (root[0, 0] + root[1, 1] + root[2, 2]) - jnp.eye(3, dtype=s.dtype)
     size = _hold(0.5 * jnp.log(total / 3.0), jnp.expm1)
     return jnp.stack([size, v[0, 0], v[1, 1], v[0, 1], v[1, 2], v[0, 2]])
@@ -233,7 +233,7 @@ def _not_a_point(total: Scalar) -> Scalar:
     return _checks.refuse(total, ~((total > 0) & (total < jnp.inf)), words)
 
 
-def _share(part: Array, total: Scalar) -> Array:
+def _quotient(part: Array, total: Scalar) -> Array:
     """Return the quotient `part / total`, with both divided by 4 first.
 
     XLA multiplies by the reciprocal of `total`, which is zero for the Earth in float32.

@@ -34,7 +34,7 @@ def points(
         raise ValueError("masses: wanted at least one, got none")
     _checks.if_known(_checks.sign, masses, "masses", "masses ≥ 0", zero=True)
     _checks.if_known(_checks.finite, positions, "positions")
-    return summed(masses, positions)
+    return sum_masses(masses, positions)
 
 
 def voxels(
@@ -53,13 +53,16 @@ def voxels(
     density = _checks.numbers(density, "density")
     if density.ndim != 3 or density.size == 0:
         raise ValueError(f"density: wanted shape (nx, ny, nz), got {density.shape}")
-    h, low = _checks.floating(spacing, (3,), "spacing"), _checks.given(corner, (3,), "corner")
+    h, low = (
+        _checks.floating(spacing, (3,), "spacing"),
+        _checks.finite_floating(corner, (3,), "corner"),
+    )
     _checks.if_known(_checks.sign, density, "density", "values ≥ 0 (kg/m³)", zero=True)
     _checks.if_known(_checks.sign, h, "spacing", "three positive edges of a cell, m")
     axes = [(jnp.arange(n, dtype=density.dtype) + 0.5) * h[i] for i, n in enumerate(density.shape)]
     centres = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     masses = density.reshape(-1) * (h[0] * h[1] * h[2])
-    body = summed(masses, centres)
+    body = sum_masses(masses, centres)
     own = body.mass * h * h / 12.0
     return MassProperties(body.mass, body.com + low, body.second_moment + jnp.diag(own))
 
@@ -98,10 +101,10 @@ def quadrature(
     per_volume, positions = jax.vmap(at)(cube)
     _checks.if_known(_checks.finite, positions, "place(u)")
     _checks.if_known(_checks.finite, per_volume, "density(r) |∂r/∂u|")
-    return summed(per_volume * weight, positions)
+    return sum_masses(per_volume * weight, positions)
 
 
-def summed(masses: Float[Array, "n"], positions: Float[Array, "n 3"]) -> MassProperties:
+def sum_masses(masses: Float[Array, "n"], positions: Float[Array, "n 3"]) -> MassProperties:
     """Return the mass, centre and second moment of points; the masses are not checked one by
     one.
     """

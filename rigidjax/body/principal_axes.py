@@ -55,7 +55,7 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
     (Array([1., 2., 3.], dtype=float64), Array([1., 0., 0., 0.], dtype=float64))
     """
     moments, axes = eigensystem(
-        validation.symmetric(_checks.floating(tensor, (3, 3), "tensor"), "tensor")
+        validation.check_symmetric(_checks.floating(tensor, (3, 3), "tensor"), "tensor")
     )
     return moments, _quaternion_near_identity(axes)
 
@@ -157,7 +157,7 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     >>> matrix_function(jnp.sqrt, 4.0 * jnp.eye(3))[0]
     Array([2., 0., 0.], dtype=float64)
     """
-    a = validation.symmetric(_checks.floating(tensor, (3, 3), "tensor"), "tensor")
+    a = validation.check_symmetric(_checks.floating(tensor, (3, 3), "tensor"), "tensor")
     _checks.function(function, "function", "number → number, written in jax.numpy")
     # The unit is a power of two near the largest entry: no product leaves the dtype's range. It is
     # one power smaller, since for the largest number of the dtype the next power is infinite.
@@ -171,7 +171,7 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     change = product(axes.T, product(a - jax.lax.stop_gradient(a), axes))
     close = _CLOSE * jnp.max(jnp.abs(values))
     x, y = values[np.array(_PAIRS)].T
-    first = jax.vmap(lambda x, y: _first(scaled, x, y, close))(x, y)[_PAIR]
+    first = jax.vmap(lambda x, y: _divided_difference(scaled, x, y, close))(x, y)[_PAIR]
     x, y, z = values[np.array(_TRIPLES)].T
     second = jax.vmap(lambda x, y, z: _second(scaled, x, y, z, close))(x, y, z)[_TRIPLE]
     bent = second * change[:, :, None] * change[None, :, :]
@@ -179,7 +179,7 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     return product(axes, product(inner, axes.T))
 
 
-def _first(f, x, y, close):
+def _divided_difference(f, x, y, close):
     """Return the divided difference f[x, y], x ≤ y: the mean of f' between x and y
     (Hermite–Genocchi if they are close).
     """
@@ -203,5 +203,7 @@ def _second(f, x, y, z, close):
         jnp.asarray(u, x.dtype), jnp.asarray(v, x.dtype)
     )
     mean = (jnp.asarray(weight, x.dtype) * bend).sum()
-    quotient = (_first(f, y, z, close) - _first(f, x, y, close)) / jnp.where(near, 1.0, z - x)
+    quotient = (
+        _divided_difference(f, y, z, close) - _divided_difference(f, x, y, close)
+    ) / jnp.where(near, 1.0, z - x)
     return jnp.where(near, mean, quotient)

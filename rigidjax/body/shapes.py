@@ -29,7 +29,7 @@ def box(mass: ScalarLike, size: Vector) -> MassProperties:
     Array([ 5., 10., 13.], dtype=float64)
     """
     edges = _lengths(size, (3,), "size")
-    return _centred(mass, edges * edges / 12.0)
+    return _body_at_centre(mass, edges * edges / 12.0)
 
 
 def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
@@ -40,7 +40,7 @@ def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
     Array([ 5., 10., 13.], dtype=float64)
     """
     half = _lengths(semi_axes, (3,), "semi_axes")
-    return _centred(mass, half * half / 5.0)
+    return _body_at_centre(mass, half * half / 5.0)
 
 
 def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
@@ -50,7 +50,7 @@ def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     Array([2., 2., 2.], dtype=float64)
     """
     r = _lengths(radius, (), "radius")
-    return _centred(mass, _round(r * r / 5.0, r * r / 5.0))
+    return _body_at_centre(mass, _round(r * r / 5.0, r * r / 5.0))
 
 
 def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> MassProperties:
@@ -62,11 +62,11 @@ def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> Mas
     >>> hollow_sphere(3.0, 1.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
     """
-    r, R = _nested(inner, outer)
+    r, R = _require_nested(inner, outer)
     # Homogeneous of degree 2: in u = r/R nothing overflows, and thin shells lose no digit.
     u = r / R
     ratio = (1.0 + u * (1.0 + u * (1.0 + u * (1.0 + u)))) / (1.0 + u * (1.0 + u))
-    return _centred(mass, _round(R * R * ratio / 5.0, R * R * ratio / 5.0))
+    return _body_at_centre(mass, _round(R * R * ratio / 5.0, R * R * ratio / 5.0))
 
 
 def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
@@ -76,7 +76,7 @@ def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     Array([2., 2., 2.], dtype=float64)
     """
     r = _lengths(radius, (), "radius")
-    return _centred(mass, _round(r * r / 3.0, r * r / 3.0))
+    return _body_at_centre(mass, _round(r * r / 3.0, r * r / 3.0))
 
 
 def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
@@ -87,7 +87,7 @@ def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassPr
     Array([4., 4., 6.], dtype=float64)
     """
     r, h = _lengths(radius, (), "radius"), _lengths(height, (), "height")
-    return _centred(mass, _round(r * r / 4.0, h * h / 12.0))
+    return _body_at_centre(mass, _round(r * r / 4.0, h * h / 12.0))
 
 
 def hollow_cylinder(
@@ -101,8 +101,8 @@ def hollow_cylinder(
     >>> hollow_cylinder(2.0, 1.0, 1.0, 0.0).inertia.moments
     Array([1., 1., 2.], dtype=float64)
     """
-    (r, R), h = _nested(inner, outer), _lengths(height, (), "height")
-    return _centred(mass, _round((r * r + R * R) / 4.0, h * h / 12.0))
+    (r, R), h = _require_nested(inner, outer), _lengths(height, (), "height")
+    return _body_at_centre(mass, _round((r * r + R * R) / 4.0, h * h / 12.0))
 
 
 def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassProperties:
@@ -120,7 +120,7 @@ def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassPro
     ends = (4.0 * r / 3.0) / (h + 4.0 * r / 3.0)
     across = f * r * r / 4.0 + ends * r * r / 5.0
     along = f * h * h / 12.0 + ends * (r * r / 5.0 + 3.0 * h * r / 8.0 + h * h / 4.0)
-    return _centred(mass, _round(across, along))
+    return _body_at_centre(mass, _round(across, along))
 
 
 def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
@@ -133,7 +133,7 @@ def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProper
     Array([24., 24., 24.], dtype=float64)
     """
     r, h = _lengths(radius, (), "radius"), _lengths(height, (), "height")
-    return _centred(mass, _round(3.0 * r * r / 20.0, 3.0 * h * h / 80.0))
+    return _body_at_centre(mass, _round(3.0 * r * r / 20.0, 3.0 * h * h / 80.0))
 
 
 def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassProperties:
@@ -146,8 +146,8 @@ def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassPropert
     >>> torus(2.0, 1.0, 0.0).inertia.moments
     Array([1., 1., 2.], dtype=float64)
     """
-    r, R = _nested(minor, major, names=("minor", "major"))
-    return _centred(mass, _round(R * R / 2.0 + 3.0 * r * r / 8.0, r * r / 4.0))
+    r, R = _require_nested(minor, major, names=("minor", "major"))
+    return _body_at_centre(mass, _round(R * R / 2.0 + 3.0 * r * r / 8.0, r * r / 4.0))
 
 
 def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
@@ -158,7 +158,7 @@ def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
     Array([0., 1., 1.], dtype=float64)
     """
     h = _lengths(length, (), "length")
-    return _centred(mass, _round(jnp.zeros_like(h), h * h / 12.0))
+    return _body_at_centre(mass, _round(jnp.zeros_like(h), h * h / 12.0))
 
 
 def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProperties:
@@ -168,15 +168,15 @@ def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProper
     Array([1., 4., 5.], dtype=float64)
     """
     edges = _lengths(size, (2,), "size")
-    return _centred(mass, jnp.concatenate([edges * edges / 12.0, jnp.zeros_like(edges[:1])]))
+    return _body_at_centre(mass, jnp.concatenate([edges * edges / 12.0, jnp.zeros_like(edges[:1])]))
 
 
 def _lengths(value, shape, name):
-    lengths = _checks.given(value, shape, name, unit="m")
+    lengths = _checks.finite_floating(value, shape, name, unit="m")
     return _checks.if_known(_checks.sign, lengths, name, "lengths ≥ 0 (m)", zero=True)
 
 
-def _nested(inner, outer, names=("inner", "outer")):
+def _require_nested(inner, outer, names=("inner", "outer")):
     r, R = _lengths(inner, (), names[0]), _lengths(outer, (), names[1])
     if _checks.known((r, R)):
         _checks.refuse(r, r > R, f"{names[0]}: wanted {names[0]} ≤ {names[1]}, got {r} and {R} (m)")
@@ -187,7 +187,7 @@ def _round(across, along):
     return jnp.stack([across, across, along])
 
 
-def _centred(mass, per_mass):
+def _body_at_centre(mass, per_mass):
     m = _checks.floating(mass, (), "mass")
     return MassProperties(m, jnp.zeros_like(per_mass), jnp.diag(m * per_mass))
 

@@ -30,7 +30,7 @@ def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 
 def real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Refuse an inertia tensor that is not symmetric, or whose moments no real body has."""
-    tensor = _symmetric(_checks.finite(tensor, "inertia tensor"), "inertia tensor")
+    tensor = _require_symmetric(_checks.finite(tensor, "inertia tensor"), "inertia tensor")
     return _moments_of_a_body(tensor, _eigenvalues(tensor))
 
 
@@ -48,7 +48,7 @@ def real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
 
 def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Refuse a second moment that is not symmetric and positive semi-definite."""
-    s = _symmetric(_checks.finite(s, "second moment"), "second moment")
+    s = _require_symmetric(_checks.finite(s, "second moment"), "second moment")
     least, largest = (e := _eigenvalues(s))[..., 0], e[..., 2]
     found = f", got principal second moments {_show(e)} kg m²" if _checks.known(s) else ""
     return _checks.refuse(
@@ -65,24 +65,24 @@ def single(
     """Return `value` if it is one body of one of `kinds` and some mass has its numbers.
 
     Known numbers that no real body has are refused; a traced body with such numbers becomes NaN. A
-    moment may be zero: a function that divides by the moments calls `possible`.
+    moment may be zero: a function that divides by the moments calls `check_body`.
     """
     _checks.single(value, kinds, name, wanted=wanted, hint=hint)
     has_mass = hasattr(value, "mass")
     tensor = value.inertia.tensor if has_mass else value.tensor
-    return possible(value, tensor, value.mass if has_mass else None, throw=False, thin=True)
+    return check_body(value, tensor, value.mass if has_mass else None, throw=False, thin=True)
 
 
-def symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
+def check_symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
     """Return a symmetric matrix; refuse a known one that is not symmetric, and make a traced one
     NaN.
     """
     if _checks.known(a):
-        return _symmetric(a, name)
+        return _require_symmetric(a, name)
     return jnp.where(_asymmetry(a)[1], jnp.nan, a)
 
 
-def possible(
+def check_body(
     body: Any,
     tensor: Float[Array, "*batch 3 3"],
     mass: Any,
@@ -196,7 +196,7 @@ def unit_quaternion(q: Quaternion) -> Quat:
     """Return a unit quaternion (w, x, y, z), normalised if it is off by round-off; refuse any
     other.
     """
-    q = _checks.given(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
+    q = _checks.finite_floating(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
     return quaternion.normalise(near_unit(q, "q", tolerance(q.dtype)))
 
 
@@ -226,7 +226,7 @@ def _asymmetry(a):
     return difference, (difference > _slack(a) * abs(_values(a)).max(axis=(-1, -2))).any()
 
 
-def _symmetric(a, name):
+def _require_symmetric(a, name):
     difference, bad = _asymmetry(a)
     found = f" (largest difference {float(difference.max()):.3g})" if _checks.known(a) else ""
     return _checks.refuse(

@@ -290,7 +290,7 @@ def _channels(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Ch
     return [spec.Channel("gyro", tuple(rates), options.unit, noise, options.limit)]
 
 
-def _read(
+def _read_logs(
     options: argparse.Namespace,
 ) -> tuple[list[spec.Channel], list[rj.identify.Recording], rj.identify.Model]:
     """Return the sensors, the recordings, and the model that the options describe."""
@@ -325,7 +325,7 @@ def _say_units(path: str, time: str, time_unit: str, channels: Sequence[spec.Cha
     units = [("time", (time,), time_unit)] + [(one.kind, one.columns, one.unit) for one in channels]
     words = [f"{what} in {unit}" for what, names, unit in units if unit_in(names[0], [unit or ""])]
     if words:
-        _say(f"{path}: {', '.join(words)}, as the names of its columns say")
+        _print_line(f"{path}: {', '.join(words)}, as the names of its columns say")
 
 
 @contextlib.contextmanager
@@ -337,7 +337,7 @@ def _log_warnings(strict: bool) -> Iterator[None]:
 
         def show(message: Any, category: type[Warning], *where: Any, **how: Any) -> None:
             if issubclass(category, LogWarning):
-                _say(str(message))
+                _print_line(str(message))
             else:
                 usual(message, category, *where, **how)
 
@@ -349,7 +349,7 @@ def _logs(options: argparse.Namespace) -> int:
     """Fit the logs that the options name, and print the report; return the exit code."""
     try:
         with _log_warnings(options.strict):
-            channels, records, model = _read(options)
+            channels, records, model = _read_logs(options)
     except ValueError as error:
         return _error(error)
     except LogWarning as warning:
@@ -358,7 +358,7 @@ def _logs(options: argparse.Namespace) -> int:
         gaps = sum(int((~reading.seen).sum()) for reading in record.readings) + record.dropped
         words = f", {gaps} gap{'s' if gaps > 1 else ''}" if gaps else ""
         count, span = record.t.shape[0] + record.dropped, record.t[-1] - record.t[0]
-        _say(f"{path}: {count} samples over {span:.4g} s{words}")
+        _print_line(f"{path}: {count} samples over {span:.4g} s{words}")
     print()
     fit = _fit(model, options, 8)
     if fit is None:
@@ -389,7 +389,7 @@ def _fit(
         return rj.identify.fit(
             model,
             starts=starts if options.starts is None else options.starts,
-            progress=_say,
+            progress=_print_line,
             checkpoint=options.checkpoint,
         )
     except (OSError, ValueError) as error:
@@ -435,7 +435,7 @@ def _write(
         try:
             if path is not None:
                 make()
-                _say(f"{what}: {path}")
+                _print_line(f"{what}: {path}")
         except Exception as error:
             # A fit of an hour must not be lost to one output.
             _error(f"no {what}: {path}: {type(error).__name__}: {error}")
@@ -466,13 +466,13 @@ def _matplotlib() -> bool:
     try:
         import matplotlib
     except ModuleNotFoundError:
-        _say("no figures: matplotlib is missing (pip install 'rigidjax[view]')")
+        _print_line("no figures: matplotlib is missing (pip install 'rigidjax[view]')")
         return False
     matplotlib.use("Agg")
     return True
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
     """Print a line, made printable."""
     try:
         print(_checks.printable(line), flush=True)

@@ -14,7 +14,7 @@ import numpy as np
 from rigidjax.cli.logs.errors import LogError
 from rigidjax.cli.logs.layouts import usual_unit
 from rigidjax.cli.logs.table import read_table
-from rigidjax.cli.logs.times import increasing, kept_rows, remark_on_step
+from rigidjax.cli.logs.times import kept_rows, mask_of_increasing, remark_on_step
 from rigidjax.cli.logs.units import TIME_UNITS, UNITS, unit_of
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.model import charts
@@ -178,7 +178,7 @@ def read_log(
     names = [time, *(c for one in channels for c in one.columns), *turning]
     table = read_table(path, names, flight=flight)
     # Count from the first stamp: seconds since 1970, or nanoseconds, leave few digits for a step.
-    t = (table[time] - _first(table[time])) * UNITS[unit]
+    t = (table[time] - _first_time(table[time])) * UNITS[unit]
     kept = kept_rows(path, t, time, window)
     # A slice makes no copy of a large log.
     kept = slice(None) if kept.size == t.size else kept
@@ -202,7 +202,7 @@ def read_log(
         raise LogError(f"{path}: {error}") from None
 
 
-def _first(t: np.ndarray) -> float:
+def _first_time(t: np.ndarray) -> float:
     """Return the first time that is not missing, or zero."""
     finite = np.isfinite(t)
     return float(t[np.argmax(finite)]) if finite.any() else 0.0
@@ -288,7 +288,7 @@ def _speeds(
     """Return the logged speed of each wheel by the name of its input, rad/s."""
     speeds = {}
     # Keep speeds outside of the window, too: a delayed speed is from before a reading.
-    kept = increasing(t) if wheels else slice(None)
+    kept = mask_of_increasing(t) if wheels else slice(None)
     for name, one in zip(input_names(wheels), wheels, strict=True):
         unit = unit_of([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
         try:

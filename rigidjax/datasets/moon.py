@@ -77,7 +77,7 @@ class Moon(eqx.Module):
             """Return coefficients on intervals of `step` days."""
             rows = np.load(Path(found.origin or "").parent / f"jpl-{name}.npy", mmap_mode="r")
             a_block = len(rows) // _BLOCKS
-            return _split(rows[low * a_block : high * a_block], _BLOCK // a_block // step)
+            return _subdivide(rows[low * a_block : high * a_block], _BLOCK // a_block // step)
 
         numbers = np.load(Path(found.origin).parent / "constants.npy")
         self.constants = {name.decode(): float(value) for name, value in numbers}
@@ -142,7 +142,7 @@ class Moon(eqx.Module):
             few, radius = -0.5 * c["J2E"] * self._mu_earth, 1e3 * c["AE"]
             earths = [(self._mu_earth - 2 * few, 0.0), (few, radius), (few, -radius)]
         law: Any = Sum(
-            *(GravityGradient(mu, _raised(self.earth, z), rows) for mu, z in earths),
+            *(GravityGradient(mu, _add_to_z(self.earth, z), rows) for mu, z in earths),
             GravityGradient(c["GMS"] * self._in_si, self.sun),
         )
         if core:
@@ -150,7 +150,7 @@ class Moon(eqx.Module):
             friction = c["KVC"] / DAY * self.body().tensor[2, 2]
             law = _Core(rate, self._core.tensor, friction, law)
             if self.first != EPOCH:
-                law = eqx.tree_at(lambda core: core.state0, law, _carried(law, self.first))
+                law = eqx.tree_at(lambda core: core.state0, law, _core_velocity_at(law, self.first))
         if tide:
             response, turn = c["K2M"] * self._radius**5 / _G, 2 * np.pi / (27.321661 * DAY)
             bulge = Tide(response, c["TAUM"] * DAY, self._mu_earth, self.earth, turn)
@@ -247,7 +247,7 @@ class _AlongEphemeris(eqx.Module):
         return self.core.rate(t, own, self.moon.attitude(t), self.moon.body(core=True))
 
 
-def _carried(core: _Core, year: float) -> Float[Array, "3"]:
+def _core_velocity_at(core: _Core, year: float) -> Float[Array, "3"]:
     """Return the core's angular velocity at a `year`, rad/s, mantle frame, from `core.state0` at
     `EPOCH`.
     """
@@ -258,11 +258,13 @@ def _carried(core: _Core, year: float) -> Float[Array, "3"]:
         )
     between = Moon(min(year, EPOCH), max(year, EPOCH))
     begin, end = (365.25 * DAY * (at - between.first) for at in (EPOCH, year))
-    return _followed(_AlongEphemeris(core, between), core.state0, jnp.array([begin, end]))
+    return _integrate_core(_AlongEphemeris(core, between), core.state0, jnp.array([begin, end]))
 
 
 @eqx.filter_jit
-def _followed(field: _AlongEphemeris, own: Array, ends: Float[Array, "2"]) -> Float[Array, "3"]:
+def _integrate_core(
+    field: _AlongEphemeris, own: Array, ends: Float[Array, "2"]
+) -> Float[Array, "3"]:
     steps = dfx.PIDController(rtol=1e-12, atol=1e-12 * jnp.max(jnp.abs(own)))
     first = jnp.sign(ends[1] - ends[0]) * jnp.minimum(DAY, jnp.abs(ends[1] - ends[0]))
     found = dfx.diffeqsolve(
@@ -272,13 +274,13 @@ def _followed(field: _AlongEphemeris, own: Array, ends: Float[Array, "2"]) -> Fl
     return found.ys[0]  # pyright: ignore[reportOptionalSubscript]
 
 
-def _raised(table: Chebyshev, z: float) -> Chebyshev:
+def _add_to_z(table: Chebyshev, z: float) -> Chebyshev:
     """Return the table of places with z added to their third component."""
     moved = table.coefficients.at[:, 2, 0].add(z)
     return eqx.tree_at(lambda t: t.coefficients, table, moved)
 
 
-def _split(rows: np.ndarray, parts: int) -> np.ndarray:
+def _subdivide(rows: np.ndarray, parts: int) -> np.ndarray:
     """Return polynomials (intervals, k, terms) on intervals shortened by `parts`, equal to those
     given.
     """

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax.rotation.barrier import batched_as
+from rigidjax.rotation.barrier import batch_as
 
 # Arguments and results of all functions: real numbers of shapes that broadcast.
 Real = Float[ArrayLike, "..."]
@@ -50,7 +50,7 @@ def complementary(name: str, value: Any, complement: Any) -> dict[str, Any]:
 @jax.custom_jvp
 def exact_complement(value: Result, complement: Result) -> Any:
     """Return `value` with the derivative −1 by its `complement` (1 − `value`) and 0 by itself."""
-    return batched_as(value, complement)
+    return batch_as(value, complement)
 
 
 @exact_complement.defjvp

@@ -68,14 +68,14 @@ class Reduced(NamedTuple):
     near: Scalar  # the rest, on the separatrix cut at the time to come to rest
 
 
-def reduced(u: Scalar, half: Scalar, m: Modulus) -> Reduced:
+def reduce_time(u: Scalar, half: Scalar, m: Modulus) -> Reduced:
     """Reduce the time u by whole half periods `half`."""
     count = jnp.round(u / half)
     rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half)
     return Reduced(count, rest, until_rest(rest, m))
 
 
-def restored(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar]:
+def restore_periods(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar]:
     """Return S, C, D at the whole time from `f`, those at `u.near`; and the phase left out."""
     big = jnp.maximum(o.modulus.p, o.modulus.q)
     whole = jnp.where(u.halves == 0, 0.0, u.halves)
@@ -126,13 +126,13 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
 @one_kernel
 def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
     """Return the body momentum at t and the quaternion of the turn since 0, in principal axes."""
-    u = reduced(0.5 * t, o.half.time, o.modulus)
+    u = reduce_time(0.5 * t, o.half.time, o.modulus)
     return from_functions(o, elliptic(u.near, o.modulus, o.mu, o.turn), u, t)
 
 
 def from_functions(o: Orbit, f: Elliptic, u: Reduced, t: Scalar) -> tuple[Triple, Four]:
     """Return momentum and turn at time t from `f`, the elliptic functions at `u.near`."""
-    f, phase = barrier(restored(o, f, u))
+    f, phase = barrier(restore_periods(o, f, u))
     full = barrier(duplicate(f, o.modulus, o.mu, o.turn))
     _, k2, k3 = barrier(momentum_at(o, f))
     m1, m2, m3 = barrier(momentum_at(o, full))

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
 from rigidjax.exact import sigma_form
-from rigidjax.exact.closed_form import Orbit, from_functions, momentum_and_turn, orbit, reduced
+from rigidjax.exact.closed_form import Orbit, from_functions, momentum_and_turn, orbit, reduce_time
 from rigidjax.exact.components3 import (
     HALF,
     Four,
@@ -37,7 +37,7 @@ from rigidjax.exact.components3 import (
     turned_back,
 )  # fmt: skip
 from rigidjax.exact.jacobian import integrals, jacobian_and_integral
-from rigidjax.exact.principal_axes import in_axes, into, out_of, principal_frame
+from rigidjax.exact.principal_axes import components_along, in_axes, out_of, principal_frame
 from rigidjax.exact.sigma_form import Differences
 from rigidjax.rotation.barrier import one_kernel
 from rigidjax.rotation.linalg3 import components
@@ -83,7 +83,7 @@ class Setting(NamedTuple):
 def set_up(tensor: Mat3, omega: Vec3) -> Setting:
     """Find the principal axes, and the orbit of the momentum in them."""
     moments, axes = principal_frame(tensor)
-    momentum = times(moments, into(axes, omega))
+    momentum = times(moments, components_along(axes, omega))
     return Setting(axes, moments[:3], momentum, orbit(moments[:3], momentum))
 
 
@@ -138,7 +138,7 @@ def _values(s: Setting, t: Scalar) -> tuple[Vec3, Quat]:
 def _in_axes(tensor: Mat3, omega: Vec3, s: Setting) -> tuple[Six, Triple]:
     """Return moments and momentum as functions of `tensor` and Ω(0); the axes are held fixed."""
     moments = in_axes(tensor, s.axes, s.moments)
-    return moments, times(moments, into(s.axes, omega))
+    return moments, times(moments, components_along(s.axes, omega))
 
 
 @one_kernel
@@ -230,7 +230,7 @@ def first_order(moments: Six, momentum: Triple, t: Scalar):
 @one_kernel
 def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
     """Return what `first_order` does, for a motion with the constants `o`."""
-    u = reduced(0.5 * t, o.half.time, o.modulus)
+    u = reduce_time(0.5 * t, o.half.time, o.modulus)
     at = integrals(u.near, o.modulus, o.mu, o.turn)
     f = at.f._replace(
         C=jnp.where(o.swapped, at.f.D, at.f.C), D=jnp.where(o.swapped, at.f.C, at.f.D)

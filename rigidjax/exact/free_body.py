@@ -40,7 +40,7 @@ class FreeBody(eqx.Module):
     setting: Setting
 
     def __init__(self, inertia: Inertia, state0: HasSpin):
-        inertia = _checked(inertia, state0)
+        inertia = _checked_inertia(inertia, state0)
         # Powers of two, so that scaling loses no digit and no body is too large or small.
         self.exponent = exponent_of(state0.omega)
         self.tensor = times_power_of_two(inertia.tensor, -exponent_of(inertia.tensor))
@@ -130,7 +130,7 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     >>> free_body(rj.Inertia.from_principal(1.0, 2.0, 3.0), state0, 20.0).omega
     Array([-0.42522037, -0.90508985,  0.24550111], dtype=float64)
     """
-    _checked(inertia, state0)
+    _checked_inertia(inertia, state0)
     return _jitted(inertia, state0, _time(t, state0.omega))
 
 
@@ -153,7 +153,7 @@ def _time(t: ScalarLike, omega: Array) -> Scalar:
     return t
 
 
-def _checked(inertia: Inertia, state0: HasSpin) -> Inertia:
+def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
     """Check body and state, and return the body; one that is traced and impossible is NaN."""
     if isinstance(state0, HasPose) or not isinstance(state0, HasSpin):
         raise TypeError(
@@ -168,7 +168,7 @@ def _checked(inertia: Inertia, state0: HasSpin) -> Inertia:
     for name, array in arrays.items():
         if array.dtype != tensor.dtype:
             raise TypeError(f"{name} is {array.dtype}, but the inertia tensor is {tensor.dtype}")
-    inertia = validation.possible(inertia, tensor, None, throw=False)
+    inertia = validation.check_body(inertia, tensor, None, throw=False)
     if not _checks.known((tensor, arrays)):
         return inertia
     for name, array in arrays.items():

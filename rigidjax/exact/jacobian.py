@@ -52,7 +52,7 @@ def jacobian_and_integral(
     m = Modulus(p, q, gap)
     three = gap > 0
     top = jnp.where(three, p, q)
-    after = twice(before, m, jnp.zeros_like(t), jnp.zeros_like(t))
+    after = double_argument(before, m, jnp.zeros_like(t), jnp.zeros_like(t))
     S, C, D, *_ = after.f
     grown2 = after.y2 + whole * mean
     grown = after.y + whole * (1.0 - top * mean) / jnp.where(halves == 0, 1.0, jnp.abs(gap))
@@ -140,10 +140,10 @@ def integrals(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
     # S²/D² and S²/C² are S²/(1 + μS²) for μ = −q and −p.
     low = jnp.where(m.gap > 0, -m.q, -m.p)
     first = Integrals(f, growth(f.S, m, jnp.zeros_like(u)), growth(f.S, m, low))
-    return jax.lax.fori_loop(0, n, lambda _, g: twice(g, m, mu, turn), first)
+    return jax.lax.fori_loop(0, n, lambda _, g: double_argument(g, m, mu, turn), first)
 
 
-def twice(g: Integrals, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
+def double_argument(g: Integrals, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
     """Return the elliptic functions, Y₂ and Y at 2u from `g`, their values at u."""
     f, three = g.f, m.gap > 0
     after = duplicate(f, m, mu, turn)

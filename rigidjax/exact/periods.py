@@ -14,7 +14,7 @@ from rigidjax.exact import sigma_form
 from rigidjax.exact.components3 import HALF, Six, Triple, times
 from rigidjax.exact.derivatives import first_order, reciprocal
 from rigidjax.exact.jacobi_duplication import Modulus, half_period, is_endless
-from rigidjax.exact.principal_axes import into, principal_frame
+from rigidjax.exact.principal_axes import components_along, principal_frame
 
 
 def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
@@ -36,7 +36,7 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> bool(abs(body_period(top, jnp.array([1.0, 0.5, 0.0])) - 4 * jnp.pi) < 1e-14)
     True
     """
-    return _periods(*_checked(inertia, omega0))[0]
+    return _periods(*_checked_arguments(inertia, omega0))[0]
 
 
 def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
@@ -57,13 +57,13 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> precession_period(top, jnp.array([1.0, 0.5, 0.0]))  # 2π I₂/|L|
     Array(8.88576588, dtype=float64)
     """
-    return _periods(*_checked(inertia, omega0))[1]
+    return _periods(*_checked_arguments(inertia, omega0))[1]
 
 
-def _checked(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
+def _checked_arguments(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
     """Check body and rate; return the tensor and Ω in its dtype."""
     _checks.single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
-    tensor = validation.possible(inertia, inertia.tensor, None, throw=False).tensor
+    tensor = validation.check_body(inertia, inertia.tensor, None, throw=False).tensor
     return tensor, _checks.floating(omega0, (3,), "omega0").astype(tensor.dtype)
 
 
@@ -72,7 +72,7 @@ def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
     """Return the body period and the precession period, from one program."""
     exponent = exponent_of(omega)
     moments, axes = principal_frame(times_power_of_two(tensor, -exponent_of(tensor)))
-    momentum = times(moments, into(axes, times_power_of_two(omega, -exponent)))
+    momentum = times(moments, components_along(axes, times_power_of_two(omega, -exponent)))
     body, _, _ = reciprocal(moments, momentum)
     v = sigma_form.invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))

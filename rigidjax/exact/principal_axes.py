@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from rigidjax._types import Mat3, Scalar, Vec3
 from rigidjax.exact.components3 import Six, Triple
-from rigidjax.rotation.barrier import batched_as, one_kernel
+from rigidjax.rotation.barrier import batch_as, one_kernel
 
 # Cyclic Jacobi converges quadratically; 3×3 needs four or five sweeps from anywhere.
 _SWEEPS = 6
@@ -28,23 +28,26 @@ def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
 def in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
     """Return `AᵀIA`, A the principal `axes` of I: diagonal in value, full in its derivative."""
     zero = jnp.zeros_like(tensor[0, 0])
-    return batched_as((*moments, zero, zero, zero), (tensor, axes, moments))
+    return batch_as((*moments, zero, zero, zero), (tensor, axes, moments))
 
 
 @in_axes.defjvp
 def _in_axes_jvp(primals, tangents):
-    axes, rows = primals[1], [into(primals[1], row) for row in tangents[0]]
-    m: list[Triple] = [into(axes, column) for column in zip(*rows, strict=True)]
+    axes, rows = primals[1], [components_along(primals[1], row) for row in tangents[0]]
+    m: list[Triple] = [components_along(axes, column) for column in zip(*rows, strict=True)]
     return in_axes(*primals), (m[0][0], m[1][1], m[2][2], m[1][0], m[2][0], m[2][1])
 
 
-def into(axes: Mat3, v: Vec3 | Triple) -> Triple:
+def components_along(axes: Mat3, v: Vec3 | Triple) -> Triple:
     """Return the components of `v` along the columns of `axes`."""
     return tuple(axes[0, i] * v[0] + axes[1, i] * v[1] + axes[2, i] * v[2] for i in range(3))
 
 
 def out_of(axes: Mat3, v: Triple) -> Triple:
-    """Return the vector with the components `v` along the columns of `axes`: inverse of `into`."""
+    """Return the vector with the components `v` along the columns of `axes`.
+
+    This is the inverse of `components_along`.
+    """
     return tuple(axes[i, 0] * v[0] + axes[i, 1] * v[1] + axes[i, 2] * v[2] for i in range(3))
 
 
@@ -69,11 +72,11 @@ def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     d, _, axes = jax.lax.fori_loop(0, 3 * _SWEEPS, rotate, (d, o, axes))
     for i, j in ((0, 1), (1, 2), (0, 1)):
         d, axes = _order(d, axes, i, j)
-    columns = _polished([[axes[j][i] for j in range(3)] for i in range(3)])
+    columns = _orthonormalise([[axes[j][i] for j in range(3)] for i in range(3)])
     return columns, tuple(c + shift for c in d)
 
 
-def _polished(a):
+def _orthonormalise(a):
     """Make a product of many rotations one to round-off again: A(3 − AᵀA)/2 (Higham 1986)."""
     excess = [
         [

@@ -125,7 +125,7 @@ def start(u: Scalar, v: Invariants) -> Sigma:
     inner = _add_scalar(_scale(x, 3 / 7), 0.6 - (2 / 7) * c1)
     more = 1.0 + (-c1 / 5 + (2.0 * c1 * c1 + 9.0 * c2) / 105)
     y = _scale(_add_scalar(product(x, inner), more), r)
-    return _scaled(Sigma(s, t, y))
+    return _rescale(Sigma(s, t, y))
 
 
 def double(f: Sigma, v: Invariants) -> Sigma:
@@ -164,7 +164,7 @@ def double(f: Sigma, v: Invariants) -> Sigma:
     after = _scale(adjugate(t), s2 / determinant(t))
     square = product(before, before)
     y = tuple(2.0 * a + b for a, b in zip(f.y, product(square, after), strict=True))
-    return _scaled(Sigma(s2, t, y))
+    return _rescale(Sigma(s2, t, y))
 
 
 def momentum_at(
@@ -291,7 +291,7 @@ def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
     return out, g
 
 
-def _scaled(f: Sigma) -> Sigma:
+def _rescale(f: Sigma) -> Sigma:
     """Scale σ and T by one factor so that T₂₂ = 1 in value."""
     r = 1.0 / jax.lax.stop_gradient(f.t[1])
     return Sigma(f.s * r, _scale(f.t, r), f.y)

@@ -105,7 +105,7 @@ def jumps_within(*laws: Any) -> Float[Array, " n"]:
     return jnp.concatenate([jnp.zeros(0), *found])
 
 
-def like(x: Array, *values: Array) -> tuple[Array, ...]:
+def cast_like(x: Array, *values: Array) -> tuple[Array, ...]:
     """Return the constants of a scene in the dtype of the state `x`, so that float32 stays
     float32.
     """

@@ -43,7 +43,7 @@ class Instant(eqx.Module):
             rate = quaternion.rotate_inverse(state.q, self.rate.astype(state.q.dtype))
             turned["q"] = quaternion.multiply(q, state.q)
             turned["omega"] = state.omega + rate
-        return _replaced(state, turned)
+        return _replace_fields(state, turned)
 
     def from_inertial(self, state: Any) -> Any:
         """Return a state given in S, transformed to S' (notes, eqs 86, 88)."""
@@ -59,7 +59,7 @@ class Instant(eqx.Module):
             turned["q"] = quaternion.multiply(back, state.q)
             rate = self.rate.astype(state.q.dtype)
             turned["omega"] = state.omega - quaternion.rotate_inverse(turned["q"], rate)
-        return _replaced(state, turned)
+        return _replace_fields(state, turned)
 
     def outward(self, y: Vector) -> Vec3:
         """Return the components in S, M y', of a vector given in S' (notes, eq 85): a force, a
@@ -118,6 +118,6 @@ def _can_travel(state: Any) -> None:
             _checks.floating(getattr(state, name), (size,), name, hint=hint)
 
 
-def _replaced(state: Any, turned: dict[str, Any]) -> Any:
+def _replace_fields(state: Any, turned: dict[str, Any]) -> Any:
     names = list(turned)
     return eqx.tree_at(lambda s: [getattr(s, n) for n in names], state, [turned[n] for n in names])

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
-from rigidjax.frames.base import AbstractScene, like
+from rigidjax.frames.base import AbstractScene, cast_like
 from rigidjax.frames.earth import GRAVITY
 from rigidjax.frames.frame_dynamics import InFrame
 from rigidjax.frames.moving import MovingFrame
@@ -36,14 +36,14 @@ class Hoop(AbstractScene):
         """
         x, _, z = components(state.x)
         vx, _, vz = components(state.v)
-        rate, gravity = like(x, self.rate, self.gravity)
+        rate, gravity = cast_like(x, self.rate, self.gravity)
         push, down = rate * rate * x, -gravity
         pull = (x * push + z * down + vx * vx + vz * vz) / (x * x + z * z)
         return jnp.stack([push - pull * x, jnp.zeros_like(x), down - pull * z])
 
     def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
         x, _, z = components(state.x)
-        rate, gravity = like(x, self.rate, self.gravity)
+        rate, gravity = cast_like(x, self.rate, self.gravity)
         jacobi = 0.5 * (jnp.sum(state.v * state.v) - (rate * x) ** 2) + gravity * z
         return {"jacobi": jacobi, "radius": jnp.sqrt(x * x + z * z)}
 
@@ -55,7 +55,7 @@ class Hoop(AbstractScene):
         12.0
         """
         require_point(state)
-        return 2 * like(state.x, self.rate)[0] * state.v[0]
+        return 2 * cast_like(state.x, self.rate)[0] * state.v[0]
 
     def state(self, angle: ScalarLike, speed: ScalarLike = 0.0) -> Point:
         """Return the bead at an angle from the lowest place, rad, with dθ/dt = `speed`, rad/s.
@@ -66,7 +66,7 @@ class Hoop(AbstractScene):
         angle, speed = _checks.floating(angle, (), "angle"), _checks.floating(speed, (), "speed")
         c, s, zero = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)
         place, along = jnp.stack([s, zero, -c]), jnp.stack([c, zero, s])
-        radius = like(place, self.radius)[0]
+        radius = cast_like(place, self.radius)[0]
         return Point(radius * place, radius * speed.astype(angle.dtype) * along)
 
     def equilibrium_angle(self) -> Scalar:
@@ -102,7 +102,7 @@ class _Angle(eqx.Module):
     growth: Scalar
 
     def __call__(self, t: Scalar) -> Scalar:
-        rate, growth = like(t, self.rate, self.growth)
+        rate, growth = cast_like(t, self.rate, self.growth)
         return t * (rate + 0.5 * growth * t)
 
 

@@ -186,19 +186,19 @@ class MovingFrame(eqx.Module):
         v = _checks.floating(potential, (), "potential").astype(state.x.dtype)
         return 0.5 * (speed - linalg3.dot(moved, moved)) + v
 
-    def then(self, inner: "MovingFrame") -> "MovingFrame":
+    def compose(self, inner: "MovingFrame") -> "MovingFrame":
         """Return the frame that moves as `inner` does **within this frame**: M = M₁M₂, X = X₁ +
         M₁X₂.
 
         >>> half = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
-        >>> half.then(half).at(0.0).rate.tolist()
+        >>> half.compose(half).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
-        both = _Composed(self, require_frame(inner, "then"))
+        both = _Composed(self, require_frame(inner, "inner"))
         return MovingFrame(both.rotation, both.origin, both.rate)
 
     def inverse(self) -> "MovingFrame":
-        """Return S relative to S': M → Mᵀ, X → −MᵀX. `frame.then(frame.inverse())` does not
+        """Return S relative to S': M → Mᵀ, X → −MᵀX. `frame.compose(frame.inverse())` does not
         move.
         """
         back = _Inverse(self)

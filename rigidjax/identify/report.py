@@ -65,7 +65,7 @@ def table(lines: list[Row]) -> str:
     out = [f"{'':{wide}}  {'value':>14}  95 % interval"]
     for name, value, low, high, unit in lines:
         shown = numbers(value, low, high)
-        out.append(f"{name:{wide}}  {shown[0]:>14}  {_between(shown)} {unit}".rstrip())
+        out.append(f"{name:{wide}}  {shown[0]:>14}  {_interval_as_text(shown)} {unit}".rstrip())
     return "\n".join(out)
 
 
@@ -102,7 +102,7 @@ def _place(number: float) -> int:
     return int(np.floor(np.log10(abs(number)))) if number else 0
 
 
-def _between(shown: list[str]) -> str:
+def _interval_as_text(shown: list[str]) -> str:
     """Return the interval as text from the result of `numbers`: "not determined" for NaN."""
     return "not determined" if "nan" in shown[1:] else f"{shown[1]} … {shown[2]}"
 
@@ -311,7 +311,7 @@ def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str
     True
     """
     lines = _cells(
-        (name, (shown := numbers(*three))[0], _between(shown), unit)
+        (name, (shown := numbers(*three))[0], _interval_as_text(shown), unit)
         for name, *three, unit in (*rows(fit, rate_unit), *more)
     )
     head, *words = verdict(fit).splitlines()

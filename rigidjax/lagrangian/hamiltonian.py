@@ -110,7 +110,7 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
 
 def _invertible(inertia: Any) -> _inertia.Inertia:
     _checks.single(inertia, _inertia.Inertia, "inertia")
-    return validation.possible(inertia, inertia.tensor, None, throw=False)
+    return validation.check_body(inertia, inertia.tensor, None, throw=False)
 
 
 class RotationalHamiltonian(eqx.Module):

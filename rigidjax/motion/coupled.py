@@ -55,7 +55,7 @@ class CoupledEquations(eqx.Module):
         return Coupled(freeze(self.field, y.own)(t, y.motion, args), own)
 
 
-def started(body: Any, state0: Any, torque: Any, t: ScalarLike) -> Any:
+def with_own_states(body: Any, state0: Any, torque: Any, t: ScalarLike) -> Any:
     """Return `state0`, as a `Coupled` if the torque has states of its own."""
     if isinstance(state0, Coupled) or not has_states(torque):
         return state0

@@ -12,7 +12,7 @@ from rigidjax import _checks, _show, _types
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, ScalarLike, Vec3, Vectors
 from rigidjax.body.inertia import Inertia, MassProperties, apply, inverse
 from rigidjax.motion.coupled import Coupled
-from rigidjax.motion.torques.base import Torque, act, evaluate, require_law
+from rigidjax.motion.torques.base import Torque, evaluate, force_and_torque, require_law
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.kernels import square4
 from rigidjax.rotation.linalg3 import components, cross
@@ -118,9 +118,9 @@ class EulerEquations(eqx.Module):
         torque = None
         if self.torque is not None:
             torque = evaluate(self.torque, t, state, self.inertia)
-        return self.turned_by(torque, state)
+        return self.rate_under_torque(torque, state)
 
-    def turned_by(self, torque: Vec3 | None, state: HasSpin) -> Vec3:
+    def rate_under_torque(self, torque: Vec3 | None, state: HasSpin) -> Vec3:
         """Return dΩ/dt (3,), rad/s², body frame, under a known torque (3,), N m, body frame."""
         dtype = state.omega.dtype
         momentum = apply(self.inertia.tensor.astype(dtype), state.omega)
@@ -160,12 +160,12 @@ class NewtonEuler(eqx.Module):
     def __call__(self, t: ScalarLike, y: HasPose, args: object = None) -> Rigid:
         force, torque = None, None
         if self.euler.torque is not None:
-            force, torque = act(self.euler.torque, t, y, self.body)
+            force, torque = force_and_torque(self.euler.torque, t, y, self.body)
         if force is None:
             acceleration = jnp.zeros_like(y.v)
         else:
             acceleration = force / self.body.mass.astype(y.v.dtype)
-        spin = self.euler.turned_by(torque, y)
+        spin = self.euler.rate_under_torque(torque, y)
         return Rigid(y.v, acceleration, quaternion.rate(y.q, y.omega), spin)
 
 

@@ -44,7 +44,7 @@ def parts(state: Any, change: Float[Array, "*batch n"]) -> dict[str, Float[Array
 
 def turns(state: Any) -> tuple[slice, ...]:
     """Return the slices of the rotation vectors in a change, one for each quaternion."""
-    pairs = zip(_places(state), _turned(state), strict=True)
+    pairs = zip(_places(state), _is_quaternion(state), strict=True)
     return tuple(place for place, turned in pairs if turned)
 
 
@@ -100,7 +100,7 @@ def coordinates(state: Any, along: Any) -> Float[Array, " n"]:
     )
 
 
-def _turned(state: Any) -> list[bool]:
+def _is_quaternion(state: Any) -> list[bool]:
     """Return, for each leaf, whether it is the quaternion of a state with an attitude."""
     out = []
     for node in jax.tree.leaves(state, is_leaf=lambda node: isinstance(node, HasAttitude)):
@@ -112,7 +112,7 @@ def _turned(state: Any) -> list[bool]:
 def _places(state: Any) -> list[slice]:
     """Return the slice of each leaf's numbers in a change."""
     end, out = 0, []
-    for leaf, turned in zip(jax.tree.leaves(state), _turned(state), strict=True):
+    for leaf, turned in zip(jax.tree.leaves(state), _is_quaternion(state), strict=True):
         begin, end = end, end + math.prod(jnp.shape(leaf)) - turned
         out.append(slice(begin, end))
     return out
@@ -126,7 +126,7 @@ def _leaf_by_leaf(
 ) -> Any:
     """Return the tree of `of_quaternion` or `of_others`, of each leaf and its part of `change`."""
     (leaves, tree), out = jax.tree.flatten(state), []
-    for leaf, place, turned in zip(leaves, _places(state), _turned(state), strict=True):
+    for leaf, place, turned in zip(leaves, _places(state), _is_quaternion(state), strict=True):
         part = change[place] if turned else change[place].reshape(jnp.shape(leaf))
         out.append(of_quaternion(leaf, part) if turned else of_others(leaf, part))
     return jax.tree.unflatten(tree, out)
@@ -139,7 +139,9 @@ def _vector(
     of_others: Callable[[Array, Array], Array],
 ) -> Array:
     """Return one vector of `of_quaternions` or `of_others`, of the leaves of two trees in pairs."""
-    pairs = zip(jax.tree.leaves(first), jax.tree.leaves(second), _turned(second), strict=True)
+    pairs = zip(
+        jax.tree.leaves(first), jax.tree.leaves(second), _is_quaternion(second), strict=True
+    )
     out = [
         of_quaternions(a, b) if turned else of_others(a, b).reshape(-1) for a, b, turned in pairs
     ]

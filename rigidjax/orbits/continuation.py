@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.orbits import differential_correction as correction
-from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing, named, orbit_of
+from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing, index_of_held, orbit_of
 
 # Steps of the search for a branching.
 _MOST = 60
@@ -46,7 +46,7 @@ def family(
     >>> [round(float(p), 3) for p in found.period]
     [2.712, 2.811]
     """
-    start, index = crossing(orbit), named(hold)
+    start, index = crossing(orbit), index_of_held(hold)
     length = np.shape(values)
     if len(length) != 1 or length[0] < 1:
         raise ValueError(f"values: wanted shape (N,), values of {hold}, got shape {length}")
@@ -56,18 +56,18 @@ def family(
     numbers, left = _at_values(scene, start, held, index, correction.usual_tolerance(start))
     where = lambda i: f" at {hold} = {values[i]:.9g}"  # noqa: E731
     advice = "; take smaller steps, or the family turns back there: hold another of x, z, vy, "
-    lost = _lost(start, numbers, left)
-    return _found(numbers, lost, where, "family: lost", advice + "period, or use follow")
+    lost = _is_lost(start, numbers, left)
+    return _orbits_or_error(numbers, lost, where, "family: lost", advice + "period, or use follow")
 
 
-def _lost(start: Array, numbers: Array, left: Array) -> Array:
+def _is_lost(start: Array, numbers: Array, left: Array) -> Array:
     """Return, for each member, whether Newton's method failed or found another solution."""
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
     return ~((left <= correction.usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
 
 
-def _found(
+def _orbits_or_error(
     numbers: Array, lost: Array, where: Callable[[int], str], what: str, advice: str
 ) -> PeriodicOrbit:
     """Return the members as orbits; raise an error if one was lost, with `where` of its number if
@@ -86,15 +86,15 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
     def step(last: Array, value: Scalar) -> Any:
         # The start of Newton's method has no derivative: the orbit found does not depend on it.
         last, aim = lax.stop_gradient(last), lax.stop_gradient(value)
-        guess = last[free] + _along(still, last, index) * (aim - last[index])
-        found, left = correction.corrected(index, tolerance, scene, guess, value)
-        numbers = correction.together(found, value, index)
+        guess = last[free] + _slope_along_family(still, last, index) * (aim - last[index])
+        found, left = correction.correct_orbit(index, tolerance, scene, guess, value)
+        numbers = correction.insert_held(found, value, index)
         return numbers, (numbers, left)
 
     # The guess is corrected first: the tangent is needed at an orbit.
     held_now = lax.stop_gradient(start[index])
-    found, _ = correction.corrected(index, tolerance, still, start[free], held_now)
-    _, out = lax.scan(step, correction.together(found, start[index], index), held)
+    found, _ = correction.correct_orbit(index, tolerance, still, start[free], held_now)
+    _, out = lax.scan(step, correction.insert_held(found, start[index], index), held)
     return out
 
 
@@ -110,24 +110,26 @@ def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> Period
     >>> round(float(hill.family_slope(orbit).period), 3)
     12.076
     """
-    change = _slope(scene, crossing(orbit), named(hold))
+    change = _slope(scene, crossing(orbit), index_of_held(hold))
     turned = ~jnp.isfinite(change.period)
     words = f"family_slope: the family has a fold in {hold} here; take another of x, z, vy, period"
     return _checks.refuse(change, turned, words)
 
 
-def _along(scene: Any, numbers: Array, index: int) -> Float[Array, "3"]:
+def _slope_along_family(scene: Any, numbers: Array, index: int) -> Float[Array, "3"]:
     """Return the derivative of the other three numbers of an orbit by the held number, along its
     family.
     """
-    _, matrix = correction.value_and_jacobian(lambda n: correction.miss(scene, n), numbers)
+    _, matrix = correction.value_and_jacobian(
+        lambda n: correction.periodicity_residual(scene, n), numbers
+    )
     return -jnp.linalg.solve(matrix[:, np.delete(np.arange(4), index)], matrix[:, index])
 
 
 @eqx.filter_jit
 def _slope(scene: Any, numbers: Array, index: int) -> PeriodicOrbit:
-    unknown = _along(scene, numbers, index)
-    change = orbit_of(correction.together(unknown, jnp.ones_like(unknown[0]), index))
+    unknown = _slope_along_family(scene, numbers, index)
+    change = orbit_of(correction.insert_held(unknown, jnp.ones_like(unknown[0]), index))
     # To hold `period` means the whole period; the fourth of `numbers` is half of it.
     return jax.tree.map(lambda leaf: 0.5 * leaf, change) if index == 3 else change
 
@@ -146,7 +148,7 @@ def follow(
     `ValueError` (`EquinoxRuntimeError` under `jit`) with the number of members found before the
     family was lost.
     """
-    start, index = crossing(orbit), named(rising)
+    start, index = crossing(orbit), index_of_held(rising)
     length = _checks.floating(step, (), "step").astype(start.dtype)
     bad = ~(jnp.isfinite(length) & (length != 0))
     length = _checks.refuse(length, bad, "step: wanted a number that is not 0")
@@ -156,15 +158,15 @@ def follow(
     numbers, left = _follow(scene, start, length, count, index, tolerance)
     moved = jnp.diff(jnp.concatenate([start[None], numbers]), axis=0)
     far = jnp.sqrt(jnp.sum(moved * moved, axis=1)) > 2 * jnp.abs(length)
-    lost = _lost(start, numbers, left) | far
+    lost = _is_lost(start, numbers, left) | far
     where = lambda i: f" after {i} of {count} members"  # noqa: E731
-    return _found(numbers, lost, where, "follow: lost", "; take smaller steps")
+    return _orbits_or_error(numbers, lost, where, "follow: lost", "; take smaller steps")
 
 
 @eqx.filter_jit
 def _follow(scene: Any, start: Array, step: Array, count: int, index: int, tolerance: float) -> Any:
     def missed(numbers: Array) -> Array:
-        return correction.miss(scene, numbers)
+        return correction.periodicity_residual(scene, numbers)
 
     def tangent(matrix: Array, before: Array) -> Array:
         """Return the unit direction in which the residual stays 0, on the side of `before`."""
@@ -225,7 +227,7 @@ def bifurcation(
     """
     from scipy.optimize import brentq
 
-    place = named(hold)
+    place = index_of_held(hold)
     if isinstance(index, bool) or index not in (0, 1):
         raise ValueError(f"index: wanted 0 or 1, which of the two stability indices, got {index!r}")
     value = _checks.number(value, "value")

@@ -65,7 +65,7 @@ def periodic_orbit(
     >>> round(float(orbit.period), 4)
     2.712
     """
-    numbers, index = crossing(guess), named(hold)
+    numbers, index = crossing(guess), index_of_held(hold)
     free = np.delete(np.arange(4), index)
     if tolerance is None:
         tolerance = usual_tolerance(numbers)
@@ -75,7 +75,7 @@ def periodic_orbit(
     words = f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
     words += "hold another of x, z, vy, period, or loosen the tolerance"
     unknown = _checks.refuse(unknown, bad, words)
-    found = together(unknown, numbers[index], index)
+    found = insert_held(unknown, numbers[index], index)
     # A half period of zero solves the equations of every start.
     ratio = found[3] / numbers[3]
     words = "periodic_orbit: Newton's method went from the guess to an orbit of less than half or "
@@ -84,7 +84,7 @@ def periodic_orbit(
     return orbit_of(found)
 
 
-def named(hold: str) -> int:
+def index_of_held(hold: str) -> int:
     """Return the index of `hold` among the four numbers of a crossing."""
     return _NAMES.index(_checks.word(hold, _NAMES, "hold"))
 
@@ -111,7 +111,7 @@ def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
     return PeriodicOrbit(Point(jnp.stack([x, zero, z]), jnp.stack([zero, vy, zero])), 2 * half)
 
 
-def together(unknown: Float[Array, "3"], held: Scalar, index: int) -> Float[Array, "4"]:
+def insert_held(unknown: Float[Array, "3"], held: Scalar, index: int) -> Float[Array, "4"]:
     """Return the four numbers of a crossing: the three unknown ones with the held one inserted at
     `index`.
     """
@@ -125,7 +125,7 @@ def usual_tolerance(numbers: Array) -> float:
     return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
 
 
-def solved(
+def integrate(
     scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **how: Any
 ) -> dfx.Solution:
     """Return the motion from 0 to `t`, with derivatives in forward mode.
@@ -139,11 +139,11 @@ def solved(
 
 
 @eqx.filter_jit
-def after(
+def state_after(
     scene: AbstractScene, numbers: Float[Array, "6"], t: Array, *, rtol: float, atol: float
 ) -> Float[Array, "6"]:
     """Return (x, v) at a time `t` after the state `numbers`; raise an error if the solve fails."""
-    out = solved(scene, Point(numbers[:3], numbers[3:]), t.astype(numbers.dtype), rtol, atol)
+    out = integrate(scene, Point(numbers[:3], numbers[3:]), t.astype(numbers.dtype), rtol, atol)
     end: Any = out.result.error_if(out.ys, out.result != dfx.RESULTS.successful)
     return jnp.concatenate([end.x[0], end.v[0]])
 
@@ -162,14 +162,14 @@ def transition(
 @eqx.filter_jit
 def _transition(scene: Any, numbers: Array, t: Array, rtol: float, atol: float) -> Array:
     # The tangents are solved along with the motion.
-    return jax.jacfwd(lambda n: after(scene, n, t, rtol=rtol, atol=atol))(numbers)
+    return jax.jacfwd(lambda n: state_after(scene, n, t, rtol=rtol, atol=atol))(numbers)
 
 
-def miss(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
+def periodicity_residual(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
     """Return y, v_x and v_z at the half period: an orbit is periodic if they vanish."""
     orbit = orbit_of(numbers)
     tight = float(jnp.finfo(numbers.dtype).eps)
-    out = solved(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight)
+    out = integrate(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight)
     end: Any = out.ys
     left = jnp.stack([end.x[0, 1], end.v[0, 0], end.v[0, 2]])
     return jnp.where(out.result == dfx.RESULTS.successful, left, jnp.nan)
@@ -205,23 +205,23 @@ def newton(f: Any, x: Array, tolerance: float) -> Array:
 # one rule serves jacfwd and grad, although the solves inside run in forward mode.
 @eqx.filter_jit
 def _solve(scene: Any, unknown: Array, held: Array, index: int, tolerance: float) -> Any:
-    return corrected(index, float(tolerance), scene, unknown, held)
+    return correct_orbit(index, float(tolerance), scene, unknown, held)
 
 
 @eqx.filter_custom_jvp
-def corrected(index: int, tolerance: float, scene: Any, unknown: Array, held: Array) -> Any:
+def correct_orbit(index: int, tolerance: float, scene: Any, unknown: Array, held: Array) -> Any:
     def missed(unknown: Array) -> Array:
-        return miss(scene, together(unknown, held, index))
+        return periodicity_residual(scene, insert_held(unknown, held, index))
 
     unknown = newton(missed, unknown, tolerance)
     return unknown, jnp.max(jnp.abs(missed(unknown)))
 
 
-@corrected.def_jvp
-def _corrected_jvp(primals: Any, tangents: Any) -> Any:
+@correct_orbit.def_jvp
+def _correct_orbit_jvp(primals: Any, tangents: Any) -> Any:
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents
-    found, left = corrected(index, tolerance, scene, unknown, held)
+    found, left = correct_orbit(index, tolerance, scene, unknown, held)
     # All derivatives of the residual are one matrix, so that the rule stays linear in the tangents
     # and can be transposed.
     numbers, rest = eqx.partition(scene, eqx.is_inexact_array)
@@ -231,7 +231,7 @@ def _corrected_jvp(primals: Any, tangents: Any) -> Any:
     def missed(flat: Array) -> Array:
         leaves, held, unknown = unflatten(flat)
         whole = eqx.combine(jax.tree.unflatten(tree, leaves), rest)
-        return miss(whole, together(unknown, held, index))
+        return periodicity_residual(whole, insert_held(unknown, held, index))
 
     matrix = jax.jacfwd(missed)(flat)
     paths = {path: dot for path, dot in jax.tree.leaves_with_path(scene_dot) if dot is not None}

@@ -1,7 +1,7 @@
 """Compute stable and unstable manifolds of periodic orbits."""
 
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import diffrax as dfx
 import equinox as eqx
@@ -15,11 +15,12 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.frames.point import Point
 from rigidjax.orbits import continuation
-from rigidjax.orbits.differential_correction import PeriodicOrbit, after, crossing, solved
+from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing, integrate, state_after
 from rigidjax.solve.run import Ends
 
 # A motion backwards in time is the mirror image in y → −y: x, y, z, vx, vy, vz.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+Branch = Literal["stable", "unstable"]
 _TIGHT = dict(rtol=1e-13, atol=1e-14)
 # Each step of inverse iteration reduces the error of an eigenvector to a hundredth at most.
 _ITERATIONS = 12
@@ -45,7 +46,7 @@ class Manifold(eqx.Module):
     multiplier: Float[Array, ""]
 
 
-def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]:
+def unstable_direction(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]:
     """Return the multiplier λ of an orbit with the largest size, and its eigenvector, of length 1.
 
     They are found from traces, inverse iteration and one bordered solve; they are NaN if no
@@ -82,30 +83,30 @@ def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]
     return jnp.where(free, value, jnp.nan), jnp.where(free, vector, jnp.nan)
 
 
-def branch(
-    scene: Any, orbit: PeriodicOrbit, phase: Scalar, which: str, side: int, distance: Scalar
+def manifold_point(
+    scene: Any, orbit: PeriodicOrbit, phase: Scalar, branch: Branch, side: int, distance: Scalar
 ) -> tuple[Point, Scalar]:
     """Return the start of the manifold at `phase`, and the multiplier: see `manifold_start`."""
-    _checks.word(which, ("stable", "unstable"), "which")
+    _checks.word(branch, ("stable", "unstable"), "branch")
     if isinstance(side, bool) or side not in (1, -1):
         raise ValueError(f"side: wanted 1 (to larger x at the orbit's start) or -1, got {side!r}")
     crossing(orbit)
-    return _branch(scene, orbit, phase, which, side, distance)
+    return _manifold_point(scene, orbit, phase, branch, side, distance)
 
 
 @eqx.filter_jit
-def _branch(
-    scene: Any, orbit: PeriodicOrbit, phase: Scalar, which: str, side: int, distance: Scalar
+def _manifold_point(
+    scene: Any, orbit: PeriodicOrbit, phase: Scalar, branch: Branch, side: int, distance: Scalar
 ) -> tuple[Point, Scalar]:
-    value, vector = unstable(scene.monodromy(orbit))
+    value, vector = unstable_direction(scene.monodromy(orbit))
     # The mirror image of the unstable manifold is the stable one, with the opposite phase.
-    turned = phase if which == "unstable" else -phase
+    turned = phase if branch == "unstable" else -phase
     turned = turned - lax.stop_gradient(jnp.floor(turned))
-    later = partial(after, scene, t=turned * orbit.period, **_TIGHT)
+    later = partial(state_after, scene, t=turned * orbit.period, **_TIGHT)
     start = jnp.concatenate([orbit.state.x, orbit.state.v])
     there, along = jax.jvp(later, (start,), (vector,))
     numbers = there + side * distance * along / jnp.sqrt(jnp.sum(along * along))
-    if which == "stable":
+    if branch == "stable":
         numbers = numbers * jnp.asarray(_MIRROR, numbers.dtype)
         value = 1 / value
     return Point(numbers[:3], numbers[3:]), value
@@ -114,7 +115,7 @@ def _branch(
 def manifold(
     scene: Any,
     orbit: PeriodicOrbit,
-    which: str,
+    branch: Branch,
     *,
     time: ScalarLike | None = None,
     side: int = 1,
@@ -124,7 +125,7 @@ def manifold(
 ) -> Manifold:
     """Return motions from an unstable periodic orbit, or towards it: its invariant manifolds.
 
-    **Arguments:** `orbit` as of `periodic_orbit`; `which` `"unstable"` (motions leave it) or
+    **Arguments:** `orbit` as of `periodic_orbit`; `branch` `"unstable"` (motions leave it) or
     `"stable"` (they approach it, and times decrease); `time` their length, two periods by default;
     `side` 1 for the branch that goes to larger x at the orbit's start, −1 for the other; `count` N
     motions, from equal phases of the orbit; `samples` T times of each; `distance` of the starts
@@ -145,21 +146,23 @@ def manifold(
     dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
     distance = _positive(distance, "distance", dtype)
     phases = jnp.arange(count).astype(distance.dtype) / count
-    starts, value = jax.vmap(lambda p: branch(scene, orbit, p, which, side, distance))(phases)
+    starts, value = jax.vmap(lambda p: manifold_point(scene, orbit, p, branch, side, distance))(
+        phases
+    )
     words = "manifold: the orbit has no multiplier that is real and larger than 1: it is stable to "
     words += "first order, or spirals"
     value = _checks.refuse(value[0], jnp.isnan(value[0]), words)
     length = 2 * orbit.period if time is None else _positive(time, "time", dtype)
     ts = jnp.linspace(jnp.zeros_like(length), length, samples)
-    states = _paths(scene, starts, ts, which)
-    return Manifold(ts if which == "unstable" else -ts, states, phases, value)
+    states = _manifold_trajectories(scene, starts, ts, branch)
+    return Manifold(ts if branch == "unstable" else -ts, states, phases, value)
 
 
 def manifold_start(
     scene: Any,
     orbit: PeriodicOrbit,
     phase: ScalarLike,
-    which: str,
+    branch: Branch,
     *,
     side: int = 1,
     distance: ScalarLike = 1e-5,
@@ -179,7 +182,7 @@ def manifold_start(
     dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
     where = _checks.time(phase, "phase").astype(dtype)
     away = _checks.floating(distance, (), "distance").astype(dtype)
-    return branch(scene, orbit, where, which, side, away)[0]
+    return manifold_point(scene, orbit, where, branch, side, away)[0]
 
 
 def _positive(value: ScalarLike, name: str, dtype: Any) -> Array:
@@ -188,19 +191,19 @@ def _positive(value: ScalarLike, name: str, dtype: Any) -> Array:
 
 
 @eqx.filter_jit
-def _paths(scene: Any, starts: Point, ts: Array, which: str) -> Point:
+def _manifold_trajectories(scene: Any, starts: Point, ts: Array, branch: Branch) -> Point:
     mirror = jnp.asarray(_MIRROR, ts.dtype)
-    turn = which == "stable"
+    turn = branch == "stable"
 
-    def seen(state: Point) -> Point:
-        # The mirror image runs forwards.
+    def mirror_if_stable(state: Point) -> Point:
+        # The stable manifold is integrated forwards in time as its mirror image.
         return Point(state.x * mirror[:3], state.v * mirror[3:]) if turn else state
 
     def path(start: Point) -> Point:
         how = dict(saveat=dfx.SaveAt(ts=ts), event=dfx.Event(Ends(scene)))
-        out = solved(scene, seen(start), ts[-1], 1e-11, 1e-12, **how)
+        out = integrate(scene, mirror_if_stable(start), ts[-1], 1e-11, 1e-12, **how)
         there: Any = jnp.isfinite(jnp.asarray(out.ts))[:, None]
         ys: Any = jax.tree.map(lambda leaf: jnp.where(there, leaf, jnp.nan), out.ys)
-        return jax.vmap(seen)(ys)
+        return jax.vmap(mirror_if_stable)(ys)
 
     return jax.vmap(path)(starts)

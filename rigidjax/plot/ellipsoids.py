@@ -38,7 +38,7 @@ def inertia_ellipsoid(
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
     ['x, m', 'x, m', 'y, m']
     """
-    best, drawn = _given(body, _checks.whole(samples, "samples", 0))
+    best, drawn = _body_and_samples(body, _checks.whole(samples, "samples", 0))
     solid = isinstance(best, MassProperties)
     size = 1.0 if solid else float(np.trace(np.asarray(best.second_moment)))
     if not size > 0:
@@ -60,7 +60,7 @@ def inertia_ellipsoid(
     return ax
 
 
-def _given(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
+def _body_and_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
     """Return the body, and bodies drawn from the Gaussian of a fit (a leading axis), or `None` if
     it is no fit.
     """

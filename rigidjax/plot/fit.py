@@ -30,7 +30,7 @@ def fit(
     count = len(record.readings)
     size, how = (max(6.2 * count, 7.5), 6), dict(squeeze=False, layout="constrained")
     figure, axes = plt.subplots(2, count, figsize=size, sharex=True, height_ratios=(2, 1), **how)
-    dense = _between(found, record, index)
+    dense = _fill_between_samples(found, record, index)
     for column, (reading, errors) in enumerate(zip(record.readings, left, strict=True)):
         upper, lower = axes[:, column]
         _one_sensor(upper, lower, record.t, reading, errors, dense, (seconds, rate, rate_unit))
@@ -44,7 +44,7 @@ def fit(
     return figure
 
 
-def _between(found: Any, record: Any, index: int) -> tuple[np.ndarray, Any] | None:
+def _fill_between_samples(found: Any, record: Any, index: int) -> tuple[np.ndarray, Any] | None:
     """Return the times and states between sparse samples of a free body, for a smooth line; else
     `None`.
     """

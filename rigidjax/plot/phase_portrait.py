@@ -47,7 +47,7 @@ def phase_portrait(
     for name, size in (("mass", ()), ("com", (3,)), ("gravity", (3,))):
         _checks.floating(getattr(_checks.instance(top, HeavyTop, "top"), name), size, f"top.{name}")
     levels = _checks.whole(levels, "levels", 1)
-    across, along, axis, weight, up = _symmetric(inertia, top)
+    across, along, axis, weight, up = _symmetric_top(inertia, top)
     m = style.matrices(style.attitudes(states))
     omega = np.einsum("tij,tj->ti", m, rows(states.omega, 3, "states.omega"))
     first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], states)
@@ -90,7 +90,7 @@ def phase_portrait(
     return ax
 
 
-def _symmetric(
+def _symmetric_top(
     inertia: Inertia, top: HeavyTop
 ) -> tuple[float, float, np.ndarray, float, np.ndarray]:
     """Return I₁, I₃, the body's axis (3,), m g l, and the upward direction (3,)."""

@@ -90,7 +90,7 @@ def polhode(
     ax.plot_wireframe(*(semi_axes[:, None, None] * style.ball()), rstride=4, cstride=6, **how)
     # All energies are equal if all moments are equal: there are no lines to draw.
     if i[2] - i[0] > 1e-9 * i[2]:
-        _others(ax, i, energies)
+        _draw_other_energies(ax, i, energies)
     how = dict(behind={"ls": (0, (1, 1)), "lw": 1.8}, label="this motion", zorder=5)
     style.around_ball(ax, pi, color=COLOURS[1], lw=2.6, **how)
     ax.plot(*pi[:1].T, color=COLOURS[1], marker="o", ms=6, ls="", label="start", zorder=6)
@@ -106,7 +106,7 @@ def polhode(
     return ax
 
 
-def _others(ax: Any, i: np.ndarray, energies: int) -> None:
+def _draw_other_energies(ax: Any, i: np.ndarray, energies: int) -> None:
     """Draw curves of equal energy on the unit momentum sphere."""
     import contourpy
 

@@ -70,10 +70,10 @@ def one_kernel(function: Function) -> Function:
     @jax.custom_jvp
     @functools.wraps(function)
     def call(*args: Any) -> Any:
-        return alone(*args)
+        return call_unbatched(*args)
 
     @jax.custom_batching.custom_vmap
-    def alone(*args: Any) -> Any:
+    def call_unbatched(*args: Any) -> Any:
         first = jax.tree.leaves(args)[0].ravel()[0]
         step = jnp.where(first == first, 1, 2)
         blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(plain, *args))
@@ -84,47 +84,47 @@ def one_kernel(function: Function) -> Function:
 
         return lax.while_loop(lambda c: c[0] < 1, turn, (jnp.zeros_like(step), args, blank))[2]
 
-    @alone.def_vmap
-    def _batched(size: int, batched: Any, *args: Any) -> Any:
+    @call_unbatched.def_vmap
+    def _call_batched(size: int, batched: Any, *args: Any) -> Any:
         del size
         axes = jax.tree.map(lambda b: 0 if b else None, tuple(batched))
         # JAX before 0.12 asks for this where only tangents are batched, too, and then nothing is.
-        some = any(jax.tree.leaves(batched))
-        out = jax.vmap(plain, axes)(*args) if some else plain(*args)
-        return out, jax.tree.map(lambda _: some, out)
+        is_batched = any(jax.tree.leaves(batched))
+        out = jax.vmap(plain, axes)(*args) if is_batched else plain(*args)
+        return out, jax.tree.map(lambda _: is_batched, out)
 
     @call.defjvp
     def _jvp(primals: Any, tangents: Any) -> Any:
         out, change = jax.jvp(plain, primals, tangents)
-        return batched_as(out, primals), change
+        return batch_as(out, primals), change
 
     return call  # pyright: ignore[reportReturnType]
 
 
 @jax.custom_jvp
-def batched_as(out: Any, args: Any) -> Any:
+def batch_as(out: Any, args: Any) -> Any:
     """Return `out` with every leaf batched if any leaf of `args` is batched.
 
     This repeats what the batching rule of `one_kernel` returns. Under `jit`, JAX takes the axes of
     a batch from the function and the values from the rule for its derivative. Where the two differ,
     arrays have wrong shapes, and no error is raised.
     """
-    return _grown(out, args)
+    return _broadcast(out, args)
 
 
-@batched_as.defjvp
-def _batched_as_jvp(primals: Any, tangents: Any) -> Any:
-    return batched_as(*primals), tangents[0]
+@batch_as.defjvp
+def _batch_as_jvp(primals: Any, tangents: Any) -> Any:
+    return batch_as(*primals), tangents[0]
 
 
 @jax.custom_batching.custom_vmap
-def _grown(out: Any, args: Any) -> Any:
+def _broadcast(out: Any, args: Any) -> Any:
     del args
     return out
 
 
-@_grown.def_vmap
-def _grown_batched(size: int, batched: Any, out: Any, args: Any) -> Any:
+@_broadcast.def_vmap
+def _broadcast_batched(size: int, batched: Any, out: Any, args: Any) -> Any:
     del args
     if not any(jax.tree.leaves(batched)):
         return out, batched[0]

@@ -39,7 +39,7 @@ def to_quaternion(angles: Vec3Like, sequence: str = "ZXZ") -> Quat:
     [0.0, 1.0, 0.0, 0.0]
     """
     axes, reverse = _axes(sequence)
-    first, second, third = map(_about, axes, _in_order(_angles(angles), reverse))
+    first, second, third = map(_rotation_about, axes, _in_order(_angles(angles), reverse))
     return quaternion.multiply(quaternion.multiply(first, second), third)
 
 
@@ -86,7 +86,7 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     q = near_one(*components(q)) * q
     symmetric = i == k
     last = 3 - i - j
-    handed = _handed(i, j)
+    handed = _handedness(i, j)
     w, x, y, z = q[0], q[1 + i], q[1 + j], q[1 + last]
     if symmetric:
         z = handed * z
@@ -186,14 +186,14 @@ def _axes(sequence: str) -> tuple[tuple[int, int, int], bool]:
     extrinsic = isinstance(sequence, str) and sequence.islower()
     letters = "xyz" if extrinsic else "XYZ"
     if not isinstance(sequence, str) or len(sequence) != 3 or not set(sequence) <= set(letters):
-        raise ValueError(_unknown(sequence, "three letters of one case are wanted"))
+        raise ValueError(_unknown_sequence(sequence, "three letters of one case are wanted"))
     i, j, k = (letters.index(letter) for letter in sequence)
     if i == j or j == k:
-        raise ValueError(_unknown(sequence, "two turns in a row are about one axis"))
+        raise ValueError(_unknown_sequence(sequence, "two turns in a row are about one axis"))
     return ((k, j, i) if extrinsic else (i, j, k)), extrinsic
 
 
-def _unknown(sequence: object, reason: str) -> str:
+def _unknown_sequence(sequence: object, reason: str) -> str:
     return (
         f"sequence: unknown {sequence!r}, {reason}; capitals are intrinsic (moving axes) as in "
         "'ZXZ' or 'ZYX', lower case is extrinsic (fixed axes) as in 'xyz'"
@@ -213,12 +213,12 @@ def _in_order(numbers: Vec3, reverse: bool) -> tuple[Scalar, Scalar, Scalar]:
     return (c, b, a) if reverse else (a, b, c)
 
 
-def _handed(i: int, j: int) -> int:
+def _handedness(i: int, j: int) -> int:
     """Return +1 if e_i × e_j is the third basis vector, −1 if it is the opposite vector."""
     return 1 if (j - i) % 3 == 1 else -1
 
 
-def _about(axis: int, angle: Scalar) -> Quat:
+def _rotation_about(axis: int, angle: Scalar) -> Quat:
     parts = [jnp.cos(0.5 * angle)] + [jnp.zeros_like(angle)] * 3
     parts[1 + axis] = jnp.sin(0.5 * angle)
     return jnp.stack(parts)
@@ -236,7 +236,7 @@ def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3
     """
     _, j, k = axes
     first, second, third = (jnp.eye(3, dtype=angles[0].dtype)[axis] for axis in axes)
-    middle, last = _about(j, angles[1]), _about(k, angles[2])
+    middle, last = _rotation_about(j, angles[1]), _rotation_about(k, angles[2])
     first = quaternion.rotate_inverse(last, quaternion.rotate_inverse(middle, first))
     return first, quaternion.rotate_inverse(last, second), third
 
@@ -244,7 +244,7 @@ def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3
 def _vanishing(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
     """Return the product first · (third × second) of the axes, and whether it is 0 to round-off."""
     i, j, k = axes
-    size = jnp.sin(middle) if i == k else -_handed(i, j) * jnp.cos(middle)
+    size = jnp.sin(middle) if i == k else -_handedness(i, j) * jnp.cos(middle)
     return size, jnp.abs(size) < 4 * jnp.finfo(middle.dtype).eps
 
 

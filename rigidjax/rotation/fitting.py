@@ -57,7 +57,7 @@ def project(matrix: Mat3Like) -> Mat3:
         if found <= 0:
             words = f"left-handed frame or singular, det = {found:.3g}; no rotation is nearest"
             raise ValueError(f"matrix: {words}")
-    return nearest(matrix)
+    return nearest_rotation(matrix)
 
 
 def wahba(
@@ -90,7 +90,7 @@ def wahba(
     # In one sum a light direction would lose its digits beside a heavy one.
     closer = jnp.where(heavy > 0, jnp.maximum(heavy, _LIGHT * jnp.max(heavy)), 0)
     try:
-        best = nearest(_weighted_sum(closer, those, these))
+        best = nearest_rotation(_weighted_sum(closer, those, these))
         for _ in range(4):
             best = _newton_step(best, heavy, those, these)
         # Each Newton step from the solution doubles the order to which derivatives are right.
@@ -210,7 +210,7 @@ def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
 
     fixed_q, fixed_w = lax.stop_gradient((q, w))
     chord = (fixed_w[:, None, None] * jax.vmap(quaternion.to_matrix)(fixed_q)).sum(0)
-    start = matrix_to_quaternion(nearest(chord))
+    start = matrix_to_quaternion(nearest_rotation(chord))
     start = lax.fori_loop(0, 6, lambda i, s: newton(i, s, fixed_q, fixed_w), start)
     # Each Newton step from the solution doubles the order to which derivatives are right.
     for i in range(2):
@@ -267,7 +267,7 @@ def _curvature(r: Mat3, b: Mat3) -> Mat3:
 
 
 @jax.custom_jvp
-def nearest(b: Mat3) -> Mat3:
+def nearest_rotation(b: Mat3) -> Mat3:
     """Return the rotation R with the largest Tr(Rᵀb), for a matrix of any size."""
     b = of_order_one(b)
     b = b / jnp.sqrt((b * b).sum())
@@ -283,10 +283,10 @@ def nearest(b: Mat3) -> Mat3:
     return quaternion.to_matrix(q)
 
 
-@nearest.defjvp
+@nearest_rotation.defjvp
 def _best_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     (b,), (db,) = primals, tangents
-    r = nearest(b)
+    r = nearest_rotation(b)
     # `b` may have any size: a common factor for `b` and `db` leaves the derivative unchanged.
     scale = near_one(jnp.max(jnp.abs(b)))
     b, db = scale * b, scale * db

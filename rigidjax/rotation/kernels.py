@@ -100,7 +100,7 @@ quaternion_to_vector = _compiled(_log)
 
 
 @_compiled
-def normalised(q: Quat) -> Quat:
+def to_unit_length(q: Quat) -> Quat:
     """Return the quaternion of length 1 in the direction of q."""
     q = near_one(*components(q)) * q
     return q / jnp.sqrt(square4(components(q)))

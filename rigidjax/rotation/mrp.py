@@ -34,7 +34,7 @@ def to_quaternion(sigma: Vec3Like) -> Quat:
     >>> to_quaternion(jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    sigma = _checks.given(sigma, (3,), "sigma")
+    sigma = _checks.finite_floating(sigma, (3,), "sigma")
     # Numerator and denominator are multiplied by the square of a power of two, `one`, so that
     # |σ|² does not overflow; the number 1 of the formula becomes `one`².
     one = jnp.minimum(near_one(*components(sigma)), 1)

@@ -37,9 +37,9 @@ from rigidjax.rotation.kernels import (
     hat_polynomial,
     is_noncanonical,
     matrix_to_quaternion,
-    normalised,
     product4,
     quaternion_to_vector,
+    to_unit_length,
     vector_to_quaternion,
 )
 from rigidjax.rotation.linalg3 import components, cross_components, dot, dot_components, near_one
@@ -239,7 +239,7 @@ def normalise(q: QuatLike) -> Quat:
     >>> normalise(jnp.array([0.0, 4.0, 0.0, 0.0])).tolist()
     [0.0, 1.0, 0.0, 0.0]
     """
-    return normalised(direction(_checks.floating(q, (4,), "q", hint=_HINT), "q"))
+    return to_unit_length(direction(_checks.floating(q, (4,), "q", hint=_HINT), "q"))
 
 
 def canonical(q: QuatLike) -> Quat:

@@ -39,7 +39,7 @@ def to_quaternion(g: Vec3Like) -> Quat:
     >>> to_quaternion(jnp.zeros(3)).tolist()
     [1.0, 0.0, 0.0, 0.0]
     """
-    g = _checks.given(g, (3,), "g")
+    g = _checks.finite_floating(g, (3,), "g")
     return quaternion.normalise(jnp.concatenate([jnp.ones_like(g[:1]), g]))
 
 

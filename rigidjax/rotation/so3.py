@@ -123,10 +123,10 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
     3.0
     """
     a, b = _checks.floating(a, (3, 3), "a"), _checks.floating(b, (3, 3), "b")
-    return quaternion.angle(matrix_to_quaternion(_between(a, b)))
+    return quaternion.angle(matrix_to_quaternion(_relative_rotation(a, b)))
 
 
-def _between(a: Mat3, b: Mat3) -> Mat3:
+def _relative_rotation(a: Mat3, b: Mat3) -> Mat3:
     between = product(a.T, b)
     if _checks.known(between):
         _checks.finite(between, "aᵀb")
@@ -237,7 +237,7 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     [0.540302, -0.841471, 0.0]
     """
     a, b = _checks.floating(a, (3, 3), "a"), _checks.floating(b, (3, 3), "b")
-    v = quaternion.log(matrix_to_quaternion(_between(a, b)))
+    v = quaternion.log(matrix_to_quaternion(_relative_rotation(a, b)))
     part = turn(_checks.floating(s, (), "s").astype(v.dtype) * v, "s times the turn")
     return product(a, vector_to_matrix(part))
 

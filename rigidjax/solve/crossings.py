@@ -33,9 +33,9 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.coupled import Coupled, started
+from rigidjax.motion.coupled import Coupled, with_own_states
 from rigidjax.motion.equations import on_the_group
-from rigidjax.motion.torques.base import lacking
+from rigidjax.motion.torques.base import missing_state_message
 from rigidjax.solve import crossing_loop, validation
 from rigidjax.solve.adaptive import taken_out
 from rigidjax.solve.adaptive_loop import Method, Run, first_step, of_body, outcome, tried
@@ -199,11 +199,11 @@ def crossings(
 
 def ready(event: Event, body: Any, state0: Any, torque: Any, t: Array) -> Any:
     """`state0` with the states of the torque; an error if the condition is no number there."""
-    state0 = started(body, state0, torque, t)
+    state0 = with_own_states(body, state0, torque, t)
     try:
         eqx.filter_eval_shape(value, event, body, t, state0)
     except AttributeError as wrong:
-        told = lacking("condition", wrong)
+        told = missing_state_message("condition", wrong)
         if told is None:
             raise
         raise TypeError(told) from wrong

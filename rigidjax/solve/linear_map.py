@@ -17,7 +17,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-from rigidjax.rotation.barrier import batched_as
+from rigidjax.rotation.barrier import batch_as
 
 Arrays = list[Any]
 Map = Callable[..., Arrays]
@@ -48,7 +48,7 @@ def as_known(known: Any, moved: Any) -> Any:
 
 @jax.custom_jvp
 def _known(known: Array, moved: Array) -> Array:
-    return batched_as(known, (known, moved))
+    return batch_as(known, (known, moved))
 
 
 @_known.defjvp
@@ -70,7 +70,7 @@ def nan_derivatives(tree: Any, inputs: Any) -> Any:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _with_nan(count: int, *numbers: Array) -> Arrays:
-    return batched_as(list(numbers[:count]), numbers)
+    return batch_as(list(numbers[:count]), numbers)
 
 
 @_with_nan.defjvp

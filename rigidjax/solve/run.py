@@ -20,7 +20,7 @@ from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of, started
+from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of, with_own_states
 from rigidjax.motion.equations import (
     AttitudeEquations,
     EulerEquations,
@@ -157,7 +157,7 @@ def solve(
         ys, stats, result = _free(setup, state0, ts)
     else:
         # With the states of the torque, where it has some.
-        state0 = started(setup.body, state0, setup.torque, ts[0])
+        state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
         scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
         watch = Ends(scene) if hasattr(scene, "ends") else None
         run: Any = _loop if isinstance(setup, Loop) else _by_diffrax
@@ -302,7 +302,7 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
     missed = stats.get("switches_missed", False)
     if not _checks.known((missed, state0, ts)) or not np.any(np.asarray(missed)):
         return
-    state0 = started(setup.body, state0, setup.torque, ts[0])
+    state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
     form = by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
     analysis = analysis_of(traced(lambda t, y: field(t, y, None), ts[0], state0).closed)
@@ -318,7 +318,7 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
 @eqx.filter_jit
 def _end_of(loop: Loop, state0: Any, ts: Array) -> Any:
     """Where a run ends: time, next step, number of steps, and state."""
-    state0 = started(loop.body, on_the_group(state0), loop.torque, ts[0])
+    state0 = with_own_states(loop.body, on_the_group(state0), loop.torque, ts[0])
     *_, stats, _, end = _loop(loop, None, state0, ts)
     return *end, stats["num_steps"]
 

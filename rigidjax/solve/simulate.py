@@ -229,7 +229,7 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
             state0 = ready(event, setup.body, state0, setup.torque, times[0])
             ys, stats, result, event_time, event_state = solve_until(setup, event, state0, times)
     except RuntimeError as error:
-        raise words_of_steps(setup, state0, times, _checks.bare(error)) from None
+        raise words_of_steps(setup, state0, times, _checks.own_sentence(error)) from None
     warn_of_missed(setup, state0, times, stats)
     if setup.throw and "ended" in stats:
         ys = refuse_ended(setup.torque, ys, stats, times)

@@ -16,7 +16,7 @@ from jaxtyping import Array
 from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, plus, times, turned_back
 from rigidjax.exact.derivatives import flow
 from rigidjax.exact.diffrax_solver import field_of
-from rigidjax.exact.principal_axes import into, out_of, principal_frame
+from rigidjax.exact.principal_axes import components_along, out_of, principal_frame
 from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import evaluate, sees_rate
@@ -184,7 +184,7 @@ def frame_of(field: Any, y0: Any) -> Frame:
 
 def enter(frame: Frame, omega: Array) -> Triple:
     """Π in principal axes."""
-    return times(frame.moments, into(frame.axes, omega))
+    return times(frame.moments, components_along(frame.axes, omega))
 
 
 def leave(frame: Frame, momentum: Triple) -> Array:
@@ -203,7 +203,9 @@ def compose(
             return change
         # A torque that says that it does not depend on the rate gets none.
         at = Attitude(q, jnp.full(3, jnp.nan, dtype))
-        torque = into(frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia))
+        torque = components_along(
+            frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia)
+        )
         return plus(change, tuple(weight * a for a in torque))
 
     # A loop, not twelve copies: the flow is long to compile.

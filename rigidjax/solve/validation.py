@@ -12,7 +12,7 @@ from jaxtyping import Array
 from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.validation import possible
+from rigidjax.body.validation import check_body
 from rigidjax.frames import AbstractScene, BodyInFrame, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -120,7 +120,7 @@ def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
     """The body; traced numbers of no real body are NaN, unless they may `throw`."""
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
-    return possible(body, tensor, body.mass if matter else None, throw)
+    return check_body(body, tensor, body.mass if matter else None, throw)
 
 
 def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:

@@ -203,7 +203,7 @@ def _only_reading(model: Model) -> Reading:
         raise ValueError("fit_light_curve: wanted one body, got several by name")
     if model.torque is not None:
         raise ValueError("fit_light_curve: wanted a free body, got a torque")
-    return stacking.one(readings[0], 0)
+    return stacking.pick_records(readings[0], 0)
 
 
 @eqx.filter_jit
@@ -243,7 +243,7 @@ def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
         if not np.isfinite(float(end.cost)):
             continue
         alias = _alias(model, end.x, float(end.cost))
-        if not any(_same(alias, other, SAME) for other in out):
+        if not any(_is_same_motion(alias, other, SAME) for other in out):
             out.append(alias)
     if not out:
         raise ValueError(
@@ -253,7 +253,7 @@ def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
     return out
 
 
-def _same(a: Alias, b: Alias, near: np.ndarray) -> bool:
+def _is_same_motion(a: Alias, b: Alias, near: np.ndarray) -> bool:
     """Return whether two motions are the same: of one mode, and `near` in the four logarithms."""
     one, other = (np.log([m.rotation, m.precession, *m.ratios]) for m in (a, b))
     return a.mode == b.mode and bool((np.abs(one - other) < near).all())
@@ -265,7 +265,7 @@ def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
     point = model.unpack(x)
     body, state0 = point.body, point.state0
     motion, t = exact.FreeBody(Inertia(tensor_of(body)), state0), model.records.t[0]
-    sensor = stacking.one(model.records.readings[0], 0).sensor
+    sensor = stacking.pick_records(model.records.readings[0], 0).sensor
 
     def at(now: Array) -> Array:
         state: Any = motion(now - t[0])
@@ -277,7 +277,7 @@ def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
 def _with_shape(best: Fit) -> Fit:
     """Return the fit with a covariance that allows for a body that is no ellipsoid."""
     linear: Any = best.linear
-    reading, weight = stacking.one(best.model.records.readings[0], 0), linear.weights[0][0]
+    reading, weight = stacking.pick_records(best.model.records.readings[0], 0), linear.weights[0][0]
     flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
     size = np.full(weight.shape, 1.0 / MAGNITUDE) if reading.sensor.unit == "mag" else flux
     n = np.asarray(_bisectors(best.x, best.model))
@@ -310,7 +310,7 @@ def _result(best: Fit, aliases: list[Alias], pairs: TwoFrequencies, cut: bool) -
     near = np.fmax(SAME, REACH * own)
     # Compare the costs of the search, which have one noise: the fit may have estimated another.
     first = _alias(best.model, best.x, aliases[0].cost)
-    others = [alias for alias in aliases if not _same(alias, first, near)]
+    others = [alias for alias in aliases if not _is_same_motion(alias, first, near)]
     # Misfits count for less if the errors are larger than the noise, or autocorrelated.
     count = int(best.model.records.readings[0].seen.sum())
     margin = MARGIN * max(1.0, 2.0 * first.cost / count) * max(best.correlation, 1.0)

@@ -71,7 +71,7 @@ class Geometric(AbstractScattering):
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
         p, _, more, _, _ = _sides(shape, sun, observer)
-        return 0.5 * math.pi * _over(more, p)
+        return 0.5 * math.pi * _ratio_or_zero(more, p)
 
 
 class LommelSeeliger(AbstractScattering):
@@ -93,7 +93,7 @@ class LommelSeeliger(AbstractScattering):
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
         p, q, more, w, rest = _sides(shape, sun, observer)
-        return math.pi * _over(more, p + q) * (1.0 - rest * _excess(w, rest))
+        return math.pi * _ratio_or_zero(more, p + q) * (1.0 - rest * _excess(w, rest))
 
 
 class Lambert(AbstractScattering):
@@ -149,9 +149,9 @@ def _sides(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
     across = dot(turned, apply(shape, turned)) * determinant(shape)
     same_side = pq > 0
     large = p * q + jnp.where(same_side, pq, -pq)
-    small = _over(across, large)
+    small = _ratio_or_zero(across, large)
     more, less = jnp.where(same_side, large, small), jnp.where(same_side, small, large)
-    rest = _over(2.0 * less, (p + q) * (p + q))
+    rest = _ratio_or_zero(2.0 * less, (p + q) * (p + q))
     return p, q, more, 1.0 - rest, rest
 
 
@@ -255,7 +255,7 @@ def _root(x: Scalar) -> Scalar:
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
-def _over(x: Scalar, y: Scalar) -> Scalar:
+def _ratio_or_zero(x: Scalar, y: Scalar) -> Scalar:
     """Return x/y, and 0 if y is 0."""
     is_positive = y > 0
     return jnp.where(is_positive, x / jnp.where(is_positive, y, 1.0), 0.0)

@@ -5,13 +5,13 @@ from typing import Any
 
 from rigidjax._checks import plain
 from rigidjax.workprecision.pareto import first_answers, front
-from rigidjax.workprecision.record import Record, listed
+from rigidjax.workprecision.record import Measurement, list_records
 
 _MARKS = "osv^<>DPX*hp8d"
 _COLOURS = {"ours": "tab20", "jax": "Set2", "peer": "Dark2"}
 
 
-def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
+def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
     """Draw the error against time, log–log: values on the left, gradients on the right, with the
     front marked.
 
@@ -28,7 +28,7 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
     **Raises:** `ModuleNotFoundError` if matplotlib is missing (`pip install 'rigidjax[view]'`);
     `ValueError` if there is nothing to draw.
     """
-    records = [r for r in listed(records) if r.error == r.error]
+    records = [r for r in list_records(records) if r.error == r.error]
     if not records:
         raise ValueError("draw: wanted records with an error and a time, got none")
     import matplotlib.pyplot as plt
@@ -48,14 +48,14 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
     labels = list(dict.fromkeys((r.label, r.group) for r in records))
     for row, name in zip(axes, names, strict=True):
         if asked:
-            _reached(row[-1], [r for r in asked if r.scene == name], labels)
+            _draw_reached_errors(row[-1], [r for r in asked if r.scene == name], labels)
             row[-1].set_title(plain(f"{name}: asked and reached"), fontsize=10)
         for axis, (kind, words, times) in zip(row, panels, strict=False):
             of = [r for r in times if (r.scene, r.kind) == (name, kind)]
             if not of:
                 axis.set_axis_off()
                 continue
-            _one(axis, of, labels)
+            _draw_times(axis, of, labels)
             what = "error of the attitude, rad" if kind == "value" else "relative error"
             if name in ("foucault", "arenstorf") and kind == "value":
                 what = "relative error of the place"
@@ -66,12 +66,14 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
     return figure
 
 
-def _places(records: list[Record]) -> tuple[list[float], list[float]]:
+def _places(records: list[Measurement]) -> tuple[list[float], list[float]]:
     """Return the errors and the times, ms."""
     return [max(r.error, 1e-16) for r in records], [1e3 * r.time for r in records]
 
 
-def _curves(records: list[Record], labels: list[tuple[str, str]]) -> Iterator[tuple[list, dict]]:
+def _curves(
+    records: list[Measurement], labels: list[tuple[str, str]]
+) -> Iterator[tuple[list, dict]]:
     """Yield the records of each method, from the smallest setting on, with the style of its
     line.
     """
@@ -93,7 +95,9 @@ def _curves(records: list[Record], labels: list[tuple[str, str]]) -> Iterator[tu
         )  # fmt: skip
 
 
-def _reached(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> None:
+def _draw_reached_errors(
+    axis: Any, records: list[Measurement], labels: list[tuple[str, str]]
+) -> None:
     for of, how in _curves(records, labels):
         axis.plot([r.setting for r in of], [max(r.error, 1e-16) for r in of], **how)
     wanted = sorted(r.setting for r in records)
@@ -102,7 +106,7 @@ def _reached(axis: Any, records: list[Record], labels: list[tuple[str, str]]) ->
     _dressed(axis)
 
 
-def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> None:
+def _draw_times(axis: Any, records: list[Measurement], labels: list[tuple[str, str]]) -> None:
     for of, how in _curves(records, labels):
         bars = [
             [max(1e3 * (r.time - r.time_low), 0.0) for r in of],

@@ -11,7 +11,13 @@ from typing import Any
 from rigidjax.workprecision import chart, pareto
 from rigidjax.workprecision.measurement import in_float32, long_drift, measure
 from rigidjax.workprecision.peers import methods
-from rigidjax.workprecision.record import Record, kept, moved, read_csv, write_csv
+from rigidjax.workprecision.record import (
+    Measurement,
+    differences,
+    read_csv,
+    records_to_store,
+    write_csv,
+)
 from rigidjax.workprecision.standard_scenes import scenes
 
 STORED = Path("tests/workprecision/record.csv")
@@ -78,14 +84,14 @@ def run(options: argparse.Namespace) -> int:
         if options.thin < 1:
             raise ValueError(f"--thin: wanted 1 or more, got {options.thin}")
         before = None if options.check is None else read_csv(options.check)
-        records = _measured(options) if options.stored is None else read_csv(options.stored)
+        records = _measure(options) if options.stored is None else read_csv(options.stored)
         if options.stored is not None and options.scene:
             records = [r for r in records if r.scene in options.scene]
         if options.csv is not None:
             write_csv(records, options.csv)
             print(f"records: {options.csv}")
         if options.keep is not None:
-            write_csv(kept(records), options.keep)
+            write_csv(records_to_store(records), options.keep)
             print(f"kept: {options.keep}")
         print(summary(records))
         timed = [r for r in records if not r.scene.startswith(DRIFT)]
@@ -99,16 +105,16 @@ def run(options: argparse.Namespace) -> int:
         return 2
     if before is None:
         return 0
-    wrong, paced = moved(records, before)
+    wrong, paced = differences(records, before)
     lines = [*(f"moved: {line}" for line in wrong), *(f"time: {line}" for line in paced)]
     print("\n".join(lines or ["nothing moved"]))
     return 1 if wrong else 0
 
 
-def _measured(options: argparse.Namespace) -> list[Record]:
+def _measure(options: argparse.Namespace) -> list[Measurement]:
     quick = options.quick or options.check is not None or options.keep is not None
     names = options.scene or (QUICK if quick else [n for n, m in scenes().items() if not m().slow])
-    found: list[Record] = []
+    found: list[Measurement] = []
     begin = time.perf_counter()
 
     def say(line: str) -> None:
@@ -131,7 +137,7 @@ def _measured(options: argparse.Namespace) -> list[Record]:
     return found
 
 
-def summary(records: Iterable[Record]) -> str:
+def summary(records: Iterable[Measurement]) -> str:
     """Return, scene by scene, the time to each wanted error, µs; * marks the front, + the front of
     JAX alone.
     """
@@ -159,7 +165,7 @@ def summary(records: Iterable[Record]) -> str:
     return "\n".join(lines)
 
 
-def _drifts(scene: str, records: list[Record]) -> list[str]:
+def _drifts(scene: str, records: list[Measurement]) -> list[str]:
     head = f"\n{scene}: largest drift of energy, of momentum along gravity; s"
     return [head] + [
         f"  {r.label:38s} h = {r.setting:<5g} {r.energy:10.1e} {r.momentum:10.1e} {r.time:10.2f}"

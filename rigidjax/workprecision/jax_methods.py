@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax.exact import FreeBody
 from rigidjax.solve import adaptive, equations_of_motion, fixed, simulate, solvers
-from rigidjax.workprecision.scene import Method, Ready, Scene
+from rigidjax.workprecision.scene import Ready, Scene, TimedMethod
 
 TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 EIGHT = (40, 60, 80, 120, 170, 240, 340, 480, 680, 1000)
@@ -108,7 +108,7 @@ def _in_diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
 
     def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
         field = equations_of_motion(body, start, scene.torque)
-        return _solved(field, None, start, solver, adjoint, setting, scene.end)
+        return _solve_field(field, None, start, solver, adjoint, setting, scene.end)
 
     return flow_of(scene, run)
 
@@ -130,13 +130,13 @@ def _diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
         def field(t: Any, y: Any, constants: Any) -> Any:
             return by_hand(t, y, *constants)
 
-        ys, steps = _solved(field, constants, start, solver, adjoint, setting, scene.end)
+        ys, steps = _solve_field(field, constants, start, solver, adjoint, setting, scene.end)
         return ys[-1], steps
 
     return flow
 
 
-def _solved(
+def _solve_field(
     field: Any, args: Any, start: Any, solver: Any, adjoint: Any, setting: Any, end: float
 ) -> tuple[Any, Any]:
     out = dfx.diffeqsolve(
@@ -148,7 +148,7 @@ def _solved(
     return out.ys, out.stats["num_steps"]
 
 
-def _ready(make: Make, take: Any, scene: Scene) -> Ready | None:
+def _prepare(make: Make, take: Any, scene: Scene) -> Ready | None:
     """Return the flow prepared for a scene, or with `take` its gradient of the scene's scalar;
     `None` if it cannot run.
     """
@@ -172,7 +172,7 @@ def _ready(make: Make, take: Any, scene: Scene) -> Ready | None:
         raise
 
 
-def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Method:
+def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> TimedMethod:
     """Return any `diffrax` solver as a method, with a step controller, on equations written by
     hand.
 
@@ -191,39 +191,41 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Me
         "backsolve": (dfx.BacksolveAdjoint(), jax.grad),
     }
     slopes = {
-        name: partial(_ready, partial(_diffrax, solver=solver, adjoint=adjoint), take)
+        name: partial(_prepare, partial(_diffrax, solver=solver, adjoint=adjoint), take)
         for name, (adjoint, take) in ways.items()
     }
-    value = partial(_ready, partial(_diffrax, solver=solver), None)
+    value = partial(_prepare, partial(_diffrax, solver=solver), None)
     name = f"diffrax {type(solver).__name__}"
-    return Method(name, "jax", TOLERANCES, value, slopes if gradients else {})
+    return TimedMethod(name, "jax", TOLERANCES, value, slopes if gradients else {})
 
 
-def _ours(name: str, settings: Any, make: Make, modes: Any = (), equal: bool = False) -> Method:
-    slopes = {mode: partial(_ready, make, MODES[mode]) for mode in modes}
-    return Method(name, "ours", settings, partial(_ready, make, None), slopes, equal)
+def _own_method(
+    name: str, settings: Any, make: Make, modes: Any = (), equal: bool = False
+) -> TimedMethod:
+    slopes = {mode: partial(_prepare, make, MODES[mode]) for mode in modes}
+    return TimedMethod(name, "ours", settings, partial(_prepare, make, None), slopes, equal)
 
 
-def methods_in_jax() -> list[Method]:
+def methods_in_jax() -> list[TimedMethod]:
     """Return our methods and diffrax's, in the order of the charts."""
     eight = solvers.DormandPrince8()
     equal = ((EIGHT, eight), (FOUR, solvers.RungeKutta4()))
     equal += ((EIGHT, solvers.Splitting4()), (EIGHT, solvers.Splitting6()))
     five, there = solvers.Tsitouras5(), partial(_in_diffrax, solver=eight)
     return [
-        _ours("closed form", (0.0,), _closed, MODES),
-        _ours("simulate", TOLERANCES, _simulate, MODES),
-        _ours("simulate, accuracy", TOLERANCES, partial(_simulate, accuracy=True)),
-        _ours("DormandPrince8", TOLERANCES, partial(_adaptive, solver=eight), MODES),
-        _ours("Tsitouras5", TOLERANCES, partial(_adaptive, solver=five)),
+        _own_method("closed form", (0.0,), _closed, MODES),
+        _own_method("simulate", TOLERANCES, _simulate, MODES),
+        _own_method("simulate, accuracy", TOLERANCES, partial(_simulate, accuracy=True)),
+        _own_method("DormandPrince8", TOLERANCES, partial(_adaptive, solver=eight), MODES),
+        _own_method("Tsitouras5", TOLERANCES, partial(_adaptive, solver=five)),
         *(
-            _ours(
+            _own_method(
                 f"{type(solver).__name__}, equal steps", counts,
                 partial(equal_steps, solver=solver), equal=True,
             )
             for counts, solver in equal
         ),
-        _ours("DormandPrince8 in diffeqsolve", TOLERANCES, there),
+        _own_method("DormandPrince8 in diffeqsolve", TOLERANCES, there),
         diffrax_method(dfx.Tsit5()),
         diffrax_method(dfx.Dopri8(), gradients=True),
     ]  # fmt: skip

@@ -20,8 +20,8 @@ from rigidjax.motion.torques import HeavyTop
 from rigidjax.solve import fixed, solvers
 from rigidjax.workprecision import peers as known
 from rigidjax.workprecision.jax_methods import equal_steps
-from rigidjax.workprecision.record import Record
-from rigidjax.workprecision.scene import Method, Ready, Reference, Scene, distance
+from rigidjax.workprecision.record import Measurement
+from rigidjax.workprecision.scene import Ready, Reference, Scene, TimedMethod, distance
 
 # Runs longer than LONG, s, are timed three times; runs shorter than SHORT are timed three times as
 # often as the others.
@@ -45,21 +45,21 @@ _PARTS = ("body", "state0", "torque")
 
 
 class _Job(NamedTuple):
-    record: Record
+    record: Measurement
     ready: Ready
     times: list[float]
 
 
 def measure(
     scene: Scene,
-    methods: Iterable[Method] | None = None,
+    methods: Iterable[TimedMethod] | None = None,
     *,
-    peers: Iterable[Method] = (),
+    peers: Iterable[TimedMethod] = (),
     gradients: bool = True,
     thin: int = 1,
     rounds: int = 5,
     progress: Callable[[str], None] | None = None,
-) -> list[Record]:
+) -> list[Measurement]:
     """Return the error and cost of each method at each of its settings, of the value and of its
     gradient.
 
@@ -71,13 +71,15 @@ def measure(
     `gradients` whether gradients are measured, too; `thin` takes every `thin`-th setting; `rounds`
     the least number of timings of each run; `progress` is called with a line of text.
 
-    **Raises:** `TypeError` for something that is no `Scene` or `Method`.
+    **Raises:** `TypeError` for something that is no `Scene` or `TimedMethod`.
     """
     made = 'standard ones are made by rj.workprecision.scenes()["heavy-top"]()'
     _checks.instance(scene, Scene, "scene", wanted="a Scene", hint=made)
     chosen = [*(known.methods() if methods is None else methods), *peers]
     for method in chosen:
-        _checks.instance(method, Method, "methods", wanted="Methods")
+        _checks.instance(
+            method, TimedMethod, "methods", wanted="methods of workprecision.methods()"
+        )
     right = scene.reference if scene.reference is not None else worked_out(scene, gradients)
     jobs: list[_Job] = []
     for method in chosen:
@@ -91,7 +93,7 @@ def measure(
                 progress(f"{scene.name}: {method.name} {adjoint or 'value'}")
             for setting in _settings(scene, method, thin * (2 if adjoint else 1)):
                 jobs += _looked_at(scene, method, adjoint, setting, ready, right)
-    _timed(jobs, rounds)
+    _time_jobs(jobs, rounds)
     found = []
     for job in jobs:
         low, middle, high = (float(p) for p in np.percentile(job.times[1:], [25, 50, 75]))
@@ -148,7 +150,7 @@ def _turn(scene: Scene) -> float:
     return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
 
 
-def _settings(scene: Scene, method: Method, thin: int) -> list[float]:
+def _settings(scene: Scene, method: TimedMethod, thin: int) -> list[float]:
     found = list(method.settings)[::-1][::thin][::-1]
     if method.equal:
         return [float(round(s * _turn(scene) / 50)) for s in found]
@@ -158,7 +160,7 @@ def _settings(scene: Scene, method: Method, thin: int) -> list[float]:
 
 
 def _looked_at(
-    scene: Scene, method: Method, adjoint: str, setting: float, ready: Ready, right: Reference
+    scene: Scene, method: TimedMethod, adjoint: str, setting: float, ready: Ready, right: Reference
 ) -> list[_Job]:
     ready.run(setting)
     begin = time.perf_counter()
@@ -167,7 +169,7 @@ def _looked_at(
     errors = (_gradient_errors if adjoint else _errors)(scene, end, right)
     if not errors["error"] < WRONG:
         return []
-    record = Record(
+    record = Measurement(
         scene.name, method.name, method.group, "gradient" if adjoint else "value", adjoint,
         setting, steps=float(steps), compile=ready.compile, memory=ready.memory, **errors,
     )  # fmt: skip
@@ -213,7 +215,7 @@ def drifts(scene: Scene, end: Any) -> tuple[float, float]:
     return float(away.get("energy", jnp.nan)), max(momenta, default=float("nan"))
 
 
-def _timed(jobs: list[_Job], rounds: int) -> None:
+def _time_jobs(jobs: list[_Job], rounds: int) -> None:
     for turn in range(3 * rounds):
         for job in jobs:
             first = job.times[0]
@@ -234,7 +236,7 @@ def long_drift(
     only: Sequence[str] | None = None,
     *,
     progress: Callable[[str], None] | None = None,
-) -> list[Record]:
+) -> list[Measurement]:
     """Return the largest drift of energy and momentum over `steps` equal steps of an asymmetric
     heavy top.
 
@@ -271,7 +273,7 @@ def long_drift(
             if not np.isfinite(list(away.values())).all():
                 raise FloatingPointError(f"long_drift: {name} gave no numbers: {away}")
             found.append(
-                Record(
+                Measurement(
                     scene, f"{name}, equal steps", "ours", "value", "", h, error=away["energy"],
                     energy=away["energy"], momentum=away["momentum_along_axis"],
                     steps=float(count), time=spent, time_low=spent, time_high=spent,

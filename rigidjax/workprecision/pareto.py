@@ -7,24 +7,24 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from rigidjax import _checks
-from rigidjax.workprecision.record import Record, listed
+from rigidjax.workprecision.record import Measurement, list_records
 
 WANTED = (1e-4, 1e-7, 1e-10)
 
 
-def front(records: Iterable[Record]) -> list[Record]:
+def front(records: Iterable[Measurement]) -> list[Measurement]:
     """Return the records of one scene and kind on the Pareto front of error and time.
 
     A record is compared with the curves of the others, log–log between their settings, not only
     with the measured points. The records are returned by falling error.
     """
-    records = [r for r in listed(records) if r.error == r.error and r.time == r.time]
+    records = [r for r in list_records(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
     if len(kinds) > 1:
         words = f"front: wanted records of one scene and kind, got {sorted(kinds)}"
         raise ValueError(f"{words}; pick them first")
     curves = [[r for r in records if r.label == n] for n in dict.fromkeys(r.label for r in records)]
-    best: list[Record] = []
+    best: list[Measurement] = []
     for record in sorted(records, key=lambda r: (r.time, r.error)):
         if best and record.error >= best[-1].error:
             continue
@@ -33,16 +33,16 @@ def front(records: Iterable[Record]) -> list[Record]:
     return best
 
 
-def first_answers(records: Iterable[Record]) -> list[Record]:
+def first_answers(records: Iterable[Measurement]) -> list[Measurement]:
     """Return the records with the time that a first answer takes: compiling and one run."""
     return [
         dataclasses.replace(r, time=r.time + c, time_low=r.time_low + c, time_high=r.time_high + c)
-        for r in listed(records)
+        for r in list_records(records)
         for c in [r.compile if r.compile == r.compile else 0.0]
     ]
 
 
-def time_to(records: Iterable[Record], error: float) -> float:
+def time_to(records: Iterable[Measurement], error: float) -> float:
     """Return the time, s, that the method of these records takes to an error, interpolated log–log
     between its settings.
 
@@ -50,7 +50,7 @@ def time_to(records: Iterable[Record], error: float) -> float:
     reaches the error.
     """
     error = _checks.positive(error, "error")
-    rungs = sorted((r for r in listed(records) if r.error == r.error), key=lambda r: r.time)
+    rungs = sorted((r for r in list_records(records) if r.error == r.error), key=lambda r: r.time)
     # Errors need not fall with every setting: only the least error up to a time counts.
     least, seen = math.inf, []
     for record in rungs:
@@ -92,7 +92,7 @@ class Choice(NamedTuple):
     peer_time: float
 
 
-def choose(records: Iterable[Record], wanted: Sequence[float] = WANTED) -> list[Choice]:
+def choose(records: Iterable[Measurement], wanted: Sequence[float] = WANTED) -> list[Choice]:
     """Return, for each scene and wanted error, the quickest method of ours, and a quicker peer if
     there is one.
 
@@ -101,13 +101,13 @@ def choose(records: Iterable[Record], wanted: Sequence[float] = WANTED) -> list[
     >>> choose([])
     []
     """
-    records = listed(records)
+    records = list_records(records)
     scenes = dict.fromkeys(r.scene for r in records)
     return [_choice([r for r in records if r.scene == s], s, e) for s in scenes for e in wanted]
 
 
-def _choice(here: list[Record], scene: str, error: float) -> Choice:
-    values, slopes = quickest(here, "value", error), quickest(here, "gradient", error)
+def _choice(here: list[Measurement], scene: str, error: float) -> Choice:
+    values, slopes = times_by_method(here, "value", error), times_by_method(here, "gradient", error)
     ours = {r.label for r in here if r.group == "ours"}
 
     def first(times: dict[str, float], own: bool = True) -> tuple[str, float]:
@@ -122,7 +122,7 @@ def _choice(here: list[Record], scene: str, error: float) -> Choice:
     return Choice(scene, error, *best, *first(slopes), *defaults, *elsewhere)
 
 
-def quickest(records: Iterable[Record], kind: str, error: float) -> dict[str, float]:
+def times_by_method(records: Iterable[Measurement], kind: str, error: float) -> dict[str, float]:
     """Return the time to an error of each method that reaches it, label → s, the quickest first."""
     of = [r for r in records if r.kind == kind]
     times = {

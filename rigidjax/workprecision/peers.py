@@ -17,7 +17,7 @@ import numpy as np
 from rigidjax import _checks
 from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.workprecision.jax_methods import methods_in_jax
-from rigidjax.workprecision.scene import Method, Ready, Scene
+from rigidjax.workprecision.scene import Ready, Scene, TimedMethod
 
 TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
 TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
@@ -34,7 +34,7 @@ def _written_out(scene: Scene) -> bool:
     return scene.plain is not None
 
 
-def _weighed(scene: Scene) -> bool:
+def _has_weight(scene: Scene) -> bool:
     return scene.notes is not None and "com" in scene.notes and scene.body is not None
 
 
@@ -65,7 +65,7 @@ def _peer(module: str, can: Callable[[Scene], bool] = _written_out) -> Callable[
     return wrapped
 
 
-def _stepped(end: float, start: np.ndarray, f: Any) -> Any:
+def _run_of_stepper(end: float, start: np.ndarray, f: Any) -> Any:
     from scipy.integrate import DOP853
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -83,7 +83,7 @@ def _stepped(end: float, start: np.ndarray, f: Any) -> Any:
 @_peer("scipy.integrate")
 def _scipy(scene: Scene, numbers: np.ndarray, start: np.ndarray, _: Any) -> Any:
     rates = _rates(scene, numbers)
-    return _stepped(scene.end, start, lambda t, y: np.array(rates(t, y)))
+    return _run_of_stepper(scene.end, start, lambda t, y: np.array(rates(t, y)))
 
 
 @_peer("numba")
@@ -95,10 +95,10 @@ def _numba(scene: Scene, numbers: np.ndarray, start: np.ndarray, numba: Any) -> 
         return np.array(rates(t, y))
 
     f(0.0, start)
-    return _stepped(scene.end, start, f)
+    return _run_of_stepper(scene.end, start, f)
 
 
-@_peer("mujoco", _weighed)
+@_peer("mujoco", _has_weight)
 def _mujoco(scene: Scene, numbers: np.ndarray, start: np.ndarray, mujoco: Any) -> Any:
     """Return the run of a body on a ball joint by MuJoCo's own Runge–Kutta 4; tops and free bodies
     only.
@@ -139,7 +139,7 @@ def _system(scene: Scene, hy: Any, numbers: Any) -> Any:
     return list(zip(variables, rates, strict=True))
 
 
-def _propagated(hy: Any, end: float, start: np.ndarray, system: Any, **how: Any) -> Any:
+def _run_of_propagator(hy: Any, end: float, start: np.ndarray, system: Any, **how: Any) -> Any:
     """Return the run tolerance → (state at the end, steps). Order and code depend on the tolerance:
     each is compiled.
     """
@@ -161,11 +161,11 @@ def _propagated(hy: Any, end: float, start: np.ndarray, system: Any, **how: Any)
 @_peer("heyoka")
 def _taylor(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> Any:
     system = _system(scene, hy, list(map(float, numbers)))
-    return _propagated(hy, scene.end, start, system)
+    return _run_of_propagator(hy, scene.end, start, system)
 
 
 @_peer("heyoka")
-def _varied(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> Any:
+def _variational(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> Any:
     """Return the run of the variational equations by initial state and inertia, contracted with the
     scalar's gradient.
     """
@@ -174,7 +174,9 @@ def _varied(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> An
     system = _system(scene, hy, [*symbols, *numbers[size:]] if size else symbols)
     flavour = hy.var_args.vars | hy.var_args.params if size else hy.var_args.vars
     varied = hy.var_ode_sys(system, flavour, order=1)
-    end_of = _propagated(hy, scene.end, start, varied, pars=numbers[:size], compact_mode=True)
+    end_of = _run_of_propagator(
+        hy, scene.end, start, varied, pars=numbers[:size], compact_mode=True
+    )
     n = len(start)
     chain = np.asarray(jax.jacfwd(lambda p: scene.flat(scene.assembled(p)[1]))(scene.numbers))
     pull = jax.jit(jax.grad(scene.loss))
@@ -216,7 +218,7 @@ class _Ensemble:
 
 
 @_peer("gradsolve", _in_double)
-def _recorded(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any) -> Any:
+def _solve_and_record(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any) -> Any:
     ensemble = _Ensemble(scene, numbers, start, module)
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -228,7 +230,7 @@ def _recorded(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any)
 
 
 @_peer("gradsolve", _in_double)
-def _replayed(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any) -> Any:
+def _replay(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any) -> Any:
     """Return the run of the gradient through recorded steps; the recording is made once, and not
     timed.
     """
@@ -255,24 +257,28 @@ def _replayed(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any)
     return run
 
 
-def methods_outside() -> list[Method]:
+def methods_outside() -> list[TimedMethod]:
     """Return the peers that can be imported here, of SciPy, numba, MuJoCo, heyoka and gradsolve.
 
     heyoka.py's adaptive Taylor method: Biscani and Izzo 2021, doi:10.1093/mnras/stab1032.
     gradsolve's replay of the recorded steps of Verner's method of order 7: arXiv:2609.02876.
     """
     peers = {
-        "scipy": Method("scipy DOP853", "peer", TOLERANCES, _scipy),
-        "numba": Method("scipy DOP853, numba", "peer", TOLERANCES, _numba),
-        "mujoco": Method("MuJoCo RK4", "peer", STEPS, _mujoco),
-        "heyoka": Method("heyoka Taylor", "peer", TAYLOR, _taylor, {"variational": _varied}),
+        "scipy": TimedMethod("scipy DOP853", "peer", TOLERANCES, _scipy),
+        "numba": TimedMethod("scipy DOP853, numba", "peer", TOLERANCES, _numba),
+        "mujoco": TimedMethod("MuJoCo RK4", "peer", STEPS, _mujoco),
+        "heyoka": TimedMethod(
+            "heyoka Taylor", "peer", TAYLOR, _taylor, {"variational": _variational}
+        ),
     }
-    replay = Method("gradsolve Vern7", "peer", TOLERANCES, _recorded, {"replay": _replayed})
+    replay = TimedMethod(
+        "gradsolve Vern7", "peer", TOLERANCES, _solve_and_record, {"replay": _replay}
+    )
     peers["gradsolve"] = replay
     return [method for name, method in peers.items() if importlib.util.find_spec(name)]
 
 
-def methods(group: str | None = None) -> list[Method]:
+def methods(group: str | None = None) -> list[TimedMethod]:
     """Return the methods that can be compared here: ours, others in JAX, and the peers installed.
 
     **Arguments:** `group` `ours`, `jax` or `peer` for those alone.

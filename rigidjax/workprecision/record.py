@@ -18,7 +18,7 @@ BASE = "diffrax Dopri8"
 
 
 @dataclasses.dataclass(frozen=True)
-class Record:
+class Measurement:
     """Hold the errors and the cost of one method at one setting on one scene.
 
     **Fields:** `scene`, `method` names; `group` `ours`, `jax` or `peer`; `kind` `value` or
@@ -64,42 +64,47 @@ class Record:
 _WORDS = ("scene", "method", "group", "kind", "adjoint")
 
 
-def listed(records: Iterable[Record], name: str = "records") -> list[Record]:
+def list_records(records: Iterable[Measurement], name: str = "records") -> list[Measurement]:
     """Return the records as a list. **Raises:** `TypeError` if something else is among them."""
     _checks.instance(records, Iterable, name, wanted="records")
     found = list(records)
     for record in found:
-        _checks.instance(record, Record, name)
+        _checks.instance(record, Measurement, name)
     return found
 
 
-def write_csv(records: Iterable[Record], path: str | Path) -> None:
+def write_csv(records: Iterable[Measurement], path: str | Path) -> None:
     """Write records to a file, one line each under a header; NaN is left empty."""
     with Path(path).open("w", newline="") as file:
         rows = csv.writer(file)
-        rows.writerow(field.name for field in dataclasses.fields(Record))
+        rows.writerow(field.name for field in dataclasses.fields(Measurement))
         for values in map(dataclasses.astuple, records):
             shown = (f"{v:.6g}" if isinstance(v, float) and v == v else v for v in values)
             rows.writerow("" if v != v else v for v in shown)
 
 
-def read_csv(path: str | Path) -> list[Record]:
+def read_csv(path: str | Path) -> list[Measurement]:
     """Return the records of a file that `write_csv` wrote. **Raises:** `ValueError` for another
     file.
     """
     with Path(path).open(newline="") as file:
-        rows, names = csv.DictReader(file), [field.name for field in dataclasses.fields(Record)]
+        rows, names = (
+            csv.DictReader(file),
+            [field.name for field in dataclasses.fields(Measurement)],
+        )
         lacks = set(names) - set(rows.fieldnames or ())
         if lacks:
             words = f"{path}: wanted the columns of a file of records, lacks "
             raise ValueError(words + ", ".join(sorted(lacks)))
         return [
-            Record(**{n: row[n] if n in _WORDS else float(row[n] or "nan") for n in names})  # pyright: ignore
+            Measurement(**{n: row[n] if n in _WORDS else float(row[n] or "nan") for n in names})  # pyright: ignore
             for row in rows
         ]
 
 
-def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str], list[str]]:
+def differences(
+    records: Iterable[Measurement], stored: Iterable[Measurement]
+) -> tuple[list[str], list[str]]:
     """Return sentences about the differences of two tables: (changed errors or steps, changed
     times).
 
@@ -108,7 +113,7 @@ def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str
     that of `diffrax Dopri8` on the same scene at common settings, that changed by more than a
     factor of 2.
     """
-    records, stored = listed(records), listed(stored, "stored")
+    records, stored = list_records(records), list_records(stored, "stored")
     now = {_key(r): r for r in records if r.group != "peer"}
     then = {_key(r): r for r in stored if r.group != "peer"}
     wrong, paced = [], []
@@ -132,7 +137,7 @@ def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str
     return wrong, paced
 
 
-def kept(records: Iterable[Record]) -> list[Record]:
+def records_to_store(records: Iterable[Measurement]) -> list[Measurement]:
     """Return the records of a stored table: no peers, and times as multiples of the median time of
     `BASE`.
     """
@@ -148,15 +153,15 @@ def kept(records: Iterable[Record]) -> list[Record]:
     ]  # fmt: skip
 
 
-def _key(record: Record) -> tuple[str, ...]:
+def _key(record: Measurement) -> tuple[str, ...]:
     return (record.scene, record.kind, record.label, f"{record.setting:.6g}")
 
 
-def _name(record: Record) -> str:
+def _name(record: Measurement) -> str:
     return f"{record.scene}, {record.kind}, {record.label} at {record.setting:g}"
 
 
-def _middles(records: Iterable[Record]) -> dict[tuple[str, str, str], float]:
+def _middles(records: Iterable[Measurement]) -> dict[tuple[str, str, str], float]:
     """Return the median time of each scene, kind and label."""
     times: dict[tuple[str, str, str], list[float]] = {}
     for r in records:

@@ -45,7 +45,7 @@ class Reference(NamedTuple):
 
 
 @functools.cache
-def stored(name: str) -> Reference | None:
+def stored_answer(name: str) -> Reference | None:
     """Return the stored answer to the standard scene of this name, or `None`.
 
     The answers are made by `tests/workprecision/make_references.py` at 40 digits and rounded to
@@ -184,7 +184,7 @@ class Ready(NamedTuple):
     memory: float = float("nan")
 
 
-class Method(NamedTuple):
+class TimedMethod(NamedTuple):
     """Define a method to compare; `measure` takes your own, or a peer's, in this form.
 
     **Fields:** `name`; `group` `ours`, `jax` (anything else that runs in JAX) or `peer`; `settings`

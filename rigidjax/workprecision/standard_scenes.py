@@ -15,7 +15,7 @@ from rigidjax.frames import Point, scenes as places
 from rigidjax.motion import Attitude
 from rigidjax.motion.torques import Damping, Flywheel, GravityGradient, HeavyTop, Sum
 from rigidjax.workprecision import equations
-from rigidjax.workprecision.scene import Scene, stored
+from rigidjax.workprecision.scene import Scene, stored_answer
 
 # Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I, II.0.
 ARENSTORF = (0.012277471, 0.994, -2.00158510637908252240, 17.0652165601579625588917)
@@ -69,7 +69,7 @@ class Circle(eqx.Module):
         return self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), zero])
 
 
-def _same(x: Any) -> Any:
+def _identity(x: Any) -> Any:
     return x
 
 
@@ -90,7 +90,7 @@ def _body(
     name: str, title: str, moments: Any, omega: Any, end: float, kind: Any, constants: Any
 ) -> Scene:
     def plain(
-        numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = _same, number: Any = _same
+        numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = _identity, number: Any = _identity
     ) -> Any:
         exact = tuple(number(c) for c in constants)
         torque = None
@@ -103,7 +103,7 @@ def _body(
     weighs = kind in (None, equations.heavy)
     return Scene(
         name, title, Inertia.from_principal(*moments), Attitude(TILTED, omega),
-        _torque(kind, constants), end, plain, stored(name), slow=omega[2] > 1e3,
+        _torque(kind, constants), end, plain, stored_answer(name), slow=omega[2] > 1e3,
         notes={"mass": 1.0, "com": com, "gravity": gravity} if weighs else None,
     )  # fmt: skip
 
@@ -112,11 +112,11 @@ def _point(
     name: str, title: str, start: Point, end: float, law: Any, kind: Any, constants: Any
 ) -> Scene:
     def plain(
-        numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = _same, number: Any = _same
+        numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = _identity, number: Any = _identity
     ) -> Any:
         return wrap(kind(tuple(number(c) for c in constants), sqrt))
 
-    return Scene(name, title, None, start, law, end, plain, stored(name))
+    return Scene(name, title, None, start, law, end, plain, stored_answer(name))
 
 
 def _foucault() -> Scene:

@@ -132,7 +132,7 @@ def test_frames_of_trajectories_compose():
 
     @eqx.filter_jit
     def both(outer, inner, state):
-        whole = outer.then(inner)
+        whole = outer.compose(inner)
         step = outer.to_inertial(inner.to_inertial(state, t), t)
         at_once = whole.to_inertial(state, t)
         return at_once, step, whole.from_inertial(step, t), whole.inverse().to_inertial(step, t)

@@ -40,7 +40,7 @@ MOON = orbits.cr3bp(0.0121505856)
         (lambda: MovingFrame(Uniform(np.ones(3)), rate=[1.0]), TypeError, "rate: wanted a functi"),
         (lambda: MovingFrame(Uniform(np.ones(3)), lambda t: jnp.zeros(2)).at(0.0), ValueError, "origin: wanted shape"),
         (lambda: FRAME.at([0.0, 1.0]), ValueError, r"t: wanted shape \(\)"),
-        (lambda: FRAME.then(np.eye(3)), TypeError, "then: wanted a MovingFrame, got ndarray"),
+        (lambda: FRAME.compose(np.eye(3)), TypeError, "inner: wanted a MovingFrame, got ndarray"),
         (lambda: FRAME.centrifugal([1.0, 2.0], 0.0), ValueError, r"x: wanted shape \(3,\)"),
         (lambda: InFrame(Uniform([0.0, 0, 1])), TypeError, "InFrame: wanted a MovingFrame, got Un"),
         (lambda: BodyInFrame(np.eye(3)), TypeError, "BodyInFrame: wanted a MovingFrame"),

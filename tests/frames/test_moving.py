@@ -182,13 +182,13 @@ def test_composition_and_inverse():
     outer, inner, t = wobbly(NUMBERS), wobbly(-0.7 * NUMBERS[::-1]), 0.4
     state = Point(NUMBERS[21:24], NUMBERS[24:27])
     step = outer.to_inertial(inner.to_inertial(state, t), t)
-    both = outer.then(inner)
+    both = outer.compose(inner)
     for name in ("x", "v"):
         whole = getattr(both.to_inertial(state, t), name)
         np.testing.assert_allclose(whole, getattr(step, name), rtol=0, atol=1e-12)
         back = getattr(outer.inverse().to_inertial(outer.to_inertial(state, t), t), name)
         np.testing.assert_allclose(back, getattr(state, name), rtol=0, atol=1e-12)
-    nothing = outer.then(outer.inverse()).at(t)
+    nothing = outer.compose(outer.inverse()).at(t)
     np.testing.assert_allclose(nothing.rotation, np.eye(3), atol=1e-14)
     for part in jax.tree.leaves(nothing)[1:]:
         np.testing.assert_allclose(part, np.zeros(3), atol=1e-12)

@@ -8,7 +8,7 @@ from scipy import signal
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.data.stacking import one
+from rigidjax.identify.data.stacking import pick_records
 from rigidjax.identify.model.terms import errors_of_one
 from rigidjax.identify.sensors import SensorInput
 
@@ -79,7 +79,7 @@ def test_the_model_goes_through_the_filter_and_so_do_its_derivatives():
     flat = problem.start(BODY, [3.0, 0.5, 4.0])
 
     def errors(x):
-        record, reference = one(problem.records, 0), one(problem.reference, 0)
+        record, reference = pick_records(problem.records, 0), pick_records(problem.reference, 0)
         return errors_of_one(problem, problem.index.rows(x)[0], record, reference, None)[0]
 
     # SciPy's filter begins at rest; by then it has forgotten that.

@@ -90,14 +90,14 @@ def test_it_is_the_whole_matrix(dtype):
         np.testing.assert_allclose(found.diagonal, np.diag(wanted), rtol=exact)
         np.testing.assert_allclose(found @ jnp.asarray(x), wanted @ x, rtol=exact, atol=100 * exact)
         whole = wanted * np.outer(unit, unit) + np.diag(more)
-        made = found.scaled(jnp.asarray(unit)).plus(jnp.asarray(more))
+        made = found.in_units(jnp.asarray(unit)).plus(jnp.asarray(more))
         for side in (x, sides):
             solved = np.linalg.solve(whole, side)
             near = exact * np.abs(solved).max()
             np.testing.assert_allclose(made.solve(jnp.asarray(side)), solved, atol=near)
     body = np.zeros((2, size), dtype)
     body[:, :4] = RNG.normal(size=(2, 4))
-    wider = found.wider(jnp.asarray(body))
+    wider = found.with_rows(jnp.asarray(body))
     np.testing.assert_allclose(
         wider @ jnp.asarray(x), wanted @ x + body.T @ (body @ x), atol=100 * exact
     )

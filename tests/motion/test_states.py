@@ -305,7 +305,7 @@ def test_a_scene_without_states_is_the_same_program():
     made = rj.equations_of_motion(BODY, START, law)
     texts = [str(jax.make_jaxpr(lambda y, f=f: f(0.5, y, None))(START)) for f in (plain, made)]
     assert texts[0] == texts[1]
-    assert rj.motion.coupled.started(BODY, START, law, 0.0) is START
+    assert rj.motion.coupled.with_own_states(BODY, START, law, 0.0) is START
     assert rj.simulate(BODY, START, [0.0, 0.1], law).own is None
 
 

@@ -130,7 +130,7 @@ def test_a_torque_and_force_are_minus_the_slope_of_the_energy(law, state):
         return law.energy(0.0, at, body)
 
     turn, shift = jax.grad(moved, argnums=(0, 1))(jnp.zeros(3), jnp.zeros(3))
-    force, torque = base.act(law, 0.0, state, body)
+    force, torque = base.force_and_torque(law, 0.0, state, body)
     np.testing.assert_allclose(torque, -turn, rtol=1e-12, atol=1e-14)
     if force is not None:
         np.testing.assert_allclose(force, -shift, rtol=1e-12, atol=1e-14)
@@ -250,7 +250,7 @@ def test_derivatives_of_first_and_second_order(law, state):
 
     def value(numbers):
         law, state, body = restore(numbers)
-        force, torque = base.act(law, 0.5, state, body)
+        force, torque = base.force_and_torque(law, 0.5, state, body)
         return torque if force is None else jnp.concatenate([force, torque])
 
     check_grads(once(value), (numbers,), order=2, modes=["fwd"], rtol=1e-5, atol=1e-6)
@@ -267,7 +267,7 @@ def test_at_rest_the_first_derivative_of_quadratic_laws_is_zero_not_nan(mode):
     drag = torques.Drag(0.5, [0.1, 0.2, 0.3])
 
     def push(v):
-        return base.act(drag, 0.0, rj.Rigid(np.zeros(3), v, Q, OMEGA), BODY)[0]
+        return base.force_and_torque(drag, 0.0, rj.Rigid(np.zeros(3), v, Q, OMEGA), BODY)[0]
 
     np.testing.assert_array_equal(mode(push)(jnp.zeros(3)), np.zeros((3, 3)))
 
@@ -406,8 +406,8 @@ def test_a_law_that_looks_at_what_the_state_has_not_is_named():
     words = r"torque function looks at state.q, the attitude, and Spin has none: start from Att"
     for law in (brake, rj.torques.Sum(brake, rj.torques.Damping([0.1, 0.1, 0.1]))):
         with pytest.raises(TypeError, match=words):
-            base.act(law, 0.0, SPIN, BODY)
+            base.force_and_torque(law, 0.0, SPIN, BODY)
     with pytest.raises(TypeError, match=r"state\.x, the position, and Attitude has none"):
-        base.act(spring, 0.0, ATTITUDE, BODY)
+        base.force_and_torque(spring, 0.0, ATTITUDE, BODY)
     with pytest.raises(AttributeError, match="banana"):
-        base.act(wrong, 0.0, SPIN, BODY)
+        base.force_and_torque(wrong, 0.0, SPIN, BODY)

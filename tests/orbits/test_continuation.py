@@ -57,7 +57,7 @@ def orbit_of(row):
 def left(scene, orbits):
     """What the orbits miss at the half period, and their stability."""
     numbers = jax.vmap(differential_correction.crossing)(orbits)
-    missed = jax.vmap(lambda n: differential_correction.miss(scene, n))(numbers)
+    missed = jax.vmap(lambda n: differential_correction.periodicity_residual(scene, n))(numbers)
     return jnp.max(jnp.abs(missed)), jax.vmap(scene.stability_indices)(orbits)
 
 

@@ -28,7 +28,7 @@ def test_the_direction_is_the_eigenvector_with_its_derivative():
     pairs = np.diag([90.0, 1 / 90.0, 1.0, 1.0, np.cos(1.0), np.cos(1.0)])
     pairs[4, 5], pairs[5, 4] = np.sin(1.0), -np.sin(1.0)
     matrix = jnp.asarray(frame @ pairs @ np.linalg.inv(frame))
-    value, vector = manifolds.unstable(matrix)
+    value, vector = manifolds.unstable_direction(matrix)
     values, vectors = np.linalg.eig(np.asarray(matrix))
     k = np.argmax(np.abs(values))
     wanted = vectors[:, k].real * np.sign(vectors[0, k].real)
@@ -39,7 +39,7 @@ def test_the_direction_is_the_eigenvector_with_its_derivative():
 
     def turned(s):
         g = jnp.asarray(frame) + s * change
-        return manifolds.unstable(g @ jnp.asarray(pairs) @ jnp.linalg.inv(g))[1]
+        return manifolds.unstable_direction(g @ jnp.asarray(pairs) @ jnp.linalg.inv(g))[1]
 
     found = jax.jacfwd(turned)(0.0)
     wanted = (turned(1e-5) - turned(-1e-5)) / 2e-5
@@ -192,7 +192,7 @@ def test_where_the_halo_orbits_begin():
 @pytest.mark.long
 def test_words(unhooked):
     orbit = MOON.lyapunov_guess(1, 0.01)
-    with pytest.raises(ValueError, match="which: wanted one of stable, unstable, got 'up'"):
+    with pytest.raises(ValueError, match="branch: wanted one of stable, unstable, got 'up'"):
         MOON.manifold_start(orbit, 0.0, "up")
     with pytest.raises(ValueError, match=r"side: wanted 1 \(to larger x"):
         MOON.manifold_start(orbit, 0.0, "stable", side=2)

@@ -370,5 +370,5 @@ row(
 leave_out("minutes of measuring: tests/workprecision", "workprecision.measure")
 leave_out(
     "a record that is filled as it comes",
-    *(f"workprecision.{n}" for n in ("Choice", "Method", "Ready", "Record", "Reference")),
+    *(f"workprecision.{n}" for n in ("Choice", "Measurement", "Ready", "Reference", "TimedMethod")),
 )

@@ -144,7 +144,11 @@ row(
     lambda: dict(self=s.frame(), state=s.point(), t=0.3, potential=0.7),
     arguments=("state", "t", "potential"),
 )
-row("frames.MovingFrame.then", lambda: dict(self=s.frame(), inner=s.frame()), arguments=("inner",))
+row(
+    "frames.MovingFrame.compose",
+    lambda: dict(self=s.frame(), inner=s.frame()),
+    arguments=("inner",),
+)
 row("frames.MovingFrame.inverse", lambda: dict(self=s.frame()), arguments=())
 for name, given in {
     "centrifugal": dict(x=Y),

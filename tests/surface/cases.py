@@ -12,7 +12,7 @@ from surface.sweep import Case
 import rigidjax as rj
 from rigidjax.frames.frame_dynamics import InFrame
 from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
-from rigidjax.motion.torques.base import act
+from rigidjax.motion.torques.base import force_and_torque
 
 q4, so3, mrp, rodrigues, euler = rj.quaternion, rj.so3, rj.mrp, rj.rodrigues, rj.euler
 ell = rj.elliptic
@@ -459,7 +459,7 @@ def laws() -> list[Case]:
         size = np.atleast_1d(np.asarray(given, float)).size
 
         def value(x: Any) -> Any:
-            found = act(make(x[:size]), 0.3, state_of(x[size:]), body)
+            found = force_and_torque(make(x[:size]), 0.3, state_of(x[size:]), body)
             return [part for part in found if part is not None]
 
         points = {"ordinary": join(given, RIGID), "at rest, identity": join(given, RESTING)}
@@ -542,7 +542,7 @@ def frames() -> list[Case]:
         return (
             frame.to_inertial(state, t), frame.from_inertial(state, t), frame.acceleration(x[8:11], x[11:14], t),
             frame.acceleration_to_inertial(x[8:11], x[11:14], x[18:21], t), frame.jacobi_integral(state, t),
-            frame.then(frame).matrix(t), frame.inverse().place(t),
+            frame.compose(frame).matrix(t), frame.inverse().place(t),
             rj.frames.BodyInFrame(frame)(t, state, s.body()).torque,
             InFrame(frame, potential=lambda y: jnp.sum(y**4)).acceleration(t, state),
         )  # fmt: skip

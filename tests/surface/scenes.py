@@ -166,7 +166,6 @@ def scene() -> Any:
 
 @functools.cache
 def records() -> tuple:
-    from rigidjax.workprecision.record import Record
 
     return tuple(
         Record("s", name, "ours", "value", "", 10.0**-k, error=10.0**-k, time=float(k))

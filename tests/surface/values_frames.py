@@ -115,7 +115,7 @@ def there(axis, k, place, t, x, u, q, w):
 def our_there(axis, k, place, t, x, u, q, w):
     frame, y = moving(axis, k, place), rj.Rigid(x, u, q, w)
     parts = lambda y: (y.x, y.v, q4.to_matrix(y.q), y.omega)
-    now, twice, back = frame.at(t), frame.then(frame), frame.inverse()
+    now, twice, back = frame.at(t), frame.compose(frame), frame.inverse()
     return [
         parts(frame.to_inertial(y, t)), parts(frame.from_inertial(y, t)),
         parts(now.to_inertial(y)), parts(now.from_inertial(y)), twice.matrix(t), twice.place(t),
@@ -125,7 +125,7 @@ def our_there(axis, k, place, t, x, u, q, w):
 
 way(
     "frames.MovingFrame.to_inertial frames.MovingFrame.from_inertial frames.Instant.to_inertial "
-    "frames.Instant.from_inertial frames.MovingFrame.then frames.MovingFrame.inverse",
+    "frames.Instant.from_inertial frames.MovingFrame.compose frames.MovingFrame.inverse",
     our_there, (*FRAME, *STATE), there, norm=True,
 )  # fmt: skip
 

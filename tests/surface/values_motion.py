@@ -424,7 +424,7 @@ way(
     lambda i, c, q, w: (
         EulerEquations(rj.Inertia(i), laws.ConstantTorque(c))(0.0, rj.Spin(w)),
         EulerEquations(rj.Inertia(i), laws.ConstantTorque(c)).rate_of(0.0, rj.Spin(w)),
-        EulerEquations(rj.Inertia(i)).turned_by(c, rj.Spin(w)),
+        EulerEquations(rj.Inertia(i)).rate_under_torque(c, rj.Spin(w)),
         AttitudeEquations(rj.Inertia(i), laws.InSpace(c))(0.0, rj.Attitude(q, w)),
         rj.equations_of_motion(rj.Inertia(i), rj.Attitude(q, w), laws.InSpace(c))(
             0.0, rj.Attitude(q, w), None),

@@ -26,15 +26,15 @@ from rigidjax.workprecision import (
 )
 from rigidjax.workprecision.measurement import in_float32, long_drift, worked_out
 from rigidjax.workprecision.pareto import front, time_to
-from rigidjax.workprecision.record import Record, moved, read_csv, write_csv
-from rigidjax.workprecision.scene import Method, Ready, distance
+from rigidjax.workprecision.record import Measurement, differences, read_csv, write_csv
+from rigidjax.workprecision.scene import Ready, TimedMethod, distance
 
 NAMES = list(scenes())
 
 
 def line(method="a", error=1e-6, time=1.0, **more):
     words = dict(scene="s", group="ours", kind="value", adjoint="", setting=1e-6) | more
-    return Record(method=method, error=error, time=time, **words)
+    return Measurement(method=method, error=error, time=time, **words)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -130,7 +130,7 @@ def test_a_scene_and_a_method_of_ones_own():
         [rj.quaternion.multiply(exact[:4], rj.quaternion.exp(jnp.array([3e-9, 0, 0]))), slowed]
     )
     np.testing.assert_allclose(distance(scene, off, exact)[0], 3e-9, rtol=1e-6)
-    guess = Method("a guess", "peer", (1e-3,), lambda scene: Ready(lambda setting: (off, 1.0)))
+    guess = TimedMethod("a guess", "peer", (1e-3,), lambda scene: Ready(lambda setting: (off, 1.0)))
     chosen = [m for m in methods("jax") if m.name == "diffrax Tsit5"]
     found = measure(scene, chosen, peers=[guess], gradients=False, thin=5, rounds=1)
     assert {r.method for r in found} == {"diffrax Tsit5", "a guess"}
@@ -191,15 +191,15 @@ def test_the_front_and_the_table():
 
 def test_what_moved_is_said():
     was = [line(time=2.0, steps=100.0), line("diffrax Dopri8", group="jax", time=1.0)]
-    assert moved(was, was) == ([], [])
+    assert differences(was, was) == ([], [])
     worse = [dataclasses.replace(was[0], error=1e-4, steps=150.0, time=9.0), was[1]]
-    wrong, paced = moved(worse, was)
+    wrong, paced = differences(worse, was)
     assert wrong == [
         "s, value, a at 1e-06: error was 1e-06, is 0.0001",
         "s, value, a at 1e-06: steps were 100, are 150",
     ]
     assert paced == ["s, value, a: time over diffrax Dopri8's was 2, is 9"]
-    assert moved([was[1]], was)[0] == ["s, value, a at 1e-06: not there any more"]
+    assert differences([was[1]], was)[0] == ["s, value, a at 1e-06: not there any more"]
 
 
 def test_files_and_charts(tmp_path):
@@ -234,7 +234,7 @@ def test_mistakes_are_named(capsys, tmp_path):
         Scene("x", "x", body, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), None, 0.0)
     with pytest.raises(TypeError, match=r'scenes\(\)\["heavy-top"\]\(\)'):
         measure("heavy-top")
-    with pytest.raises(TypeError, match="wanted Methods, got str"):
+    with pytest.raises(TypeError, match=r"wanted methods of workprecision.methods\(\), got str"):
         measure(scenes()["free-top"](), ["Tsit5"])
     assert main(["workprecision", "heavy top"]) == 2
     assert "no scene 'heavy top'; there are free-top" in capsys.readouterr().err

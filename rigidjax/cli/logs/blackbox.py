@@ -214,10 +214,10 @@ class _Flight:
             if next(stream) > 127:
                 stream.place += 4
                 return event, []
-            return event, [_unsigned(stream)]
+            return event, [_read_unsigned(stream)]
         if event not in _EVENT_NUMBERS:
             return -1, []
-        return event, [_unsigned(stream) for _ in range(_EVENT_NUMBERS[event])]
+        return event, [_read_unsigned(stream) for _ in range(_EVENT_NUMBERS[event])]
 
 
 class _Order:
@@ -288,7 +288,7 @@ class _Order:
         return self.incomplete if 2 * len(self.incomplete) < self.groups else []
 
 
-def _unsigned(stream: _Bytes) -> int:
+def _read_unsigned(stream: _Bytes) -> int:
     """Read a number of variable length: seven bits a byte, the eighth is set if more follow."""
     number, shift = 0, 0
     while shift < 35:

@@ -70,9 +70,9 @@ def read_header(file: io.TextIOBase) -> Header:
     while first.startswith("#") or (first and not first.strip()):
         comments = first if first.startswith("#") else comments
         first, line = file.readline(_LONGEST), line + 1
-    names, separator = _split(first)
+    names, separator = _split_names(first)
     if comments and (not first or any(map(_NUMBER.fullmatch, names))):
-        return Header(*_split(comments.lstrip("#")), line - 1, [first])
+        return Header(*_split_names(comments.lstrip("#")), line - 1, [first])
     return Header(names, separator, line, [])
 
 
@@ -82,7 +82,7 @@ _LONGEST = 131_072
 _NUMBER = re.compile(r"[-+.\d][-+.\deE]*")
 
 
-def _split(first: str) -> tuple[list[str], str]:
+def _split_names(first: str) -> tuple[list[str], str]:
     """Return the names in a line and their separator, the one that gives most names."""
     separator = max(SEPARATORS, key=first.count)
     return [name.strip() for name in next(csv.reader([first], delimiter=separator), [])], separator

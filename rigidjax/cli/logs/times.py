@@ -19,7 +19,7 @@ _ODD_STEPS = (1e-7, 1e3)
 _GAP = 1e5
 
 
-def increasing(t: np.ndarray) -> np.ndarray:
+def mask_of_increasing(t: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of times that increase, with as few left out as possible.
 
     They are a longest increasing subsequence, found by patience sorting. A time that is repeated,
@@ -82,7 +82,7 @@ def kept_rows(
                 f"{least:g} to {most:g} s"
             )
     rows = np.flatnonzero(inside)
-    keep = increasing(t[rows])
+    keep = mask_of_increasing(t[rows])
     if rows.size < _FEWEST:
         raise LogError(f"{path}: wanted at least {_FEWEST} samples, got {rows.size}")
     bad = rows[~keep]

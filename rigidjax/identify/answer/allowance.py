@@ -49,7 +49,8 @@ def allowance(
         out.append(f"They allow for {describe_considered(parts, sensors)}.")
     for index, by_kind in moves:
         clauses = [
-            f"{_WAYS[kind]} would move {_listed(named, sizes)}" for kind, sizes in by_kind.items()
+            f"{_WAYS[kind]} would move {_list_shifts(named, sizes)}"
+            for kind, sizes in by_kind.items()
         ]
         name = type(sensors[index]).__name__
         out.append(
@@ -87,7 +88,7 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
     return " ".join(out)
 
 
-def _listed(named: Sequence[Quantity], sizes: Float[np.ndarray, " quantities"]) -> str:
+def _list_shifts(named: Sequence[Quantity], sizes: Float[np.ndarray, " quantities"]) -> str:
     """List by how much each quantity would move, with the half-width of its interval."""
     words = []
     for quantity, size in list(zip(named, sizes, strict=True))[:MOST]:

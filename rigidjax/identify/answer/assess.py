@@ -27,7 +27,7 @@ from rigidjax.identify.search.noise import median_of_chi2
 from rigidjax.identify.search.stages import (
     Attempt,
     errors_and_slopes,
-    nominal,
+    has_unit_noise,
     nominal_count,
 )
 from rigidjax.identify.uncertainty import considered, covariance as uncertainty, flat_limit
@@ -137,10 +137,10 @@ def _in_words(
         over = np.sqrt(np.mean(np.concatenate(rows) ** 2) / apart) if apart > 0 else np.inf
         words.append(f"{over:.3g} times their scatter between neighbours")
         words.append(f"autocorrelated over {span:.0f} samples")
-    return f"{', '.join(words)}, {_where(model, error, kept)}"
+    return f"{', '.join(words)}, {_describe_interval(model, error, kept)}"
 
 
-def _where(model: Model, error: np.ndarray, kept: np.ndarray) -> str:
+def _describe_interval(model: Model, error: np.ndarray, kept: np.ndarray) -> str:
     """Describe the shortest interval of time that holds half of the sum of squared errors."""
     squares = np.sum(np.where(kept, error, 0.0) ** 2, axis=-1)
     row = int(np.argmax(squares.sum(axis=1)))
@@ -271,7 +271,7 @@ def assess(
     - `interrupted`, `remarks`: reasons for the answer on the search, in words.
     """
     x = best.x
-    near = flat_limit.thickened(model, x)
+    near = flat_limit.thicken(model, x)
     thickened = None if near is None else (near, errors_and_slopes(model, near))
     linear = uncertainty.linearise(model, x, noise, best.blocks, thickened)
     times = uncertainty.correlation_times(linear)
@@ -301,7 +301,7 @@ def assess(
     believable = explanation.word != FAILS
     # A start fits as well within ten units of log-likelihood, measured in the estimated noise if
     # some noise is estimated; autocorrelated errors count as fewer.
-    guessed = not all(r.known_noise and not nominal(r) for r in model.records.readings)
+    guessed = not all(r.known_noise and not has_unit_noise(r) for r in model.records.readings)
     unit = 2 * best_cost / model.records.size if guessed else 1.0
     margin = 10.0 * unit * max(times.longest, 1.0)
 

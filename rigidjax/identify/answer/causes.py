@@ -52,7 +52,7 @@ ATTITUDES = {
 }
 
 
-def misread(recordings: Sequence[Recording], torque: Any) -> Cause | None:
+def misreading(recordings: Sequence[Recording], torque: Any) -> Cause | None:
     """Return the mistake made when the rates of one body were read, `None` if there is none.
 
     The rates are compared with the rates between attitudes or, without attitudes, with Euler's
@@ -149,7 +149,7 @@ def causes(
     """Return the most likely cause of the errors of each sensor in `indices`, if it has one."""
     given = zip(stacking.on_host(model.records, model.counts), model.body_names, strict=True)
     mine = [recording for recording, name in given if name == model.body_names[0]]
-    wrong = misread(mine, model.torque)
+    wrong = misreading(mine, model.torque)
     if wrong is not None:
         return (wrong,)
     if not np.isfinite(linear.dense).all():
@@ -162,7 +162,7 @@ def causes(
         if cause is None and _of_three(sensor):
             rows = _table(model, x, noise, linear, index)
             given = model, noise, linear, index, free
-            shares = [_explained(*given, row[1]) for row in rows]
+            shares = [_explained_share(*given, row[1]) for row in rows]
             cause = _largest(sensor, rows, shares)
         if cause is None and hasattr(sensor, "suspect"):
             cause = Cause(sensor.suspect[0], type(sensor).__name__, None, *sensor.suspect[1:])
@@ -213,7 +213,7 @@ def _largest(
 ) -> Cause | None:
     """Return the cause that explains the most, joined with those that explain nearly as much.
 
-    `rows` are those of `_table`, `shares` the results of `_explained` for them.
+    `rows` are those of `_table`, `shares` the results of `_explained_share` for them.
     """
     candidates = [
         (share, name, words.format(size=", ".join(f"{x:.2g}" for x in size)), remedy)
@@ -285,7 +285,9 @@ def _response(
     width = model.index.width
     flow = linear.raw_slopes[index][..., width - 3 : width]
     tensors = np.stack([np.asarray(tensor_of(b)) for b in as_list(model.bodies(x))])
-    of = np.zeros(model.count, int) if model.which is None else np.asarray(model.which)
+    of = (
+        np.zeros(model.count, int) if model.body_indices is None else np.asarray(model.body_indices)
+    )
     back = np.linalg.pinv(flow) @ np.linalg.inv(tensors)[of][:, None]
     steps = np.diff(np.asarray(model.records.t), axis=1)[..., None, None]
 
@@ -297,7 +299,7 @@ def _response(
     return response
 
 
-def _explained(
+def _explained_share(
     model: Model,
     noise: Noise,
     linear: Linearised,

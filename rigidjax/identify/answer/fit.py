@@ -31,10 +31,10 @@ from rigidjax.identify.search.stages import (
     Attempt,
     Task,
     cost_of,
-    enough,
     errors_and_slopes,
     fit_in_stages,
     polish,
+    sufficient_misfit,
 )
 from rigidjax.identify.search.starts import starting_points
 from rigidjax.identify.search.stochastic_gradient import Descent, descend_from
@@ -153,7 +153,7 @@ def fit(
         finer = _finer_integrator(first, task, rough)
         task = task if rough else task._replace(model=_with_integrator(padded, finer))
     if descent is not None:
-        points = _descended(points, task, descent, key, progress, interrupts)
+        points = _descend_from_each(points, task, descent, key, progress, interrupts)
     attempts = _from_each(points, task, checkpoint, progress, interrupts)
     best = min(attempts, key=_cost)
     lowest = float(best.cost)
@@ -192,7 +192,7 @@ def _with_original_readings(given: Model, fitted: Model) -> Model:
     for index, r in enumerate(fitted.records.readings):
         if r.late is not None:
             one, jitter = records.readings[index], cast(Any, r.sensor).jitter
-            one = one.scattered(r.late[:, : one.mask.shape[1]], jitter.deviation)
+            one = one.with_jitter(r.late[:, : one.mask.shape[1]], jitter.deviation)
             records = eqx.tree_at(lambda a, i=index: a.readings[i], records, one)
     return eqx.tree_at(lambda m: m.records, fitted, records)
 
@@ -224,7 +224,7 @@ def _with_noise(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     return best, task
 
 
-def _descended(
+def _descend_from_each(
     points: list[Array],
     task: Task,
     descent: Descent,
@@ -277,7 +277,7 @@ def _from_each(
             # does so, too: they may end at this misfit.
             ended = [float(one.cost) for one in attempts if bool(one.converged)]
             aim = min(ended, default=np.inf)
-            aim = aim if aim <= enough(task.model) else 0.0
+            aim = aim if aim <= sufficient_misfit(task.model) else 0.0
             attempts.append(fit_in_stages(point, task, aim=aim, watch=watch))
             latest = like
             # Only the best start keeps its derivatives, which need memory.

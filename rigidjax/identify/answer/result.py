@@ -15,7 +15,7 @@ from rigidjax.identify.answer import answers, undetermined as identifiability
 from rigidjax.identify.answer.answers import Answer, Cause
 from rigidjax.identify.answer.causes import causes
 from rigidjax.identify.answer.undetermined import Combination, undetermined
-from rigidjax.identify.model.model import Model, Unpacked, unpacked
+from rigidjax.identify.model.model import Model, Unpacked, unpack_numbers
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.uncertainty.considered import Consideration
 from rigidjax.identify.uncertainty.covariance import Linearised
@@ -265,7 +265,7 @@ class Fit(eqx.Module):
             )
 
         def value(x: Array) -> Array:
-            point = unpacked(self.model, x)
+            point = unpack_numbers(self.model, x)
             point = dataclasses.replace(point, noise=self.noises)
             return _checks.numbers(of(point), "of(point)")
 

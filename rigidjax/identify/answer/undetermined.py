@@ -130,7 +130,7 @@ def undetermined(fit: "Fit") -> tuple[Combination, ...]:
         relative = np.array([one[2] for one in here])
         size = np.where(relative | (size == 0), 1.0, size)
         changes = null @ slope.T / size
-        changes = np.where(_named(fit, [one[0] for one in here], changes), changes, 0.0)
+        changes = np.where(_mask_to_report(fit, [one[0] for one in here], changes), changes, 0.0)
         echelon = _reduced_echelon_form(changes)
         if best is None or np.count_nonzero(echelon) < np.count_nonzero(best[0]):
             best, basis = (echelon, here, size, values[rows]), changes
@@ -212,10 +212,10 @@ def _slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
     (n,) of the free numbers.
     """
     reference = model.reference
-    start = jax.vmap(ReferenceStates.moved)(reference, point[model.index.start])
+    start = jax.vmap(ReferenceStates.start_at)(reference, point[model.index.start])
 
     def initial_states(x: Array) -> list[Array]:
-        states = jax.vmap(ReferenceStates.moved)(reference, x[model.index.start])
+        states = jax.vmap(ReferenceStates.start_at)(reference, x[model.index.start])
         one, numbers = jax.tree.map(lambda leaf: leaf[0], states), []
         change = parts(one, jax.vmap(minus)(states, start))
         offset = parts(one, jax.vmap(minus)(states, reference.state))
@@ -235,7 +235,7 @@ def _slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
     return jax.jacfwd(value)(point), value(point)
 
 
-def _named(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
+def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
     """Return the mask (M,) of the numbers in which `changes` (k, M) are to be reported.
 
     A body's tensor is reported by its moments, or by its components if changes turn its axes.
@@ -289,7 +289,7 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
             "best point found, and say nothing about the body."
         ]
         # Undetermined directions are the likely reason why a search did not end: name them.
-        out += [] if lost else _unseen(fit)
+        out += [] if lost else _list_undetermined(fit)
         return (*out, *in_words(fit.model.records.readings))
     out = []
     moments, first = [], 0
@@ -318,7 +318,7 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
     count = fit.model.count
     if reports_starts(fit.model):
         out.append(_rate(fit.quantities[first : first + 3 * count], count))
-    out += _unseen(fit)
+    out += _list_undetermined(fit)
     out += correlations(fit)
     if fit.model.torque is None:
         out.append(
@@ -355,7 +355,7 @@ def _rate(rates: Sequence[Quantity], count: int) -> str:
     return f"{what} {grade} determined, to ±{wide:.2g} of {its}."
 
 
-def _unseen(fit: "Fit") -> list[str]:
+def _list_undetermined(fit: "Fit") -> list[str]:
     """List what the data do not determine, a sentence each."""
     combinations = undetermined(fit)
     if not combinations:

@@ -56,7 +56,7 @@ class Reading(eqx.Module):
             return seen
         return seen & (np.abs(self.values) < np.asarray(limit)[..., None, :] * (1 - 1e-6))
 
-    def scattered(self, late: Array, deviation: Array) -> "Reading":
+    def with_jitter(self, late: Array, deviation: Array) -> "Reading":
         """Return these readings with another jitter: its error `late` and its `deviation`, s.
 
         A search holds `late` constant. If it did not, errors would count less wherever a motion
@@ -158,7 +158,7 @@ class Recording(eqx.Module):
         ends = " … ".join(_show.time(end, t[-1] - t[0]) for end in (t[0], t[-1])) + " s"
         parts = [f"{self.t.shape[0]} times {ends}"]
         for reading in self.readings:
-            first = _show.shown(np.asarray(reading.values)[int(np.argmax(reading.seen))])
+            first = _show.as_text(np.asarray(reading.values)[int(np.argmax(reading.seen))])
             name, count = type(reading.sensor).__name__, int(reading.seen.sum())
             parts.append(f"{name}: {count} readings from {first}")
         if self.inputs:
@@ -258,7 +258,7 @@ def _reading(
             f"{name}: noise: wanted an array of shape ({sensor.components},), a standard deviation "
             f"for each component of the error, or None, got shape {np.shape(sensor.noise)}"
         )
-    values, no_value = _checks.unmasked(values)
+    values, no_value = _checks.data_and_mask(values)
     values = _checks.on_host(values, f"{name}: readings")
     rows_hidden = None if no_value is None else no_value.reshape(len(no_value), -1).any(axis=1)
     if rows_hidden is not None:
@@ -270,7 +270,7 @@ def _reading(
         turned = "; transposed?" if values.shape == wanted[::-1] else ""
         many = f"; t has {t.size} times" if values.shape[1:] == wanted[1:] else turned
         raise ValueError(f"{name}: wanted readings of shape {wanted}, got {values.shape}{many}")
-    mask, no_flag = _checks.unmasked(mask)
+    mask, no_flag = _checks.data_and_mask(mask)
     try:
         flags = np.ones(t.size, bool) if mask is None else np.asarray(mask)
     except ValueError as error:

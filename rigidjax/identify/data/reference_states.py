@@ -24,7 +24,7 @@ from rigidjax.identify.sensors import (
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import names, plus
 from rigidjax.rotation import quaternion, so3
-from rigidjax.rotation.fitting import nearest
+from rigidjax.rotation.fitting import nearest_rotation
 
 # The turn, rad, between two attitudes from which a rate is taken: large against noise, but so small
 # that the axis hardly moves.
@@ -81,7 +81,7 @@ def _attitudes_of(sums: ArrayLike) -> Array:
     This is `so3.wahba` without its check: `equinox.error_if` always raises in a compiled function
     that is called within `jax.ensure_compile_time_eval`, as the model calls this one.
     """
-    return jax.vmap(lambda one: quaternion.from_matrix(nearest(one)))(sums)
+    return jax.vmap(lambda one: quaternion.from_matrix(nearest_rotation(one)))(sums)
 
 
 def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
@@ -138,7 +138,7 @@ class ReferenceStates(eqx.Module):
     rate: Float[Array, "*records"]
     units: Float[Array, "*records n"]
 
-    def moved(self, change: Float[Array, " n"]) -> PyTree:
+    def start_at(self, change: Float[Array, " n"]) -> PyTree:
         """Return the initial state of one recording for the free numbers `change`.
 
         An empty `change` belongs to a known initial state, which is the reference.

@@ -33,7 +33,7 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
                 "its inputs; give all recordings the same kinds in the same order, with the same "
                 "options"
             )
-    return eqx.combine(jax.tree.map(_stacked, *numbers), others[0]), counts
+    return eqx.combine(jax.tree.map(_stack_leaves, *numbers), others[0]), counts
 
 
 def _is_number(leaf: Any) -> bool:
@@ -70,7 +70,7 @@ def _length(count: int) -> int:
     return int(lengths[0] if lengths[0] >= count else lengths[1])
 
 
-def _stacked(*leaves: Any) -> Any:
+def _stack_leaves(*leaves: Any) -> Any:
     """Stack leaves along a new first axis."""
     # Use NumPy if the numbers are known: JAX would compile a program for each shape.
     if _checks.known(leaves):
@@ -78,7 +78,7 @@ def _stacked(*leaves: Any) -> Any:
     return jnp.stack(leaves)
 
 
-def one(records: PyTree, index: int | slice | Int[Array | np.ndarray, "*rows"]) -> PyTree:
+def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "*rows"]) -> PyTree:
     """Return the tree of arrays at one index of their leading axis, or at several."""
 
     def pick(leaf: Any) -> Any:

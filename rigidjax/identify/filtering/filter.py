@@ -185,15 +185,17 @@ def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recordi
         x = model.start()
     scene = _scene_at(model, require_numbers(model, x))
     steps.require_sensors(scene.sensors)
-    return scene, stacking.one(model.records, 0)
+    return scene, stacking.pick_records(model.records, 0)
 
 
 @eqx.filter_jit
 def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
     """Return the scene of the first recording, its inputs bound to the torque."""
     row = model.index.rows(x)[0]
-    record, reference, which = stacking.one((model.records, model.reference, model.which), 0)
-    scene = scene_of(model, row, record, reference, which)
+    record, reference, body_index = stacking.pick_records(
+        (model.records, model.reference, model.body_indices), 0
+    )
+    scene = scene_of(model, row, record, reference, body_index)
     return dataclasses.replace(scene, torque=torque_of_scene(scene, record))
 
 

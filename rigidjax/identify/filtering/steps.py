@@ -20,7 +20,7 @@ from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.filtering import roots
 from rigidjax.identify.model.free import with_leaves
 from rigidjax.identify.model.model import TURN_OF_A_FILTER_STEP
-from rigidjax.identify.model.predict import body_of_equations, shifted
+from rigidjax.identify.model.predict import body_of_equations, shift_in_time
 from rigidjax.identify.model.scene import (
     Process,
     Scene,
@@ -35,7 +35,7 @@ from rigidjax.motion.manifold import coordinates, dimension, tangent, turns
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
 from rigidjax.motion.torques.base import Torque, in_precision, require_law, tensor_of
 from rigidjax.motion.torques.composite import parts_of
-from rigidjax.rotation.kernels import normalised
+from rigidjax.rotation.kernels import to_unit_length
 from rigidjax.rotation.linalg3 import cross
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.equal_steps import advance
@@ -139,7 +139,7 @@ class Dynamics(eqx.Module):
 
         motion, torques = advance(KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques))
         if isinstance(motion, HasAttitude):
-            motion = eqx.tree_at(lambda s: s.q, motion, normalised(motion.q))
+            motion = eqx.tree_at(lambda s: s.q, motion, to_unit_length(motion.q))
         return Extended(motion, torques, x.walks)
 
     def predict(
@@ -256,7 +256,7 @@ def linearise_readings(
             motion, when = y.motion, t
             offset = getattr(drifted, "offset", None)
             if offset is not None:
-                motion, when = shifted(field, t, motion, offset), t + offset
+                motion, when = shift_in_time(field, t, motion, offset), t + offset
             return drifted.error(SensorInput(when, motion, dynamics.scene.body, field), value)
 
         value_of_error, push = jax.linearize(error, x)

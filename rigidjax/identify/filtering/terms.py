@@ -19,7 +19,7 @@ from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.normal import normal_of
 from rigidjax.identify.model.scene import Scene
 from rigidjax.identify.model.terms import (
-    Which,
+    BodyIndex,
     blocks,
     by_recording,
     errors_of_scene,
@@ -33,7 +33,7 @@ from rigidjax.motion.manifold import dimension
 
 
 def terms_of_one(
-    model: Model, row: Array, record: Recording, reference: ReferenceStates, which: Which
+    model: Model, row: Array, record: Recording, reference: ReferenceStates, body_index: BodyIndex
 ) -> Terms:
     """Return the terms of the readings of one recording.
 
@@ -43,7 +43,7 @@ def terms_of_one(
     **Arguments:** `row` the free numbers of the recording; `record`, `reference` and `which` its
     readings, its reference state and the index of its body.
     """
-    scene = scene_of(model, row, record, reference, which)
+    scene = scene_of(model, row, record, reference, body_index)
     if scene.process is None and not model.walks:
         return _terms_of_motion(model, scene, record)
     require_sensors(scene.sensors)

@@ -17,7 +17,7 @@ from rigidjax.identify.model.charts import Known, places_of
 from rigidjax.identify.model.free import with_steps
 from rigidjax.identify.model.index import index_of
 from rigidjax.identify.model.model import Model, with_parts
-from rigidjax.identify.model.terms import independent, template, whitened
+from rigidjax.identify.model.terms import independent, template, whiten
 from rigidjax.identify.search.stages import errors_and_slopes
 
 
@@ -93,7 +93,7 @@ def _log_squares(fit: Fit) -> np.ndarray:
     """
     out, model = 2.0 * np.log(np.maximum(fit.rms, 1e-300)), fit.model
     errors, _ = errors_and_slopes(model, fit.x)
-    white = whitened(model, errors, fit.noises)
+    white = whiten(model, errors, fit.noises)
     for index, (reading, e, sigma) in enumerate(
         zip(model.records.readings, white, fit.noises, strict=True)
     ):
@@ -146,7 +146,7 @@ def _with_shared(model: Model, of_others: Fit) -> Model:
     for slot, fitted in zip(model.slots, of_others.model.slots, strict=True):
         if slot.shared is not None and fitted.shared is not None:
             x = x.at[slot.shared].set(of_others.x[fitted.shared])
-    record = stacking.one(model.records, 0)
+    record = stacking.pick_records(model.records, 0)
     scene = with_steps(template(model, record), model.slots, model.index.rows(x)[0])
     sensors = jax.tree.map(lambda leaf: leaf[None] if eqx.is_array(leaf) else leaf, scene.sensors)
     own = [

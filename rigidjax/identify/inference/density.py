@@ -24,7 +24,7 @@ from rigidjax.identify.model.model import (
     Unpacked,
     filter_steps_of,
     scenes_of,
-    unpacked,
+    unpack_numbers,
     with_parts,
 )
 from rigidjax.identify.model.scene import Process, Scene, require_process
@@ -148,9 +148,9 @@ class LogDensity(eqx.Module):
         sensor, and the process.
         """
         x = _checks.floating(x, self.x0.shape, "x")
-        scenes, point = scenes_of(self.model, x), unpacked(self.model, x)
+        scenes, point = scenes_of(self.model, x), unpack_numbers(self.model, x)
         noise: Any = tuple(sensor.noise for sensor in scenes.sensors)
-        process = stacking.one(scenes.process, 0)
+        process = stacking.pick_records(scenes.process, 0)
         return dataclasses.replace(point, noise=noise, process=process)
 
 
@@ -228,7 +228,7 @@ def _with_slots(
 
     The second result (n,) holds the places of the old free numbers among the new ones.
     """
-    bodies = places_of(model.chart, model.which, model.count)
+    bodies = places_of(model.chart, model.body_indices, model.count)
     kinds = model.index.start.shape[1] // 3
     every = [*model.slots, *slots]
     index, placed = index_of(bodies, model.index.bodies, every, kinds)

@@ -41,7 +41,7 @@ def expected(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, ...]:
     """
     _require_known(model, x)
     _require_noise(model, x)
-    near = flat_limit.thickened(model, x)
+    near = flat_limit.thicken(model, x)
     information = np.asarray(_fisher(model, x if near is None else near))
     if not np.isfinite(information).all():
         raise ValueError(

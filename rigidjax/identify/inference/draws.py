@@ -380,12 +380,12 @@ def _refit(density: LogDensity, settings: Settings, key: Any, count: int) -> Ref
     order_one = is_order_one(density.model, density.x0.dtype)
     end = minimise(evaluate, density.x0, order_one, settings, None)
     covariance = jnp.linalg.inv(end.normal.core)
-    draws, weights = _weighted(density, end.point, covariance, key, count)
+    draws, weights = _weighted_draws(density, end.point, covariance, key, count)
     converged = end.converged & jnp.isfinite(weights).all()
     return Refit(density, end.point, -end.cost, covariance, converged, draws, weights)
 
 
-def _weighted(
+def _weighted_draws(
     density: LogDensity, top: Array, covariance: Array, key: Any, count: int
 ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
     """Return `count` draws of Student's t about the maximum `top`, and their weights."""

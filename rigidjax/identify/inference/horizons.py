@@ -63,13 +63,13 @@ def _on_windows(
 ) -> tuple[Model, Float[Array, " m"]]:
     """Return the model of these windows with known starts, and its shared free numbers."""
     reference, _, clusters = starts_of_windows(windows, 1)
-    which = None
-    bodies = places_of(model.chart, which, windows.count)
+    body_indices = None
+    bodies = places_of(model.chart, body_indices, windows.count)
     index, slots = index_of(bodies, model.index.bodies, model.slots, 0)
     parts = dict(
         records=windows.records(),
         counts=np.full(windows.count, windows.length + 1, np.int32),
-        which=which,
+        body_indices=body_indices,
         reference=reference,
         index=index,
         slots=slots,

@@ -130,20 +130,20 @@ class PrincipalRatios(AbstractBodyChart):
     scale: ClassVar[str | None] = "arbitrary"
 
     def body(self, vector: Numbers) -> Inertia:
-        return Inertia(jnp.diag(charts.unpack_moments(_padded(vector, 1, 0)) / 3.0))
+        return Inertia(jnp.diag(charts.unpack_moments(_pad(vector, 1, 0)) / 3.0))
 
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_moments(jnp.diagonal(body.tensor))[1:]
 
     def bend(self, vector: Numbers, slope: Numbers) -> Rows:
-        return charts.flat_bend(_padded(vector, 0, 3), _padded(slope, 0, 3))[:, :2]
+        return charts.flat_bend(_pad(vector, 0, 3), _pad(slope, 0, 3))[:, :2]
 
     def logs(self, body: Inertia) -> Float[Array, "2"]:
         i = jnp.diagonal(body.tensor)
         return jnp.log(i[:2] / i[2])
 
 
-def _typical(value: Any) -> Array:
+def _typical_moments(value: Any) -> Array:
     """Return the rough size of the moments as an array; raise an error unless it is positive."""
     if isinstance(value, Inertia | MassProperties):
         raise TypeError(
@@ -168,7 +168,7 @@ class Tensor(AbstractBodyChart):
     Array(0.001, dtype=float64)
     """
 
-    typical: Float[Array, ""] = eqx.field(converter=_typical, default=1.0)
+    typical: Float[Array, ""] = eqx.field(converter=_typical_moments, default=1.0)
     size: ClassVar[int] = 6
     log_names: ClassVar[tuple[str, ...]] = ("I1", "I2", "I3")
     plain_names: ClassVar[tuple[str, ...]] = ("Ixx", "Iyy", "Izz", "Iyz", "Ixz", "Ixy")
@@ -181,7 +181,7 @@ class Tensor(AbstractBodyChart):
         return charts.pack_second_moment(body.second_moment / (0.5 * self.typical))
 
     def bend(self, vector: Numbers, slope: Numbers) -> Rows:
-        return _padded(Ratios().bend(vector[1:], slope[1:]), 1, 0)
+        return _pad(Ratios().bend(vector[1:], slope[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(body.moments)
@@ -202,7 +202,7 @@ class Principal(AbstractBodyChart):
     Array(2., dtype=float64)
     """
 
-    typical: Float[Array, ""] = eqx.field(converter=_typical, default=1.0)
+    typical: Float[Array, ""] = eqx.field(converter=_typical_moments, default=1.0)
     size: ClassVar[int] = 3
     log_names: ClassVar[tuple[str, ...]] = ("Ix", "Iy", "Iz")
     unit: ClassVar[str] = "kg m²"
@@ -214,7 +214,7 @@ class Principal(AbstractBodyChart):
         return charts.pack_moments(jnp.diagonal(body.tensor) / (0.5 * self.typical))
 
     def bend(self, vector: Numbers, slope: Numbers) -> Rows:
-        return _padded(PrincipalRatios().bend(vector[1:], slope[1:]), 1, 0)
+        return _pad(PrincipalRatios().bend(vector[1:], slope[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(jnp.diagonal(body.tensor))
@@ -294,7 +294,7 @@ class Mass(AbstractBodyChart):
         rows = charts.flat_bend(
             charts.pack(self.guess)[2:7] + vector[first : first + 5], slope[first : first + 5]
         )
-        return _padded(rows, first, self.size - first - 5)
+        return _pad(rows, first, self.size - first - 5)
 
     def logs(self, body: MassProperties) -> Float[Array, " logs"]:
         mass, moments = body.mass[None], body.inertia.moments
@@ -332,7 +332,7 @@ class Known(AbstractBodyChart):
         return jnp.zeros(0)
 
 
-def _padded(x: Float[Array, "*rows n"], before: int, after: int) -> Float[Array, "*rows m"]:
+def _pad(x: Float[Array, "*rows n"], before: int, after: int) -> Float[Array, "*rows m"]:
     """Return x with zeros `before` and `after` it along the last axis."""
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(before, after)])
 
@@ -381,11 +381,11 @@ class Bodies(eqx.Module):
     def all(self, vector: Float[Array, " numbers"]) -> dict[str, Any]:
         """Return every body by its name."""
         rows = zip(self.names, self.charts, numbers_of(self, vector), strict=True)
-        return {name: scaled(chart, numbers) for name, chart, numbers in rows}
+        return {name: scaled_body(chart, numbers) for name, chart, numbers in rows}
 
-    def body(self, vector: Numbers, which: Int[Array, ""]) -> Inertia | MassProperties:
-        """Return the body at the index `which` from its numbers `vector`, padded with zeros."""
-        kind, row = jnp.asarray(self.kind_of)[which], jnp.asarray(self.row_of)[which]
+    def body(self, vector: Numbers, body_index: Int[Array, ""]) -> Inertia | MassProperties:
+        """Return the body number `body_index` from its numbers `vector`, padded with zeros."""
+        kind, row = jnp.asarray(self.kind_of)[body_index], jnp.asarray(self.row_of)[body_index]
         chosen: Any = None
         for index, alike in enumerate(self.kinds):
             here = jnp.where(kind == index, row, 0)
@@ -401,7 +401,7 @@ class Bodies(eqx.Module):
         return chosen
 
 
-def scaled(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
+def scaled_body(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
     """Return the body of a chart as a user gets it, with the scale of the chart."""
     body = chart.body(vector)
     if chart.scale is None or isinstance(body, MassProperties):
@@ -410,32 +410,32 @@ def scaled(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassPropertie
 
 
 def places_of(
-    body: AbstractBodyChart | Bodies, which: Int[Array, " records"] | None, count: int
+    body: AbstractBodyChart | Bodies, body_indices: Int[Array, " records"] | None, count: int
 ) -> Int[np.ndarray, "records numbers"]:
     """Return the places of the numbers of each recording's body among those of all bodies.
 
-    **Arguments:** `body` the chart or charts; `which` (R,) the index of each recording's body,
-    `None` for one body; `count` R. The rows of smaller charts are filled with −1.
+    **Arguments:** `body` the chart or charts; `body_indices` (R,) the index of each
+    recording's body, `None` for one body; `count` R. The rows of smaller charts are filled with −1.
     """
     if not isinstance(body, Bodies):
         return np.broadcast_to(np.arange(body.size), (count, body.size))
     widest = max(chart.size for chart in body.charts)
     parts = numbers_of(body, np.arange(body.size))
     rows = [np.pad(part, (0, widest - part.size), constant_values=-1) for part in parts]
-    return np.stack(rows)[np.asarray(which)]
+    return np.stack(rows)[np.asarray(body_indices)]
 
 
 def body_of_recording(
-    body: AbstractBodyChart | Bodies, vector: Numbers, which: Int[Array, ""] | None
+    body: AbstractBodyChart | Bodies, vector: Numbers, body_index: Int[Array, ""] | None
 ) -> Inertia | MassProperties:
     """Return the body of one recording from a row `vector` that begins with its numbers.
 
-    `which` is its index among several bodies, `None` for one body.
+    `body_index` is its index among several bodies, `None` for one body.
     """
     if not isinstance(body, Bodies):
         return body.body(vector[: body.size])
-    assert which is not None
-    return body.body(vector, which)
+    assert body_index is not None
+    return body.body(vector, body_index)
 
 
 def charts_of(body: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...]:

@@ -90,7 +90,7 @@ def index_of(
                 twice.append(of_each.reshape(count, width))
                 columns += range(column, column + width)
         parts = (None if x is None else jnp.asarray(x, jnp.int32) for x in (of_all, of_each))
-        placed.append(_placed(slot, column, *parts))
+        placed.append(_with_places(slot, column, *parts))
         column += width
     blocks.append(start)
     width = column + start.shape[1]
@@ -110,6 +110,6 @@ def index_of(
     return index, tuple(placed)
 
 
-def _placed(slot: Slot, column: int, shared: Array | None, own: Array | None) -> Slot:
+def _with_places(slot: Slot, column: int, shared: Array | None, own: Array | None) -> Slot:
     """Return the slot with its column and its places."""
     return dataclasses.replace(slot, column=column, shared=shared, own=own)

@@ -32,7 +32,7 @@ from rigidjax.identify.model.charts import (
     charts_of,
     has_mass,
     places_of,
-    scaled,
+    scaled_body,
 )
 from rigidjax.identify.model.free import Free, Slot, checked_labels, find_slots, group_of_each
 from rigidjax.identify.model.index import Index, index_of
@@ -147,7 +147,7 @@ class Model(eqx.Module):
     counts: Int[np.ndarray, " records"]
     chart: AbstractBodyChart | Bodies
     body_names: tuple[str, ...] = eqx.field(static=True)
-    which: Int[Array, " records"] | None
+    body_indices: Int[Array, " records"] | None
     torque: Torque | None
     process: Process | None
     walks: tuple[Drift, ...]
@@ -205,9 +205,9 @@ class Model(eqx.Module):
         self.start_weight, self.clusters = data.start_weight, data.clusters
         self.chart, self.torque, self.process = charts, torque, process
         self.loss, self.prior = loss, prior
-        self.body_names, self.which, self.pull = names, None, None
+        self.body_names, self.body_indices, self.pull = names, None, None
         if isinstance(charts, Bodies):
-            self.which = jnp.asarray([charts.names.index(name) for name in names], jnp.int32)
+            self.body_indices = jnp.asarray([charts.names.index(name) for name in names], jnp.int32)
             if prior is not None:
                 raise ValueError("Model: a prior is about one body, got several; give None")
         apart = checked_labels(noise_each, "noise_each")
@@ -218,7 +218,7 @@ class Model(eqx.Module):
         self.walks = find_drifts(walks, scene)
         slots = find_slots(free, scene, names)
         _require_own_names(slots, charts)
-        bodies = places_of(charts, self.which, len(names))
+        bodies = places_of(charts, self.body_indices, len(names))
         self.index, self.slots = index_of(bodies, charts.size, slots, data.kinds)
         turn = 1.5 * data.widest * float(np.max(np.asarray(self.reference.rate)))
         if windows is not None and process is not None:
@@ -250,7 +250,7 @@ class Model(eqx.Module):
     def recordings(self) -> tuple[Recording, ...]:
         """Return the recordings, one by one."""
         return tuple(
-            stacking.cut(stacking.one(self.records, index), count)
+            stacking.cut(stacking.pick_records(self.records, index), count)
             for index, count in enumerate(np.asarray(self.counts).tolist())
         )
 
@@ -316,14 +316,14 @@ class Model(eqx.Module):
 
         With several recordings the states have a leading axis.
         """
-        return unpacked(self, require_numbers(self, x))
+        return unpack_numbers(self, require_numbers(self, x))
 
     def bodies(self, x: Float[Array, " n"]) -> Any:
         """Return the body that the free numbers x represent; for several bodies a dict by name."""
         numbers = x[: self.index.bodies]
         if isinstance(self.chart, Bodies):
             return self.chart.all(numbers)
-        return scaled(self.chart, numbers)
+        return scaled_body(self.chart, numbers)
 
     def scenes(self, x: Float[Array, " n"]) -> Scene:
         """Return the scene of each recording at the free numbers x, with a leading axis."""
@@ -350,7 +350,7 @@ class Model(eqx.Module):
             return motion_of(motion_of_scene(self, scene, record)[0])
 
         states = over_records(of_one, self, self.index.rows(x))
-        return stacking.one(states, 0) if self.count == 1 else states
+        return stacking.pick_records(states, 0) if self.count == 1 else states
 
     def errors(self, x: Float[Array, " n"]) -> tuple[Float[Array, "*records times _"], ...]:
         """Return reading minus prediction for each sensor at the free numbers x, in its unit.
@@ -394,7 +394,7 @@ def _data_of_recordings(recordings: list[Recording], torque: Any, charts: Any) -
     # The readings are known, even if the torque is traced: keep these numbers known, too.
     with jax.ensure_compile_time_eval():
         reference = reference_of(recordings, state_kind)
-    kinds = dimension(stacking.one(reference.state, 0)) // 3
+    kinds = dimension(stacking.pick_records(reference.state, 0)) // 3
     widest = max(float(np.diff(r.t).max()) for r in recordings)
     return _Data(records, counts, sensors, state_kind, reference, None, None, kinds, widest)
 
@@ -408,7 +408,7 @@ def _data_of_windows(windows: Windows, torque: Any, charts: Any, stretches: int)
     stretches = _checks.whole(stretches, "stretches", 2)
     reference, weight, clusters = starts_of_windows(windows, stretches)
     _require_states(windows, state_kind)
-    kinds = 0 if weight is None else dimension(stacking.one(reference.state, 0)) // 3
+    kinds = 0 if weight is None else dimension(stacking.pick_records(reference.state, 0)) // 3
     return _Data(
         records, counts, records.sensors, state_kind, reference, weight, clusters, kinds, 0.0
     )
@@ -441,10 +441,10 @@ def _require_own_names(slots: Sequence[Slot], charts: Any) -> None:
             raise ValueError(f"Free {slot.name!r}: {words}")
 
 
-def unpacked(model: Model, x: Float[Array, " n"]) -> Unpacked:
+def unpack_numbers(model: Model, x: Float[Array, " n"]) -> Unpacked:
     """Return the result of `Model.unpack`, without a check of x."""
-    starts = jax.vmap(ReferenceStates.moved)(model.reference, x[model.index.start])
-    state0 = stacking.one(starts, 0) if model.count == 1 else starts
+    starts = jax.vmap(ReferenceStates.start_at)(model.reference, x[model.index.start])
+    state0 = stacking.pick_records(starts, 0) if model.count == 1 else starts
     return Unpacked(x, model.bodies(x), state0, values_of(model, x))
 
 
@@ -455,7 +455,7 @@ def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
         return scene_of(model, row, *rest)
 
     rows = model.index.rows(x)
-    return eqx.filter_vmap(of_one)(rows, model.records, model.reference, model.which)
+    return eqx.filter_vmap(of_one)(rows, model.records, model.reference, model.body_indices)
 
 
 def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:

@@ -35,17 +35,17 @@ class Normal(eqx.Module):
     def diagonal(self) -> Float[Array, " n"]:
         """Return the diagonal."""
         own = self.alone and jnp.diagonal(self.alone.own, axis1=1, axis2=2)
-        return self._joined(jnp.diagonal(self.core), own)
+        return self._join_rows(jnp.diagonal(self.core), own)
 
     def plus(self, diagonal: Float[Array, " n"]) -> "Normal":
         """Return the matrix with the numbers `diagonal` added to its diagonal."""
-        shared, own = self._split(diagonal)
+        shared, own = self._split_rows(diagonal)
         core, alone = self.core + jnp.diag(shared), self.alone
         if alone is None:
             return Normal(core)
         return Normal(core, Alone(alone.own + jax.vmap(jnp.diag)(own), alone.sides, alone.at))
 
-    def wider(self, rows: Float[Array, "m n"]) -> "Normal":
+    def with_rows(self, rows: Float[Array, "m n"]) -> "Normal":
         """Return the matrix with residuals of derivative `rows` added.
 
         These residuals may change only with numbers of the core.
@@ -53,9 +53,9 @@ class Normal(eqx.Module):
         rows = rows[:, : self.core.shape[0]]
         return Normal(self.core + rows.T @ rows, self.alone)
 
-    def scaled(self, unit: Float[Array, " n"]) -> "Normal":
+    def in_units(self, unit: Float[Array, " n"]) -> "Normal":
         """Return the matrix of the numbers counted in the units `unit`."""
-        shared, own = self._split(unit)
+        shared, own = self._split_rows(unit)
         core, alone = self.core * (shared[:, None] * shared[None, :]), self.alone
         if alone is None:
             return Normal(core)
@@ -64,31 +64,31 @@ class Normal(eqx.Module):
         return Normal(core, Alone(alone.own * rows * own[:, None, :], sides, alone.at))
 
     def __matmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        shared, own = self._split(x)
+        shared, own = self._split_rows(x)
         first, alone = self.core @ shared, self.alone
         if alone is None:
             return first
         first = first + jnp.einsum("rks,rk->s", alone.sides, own)
         from_core = jnp.einsum("rks,s->rk", alone.sides, shared)
-        return self._joined(first, jnp.einsum("rkl,rl->rk", alone.own, own) + from_core)
+        return self._join_rows(first, jnp.einsum("rkl,rl->rk", alone.own, own) + from_core)
 
     def solve(self, side: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
         """Return the x with `matrix @ x = side`; NaN unless the matrix is positive definite."""
         alone, count = self.alone, self.core.shape[0]
         if alone is None:
             return _solve(self.core, side)
-        shared, own = self._split(side.reshape(side.shape[0], -1))
+        shared, own = self._split_rows(side.reshape(side.shape[0], -1))
         taken = jax.vmap(_solve)(alone.own, jnp.concatenate([alone.sides, own], axis=2))
         rest = jnp.einsum("rks,rkt->st", alone.sides, taken)
         first = _solve(self.core - rest[:, :count], shared - rest[:, count:])
         last = taken[:, :, count:] - jnp.einsum("rks,st->rkt", taken[:, :, :count], first)
-        return self._joined(first, last).reshape(side.shape)
+        return self._join_rows(first, last).reshape(side.shape)
 
-    def _split(self, x: Array) -> tuple[Array, Array]:
+    def _split_rows(self, x: Array) -> tuple[Array, Array]:
         """Return the rows of x (n, …) of the core, and those (R, k, …) of one recording alone."""
         return (x, x) if self.alone is None else (x[: self.core.shape[0]], x[self.alone.at])
 
-    def _joined(self, shared: Array, own: Array | None) -> Array:
+    def _join_rows(self, shared: Array, own: Array | None) -> Array:
         """Return all rows (n, …) from those of the core and of one recording alone."""
         if self.alone is None:
             return shared

@@ -19,7 +19,7 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.identify.sensors import AbstractSensor, SensorInput
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.coupled import Coupled, CoupledEquations, started
+from rigidjax.motion.coupled import Coupled, CoupledEquations, with_own_states
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.motion.torques.states import freeze
@@ -97,7 +97,7 @@ class FixedSteps(AbstractIntegrator):
     def states(
         self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
     ) -> PyTree:
-        y0 = started(body, state0, torque, ts[0])
+        y0 = with_own_states(body, state0, torque, ts[0])
         field = equations_of_motion(body, y0, torque)
         return fixed(in_a_loop(self.solver), field, ts, y0, self.substeps, self.last)
 
@@ -193,9 +193,9 @@ class HeldSteps(AbstractIntegrator):
     def states(
         self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
     ) -> PyTree:
-        return self.driven(body, state0, ts, torque, {})
+        return self.states_with_inputs(body, state0, ts, torque, {})
 
-    def driven(
+    def states_with_inputs(
         self,
         body: Body,
         state0: State,
@@ -211,7 +211,7 @@ class HeldSteps(AbstractIntegrator):
         """
         count, size = ts.shape[0] - 1, (ts[1] - ts[0]).astype(state0.omega.dtype)
         before = max((len(rows) - ts.shape[0] for rows in inputs.values()), default=0)
-        start = started(body, state0, bind(torque, first_row(torque, size, inputs)), 0.0)
+        start = with_own_states(body, state0, bind(torque, first_row(torque, size, inputs)), 0.0)
         field = equations_of_motion(body, start, torque)
         stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
 
@@ -232,7 +232,7 @@ class HeldSteps(AbstractIntegrator):
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, later)
 
 
-def shifted(field: Callable[..., Any], t: Array, state: PyTree, offset: Array) -> PyTree:
+def shift_in_time(field: Callable[..., Any], t: Array, state: PyTree, offset: Array) -> PyTree:
     """Return the state at t + `offset`, s, by four steps of the classical method of order 4."""
     h = offset / 4.0
     for index in range(4):
@@ -280,7 +280,7 @@ def sensor_inputs(
         else:
             whole = CoupledEquations(field, turned) if isinstance(states, Coupled) else field
             axes = (0, 0, 0 if jnp.ndim(offset) else None)
-            states = jax.vmap(partial(shifted, whole), axes)(ts, states, offset)
+            states = jax.vmap(partial(shift_in_time, whole), axes)(ts, states, offset)
 
     def input_at(t: Array, state: PyTree) -> SensorInput:
         if not isinstance(state, Coupled):

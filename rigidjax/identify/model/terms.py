@@ -25,14 +25,14 @@ from rigidjax.identify.model.predict import (
 from rigidjax.identify.model.scene import Scene
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import Input, bind
-from rigidjax.rotation.barrier import batched_as, platform
+from rigidjax.rotation.barrier import batch_as, platform
 
 if TYPE_CHECKING:
     from rigidjax.identify.model.model import Model
 
 # The row of a recording's free numbers; the index of its body, `None` for one body.
 Row = Float[Array, " columns"]
-Which = Array | None
+BodyIndex = Array | None
 # The errors (R, T, k) of each sensor, and their derivatives (R, T, k, m) by the m numbers of a row.
 Blocks = tuple[tuple[Array, ...], tuple[Array, ...]]
 # The standard deviations (R, k) of each sensor, of R recordings and k components.
@@ -45,12 +45,12 @@ def template(model: "Model", record: Recording) -> Scene:
 
 
 def scene_of(
-    model: "Model", row: Row, record: Recording, reference: ReferenceStates, which: Which
+    model: "Model", row: Row, record: Recording, reference: ReferenceStates, body_index: BodyIndex
 ) -> Scene:
     """Return the scene of one recording from the row of its free numbers."""
     scene = with_steps(template(model, record), model.slots, row)
-    body = body_of_recording(model.chart, row, which)
-    start = reference.moved(row[model.index.first :])
+    body = body_of_recording(model.chart, row, body_index)
+    start = reference.start_at(row[model.index.first :])
     return Scene(body, scene.torque, scene.process, scene.sensors, start)
 
 
@@ -63,7 +63,7 @@ def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[An
         samples = {n: rows for n, rows in record.inputs.items() if n not in functions}
         unbound = {name: Input(name) for name in samples}
         torque = bind(scene.torque, functions | unbound)
-        states = model.integrator.driven(body, scene.start, record.t, torque, samples)
+        states = model.integrator.states_with_inputs(body, scene.start, record.t, torque, samples)
         return states, torque_of_scene(scene, record)
     torque = torque_of_scene(scene, record)
     return states_at(model.integrator, body, scene.start, record.t, torque), torque
@@ -79,7 +79,7 @@ def errors_of_one(
     row: Row,
     record: Recording,
     reference: ReferenceStates,
-    which: Which,
+    body_index: BodyIndex,
     late: Array | None = None,
 ) -> tuple[Array, ...]:
     """Return the errors (T, k) of each sensor in one recording, in its unit; zero where masked.
@@ -88,10 +88,10 @@ def errors_of_one(
 
     - `row`: the free numbers of the recording.
     - `record`, `reference`: its readings, and its reference state.
-    - `which`: the index of its body.
+    - `body_index`: the index of its body.
     - `late`: s, by which all clocks are behind, in addition to their offsets.
     """
-    scene = scene_of(model, row, record, reference, which)
+    scene = scene_of(model, row, record, reference, body_index)
     return errors_of_scene(model, scene, record, late)
 
 
@@ -114,7 +114,7 @@ def over_records(function: Any, model: "Model", *rows: Any) -> Any:
     On a CPU the recordings follow one after another: XLA makes one kernel of a loop over a few
     dozen numbers, whereas batched scalars in the inner loop run at half the speed.
     """
-    trees = *rows, model.records, model.reference, model.which
+    trees = *rows, model.records, model.reference, model.body_indices
     arrays, rest = eqx.partition(trees, eqx.is_array)
 
     def of_one(part: PyTree[Array]) -> PyTree:
@@ -122,7 +122,7 @@ def over_records(function: Any, model: "Model", *rows: Any) -> Any:
 
     if model.count == 1:
         # One recording needs no loop: the program is smaller.
-        return jax.tree.map(lambda leaf: leaf[None], of_one(stacking.one(arrays, 0)))
+        return jax.tree.map(lambda leaf: leaf[None], of_one(stacking.pick_records(arrays, 0)))
     if platform() == "cpu":
         return lax.map(of_one, arrays, batch_size=1)
     return jax.vmap(of_one)(arrays)
@@ -146,7 +146,7 @@ def by_recording(rows: Float[Array, "records columns"], model: "Model", function
     def of_one(row: Row, *rest: Any) -> Any:
         return function(model, row, *rest)
 
-    return batched_as(over_records(of_one, model, rows), rows)
+    return batch_as(over_records(of_one, model, rows), rows)
 
 
 @by_recording.def_jvp
@@ -160,7 +160,7 @@ def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree
         )
     out, slopes = _with_slopes(model, rows, function)
     along = jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, step), slopes)
-    return batched_as(out, rows), along
+    return batch_as(out, rows), along
 
 
 def blocks(model: "Model", x: Float[Array, " n"], function: Any = errors_of_one) -> tuple[Any, Any]:
@@ -210,7 +210,7 @@ def with_jacobian(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tu
     return jax.jacfwd(value_and_aux, has_aux=True)(x)
 
 
-def whitened(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
+def whiten(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
     """Return the errors (R, T, k) of each sensor in standard deviations, by `standardised`."""
     out = []
     for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
@@ -298,7 +298,7 @@ def reading_residuals(
     They are whitened, shrunk by the robust loss, and multiplied by the `weights`.
     """
     out = []
-    for scaled in whitened(model, errors, noise):
+    for scaled in whiten(model, errors, noise):
         if model.loss is not None:
             scaled = jax.vmap(jax.vmap(model.loss.shrink))(scaled)
         out.append(scaled * weights[..., None])
@@ -354,7 +354,7 @@ def weights_of(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array
     if model.loss is None:
         return tuple(mask.astype(e.dtype) for mask, e in zip(masks, errors, strict=True))
     weight = jax.vmap(jax.vmap(model.loss.weight))
-    scaled = whitened(model, errors, noise)
+    scaled = whiten(model, errors, noise)
     return tuple(jnp.where(mask, weight(e), 0.0) for mask, e in zip(masks, scaled, strict=True))
 
 

@@ -239,6 +239,6 @@ def _damped_step(
     # Scale columns to length one, so that Cholesky's factor loses no digits to units.
     root = jnp.sqrt(diagonal)
     damped = damping * jnp.maximum(diagonal, order_one) / root**2
-    move = -normal.scaled(1.0 / root).plus(damped).solve(slope / root) / root
+    move = -normal.in_units(1.0 / root).plus(damped).solve(slope / root) / root
     far = jnp.max(jnp.abs(move) * order_one)
     return move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300)), root

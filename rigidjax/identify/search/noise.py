@@ -65,7 +65,7 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
             both = _jitter(e * root[..., None], u, kept.sum(axis=-1), groups, known, tau)
             grown, tau = (jnp.asarray(each, sigma.dtype) for each in both)
             sigma = sigma * grown[:, None]
-            readings[index] = reading.scattered(tau[:, None, None] * change, tau)
+            readings[index] = reading.with_jitter(tau[:, None, None] * change, tau)
         out.append(sigma)
     if any(reading.late is not None for reading in readings):
         model = eqx.tree_at(lambda p: p.records.readings, model, tuple(readings))

@@ -126,11 +126,11 @@ def least_squares_from(
         row, e = terms.with_jacobian(lambda x: terms.extra_residuals(model, x), x)
         if e.size:
             total, slope = total + jnp.sum(e**2), slope + e @ row
-            normal = normal.wider(row)
-        normal = normal.wider(_bends(model, x, slope))
+            normal = normal.with_rows(row)
+        normal = normal.with_rows(_bends(model, x, slope))
         return Kept((errors, slopes), pulls), 0.5 * total, normal, slope
 
-    nothing = _nothing(model, kind)
+    nothing = _zeros_of_kept(model, kind)
     empty = normal_of(
         (jnp.zeros((places.shape[0], 0, 0, places.shape[1]), kind),), places, number, alone
     )
@@ -164,7 +164,7 @@ def _gain_of_noise(model: Model, kept: Kept, normal: Normal) -> Float[Array, ""]
     slopes = slopes.at[:, starts].set(0.0)
     diagonal = normal.diagonal
     root = jnp.sqrt(jnp.maximum(diagonal, 1e-12 * jnp.max(diagonal)))
-    definite = normal.scaled(1.0 / root).plus(jnp.full_like(root, 1e-12))
+    definite = normal.in_units(1.0 / root).plus(jnp.full_like(root, 1e-12))
     scaled = slopes / root[None, :]
     return 0.5 * jnp.sum(scaled * definite.solve(scaled.T).T)
 
@@ -201,7 +201,7 @@ def _until_last_weight(model: Model, weights: Float[Array, "records times"]) -> 
     return eqx.tree_at(lambda m: m.integrator, model, shorter)
 
 
-def _nothing(model: Model, kind: Any) -> Kept:
+def _zeros_of_kept(model: Model, kind: Any) -> Kept:
     """Return zeros of the shapes that are kept: to trace `terms.blocks` once more takes seconds."""
     count, times = model.records.t.shape
     columns = model.index.places.shape[1]
@@ -332,7 +332,7 @@ def fit_in_stages(
         return _fit_windows(x, task, aim, watch)
     end = _search(x, task, whole_record(model), CAREFUL, aim)
     at_once = _attempt(end)
-    if bool(end.converged) and float(end.cost) <= enough(model):
+    if bool(end.converged) and float(end.cost) <= sufficient_misfit(model):
         watch(at_once)
         return at_once
     level = float(end.first)
@@ -378,7 +378,7 @@ def _fit_windows(
     return attempt
 
 
-def nominal(reading: Reading) -> bool:
+def has_unit_noise(reading: Reading) -> bool:
     """Return whether the noise of a reading is no more than the unit of its errors."""
     return getattr(reading.sensor, "nominal", False)
 
@@ -386,15 +386,15 @@ def nominal(reading: Reading) -> bool:
 def nominal_count(model: Model) -> int:
     """Return the number of errors if the size of none is known by a noise, else 0."""
     readings = model.records.readings
-    return sum(map(count_of, readings)) if all(map(nominal, readings)) else 0
+    return sum(map(count_of, readings)) if all(map(has_unit_noise, readings)) else 0
 
 
-def enough(model: Model) -> float:
+def sufficient_misfit(model: Model) -> float:
     """Return a misfit that only the true motion reaches.
 
     It is twice the mean of half χ² for sensors of known noise, and 1 % of the signal for others.
     """
     return sum(
-        (1.0 if reading.known_noise and not nominal(reading) else 0.01) * count_of(reading)
+        (1.0 if reading.known_noise and not has_unit_noise(reading) else 0.01) * count_of(reading)
         for reading in model.records.readings
     )

@@ -172,7 +172,7 @@ def misfit_of(x: Float[Array, " n"], model: Model, noise: Noise, rows: Array) ->
 
     Its mean over batches is the misfit of the whole model.
     """
-    few, sizes = chosen_recordings(model, rows), stacking.one(noise, rows)
+    few, sizes = chosen_recordings(model, rows), stacking.pick_records(noise, rows)
     weights = jnp.ones_like(few.records.t)
     residuals = reading_residuals(few, all_errors(few, x), sizes, weights)
     scale = model.count / rows.shape[0]
@@ -184,7 +184,7 @@ def chosen_recordings(model: Model, rows: Array) -> Model:
 
     The indices may be traced; the recordings keep their padding.
     """
-    parts = lambda m: (m.records, m.reference, m.which, m.index.places, m.index.start)  # noqa: E731
+    parts = lambda m: (m.records, m.reference, m.body_indices, m.index.places, m.index.start)  # noqa: E731
     return eqx.tree_at(
-        parts, model, stacking.one(parts(model), rows), is_leaf=lambda node: node is None
+        parts, model, stacking.pick_records(parts(model), rows), is_leaf=lambda node: node is None
     )

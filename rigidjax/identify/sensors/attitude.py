@@ -47,12 +47,12 @@ class AttitudeSensor(ClockedSensor):
     mounting: Vec3 | None = eqx.field(converter=base.optional("mounting"), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
-        q = _mounted(now.state.q, self.mounting)
+        q = _mounted_attitude(now.state.q, self.mounting)
         return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
 
     def reading_of(self, now: SensorInput, error: Vec3) -> Float[Array, "4"]:
         """Return the reading (4,) that has the `error` (3,), rad."""
-        q = _mounted(now.state.q, self.mounting)
+        q = _mounted_attitude(now.state.q, self.mounting)
         return quaternion.multiply(q, quaternion.exp(error))
 
     def readings(self, values: np.ndarray) -> np.ndarray:
@@ -81,7 +81,7 @@ def _quaternions(matrices: np.ndarray) -> np.ndarray:
     return np.where(finite[:, None], out, np.nan)
 
 
-def _mounted(q: Array, mounting: Vec3 | None) -> Array:
+def _mounted_attitude(q: Array, mounting: Vec3 | None) -> Array:
     """Return the attitude of a sensor's axes on a body of attitude q."""
     return q if mounting is None else quaternion.multiply(q, quaternion.exp(mounting))
 
@@ -125,7 +125,7 @@ class Direction(ClockedSensor):
         predicted = self._predict(now)
         # The axes across the reading are data: no derivative passes through them. Axes across the
         # prediction would jump as the motion changes.
-        first, second = _across(reading)
+        first, second = _orthogonal_pair(reading)
         # The chord is sin θ / cos ½θ = 2 sin ½θ; the bound guards opposite directions.
         half = jnp.sqrt(jnp.maximum(0.5 * (1.0 + dot(predicted, reading)), 1e-12))
         return -jnp.stack([dot(first, predicted), dot(second, predicted)]) / half
@@ -137,7 +137,7 @@ class Direction(ClockedSensor):
         prediction, which are turned from those across the reading by the angle between the two.
         """
         predicted = self._predict(now)
-        first, second = _across(predicted)
+        first, second = _orthogonal_pair(predicted)
         # |error| is a chord: cos θ = 1 − ½ |error|², sin θ = |error| cos ½θ.
         square = jnp.minimum(error[0] * error[0] + error[1] * error[1], 4.0)
         half = jnp.sqrt(1.0 - 0.25 * square)
@@ -145,7 +145,7 @@ class Direction(ClockedSensor):
 
     def _predict(self, now: SensorInput) -> Vec3:
         """Return the predicted direction (3,) in the sensor's axes."""
-        return quaternion.rotate_inverse(_mounted(now.state.q, self.mounting), self.world)
+        return quaternion.rotate_inverse(_mounted_attitude(now.state.q, self.mounting), self.world)
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         """Return the rows that are no unit vectors, (T,) true where wrong, and why."""
@@ -157,7 +157,7 @@ def _not_unit(rows: np.ndarray) -> np.ndarray:
     return np.abs(np.linalg.norm(rows, axis=1) - 1) > 1e-6
 
 
-def _across(line: Vec3) -> tuple[Vec3, Vec3]:
+def _orthogonal_pair(line: Vec3) -> tuple[Vec3, Vec3]:
     """Return two unit vectors that are orthogonal to the unit vector `line` and to each other."""
     least = jnp.eye(3, dtype=line.dtype)[jnp.argmin(jnp.abs(line))]
     first = cross(line, least)
@@ -264,7 +264,9 @@ class Velocity(ClockedSensor):
             arm = now.lever(self.place)
             velocity = velocity + quaternion.rotate(state.q, cross(state.omega, arm))
         if self.mounting is not None:
-            velocity = quaternion.rotate_inverse(_mounted(state.q, self.mounting), velocity)
+            velocity = quaternion.rotate_inverse(
+                _mounted_attitude(state.q, self.mounting), velocity
+            )
         return reading - (velocity if self.bias is None else velocity + self.bias)
 
 

@@ -16,7 +16,7 @@ from rigidjax.identify.model.terms import (
     extra_residuals,
     prior_weights,
     weights_of,
-    whitened,
+    whiten,
     with_jacobian,
     with_rows,
 )
@@ -132,10 +132,10 @@ def _flat(slopes: np.ndarray) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _linearised(model: Model, x: Array, noise: Noise, blocks: Blocks) -> PyTree[Array]:
+def _linearise_parts(model: Model, x: Array, noise: Noise, blocks: Blocks) -> PyTree[Array]:
     """Return the parts of `linearise` as one program: of readings, places, of other residuals."""
     errors, slopes = blocks
-    out, slopes = with_rows(lambda e: whitened(model, e, noise), errors, slopes)
+    out, slopes = with_rows(lambda e: whiten(model, e, noise), errors, slopes)
     extra_slopes, extra = with_jacobian(lambda x: extra_residuals(model, x), x)
     weights, prior = weights_of(model, errors, noise), prior_weights(model)
     return (out, slopes, weights), model.index.places, (prior * x, prior, extra, extra_slopes)
@@ -159,7 +159,7 @@ def linearise(
       taken, and the `blocks` there.
     """
     (errors, slopes, weights), places, others = jax.tree.map(
-        np.asarray, _linearised(model, x, noise, blocks)
+        np.asarray, _linearise_parts(model, x, noise, blocks)
     )
     raw, raw_slopes = (tuple(map(np.asarray, part)) for part in blocks)
     if thickened is not None:

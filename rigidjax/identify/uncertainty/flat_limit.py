@@ -76,13 +76,13 @@ def interval_ends(
     return end(-1.0), end(1.0)
 
 
-def thickened(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
+def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     """Return the free numbers x with each flat body made thicker; `None` if no body is flat.
 
     The derivative of a chart is zero at a flat body. The information on the tensor itself is
     regular there, and hardly differs between a flat body and one of so small a thickness.
     """
-    thick = list(map(_thicker, charts_of(model.chart), bodies_of(model, x)))
+    thick = list(map(_thicken_chart, charts_of(model.chart), bodies_of(model, x)))
     if all(one is None for one in thick):
         return None
     pairs = zip(numbers_of(model.chart, x[: model.index.bodies]), thick, strict=True)
@@ -97,7 +97,7 @@ def bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
     return as_list(model.bodies(x))
 
 
-def _thicker(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
+def _thicken_chart(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
     """Return the numbers of a thicker body in the chart; `None` for a body that is not flat.
 
     It is `None` for a chart by a user, too, of which the limit is not known.

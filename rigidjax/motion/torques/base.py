@@ -179,7 +179,7 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
     """Return the torque's value (3,), N m, body frame. **Raises:** `TypeError` for a force, which
     needs a `Rigid`.
     """
-    force, value = act(torque, t, state, body)
+    force, value = force_and_torque(torque, t, state, body)
     if force is not None:
         raise TypeError(
             f"{type(torque).__name__} returns a force (a Wrench): wanted a Rigid state, got "
@@ -188,7 +188,7 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
     return value
 
 
-def act(
+def force_and_torque(
     law: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> tuple[Vec3 | None, Vec3]:
     """Return the force on the centre of mass (N, world frame, or `None`), and the torque about it
@@ -202,7 +202,7 @@ def act(
     try:
         found = in_precision(law, dtype)(t, state, in_precision(body, dtype))
     except AttributeError as wrong:
-        told = lacking(name, wrong)
+        told = missing_state_message(name, wrong)
         if told is None:
             raise
         hint = "; a subclass of AbstractTorque declares the state that it reads by feels"
@@ -223,7 +223,7 @@ _HIGHER = {
 }
 
 
-def lacking(who: str, wrong: AttributeError) -> str | None:
+def missing_state_message(who: str, wrong: AttributeError) -> str | None:
     """Return the message for a user's function that read a part which its state lacks; `None` for
     any other error.
     """
@@ -268,12 +268,12 @@ def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Arr
 
 def vector(name: str, *, hint: str = "") -> Callable[[Any], Array]:
     """Return a converter to a field of three numbers, for `equinox.field(converter=…)`."""
-    return lambda value: _checks.given(value, (3,), name, hint=hint)
+    return lambda value: _checks.finite_floating(value, (3,), name, hint=hint)
 
 
 def number(name: str) -> Callable[[Any], Array]:
     """Return a converter to a field of one number."""
-    return lambda value: _checks.given(value, (), name)
+    return lambda value: _checks.finite_floating(value, (), name)
 
 
 def source(name: str) -> Callable[[Any], Any]:
@@ -285,7 +285,7 @@ def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
     """Return `source` unchanged if it can be called with a time; otherwise as a vector (size,)."""
     if callable(source):
         return _checks.function(source, name, f"of time to ({size},)")
-    return _checks.given(source, (size,), name)
+    return _checks.finite_floating(source, (size,), name)
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:
@@ -312,7 +312,7 @@ def jumps_of_parts(law: object) -> Float[Array, " n"]:
 
 def unit_rows(value: Any, name: str, count: int) -> Float[Array, "n 3"]:
     """Return directions (count, 3); known directions must be unit vectors."""
-    rows = _checks.given(value, (count, 3), name)
+    rows = _checks.finite_floating(value, (count, 3), name)
     if _checks.known(rows):
         lengths = np.linalg.norm(np.asarray(rows, float), axis=1)
         if abs(lengths - 1).max() > 1e-6:
@@ -330,9 +330,11 @@ def count_of(value: Any, name: str, one: str) -> int:
     return shape[0]
 
 
-def each(value: Any, count: int, name: str) -> Array:
+def one_or_each(value: Any, count: int, name: str) -> Array:
     """Return one number for all, or one number for each of `count`, by the shape of `value`."""
-    return _checks.given(value, (count,) if _checks.numbers(value, name).ndim else (), name)
+    return _checks.finite_floating(
+        value, (count,) if _checks.numbers(value, name).ndim else (), name
+    )
 
 
 def length_or_zero(v: Vec3) -> Scalar:

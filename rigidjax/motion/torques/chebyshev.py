@@ -44,7 +44,10 @@ class Chebyshev(eqx.Module):
             raise ValueError(f"coefficients: wanted (intervals, k, terms), got {rows.shape}")
         dtype = jnp.result_type(float)
         self.coefficients = _checks.finite(rows, "coefficients").astype(dtype)
-        self.start, step = _checks.given(start, (), "start"), _checks.given(step, (), "step")
+        self.start, step = (
+            _checks.finite_floating(start, (), "start"),
+            _checks.finite_floating(step, (), "step"),
+        )
         self.start = self.start.astype(dtype)
         self.step = _checks.sign(step, "step", "a positive length, s").astype(dtype)
 

@@ -64,7 +64,7 @@ class Sum(eqx.Module):
     def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | base.Wrench:
         forces, torque = [], None
         for part in self.parts:
-            force, more = base.act(part, t, state, body)
+            force, more = base.force_and_torque(part, t, state, body)
             torque = more if torque is None else torque + more
             forces += [] if force is None else [force]
         if not forces:
@@ -157,7 +157,7 @@ class ChangingInertia(eqx.Module):
         turning = cross(held, omega) - slopes[0]
         force = None
         if self.torque is not None:
-            force, torque = base.act(self.torque, t, state, with_tensor(body, now))
+            force, torque = base.force_and_torque(self.torque, t, state, with_tensor(body, now))
             turning = turning + torque
         # The equations of the body use its own inertia: return the torque that gives them this Ω̇.
         fixed = tensor_of(body)

@@ -147,12 +147,15 @@ class Rotors(base.AbstractForce):
         speeds: Any,
     ):
         count = base.count_of(positions, "positions", "rotor")
-        self.positions = _checks.given(positions, (count, 3), "positions")
+        self.positions = _checks.finite_floating(positions, (count, 3), "positions")
         self.directions = base.unit_rows(directions, "directions", count)
-        self.spins = _checks.given(spins, (count,), "spins")
+        self.spins = _checks.finite_floating(spins, (count,), "spins")
         if _checks.known(self.spins) and (abs(np.asarray(self.spins)) != 1).any():
             raise ValueError(f"spins: wanted 1 or -1 for each rotor, got {np.asarray(self.spins)}")
-        self.thrust, self.drag = base.each(thrust, count, "thrust"), base.each(drag, count, "drag")
+        self.thrust, self.drag = (
+            base.one_or_each(thrust, count, "thrust"),
+            base.one_or_each(drag, count, "drag"),
+        )
         self.speeds = base.constant_or_callable(speeds, "speeds", count)
 
     jump_times = property(base.jumps_of_parts)

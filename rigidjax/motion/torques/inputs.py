@@ -76,7 +76,7 @@ class Delayed(eqx.Module):
             words = "has states, whose past is not kept; delay its input"
             words += ": Lagged(Delayed(source, delay), time)"
             raise TypeError(f"Delayed: {type(source).__name__} {words}")
-        self.delay = _checks.given(delay, (), "delay").astype(jnp.result_type(float))
+        self.delay = _checks.finite_floating(delay, (), "delay").astype(jnp.result_type(float))
         if isinstance(source, Delayed):
             source, self.delay = source.source, self.delay + source.delay
         if not isinstance(source, Input) and inputs_of(source):

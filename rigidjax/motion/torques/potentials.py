@@ -91,10 +91,10 @@ class GravityGradient(base.OfTime):
     harmonics: tuple[Float[Array, " orders"], ...]
 
     def __init__(self, mu: ScalarLike, position: object, harmonics: Sequence[ArrayLike] = ()):
-        self.mu = _checks.given(mu, (), "mu")
+        self.mu = _checks.finite_floating(mu, (), "mu")
         self.position = base.constant_or_callable(position, "position")
         self.harmonics = tuple(
-            _checks.given(row, (2 * n + 1,), f"harmonics: degree {n}")
+            _checks.finite_floating(row, (2 * n + 1,), f"harmonics: degree {n}")
             for n, row in enumerate(harmonics, 3)
         )
         at: Any = self.position

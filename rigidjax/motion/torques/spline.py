@@ -144,10 +144,14 @@ class Wheel(eqx.Module):
         axis = _checks.refuse(axis, off, f"axis: wanted a unit vector (3,){found}")
         _checks.function(speed, "speed", "of time to rad/s")
         kind = jnp.result_type(float)
-        self.inertia = _checks.given(inertia, (), "inertia").astype(kind)
+        self.inertia = _checks.finite_floating(inertia, (), "inertia").astype(kind)
         self.axis, self.speed = axis.astype(kind), speed
-        self.delay = None if delay is None else _checks.given(delay, (), "delay").astype(kind)
-        self.tilt = None if tilt is None else _checks.given(tilt, (2,), "tilt").astype(kind)
+        self.delay = (
+            None if delay is None else _checks.finite_floating(delay, (), "delay").astype(kind)
+        )
+        self.tilt = (
+            None if tilt is None else _checks.finite_floating(tilt, (2,), "tilt").astype(kind)
+        )
 
     @property
     def direction(self) -> Vec3:

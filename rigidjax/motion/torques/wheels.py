@@ -140,19 +140,19 @@ class ReactionWheels(base.AbstractTorque):
     ):
         count = base.count_of(axes, "axes", "wheel")
         self.axes = base.unit_rows(axes, "axes", count)
-        inertia = _checks.given(inertia, (count,), "inertia")
+        inertia = _checks.finite_floating(inertia, (count,), "inertia")
         self.inertia = _checks.if_known(_checks.sign, inertia, "inertia", "> 0")
-        self.speeds = _checks.given(speeds, (count,), "speeds")
+        self.speeds = _checks.finite_floating(speeds, (count,), "speeds")
         self.motor = None if motor is None else base.constant_or_callable(motor, "motor", count)
         if feedback is not None:
             words = "(t, state, speeds) → torques (R,), N m"
             feedback = _checks.function(feedback, "feedback", words)
         self.feedback = feedback
-        self.max_torque = _each(max_torque, count, "max_torque", "> 0")
-        self.max_speed = _each(max_speed, count, "max_speed", "> 0")
-        self.viscous = _each(viscous, count, "viscous", "≥ 0")
-        self.coulomb = _each(coulomb, count, "coulomb", "≥ 0")
-        turn_over = _checks.given(turn_over, (), "turn_over")
+        self.max_torque = _one_or_each(max_torque, count, "max_torque", "> 0")
+        self.max_speed = _one_or_each(max_speed, count, "max_speed", "> 0")
+        self.viscous = _one_or_each(viscous, count, "viscous", "≥ 0")
+        self.coulomb = _one_or_each(coulomb, count, "coulomb", "≥ 0")
+        turn_over = _checks.finite_floating(turn_over, (), "turn_over")
         self.turn_over = _checks.if_known(_checks.sign, turn_over, "turn_over", "> 0")
 
     @property
@@ -237,11 +237,11 @@ def _smooth(x: Array) -> Array:
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))
 
 
-def _each(value: Any, count: int, name: str, wanted: str) -> Array | None:
+def _one_or_each(value: Any, count: int, name: str, wanted: str) -> Array | None:
     """Return one number for all wheels, or one number for each, checked to be "> 0" or "≥ 0";
     `None` for `None`.
     """
     if value is None:
         return None
-    found = base.each(value, count, name)
+    found = base.one_or_each(value, count, name)
     return _checks.if_known(_checks.sign, found, name, wanted, zero=wanted == "≥ 0")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.times import increasing, kept_rows, remark_on_step
+from rigidjax.cli.logs.times import kept_rows, mask_of_increasing, remark_on_step
 
 NAN = np.nan
 
@@ -28,7 +28,7 @@ def longest(t):
 def test_as_few_rows_as_possible_are_left_out(seed):
     rng = np.random.default_rng(seed)
     t = np.where(rng.random(9) < 0.15, NAN, rng.integers(0, 9, 9).astype(float))
-    keep = increasing(t)
+    keep = mask_of_increasing(t)
     assert (np.diff(t[keep]) > 0).all() and np.isfinite(t[keep]).all()
     assert keep.sum() == longest(t)
 
