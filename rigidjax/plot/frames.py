@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax.frames import MovingFrame, Point
+from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.plot.style import AXES, COLOURS, plain, rows, several_axes, times
 
 
 def frames(
-    frame: MovingFrame,
+    frame: MovingFrame | AbstractScene,
     ts: Float[ArrayLike, " times"],
     inside: Point,
     *,
@@ -26,18 +26,21 @@ def frames(
 ) -> Any:
     """Draw a path in the moving frame on the left, and in the inertial frame on the right.
 
-    **Arguments:** `frame` the `MovingFrame`; `ts` (T,); `inside` the path in the moving frame, a
-    `Point` with a leading time axis (`frame.from_inertial` makes it from a path in the inertial
-    frame); `plane` two of `xyz`; `unit` of length; `marks` places at rest in the frame, name →
-    (3,); `title`; `ax` two axes. **Returns** the axes (2,).
+    **Arguments:** `frame` the `MovingFrame`, or a scene that has one as its `frame`; `ts` (T,);
+    `inside` the path in the moving frame, a `Point` with a leading time axis
+    (`frame.from_inertial` makes it from a path in the inertial frame); `plane` two of `xyz`; `unit`
+    of length; `marks` places at rest in the frame, name → (3,); `title`; `ax` two axes. **Returns**
+    the axes (2,).
 
-    >>> turntable = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
+    >>> turntable = rj.scenes.turntable(1.0)
     >>> ts = jnp.linspace(0.0, 3.0, 20)
     >>> seen = rj.simulate(None, Point([1.0, 0, 0], [0.0, 0, 0]), ts, turntable).ys
     >>> [one.get_title() for one in frames(turntable, ts, seen)]
     ['seen from the moving frame', 'seen from the inertial frame']
     """
-    _checks.instance(frame, MovingFrame, "frame")
+    moving: Any = getattr(frame, "frame", frame)
+    wanted = "a MovingFrame, or a scene with one such as scenes.turntable"
+    _checks.instance(moving, MovingFrame, "frame", wanted=wanted)
     _checks.instance(inside, Point, "inside")
     known = isinstance(plane, str) and set(plane) <= set(AXES)
     if not known or len(plane) != 2 or plane[0] == plane[1]:
@@ -46,7 +49,7 @@ def frames(
     path = rows(inside.x, 3, "inside.x")
     kind = _checks.numbers(inside.x, "inside.x").dtype
     t = jnp.asarray(times(ts, path.shape[0], "the path has"), kind)
-    outside = np.asarray(jax.vmap(frame.to_inertial)(inside, t).x)
+    outside = np.asarray(jax.vmap(moving.to_inertial)(inside, t).x)
     ax = several_axes(ax, (2,), ncols=2, figsize=(9.6, 4.6))
     names = (("moving", path), ("inertial", outside))
     for one, (name, line) in zip(ax, names, strict=True):
@@ -65,7 +68,7 @@ def frames(
             raise ValueError(f"marks[{name!r}]: wanted a place (3,), got shape {here.shape}")
         still = jax.tree.map(lambda leaf: jnp.zeros_like(leaf), inside)
         still = Point(still.x + jnp.asarray(here, still.x.dtype)[None], still.v)
-        moved = np.asarray(jax.vmap(frame.to_inertial)(still, t).x)
+        moved = np.asarray(jax.vmap(moving.to_inertial)(still, t).x)
         ax[0].plot(here[i], here[j], color=colour, marker="s", ms=6, ls="", label=plain(name))
         ax[1].plot(moved[:, i], moved[:, j], color=colour, lw=0.9, ls="--", label=plain(name))
     ax[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)

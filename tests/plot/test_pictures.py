@@ -259,8 +259,12 @@ def test_the_pictures_of_a_fit(found):
     assert figure.axes[0].get_ylabel() == "body rate, rad/s"
 
 
-def test_a_free_particle_goes_straight_on_the_right():
-    turntable = rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.5]))
+@pytest.mark.parametrize(
+    "turntable",
+    [rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.5])), rj.scenes.turntable(1.5)],
+    ids=["frame", "scene"],
+)
+def test_a_free_particle_goes_straight_on_the_right(turntable):
     ts = jnp.linspace(0.0, 3.0, 30)
     seen = rj.simulate(None, rj.Point([1.0, 0, 0], [0.0, 0.2, 0.0]), ts, turntable).ys
     left, right = rj.plot.frames(turntable, ts, seen, marks={"post": [0.5, 0.0, 0.0]})
@@ -354,6 +358,8 @@ def test_words_on_mistakes(flip, monkeypatch):
             rj.Point(flip.ys.omega, flip.ys.omega),
             plane="xyz",
         )
+    with pytest.raises(TypeError, match="frame: wanted a MovingFrame, or a scene with one"):
+        rj.plot.frames(rj.scenes.earth(0.5), flip.ts, rj.Point(flip.ys.omega, flip.ys.omega))
     with pytest.raises(ValueError, match="fps: wanted a positive number, got 0"):
         rj.plot.tumble(BODY, flip.ts, flip.ys, fps=0)
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
