@@ -168,7 +168,7 @@ def test_linear_of_any_number_of_channels_under_jit_and_vmap():
         (lambda: torques.Delayed(torques.Held([0.0, 1.0], [1.0, 2.0]), 1.0), ValueError, "delay: 1 s is as long as the record of 1 s"),
         (lambda: torques.Delayed(torques.InSpace(torques.Input("u")), 0.1), TypeError, "delay the Input itself"),
         (lambda: torques.Delayed(torques.Input("u"), np.nan), ValueError, "delay: contains NaN"),
-        (lambda: rj.batch.rollout(BODY, spins(2), H, STEPS, Turn(torques.Delayed(torques.Input("u"), 0.7)), inputs={"u": ROWS}), ValueError, r"inputs\['u'\]: a delay of 0\.7 s, and a run of 0\.6 s"),
+        (lambda: rj.batch.rollout(BODY, spins(2), H, STEPS, Turn(torques.Delayed(torques.Input("u"), 0.7)), inputs={"u": ROWS}), ValueError, r"inputs\['u'\]: its delay of 0\.7 s is not shorter than the run of 0\.6 s"),
         (lambda: rj.simulate(BODY, rj.Spin([0.0, 0, 0]), [0.0, 1.0], Turn(torques.Delayed(torques.Input("u"), 0.6))), ValueError, r"Input\('u'\) has no value"),
     ],
 )  # fmt: skip

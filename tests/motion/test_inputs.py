@@ -63,11 +63,12 @@ def test_by_attitude_by_magnus_and_by_sensitivity():
         (
             {"inputs": {"u": RAMP[:, :-1]}},
             ValueError,
-            r"\(N, num_steps, \*k\) = \(2, 12\).*\(2, 11",
+            r"\(N, num_steps, \*k\) that begins with \(2, 12\), got \(2, 11\)",
         ),
         ({"inputs": {"u": RAMP * np.nan}}, ValueError, r"inputs\['u'\].*NaN"),
     ],
 )
+@pytest.mark.usefixtures("unhooked")
 def test_wrong_inputs_are_named(change, kind, words):
     with pytest.raises(kind, match=words):
         rj.batch.rollout(BODY, spins(2), H, STEPS, Drive(torques.Input("u")), **change)
