@@ -40,8 +40,8 @@ def terms_of_one(
     Readings are normal about the motion. If a torque or a sensor error is unknown, the filter
     integrates it out, and readings are normal about the predictions of the filter.
 
-    **Arguments:** `row` the free numbers of the recording; `record`, `reference` and `which` its
-    readings, its reference state and the index of its body.
+    **Arguments:** `row` the free numbers of the recording; `record`, `reference` and `body_index`
+    its readings, its reference state and the index of its body.
     """
     scene = scene_of(model, row, record, reference, body_index)
     if scene.process is None and not model.walks:
