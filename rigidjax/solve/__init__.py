@@ -1,4 +1,4 @@
-"""Motions by a solver: in our own loops, or by diffrax."""
+"""Motions by a solver of diffrax, adaptive or with fixed steps."""
 
 from rigidjax._names import show
 from rigidjax.solve.adaptive import adaptive as adaptive

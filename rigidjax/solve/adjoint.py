@@ -6,7 +6,7 @@ other steps between the same ends: the derivative is then that of these, the sam
 """
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,31 +21,41 @@ from rigidjax.solve.adaptive_loop import (
     Record,
     Run,
     Segment,
-    going,
+    is_running,
     per_body,
     recorded,
-    saved,
     segment,
     state_in_step,
+    states_at_saved_times,
     times_of,
-    unpacked,
 )  # fmt: skip
 from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Step, stages
 
 
+class Smooth(NamedTuple):
+    """The numbers of a run that have derivatives, or their tangents or cotangents."""
+
+    t0: Array
+    stops: Array
+    between: Array
+    y0: Array
+
+
 def passed(run: Run, part: Segment) -> Array:
-    """The number of saved times passed at the start of each row, and at the end."""
+    """Return the number of saved times passed at the start of each row, and at the end."""
     ends = jnp.concatenate([jnp.minimum(part.times, part.end[None]), part.end[None]])
     search = lambda ts, t: jnp.searchsorted(ts, t, side="right").astype(jnp.int32)  # noqa: E731
-    return per_body(run, search)(lax.stop_gradient(run.between), ends)
+    count = per_body(run, search)(lax.stop_gradient(run.between), ends)
+    # A time at the start is in the first step.
+    return jnp.where(ends <= lax.stop_gradient(run.t0)[None], 0, count)
 
 
 def of_saved(
     method: Method, run: Run, step: Step, slopes: Array, first: Array, last: Array, bars: Array,
     between: Array | None,
 ) -> tuple[Array | None, Step, Array]:  # fmt: skip
-    """The transpose of the states at the times in a step, from number `first` to before `last`.
+    """Transpose the states at the times in a step, from number `first` to before `last`.
 
     `bars` (K, n, *bodies) are the cotangents of all states. **Returns** `between`, if it is not
     `None`, with the cotangents of the times added, and those of the step and its slopes.
@@ -69,16 +79,15 @@ def of_saved(
     return total, *by
 
 
-def replayed(
+def replay_steps(
     method: Method, constants: Arrays, run: Run, record: Record
 ) -> tuple[Array, Array, Array, Array]:
-    """States between and at the end, starts, rows, by the steps of the record, which are held."""
-    head = record.starts.shape[1] - run.y0.shape[0]
+    """Return states between, at the end, at starts, and rows, by the steps of the record, held."""
 
     def one(i: Array, state: tuple[Array, Array, Array, Array]) -> Any:
         y, ys, starts, _ = state
         part = _again(method, *still, held, i)
-        starts = lax.dynamic_update_index_in_dim(starts, starts[i].at[head:].set(y), i, 0)
+        starts = lax.dynamic_update_index_in_dim(starts, y, i, 0)
 
         def step(k: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
             y, rows = both
@@ -89,32 +98,31 @@ def replayed(
 
         y, rows = lax.fori_loop(0, part.number, step, (y, part.rows))
         if run.between.shape[0]:
-            ys = saved(method, constants, run, part._replace(rows=rows), ys)
+            ys = states_at_saved_times(method, constants, run, part._replace(rows=rows), ys)
         return y, ys, starts, rows
 
     still, held = lax.stop_gradient(((constants, run), record))
     number = jnp.max(held.number)
     ys = jnp.zeros((run.between.shape[0], *run.y0.shape), run.y0.dtype)
-    state = (run.y0, ys, held.starts, held.rows)
+    state = (run.y0, ys, held.starts.y, held.rows)
     y, ys, starts, rows = lax.fori_loop(0, number, one, state)
-    starts = lax.dynamic_update_index_in_dim(starts, starts[number].at[head:].set(y), number, 0)
-    return ys, y, starts, rows
+    return ys, y, lax.dynamic_update_index_in_dim(starts, y, number, 0), rows
 
 
 def cotangents(
     method: Method, constants: Arrays, run: Run, record: Record, bars: Arrays, timed: bool
-) -> tuple[Arrays, Run]:
-    """The transpose of the tangents of `replayed`: cotangents of the constants and of the run.
+) -> tuple[Arrays, Smooth]:
+    """Return the cotangents of the constants and of the run: the transpose of `replay_steps`.
 
     `bars` are those of the states between and at the end. Times have some only where `timed`.
     """
     number, size = jnp.max(record.number), run.between.shape[0]
 
-    def one(i: Array, sums: tuple[Arrays, Run]) -> tuple[Arrays, Run]:
+    def one(i: Array, sums: tuple[Arrays, Smooth]) -> tuple[Arrays, Smooth]:
         part = _again(method, constants, run, record, number - 1 - i)
         known = passed(run, part) if size else None
 
-        def step(k: Array, sums: tuple[Arrays, Run]) -> tuple[Arrays, Run]:
+        def step(k: Array, sums: tuple[Arrays, Smooth]) -> tuple[Arrays, Smooth]:
             total, of_run = sums
             k = part.number - 1 - k
             row = part.rows[k]
@@ -149,24 +157,24 @@ def cotangents(
 
         return lax.fori_loop(0, part.number, step, sums)
 
-    none = Run(*(jnp.zeros_like(a) for a in run))._replace(y0=bars[1])
+    none = Smooth(*(jnp.zeros_like(a) for a in run[: len(Smooth._fields)]))._replace(y0=bars[1])
     return lax.fori_loop(0, number, one, ([jnp.zeros_like(c) for c in constants], none))
 
 
 def _where(there: Array, a: Array) -> Array:
-    """`a` (…, *bodies), nothing where it is not `there`."""
+    """Return `a` (…, *bodies), 0 where it is not `there`."""
     return jnp.where(lift(there, a), a, jnp.zeros_like(a))
 
 
 def _again(method: Method, constants: Arrays, run: Run, record: Record, number: Array) -> Segment:
-    """A segment of the record; any but the last is run once more."""
-    loop, after = (unpacked(record.starts[i]) for i in (number, number + 1))
+    """Return a segment of the record; any but the last is run once more."""
+    loop, after = (jax.tree.map(lambda a: a[i], record.starts) for i in (number, number + 1))  # noqa: B023
     again = number < jnp.max(record.number) - 1
     # Nothing is left to do of the last one.
-    until = jnp.where(again, after.t, -jnp.inf)
+    until = jnp.where(again, lax.stop_gradient(after.t), -jnp.inf)
     end, rows, count = recorded(method, constants, run, loop, record.rows, until)
     # With too little room for its steps there would be wrong numbers: then there are none.
-    short = jnp.where(jnp.any(going(method, run, end, until)), jnp.nan, 0.0)
+    short = jnp.where(jnp.any(is_running(method, run, end, until)), jnp.nan, 0.0)
     rows = rows.at[:, HEAD:].add(short.astype(rows.dtype))
     count = jnp.where(again, count, jnp.max(record.filled))
     return segment(rows, after.t, count)

@@ -34,11 +34,13 @@ class Layout(NamedTuple):
         axes = [None if s else -1 for s in self.shared]
         return jax.vmap(function, (axes, -1, -1), -1) if self.bodies else function
 
-    def owned(self, constants: Arrays, which: list[bool], like: Any) -> tuple["Layout", Arrays]:
-        """The constants, `which` of them one of each body, of which `like` has as many."""
+    def broadcast_to_bodies(
+        self, constants: Arrays, per_body: list[bool], like: Any
+    ) -> tuple["Layout", Arrays]:
+        """Return the constants, those `per_body` one of each body, of which `like` has as many."""
         if not self.bodies:
             return self, constants
-        own = [s and w for s, w in zip(self.shared, which, strict=True)]
+        own = [s and w for s, w in zip(self.shared, per_body, strict=True)]
         constants = [
             jnp.broadcast_to(c[..., None], (*c.shape, like.shape[-1])) if o else c
             for c, o in zip(constants, own, strict=True)
@@ -116,11 +118,11 @@ def _jvp(
     constants, each = list(primals[:number]), list(primals[number:])
     moving = [not isinstance(t, SymbolicZero) for t in tangents]
     # Tangents of constants have a last axis of bodies, and so have then these.
-    _, along = was.owned(list(tangents[:number]), moving[:number], each[0])
+    _, along = was.broadcast_to_bodies(list(tangents[:number]), moving[:number], each[0])
     along = [t for t, m in zip([*along, *tangents[number:]], moving, strict=True) if m]
 
     def with_tangents(layout: Layout, constants: Arrays, rest: Arrays) -> Arrays:
-        layout, constants = layout.owned(constants, moving[:number], rest[0])
+        layout, constants = layout.broadcast_to_bodies(constants, moving[:number], rest[0])
         args, given = [*constants, *rest[: len(each)]], iter(rest[len(each) :])
         both = zip(args, moving, strict=True)
         moved = [next(given) if m else zero_from_primal(a) for a, m in both]

@@ -10,17 +10,47 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import diffrax as dfx
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve.adaptive_loop import Run, at, controlled
-from rigidjax.solve.batching import lift
-from rigidjax.solve.runge_kutta import Step
+from rigidjax.solve.adaptive_loop import NONFINITE, before, take
+from rigidjax.solve.batching import Arrays, lift
+from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
+from rigidjax.solve.tableaus import Tableau
 
+# The defaults of diffrax.PIDController.
+_SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 # Newton's guesses in a step, from then on halves; and how often a step is taken again for a turn.
 _GUESSES = 8
 _MOST = 70
+
+
+class Method(NamedTuple):
+    """An explicit method for a field, on (n, *bodies)."""
+
+    tableau: Tableau
+    field: Field
+    project: Callable[[Array], Array]
+    sizes: list[int]  # of the arrays of the state
+
+
+class Path(NamedTuple):
+    """The numbers of a search, a last axis of bodies in each."""
+
+    t0: Array
+    stops: Array  # (J,) where the field jumps, and the last time
+    y0: Array  # (n,)
+    rtol: Array
+    atol: Array
+    h0: Array  # the first step, NaN to choose one
+
+    @property
+    def before(self) -> Array:
+        """The last moment before each stop (J,): a stage there sees the field before the jump."""
+        return jnp.concatenate([before(self.stops[:-1]), self.stops[-1:]])
 
 
 class Motion(NamedTuple):
@@ -82,8 +112,8 @@ class _Body(NamedTuple):
     jumped: Array  # whether g jumped over the zero found last
 
 
-def locate(motion: Motion, search: Search, run: Run) -> Located:
-    """The crossings after `run.t0` on the way through `run.stops`, from the first step `run.h0`."""
+def locate(motion: Motion, search: Search, run: Path) -> Located:
+    """Return the crossings after `run.t0` through all `run.stops`; the first step is `run.h0`."""
     t0, y0 = run.t0, run.y0
     g, rate, *_ = motion.condition(t0, y0)
     # On the section but for round-off of the time: then the side is where g goes.
@@ -97,7 +127,7 @@ def locate(motion: Motion, search: Search, run: Run) -> Located:
     end = _End(x, none, none)
     g = jnp.where(there, none, g)
     body = _Body(t0, y0, h, side, g, rate, zero, no, x, end, end, zero, zero, no, no)
-    on = lambda body: jnp.any(_going(search, run, body))  # noqa: E731
+    on = lambda body: jnp.any(_is_running(search, run, body))  # noqa: E731
 
     def next_zero(body: _Body) -> _Body:
         body = lax.while_loop(on, partial(_pass, motion, search, run), body)
@@ -124,15 +154,15 @@ def locate(motion: Motion, search: Search, run: Run) -> Located:
     return Located(times, states, jumps, count, body.t, body.h, body.steps)
 
 
-def _going(search: Search, run: Run, body: _Body) -> Array:
+def _is_running(search: Search, run: Path, body: _Body) -> Array:
     ahead = (body.stop < run.stops.shape[0]) & (body.steps < search.max_steps)
     return ahead & (body.h > 0) & ~body.found
 
 
-def _pass(motion: Motion, search: Search, run: Run, body: _Body) -> _Body:
-    on = _going(search, run, body)
+def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
+    on = _is_running(search, run, body)
     t, h, y, side = body.t, body.h, body.y, body.side
-    begin, end = at(run.stops, body.stop), at(run.before, body.stop)
+    begin, end = take(run.stops, body.stop), take(run.before, body.stop)
     arrived = on & ~body.refining & (t >= begin)
     left = end - t
     last = ~body.refining & (h >= left)
@@ -257,3 +287,84 @@ def _first_guess(side: Array, low: _End, high: _End) -> Array:
     x = low.x + x.astype(low.x.dtype)
     inside = steady & (x > low.x) & (x < high.x)
     return jnp.where(inside, x, middle)
+
+
+def step_with_error(
+    method: Method, constants: Arrays, run: Path, step: Step
+) -> tuple[Array, Array]:
+    """Return the state a step later, and the root mean square of its error over the tolerance."""
+    there = stages(method.tableau, method.field, constants, step)
+    right = method.project(there.end)
+    # Which steps are taken is no thing to differentiate.
+    left, after, h, slopes = lax.stop_gradient((step.y, right, step.h, there.slopes))
+    error = error_estimate(method.tableau, method.sizes, h, slopes)
+    largest = jnp.maximum(jnp.abs(left), jnp.abs(after))
+    scale = lift(run.atol, left) + lift(run.rtol, left) * largest
+    tiny = float(jnp.finfo(error.dtype).tiny)
+    norm = jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
+    # NaN in a step too long says as little as infinity: try a shorter one.
+    return right, jnp.where(jnp.isnan(norm), jnp.inf, norm)
+
+
+def controlled(
+    norm: Array, order: int, t: Array, h: Array, kept: Array, last: Array, length: Array
+) -> tuple[Array, Array]:
+    """Return whether a step is accepted, and the next one: 0 where none is left, NaN after a NaN.
+
+    `norm` as of `step_with_error`; `kept` the step wanted before it was cut short as the `last`
+    before a stop; `length` of the run, whose round-off counts where that of `t` vanishes.
+    """
+    norm, h, kept = lax.stop_gradient((norm, h, kept))
+    good = norm < 1
+    factor = jnp.clip(_SAFETY * norm ** (-1 / order), _SMALLEST, _LARGEST)
+    following = h * factor.astype(h.dtype)
+    eps = jnp.finfo(h.dtype).eps
+    unit = 8 * eps * jnp.maximum(jnp.abs(t), eps * length)
+    why = jnp.where(jnp.isfinite(norm), 0.0, jnp.nan).astype(h.dtype)
+    shorter = jnp.where(following > unit, following, why)
+    longer = jnp.where(last, jnp.maximum(following, kept), following)
+    return good, jnp.where(good, longer, shorter)
+
+
+def outcome(h: Array, t: Array, end: Array, met: Array) -> dfx.RESULTS:
+    """Return the result of a search by its next step, its time, the last time, if it is full."""
+    result = dfx.RESULTS.dt_min_reached
+    for there, word in (
+        (jnp.isnan(h), NONFINITE),
+        (h > 0, dfx.RESULTS.max_steps_reached),
+        (t >= end, dfx.RESULTS.successful),
+        (met, dfx.RESULTS.event_occurred),
+    ):
+        result = dfx.RESULTS.where(there, word, result)
+    return result
+
+
+def first_step(method: Method, constants: Arrays, run: Path) -> Array:
+    """Return the starting step of Hairer, Nørsett and Wanner (1993), II.4."""
+    y0, t0 = run.y0, run.t0
+    scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
+
+    def norm(a: Array) -> Array:
+        return jnp.sqrt(jnp.mean((a / scale) ** 2, 0))
+
+    d0 = norm(y0)
+
+    def slope(_: Array, state: Any) -> Any:
+        # At the start, then after a short step of Euler's: one field to compile.
+        h, first, _ = state
+        now = method.field(constants, t0 + h.astype(t0.dtype), y0 + lift(h, y0) * first)
+        d1 = norm(now)
+        small = (d0 < 1e-5) | (d1 < 1e-5)
+        short = jnp.where(small, 1e-6, 0.01 * d0 / jnp.where(small, 1.0, d1)).astype(d0.dtype)
+        begun = h != 0
+        return jnp.where(begun, h, short), jnp.where(lift(begun, y0), first, now), now
+
+    h = jnp.zeros_like(d0)
+    state = (h, jnp.zeros_like(y0), jnp.zeros_like(y0))
+    h, first, last = lax.fori_loop(np.int32(0), np.int32(2), slope, state)
+    d2 = norm(last - first) / h
+    largest = jnp.maximum(norm(first), d2)
+    flat = largest <= 1e-15
+    guess = (0.01 / jnp.where(flat, 1.0, largest)) ** (1 / method.tableau.order)
+    h = jnp.minimum(100 * h, jnp.where(flat, jnp.maximum(1e-6, 1e-3 * h), guess))
+    return h.astype(t0.dtype)

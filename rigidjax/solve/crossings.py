@@ -37,22 +37,31 @@ from rigidjax.motion.coupled import Coupled, with_own_states
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.base import missing_state_message
 from rigidjax.solve import crossing_loop, validation
-from rigidjax.solve.adaptive import taken_out
-from rigidjax.solve.adaptive_loop import Method, Run, first_step, of_body, outcome, tried
+from rigidjax.solve.adaptive import NO_METER, REPLAY
+from rigidjax.solve.adaptive_loop import of_body
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
-from rigidjax.solve.crossing_loop import Located, Motion, Search
+from rigidjax.solve.crossing_loop import (
+    Located,
+    Method,
+    Motion,
+    Path,
+    Search,
+    first_step,
+    outcome,
+    step_with_error,
+)
 from rigidjax.solve.explicit import AbstractExplicit, explicit
 from rigidjax.solve.linear_map import as_known, nan_derivatives
 from rigidjax.solve.momentum import ByMomentum, by_momentum
 from rigidjax.solve.run import (
-    Free,
-    Loop,
-    ahead,
+    ClosedFormRun,
+    DiffraxRun,
     direction as direction_of,
     equations_of_motion,
+    in_forward_time,
     solve,
 )
-from rigidjax.solve.stops import stopped
+from rigidjax.solve.stops import constants_of, stopped
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 
@@ -187,18 +196,20 @@ def crossings(
         raise ValueError(f"t1: wanted another time than t0, got {float(end):g} for both")
     ts = jnp.stack([begin, end])
     body, state0, times = validation.scene(body, state0, ts, torque, throw=False)
-    state0 = ready(event, body, state0, torque, times[0])
+    state0 = checked_start(event, body, state0, torque, times[0])
     if torque is None and solver is None and body is not None:
-        return _solved(Free(body, False), event, many, max_steps, state0, times)
+        return _solved(ClosedFormRun(body, False), event, many, max_steps, state0, times)
     solver = explicit(solver)
     rtol, atol = validation.tolerances(rtol, atol, times.dtype)
     way = direction_of(times)
-    setup = Loop(body, torque, solver, rtol, atol, None, way, max_steps, False)
+    setup = DiffraxRun(
+        body, torque, solver, rtol, atol, None, None, None, REPLAY, NO_METER, way, max_steps, False
+    )
     return _solved(setup, event, many, max_steps, state0, times)
 
 
-def ready(event: Event, body: Any, state0: Any, torque: Any, t: Array) -> Any:
-    """`state0` with the states of the torque; an error if the condition is no number there."""
+def checked_start(event: Event, body: Any, state0: Any, torque: Any, t: Array) -> Any:
+    """Return `state0` with the states of the torque; raise if the condition is no number there."""
     state0 = with_own_states(body, state0, torque, t)
     try:
         eqx.filter_eval_shape(value, event, body, t, state0)
@@ -229,12 +240,12 @@ _value = eqx.filter_jit(value)
 
 @eqx.filter_jit
 def solve_until(
-    setup: Free | Loop, event: Event, state0: Any, ts: Array
+    setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
     """As `solve`, up to the event; and the event's time and state, NaN if there is none."""
     state0 = on_the_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
-    steps = setup.max_steps if isinstance(setup, Loop) else 1_000_000
+    steps = setup.max_steps if isinstance(setup, DiffraxRun) else 1_000_000
     found = located(crossed, Search(event.direction, 1, steps), numbers)
     met, last = found.number > 0, lax.stop_gradient(ts[-1])
     end = jnp.where(met, crossed.time(found.times[0]), last)
@@ -271,8 +282,9 @@ def _with_derivatives(crossing: Any, jumps: Array, inputs: Any) -> Any:
 
 @eqx.filter_jit
 def _solved(
-    setup: Free | Loop, event: Event, many: int, max_steps: int, state0: Any, ts: Array
-) -> Crossings:
+    setup: ClosedFormRun | DiffraxRun, event: Event, many: int, max_steps: int, state0: Any,
+    ts: Array,
+) -> Crossings:  # fmt: skip
     state0 = on_the_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
     found = located(crossed, Search(event.direction, many, max_steps), numbers)
@@ -299,8 +311,9 @@ def _(primals: Any, tangents: Any) -> Any:
 
 
 def _corrected(
-    times: Array, jumps: Array, setup: Free | Loop, event: Event, state0: Any, ts: Array
-) -> tuple[Array, Array]:
+    times: Array, jumps: Array, setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any,
+    ts: Array,
+) -> tuple[Array, Array]:  # fmt: skip
     """Times, in s, and states of the crossings found as functions of all numbers of the scene."""
     crossed, (constants, *_) = section(setup, event, state0, ts)
     there = jnp.isfinite(times)
@@ -346,12 +359,14 @@ class Section(NamedTuple):
 
 
 # The constants of a section's functions, the run, its longest step.
-Numbers = tuple[Arrays, Run, Array]
+Numbers = tuple[Arrays, Path, Array]
 
 
-def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[Section, Numbers]:
-    """The section between `ts[0]` and `ts[-1]`, and what it is made of."""
-    form = by_momentum(setup.body, state0, setup.torque) if isinstance(setup, Loop) else None
+def section(
+    setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
+) -> tuple[Section, Numbers]:
+    """Return the section between `ts[0]` and `ts[-1]`, and what it is made of."""
+    form = by_momentum(setup.body, state0, setup.torque) if isinstance(setup, DiffraxRun) else None
 
     def condition(t: Array, y: Any) -> Array:
         return value(event, setup.body, t, y if form is None else form.leave(t, y))
@@ -359,26 +374,26 @@ def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[S
     inside = state0 if form is None else form.enter(ts[0], state0)
     (y0, tree), dtype = ravel_pytree(inside), ts.dtype
     sign = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
-    way = setup.sign if isinstance(setup, Loop) else sign
+    way = setup.sign if isinstance(setup, DiffraxRun) else sign
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
-    field, asked, along, jumps = ahead(way, field, condition, ts[jnp.array([0, -1])])
+    field, asked, along, jumps = in_forward_time(way, field, condition, ts[jnp.array([0, -1])])
     whole: Any = lambda s, y, *sides: ravel_pytree(field(s, tree(y), sides or None))[0]  # noqa: E731
-    ready = stopped(whole, jumps, along[0], along[1], y0)
+    program = stopped(whole, jumps, along[0], along[1], y0)
     longest = length = lax.stop_gradient(along[1] - along[0])
     if event.max_step is not None:
         longest = lax.stop_gradient(jnp.asarray(event.max_step, dtype))
-    if isinstance(setup, Loop) and setup.max_step is not None:
+    if isinstance(setup, DiffraxRun) and setup.max_step is not None:
         longest = jnp.minimum(longest, setup.max_step)
 
     def slope(s: Array, y: Array) -> Array:
-        return ready.field(ready.constants, s, y)
+        return program.field(program.constants, s, y)
 
     def rates(s: Array, y: Array) -> tuple[Array, Array, Array]:
         there = slope(s, y)
         of_y = lambda s, y: asked(s, tree(y))  # noqa: E731
         return *jax.jvp(of_y, (s, y), (jnp.ones_like(s), there)), there
 
-    if isinstance(setup, Loop):
+    if isinstance(setup, DiffraxRun):
         solver, motion = setup.solver, slope
         rtol, atol = (jnp.asarray(a, y0.dtype) for a in (setup.rtol, setup.atol))
         h0 = jnp.asarray(jnp.nan if setup.dt0 is None else setup.dt0, dtype)
@@ -387,11 +402,11 @@ def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[S
         motion = lambda s, _: ravel_pytree(free(sign.astype(s.dtype) * s - ts[0]))[0]  # noqa: E731
         longest = jnp.minimum(longest, _spacing(setup.body, state0, length))
         rtol, atol, h0 = jnp.zeros((), y0.dtype), jnp.zeros((), y0.dtype), longest
-    (of_motion, of_rates), constants = taken_out([motion, rates], along[0], y0)
-    stops = jnp.concatenate([ready.stops, along[1:]])
+    (of_motion, of_rates), constants = constants_of([motion, rates], along[0], y0)
+    stops = jnp.concatenate([program.stops, along[1:]])
     sizes = [leaf.size for leaf in jax.tree.leaves(state0)]
     crossed = Section(solver, of_motion, of_rates, tree, sizes, sign, form)
-    run = Run(along[0], stops, stops[:0], y0, rtol, atol, h0, longest)
+    run = Path(along[0], stops, y0, rtol, atol, h0)
     return crossed, (constants, run, longest)
 
 
@@ -416,7 +431,7 @@ def located(section: Section, what: Search, numbers: Numbers) -> Located:
 def _located(
     section: Section, what: Search, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    run, longest = Run(*each[:-1]), each[-1]
+    run, longest = Path(*each[:-1]), each[-1]
     solver, motion = section.solver, layout.over(section.motion)
     project = jax.vmap(section.project, -1, -1) if layout.bodies else section.project
     seen, clear = (partial(layout.over(partial(f, section)), constants) for f in (_seen, _clear))
@@ -429,11 +444,11 @@ def _located(
     order, still = 1, jnp.zeros_like(run.rtol)
     attempt: Any = lambda step: (motion(constants, step.end, step.y), still)  # noqa: E731
     if solver is not None:
-        method = Method(solver.tableau, motion, project, None, section.sizes, 0)
-        h0, _ = first_step(method, constants, run)
+        method = Method(solver.tableau, motion, project, section.sizes)
+        h0 = first_step(method, constants, run)
         h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), longest)
         run = run._replace(h0=h0)
-        attempt, order = partial(tried, method, constants, run), solver.tableau.order
+        attempt, order = partial(step_with_error, method, constants, run), solver.tableau.order
     moving = Motion(attempt, order, longest, seen, counts, project)
     return list(crossing_loop.locate(moving, what, run))
 

@@ -24,7 +24,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.motion.manifold import minus, names, parts
 from rigidjax.solve import difference, validation
 from rigidjax.solve.linear_map import as_known
-from rigidjax.solve.run import Free, Loop, equations_of_motion, solve
+from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
 
 # Order 8 makes that 1.6 times the steps.
 _CLOSER = 2e-2
@@ -120,7 +120,7 @@ def error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None
         rtol, (before, others) = setup.rtol, tried
         far = _largest(_apart(others, ys), _sizes(ys)) > _FORESEEN
         factor = jnp.where(far, jnp.inf, _ALLOWED * rtol / before)
-    elif not isinstance(setup, Free):
+    elif not isinstance(setup, ClosedFormRun):
         second, rtol, factor = _closer(setup, ts, _sudden_times(setup, ts, ys))
         others, *_ = solve(second, jax.tree.map(lambda leaf: leaf[0], ys), ts)
     steps = jax.tree.map(lambda part: factor * part, _apart(others, ys))
@@ -146,7 +146,7 @@ def _with_round_off(
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
     setup, ys, more = _cheaper(setup, start, times, ys, count)
 
-    free = isinstance(setup, Free)
+    free = isinstance(setup, ClosedFormRun)
 
     def neighbour(numbers: Any, later: Array) -> Array:
         body, torque, y0 = eqx.combine(numbers, rest)
@@ -173,9 +173,10 @@ def _cheaper(setup: Any, start: Any, ts: Array, ys: Any, count: Array) -> tuple[
 
     Roundings grow alike at any tolerance; n of them add up to √n. float32 takes few steps anyway.
     """
-    if not isinstance(setup, Loop) or ts.dtype == jnp.float32:
+    replayed = isinstance(setup, DiffraxRun) and setup.is_replayed
+    if not replayed or ts.dtype == jnp.float32:
         return setup, ys, 1.0
-    setup = _at(setup, jnp.maximum(setup.rtol, _LOOSE).astype(ts.dtype))
+    setup = _with_tolerance(setup, jnp.maximum(setup.rtol, _LOOSE).astype(ts.dtype))
     ys, stats, _ = solve(setup, start, ts)
     fewer = jnp.maximum(stats["num_accepted_steps"], 1)
     return setup, ys, jnp.sqrt(jnp.maximum(count / fewer, 1.0)).astype(ts.dtype)
@@ -210,19 +211,22 @@ def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
 
 
 @eqx.filter_jit
-def solve_to(loop: Loop, state0: Any, ts: Array, accuracy: Array) -> tuple[Loop, Any, Any]:
-    """A run with a global error of `accuracy`, if there is one.
+def solve_to(
+    setup: DiffraxRun, state0: Any, ts: Array, accuracy: Array
+) -> tuple[DiffraxRun, Any, Any]:
+    """Return a run with a global error of `accuracy`, if there is one.
 
     The error of each run is its distance to the next, and decreases as the tolerance does.
-    **Returns** the loop at its tolerance, its result, tolerance and states of the run before.
+    **Returns** the set-up at its tolerance, its result, tolerance and states of the run before.
     """
-    still = _still((loop, state0, ts, accuracy))
+    still = _still((setup, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
 
     sudden = _sudden_times(still[0], ts, jax.tree.map(lambda leaf: leaf[None], still[1]))
 
     def run(rtol: Array, times: Array) -> Any:
-        return solve(dataclasses.replace(_at(still[0], rtol), cuts=sudden), still[1], times)
+        at_rtol = dataclasses.replace(_with_tolerance(still[0], rtol), cuts=sudden)
+        return solve(at_rtol, still[1], times)
 
     def closer(carry: Any) -> Any:
         (others, stats, _), _, before, rtol, ended = carry
@@ -234,7 +238,7 @@ def solve_to(loop: Loop, state0: Any, ts: Array, accuracy: Array) -> tuple[Loop,
         # A run that is lost foresees nothing, nor does one whose steps are not those of its
         # tolerance: short runs end before their steps have grown so long.
         count, counted = (a["num_accepted_steps"].astype(ts.dtype) for a in (new[1], stats))
-        more = (before / rtol) ** (1 / loop.solver.tableau.order)
+        more = (before / rtol) ** (1 / setup.solver.tableau.order)
         sound = (off < _FORESEEN) & (count >= _FEW) & (count >= 0.75 * more * counted)
         good = sound & (_ALLOWED * off * rtol <= before * still[3])
         following = jnp.where(sound, jnp.clip(wanted, least, jnp.maximum(rtol / 3, floor)), least)
@@ -246,12 +250,12 @@ def solve_to(loop: Loop, state0: Any, ts: Array, accuracy: Array) -> tuple[Loop,
     begun = run(first, ts)
     carry = (begun, (first, begun[0]), first, 0.03 * first, jnp.asarray(False))
     new, tried, rtol, *_ = lax.while_loop(lambda carry: ~carry[-1], closer, carry)
-    loop = dataclasses.replace(_at(loop, lax.stop_gradient(rtol)), cuts=sudden)
-    return loop, (_as_solved(loop, state0, ts, new[0]), *new[1:]), tried
+    setup = dataclasses.replace(_with_tolerance(setup, lax.stop_gradient(rtol)), cuts=sudden)
+    return setup, (_as_solved(setup, state0, ts, new[0]), *new[1:]), tried
 
 
 @eqx.filter_custom_jvp
-def _as_solved(loop: Loop, state0: Any, ts: Array, ys: Any) -> Any:
+def _as_solved(setup: DiffraxRun, state0: Any, ts: Array, ys: Any) -> Any:
     """The states, which `solve` has given: only derivatives run it once more."""
     return ys
 
@@ -263,9 +267,9 @@ def _(primals: Any, tangents: Any) -> Any:
     return as_known(primals[3], ys), along
 
 
-def _at(loop: Loop, rtol: Any) -> Loop:
-    """The loop at another tolerance, `atol` as the defaults have it."""
-    return dataclasses.replace(loop, rtol=rtol, atol=_SMALL * rtol, throw=False)
+def _with_tolerance(setup: DiffraxRun, rtol: Any) -> DiffraxRun:
+    """Return the set-up at another tolerance, `atol` as the defaults have it."""
+    return dataclasses.replace(setup, rtol=rtol, atol=_SMALL * rtol, throw=False)
 
 
 def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
@@ -307,21 +311,22 @@ def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
 
 
 def _closer(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
-    """The set-up of a closer run, the tolerance of the given one, the factor of their distance.
+    """Return the set-up of a closer run, the tolerance of the given one, their distance's factor.
 
     Steps of the closer run end at the `sudden` times, too.
     """
     eps = float(jnp.finfo(ts.dtype).eps)
     most = None if setup.max_steps is None else 4 * setup.max_steps
-    if isinstance(setup, Loop):
+    setup = dataclasses.replace(setup, max_steps=most, throw=False)
+    if setup.controller is None:
         rtol = jnp.asarray(setup.rtol, ts.dtype)
         less = jnp.maximum(_CLOSER * rtol, _DEEPEST * eps)
-        atol = setup.atol * (less / rtol)
-        cuts = ts[0] + (ts[-1] - ts[0]) * jnp.arange(1, _CUTS).astype(ts.dtype) / _CUTS
-        cuts = jnp.concatenate([cuts, sudden])
-        new = dict(rtol=less, atol=atol, cuts=cuts, max_steps=most, throw=False)
+        cuts = sudden
+        if setup.seeks_stops:
+            parts = jnp.arange(1, _CUTS).astype(ts.dtype) / _CUTS
+            cuts = jnp.concatenate([ts[0] + (ts[-1] - ts[0]) * parts, sudden])
+        new = dict(rtol=less, atol=setup.atol * (less / rtol), cuts=cuts if cuts.size else None)
         return dataclasses.replace(setup, **new), rtol, 1.0
-    setup = dataclasses.replace(setup, max_steps=most, throw=False)
     pid = lambda node: isinstance(node, dfx.PIDController)  # noqa: E731
     inside: Any = lambda c: [n for n in jax.tree.leaves(c, is_leaf=pid) if pid(n)]  # noqa: E731
     if found := inside(setup.controller):
@@ -329,12 +334,7 @@ def _closer(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
         both = less, found[0].atol * (less / found[0].rtol)
         where = lambda s: (inside(s.controller)[0].rtol, inside(s.controller)[0].atol)  # noqa: E731
         setup = eqx.tree_at(where, setup, both)
-        if sudden.size:
-            # A run whose switches are sought goes forward, in the time times its sign.
-            sign = setup.sign if setup.stops else None
-            along = sudden if sign is None else sign.astype(ts.dtype) * sudden
-            control = dfx.ClipStepSizeController(setup.controller, step_ts=jnp.sort(along))
-            setup = dataclasses.replace(setup, controller=control)
+        setup = dataclasses.replace(setup, cuts=sudden) if sudden.size else setup
         return setup, jnp.asarray(found[0].rtol, ts.dtype), 1.0
     if not isinstance(setup.controller, dfx.ConstantStepSize):
         raise TypeError(

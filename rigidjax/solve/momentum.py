@@ -82,6 +82,6 @@ def changing(torque: Any) -> ChangingInertia | None:
     return parts[0] if len(parts) == 1 and isinstance(parts[0], ChangingInertia) else None
 
 
-def left(form: ByMomentum | None, ts: Array, ys: Any) -> Any:
+def with_body_rates(form: ByMomentum | None, ts: Array, ys: Any) -> Any:
     """Return the states `ys` at `ts` (T,) with their body rates."""
     return ys if form is None else jax.vmap(form.leave)(ts, ys)

@@ -1,4 +1,4 @@
-"""Wrappers for diffrax: any solver kept on the group, any step controller ended by NaN."""
+"""Wrappers for diffrax: a solver kept on the group, a controller that ends at NaN or at jumps."""
 
 from typing import Any
 
@@ -6,10 +6,11 @@ import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax import lax
 
 from rigidjax import _checks
 from rigidjax.motion.equations import on_the_group
-from rigidjax.solve.adaptive_loop import NONFINITE, finite
+from rigidjax.solve.adaptive_loop import NONFINITE, before, finite, take
 
 
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
@@ -131,8 +132,16 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         # At t = 0 the round-off of t vanishes: that of the length of the run is taken.
         least = jnp.finfo(t0.dtype).eps * jnp.abs(t1 - t0)
-        # Where the first derivative is not finite the run ends at once.
-        return first, (inner, least, ~finite((y0, func(terms, t0, y0, args))))
+        # A step of length 0 would be accepted for ever.
+        first = jnp.maximum(first, t0 + self._unit(t0, least))
+        # Where the first derivative is not finite the run ends at once: so is then the first step
+        # that was chosen by it.
+        slope = () if dt0 is None else func(terms, t0, y0, args)
+        return first, (inner, least, ~finite((y0, first, slope)))
+
+    def _unit(self, t: Any, least: Any) -> Any:
+        """Return the shortest step at the time t, some units of round-off."""
+        return 8 * jnp.finfo(t.dtype).eps * jnp.maximum(jnp.abs(t), least)
 
     def adapt_step_size(
         self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any,
@@ -142,10 +151,76 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
-        unit = 8 * jnp.finfo(left.dtype).eps * jnp.maximum(jnp.abs(left), least)
-        stuck = lost | (~keep & ~(right - left > unit))
+        stuck = lost | (~keep & ~(right - left > self._unit(left, least)))
         stuck = stuck & (result == dfx.RESULTS.successful)
         ill = lost | ~finite((right, y1_candidate, y_error))
         why = dfx.RESULTS.where(ill, NONFINITE, dfx.RESULTS.dt_min_reached)
         result = dfx.RESULTS.where(stuck, why, result)
         return keep, left, right, jumped, (inner, least, lost), result
+
+
+class Stopping(dfx.AbstractAdaptiveStepSizeController):
+    """Wraps an adaptive step controller so that a step ends at each of the `stops`, where f jumps.
+
+    A step ends at the last moment before a stop, and the next one begins at the stop with the
+    length that the controller wanted there. (`diffrax.ClipStepSizeController` goes on from the
+    length of the step that was cut: a stop then costs several short steps.)
+
+    **Arguments:** `controller` any adaptive controller of diffrax; `stops` (J,) times in order.
+
+    >>> Stopping(dfx.PIDController(rtol=1e-6, atol=1e-9), jnp.array([0.5])).rtol
+    1e-06
+    """
+
+    controller: Any
+    stops: Any
+    # The index of the first stop after each.
+    following: Any
+
+    def __init__(self, controller: Any, stops: Any):
+        self.controller = controller
+        self.stops = stops
+        still = lax.stop_gradient(stops)
+        self.following = jnp.searchsorted(still, still, side="right").astype(jnp.int32)
+
+    rtol = _of("controller", "rtol")
+    atol = _of("controller", "atol")
+    norm = _of("controller", "norm")
+
+    def wrap(self, direction: Any) -> "Stopping":
+        way = jnp.asarray(direction).astype(self.stops.dtype)
+        stops = jnp.where(way < 0, -self.stops[::-1], self.stops)
+        return Stopping(self.controller.wrap(direction), stops)
+
+    def init(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any,
+        error_order: Any,
+    ) -> tuple[Any, Any]:  # fmt: skip
+        first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        index = jnp.sum(self.stops <= t0, dtype=jnp.int32)
+        return jnp.minimum(first, self._next(index)[1]), (inner, first - t0, index)
+
+    def _next(self, index: Any) -> tuple[Any, Any]:
+        """Return the stop of this index and the last moment before it; infinite after the last."""
+        none = jnp.full_like(self.stops[:1], jnp.inf)
+        stop = take(jnp.concatenate([self.stops, none]), index)
+        still = lax.stop_gradient(stop)
+        gap = jnp.where(jnp.isinf(still), 0, before(still) - still)
+        return stop, stop + gap
+
+    def adapt_step_size(
+        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any,
+        error_order: Any, controller_state: Any,
+    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:  # fmt: skip
+        inner, kept, index = controller_state
+        keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
+        )
+        stop, end = self._next(index)
+        reached = keep & (t1 >= end)
+        length = lax.stop_gradient(right - left)
+        length = jnp.where(reached, jnp.maximum(length, kept), length)
+        left = jnp.where(reached, stop, left)
+        index = jnp.where(reached, take(self.following, index), index)
+        right = jnp.minimum(left + length, self._next(index)[1])
+        return keep, left, right, jumped | reached, (inner, length, index), result

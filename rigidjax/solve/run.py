@@ -1,8 +1,9 @@
-"""A run in one compiled piece: by the closed form, by diffrax, or by our own loop."""
+"""A run in one compiled piece: by the closed form, or by one `diffrax.diffeqsolve`."""
 
 import dataclasses
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import diffrax as dfx
@@ -10,7 +11,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Int
 
 from rigidjax import _checks
@@ -29,19 +29,22 @@ from rigidjax.motion.equations import (
 )  # fmt: skip
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import validation
-from rigidjax.solve.adaptive import adaptive
+from rigidjax.solve.adaptive import integrated
 from rigidjax.solve.adaptive_loop import NONFINITE, finite, of_body
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
-from rigidjax.solve.momentum import by_momentum, changing, left
+from rigidjax.solve.momentum import by_momentum, changing, with_body_rates
+from rigidjax.solve.projection import Watched
+from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.sides import declared_jumps, on_sides
-from rigidjax.solve.stops import stopped, traced
+from rigidjax.solve.splitting import AbstractSplitting
+from rigidjax.solve.stops import traced
 from rigidjax.solve.switching import MOST, analysis_of
 
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
-class Free(eqx.Module):
+class ClosedFormRun(eqx.Module):
     """A free body: the closed form, any time at the cost of one."""
 
     body: Inertia | MassProperties
@@ -49,37 +52,46 @@ class Free(eqx.Module):
     torque: ClassVar[None] = None
 
 
-class Setup(eqx.Module):
-    """A solve by diffrax: everything but the start and the times."""
+class DiffraxRun(eqx.Module):
+    """A run by diffrax: everything but the start and the times."""
 
     body: Inertia | MassProperties | None
     torque: Any
     solver: Any
-    controller: Any
-    dt0: Any
-    adjoint: Any
-    progress_meter: dfx.AbstractProgressMeter
-    max_steps: int | None = eqx.field(static=True)
-    throw: bool = eqx.field(static=True)
-    # Whether steps end where the law switches, in s = σt: under no controller of one's own.
-    stops: bool = eqx.field(static=True, default=False)
-    sign: Array | None = None  # σ as of `Loop`
-
-
-class Loop(eqx.Module):
-    """A solve by our own loop."""
-
-    body: Inertia | MassProperties | None
-    torque: Any
-    solver: AbstractExplicit
     rtol: Any
     atol: Any
+    controller: Any  # one of the user's, in the place of tolerances
     dt0: Any
+    max_step: Any
+    adjoint: Any
+    progress_meter: dfx.AbstractProgressMeter
     sign: Array | None  # of the direction of time; None: known to go forwards
-    max_steps: int = eqx.field(static=True)
+    max_steps: int | None = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
     cuts: Array | None = None  # where a step has to end, beside the jumps of the torque
-    max_step: Any = None
+
+    @property
+    def seeks_stops(self) -> bool:
+        """Whether steps end where the law switches, in s = σt."""
+        # A splitting looks into the field, of a known class.
+        return self.controller is None and not isinstance(self.solver, AbstractSplitting)
+
+    @property
+    def is_replayed(self) -> bool:
+        """Whether an explicit method of ours runs under tolerances and the adjoint of ours."""
+        explicit = isinstance(self.solver, AbstractExplicit) and self.max_steps is not None
+        return explicit and self.controller is None and isinstance(self.adjoint, ReplayAdjoint)
+
+    def step_controller(self) -> Any:
+        """Return the controller of the steps, which ends a run that cannot go on."""
+        control = self.controller
+        if control is None:
+            control = dfx.PIDController(rtol=self.rtol, atol=self.atol, dtmax=self.max_step)
+        if isinstance(control, dfx.AbstractAdaptiveStepSizeController):
+            control = Watched(control)
+        if self.cuts is not None and not self.seeks_stops:
+            control = dfx.ClipStepSizeController(control, step_ts=jnp.sort(self.cuts))
+        return control
 
 
 class Ends(eqx.Module):
@@ -96,7 +108,7 @@ def equations_of_motion(
     state0: Spin | Attitude | Rigid | Point | Coupled,
     torque: Torque | AbstractScene | MovingFrame | None = None,
 ) -> Callable[..., Any]:
-    """The vector field of this body for states like `state0`, for plain `diffrax.ODETerm`.
+    """Return the vector field of this body for states like `state0`, for `diffrax.ODETerm`.
 
     **Arguments** `body`, `state0`, `torque` as for `simulate`; under a torque with states of its
     own `state0` is a `rigidjax.motion.coupled.Coupled`. **Raises** `TypeError` where they do not
@@ -119,7 +131,7 @@ def equations_of_motion(
 
 
 def direction(times: Array) -> Int[Array, ""] | None:
-    """`None` for times known to increase; else the sign of t's change, known or traced."""
+    """Return `None` for times known to increase; else the sign of t's change, known or traced."""
     ends = _checks.namespace(times).asarray(times)
     change = ends[-1] - ends[0]
     if _checks.known(times) and change > 0:
@@ -128,16 +140,14 @@ def direction(times: Array) -> Int[Array, ""] | None:
     return jnp.asarray(jnp.sign(change), jnp.int32)
 
 
-def ahead(
+def in_forward_time(
     sign: Array | None, field: Callable[..., Any], condition: Any, ts: Array
 ) -> tuple[Callable[..., Any], Any, Array, list[Array]]:
-    """A vector field, a condition, times and jump times in s = σt; `sign` σ is `None` for s = t.
+    """Return a vector field, a condition, times and jump times in s = σt; `sign` is σ, or `None`.
 
     The field takes the stops of its parts that jump, in s, as its third argument (see `adaptive`).
     """
-
-    def time(s: Array) -> Array:
-        return s if sign is None else sign.astype(s.dtype) * s
+    time = partial(_signed, sign)
 
     def directed(s: Array, y: Any, sides: Any = None) -> Any:
         sided = on_sides(field, sign, None if sides is None else [time(side) for side in sides])
@@ -149,19 +159,19 @@ def ahead(
 
 @eqx.filter_jit
 def solve(
-    setup: Free | Loop | Setup, state0: Any, ts: Array
+    setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+    """Return the states at `ts`, the counts of steps, and the result."""
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
     state0 = given = on_the_group(state0)
-    if isinstance(setup, Free):
+    if isinstance(setup, ClosedFormRun):
         ys, stats, result = _free(setup, state0, ts)
     else:
         # With the states of the torque, where it has some.
         state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
         scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
         watch = Ends(scene) if hasattr(scene, "ends") else None
-        run: Any = _loop if isinstance(setup, Loop) else _by_diffrax
-        ys, stats, result, end = run(setup, watch, state0, ts)
+        ys, stats, result, end = _integrated(setup, watch, state0, ts)
         if setup.throw:
             ys = refuse(ys, result, setup.torque)
         if watch is not None:
@@ -173,85 +183,38 @@ def solve(
     return nan_derivatives(ys, inputs), stats, of_body(result, setup.body)
 
 
-class _OfNumbers(eqx.Module):
-    """A field of the numbers of a state as one of states, for diffrax."""
-
-    constants: Any
-    field: Any = eqx.field(static=True)
-    tree: Any = eqx.field(static=True)
-
-    def __call__(self, t: Any, y: Any, args: object = None) -> Any:
-        return self.tree(self.field(self.constants, t, ravel_pytree(y)[0]))
-
-
-def _by_diffrax(
-    setup: Setup, watch: Ends | None, state0: Any, ts: Array
+def _integrated(
+    setup: DiffraxRun, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
+    """Return the states at `ts`, counts, the result, and time, state and next step at the end."""
     form = by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
     state0 = state0 if form is None else form.enter(ts[0], state0)
-    controller, over, along, ends = setup.controller, None, ts, watch
-    if setup.stops:
-        numbers, tree = ravel_pytree(state0)
-        directed, ends, along, jumps = ahead(setup.sign, field, watch, ts)
-        of_one = lambda s, y, *sides: ravel_pytree(directed(s, tree(y), sides or None))[0]  # noqa: E731
-        ready = stopped(of_one, jumps, along[0], along[-1], numbers)
-        over = ready.over
-        if setup.sign is not None or len(ready.constants) > ready.smooth:
-            field = _OfNumbers(ready.constants, ready.field, tree)
-        if ready.stops.size:
-            controller = dfx.ClipStepSizeController(controller, jump_ts=ready.stops)
-    subs = [dfx.SubSaveAt(ts=along)] + [dfx.SubSaveAt(t1=True)] * (watch is not None)
-    event = None if ends is None else dfx.Event(lambda t, y, args, **_: ends(t, y))
-    term = dfx.ODETerm(field)
-    out = dfx.diffeqsolve(
-        term, setup.solver, along[0], along[-1], setup.dt0, state0,
-        saveat=dfx.SaveAt(subs=subs), stepsize_controller=controller, adjoint=setup.adjoint,
-        max_steps=setup.max_steps, throw=False, progress_meter=setup.progress_meter,
-        event=event,
+    along, jumps, dt0, sign, halt = ts, None, setup.dt0, None, watch
+    if setup.seeks_stops:
+        sign = setup.sign
+        field, halt, along, jumps = in_forward_time(sign, field, watch, ts)
+        if setup.cuts is not None:
+            jumps = [*jumps, _signed(sign, setup.cuts)]
+    elif dt0 is not None:
+        dt0 = dt0 * jnp.sign(ts[-1] - ts[0])
+    out = integrated(
+        setup.solver, field, along, state0, setup.step_controller(), jumps=jumps, halt=halt,
+        dt0=dt0, max_steps=setup.max_steps, adjoint=setup.adjoint,
+        progress_meter=setup.progress_meter,
     )  # fmt: skip
-    stats: dict[str, Any] = {k: value for k, value in out.stats.items() if k != "max_steps"}
-    if over is not None:
-        stats["switches_missed"] = over
-    (times, *last_time), (ys, *last) = out.ts, out.ys  # pyright: ignore
-
-    def reached(leaf: Array) -> Array:
-        # Where nothing was saved, diffrax says t = inf: not to be taken for a state.
-        there = jnp.isfinite(times).reshape(-1, *[1] * (leaf.ndim - 1))
-        return jnp.where(there, leaf, jnp.full_like(leaf, jnp.nan))
-
-    ys, result = left(form, ts, jax.tree.map(reached, ys)), out.result
-    if not isinstance(setup.controller, dfx.AbstractAdaptiveStepSizeController):
-        # Equal steps look at no error, and would go on with NaN.
-        ill = (result == dfx.RESULTS.successful) & ~finite(ys)
-        result = dfx.RESULTS.where(ill, NONFINITE, result)
-    if setup.stops and setup.sign is not None:
-        last_time = [setup.sign.astype(ts.dtype) * t for t in last_time]
-    end = jax.tree.map(lambda leaf: leaf[0], (*last_time, *last))
-    return ys, stats, result, end
-
-
-def _loop(
-    setup: Loop, watch: Ends | None, state0: Any, ts: Array
-) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
-    form = by_momentum(setup.body, state0, setup.torque)
-    field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
-    state0 = state0 if form is None else form.enter(ts[0], state0)
-    field, watch, along, jumps = ahead(setup.sign, field, watch, ts)
-    if setup.cuts is not None:
-        cuts = setup.cuts if setup.sign is None else setup.sign.astype(ts.dtype) * setup.cuts
-        jumps = [*jumps, cuts]
-    how = dict(rtol=setup.rtol, atol=setup.atol, dt0=setup.dt0, max_steps=setup.max_steps)
-    how |= dict(max_step=setup.max_step)
-    out = adaptive(setup.solver, field, along, state0, jumps=jumps, halt=watch, **how)
     taken = (out.num_steps, out.num_steps - out.num_rejected, out.num_rejected)
-    sign = setup.sign
-    last_time = out.last_time if sign is None else sign.astype(ts.dtype) * out.last_time
     stats: dict[str, Any] = dict(zip(_COUNTS, taken, strict=True))
-    if out.over is not None:
-        stats["switches_missed"] = out.over
+    if out.missed is not None:
+        stats["switches_missed"] = out.missed
+    last_time = _signed(sign, out.last_time)
     last = out.last if form is None else form.leave(last_time, out.last)
-    return left(form, ts, out.ys), stats, out.result, (last_time, last, out.next_step)
+    return with_body_rates(form, ts, out.ys), stats, out.result, (last_time, last, out.next_step)
+
+
+def _signed(sign: Array | None, t: Array) -> Array:
+    """Return s = σt, or t = σs; `sign` σ is `None` for s = t."""
+    return t if sign is None else sign.astype(t.dtype) * t
 
 
 _INERTIA = (
@@ -282,7 +245,7 @@ def _shortest_step_words(dtype: Any) -> str:
 
 
 def refuse(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
-    """The states `ys`, or an error in words where the run did not get to its end."""
+    """Return the states `ys`, or an error in words where the run did not get to its end."""
     if changing(torque) is not None:
         ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
@@ -316,10 +279,10 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
 
 
 @eqx.filter_jit
-def _end_of(loop: Loop, state0: Any, ts: Array) -> Any:
-    """Where a run ends: time, next step, number of steps, and state."""
-    state0 = with_own_states(loop.body, on_the_group(state0), loop.torque, ts[0])
-    *_, stats, _, end = _loop(loop, None, state0, ts)
+def _end_of(setup: DiffraxRun, state0: Any, ts: Array) -> Any:
+    """Return where a run ends: time, state, next step, and the number of steps."""
+    state0 = with_own_states(setup.body, on_the_group(state0), setup.torque, ts[0])
+    *_, stats, _, end = _integrated(setup, None, state0, ts)
     return *end, stats["num_steps"]
 
 
@@ -327,12 +290,13 @@ def _end_of(loop: Loop, state0: Any, ts: Array) -> Any:
 _STUCK = 1e-2
 
 
-def words_of_steps(loop: Loop, state0: Any, ts: Array, error: RuntimeError) -> RuntimeError:
-    """The same error; if a run has taken all its steps, with what they were spent on."""
-    numbers = (loop, state0, ts)
-    if _MANY_STEPS not in str(error) or not isinstance(loop, Loop) or not _checks.known(numbers):
+def words_of_steps(setup: Any, state0: Any, ts: Array, error: RuntimeError) -> RuntimeError:
+    """Return the same error; if a run has taken all its steps, with what they were spent on."""
+    if _MANY_STEPS not in str(error) or not isinstance(setup, DiffraxRun):
         return error
-    t, state, step, count = _end_of(dataclasses.replace(loop, throw=False), state0, ts)
+    if not setup.is_replayed or not _checks.known((setup, state0, ts)):
+        return error
+    t, state, step, count = _end_of(dataclasses.replace(setup, throw=False), state0, ts)
     begun, end, t = float(ts[0]), float(ts[-1]), float(t)
     gone, step = abs(t - begun), float(step)
     words = f"simulate: the maximum number of solver steps, {int(count)}, "
@@ -354,7 +318,7 @@ def words_of_steps(loop: Loop, state0: Any, ts: Array, error: RuntimeError) -> R
     return type(error)(f"{words}; give max_steps={int(float(f'{needed:.1g}')):_} or more")
 
 
-def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+def _free(setup: ClosedFormRun, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     ys = FreeMotion(setup.body, state0)(ts - ts[0])
     stats: Any = dict.fromkeys(_COUNTS, jnp.zeros((), int))
     if setup.throw:
@@ -369,7 +333,7 @@ def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
 
 
 def refuse_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
-    """The states `ys` saved at `ts`, unless the scene has ended the run: an error in its words."""
+    """Return the states `ys` saved at `ts`; an error in the scene's words if it ended the run."""
     ended, advice = stats["ended"], "; give throw=False to keep what came before it"
     if _checks.known(ended) and not np.any(np.asarray(ended)):
         return ys

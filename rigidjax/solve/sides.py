@@ -26,7 +26,7 @@ class Sided(eqx.Module):
     """A law that is called on the side of its jumps that a step is on.
 
     `stops` (n,) s are the times at which steps end for the `jumps` (n,) of the law, at most some
-    units of round-off away; `None` where they are the same. `sign` is as for `ahead`.
+    units of round-off away; `None` where they are the same. `sign` is as for `in_forward_time`.
     """
 
     law: Any

@@ -15,14 +15,14 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame
 from rigidjax.motion.coupled import Coupled
 from rigidjax.solve import validation
-from rigidjax.solve.crossings import Event, ready, solve_until
+from rigidjax.solve.adaptive import NO_METER, REPLAY
+from rigidjax.solve.crossings import Event, checked_start, solve_until
 from rigidjax.solve.error import error_of_run, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
-from rigidjax.solve.projection import Projected, Watched
+from rigidjax.solve.projection import Projected
 from rigidjax.solve.run import (
-    Free,
-    Loop,
-    Setup,
+    ClosedFormRun,
+    DiffraxRun,
     direction,
     refuse,
     refuse_ended,
@@ -30,7 +30,7 @@ from rigidjax.solve.run import (
     warn_of_missed,
     words_of_steps,
 )
-from rigidjax.solve.solution import Solution, State, told
+from rigidjax.solve.solution import Solution, State, with_error
 from rigidjax.solve.splitting import AbstractSplitting
 
 # A torque must accept the given state: gravity on a `Spin` is an error that type checkers see.
@@ -39,8 +39,7 @@ Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 # Made once: building a Module costs as much as ten steps.
 SOLVER = Projected(dfx.Dopri8())
 ADJOINT = dfx.RecursiveCheckpointAdjoint()
-NO_METER = dfx.NoProgressMeter()
-# Our loop has both modes of differentiation, all that these adjoints of diffrax ask.
+# All that these adjoints of diffrax ask, `ReplayAdjoint` has.
 _EITHER_MODE = (type(None), dfx.ForwardMode, dfx.RecursiveCheckpointAdjoint)
 # A step that reverse mode runs again rounds differently. So near to round-off its length then
 # differs, too (2e-4 of a gradient at 1e-13): keep the start of every step of all but long runs.
@@ -84,12 +83,11 @@ def simulate(
       own states (`rigidjax.torques.AbstractTorque`) are in `own`. For a `Point` it is a scene of
       `rigidjax.scenes`, a `MovingFrame`, or a force per mass `(t, state, None) → (3,)`, m/s².
     - `solver`: `None` is the cheapest accurate choice: the closed form (`rigidjax.exact`) for a
-      free body, else `rigidjax.solvers.DormandPrince8` (order 8), for any number of saved times.
-      The explicit methods of `rigidjax.solvers` run in our own loop; so does the default, unless a
-      controller, a progress meter, `max_steps=None` or `adjoint=diffrax.ForwardMode()` is given:
-      then diffrax runs its Dopri8. It may be any `diffrax.AbstractSolver`; a wrapper keeps
-      attitudes unit quaternions, at every step and every saved time. Between its steps the error of
-      `DormandPrince8` is up to ten times `rtol`, that of Dopri8 up to 26 times below `rtol=1e-10`.
+      free body, else `rigidjax.solvers.DormandPrince8` (order 8), for any number of saved times;
+      with `max_steps=None` or `adjoint=diffrax.ForwardMode()` it is `diffrax.Dopri8`. It may be any
+      `diffrax.AbstractSolver`; a wrapper keeps attitudes unit quaternions, at every step and every
+      saved time. Between its steps the error of `DormandPrince8` is up to ten times `rtol`, that of
+      Dopri8 up to 26 times below `rtol=1e-10`.
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
       float32. Traced ones are not checked, and other values do not compile again. Scale `atol` to
       the smallest number that matters. The closed form uses neither.
@@ -102,18 +100,19 @@ def simulate(
     - `max_step`: the longest step, s, such as half of the shortest event in a law that steps could
       pass over (a smooth bump, a switch by the state). The closed form takes no steps; a
       `stepsize_controller` has its own limit.
-    - `adjoint`: how derivatives through a solver of diffrax are taken, as there. `None` is
-      `diffrax.RecursiveCheckpointAdjoint()` for `jax.grad`, with 4096 checkpoints where `rtol` is
-      known to be below 1e-10; `diffrax.ForwardMode()` is for `jax.jacfwd`. Our loop and the closed
-      form need none: `jax.grad`, `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over
-      reverse) work, and `jax.grad` of a `jax.grad` is refused. If you need only `jax.jacfwd` of a
-      body, `diffrax.ForwardMode()` is faster; it is not for a particle with few saved times.
+    - `adjoint`: how derivatives are taken, as in diffrax. `None` is `rigidjax.solvers.
+      ReplayAdjoint()` for the explicit methods of `rigidjax.solvers`: `jax.grad`, `jax.jacfwd`,
+      `jax.jacrev` and `jax.hessian` (forward over reverse) work, as in closed form, and `jax.grad`
+      of a `jax.grad` is refused. For other solvers it is `diffrax.RecursiveCheckpointAdjoint()` for
+      `jax.grad`, with 4096 checkpoints where `rtol` is known to be below 1e-10, and
+      `diffrax.ForwardMode()` is for `jax.jacfwd`. If you need only `jax.jacfwd` of a body,
+      `diffrax.ForwardMode()` is faster; it is not for a particle with few saved times.
     - `event`: `(t, state, body) → scalar`, or an `Event` of it: the run ends at its first zero.
       `event_time` and `event_state` of the solution are exact to the tolerances, with first and
       second derivatives with respect to all numbers, also the condition's own; later `ys` are NaN,
       and `result` is `event_occurred`. Without a zero they are NaN and the run goes to its end.
-      Events work in our own loop and the closed form; for a solver of diffrax give `diffrax.Event`
-      there.
+      Events are for the closed form and the explicit methods of `rigidjax.solvers`; for a solver of
+      diffrax give `diffrax.Event` there.
     - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
     - `throw`: with `False` nothing in a run, and no bad start in a batch, raises an error: `result`
       gives the reason, states not reached are NaN, as are their derivatives, and other bodies of
@@ -153,67 +152,65 @@ def simulate(
     if stepsize_controller is None:
         rtol, atol = validation.tolerances(rtol, atol, times.dtype)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
-        found = _solution(Free(body, throw), event, state0, times)
-        return found if accuracy is None else told(found, found.error, accuracy)
-    method = DormandPrince8() if solver is None else solver
-    plain = isinstance(method, AbstractExplicit) and max_steps is not None
-    plain = plain and stepsize_controller is None and progress_meter is None
-    # Where forward mode is all that is asked, diffrax is quicker: tangents go along with the run.
-    forward = isinstance(adjoint, dfx.ForwardMode) and solver is None and event is None
-    first = None if dt0 is None else validation.first_step(dt0, times)
-    if plain and isinstance(adjoint, _EITHER_MODE) and not forward:
-        way = direction(times)
-        # As arrays: another tolerance does not compile again.
+        found = _solution(ClosedFormRun(body, throw), event, state0, times)
+        return found if accuracy is None else with_error(found, found.error, accuracy)
+    # As arrays: another tolerance does not compile again.
+    if stepsize_controller is None:
         rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
-        loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw, None, max_step)  # pyright: ignore
-        if accuracy is None:
-            return _solution(loop, event, state0, times)
-        return _accurate(loop, event, state0, times, accuracy)
+    setup = DiffraxRun(
+        body, torque, _solver(solver, adjoint, event, max_steps), rtol, atol, stepsize_controller,
+        None if dt0 is None else validation.first_step(dt0, times), max_step, adjoint,
+        progress_meter or NO_METER, direction(times), max_steps, throw,
+    )  # fmt: skip
+    setup = dataclasses.replace(setup, adjoint=_adjoint(setup))
+    sought = setup.is_replayed and progress_meter is None
+    if accuracy is not None and not sought:
+        raise ValueError(
+            "simulate: an accuracy is for the closed form and the explicit methods of "
+            "rigidjax.solvers under ReplayAdjoint: leave solver, adjoint, progress_meter and "
+            "max_steps to their defaults, or take a solver of rigidjax.solvers"
+        )
+    if event is not None and not sought:
+        raise ValueError(
+            "simulate: an event is for the closed form and the explicit methods of "
+            "rigidjax.solvers under ReplayAdjoint: leave solver, stepsize_controller, adjoint and "
+            "progress_meter to their defaults (or take a solver of rigidjax.solvers), or give "
+            "diffrax.Event to diffrax.diffeqsolve"
+        )
     if accuracy is not None:
-        raise ValueError(
-            "simulate: an accuracy is for the closed form and our own loop: leave solver, adjoint, "
-            "progress_meter and max_steps to their defaults, or take a solver of rigidjax.solvers"
-        )
-    if event is not None:
-        raise ValueError(
-            "simulate: an event is looked for in our own loop and in closed form: leave solver, "
-            "stepsize_controller, adjoint and progress_meter to their defaults (or take a solver "
-            "of rigidjax.solvers), or give diffrax.Event to diffrax.diffeqsolve"
-        )
-    meter, control = progress_meter or NO_METER, stepsize_controller
-    setup = Setup(body, torque, solver, control, first, adjoint, meter, max_steps, throw)
-    return _solution(_completed(setup, rtol, atol, times, max_step), None, state0, times)
+        return _accurate(setup, event, state0, times, accuracy)
+    return _solution(setup, event, state0, times)
 
 
-def _completed(setup: Setup, rtol: Any, atol: Any, times: Array, max_step: Any) -> Setup:
-    """A run by diffrax with what was left to its defaults."""
-    solver, control, adjoint, dt0 = setup.solver, setup.controller, setup.adjoint, setup.dt0
-    if control is None:
-        control = Watched(dfx.PIDController(rtol=rtol, atol=atol, dtmax=max_step))
-        # A splitting looks into the field, of a known class.
-        stops = not isinstance(solver, AbstractSplitting)
-        setup = dataclasses.replace(setup, stops=stops, sign=direction(times))
-    elif isinstance(control, dfx.AbstractAdaptiveStepSizeController):
-        control = Watched(control)
+def _solver(solver: Any, adjoint: Any, event: Any, max_steps: int | None) -> Any:
+    """Return the solver of a run, on the group; `None` is the quickest one under this adjoint."""
+    if solver is None:
+        # Where forward mode is all that is asked, tangents go along with the run of diffrax.
+        forward = isinstance(adjoint, dfx.ForwardMode) and event is None
+        return SOLVER if forward or max_steps is None else DormandPrince8()
     # Ours project inside their one kernel; a second time outside of it breaks the kernel up.
-    if not isinstance(solver, AbstractExplicit | AbstractSplitting | Projected):
-        solver = SOLVER if solver is None else Projected(solver)
-    if adjoint is None:
-        rtol = getattr(control, "rtol", None)
-        tight = rtol is not None and _checks.known(rtol) and float(rtol) < _TIGHT
-        adjoint = _EVERY_STEP if tight else ADJOINT
-    if dt0 is not None and not setup.stops:
-        dt0 = dt0 * jnp.sign(times[-1] - times[0])
-    new = dict(solver=solver, controller=control, adjoint=adjoint, dt0=dt0)
-    return dataclasses.replace(setup, **new)
+    ours = isinstance(solver, AbstractExplicit | AbstractSplitting | Projected)
+    return solver if ours else Projected(solver)
 
 
-def _accurate(loop: Loop, event: Any, state0: Any, times: Array, accuracy: Any) -> Solution:
-    found, run, tried = solve_to(loop, state0, times, jnp.asarray(accuracy, times.dtype))
-    found = dataclasses.replace(found, throw=loop.throw)
+def _adjoint(setup: DiffraxRun) -> dfx.AbstractAdjoint:
+    """Return the adjoint of a run; `ReplayAdjoint` where it takes the run, in either mode."""
+    explicit = isinstance(setup.solver, AbstractExplicit) and setup.max_steps is not None
+    if explicit and isinstance(setup.adjoint, _EITHER_MODE):
+        return REPLAY
+    if setup.adjoint is not None:
+        return setup.adjoint
+    rtol = getattr(setup.step_controller(), "rtol", None)
+    tight = rtol is not None and _checks.known(rtol) and float(rtol) < _TIGHT
+    return _EVERY_STEP if tight else ADJOINT
+
+
+def _accurate(setup: DiffraxRun, event: Any, state0: Any, times: Array, accuracy: Any) -> Solution:
+    found, run, tried = solve_to(setup, state0, times, jnp.asarray(accuracy, times.dtype))
+    found = dataclasses.replace(found, throw=setup.throw)
     sol = _solution(found, event, state0, times, None if event is not None else run)
     error = error_of_run(found, times, sol._states, sol.stats["num_steps"], tried)
-    return told(sol, error, accuracy)
+    return with_error(sol, error, accuracy)
 
 
 def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None) -> Solution:
@@ -226,7 +223,7 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
             ys, stats, result = solve(setup, state0, times)
         else:
             event = event if isinstance(event, Event) else Event(event)
-            state0 = ready(event, setup.body, state0, setup.torque, times[0])
+            state0 = checked_start(event, setup.body, state0, setup.torque, times[0])
             ys, stats, result, event_time, event_state = solve_until(setup, event, state0, times)
     except RuntimeError as error:
         raise words_of_steps(setup, state0, times, _checks.own_sentence(error)) from None

@@ -20,7 +20,7 @@ from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.manifold import dimension, minus_small, parts, plus, turns
 from rigidjax.motion.torques.states import require_stateless
 from rigidjax.solve.error import Error, error_of_run, largest_in_run
-from rigidjax.solve.run import Free, Loop, Setup, solve
+from rigidjax.solve.run import ClosedFormRun, DiffraxRun, solve
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
 
@@ -96,8 +96,9 @@ class Solution(eqx.Module, Generic[State]):
         Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
         found = _growth(self._setup, self.ts, self._states)
-        how = self._setup.controller if isinstance(self._setup, Setup) else self._setup
-        rtol = getattr(how, "rtol", None)
+        rtol = None
+        if isinstance(self._setup, DiffraxRun):
+            rtol = getattr(self._setup.step_controller(), "rtol", None)
         if rtol is None:
             rtol = 100 * float(jnp.finfo(self.ts.dtype).eps)
         if _checks.known((found, rtol, self.ts)):
@@ -179,7 +180,7 @@ class Solution(eqx.Module, Generic[State]):
         return self.ys if self.own is None else Coupled(self.ys, self.own)
 
 
-def told(sol: Solution, error: Error, accuracy: Any) -> Solution:
+def with_error(sol: Solution, error: Error, accuracy: Any) -> Solution:
     """The solution with its error; in words where that exceeds the accuracy asked for."""
     _say(error, accuracy, "simulate: the accuracy cannot be had")
     return dataclasses.replace(sol, _error=error)
@@ -202,14 +203,15 @@ def _say(error: Error, most: Any, words: str) -> None:
 
 
 @eqx.filter_jit
-def _drift(setup: Free | Loop | Setup, ts: Array, ys: Any) -> dict[str, Array]:
+def _drift(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> dict[str, Array]:
     return drift(ts, ys, setup.body, setup.torque)  # pyright: ignore[reportArgumentType]
 
 
 @eqx.filter_jit
-def _transition(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, "times n n"]:
+def _transition(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, "times n n"]:
     # A run that raises nothing, and which forward mode goes through.
-    more = dict(adjoint=dfx.ForwardMode()) if isinstance(setup, Setup) else {}
+    plain = isinstance(setup, DiffraxRun) and not setup.is_replayed
+    more = dict(adjoint=dfx.ForwardMode()) if plain else {}
     setup = dataclasses.replace(setup, throw=False, **more)
     start = jax.tree.map(lambda leaf: leaf[0], ys)
 
@@ -220,7 +222,7 @@ def _transition(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, 
 
 
 @eqx.filter_jit
-def _growth(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, " times"]:
+def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, " times"]:
     """The largest singular value of dy(t)/dy(t0), each part relative to its largest size."""
     start = jax.tree.map(lambda leaf: leaf[0], ys)
     each = parts(start, jnp.ones(dimension(start), ts.dtype)).values()

@@ -1,4 +1,4 @@
-"""Every solver of ours, in one module: `rigidjax.solvers`."""
+"""Every solver of ours, and the adjoint that runs them, in one module: `rigidjax.solvers`."""
 
 from rigidjax._names import show
 from rigidjax.exact.diffrax_solver import FreeSolver as FreeSolver
@@ -9,6 +9,7 @@ from rigidjax.solve.explicit import (
 )
 from rigidjax.solve.magnus import Magnus4 as Magnus4
 from rigidjax.solve.projection import Projected as Projected
+from rigidjax.solve.replay_adjoint import ReplayAdjoint as ReplayAdjoint
 from rigidjax.solve.splitting import (
     Splitting2 as Splitting2,
     Splitting4 as Splitting4,

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -57,6 +58,20 @@ def traced(function: Callable[..., Any], *like: Any) -> Traced:
     """Trace a function of such arguments once."""
     closed, out = jax.make_jaxpr(function, return_shape=True)(*like)
     return Traced(closed, jax.tree.structure(out))
+
+
+def constants_of(
+    functions: list[Callable[..., Any]], *like: Any
+) -> tuple[list[Callable[..., Any]], Arrays]:
+    """Return each function as `f(constants, *args)`, and the constants of all."""
+    programs = [traced(function, *like) for function in functions]
+    ends = np.cumsum([0, *(len(program.constants) for program in programs)])
+
+    def call(i: int, constants: Arrays, *args: Any) -> Any:
+        return programs[i].call(constants[ends[i] : ends[i + 1]], *args)
+
+    calls = [partial(call, i) for i in range(len(programs))]
+    return calls, [c for program in programs for c in program.constants]
 
 
 class Stopped(NamedTuple):

@@ -1,4 +1,4 @@
-"""A scene of one's own that ends its runs, in our loop and in diffrax's."""
+"""A scene of one's own that ends its runs, under our adjoint and diffrax's."""
 
 import diffrax as dfx
 import jax.numpy as jnp

@@ -98,7 +98,7 @@ def test_where_forward_mode_is_all_that_is_asked_diffrax_runs_its_own_method():
     found = rj.simulate(rj.Inertia(TENSOR), start, ts, law, **forward)
     by_diffrax = rj.simulate(rj.Inertia(TENSOR), start, ts, law, solver=dfx.Dopri8(), **forward)
     np.testing.assert_array_equal(found.ys.q, by_diffrax.ys.q)
-    # An event is found in our own loop only; and a method that was chosen is taken.
+    # An event is found with methods of ours only; and a method that was chosen is taken.
     event = dict(event=lambda t, state, body: t - 1.5, **forward)
     assert (
         abs(float(rj.simulate(rj.Inertia(TENSOR), start, ts, law, **event).event_time) - 1.5) < 1e-9

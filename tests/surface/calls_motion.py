@@ -179,7 +179,7 @@ row(
 row("frames.BodyInFrame", lambda: dict(frame=s.frame(), torque=s.damping()))
 row("frames.Force", dict(force=lambda t, state, body: -state.x), transforms=())
 leave_out("made by MovingFrame.at", "frames.Instant")
-leave_out("made by BodyInFrame and by adaptive", "frames.FrameWrench", "solve.Found")
+leave_out("made by BodyInFrame and by adaptive", "frames.FrameWrench", "solve.AdaptiveRun")
 leave_out("abstract: made by subclassing", "frames.AbstractScene")
 
 # Scenes of particles.
@@ -292,6 +292,7 @@ for name in ("DormandPrince8", "Magnus4", "RungeKutta4", "Splitting2", "Splittin
     row(f"solve.solvers.{name}", transforms=())
 row("solve.solvers.Tsitouras5", transforms=())
 row("solve.solvers.FreeSolver", transforms=())
+row("solve.solvers.ReplayAdjoint", transforms=())
 row("solve.solvers.Projected", lambda: dict(solver=dfx.Tsit5()), transforms=())
 row(
     "simulate",

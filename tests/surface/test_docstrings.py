@@ -28,7 +28,7 @@ WITHOUT_EXAMPLE = {
     **dict.fromkeys(
         (
             "frames.FrameWrench",
-            "solve.Found",
+            "solve.AdaptiveRun",
             "lagrangian.LiePoisson",
             "identify.Extended",
             "lagrangian.LiePoissonWithDirection",

@@ -338,6 +338,7 @@ leave_out(
       "DormandPrince8", "Splitting2", "Splitting4", "Splitting6")
       for what in ("order", "init", "step", "func")),
     *(f"solve.solvers.FreeSolver.{what}" for what in ("error_order", "func", "init", "order", "step")),
+    "solve.solvers.ReplayAdjoint.loop",
     *(f"solve.solvers.Projected.{what}" for what in (
         "error_order", "func", "init", "order", "step", "strong_order", "term_structure",
         "interpolation_cls", "term_compatible_contr_kwargs", "scan_kind", "root_finder",
@@ -488,7 +489,7 @@ leave_out(
 )
 leave_out("shares of a run's own statistics: `drift` and `lyapunov_exponents` are rows",
           "solve.Solution.drift", "solve.Solution.growth")  # fmt: skip
-leave_out("holds what the rows of `adaptive` and of `BodyInFrame` compare", "solve.Found",
+leave_out("holds what the rows of `adaptive` and of `BodyInFrame` compare", "solve.AdaptiveRun",
           "frames.FrameWrench")  # fmt: skip
 leave_out("a truth value beside `times`: the row of `crossings`", "solve.Crossings.full")
 leave_out(

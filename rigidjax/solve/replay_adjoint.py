@@ -1,0 +1,202 @@
+"""The adjoint of diffrax that runs the explicit methods of this package, for any vector field."""
+
+import dataclasses
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from rigidjax import _checks
+from rigidjax.motion.equations import on_the_group
+from rigidjax.solve.adaptive_loop import LoopState, Method, Run
+from rigidjax.solve.explicit import AbstractExplicit
+from rigidjax.solve.projection import Stopping, Watched
+from rigidjax.solve.recorded_run import states_of
+from rigidjax.solve.stops import traced
+
+# Controllers that do not look at `args`: these may be large, and each body would have its own.
+_WITHOUT_ARGS = (
+    dfx.PIDController, dfx.ClipStepSizeController, dfx.ConstantStepSize, dfx.StepTo, Stopping,
+    Watched,
+)  # fmt: skip
+
+
+class ReplayAdjoint(dfx.AbstractAdjoint):
+    """Runs `diffrax.diffeqsolve` on records of its steps, with derivatives of both modes.
+
+    For any vector field under the explicit methods of `rigidjax.solvers`. The steps are those that
+    the controller asks for; derivatives take the recorded steps once more, their lengths held.
+    `jax.grad`, `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over reverse) work, by all
+    numbers: of the field and what it closes over, `args`, the start, t0, t1, saved times and the
+    `jump_ts` of a `diffrax.ClipStepSizeController`. Under `jax.vmap` a step has the bodies in the
+    last axis of its arrays, which makes batches several times faster on CPU.
+
+    **Arguments:** `otherwise` the adjoint that takes every other run: another solver,
+    `max_steps=None`, `SaveAt(dense=True)` or `SaveAt(steps=…)`, an event that is sought (with a
+    `root_finder`, a real number, or several conditions), a state of complex numbers or of several
+    dtypes. A boolean event without a `root_finder` ends a run here.
+
+    **Raises:** `TypeError` for `jax.grad` of a `jax.grad`: second derivatives are forward over
+    reverse.
+
+    >>> import diffrax
+    >>> def end(rate):
+    ...     return diffrax.diffeqsolve(
+    ...         diffrax.ODETerm(lambda t, y, rate: -rate * y), rj.solvers.DormandPrince8(),
+    ...         0.0, 1.0, None, jnp.array([1.0]), rate, adjoint=ReplayAdjoint(),
+    ...         stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9),
+    ...     ).ys[-1, 0]
+    >>> slope = jax.grad(end)(0.5)   # −exp(−rate)
+    >>> bool(abs(slope + jnp.exp(-0.5)) < 1e-9)
+    True
+    """
+
+    otherwise: dfx.AbstractAdjoint = dfx.RecursiveCheckpointAdjoint()
+
+    def __check_init__(self) -> None:
+        _checks.instance(self.otherwise, dfx.AbstractAdjoint, "otherwise")
+
+    def loop(
+        self, *, args: Any, terms: Any, solver: Any, stepsize_controller: Any, event: Any,
+        saveat: Any, t0: Any, t1: Any, dt0: Any, max_steps: Any, init_state: Any,
+        progress_meter: Any, **rest: Any,
+    ) -> Any:  # fmt: skip
+        how = dict(terms=terms, solver=solver, stepsize_controller=stepsize_controller)
+        how |= dict(saveat=saveat, t0=t0, t1=t1, dt0=dt0, max_steps=max_steps)
+        if not _replayed(solver, saveat, event, max_steps, init_state):
+            more = dict(args=args, event=event, init_state=init_state)
+            return self.otherwise.loop(progress_meter=progress_meter, **how, **more, **rest)
+        y0, tree = ravel_pytree(init_state.y)
+        # Backwards in time diffrax counts −t.
+        way = jnp.where(jnp.asarray(terms.contr(t0, t1)) < 0, -1, 1).astype(y0.dtype)
+        program = traced(
+            lambda t, y: way * ravel_pytree(terms.vf(t, tree(y), args))[0].astype(y.dtype), t0, y0
+        )
+        constants, count, halt = program.constants, len(program.constants), None
+        if event is not None:
+            condition = traced(lambda t, y: event.cond_fn(t, tree(y), args, **how), t0, y0)
+            constants = constants + condition.constants
+            halt = lambda given, t, y: condition.call(given[count:], t, y)  # noqa: E731
+        controlled_by = _nest(stepsize_controller)
+        plain = all(isinstance(c, _WITHOUT_ARGS) for c in controlled_by)
+        control = (stepsize_controller, progress_meter, None if plain else args)
+        arrays, static = eqx.partition(control, eqx.is_array)
+        method = Method(
+            tableau=solver.tableau,
+            field=lambda given, t, y: program.call(given[:count], t, y),
+            project=lambda y: ravel_pytree(on_the_group(tree(y)))[0],
+            halt=halt,
+            sizes=[leaf.size for leaf in jax.tree.leaves(init_state.y)],
+            max_steps=max_steps,
+            tree=tree,
+            order=solver.error_order(terms),
+            static=static,
+        )
+        subs = _subs(saveat)
+        asked = jnp.concatenate([t0[None][:0], *(s.ts for s in subs if s.ts is not None)])
+        # The times of several sets are taken in their order.
+        order = jnp.argsort(lax.stop_gradient(asked)) if len(subs) > 1 else None
+        state = (init_state.controller_state, init_state.progress_meter_state)
+        begun = jax.tree.map(jnp.asarray, (init_state.tnext, state, init_state.result, arrays))
+        between = asked if order is None else asked[order]
+        run = Run(t0, _stops(controlled_by, t0, t1), between, y0, *lax.stop_gradient(begun))
+        # What ends a run has no derivative.
+        smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
+        ys, end = states_of(method, smooth, constants, run)
+        if order is not None:
+            ys = jnp.zeros_like(ys).at[order].set(ys)
+        final = _final(init_state, saveat, event, args, tree, run, asked, ys, end)
+        return final, {"next_step": end.end - end.t}
+
+
+def _replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: Any) -> bool:
+    """Return whether a run is one of those that are recorded, not one for another adjoint."""
+    kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(state.y)}
+    plain = isinstance(solver, AbstractExplicit) and max_steps is not None and not saveat.dense
+    plain = plain and len(kinds) == 1 and jnp.issubdtype(min(kinds, key=str), jnp.floating)
+    if event is not None:
+        values = jax.tree.leaves(state.event_values)
+        plain = plain and event.root_finder is None and callable(event.cond_fn)
+        plain = plain and jnp.issubdtype(jnp.result_type(values[0]), jnp.bool_)
+    return plain and not any(sub.steps for sub in _subs(saveat))
+
+
+def _subs(saveat: Any) -> list[Any]:
+    is_sub = lambda s: isinstance(s, dfx.SubSaveAt)  # noqa: E731
+    return [s for s in jax.tree.leaves(saveat.subs, is_leaf=is_sub) if is_sub(s)]
+
+
+def _nest(controller: Any) -> list[Any]:
+    """Return a controller and those inside it."""
+    found = []
+    while isinstance(controller, dfx.AbstractStepSizeController):
+        found.append(controller)
+        controller = getattr(controller, "controller", None)
+    return found
+
+
+def _stops(controllers: list[Any], t0: Array, t1: Array) -> Array:
+    """Return the times in order at which a step ends for a jump of the field, and the last time."""
+    names = {Stopping: "stops", dfx.ClipStepSizeController: "jump_ts"}
+    jumps = [getattr(c, names[type(c)]) for c in controllers if type(c) in names]
+    jumps = [jnp.clip(j.astype(t0.dtype), t0, t1) for j in jumps if j is not None and j.size]
+    if len(jumps) > 1:
+        jumps = [jnp.sort(jnp.concatenate(jumps))]
+    return jnp.concatenate([*jumps, t1[None]])
+
+
+def _final(
+    state: Any, saveat: Any, event: Any, args: Any, tree: Any, run: Run, asked: Array, ys: Array,
+    end: LoopState,
+) -> Any:  # fmt: skip
+    """Return the state of diffrax at the end of a run, with what is saved of it."""
+    t1 = run.stops[-1]
+    # Nothing is saved before a step is taken, but of a run that is over at its start.
+    reached = (asked <= end.t) & ((end.t > run.t0) | (t1 <= run.t0))
+    counts = [s.ts.shape[0] for s in _subs(saveat) if s.ts is not None]
+    parts = [jnp.split(a, np.cumsum(counts)[:-1]) for a in (reached, ys)]
+    each = iter(zip(*parts, strict=True))
+
+    def saved(sub: Any, old: Any) -> Any:
+        ts, states, there = [], [], []
+        if sub.t0:
+            ts, states, there = [run.t0[None]], [run.y0[None]], [jnp.ones(1, bool)]
+        if sub.ts is not None:
+            known, states_there = next(each)
+            ts, states, there = [*ts, sub.ts], [*states, states_there], [*there, known]
+        if sub.t1:
+            ts, there = [*ts, end.t[None]], [*there, jnp.ones(1, bool)]
+            states.append(end.y[None])
+        ts, states, there = (jnp.concatenate(a) for a in (ts, states, there))
+        # A function of the state has no value where there is none.
+        states = jnp.where(there[:, None], states, run.y0)
+        out = jax.vmap(lambda t, y: sub.fn(t, tree(y), args))(ts, states)
+        masked = lambda a: jnp.where(there.reshape(-1, *[1] * (a.ndim - 1)), a, jnp.inf)  # noqa: E731
+        new = dict(ts=masked(ts), ys=jax.tree.map(masked, out), save_index=jnp.sum(there))
+        return dataclasses.replace(old, **new)
+
+    is_sub = lambda s: isinstance(s, dfx.SubSaveAt)  # noqa: E731
+    short = (end.result == dfx.RESULTS.successful) & (end.t < t1)
+    control, progress = end.state
+    new = dict(
+        y=tree(lax.stop_gradient(end.y)),
+        tprev=end.t,
+        tnext=end.end,
+        controller_state=control,
+        progress_meter_state=progress,
+        result=dfx.RESULTS.where(short, dfx.RESULTS.max_steps_reached, end.result),
+        num_steps=end.steps,
+        num_rejected_steps=end.rejected,
+        num_accepted_steps=end.steps - end.rejected,
+        save_state=jax.tree.map(saved, saveat.subs, state.save_state, is_leaf=is_sub),
+    )
+    if event is not None:
+        met = end.result == dfx.RESULTS.event_occurred
+        new["event_mask"] = jax.tree.map(lambda _: met, event.cond_fn)
+    return dataclasses.replace(state, **new)
