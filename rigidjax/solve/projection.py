@@ -6,7 +6,10 @@ import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax.motion.equations import on_the_group
@@ -129,15 +132,26 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any,
         error_order: Any,
     ) -> tuple[Any, Any]:  # fmt: skip
+        slope_at = lambda t, y: func(terms, t, y, args)  # noqa: E731
+        # A solver without an order of its error is refused by the inner controller.
+        chosen = dt0 is None and error_order is not None
+        if chosen:
+            h = _first_step(self.controller, slope_at, t0, y0, error_order)
+            # The step of one that cannot be chosen is not finite; any other does for the inner one.
+            dt0 = jnp.where(jnp.isfinite(h), h, jnp.ones_like(h))
+            sound = finite((y0, h))
+        else:
+            sound = finite((y0, dt0, slope_at(t0, y0)))
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         # At t = 0 the round-off of t vanishes: that of the length of the run is taken.
         least = jnp.finfo(t0.dtype).eps * jnp.abs(t1 - t0)
+        result = dfx.RESULTS.where(sound, dfx.RESULTS.successful, NONFINITE)
+        if chosen:
+            lost = sound & ~(first > t0)
+            result = dfx.RESULTS.where(lost, dfx.RESULTS.dt_min_reached, result)
         # A step of length 0 would be accepted for ever.
         first = jnp.maximum(first, t0 + self._unit(t0, least))
-        # Where the first derivative is not finite the run ends at once: so is then the first step
-        # that was chosen by it.
-        slope = () if dt0 is None else func(terms, t0, y0, args)
-        return first, (inner, least, ~finite((y0, first, slope)))
+        return first, (inner, least, result)
 
     def _unit(self, t: Any, least: Any) -> Any:
         """Return the shortest step at the time t, some units of round-off."""
@@ -147,16 +161,52 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any,
         error_order: Any, controller_state: Any,
     ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:  # fmt: skip
-        inner, least, lost = controller_state
+        inner, least, begun = controller_state
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
-        stuck = lost | (~keep & ~(right - left > self._unit(left, least)))
-        stuck = stuck & (result == dfx.RESULTS.successful)
-        ill = lost | ~finite((right, y1_candidate, y_error))
+        well = dfx.RESULTS.successful
+        stuck = ~keep & ~(right - left > self._unit(left, least))
+        ill = ~finite((right, y1_candidate, y_error))
         why = dfx.RESULTS.where(ill, NONFINITE, dfx.RESULTS.dt_min_reached)
-        result = dfx.RESULTS.where(stuck, why, result)
-        return keep, left, right, jumped, (inner, least, lost), result
+        why = dfx.RESULTS.where(stuck, why, well)
+        why = dfx.RESULTS.where(begun == well, why, begun)
+        result = dfx.RESULTS.where(result == well, why, result)
+        return keep, left, right, jumped, (inner, least, begun), result
+
+
+def _first_step(controller: Any, slope_at: Any, t0: Array, y0: Any, order: Any) -> Array:
+    """Return the starting step of Hairer, Nørsett and Wanner (1993), II.4; not finite after NaN.
+
+    diffrax takes 0.01 for any field that runs in a direction of time, as in `diffeqsolve` all do.
+    """
+    y, tree = ravel_pytree(lax.stop_gradient(y0))
+    t0 = lax.stop_gradient(t0)
+    scale = controller.atol + controller.rtol * jnp.abs(y)
+    norm = lambda a: controller.norm(tree(a / scale))  # noqa: E731
+    d0 = norm(y)
+
+    def slope(_: Array, state: Any) -> Any:
+        # At the start, then after a short step of Euler's: one field to compile.
+        h, first, _ = state
+        now = slope_at(t0 + h.astype(t0.dtype), tree(y + h * first))
+        now = ravel_pytree(lax.stop_gradient(now))[0]
+        d1 = norm(now)
+        small = (d0 < 1e-5) | (d1 < 1e-5)
+        short = jnp.where(small, 1e-6, 0.01 * d0 / jnp.where(small, 1.0, d1)).astype(d0.dtype)
+        begun = h != 0
+        return jnp.where(begun, h, short), jnp.where(begun, first, now), now
+
+    state = (jnp.zeros_like(d0), jnp.zeros_like(y), jnp.zeros_like(y))
+    h, first, last = lax.fori_loop(np.int32(0), np.int32(2), slope, state)
+    d2 = norm(last - first) / h
+    largest = jnp.maximum(norm(first), d2)
+    flat = largest <= 1e-15
+    guess = (0.01 / jnp.where(flat, 1.0, largest)) ** (1 / order)
+    h = jnp.minimum(100 * h, jnp.where(flat, jnp.maximum(1e-6, 1e-3 * h), guess))
+    # A slope of infinity makes a step of length 0.
+    h = jnp.where(finite((first, last)), h, jnp.nan)
+    return h.astype(t0.dtype)
 
 
 class Stopping(dfx.AbstractAdaptiveStepSizeController):

@@ -143,9 +143,12 @@ def _nest(controller: Any) -> list[Any]:
 
 def _stops(controllers: list[Any], t0: Array, t1: Array) -> Array:
     """Return the times in order at which a step ends for a jump of the field, and the last time."""
-    names = {Stopping: "stops", dfx.ClipStepSizeController: "jump_ts"}
-    jumps = [getattr(c, names[type(c)]) for c in controllers if type(c) in names]
-    jumps = [jnp.clip(j.astype(t0.dtype), t0, t1) for j in jumps if j is not None and j.size]
+    jumps = [c.stops for c in controllers if type(c) is Stopping]
+    for c in controllers:
+        if type(c) is dfx.ClipStepSizeController and c.jump_ts is not None:
+            ts = c.jump_ts.astype(t0.dtype)
+            # A step goes to t1 itself if a jump is beyond it; one at t0 is over.
+            jumps.append(jnp.sort(jnp.where((t0 < ts) & (ts <= t1), ts, t0)))
     if len(jumps) > 1:
         jumps = [jnp.sort(jnp.concatenate(jumps))]
     return jnp.concatenate([*jumps, t1[None]])

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from once import once
-from rigidjax.solvers import DormandPrince8, ReplayAdjoint, RungeKutta4, Tsitouras5
+
+from rigidjax.solve.solvers import DormandPrince8, ReplayAdjoint, RungeKutta4, Tsitouras5
 
 REPLAY, PLAIN = ReplayAdjoint(), dfx.RecursiveCheckpointAdjoint()
 PID = dfx.PIDController(rtol=1e-9, atol=1e-11)
@@ -30,7 +31,10 @@ def solved(adjoint, k, x0, ts, solver=None, control=PID, dt0=None, **how):
 
 
 def number(ys):
-    parts = (jnp.sum(jnp.cos(i + jnp.arange(a.size)) * a.ravel()) for i, a in enumerate(ys))
+    parts = (
+        jnp.sum(jnp.cos(i + jnp.arange(a.size, dtype=a.dtype)) * a.ravel())
+        for i, a in enumerate(ys)
+    )
     return sum(parts)
 
 
@@ -83,6 +87,10 @@ def test_derivatives_are_those_of_diffrax_by_every_number(solver, control, dt0, 
     run = jax.value_and_grad(lambda *a: value(PLAIN)(*a, *more), tuple(range(len(args))))
     theirs, by_theirs = once(run)(*args)
     np.testing.assert_allclose(ours, theirs, rtol=1e-13)
+    if isinstance(control, dfx.ConstantStepSize):
+        # diffrax moves its equal steps with t0 and t1: a difference as small as their error.
+        np.testing.assert_allclose(by_ours[2], by_theirs[2], atol=1e-9)
+        by_ours, by_theirs = ((*by[:2], by[2][1:-1]) for by in (by_ours, by_theirs))
     for a, b in zip(by_ours, by_theirs, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.abs(b).max())
 
@@ -109,7 +117,7 @@ class Levels:
     @staticmethod
     def field(t, y, edges):
         return jnp.full_like(y, Levels.heights[0]) + sum(
-            (new - old) * (t >= edge)
+            jnp.where(t >= edge, new - old, 0.0)
             for old, new, edge in zip(Levels.heights, Levels.heights[1:], edges, strict=False)
         )
 
@@ -205,7 +213,9 @@ def test_sets_of_saved_times_their_functions_an_event_and_a_meter_are_those_of_d
     for how in (dict(), dict(event=event)):
         ours, theirs = run(REPLAY, **how), run(PLAIN, **how)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11), ours, theirs)
-    jax.tree.map(np.testing.assert_array_equal, run(REPLAY, progress_meter=meter), run(REPLAY))
+    # Another program rounds in another way.
+    same = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12)
+    jax.tree.map(same, run(REPLAY, progress_meter=meter), run(REPLAY))
 
 
 def test_a_run_without_a_step_and_saved_times_at_the_start():
