@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool
 
@@ -31,8 +31,6 @@ _MORE = 64
 _BLOCK, _MOST = 560, 8
 # Times of one body that are taken together.
 _TOGETHER = 16
-# diffrax rounds a step up to the end of a run that is nearer than so many units of round-off.
-_SLIVER = 100
 
 
 class Method(NamedTuple):
@@ -42,11 +40,10 @@ class Method(NamedTuple):
     field: Field  # on (n, *bodies), as `project`
     project: Callable[[Array], Array]
     halt: Callable[..., Array] | None  # (t, y): whether the run ends here
+    # (again, (state, times), (left, right, error)): what the controller makes of a step, see there
+    control: Callable[..., Any]
     sizes: list[int]  # of the arrays of the state
     max_steps: int
-    tree: Callable[[Array], Any]  # the state of one body, as a controller takes it
-    order: Any  # of the error
-    static: Any  # the controller, the progress meter and `args`, without their arrays
 
 
 class Run(NamedTuple):
@@ -57,9 +54,8 @@ class Run(NamedTuple):
     between: Array  # (K,) times asked for
     y0: Array  # (n,)
     end: Array  # of the first step
-    state: Any  # of controller and progress meter at the start
-    result: dfx.RESULTS  # at the start
-    arrays: Any  # of controller, progress meter and `args`
+    result: dfx.RESULTS | None  # at the start; `None`: successful
+    state: Any = None  # of controller and progress meter at the start
 
     @property
     def before(self) -> Array:
@@ -89,13 +85,44 @@ HEAD = 4
 NONE, STEP, LAST = range(3)
 
 
+def pack(loop: LoopState) -> Arrays:
+    """Return the numbers y (n, *bodies) of a loop, and the rest as one array of each dtype.
+
+    A loop over blocks of bodies has a kernel for each array that goes in or comes out.
+    """
+    rest = _by_dtype(loop._replace(y=None))
+    join = lambda leaves: jnp.concatenate([a.reshape(-1, *loop.t.shape) for a in leaves])  # noqa: E731
+    return [loop.y, *(join([a.astype(kind) for a in leaves]) for kind, leaves in rest.items())]
+
+
+def unpack(arrays: Arrays, like: LoopState) -> LoopState:
+    """Return the inverse of `pack`, of a loop with arrays `like` these."""
+    rest, tree = jax.tree.flatten(like._replace(y=None))
+    parts = {}
+    for (kind, leaves), array in zip(_by_dtype(rest).items(), arrays[1:], strict=True):
+        sizes = [a.size // max(like.t.size, 1) for a in leaves]
+        parts[kind] = iter(jnp.split(array, np.cumsum(sizes)[:-1]))
+    rest = [next(parts[_kind(a)]).reshape(a.shape).astype(a.dtype) for a in rest]
+    return tree.unflatten(rest)._replace(y=arrays[0])
+
+
+def _kind(a: Array) -> Any:
+    return jnp.dtype(jnp.int32) if a.dtype == bool else a.dtype
+
+
+def _by_dtype(tree: Any) -> dict[Any, Arrays]:
+    parts: dict[Any, Arrays] = {}
+    for a in jax.tree.leaves(tree):
+        parts.setdefault(_kind(a), []).append(a)
+    return parts
+
+
 class Record(NamedTuple):
     """A recorded run."""
 
-    starts: LoopState  # of each segment, arrays (S, …), and the end of the last
-    number: Array  # of segments
+    starts: Arrays  # of each segment, as of `pack`, (S, …), and the end of the last
     rows: Rows  # of the last segment
-    filled: Array  # their number
+    counts: Array  # (2,) of segments, and of these rows
 
 
 class Segment(NamedTuple):
@@ -165,7 +192,10 @@ def start(run: Run) -> LoopState:
     # Stops at the start or before it need no step.
     passed = jnp.sum(run.stops[:-1] <= run.t0[None], 0, dtype=jnp.int32)
     still = lax.stop_gradient((run.t0, run.end))
-    return LoopState(run.y0, *still, passed, zero, zero, run.result, run.state)
+    result = run.result
+    if result is None:
+        result = jax.tree.map(lambda a: jnp.full_like(zero, a), dfx.RESULTS.successful)
+    return LoopState(run.y0, *still, passed, zero, zero, result, run.state)
 
 
 def is_running(method: Method, run: Run, loop: LoopState, until: Array | None) -> Array:
@@ -226,29 +256,28 @@ def recording(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopS
     """Return states between (K, n, *bodies), NaN if not reached; the end; what derivatives need."""
     loop, most = start(run), method.max_steps + run.stops.shape[0]
     count = -(-most // SEGMENT) + 1
-    starts = jax.tree.map(lambda a: jnp.zeros((count, *a.shape), a.dtype), loop)
+    starts = [jnp.zeros((count, *a.shape), a.dtype) for a in pack(loop)]
     ys = _unreached(run)
     rows = jnp.zeros((SEGMENT + _MORE + _MOST, HEAD + run.y0.shape[0], *run.t0.shape), ys.dtype)
     zero = jnp.zeros((), jnp.int32)
 
-    def put(into: LoopState, i: Array, loop: LoopState) -> LoopState:
-        write = lambda a, b: lax.dynamic_update_index_in_dim(a, b, i, 0)  # noqa: E731
-        return jax.tree.map(write, into, loop)
+    def put(into: Arrays, i: Array, loop: LoopState) -> Arrays:
+        both = zip(into, pack(loop), strict=True)
+        return [lax.dynamic_update_index_in_dim(a, b, i, 0) for a, b in both]
 
     def one(state: Any) -> Any:
-        loop, ys, record = state
-        after, rows, count = recorded(method, constants, run, loop, record.rows, None)
+        loop, ys, starts, rows, number, _ = state
+        after, rows, count = recorded(method, constants, run, loop, rows, None)
         if run.between.shape[0]:
             part = segment(rows, after.t, count)
             ys = states_at_saved_times(method, constants, run, part, ys)
-        number = record.number + 1
-        return after, ys, Record(put(record.starts, number, after), number, rows, count)
+        return after, ys, put(starts, number + 1, after), rows, number + 1, count
 
-    state = (loop, ys, Record(put(starts, zero, loop), zero, rows, zero))
+    state = (loop, ys, put(starts, zero, loop), rows, zero, zero)
     more = lambda state: jnp.any(is_running(method, run, state[0], None))  # noqa: E731
-    loop, ys, record = lax.while_loop(more, one, state)
-    number, filled = (jnp.broadcast_to(a, run.t0.shape) for a in (record.number, record.filled))
-    return ys, loop, record._replace(number=number, filled=filled)
+    loop, ys, starts, rows, *counts = lax.while_loop(more, one, state)
+    each = jnp.stack([jnp.broadcast_to(count, run.t0.shape) for count in counts])
+    return ys, loop, Record(starts, rows, each)
 
 
 def _attempt(
@@ -259,82 +288,61 @@ def _attempt(
 
     Only a segment that is run again, `until` its end, has derivatives by the times.
     """
-    on = is_running(method, run, loop, until)
+    # The loop around has asked whether one body is on its way; of many bodies some are not.
+    on = is_running(method, run, loop, until) if run.t0.ndim else True
     stop, end = lax.stop_gradient((take(run.stops, loop.stop), take(run.before, loop.stop)))
     # A stop that is passed already, such as the second of two at one time, needs no step.
-    arrived = on & (loop.t >= stop)
-    moving = on & ~arrived
+    arrived = on & (loop.t >= stop) if run.stops.shape[0] > 1 else False
+    moving = on if arrived is False else on & ~arrived
     # No step goes over a stop, whatever its controller rounds: it would see both sides of a jump.
     last = loop.end >= end
     end = jnp.where(last, end, loop.end)
     if until is not None:
         last, end = last & (end <= until), jnp.minimum(end, until)
-    end = jnp.where(moving, end, loop.t)
+    end = _where(moving, end, loop.t)
     h, kind = end - loop.t, jnp.where(last, LAST, STEP)
-    head = jnp.stack([a.astype(loop.y.dtype) for a in (loop.t, h, kind, loop.stop)])
     step = Step(loop.t, h, end, loop.y)
     if until is not None:
-        moved = times_of(run, head)
-        times = (jnp.where(moving, a, b) for a, b in zip(moved, step[:3], strict=True))
-        step = Step(*times, loop.y)
+        head = [a.astype(loop.y.dtype) for a in (loop.t, h, kind, loop.stop)]
+        moved = times_of(run, jnp.stack(head))
+        step = Step(*(_where(moving, a, b) for a, b in zip(moved, step[:3], strict=True)), loop.y)
     there = stages(method.tableau, method.field, constants, step, dense)
     y = method.project(there.end)
     # Which steps are taken is no thing to differentiate.
     left, right, slopes = lax.stop_gradient((loop.y, y, there.slopes))
     error = error_estimate(method.tableau, method.sizes, h, slopes)
-    found = _controlled(method, run, loop, end, (left, right, error), until)
+    # NaN in a step too long says as little as infinity: a shorter one is tried.
+    error = jnp.where(jnp.isfinite(error) & jnp.isfinite(right), error, jnp.inf)
+    times = lax.stop_gradient((run.t0, run.stops[-1], loop.t, end))
+    found = method.control(until is not None, (loop.state, times), (left, right, error))
     keep, t, following, state, result = found
     accept = moving & keep
     if until is None and method.halt is not None:
         met = accept & method.halt(t, y)
         ended = lambda met, why: dfx.RESULTS.where(met, dfx.RESULTS.event_occurred, why)  # noqa: E731
         result = per_body(run, ended)(met, result)
-    choose = lambda which, a, b: jax.tree.map(  # noqa: E731
-        lambda a, b: jnp.where(which, a, b).astype(b.dtype), a, b
-    )
+    reached = accept & (t >= stop) | arrived if run.stops.shape[0] > 1 else 0
     after = LoopState(
-        y=jnp.where(lift(accept, y), y, loop.y),
-        t=jnp.where(accept, t, loop.t),
-        end=jnp.where(moving, following, loop.end),
-        stop=loop.stop + (arrived | (accept & (t >= stop))).astype(jnp.int32),
-        steps=loop.steps + moving.astype(jnp.int32),
-        rejected=loop.rejected + (moving & ~accept).astype(jnp.int32),
-        result=choose(moving, result, loop.result),
-        state=choose(moving, state, loop.state),
+        y=_where(accept, y, loop.y),
+        t=_where(accept, t, loop.t),
+        end=_where(moving, following, loop.end),
+        stop=loop.stop + jnp.asarray(reached, jnp.int32),
+        steps=loop.steps + jnp.asarray(moving, jnp.int32),
+        rejected=loop.rejected + jnp.asarray(moving & ~keep, jnp.int32),
+        result=_where(moving, result, loop.result),
+        state=_where(moving, state, loop.state),
     )
-    head = head.at[2].set(jnp.where(accept, kind, NONE).astype(head.dtype))
-    return after, jnp.concatenate([head, loop.y]), (step, there.slopes)
+    head = (loop.t, h, jnp.where(accept, kind, NONE), loop.stop)
+    row = jnp.concatenate([jnp.stack([a.astype(y.dtype) for a in head]), loop.y])
+    return after, row, (step, there.slopes)
 
 
-def _controlled(
-    method: Method, run: Run, loop: LoopState, end: Array, numbers: tuple[Array, Array, Array],
-    until: Array | None,
-) -> Any:  # fmt: skip
-    """Return what the controller makes of a step of every body, of which the `numbers` are those
-    of the state before and after it, and of its error: whether the step is accepted, the time after
-    it, the end of the next one, the states of controller and progress meter, and the result.
-    """
-
-    def one(given: Any, times: Any, left: Array, right: Array, error: Array) -> Any:
-        (arrays, (control, progress)), (t0, last, begin, end) = given, times
-        controller, meter, args = eqx.combine(arrays, method.static)
-        # NaN in a step too long says as little as infinity: a shorter one is tried.
-        error = jnp.where(jnp.isnan(error), jnp.inf, error)
-        states = [method.tree(y) for y in (left, right)]
-        keep, t, following, _, control, result = controller.adapt_step_size(
-            begin, end, *states, args, method.tree(error), method.order, control
-        )
-        # As diffrax does: no step is a few units of round-off long because the run ends.
-        t = jnp.minimum(t, last)
-        near = last - _SLIVER * jnp.finfo(t.dtype).eps * jnp.abs(last)
-        shorter = jnp.where(keep, last, t + 0.5 * (last - t))
-        following = jnp.where(following > near, shorter, following)
-        if until is None:
-            progress = meter.step(progress, (t - t0) / (last - t0))
-        return jax.tree.map(jnp.asarray, (keep, t, following, (control, progress), result))
-
-    given, times = (run.arrays, loop.state), (run.t0, run.stops[-1], loop.t, end)
-    return per_body(run, one)(*lax.stop_gradient((given, times)), *numbers)
+def _where(which: Any, new: Any, old: Any) -> Any:
+    """Return the arrays (…, *bodies) of `new` where it is so, else of `old`; `True`: everywhere."""
+    if which is True:
+        return jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), new, old)
+    choose = lambda a, b: jnp.where(lift(which, a), a, b).astype(b.dtype)  # noqa: E731
+    return jax.tree.map(choose, new, old)
 
 
 def recorded(

@@ -25,9 +25,11 @@ from rigidjax.solve.adaptive_loop import (
     per_body,
     recorded,
     segment,
+    start,
     state_in_step,
     states_at_saved_times,
     times_of,
+    unpack,
 )  # fmt: skip
 from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Step, stages
@@ -102,9 +104,9 @@ def replay_steps(
         return y, ys, starts, rows
 
     still, held = lax.stop_gradient(((constants, run), record))
-    number = jnp.max(held.number)
+    number = jnp.max(held.counts[0])
     ys = jnp.zeros((run.between.shape[0], *run.y0.shape), run.y0.dtype)
-    state = (run.y0, ys, held.starts.y, held.rows)
+    state = (run.y0, ys, held.starts[0], held.rows)
     y, ys, starts, rows = lax.fori_loop(0, number, one, state)
     return ys, y, lax.dynamic_update_index_in_dim(starts, y, number, 0), rows
 
@@ -116,7 +118,7 @@ def cotangents(
 
     `bars` are those of the states between and at the end. Times have some only where `timed`.
     """
-    number, size = jnp.max(record.number), run.between.shape[0]
+    number, size = jnp.max(record.counts[0]), run.between.shape[0]
 
     def one(i: Array, sums: tuple[Arrays, Smooth]) -> tuple[Arrays, Smooth]:
         part = _again(method, constants, run, record, number - 1 - i)
@@ -168,13 +170,17 @@ def _where(there: Array, a: Array) -> Array:
 
 def _again(method: Method, constants: Arrays, run: Run, record: Record, number: Array) -> Segment:
     """Return a segment of the record; any but the last is run once more."""
-    loop, after = (jax.tree.map(lambda a: a[i], record.starts) for i in (number, number + 1))  # noqa: B023
-    again = number < jnp.max(record.number) - 1
+    like = start(run)
+    loop, after = (unpack([a[i] for a in record.starts], like) for i in (number, number + 1))
+    # The counts of steps and the result are those of the forward run.
+    loop = loop._replace(steps=like.steps, result=like.result)
+    count, filled = (jnp.max(a) for a in record.counts)
+    again = number < count - 1
     # Nothing is left to do of the last one.
     until = jnp.where(again, lax.stop_gradient(after.t), -jnp.inf)
     end, rows, count = recorded(method, constants, run, loop, record.rows, until)
     # With too little room for its steps there would be wrong numbers: then there are none.
     short = jnp.where(jnp.any(is_running(method, run, end, until)), jnp.nan, 0.0)
     rows = rows.at[:, HEAD:].add(short.astype(rows.dtype))
-    count = jnp.where(again, count, jnp.max(record.filled))
+    count = jnp.where(again, count, filled)
     return segment(rows, after.t, count)

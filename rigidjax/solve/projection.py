@@ -145,13 +145,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         # At t = 0 the round-off of t vanishes: that of the length of the run is taken.
         least = jnp.finfo(t0.dtype).eps * jnp.abs(t1 - t0)
-        result = dfx.RESULTS.where(sound, dfx.RESULTS.successful, NONFINITE)
-        if chosen:
-            lost = sound & ~(first > t0)
-            result = dfx.RESULTS.where(lost, dfx.RESULTS.dt_min_reached, result)
-        # A step of length 0 would be accepted for ever.
-        first = jnp.maximum(first, t0 + self._unit(t0, least))
-        return first, (inner, least, result)
+        # A step of length 0 would be accepted for ever; one of length NaN ends the run.
+        first = jnp.where(sound, jnp.maximum(first, t0 + self._unit(t0, least)), jnp.nan)
+        return first.astype(t0.dtype), (inner, least)
 
     def _unit(self, t: Any, least: Any) -> Any:
         """Return the shortest step at the time t, some units of round-off."""
@@ -161,18 +157,14 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any,
         error_order: Any, controller_state: Any,
     ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:  # fmt: skip
-        inner, least, begun = controller_state
+        inner, least = controller_state
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
-        well = dfx.RESULTS.successful
         stuck = ~keep & ~(right - left > self._unit(left, least))
-        ill = ~finite((right, y1_candidate, y_error))
-        why = dfx.RESULTS.where(ill, NONFINITE, dfx.RESULTS.dt_min_reached)
-        why = dfx.RESULTS.where(stuck, why, well)
-        why = dfx.RESULTS.where(begun == well, why, begun)
-        result = dfx.RESULTS.where(result == well, why, result)
-        return keep, left, right, jumped, (inner, least, begun), result
+        why = dfx.RESULTS.where(finite(y_error), dfx.RESULTS.dt_min_reached, NONFINITE)
+        why = dfx.RESULTS.where(stuck & (result == dfx.RESULTS.successful), why, result)
+        return keep, left, right, jumped, (inner, least), why
 
 
 def _first_step(controller: Any, slope_at: Any, t0: Array, y0: Any, order: Any) -> Array:

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jaxtyping import Array
 
@@ -18,24 +19,27 @@ SMOOTH = len(Smooth._fields)
 
 
 def states_of(
-    method: Method, smooth: list[bool], constants: Arrays, run: Run
+    method: Method, smooth: list[bool], constants: Arrays, state: Any, run: Run
 ) -> tuple[Array, LoopState]:
     """Return the states between (K, n), NaN where the run did not get, and the end of the loop.
 
     `smooth` says which of the constants have derivatives. Those of the states and of the last state
     are by these constants and the `Smooth` numbers of the run; the lengths of steps are held.
+    `state` of controller and progress meter is that at the start; bodies may share it.
     """
     each, run_tree = jax.tree.flatten(run)
-    number, no = len(constants), jnp.zeros((), jnp.int32)
-    like = adaptive_loop.start(run)
-    tree = jax.tree.structure((no, like, Record(like, no, no, no)))
-    between, end, record = tree.unflatten(range(tree.num_leaves))
-    # The results that have derivatives, and those that the value has.
-    states = [between, end.y, record.starts.y, record.rows]
-    head = tree.num_leaves - len(jax.tree.leaves(record))
+    first, state_tree = jax.tree.flatten(state)
+    number, smooth = len(constants) + len(first), [*smooth, *(False for _ in first)]
+    like = adaptive_loop.start(run._replace(state=state))
+    shapes = jax.eval_shape(adaptive_loop.pack, like)
+    trees = run_tree, state_tree
+    # The numbers between and at the end, then the record: its starts, rows and counts. The results
+    # that have derivatives, and those that the value has.
+    size = len(shapes)
+    states, head = [0, 1, 1 + size, 1 + 2 * size], 1 + size
 
     def mapped(program: Any, linear: int, *args: Any) -> Arrays:
-        call = partial(program, method, run_tree)
+        call = partial(program, method, trees)
         return in_lanes(call, list(args[:number]), list(args[number:]), linear)
 
     answer: Any = jax.custom_jvp(partial(mapped, partial(_forward, False), 0))
@@ -49,9 +53,8 @@ def states_of(
         moving = [s and t for s, t in zip(smooth, there[:number], strict=True)], of_run
         along = [t for t, m in zip(tangents, [*moving[0], *moving[1]], strict=True) if m]
         found = recorded(*primals)
-        held = tree.unflatten(found)[2]
         push = partial(mapped, partial(_pushed, moving), len(along))
-        given = [*primals, *jax.tree.leaves(held)]
+        given = [*primals, *found[head:]]
         if pull is None:
             return found, linear_map(push, refuse, given, along)
         # The states between and at the end alone are transposed.
@@ -73,29 +76,47 @@ def states_of(
 
     answer.defjvp(of_answer, symbolic_zeros=True)
     recorded.defjvp(of_record, symbolic_zeros=True)
-    between, *end = answer(*constants, *each)
-    return between, jax.tree.structure(like).unflatten(end)
+    between, *end = answer(*constants, *first, *each)
+    return between, adaptive_loop.unpack(end, like)
 
 
-def _over_bodies(method: Method, layout: Layout, constants: Arrays) -> Method:
-    """Return the method on (n, *bodies); that of one body has `halt(constants, t, y)`."""
-    halt = None if method.halt is None else partial(layout.over(method.halt), constants)
+def _over_bodies(
+    method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
+) -> tuple[Method, Run, Layout, Arrays]:
+    """Return the method and the run on (n, *bodies), and the constants without the first state.
+
+    The method of one body has `halt(constants, t, y)` and `control(again, constants, …)`.
+    """
+    run_tree, state_tree = trees
+    run, count = run_tree.unflatten(each), len(constants) - state_tree.num_leaves
+    state = layout.broadcast_to_bodies(constants, [i >= count for i in range(len(constants))], run.t0)
+    run = run._replace(state=state_tree.unflatten(state[1][count:]))
+    constants, layout = constants[:count], layout._replace(shared=layout.shared[:count])
+    held, one = lax.stop_gradient(constants), method.control
+    halt = None if method.halt is None else partial(layout.over(method.halt), held)
+
+    def control(again: bool, *numbers: Any) -> Any:
+        return layout.over(partial(one, again))(held, *numbers)
+
     project = jax.vmap(method.project, -1, -1) if layout.bodies else method.project
-    return method._replace(field=layout.over(method.field), project=project, halt=halt)
+    field = layout.over(method.field)
+    method = method._replace(field=field, project=project, halt=halt, control=control)
+    return method, run, layout, constants
 
 
 def _forward(
-    record: bool, method: Method, tree: Any, layout: Layout, constants: Arrays, each: Arrays
+    record: bool, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
     """Return the states between and the end, with the `record` if asked for."""
-    method, run = _over_bodies(method, layout, constants), tree.unflatten(each)
-    if record:
-        return jax.tree.leaves(adaptive_loop.recording(method, constants, run))
-    if not run.between.shape[0]:
-        return [run.y0[None][:0], *jax.tree.leaves(adaptive_loop.value(method, constants, run))]
-    if layout.bodies:
-        return jax.tree.leaves(adaptive_loop.recording(method, constants, run)[:2])
-    return jax.tree.leaves(adaptive_loop.states_of_one(method, constants, run))
+    method, run, _, constants = _over_bodies(method, trees, layout, constants, each)
+    if record or (run.between.shape[0] and layout.bodies):
+        between, end, kept = adaptive_loop.recording(method, constants, run)
+    elif run.between.shape[0]:
+        between, end = adaptive_loop.states_of_one(method, constants, run)
+    else:
+        between, end = run.y0[None][:0], adaptive_loop.value(method, constants, run)
+    states = [between, *adaptive_loop.pack(end)]
+    return [*states, *jax.tree.leaves(kept)] if record else states
 
 
 # Which of the constants and which numbers of a run have tangents.
@@ -103,31 +124,33 @@ Moving = tuple[list[bool], list[bool]]
 
 
 def _again(
-    moving: Moving, method: Method, tree: Any, layout: Layout, constants: Arrays, each: Arrays
+    moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> tuple[Method, Arrays, Run, Record, Arrays]:
     """Return a recorded run, the constants that move, one a body; and tangents or cotangents."""
-    run = tree.unflatten(each[: tree.num_leaves])
-    like = adaptive_loop.start(run)
-    held = jax.tree.structure(Record(like, *like[:3]))
-    whole = tree.num_leaves + held.num_leaves
-    record = held.unflatten(each[tree.num_leaves : whole])
-    layout, constants = layout.broadcast_to_bodies(constants, moving[0], run.t0)
-    method = _over_bodies(method, layout, constants)
+    whole = trees[0].num_leaves
+    one = method.field
+    method, run, layout, constants = _over_bodies(method, trees, layout, constants, each[:whole])
+    starts = len(jax.eval_shape(adaptive_loop.pack, adaptive_loop.start(run)))
+    *kept, rows, counts = each[whole : whole + starts + 2]
+    there = moving[0][: len(constants)]
+    layout, constants = layout.broadcast_to_bodies(constants, there, run.t0)
+    field = layout.over(one)
 
     def of_moving(chosen: Arrays, t: Array, y: Array) -> Array:
         rest = iter(chosen)
-        mixed = [next(rest) if m else c for c, m in zip(constants, moving[0], strict=True)]
-        return method.field(mixed, t, y)
+        mixed = [next(rest) if m else c for c, m in zip(constants, there, strict=True)]
+        return field(mixed, t, y)
 
-    chosen = [c for c, m in zip(constants, moving[0], strict=True) if m]
-    return method._replace(field=of_moving), chosen, run, record, each[whole:]
+    chosen = [c for c, m in zip(constants, there, strict=True) if m]
+    record, bars = Record(kept, rows, counts), each[whole + starts + 2 :]
+    return method._replace(field=of_moving), chosen, run, record, bars
 
 
 def _pushed(
-    moving: Moving, method: Method, tree: Any, layout: Layout, constants: Arrays, each: Arrays
+    moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
     """Return the tangents of the states; `each` ends with those of the moving numbers."""
-    method, chosen, run, record, along = _again(moving, method, tree, layout, constants, each)
+    method, chosen, run, record, along = _again(moving, method, trees, layout, constants, each)
     rest = iter(along[len(chosen) :])
     smooth = Smooth(*run[:SMOOTH])
     still = zip(smooth, moving[1], strict=False)
@@ -141,9 +164,9 @@ def _pushed(
 
 
 def _pulled(
-    moving: Moving, method: Method, tree: Any, layout: Layout, constants: Arrays, each: Arrays
+    moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
     """Return the cotangents of the moving numbers; `each` ends with those of the states."""
-    method, chosen, run, record, bars = _again(moving, method, tree, layout, constants, each)
+    method, chosen, run, record, bars = _again(moving, method, trees, layout, constants, each)
     total, of_run = adjoint.cotangents(method, chosen, run, record, bars, any(moving[1][:3]))
     return [*total, *(a for a, moves in zip(of_run, moving[1], strict=False) if moves)]

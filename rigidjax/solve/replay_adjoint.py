@@ -1,7 +1,8 @@
 """The adjoint of diffrax that runs the explicit methods of this package, for any vector field."""
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -15,6 +16,7 @@ from jaxtyping import Array
 from rigidjax import _checks
 from rigidjax.motion.equations import on_the_group
 from rigidjax.solve.adaptive_loop import LoopState, Method, Run
+from rigidjax.solve.batching import Arrays
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.projection import Stopping, Watched
 from rigidjax.solve.recorded_run import states_of
@@ -25,6 +27,11 @@ _WITHOUT_ARGS = (
     dfx.PIDController, dfx.ClipStepSizeController, dfx.ConstantStepSize, dfx.StepTo, Stopping,
     Watched,
 )  # fmt: skip
+
+# The norm of an error that is the same for a state and for its numbers in a row.
+_NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
+# diffrax rounds a step up to the end of a run that is nearer than so many units of round-off.
+_SLIVER = 100
 
 
 class ReplayAdjoint(dfx.AbstractAdjoint):
@@ -87,32 +94,68 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         plain = all(isinstance(c, _WITHOUT_ARGS) for c in controlled_by)
         control = (stepsize_controller, progress_meter, None if plain else args)
         arrays, static = eqx.partition(control, eqx.is_array)
+        arrays, arrays_tree = jax.tree.flatten(lax.stop_gradient(arrays))
+        given = lambda constants: arrays_tree.unflatten(constants[len(constants) - len(arrays) :])  # noqa: E731
+        constants = constants + arrays
+        # Such controllers see a state as numbers in a row.
+        rows = plain and all(getattr(c, "norm", _NORM) is _NORM for c in controlled_by)
         method = Method(
             tableau=solver.tableau,
             field=lambda given, t, y: program.call(given[:count], t, y),
             project=lambda y: ravel_pytree(on_the_group(tree(y)))[0],
             halt=halt,
+            control=_Control(static, given, (lambda y: y) if rows else tree, solver.error_order(terms)),
             sizes=[leaf.size for leaf in jax.tree.leaves(init_state.y)],
             max_steps=max_steps,
-            tree=tree,
-            order=solver.error_order(terms),
-            static=static,
         )
         subs = _subs(saveat)
         asked = jnp.concatenate([t0[None][:0], *(s.ts for s in subs if s.ts is not None)])
         # The times of several sets are taken in their order.
         order = jnp.argsort(lax.stop_gradient(asked)) if len(subs) > 1 else None
         state = (init_state.controller_state, init_state.progress_meter_state)
-        begun = jax.tree.map(jnp.asarray, (init_state.tnext, state, init_state.result, arrays))
-        between = asked if order is None else asked[order]
-        run = Run(t0, _stops(controlled_by, t0, t1), between, y0, *lax.stop_gradient(begun))
+        state = lax.stop_gradient(jax.tree.map(jnp.asarray, state))
+        between, first = asked if order is None else asked[order], init_state.tnext
+        run = Run(
+            t0, _stops(controlled_by, t0, t1), between, y0, lax.stop_gradient(first),
+            None if event is None else init_state.result,
+        )  # fmt: skip
         # What ends a run has no derivative.
         smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
-        ys, end = states_of(method, smooth, constants, run)
+        ys, end = states_of(method, smooth, constants, state, run)
         if order is not None:
             ys = jnp.zeros_like(ys).at[order].set(ys)
         final = _final(init_state, saveat, event, args, tree, run, asked, ys, end)
         return final, {"next_step": end.end - end.t}
+
+
+class _Control(NamedTuple):
+    """What a controller makes of a step of one body."""
+
+    static: Any  # the controller, the progress meter and `args`, without their arrays
+    arrays: Callable[[Arrays], Any]  # these, of the constants
+    tree: Callable[[Array], Any]  # the numbers of a state, as the controller takes it
+    order: Any  # of the error
+
+    def __call__(self, again: bool, constants: Arrays, given: Any, numbers: Any) -> Any:
+        """Return whether a step is accepted, the time after it, the end of the next one, the states
+        of controller and progress meter, and the result.
+
+        `given` are these states and the times t0, t1, begin and end of the step; `numbers` those of
+        the state before and after it and of its error. A step taken `again` shows no progress.
+        """
+        controller, meter, args = eqx.combine(self.arrays(constants), self.static)
+        (control, progress), (t0, last, begin, end) = given
+        *states, error = (self.tree(y) for y in numbers)
+        keep, t, following, _, control, result = controller.adapt_step_size(
+            begin, end, *states, args, error, self.order, control
+        )
+        # As diffrax does: no step is a few units of round-off long because the run ends.
+        t = jnp.minimum(t, last)
+        near = last - _SLIVER * jnp.finfo(t.dtype).eps * jnp.abs(last)
+        following = jnp.where(keep & (following > near), last, following)
+        if not again:
+            progress = meter.step(progress, (t - t0) / (last - t0))
+        return jax.tree.map(jnp.asarray, (keep, t, following, (control, progress), result))
 
 
 def _replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: Any) -> bool:
