@@ -79,8 +79,8 @@ def integrated(
         field, missed = _FieldOfNumbers(program.constants, program.field, tree), program.over
         if program.stops.size:
             controller = Stopping(controller, program.stops)
-    # The first and the last state need no dense output.
-    subs = [dfx.SubSaveAt(t0=True, t1=True)]
+    # The last state needs no dense output.
+    subs = [dfx.SubSaveAt(t1=True)]
     subs += [dfx.SubSaveAt(ts=ts[1:-1])] if ts.shape[0] > 2 else []
     out = dfx.diffeqsolve(
         dfx.ODETerm(field), solver, ts[0], ts[-1], dt0, y0,
@@ -90,17 +90,17 @@ def integrated(
     )  # fmt: skip
     saved: Any = (out.ts, out.ys)
     (ends, *times), (states, *between) = saved
-    last_time, last = jax.tree.map(lambda leaf: leaf[-1], (ends, states))
+    last_time, last = jax.tree.map(lambda leaf: leaf[0], (ends, states))
     done = jnp.where(ts[0] > ts[-1], last_time <= ts[-1], last_time >= ts[-1])
     # Where nothing was saved, diffrax says t = inf: not to be taken for a state.
     there = jnp.concatenate([jnp.ones(1, bool), *(jnp.isfinite(t) for t in times), done[None]])
 
-    def joined(end: Array, *between: Array) -> Array:
-        leaf = jnp.concatenate([end[:1], *between, end[1:]])[: ts.shape[0]]
+    def joined(first: Array, end: Array, *between: Array) -> Array:
+        leaf = jnp.concatenate([first[None], *between, end])[: ts.shape[0]]
         known = there[: ts.shape[0]].reshape(-1, *[1] * (leaf.ndim - 1))
         return jnp.where(known, leaf, jnp.full_like(leaf, jnp.nan))
 
-    ys = jax.tree.map(joined, states, *between)
+    ys = jax.tree.map(joined, y0, states, *between)
     ill = ~done
     if not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
         # Equal steps look at no error, and would go on with NaN.

@@ -15,6 +15,9 @@ from rigidjax import _checks
 from rigidjax.motion.equations import on_the_group
 from rigidjax.solve.adaptive_loop import NONFINITE, before, finite, take
 
+# The norm of an error by default: that of the numbers of a state in a row.
+NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
+
 
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
     """Dense output of another interpolation, its quaternion scaled to length 1."""
@@ -137,9 +140,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         chosen = dt0 is None and error_order is not None
         if chosen:
             h = _first_step(self.controller, slope_at, t0, y0, error_order)
-            # The step of one that cannot be chosen is not finite; any other does for the inner one.
-            dt0 = jnp.where(jnp.isfinite(h), h, jnp.ones_like(h))
-            sound = finite((y0, h))
+            # After NaN or infinity it is not positive; the inner controller gets any other.
+            sound = h > 0
+            dt0 = jnp.where(sound, h, jnp.ones_like(h))
         else:
             sound = finite((y0, dt0, slope_at(t0, y0)))
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
@@ -168,14 +171,17 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
 
 
 def _first_step(controller: Any, slope_at: Any, t0: Array, y0: Any, order: Any) -> Array:
-    """Return the starting step of Hairer, Nørsett and Wanner (1993), II.4; not finite after NaN.
+    """Return the starting step of Hairer, Nørsett and Wanner (1993), II.4; 0 or NaN if f is not
+    finite.
 
     diffrax takes 0.01 for any field that runs in a direction of time, as in `diffeqsolve` all do.
     """
     y, tree = ravel_pytree(lax.stop_gradient(y0))
     t0 = lax.stop_gradient(t0)
     scale = controller.atol + controller.rtol * jnp.abs(y)
-    norm = lambda a: controller.norm(tree(a / scale))  # noqa: E731
+    # The norm of a state, or the same of its numbers in a row.
+    of_state = (lambda a: a) if controller.norm is NORM else tree
+    norm = lambda a: controller.norm(of_state(a / scale))  # noqa: E731
     d0 = norm(y)
 
     def slope(_: Array, state: Any) -> Any:
@@ -196,8 +202,6 @@ def _first_step(controller: Any, slope_at: Any, t0: Array, y0: Any, order: Any) 
     flat = largest <= 1e-15
     guess = (0.01 / jnp.where(flat, 1.0, largest)) ** (1 / order)
     h = jnp.minimum(100 * h, jnp.where(flat, jnp.maximum(1e-6, 1e-3 * h), guess))
-    # A slope of infinity makes a step of length 0.
-    h = jnp.where(finite((first, last)), h, jnp.nan)
     return h.astype(t0.dtype)
 
 

@@ -18,7 +18,7 @@ from rigidjax.motion.equations import on_the_group
 from rigidjax.solve.adaptive_loop import LoopState, Method, Run
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.projection import Stopping, Watched
+from rigidjax.solve.projection import NORM, Stopping, Watched
 from rigidjax.solve.recorded_run import states_of
 from rigidjax.solve.stops import traced
 
@@ -28,8 +28,6 @@ _WITHOUT_ARGS = (
     Watched,
 )  # fmt: skip
 
-# The norm of an error that is the same for a state and for its numbers in a row.
-_NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
 # diffrax rounds a step up to the end of a run that is nearer than so many units of round-off.
 _SLIVER = 100
 
@@ -98,7 +96,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         given = lambda constants: arrays_tree.unflatten(constants[len(constants) - len(arrays) :])  # noqa: E731
         constants = constants + arrays
         # Such controllers see a state as numbers in a row.
-        rows = plain and all(getattr(c, "norm", _NORM) is _NORM for c in controlled_by)
+        rows = plain and all(getattr(c, "norm", NORM) is NORM for c in controlled_by)
         method = Method(
             tableau=solver.tableau,
             field=lambda given, t, y: program.call(given[:count], t, y),
@@ -220,9 +218,12 @@ def _final(
             ts, there = [*ts, end.t[None]], [*there, jnp.ones(1, bool)]
             states.append(end.y[None])
         ts, states, there = (jnp.concatenate(a) for a in (ts, states, there))
-        # A function of the state has no value where there is none.
-        states = jnp.where(there[:, None], states, run.y0)
+        if sub.ts is not None:
+            # A function of the state has no value where there is none.
+            states = jnp.where(there[:, None], states, run.y0)
         out = jax.vmap(lambda t, y: sub.fn(t, tree(y), args))(ts, states)
+        if sub.ts is None:
+            return dataclasses.replace(old, ts=ts, ys=out, save_index=jnp.asarray(len(ts)))
         masked = lambda a: jnp.where(there.reshape(-1, *[1] * (a.ndim - 1)), a, jnp.inf)  # noqa: E731
         new = dict(ts=masked(ts), ys=jax.tree.map(masked, out), save_index=jnp.sum(there))
         return dataclasses.replace(old, **new)
