@@ -304,8 +304,8 @@ def _attempt(
     step = Step(loop.t, h, end, loop.y)
     if until is not None:
         head = [a.astype(loop.y.dtype) for a in (loop.t, h, kind, loop.stop)]
-        moved = times_of(run, jnp.stack(head))
-        step = Step(*(_where(moving, a, b) for a, b in zip(moved, step[:3], strict=True)), loop.y)
+        moved = _where(moving, times_of(run, jnp.stack(head)), step[:3])
+        step = Step(*moved, loop.y)
     there = stages(method.tableau, method.field, constants, step, dense)
     y = method.project(there.end)
     # Which steps are taken is no thing to differentiate.

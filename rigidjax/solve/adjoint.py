@@ -44,6 +44,11 @@ class Smooth(NamedTuple):
     y0: Array
 
 
+def smooth_numbers(run: Run) -> Smooth:
+    """Return the numbers of a run that have derivatives."""
+    return Smooth(run.t0, run.stops, run.between, run.y0)
+
+
 def passed(run: Run, part: Segment) -> Array:
     """Return the number of saved times passed at the start of each row, and at the end."""
     ends = jnp.concatenate([jnp.minimum(part.times, part.end[None]), part.end[None]])
@@ -159,7 +164,7 @@ def cotangents(
 
         return lax.fori_loop(0, part.number, step, sums)
 
-    none = Smooth(*(jnp.zeros_like(a) for a in run[: len(Smooth._fields)]))._replace(y0=bars[1])
+    none = jax.tree.map(jnp.zeros_like, smooth_numbers(run))._replace(y0=bars[1])
     return lax.fori_loop(0, number, one, ([jnp.zeros_like(c) for c in constants], none))
 
 

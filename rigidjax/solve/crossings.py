@@ -245,7 +245,8 @@ def solve_until(
     """As `solve`, up to the event; and the event's time and state, NaN if there is none."""
     state0 = on_the_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
-    steps = setup.max_steps if isinstance(setup, DiffraxRun) else 1_000_000
+    given = setup.max_steps if isinstance(setup, DiffraxRun) else None
+    steps = 1_000_000 if given is None else given
     found = located(crossed, Search(event.direction, 1, steps), numbers)
     met, last = found.number > 0, lax.stop_gradient(ts[-1])
     end = jnp.where(met, crossed.time(found.times[0]), last)

@@ -89,7 +89,9 @@ def _over_bodies(
     """
     run_tree, state_tree = trees
     run, count = run_tree.unflatten(each), len(constants) - state_tree.num_leaves
-    state = layout.broadcast_to_bodies(constants, [i >= count for i in range(len(constants))], run.t0)
+    state = layout.broadcast_to_bodies(
+        constants, [i >= count for i in range(len(constants))], run.t0
+    )
     run = run._replace(state=state_tree.unflatten(state[1][count:]))
     constants, layout = constants[:count], layout._replace(shared=layout.shared[:count])
     held, one = lax.stop_gradient(constants), method.control
@@ -109,14 +111,14 @@ def _forward(
 ) -> Arrays:
     """Return the states between and the end, with the `record` if asked for."""
     method, run, _, constants = _over_bodies(method, trees, layout, constants, each)
+    kept = None
     if record or (run.between.shape[0] and layout.bodies):
         between, end, kept = adaptive_loop.recording(method, constants, run)
     elif run.between.shape[0]:
         between, end = adaptive_loop.states_of_one(method, constants, run)
     else:
         between, end = run.y0[None][:0], adaptive_loop.value(method, constants, run)
-    states = [between, *adaptive_loop.pack(end)]
-    return [*states, *jax.tree.leaves(kept)] if record else states
+    return [between, *adaptive_loop.pack(end), *jax.tree.leaves(kept if record else None)]
 
 
 # Which of the constants and which numbers of a run have tangents.
@@ -152,7 +154,7 @@ def _pushed(
     """Return the tangents of the states; `each` ends with those of the moving numbers."""
     method, chosen, run, record, along = _again(moving, method, trees, layout, constants, each)
     rest = iter(along[len(chosen) :])
-    smooth = Smooth(*run[:SMOOTH])
+    smooth = adjoint.smooth_numbers(run)
     still = zip(smooth, moving[1], strict=False)
     of_run = Smooth(*(next(rest) if moves else jnp.zeros_like(a) for a, moves in still))
 

@@ -102,7 +102,9 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             field=lambda given, t, y: program.call(given[:count], t, y),
             project=lambda y: ravel_pytree(on_the_group(tree(y)))[0],
             halt=halt,
-            control=_Control(static, given, (lambda y: y) if rows else tree, solver.error_order(terms)),
+            control=_Control(
+                static, given, (lambda y: y) if rows else tree, solver.error_order(terms)
+            ),
             sizes=[leaf.size for leaf in jax.tree.leaves(init_state.y)],
             max_steps=max_steps,
         )
