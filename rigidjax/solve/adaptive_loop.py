@@ -304,8 +304,8 @@ def _attempt(
     step = Step(loop.t, h, end, loop.y)
     if until is not None:
         head = [a.astype(loop.y.dtype) for a in (loop.t, h, kind, loop.stop)]
-        moved = _where(moving, times_of(run, jnp.stack(head)), step[:3])
-        step = Step(*moved, loop.y)
+        begin, length, late = _where(moving, times_of(run, jnp.stack(head)), step[:3])
+        step = Step(begin, length, late, loop.y)
     there = stages(method.tableau, method.field, constants, step, dense)
     y = method.project(there.end)
     # Which steps are taken is no thing to differentiate.
