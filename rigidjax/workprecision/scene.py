@@ -32,7 +32,7 @@ class Reference(NamedTuple):
     method that made it; `gradient` of the scene's scalar, empty if there is none, and
     `gradient_error` of its largest number; `source` a sentence.
 
-    >>> top = stored("heavy top")
+    >>> top = stored_answer("heavy top")
     >>> top is None or top.error < 1e-12
     True
     """
@@ -195,7 +195,7 @@ class TimedMethod(NamedTuple):
 
     >>> import numpy as np
     >>> ready = Ready(lambda setting: (np.ones(7), 0))
-    >>> guess = Method("a guess", "peer", (1e-3,), lambda scene: ready)
+    >>> guess = TimedMethod("a guess", "peer", (1e-3,), lambda scene: ready)
     >>> guess.gradients
     {}
     """
