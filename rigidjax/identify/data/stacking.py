@@ -105,18 +105,22 @@ def on_host(records: Recording, counts: Int[ArrayLike, " records"]) -> tuple[Rec
     )
 
 
-def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
-    """Return the rows of a recording from `begin` to before `end`."""
-    if recording.t.shape[0] == end - begin:
+def cut(recording: Recording, end: int, begin: int = 0, axis: int = 0) -> Recording:
+    """Return the rows of a recording from `begin` to before `end`.
+
+    Times are along `axis`: 0 for one recording, 1 for several with a leading axis.
+    """
+    if recording.t.shape[axis] == end - begin:
         return recording
+    rows = (slice(None),) * axis + (slice(begin, end),)
 
     def long(r: Recording) -> list[Any]:
         parts = [(reading.values, reading.mask, reading.late) for reading in r.readings]
         return jax.tree.leaves((r.t, parts))
 
-    shorter = eqx.tree_at(long, recording, [leaf[begin:end] for leaf in long(recording)])
+    shorter = eqx.tree_at(long, recording, [leaf[rows] for leaf in long(recording)])
     inputs = {
-        name: source[begin:end] if eqx.is_array(source) else source
+        name: source[rows] if eqx.is_array(source) else source
         for name, source in recording.inputs.items()
     }
     return eqx.tree_at(lambda r: r.inputs, shorter, inputs) if inputs else shorter

@@ -45,6 +45,7 @@ from rigidjax.identify.model.terms import (
     over_records,
     scene_of,
     template,
+    with_jacobian,
 )
 from rigidjax.identify.model.walks import Drift, Walk, find_drifts
 from rigidjax.identify.sensors import AbstractSensor
@@ -446,6 +447,28 @@ def unpack_numbers(model: Model, x: Float[Array, " n"]) -> Unpacked:
     starts = jax.vmap(ReferenceStates.start_at)(model.reference, x[model.index.start])
     state0 = stacking.pick_records(starts, 0) if model.count == 1 else starts
     return Unpacked(x, model.bodies(x), state0, values_of(model, x))
+
+
+def unpack_with_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
+    """Return what x represents, and its derivatives by x along a new last axis of each array."""
+    slopes, point = _unpack_with_jacobian(without_samples(model), x)
+    return point, slopes
+
+
+@eqx.filter_jit
+def _unpack_with_jacobian(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
+    """Return the derivatives of `unpack_numbers` and its result, as one program."""
+    return with_jacobian(lambda x: unpack_numbers(model, x), x)
+
+
+def without_samples(model: Model) -> Model:
+    """Return a model of known numbers with the first time of each recording alone.
+
+    What x represents depends on no reading. A program that computes it from this model is compiled
+    once, and not again for recordings of another length.
+    """
+    records = jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, model.records)
+    return with_parts(model, records=stacking.cut(records, 1, axis=1))
 
 
 def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
