@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax.motion.equations import on_the_group
 from rigidjax.solve import adaptive_loop, adjoint, validation
@@ -134,7 +134,9 @@ def _solved(
     answer: Any = jax.custom_jvp(partial(mapped, partial(_forward, False), 0))
     recorded: Any = jax.custom_jvp(partial(mapped, partial(_forward, True), 0))
 
-    def tangents_of(primals: Any, tangents: Any, pull: Any = None) -> tuple[Arrays, Arrays]:
+    def tangents_of(
+        primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...], pull: Any = None
+    ) -> tuple[Arrays, Arrays]:
         """The result of `recorded`, and the tangents of its states; transposed by `pull`."""
         # A number without a tangent needs no derivative.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
@@ -148,11 +150,11 @@ def _solved(
         back = partial(mapped, partial(pull, moving), ends)
         return found, linear_map(lambda *args: push(*args)[:ends], back, given, along)
 
-    def of_answer(primals: Any, tangents: Any) -> Any:
+    def of_answer(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
         found, moved = tangents_of(primals, tangents, _pulled)
         return found[:head], [*moved, *(zero_from_primal(a) for a in found[ends:head])]
 
-    def of_record(primals: Any, tangents: Any) -> Any:
+    def of_record(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
         found, (between, end, starts, rows) = tangents_of(primals, tangents)
         rest = [zero_from_primal(a) for a in found]
         record = Record(*rest[head:])._replace(starts=starts, rows=rows)

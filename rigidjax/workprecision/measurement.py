@@ -9,6 +9,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia
@@ -132,8 +134,8 @@ def in_float32(scene: Scene, gradients: bool = True) -> Scene:
     rounded numbers.
     """
 
-    def cast(given: Scene, dtype: Any) -> Scene:
-        def one(a: Any) -> Any:
+    def cast(given: Scene, dtype: DTypeLike) -> Scene:
+        def one(a: PyTree) -> Any:
             return jnp.asarray(a, dtype) if eqx.is_inexact_array(a) else a
 
         parts = {name: jax.tree.map(one, getattr(given, name)) for name in _PARTS}
@@ -176,13 +178,13 @@ def _looked_at(
     return [_Job(record, ready, [first])]
 
 
-def _errors(scene: Scene, end: Any, right: Reference) -> dict[str, float]:
+def _errors(scene: Scene, end: np.ndarray | Array, right: Reference) -> dict[str, float]:
     error, rate = distance(scene, end, right.end)
     energy, momentum = drifts(scene, np.asarray(end))
     return {"error": error, "error_rate": rate, "energy": energy, "momentum": momentum}
 
 
-def _gradient_errors(scene: Scene, slope: Any, right: Reference) -> dict[str, float]:
+def _gradient_errors(scene: Scene, slope: np.ndarray | Array, right: Reference) -> dict[str, float]:
     found, wanted = np.asarray(slope, float), np.asarray(right.gradient)
 
     def off(part: slice) -> float:
@@ -193,7 +195,7 @@ def _gradient_errors(scene: Scene, slope: Any, right: Reference) -> dict[str, fl
     return {"error": off(slice(None)), **parts}
 
 
-def drifts(scene: Scene, end: Any) -> tuple[float, float]:
+def drifts(scene: Scene, end: np.ndarray | Array) -> tuple[float, float]:
     """Return the relative drift of energy and momentum (for a point the drift of its integral, and
     NaN).
     """

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax.body import validation
@@ -127,7 +127,7 @@ class Scene(eqx.Module):
         tensor = from_components(*(numbers[i] for i in range(6)))
         return Inertia(tensor), Attitude(quaternion.normalise(numbers[9:]), numbers[6:9])
 
-    def flat(self, state: Any) -> Float[Array, " state"]:
+    def flat(self, state: PyTree) -> Float[Array, " state"]:
         """Return a state as one vector, (7,) or (6,)."""
         return jnp.concatenate(jax.tree.leaves(state))
 
@@ -149,7 +149,9 @@ class Scene(eqx.Module):
         return jnp.sum(a * quaternion.rotate(end[:4], b)) + jnp.sum(c * end[4:]) / two
 
 
-def distance(scene: Scene, end: Any, right: Any) -> tuple[float, float]:
+def distance(
+    scene: Scene, end: ArrayLike | Sequence[float], right: ArrayLike | Sequence[float]
+) -> tuple[float, float]:
     """Return the errors of attitude (an angle, rad) and of Ω; for a point those of position and
     velocity, all relative.
     """

@@ -1,13 +1,13 @@
 """Define the standard scenes."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import orbits
 from rigidjax.body.inertia import Inertia
@@ -63,7 +63,7 @@ class Circle(eqx.Module):
     radius: Float[Array, ""]
     rate: Float[Array, ""]
 
-    def __call__(self, t: Any) -> Float[Array, "3"]:
+    def __call__(self, t: Array) -> Float[Array, "3"]:
         angle = self.rate * t
         zero = jnp.zeros_like(angle)
         return self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), zero])
@@ -73,7 +73,7 @@ def _identity(x: Any) -> Any:
     return x
 
 
-def _torque(kind: Any, constants: Any) -> Any:
+def _torque(kind: Callable[..., Any] | None, constants: Sequence[float]) -> Any:
     """Return the library's torque for an equation of `workprecision.equations`."""
     if kind is equations.heavy:
         return HeavyTop(1.0, constants[:3], constants[3:])
@@ -87,10 +87,21 @@ def _torque(kind: Any, constants: Any) -> Any:
 
 
 def _body(
-    name: str, title: str, moments: Any, omega: Any, end: float, kind: Any, constants: Any
+    name: str,
+    title: str,
+    moments: Sequence[float],
+    omega: Sequence[float],
+    end: float,
+    kind: Callable[..., Any] | None,
+    constants: Sequence[float],
 ) -> Scene:
     def plain(
-        numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = _identity, number: Any = _identity
+        numbers: Sequence[Any],
+        sin: Callable[..., Any],
+        cos: Callable[..., Any],
+        sqrt: Callable[..., Any],
+        wrap: Callable[..., Any] = _identity,
+        number: Callable[..., Any] = _identity,
     ) -> Any:
         exact = tuple(number(c) for c in constants)
         torque = None
@@ -109,10 +120,21 @@ def _body(
 
 
 def _point(
-    name: str, title: str, start: Point, end: float, law: Any, kind: Any, constants: Any
+    name: str,
+    title: str,
+    start: Point,
+    end: float,
+    law: PyTree,
+    kind: Callable[..., Any],
+    constants: Sequence[float],
 ) -> Scene:
     def plain(
-        numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = _identity, number: Any = _identity
+        numbers: Sequence[Any],
+        sin: Callable[..., Any],
+        cos: Callable[..., Any],
+        sqrt: Callable[..., Any],
+        wrap: Callable[..., Any] = _identity,
+        number: Callable[..., Any] = _identity,
     ) -> Any:
         return wrap(kind(tuple(number(c) for c in constants), sqrt))
 

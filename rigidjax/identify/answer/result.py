@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax.identify.answer import answers, undetermined as identifiability
@@ -306,7 +306,7 @@ class Fit(eqx.Module):
         return identifiability.identifiability(self)
 
 
-def require_one_fit(fit: Any, name: str = "fit") -> Fit:
+def require_one_fit(fit: PyTree, name: str = "fit") -> Fit:
     """Return the `fit`; raise `TypeError` or `ValueError` unless it is one `Fit`, not a batch."""
     _checks.instance(fit, Fit, name)
     if np.shape(fit.chi2) != ():
