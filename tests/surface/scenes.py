@@ -166,9 +166,10 @@ def scene() -> Any:
 
 @functools.cache
 def records() -> tuple:
+    from rigidjax.workprecision.record import Measurement
 
     return tuple(
-        Record("s", name, "ours", "value", "", 10.0**-k, error=10.0**-k, time=float(k))
+        Measurement("s", name, "ours", "value", "", 10.0**-k, error=10.0**-k, time=float(k))
         for name in ("a", "b")
         for k in (3, 6, 9)
     )
