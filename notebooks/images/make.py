@@ -128,6 +128,27 @@ def predict():
     save(figure, "predict.png")
 
 
+def simulators():
+    """Draw the table of the guide's page on simulators, as it stands there."""
+    page = (HERE.parent / "guide" / "check_simulator.md").read_text(encoding="utf-8")
+    rows = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| ")]
+    figure, ax = plt.subplots(figsize=(8.4, 4.0), layout="constrained")
+    steps = 1e3 * jnp.array([1.0 / 120.0, 2e-3, 1e-3])
+    colours = dict(zip(("mujoco", "mujoco-mjx", "brax", "jsbsim"), rj.plot.COLOURS, strict=False))
+    for (package, name, *numbers), marker in zip(rows[2:], "os^os^sDosD^", strict=True):
+        angles = [float(number) for number in numbers[:3]]
+        kind = package.split()[0]
+        ax.loglog(
+            steps, angles, color=colours[kind], marker=marker, ms=5, lw=1.2, label=f"{kind}, {name}"
+        )
+    ax.set(xlabel="step, ms", ylabel="angle to the exact attitude at 5 s, rad")
+    ax.set_xticks([1, 2, 8.33], ["1", "2", "1000/120"])
+    ax.minorticks_off()
+    ax.grid(alpha=0.3)
+    figure.legend(loc="outside right center", fontsize=8, frameon=False)
+    save(figure, "simulators.png")
+
+
 if __name__ == "__main__":
-    for draw in (frames, flip, start, fit, predict):
+    for draw in (frames, flip, start, fit, predict, simulators):
         draw()
