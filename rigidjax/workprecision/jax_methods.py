@@ -216,7 +216,11 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Ti
 
 
 def _own_method(
-    name: str, settings: Sequence[float], make: Make, modes: Iterable[str] = (), equal: bool = False
+    name: str,
+    settings: Sequence[float | int],
+    make: Make,
+    modes: Iterable[str] = (),
+    equal: bool = False,
 ) -> TimedMethod:
     slopes = {mode: partial(_prepare, make, MODES[mode]) for mode in modes}
     return TimedMethod(name, "ours", settings, partial(_prepare, make, None), slopes, equal)

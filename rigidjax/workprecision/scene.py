@@ -204,7 +204,7 @@ class TimedMethod(NamedTuple):
 
     name: str
     group: str
-    settings: Sequence[float]
+    settings: Sequence[float | int]
     value: Callable[[Scene], Ready | None]
     gradients: dict[str, Callable[[Scene], Ready | None]] = {}  # noqa: RUF012
     equal: bool = False

@@ -5,9 +5,9 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from rigidjax.body.inertia import Body, Inertia, MassProperties
+from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import swap_trace
 from rigidjax.identify.model.charts import AbstractBodyChart, as_list, charts_of, numbers_of
 from rigidjax.identify.model.model import Model, without_samples
@@ -171,7 +171,7 @@ def limits(
     )
 
 
-def why_unreal(body: Body) -> str | None:
+def why_unreal(body: PyTree) -> str | None:
     """Say why no real body has the numbers of `body`; return `None` for a real body."""
     try:
         if isinstance(body, MassProperties):

@@ -1,6 +1,6 @@
 """Name inputs of a torque, set in a loop or as functions of time; delay and lag them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -122,9 +122,7 @@ class Lagged(eqx.Module):
     time: Float[Array, "*k"]
     start: Array | None
 
-    def __init__(
-        self, source: Callable[..., Any], time: NumbersLike, start: NumbersLike | None = None
-    ):
+    def __init__(self, source: object, time: NumbersLike, start: NumbersLike | None = None):
         self.source = _checks.function(source, "source", "of time")
         kind = jnp.result_type(float)
         time = _checks.if_known(_checks.sign, _channels(time, "time"), "time", "a positive time, s")
