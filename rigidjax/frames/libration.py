@@ -15,7 +15,7 @@ from rigidjax.frames.rotation_models import Uniform
 from rigidjax.rotation import linalg3, quaternion
 
 
-class Tide(eqx.Module):
+class OrbitalGravityGradient(eqx.Module):
     """Compute the gravity-gradient torque 3n² u × I u, with u away from the planet (Hughes 1986,
     sec. 8.1).
     """
@@ -47,7 +47,9 @@ def libration(rate: ScalarLike) -> BodyInFrame:
     [0.0, 0.0, 0.0]
     """
     n = _checks.finite(_checks.floating(rate, (), "rate"), "rate")
-    return BodyInFrame(MovingFrame(Uniform(n * jnp.eye(3, dtype=n.dtype)[2])), Tide(n))
+    return BodyInFrame(
+        MovingFrame(Uniform(n * jnp.eye(3, dtype=n.dtype)[2])), OrbitalGravityGradient(n)
+    )
 
 
 def libration_integral(state: PyTree, body: _inertia.Inertia, rate: ScalarLike) -> Scalar:

@@ -16,7 +16,7 @@ from rigidjax.exact import FreeBody
 from rigidjax.solve import adaptive, equations_of_motion, fixed, simulate, solvers
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.splitting import AbstractSplitting
-from rigidjax.workprecision.scene import Ready, Scene, TimedMethod
+from rigidjax.workprecision.scene import BenchmarkScene, Ready, TimedMethod
 
 TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 EIGHT = (40, 60, 80, 120, 170, 240, 340, 480, 680, 1000)
@@ -26,10 +26,10 @@ MODES = {"forward": jax.jacfwd, "reverse": jax.grad}
 
 # numbers, setting → the last state as a vector, steps
 Flow = Callable[[Any, Any], tuple[Any, Any]]
-Make = Callable[[Scene], Flow | None]
+Make = Callable[[BenchmarkScene], Flow | None]
 
 
-def compiled(scene: Scene, flow: Flow) -> Ready:
+def compiled(scene: BenchmarkScene, flow: Flow) -> Ready:
     """Return one compiled call for all settings.
 
     It is timed as a user would call it: only numbers go in.
@@ -52,7 +52,7 @@ def compiled(scene: Scene, flow: Flow) -> Ready:
     return Ready(run, spent, held)
 
 
-def flow_of(scene: Scene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]) -> Flow:
+def flow_of(scene: BenchmarkScene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]) -> Flow:
     """Return the flow of `run`, which takes a body, an initial state, both times and a setting to
     states over time and a number of steps.
     """
@@ -65,7 +65,7 @@ def flow_of(scene: Scene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]) 
     return flow
 
 
-def _closed(scene: Scene) -> Flow | None:
+def _closed(scene: BenchmarkScene) -> Flow | None:
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         end: Any = FreeBody(body, start)(ts[1])
         return jax.tree.map(lambda leaf: leaf[None], end), jnp.zeros(())
@@ -73,7 +73,7 @@ def _closed(scene: Scene) -> Flow | None:
     return flow_of(scene, run) if scene.torque is None and scene.body is not None else None
 
 
-def _simulate(scene: Scene, accuracy: bool = False) -> Flow | None:
+def _simulate(scene: BenchmarkScene, accuracy: bool = False) -> Flow | None:
     """Return the flow of `simulate` with its defaults, except for the tolerance, which is traced so
     that one program does.
     """
@@ -87,7 +87,7 @@ def _simulate(scene: Scene, accuracy: bool = False) -> Flow | None:
     return None if scene.torque is None else flow_of(scene, run)
 
 
-def _adaptive(scene: Scene, solver: AbstractExplicit) -> Flow:
+def _adaptive(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
     """Return the flow of the loop in which `simulate` runs under a torque, in both modes."""
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -98,7 +98,7 @@ def _adaptive(scene: Scene, solver: AbstractExplicit) -> Flow:
     return flow_of(scene, run)
 
 
-def equal_steps(scene: Scene, solver: AbstractExplicit | AbstractSplitting) -> Flow:
+def equal_steps(scene: BenchmarkScene, solver: AbstractExplicit | AbstractSplitting) -> Flow:
     """Return the flow of `solver` with a number of equal steps, which is the setting."""
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -109,7 +109,7 @@ def equal_steps(scene: Scene, solver: AbstractExplicit | AbstractSplitting) -> F
 
 
 def _in_diffrax(
-    scene: Scene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
+    scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
     """Return the flow of our field and state in diffrax's loop."""
 
@@ -121,7 +121,7 @@ def _in_diffrax(
 
 
 def _diffrax(
-    scene: Scene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
+    scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
     """Return the flow of a user's own code: equations written by hand, one array, constants
     computed once.
@@ -163,7 +163,7 @@ def _solve_field(
     return out.ys, out.stats["num_steps"]
 
 
-def _prepare(make: Make, take: Callable[..., Any] | None, scene: Scene) -> Ready | None:
+def _prepare(make: Make, take: Callable[..., Any] | None, scene: BenchmarkScene) -> Ready | None:
     """Return the flow prepared for a scene, or with `take` its gradient of the scene's scalar;
     `None` if it cannot run.
     """

@@ -59,7 +59,7 @@ def stored_answer(name: str) -> Reference | None:
     return Reference(end, float(row["error"]), slope, float(row["gradient_error"]), row["source"])
 
 
-class Scene(eqx.Module):
+class BenchmarkScene(eqx.Module):
     """Define one motion for the comparison of methods.
 
     **Fields:** `name`, `title` words; `body` an `Inertia`, `None` for a `Point`; `state0` an
@@ -70,7 +70,7 @@ class Scene(eqx.Module):
     `notes` data for a peer beyond the equations.
 
     >>> from rigidjax import Attitude, Inertia, torques
-    >>> scene = Scene("mine", "my body", Inertia(jnp.eye(3)),
+    >>> scene = BenchmarkScene("mine", "my body", Inertia(jnp.eye(3)),
     ...     Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), torques.Damping([0.1, 0.1, 0.1]), 5.0)
     >>> scene.numbers.shape
     (13,)
@@ -90,7 +90,7 @@ class Scene(eqx.Module):
     def __check_init__(self) -> None:
         if isinstance(self.state0, Point) == (self.body is not None):
             raise TypeError(
-                "Scene: wanted an Inertia with an Attitude, or None with a Point, got "
+                "BenchmarkScene: wanted an Inertia with an Attitude, or None with a Point, got "
                 f"{type(self.body).__name__} with {type(self.state0).__name__}"
             )
         hint = "errors are angles between attitudes, or distances"
@@ -150,7 +150,7 @@ class Scene(eqx.Module):
 
 
 def distance(
-    scene: Scene, end: ArrayLike | Sequence[float], right: ArrayLike | Sequence[float]
+    scene: BenchmarkScene, end: ArrayLike | Sequence[float], right: ArrayLike | Sequence[float]
 ) -> tuple[float, float]:
     """Return the errors of attitude (an angle, rad) and of Ω; for a point those of position and
     velocity, all relative.
@@ -205,6 +205,6 @@ class TimedMethod(NamedTuple):
     name: str
     group: str
     settings: Sequence[float | int]
-    value: Callable[[Scene], Ready | None]
-    gradients: dict[str, Callable[[Scene], Ready | None]] = {}  # noqa: RUF012
+    value: Callable[[BenchmarkScene], Ready | None]
+    gradients: dict[str, Callable[[BenchmarkScene], Ready | None]] = {}  # noqa: RUF012
     equal: bool = False

@@ -15,7 +15,7 @@ from rigidjax.frames import Point, scenes as places
 from rigidjax.motion import Attitude
 from rigidjax.motion.torques import Damping, Flywheel, GravityGradient, HeavyTop, Sum
 from rigidjax.workprecision import equations
-from rigidjax.workprecision.scene import Scene, stored_answer
+from rigidjax.workprecision.scene import BenchmarkScene, stored_answer
 
 # Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I, II.0.
 ARENSTORF = (0.012277471, 0.994, -2.00158510637908252240, 17.0652165601579625588917)
@@ -94,7 +94,7 @@ def _body(
     end: float,
     kind: Callable[..., Any] | None,
     constants: Sequence[float],
-) -> Scene:
+) -> BenchmarkScene:
     def plain(
         numbers: Sequence[Any],
         sin: Callable[..., Any],
@@ -112,7 +112,7 @@ def _body(
     # MuJoCo can do scenes with weight alone, or without torque.
     com, gravity = (constants[:3], constants[3:]) if kind is equations.heavy else ((0.0,) * 3,) * 2
     weighs = kind in (None, equations.heavy)
-    return Scene(
+    return BenchmarkScene(
         name, title, Inertia.from_principal(*moments), Attitude(TILTED, omega),
         _torque(kind, constants), end, plain, stored_answer(name), slow=omega[2] > 1e3,
         notes={"mass": 1.0, "com": com, "gravity": gravity} if weighs else None,
@@ -127,7 +127,7 @@ def _point(
     law: PyTree,
     kind: Callable[..., Any],
     constants: Sequence[float],
-) -> Scene:
+) -> BenchmarkScene:
     def plain(
         numbers: Sequence[Any],
         sin: Callable[..., Any],
@@ -138,10 +138,10 @@ def _point(
     ) -> Any:
         return wrap(kind(tuple(number(c) for c in constants), sqrt))
 
-    return Scene(name, title, None, start, law, end, plain, stored_answer(name))
+    return BenchmarkScene(name, title, None, start, law, end, plain, stored_answer(name))
 
 
-def _foucault() -> Scene:
+def _foucault() -> BenchmarkScene:
     """Return Foucault's pendulum, released at rest, for ten minutes."""
     law = places.foucault(0.85, 67.0)
     _, north, up = (float(w) for w in law.place.angular_velocity())
@@ -151,7 +151,7 @@ def _foucault() -> Scene:
     )  # fmt: skip
 
 
-def _arenstorf() -> Scene:
+def _arenstorf() -> BenchmarkScene:
     """Return Arenstorf's orbit about Earth and Moon, for one period."""
     mu, x, v, period = ARENSTORF
     return _point(
@@ -160,7 +160,7 @@ def _arenstorf() -> Scene:
     )  # fmt: skip
 
 
-def scenes() -> dict[str, Callable[[], Scene]]:
+def scenes() -> dict[str, Callable[[], BenchmarkScene]]:
     """Return the standard scenes: name → a function that makes the scene (in the default precision
     of JAX).
 

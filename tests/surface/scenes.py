@@ -154,11 +154,11 @@ def found() -> rj.identify.Fit:
 @functools.cache
 def scene() -> Any:
     """A scene of work and precision, with a reference of its own."""
-    from rigidjax.workprecision import Scene
+    from rigidjax.workprecision import BenchmarkScene
     from rigidjax.workprecision.scene import Reference
 
     end = tuple(float(x) for x in [*Q, *W])
-    return Scene(
+    return BenchmarkScene(
         "mine", "a body slowed down", inertia(), attitude(), damping(), 1.0,
         reference=Reference(end, 1e-15, (), 0.0, "typed in"),
     )  # fmt: skip
