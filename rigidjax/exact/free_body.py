@@ -45,7 +45,7 @@ class FreeBody(eqx.Module):
         self.exponent = exponent_of(state0.omega)
         self.tensor = times_power_of_two(inertia.tensor, -exponent_of(inertia.tensor))
         self.omega = times_power_of_two(state0.omega, -self.exponent)
-        self.setting = jax.lax.stop_gradient(set_up(self.tensor, self.omega))
+        self.setting = set_up(*jax.lax.stop_gradient((self.tensor, self.omega)))
         self.state0 = state0
 
     def __call__(self, t: ScalarLike) -> HasSpin:
