@@ -22,13 +22,7 @@ from jaxtyping import Array, Float
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
 from rigidjax.exact import sigma_form
-from rigidjax.exact.closed_form import (
-    Orbit,
-    from_functions,
-    momentum_and_turn,
-    orbit,
-    reduce_time,
-)
+from rigidjax.exact.closed_form import Orbit, from_functions, momentum_and_turn, orbit, reduce_time
 from rigidjax.exact.components3 import (
     HALF,
     Four,
@@ -71,7 +65,7 @@ def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
 @flow.defjvp
 def _flow_jvp(primals, tangents):
     motion, rows, _ = slopes(*primals)
-    d_out, d_turn, _ = _along(motion, rows, _variables(primals, tangents)[3])
+    d_out, d_turn, _ = _change_along(motion, rows, _variables(primals, tangents)[3])
     return motion[:2], (d_out, d_turn)
 
 
@@ -81,7 +75,7 @@ def _variables(primals, tangents):
     return parts, changes, inputs_of(parts, *primals[1:]), inputs_of(changes, *tangents[1:])
 
 
-def _along(motion, rows, change):
+def _change_along(motion, rows, change):
     """Return the change of the result `motion` of `slopes` as `inputs_of` move by `change`."""
     out, theta, rate = (tuple(jnp.sum(row * change) for row in three) for three in rows)
     return out, half_product(motion[1], theta), rate
@@ -215,7 +209,7 @@ def slopes(moments: Six, momentum: Triple, t: Scalar):
 def _slopes_jvp(primals, tangents):
     motion, rows, parts = slopes(*primals)
     (body, *k), (_, *d_k), inputs, change = _variables(primals, tangents)
-    d_motion = _along(motion, rows, change)
+    d_motion = _change_along(motion, rows, change)
     d_parts = _second_order(body, inputs, change)
     at, changes = (*k, *primals[1:], motion, *parts), (*d_k, *tangents[1:], d_motion, *d_parts)
     return (motion, rows, parts), (d_motion, jax.jvp(_columns, at, changes)[1], d_parts)

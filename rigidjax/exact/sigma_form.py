@@ -158,13 +158,15 @@ def double(f: Sigma, v: Invariants) -> Sigma:
 
 
 class Divisor(NamedTuple):
-    """Hold the parts of W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²), i = 1 or 3, for any Π.
+    """Hold the parts of W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²) that do not depend on Π.
 
-    For these two i it is a sum of positive terms.
+    `first` says whether i is 1; else it is 3. For these two i, W is a sum of positive terms. The
+    second factor is, with K without its diagonal in KΠ,
+    `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13 Π₁ Π₃ + |KΠ|² − less`, and `square` is (T²)ᵢᵢ.
     """
 
-    first: Array  # whether i = 1
-    square: Scalar  # (T²)ᵢᵢ
+    first: Array
+    square: Scalar
     d: Scalar
     slant: Scalar
     k: Scalar
@@ -183,7 +185,7 @@ def divisor(body: Differences, v: Invariants, f: Sigma) -> Divisor:
 
 
 def move(body: Differences, w: Divisor, f: Sigma, momentum: Triple) -> tuple[Triple, Six]:
-    """Return Π after the time of `f`, and 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ, W as in the head."""
+    """Return Π after the time of `f`, and 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ, W that of `w`."""
     p1, p2, p3 = momentum
     d12, d13, d23, k12, k13, k23 = body
     # K without its diagonal, times Π.

@@ -161,7 +161,7 @@ def tried(method: Method, constants: Arrays, run: Run, step: Step) -> tuple[Arra
     """The state a step later, and the root mean square of its error over the tolerance."""
     there = stages(method.tableau, method.field, constants, step)
     right = method.project(there.end)
-    # Which steps are taken is no thing to differentiate.
+    # Derivatives hold the chosen steps constant.
     left, after, h, slopes = lax.stop_gradient((step.y, right, step.h, there.slopes))
     error = error_estimate(method.tableau, method.sizes, h, slopes)
     largest = jnp.maximum(jnp.abs(left), jnp.abs(after))

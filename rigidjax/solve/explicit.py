@@ -94,7 +94,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
         there = stages(self.tableau, field, [], step)
         # Once, after the stages: inside them it changes the order (jaxsim#192).
         y1 = on_the_group(tree(there.end))
-        # Which steps are taken is no thing to differentiate: their error is below the tolerance.
+        # Derivatives hold the chosen steps constant: the error of a step is below the tolerance.
         sizes = [leaf.size for leaf in jax.tree.leaves(y0)]
         error = lax.stop_gradient(error_estimate(self.tableau, sizes, h, there.slopes))
         rows = dense_rows(self.tableau, field, step, there.slopes)

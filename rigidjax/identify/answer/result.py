@@ -271,12 +271,12 @@ class Fit(eqx.Module):
         # Compile one program for what x represents: outside of a trace each operation of JAX is a
         # program of its own, and some ninety of them took seconds to compile.
         point, slopes = unpack_with_slopes(self.model, self.derivative_point)
-        middle = point if self.near is None else unpack_with_slopes(self.model, self.x)[0]
+        best = point if self.near is None else unpack_with_slopes(self.model, self.x)[0]
 
         def change(step: Unpacked) -> Array:
             return jax.jvp(value, (point,), (step,))[1]
 
-        middle = np.asarray(_checks.finite(value(middle), "of(point)"))
+        middle = np.asarray(_checks.finite(value(best), "of(point)"))
         slope = np.asarray(jax.vmap(change, in_axes=-1, out_axes=-1)(slopes))
         seen, null = np.asarray(self.seen), np.asarray(self.null_directions)
         if self.hidden is not None:
