@@ -8,6 +8,7 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -15,7 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool
+from jax.typing import DTypeLike
+from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 Numbers = TypeVar("Numbers", bound=Any)
 
@@ -34,7 +36,7 @@ _PINT = {"[length]": "m", "[mass]": "kg", "[time]": "s"}
 
 
 def floating(
-    value: Any,
+    value: object,
     shape: tuple[int, ...],
     name: str,
     *,
@@ -61,7 +63,7 @@ def floating(
     return array
 
 
-def rows(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
+def rows(value: object, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
     """Return `value` as an array (n, *shape) with n rows, converted as by `floating`."""
     array = numbers(value, name)
     if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
@@ -74,14 +76,14 @@ def _with_hint(hint: str) -> str:
     return f"; {hint}" if hint else ""
 
 
-def kind(value: Any) -> str:
+def kind(value: object) -> str:
     """Return the name of a value's type for a message, or of the value if it is a class."""
     if isinstance(value, jax.Array):
         return f"an array of shape {value.shape}"
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
 
-def numbers(value: Any, name: str, unit: str = "") -> Array:
+def numbers(value: object, name: str, unit: str = "") -> Array:
     """Return `value` as a float32 or float64 array of any shape, converted as by `floating`."""
     value = _in_si(value, name, unit)
     try:
@@ -101,7 +103,7 @@ def numbers(value: Any, name: str, unit: str = "") -> Array:
     return array
 
 
-def data_and_mask(value: Any) -> tuple[Any, np.ndarray | None]:
+def data_and_mask(value: object) -> tuple[Any, np.ndarray | None]:
     """Return the data of a masked array and its mask, true where an entry has no value.
 
     The mask is `None` if no entry is masked, and for a value that is no masked array, which is
@@ -115,7 +117,7 @@ def data_and_mask(value: Any) -> tuple[Any, np.ndarray | None]:
     return data, np.broadcast_to(mask, data.shape) if np.any(mask) else None
 
 
-def without_mask(value: Any, name: str) -> Any:
+def without_mask(value: object, name: str) -> Any:
     """Return `value`, or the data of a masked array; refuse masked entries.
 
     The number under a mask is often a wild reading.
@@ -160,7 +162,7 @@ def _in_si(value: Any, name: str, wanted: str = "") -> Any:
     )
 
 
-def is_rotation(value: Any) -> bool:
+def is_rotation(value: object) -> bool:
     """Return whether `value` is a `Rotation` of `scipy.spatial.transform`, one or many."""
     return hasattr(value, "as_quat")
 
@@ -206,12 +208,12 @@ def _warn_of_lost_digits() -> None:
     )
 
 
-def known(value: Any) -> bool:
+def known(value: object) -> bool:
     """Return whether `value` is an array of known numbers, and not traced."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
 
 
-def namespace(value: Any) -> Any:
+def namespace(value: object) -> Any:
     """Return NumPy for a known `value`, else `jax.numpy`.
 
     A check of known numbers is done by NumPy on the host: a JAX operation outside `jit` costs some
@@ -220,7 +222,7 @@ def namespace(value: Any) -> Any:
     return np if known(value) else jnp
 
 
-def refuse(value: Any, bad: Bool[ArrayLike, "..."], message: str) -> Any:
+def refuse(value: PyTree, bad: Bool[ArrayLike, "..."], message: str) -> Any:
     """Return `value` unless `bad`; then raise an error with `message`, also under `jit`.
 
     Outside a trace this is a `ValueError` with the text alone. Inside a trace it is
@@ -245,7 +247,7 @@ def own_sentence(error: RuntimeError) -> RuntimeError:
 _MANY = 4096
 
 
-def first_bad(faults: Callable[[Any, Any], Any], rows: Any) -> Any:
+def first_bad(faults: Callable[[Any, Any], Any], rows: Array | np.ndarray) -> Any:
     """Return the index of the first of these known rows (n, …) that has a fault, −1 if none has.
 
     `faults(xp, rows)` is (n,), true where there is one, by the functions of `xp`, which is NumPy or
@@ -259,7 +261,7 @@ def first_bad(faults: Callable[[Any, Any], Any], rows: Any) -> Any:
         return _first_true(np, faults(np, np.asarray(rows)))
 
 
-def _first_true(xp: Any, bad: Any) -> Any:
+def _first_true(xp: ModuleType, bad: Array | np.ndarray) -> Any:
     return xp.where(bad.any(), xp.argmax(bad), -1)
 
 
@@ -268,7 +270,7 @@ def _compiled_first(faults: Callable[[Any, Any], Any], rows: Array) -> Array:
     return _first_true(jnp, faults(jnp, rows))
 
 
-def _not_finite(xp: Any, rows: Any) -> Any:
+def _not_finite(xp: ModuleType, rows: Array | np.ndarray) -> Any:
     return ~xp.isfinite(rows).reshape(rows.shape[0], -1).all(axis=1)
 
 
@@ -289,19 +291,19 @@ def finite(value: Numbers, name: str) -> Numbers:
     return refuse(value, bad.any(), f"{name}: contains NaN or infinity{where}")
 
 
-def finite_floating(value: Any, shape: tuple[int, ...], name: str, **how: Any) -> Array:
+def finite_floating(value: object, shape: tuple[int, ...], name: str, **how: Any) -> Array:
     """Return `value` as `floating` does; its numbers must be finite if they are known."""
     array = floating(value, shape, name, **how)
     return finite(array, name) if known(array) else array
 
 
-def scalars(**named: Any) -> list[Array]:
+def scalars(**named: object) -> list[Array]:
     """Return named numbers, each converted as by `floating`, in one common precision."""
     found = [floating(value, (), name) for name, value in named.items()]
     return [value.astype(jnp.result_type(*found)) for value in found]
 
 
-def time(value: Any, name: str = "t") -> Array:
+def time(value: object, name: str = "t") -> Array:
     """Return a time, which is one number; it must be finite if it is known."""
     return finite_floating(value, (), name)
 
@@ -321,7 +323,7 @@ def if_known(check: Callable[..., Array], value: Array, *args: Any, **options: A
 
 
 def instance(
-    value: Any, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
+    value: object, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
 ) -> Any:
     """Return `value` if it is an instance of `kinds`, or raise `TypeError` with what was wanted."""
     if isinstance(value, kinds):
@@ -344,7 +346,7 @@ _ONE = {
 
 
 def single(
-    value: Any, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
+    value: object, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
 ) -> Any:
     """Return `value` if it is an instance of `kinds`, and one body or state, without leading axes.
 
@@ -359,7 +361,7 @@ def single(
     return value
 
 
-def function(value: Any, name: str, of: str, *, hint: str = "") -> Any:
+def function(value: object, name: str, of: str, *, hint: str = "") -> Any:
     """Return `value` if it is a function and no class; `of` describes arguments and result, as in
     "t → (3,)".
 
@@ -374,7 +376,7 @@ def function(value: Any, name: str, of: str, *, hint: str = "") -> Any:
     raise TypeError(f"{name}: wanted a function {of}, got {found}{_with_hint(hint)}")
 
 
-def _accepts(value: Any, count: int) -> bool:
+def _accepts(value: Callable[..., Any], count: int) -> bool:
     """Return whether the function `value` can be called with `count` arguments."""
     try:
         inspect.signature(value).bind(*[None] * count)
@@ -384,7 +386,7 @@ def _accepts(value: Any, count: int) -> bool:
     return True
 
 
-def whole(value: Any, name: str, least: int) -> int:
+def whole(value: object, name: str, least: int) -> int:
     """Return `value` as a Python integer of at least `least`, known before anything is compiled."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name}: wanted a whole number of Python, got {_describe(value)}")
@@ -393,7 +395,7 @@ def whole(value: Any, name: str, least: int) -> int:
     return int(value)
 
 
-def number(value: Any, name: str) -> float:
+def number(value: object, name: str) -> float:
     """Return `value` as one Python float, known before anything is compiled."""
     array = on_host(value, name)
     if array.shape != ():
@@ -401,7 +403,7 @@ def number(value: Any, name: str) -> float:
     return float(array)
 
 
-def positive(value: Any, name: str, what: str = "a positive number") -> float:
+def positive(value: object, name: str, what: str = "a positive number") -> float:
     """Return `value` as a positive, finite Python float, known before anything is compiled."""
     found = number(value, name)
     if not 0 < found < np.inf:
@@ -409,7 +411,7 @@ def positive(value: Any, name: str, what: str = "a positive number") -> float:
     return found
 
 
-def fraction(value: Any, name: str, what: str = "a number between 0 and 1") -> float:
+def fraction(value: object, name: str, what: str = "a number between 0 and 1") -> float:
     """Return `value` as a Python float above 0 and below 1."""
     found = positive(value, name, what)
     if not found < 1:
@@ -417,13 +419,13 @@ def fraction(value: Any, name: str, what: str = "a number between 0 and 1") -> f
     return found
 
 
-def not_negative(value: Any, name: str) -> float:
+def not_negative(value: object, name: str) -> float:
     """Return `value` as a finite Python float ≥ 0, known before anything is compiled."""
     found = number(value, name)
     return 0.0 if found == 0 else positive(found, name, "a number ≥ 0")
 
 
-def on_host(value: Any, name: str) -> np.ndarray:
+def on_host(value: object, name: str) -> np.ndarray:
     """Return known numbers as a NumPy array of floats; refuse traced arrays and other values."""
     if isinstance(value, Tracer):
         raise TypeError(
@@ -449,29 +451,29 @@ def path(value: Any, name: str = "path") -> Path:
     return Path(value)
 
 
-def printable(text: Any) -> str:
+def printable(text: object) -> str:
     """Return the text with control characters (escapes, ends of line) as Python writes them."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
 
 
-def plain(text: Any) -> str:
+def plain(text: object) -> str:
     """Return the text as matplotlib shows it unchanged: no formula between `$`, no hidden label."""
     text = str(text).replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
 
-def word(value: Any, options: Sequence[str], name: str) -> str:
+def word(value: object, options: Sequence[str], name: str) -> str:
     """Return `value` if it is one of `options`."""
     if isinstance(value, str) and value in options:
         return value
     raise ValueError(f"{name}: wanted one of {', '.join(options)}, got {_describe(value)}")
 
 
-def _describe(value: Any) -> str:
+def _describe(value: object) -> str:
     return repr(value) if isinstance(value, int | float | str) else type(value).__name__
 
 
-def key(value: Any, name: str = "key") -> Any:
+def key(value: object, name: str = "key") -> Any:
     """Return `value` if it is one random key of JAX, new or old."""
     array = isinstance(value, jax.Array)
     if array and jnp.issubdtype(value.dtype, jax.dtypes.prng_key) and value.shape == ():
@@ -507,7 +509,7 @@ def float_type(value: Any, name: str = "dtype") -> Any:
     return kind
 
 
-def later_origin(dtype: Any) -> str:
+def later_origin(dtype: DTypeLike) -> str:
     """Return the advice for times that are so large that `dtype` cannot resolve their steps."""
     if np.dtype(dtype) == np.float64:
         return "count time from a later origin, such as the first time of the run"

@@ -20,10 +20,10 @@ def numbers(self: Any) -> str:
     return f"{type(self).__name__}({parts})"
 
 
-def as_text(value: Any) -> str:
+def as_text(value: object) -> str:
     """Return the numbers of an array, or its shape if it is traced or has many."""
-    known = isinstance(value, (jax.Array, np.ndarray)) and not isinstance(value, Tracer)
-    if not known or value.size > MOST:
+    is_array = isinstance(value, (jax.Array, np.ndarray))
+    if not is_array or isinstance(value, Tracer) or value.size > MOST:
         return eqx.tree_pformat(value)
     return _nested_as_text(np.asarray(value).tolist())
 
@@ -37,7 +37,7 @@ def time(t: Any, span: Any, digits: int = 6) -> str:
     return f"{t:.{digits + max(0, int(np.ceil(more)))}g}"
 
 
-def _nested_as_text(value: Any) -> str:
+def _nested_as_text(value: object) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_nested_as_text, value))}]"
     return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -7,6 +7,7 @@ NumPy-like of the same shape. A function takes one body at a time; batch with `j
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 Scalar = Float[Array, ""]
@@ -23,12 +24,15 @@ class Rotation(Protocol):
 
 
 ScalarLike = Float[ArrayLike, ""]
+# A real number as diffrax hands it to a solver.
+RealLike = Scalar | np.ndarray | float | int
 Vec3Like = Float[ArrayLike, "3"]
 Mat3Like = Float[ArrayLike, "3 3"]
 QuatLike = Float[ArrayLike, "4"] | Rotation
 
 # Constructors take an array, or nested lists of numbers.
 Numbers = Sequence[Any]
+NumbersLike = ArrayLike | Numbers
 Vector = Vec3Like | Numbers
 Matrix = Mat3Like | Numbers
 Quaternion = QuatLike | Numbers

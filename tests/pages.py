@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 
 import jax
+from jax.experimental.compilation_cache import compilation_cache
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -63,6 +64,8 @@ def run(path, parts=slice(None)):
                 printed.append("".join(f"{line}\n" for line in lines))
         finally:
             jax.config.update("jax_compilation_cache_dir", cache)
+            # JAX keeps the folder in which it wrote first, which a page may have chosen.
+            compilation_cache.reset_cache()
             plt.close("all")
     return names, printed
 

@@ -97,6 +97,58 @@ def fit():
     save(figure, "fit.png")
 
 
+def predict():
+    """Draw the prediction of the guide's page on predictions, from the same readings."""
+    truth, first = rj.Inertia.from_principal(1.0, 1.6, 2.2), rj.Spin([1.0, 0.5, 1.2])
+    gyro, t = identify.Gyro(noise=0.05), jnp.linspace(0.0, 10.0, 101)
+    rates = identify.simulate_readings(gyro, truth, first, t, key=jax.random.key(0))
+    record = identify.Recording(t, (gyro, rates))
+    found = identify.fit(identify.Model(record, identify.PrincipalRatios()), starts=1)
+    ts = jnp.linspace(0.0, 80.0, 641)
+    low, high = found.interval_of(lambda p: rj.simulate(p.body, p.state0, ts).ys.omega[:, 0])
+    real = rj.simulate(truth, first, ts).ys.omega[:, 0]
+    figure, sides = plt.subplots(1, 2, figsize=(8.4, 3.0), sharey=True, layout="constrained")
+    for ax, ends, title in zip(
+        sides,
+        ((0.0, 20.0), (60.0, 80.0)),
+        ("the readings end at 10 s", "a minute later"),
+        strict=True,
+    ):
+        ax.fill_between(
+            ts, low, high, color=rj.plot.COLOURS[1], alpha=0.6, lw=0, label="95 % interval"
+        )
+        ax.plot(ts, real, color="black", lw=1.0, label="true rate")
+        ax.plot(t, rates[:, 0], ".", color=rj.plot.COLOURS[0], ms=4, label="readings")
+        ax.set(xlabel="time, s", xlim=ends)
+        ax.set_title(title, fontsize=10)
+    sides[0].set_ylabel("$\\Omega_x$, rad/s")
+    figure.legend(
+        *sides[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
+    )
+    save(figure, "predict.png")
+
+
+def simulators():
+    """Draw the table of the guide's page on simulators, as it stands there."""
+    page = (HERE.parent / "guide" / "check_simulator.md").read_text(encoding="utf-8")
+    rows = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| ")]
+    figure, ax = plt.subplots(figsize=(8.4, 4.0), layout="constrained")
+    steps = 1e3 * jnp.array([1.0 / 120.0, 2e-3, 1e-3])
+    colours = dict(zip(("mujoco", "mujoco-mjx", "brax", "jsbsim"), rj.plot.COLOURS, strict=False))
+    for (package, name, *numbers), marker in zip(rows[2:], "os^os^sDosD^", strict=True):
+        angles = [float(number) for number in numbers[:3]]
+        kind = package.split()[0]
+        ax.loglog(
+            steps, angles, color=colours[kind], marker=marker, ms=5, lw=1.2, label=f"{kind}, {name}"
+        )
+    ax.set(xlabel="step, ms", ylabel="angle to the exact attitude at 5 s, rad")
+    ax.set_xticks([1, 2, 8.33], ["1", "2", "1000/120"])
+    ax.minorticks_off()
+    ax.grid(alpha=0.3)
+    figure.legend(loc="outside right center", fontsize=8, frameon=False)
+    save(figure, "simulators.png")
+
+
 if __name__ == "__main__":
-    for draw in (frames, flip, start, fit):
+    for draw in (frames, flip, start, fit, predict, simulators):
         draw()

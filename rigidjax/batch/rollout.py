@@ -79,7 +79,7 @@ def rollout(
 
 def rollout(
     bodies: Inertia | MassProperties,
-    states0: Any,
+    states0: PyTree,
     step_size: ScalarLike,
     num_steps: int,
     torque: Torque | None = None,
@@ -87,7 +87,7 @@ def rollout(
     solver: Solver = None,
     save_every: int | None = None,
     reduce: Reduce | None = None,
-    initial: Any = None,
+    initial: PyTree = None,
     t0: ScalarLike = 0.0,
     inputs: Inputs = None,
     torque_axes: TorqueAxes = None,

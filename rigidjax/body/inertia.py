@@ -299,22 +299,26 @@ class MassProperties(eqx.Module):
         return _add_mass(self, -other.mass, other.com, -other.second_moment)
 
 
-def tensor_of(body: Inertia | MassProperties) -> Float[Array, "*batch 3 3"]:
+# What turns: an inertia, or a body with mass.
+Body = Inertia | MassProperties
+
+
+def tensor_of(body: Body) -> Float[Array, "*batch 3 3"]:
     """Return the inertia tensor (3, 3), kg m²; of `MassProperties` the one about the centre of
     mass.
     """
     return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
 
 
-Body = TypeVar("Body", Inertia, MassProperties)
+OneBody = TypeVar("OneBody", bound=Body)
 
 
-def with_tensor(body: Body, tensor: Mat3) -> Body:
+def with_tensor(body: OneBody, tensor: Mat3) -> OneBody:
     """Return the body with another inertia tensor, unchecked, since a part of a body need not be a
     real body.
     """
     if isinstance(body, Inertia):
-        return Inertia(tensor)
+        return Inertia(tensor)  # pyright: ignore[reportReturnType]
     return eqx.tree_at(lambda b: b.second_moment, body, swap_trace_back(tensor))
 
 

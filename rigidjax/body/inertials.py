@@ -4,11 +4,12 @@ import warnings
 import xml.etree.ElementTree as Tree
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from jaxtyping import ArrayLike
 
 from rigidjax import _checks
+from rigidjax._types import Numbers
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.rotation import euler, quaternion
@@ -171,7 +172,9 @@ def _from_mujoco(inertial: Tree.Element) -> MassProperties:
     return _body(_numbers(inertial, "mass", 1)[0], place, quaternion.to_matrix(q), six)
 
 
-def _body(mass: float, place: np.ndarray, turn: Any, six: Any) -> MassProperties:
+def _body(
+    mass: float, place: np.ndarray, turn: ArrayLike, six: Sequence[float] | np.ndarray
+) -> MassProperties:
     xx, yy, zz, xy, xz, yz = six
     turn = np.asarray(turn, float)
     tensor = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
@@ -188,7 +191,9 @@ def _body(mass: float, place: np.ndarray, turn: Any, six: Any) -> MassProperties
     return MassProperties(mass, place, second)
 
 
-def _numbers(node: Any, key: str, count: int, otherwise: Any = None) -> np.ndarray:
+def _numbers(
+    node: Tree.Element | None, key: str, count: int, otherwise: list[float] | None = None
+) -> np.ndarray:
     text = None if node is None else node.get(key)
     if text is None:
         if otherwise is None:
@@ -203,7 +208,7 @@ def _numbers(node: Any, key: str, count: int, otherwise: Any = None) -> np.ndarr
     return numbers
 
 
-def _text(numbers: Any) -> str:
+def _text(numbers: ArrayLike | Numbers) -> str:
     return " ".join(repr(float(number)) for number in np.ravel(numbers))
 
 

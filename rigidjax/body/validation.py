@@ -5,6 +5,7 @@ exception that shows the numbers, traced values with `equinox.error_if`, without
 units of round-off are tolerated: plates, rods and points lie on the boundary and pass.
 """
 
+from types import ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Quat, Quaternion
@@ -60,17 +61,17 @@ def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 
 
 
 def single(
-    value: Any, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
+    value: object, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
 ) -> Any:
     """Return `value` if it is one body of one of `kinds` and some mass has its numbers.
 
     Known numbers that no real body has are refused; a traced body with such numbers becomes NaN. A
     moment may be zero: a function that divides by the moments calls `check_body`.
     """
-    _checks.single(value, kinds, name, wanted=wanted, hint=hint)
-    has_mass = hasattr(value, "mass")
-    tensor = value.inertia.tensor if has_mass else value.tensor
-    return check_body(value, tensor, value.mass if has_mass else None, throw=False, thin=True)
+    body = _checks.single(value, kinds, name, wanted=wanted, hint=hint)
+    has_mass = hasattr(body, "mass")
+    tensor = body.inertia.tensor if has_mass else body.tensor
+    return check_body(body, tensor, body.mass if has_mass else None, throw=False, thin=True)
 
 
 def check_symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
@@ -83,9 +84,9 @@ def check_symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
 
 
 def check_body(
-    body: Any,
+    body: PyTree,
     tensor: Float[Array, "*batch 3 3"],
-    mass: Any,
+    mass: Array | None,
     throw: bool,
     *,
     thin: bool = False,
@@ -130,7 +131,7 @@ def first_impossible(tensors: Float[Array, "n 3 3"]) -> Any:
     return _checks.first_bad(_impossible, tensors)
 
 
-def _impossible(xp: Any, tensors: Any) -> Any:
+def _impossible(xp: ModuleType, tensors: Array | np.ndarray) -> Any:
     flat, broken, skew = _faults(xp, tensors, thin=False)
     return (flat | broken | skew) & ~xp.isnan(xp.asarray(tensors)).any(axis=(-1, -2))
 
@@ -150,7 +151,7 @@ _THIN = (
 )
 
 
-def _faults(xp: Any, tensor: Any, thin: bool) -> tuple[Any, Any, Any]:
+def _faults(xp: ModuleType, tensor: Array | np.ndarray, thin: bool) -> tuple[Any, Any, Any]:
     """Return three answers: is a moment zero or NaN (never if `thin`), has no mass these moments,
     is I ≠ Iᵀ.
 

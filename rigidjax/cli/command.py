@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
 
 
-def _raise_interrupt_again(dropped: Any) -> None:
+def _raise_interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
     """Raise a Ctrl-C again that Python dropped, as in JAX's callback of the garbage collector.
 
     `dropped` holds the exception, as `sys.unraisablehook` gets it.
@@ -335,7 +335,7 @@ def _log_warnings(strict: bool) -> Iterator[None]:
         warnings.simplefilter("error" if strict else "always", LogWarning)
         usual = warnings.showwarning
 
-        def show(message: Any, category: type[Warning], *where: Any, **how: Any) -> None:
+        def show(message: Warning | str, category: type[Warning], *where: Any, **how: Any) -> None:
             if issubclass(category, LogWarning):
                 _print_line(str(message))
             else:

@@ -195,10 +195,10 @@ class _Shape(AbstractBodyChart):
         beta, gamma = jnp.exp(1e-3 * vector + self._known)
         return self.moon.body(beta, gamma, core=self.core)
 
-    def vector(self, body: Any) -> Array:
+    def vector(self, body: Inertia) -> Array:
         return 1e3 * (self.logs(body) - self._known)
 
-    def logs(self, body: Any) -> Array:
+    def logs(self, body: Inertia) -> Array:
         tensor = body.tensor + self.moon._core.tensor if self.core else body.tensor
         a, b, c = (tensor[i, i] for i in range(3))
         return jnp.log(jnp.stack([(c - a) / b, (b - a) / c]))
@@ -222,17 +222,17 @@ class _Core(eqx.Module):
     friction: Array
     gravity: Sum
 
-    def on_mantle(self, state: Any, own: Array) -> Array:
+    def on_mantle(self, state: HasAttitude, own: Array) -> Array:
         x, y, z = own
         flat = self.tensor[2, 2] - self.tensor[0, 0]
         pushed = flat * z * jnp.stack([-y, x, jnp.zeros_like(z)])
         return self.friction * (own - state.omega) + pushed
 
-    def rate(self, t: ScalarLike, own: Array, state: Any, body: Inertia) -> Array:
+    def rate(self, t: ScalarLike, own: Array, state: HasAttitude, body: Inertia) -> Array:
         moments = jnp.stack([self.tensor[i, i] for i in range(3)])
         return (cross(moments * own, state.omega) - self.on_mantle(state, own)) / moments
 
-    def __call__(self, t: ScalarLike, state: Any, body: Inertia, own: Array) -> Array:
+    def __call__(self, t: ScalarLike, state: HasAttitude, body: Inertia, own: Array) -> Array:
         whole = Inertia(body.tensor + self.tensor)
         return evaluate(self.gravity, t, state, whole) + self.on_mantle(state, own)
 

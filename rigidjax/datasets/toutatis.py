@@ -6,6 +6,7 @@ doi:10.1088/0004-6256/146/4/95; from the radar imaging of R. S. Hudson and S. J.
 270:84 (1995).
 """
 
+from collections.abc import Callable
 from datetime import datetime
 from typing import Any
 
@@ -17,6 +18,7 @@ from jaxtyping import Array
 from rigidjax import exact
 from rigidjax._names import show
 from rigidjax.body import spatial_angular_momentum
+from rigidjax.body.inertia import Inertia
 from rigidjax.identify.answer.result import Fit
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.model.charts import PrincipalRatios
@@ -24,6 +26,7 @@ from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.priors import SoftL1
 from rigidjax.identify.report import Row
 from rigidjax.identify.sensors import AttitudeSensor, Gyro
+from rigidjax.motion import Attitude
 from rigidjax.rotation import euler
 
 CITATION = "Takahashi, Busch & Scheeres 2013, AJ 146:95, table 3"
@@ -87,14 +90,14 @@ def model() -> Model:
 
 
 @jax.jit
-def _periods(body: Any, state: Any) -> Array:
+def _periods(body: Inertia, state: Attitude) -> Array:
     turning = exact.body_period(body, state.omega)
     precessing = exact.precession_period(body, state.omega)
     return jnp.log(jnp.stack([turning, precessing]) / DAY)
 
 
 @jax.jit
-def _direction(body: Any, state: Any) -> Array:
+def _direction(body: Inertia, state: Attitude) -> Array:
     momentum = spatial_angular_momentum(body, state)
     flat = jnp.hypot(momentum[0], momentum[1])
     return jnp.stack([jnp.arctan2(momentum[1], momentum[0]), jnp.arctan2(momentum[2], flat)])
@@ -107,7 +110,11 @@ def rows(fit: Fit) -> list[Row]:
     degrees of ecliptic longitude and latitude (J2000), with 95 % intervals.
     """
 
-    def ranges(of: Any, names: tuple[str, str], shown: Any) -> Any:
+    def ranges(
+        of: Callable[[Any, Any], Array],
+        names: tuple[str, str],
+        shown: Callable[[np.ndarray], np.ndarray],
+    ) -> Any:
         bounds = fit.interval_of(lambda point: of(point.body, point.state0))
         # A number that the data do not determine has an interval that ends at infinity.
         with np.errstate(over="ignore"):

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax.rotation.barrier import batch_as
@@ -15,7 +15,7 @@ Real = Float[ArrayLike, "..."]
 Result = Float[Array, "..."]
 
 
-def common(**named: Any) -> tuple[Result, ...]:
+def common(**named: Real) -> tuple[Result, ...]:
     """Convert the arguments to arrays of one dtype and shape; Python numbers take the dtype."""
     arrays = {
         name: _checks.floating(value, (), name, batched=True) for name, value in named.items()
@@ -29,7 +29,7 @@ def common(**named: Any) -> tuple[Result, ...]:
     return tuple(jnp.broadcast_to(array.astype(dtype), shape) for array in arrays.values())
 
 
-def complementary(name: str, value: Any, complement: Any) -> dict[str, Any]:
+def complementary(name: str, value: Real, complement: Real | None) -> dict[str, Any]:
     """Return `value` and 1 − `value` by name; a `complement` that is given must fit `value`."""
     value = _checks.floating(value, (), name, batched=True)
     if complement is None:
@@ -54,5 +54,7 @@ def exact_complement(value: Result, complement: Result) -> Any:
 
 
 @exact_complement.defjvp
-def _exact_complement_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _exact_complement_jvp(
+    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[Any, Any]:
     return exact_complement(*primals), -tangents[1]

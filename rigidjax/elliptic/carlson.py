@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, PyTree
 
 from rigidjax.elliptic.arguments import Real, Result, common
 from rigidjax.elliptic.carlson_r import change, nan_below_zero, r_integral, scale_of
@@ -82,7 +83,7 @@ def rc(x: Real, y: Real) -> Result:
 
 
 @jax.custom_jvp
-def _rf(arguments: Any) -> Any:
+def _rf(arguments: tuple[Array, ...]) -> Any:
     scale = scale_of(arguments)
     x, y, z = (a / scale for a in arguments)
     for _ in range(_STEPS[np.dtype(x.dtype)]):
@@ -99,7 +100,7 @@ def _rf(arguments: Any) -> Any:
 
 
 @partial(_rf.defjvp, symbolic_zeros=True)
-def _rf_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _rf_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
     (a,), (directions,) = primals, tangents
     tangent = jnp.zeros_like(a[0])
     for i, direction in enumerate(directions):
@@ -109,7 +110,7 @@ def _rf_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 @jax.custom_jvp
-def _rd(arguments: Any) -> Any:
+def _rd(arguments: tuple[Array, ...]) -> Any:
     scale = scale_of(arguments)
     x, y, z = (a / scale for a in arguments)
     total, weight = jnp.zeros_like(x), 3.0
@@ -135,18 +136,18 @@ def _rd(arguments: Any) -> Any:
 
 
 @partial(_rd.defjvp, symbolic_zeros=True)
-def _rd_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _rd_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
     (arguments,), (directions,) = primals, tangents
     return _rd(arguments), 1.5 * change((0.5, 0.5, 1.5), arguments, directions)
 
 
-def _lambda(x: Any, y: Any, z: Any) -> Any:
+def _lambda(x: Array, y: Array, z: Array) -> Any:
     """Return λ = √x√y + √x√z + √y√z of the duplication theorem (DLMF 19.26.18)."""
     a, b, c = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
     return a * b + b * c + c * a
 
 
-def _domain(value: Any, arguments: Any) -> Any:
+def _domain(value: Array, arguments: tuple[Array, ...]) -> Any:
     """Return infinity if two arguments are 0, NaN if one is negative or NaN, else `value`."""
     x, y, z = (a == 0 for a in arguments)
     return nan_below_zero(jnp.where((x & y) | (y & z) | (z & x), jnp.inf, value), arguments)

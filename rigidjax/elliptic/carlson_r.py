@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, PyTree
 
 from rigidjax.elliptic.arguments import Result
 
@@ -66,12 +67,18 @@ def r_integral(powers: tuple[float, ...], arguments: tuple[Result, ...]) -> Resu
 
 
 @partial(r_integral.defjvp, symbolic_zeros=True)
-def _r_integral_jvp(powers: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _r_integral_jvp(
+    powers: tuple[float, ...], primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[Any, Any]:
     (arguments,), (directions,) = primals, tangents
     return r_integral(powers, arguments), change(powers, arguments, directions)
 
 
-def change(powers: tuple[float, ...], arguments: Any, directions: Any) -> Any:
+def change(
+    powers: tuple[float, ...],
+    arguments: tuple[Array, ...],
+    directions: tuple[Array | SymbolicZero, ...],
+) -> Any:
     """Return the derivative of `r_integral` as its `arguments` move along `directions`."""
     tangent = jnp.zeros_like(arguments[0])
     for i, direction in enumerate(directions):
@@ -81,13 +88,13 @@ def change(powers: tuple[float, ...], arguments: Any, directions: Any) -> Any:
     return tangent
 
 
-def nan_below_zero(value: Any, arguments: Any) -> Any:
+def nan_below_zero(value: Array, arguments: tuple[Array, ...]) -> Any:
     """Return NaN if one of `arguments` is negative or NaN, else `value`."""
     good = functools.reduce(jnp.logical_and, (a >= 0 for a in arguments))
     return jnp.where(good, value, jnp.nan)
 
 
-def scale_of(arguments: Any) -> Any:
+def scale_of(arguments: tuple[Array, ...]) -> Any:
     """Return the largest argument, or 1 if all are 0.
 
     The integrals are homogeneous: with arguments divided by it no square overflows.
@@ -96,7 +103,7 @@ def scale_of(arguments: Any) -> Any:
     return jnp.where(largest > 0, largest, 1)
 
 
-def _divide(value: Any, x: Any, power: float) -> Any:
+def _divide(value: Array, x: Array, power: float) -> Any:
     """Divide `value` by x^power, `power` a multiple of ½, one factor after the other."""
     whole = math.floor(power)
     if power > whole:

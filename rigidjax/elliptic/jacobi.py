@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, PyTree
 
 from rigidjax.elliptic.arguments import Real, Result, common, complementary, exact_complement
 from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, near_one
@@ -64,7 +65,7 @@ def am(u: Real, m: Real, m1: Real | None = None) -> Result:
     return jnp.arctan2(sign * s, sign * c) + math.pi * turns
 
 
-def _functions(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any, Any]:
+def _functions(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any, Any]:
     """Return sn, cn, dn for any real m, and the number of half turns in the amplitude."""
     # DLMF 22.17.2–4: m > 1 becomes 1/m, and cn and dn change places.
     above = m1 < 0
@@ -80,7 +81,7 @@ def _functions(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any, Any]:
 
 
 @jax.custom_jvp
-def _core(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
+def _core(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
     """Return sn, cn, dn for m ≤ 1, as functions of u and m1; m must be 1 − m1."""
     turns, angle, rows = _reduce_argument(u, m1)
     sign = parity(turns)
@@ -113,7 +114,7 @@ def _core(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
 
 
 @partial(_core.defjvp, symbolic_zeros=True)
-def _core_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _core_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
     (u, m, m1), (du, _, dm1) = primals, tangents
     s, c, d = _core(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
@@ -127,13 +128,13 @@ def _core_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 @jax.custom_jvp
-def _slopes(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
+def _slopes(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
     """Return the derivatives of sn, cn, dn with respect to m at a fixed u."""
     return _slopes_from_integral(u, m, m1)
 
 
 @partial(_slopes.defjvp, symbolic_zeros=True)
-def _slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _slopes_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
     (u, m, m1), (du, _, dm1) = primals, tangents
     sm, cm, dm = slopes = _slopes(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
@@ -150,7 +151,7 @@ def _slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
         near_m = jnp.where(near, m, 1 - LARGEST_M1)
         near_m1 = jnp.where(near, m1, LARGEST_M1)
 
-        def first(a: Any, b: Any) -> Any:
+        def first(a: Array, b: Array) -> Any:
             return jax.jvp(partial(near_one, u), (a, b), (one, -one))[1]
 
         _, close = jax.jvp(first, (near_m, near_m1), (one, -one))
@@ -159,7 +160,7 @@ def _slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return slopes, (ds, dc, dd)
 
 
-def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
+def _slopes_from_integral(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
     """Return the derivatives of sn, cn, dn by m: those by the amplitude φ times dn X.
 
     X is the integral in the head of this file: Carlson's R_D of u reduced by half periods.
@@ -178,7 +179,7 @@ def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
     return c * d * x, -s * d * x * up, -(0.5 * s * s / d + m * s * c * x) * up
 
 
-def _reduce_argument(u: Any, m1: Any) -> tuple[Any, Any, list[tuple[Any, Any]]]:
+def _reduce_argument(u: Array, m1: Array) -> tuple[Any, Any, list[tuple[Any, Any]]]:
     """Reduce the argument, u = 2Kn + r.
 
     Returns n, the angle πr/2K and the arithmetic and geometric means of 1 and √m1.

@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from rigidjax.elliptic.arguments import Result
 from rigidjax.rotation.stumpff import parity
@@ -62,7 +63,7 @@ def near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
 
 
 @jax.custom_jvp
-def _power_exp(p: Any, y: Any, n: Any) -> Any:
+def _power_exp(p: Array, y: Array, n: Array) -> Any:
     """Return pⁿ e^y.
 
     For n = 1 its second derivative by p is exactly 0; that of exp(y + n ln p) is not.
@@ -71,7 +72,7 @@ def _power_exp(p: Any, y: Any, n: Any) -> Any:
 
 
 @_power_exp.defjvp
-def _power_exp_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _power_exp_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
     (p, y, n), (dp, dy, _) = primals, tangents
     value = _power_exp(p, y, n)
     slope = jnp.where(n == 0, 0, n * _power_exp(p, y, n - 1))

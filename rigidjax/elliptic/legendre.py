@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, PyTree
 
 from rigidjax.elliptic.arguments import Real, Result, common, complementary
 from rigidjax.elliptic.carlson import rd, rf
@@ -115,7 +116,7 @@ def ellippiinc(
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def integral(orders: tuple[int, int, int], sine: Any, cosine: Any, m1: Any, n1: Any) -> Any:
+def integral(orders: tuple[int, int, int], sine: Array, cosine: Array, m1: Array, n1: Array) -> Any:
     """Return I_jkl for `orders` (j, k, l) from the sine and cosine of φ, |φ| ≤ π/2.
 
     From both, not from φ, so that no digit is lost near π/2.
@@ -138,7 +139,9 @@ def integral(orders: tuple[int, int, int], sine: Any, cosine: Any, m1: Any, n1: 
 
 
 @partial(integral.defjvp, symbolic_zeros=True)
-def _integral_jvp(orders: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _integral_jvp(
+    orders: tuple[int, int, int], primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[Any, Any]:
     j, k, last = orders
     s, c, m1, n1 = primals
     ds, dc, dm1, dn1 = tangents
@@ -159,13 +162,13 @@ def _integral_jvp(orders: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
     return value, tangent
 
 
-def complete(orders: tuple[int, int, int], m1: Any, n1: Any = None) -> Any:
+def complete(orders: tuple[int, int, int], m1: Array, n1: Array | None = None) -> Any:
     """Return I_jkl, `orders` (j, k, l), at φ = π/2."""
     one = jnp.ones_like(m1)
     return integral(orders, one, jnp.zeros_like(m1), m1, one if n1 is None else n1)
 
 
-def mean_iterates(m1: Any) -> list[tuple[Any, Any]]:
+def mean_iterates(m1: Array) -> list[tuple[Any, Any]]:
     """Return the pairs of arithmetic and geometric means from (1, √m1) to their common value."""
     rows = [(jnp.ones_like(m1), jnp.sqrt(m1))]
     for _ in range(_MEAN_STEPS[np.dtype(m1.dtype)]):
@@ -175,19 +178,21 @@ def mean_iterates(m1: Any) -> list[tuple[Any, Any]]:
 
 
 @jax.custom_jvp
-def _complete_first(m1: Any) -> Any:
+def _complete_first(m1: Array) -> Any:
     """Return K = π/(2 agm(1, √m1)); infinity for m1 = 0."""
     a, b = mean_iterates(m1)[-1]
     return jnp.where(m1 == 0, jnp.inf, math.pi / (a + b))
 
 
 @_complete_first.defjvp
-def _complete_first_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _complete_first_jvp(
+    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[Any, Any]:
     (m1,), (dm1,) = primals, tangents
     return _complete_first(m1), -0.5 * complete((1, 1, 0), m1) * dm1
 
 
-def _second_kind(s: Any, c2: Any, delta2: Any, m1: Any) -> Any:
+def _second_kind(s: Array, c2: Array, delta2: Array, m1: Array) -> Any:
     """Return E(φ|m) for |φ| ≤ π/2 from s = sin φ, c2 = cos²φ and delta2 = 1 − m s².
 
     By DLMF 19.25.10 for 0 ≤ m ≤ 1 and by 19.25.9 for m < 0, where every term is positive.
@@ -205,7 +210,9 @@ def _second_kind(s: Any, c2: Any, delta2: Any, m1: Any) -> Any:
     return jnp.where(m1 < 0, jnp.nan, value)
 
 
-def _incomplete(orders: tuple[int, int, int], phi: Any, m1: Any, n1: Any = None) -> Any:
+def _incomplete(
+    orders: tuple[int, int, int], phi: Array, m1: Array, n1: Array | None = None
+) -> Any:
     """Return I_jkl, `orders` (j, k, l), at any amplitude φ.
 
     Whole half turns come from the complete integral, the rest from its sine and cosine.

@@ -3,6 +3,9 @@
 XLA makes one kernel of a batch of them (stacked arrays cost ten times it).
 """
 
+import jax.numpy as jnp
+from jaxtyping import Array
+
 from rigidjax._types import Scalar
 from rigidjax.rotation.linalg3 import cross_components as cross
 
@@ -41,6 +44,12 @@ def product(m: Six, n: Six) -> Six:
         a * v + x * w + y * f,
         x * v + b * w + z * f,
     )
+
+
+def symmetric(m: Six) -> tuple[Array, ...]:
+    """Return the rows of a symmetric matrix."""
+    a, b, c, x, y, z = m
+    return jnp.stack([a, x, y]), jnp.stack([x, b, z]), jnp.stack([y, z, c])
 
 
 def determinant(m: Six) -> Scalar:

@@ -33,6 +33,7 @@ from rigidjax.exact.components3 import (
     determinant,
     half_product,
     plus,
+    symmetric,
     times,
     turned_back,
 )  # fmt: skip
@@ -63,11 +64,21 @@ def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
 
 @flow.defjvp
 def _flow_jvp(primals, tangents):
-    motion, rows = slopes(*primals)
-    _, change = jax.jvp(inputs_of, primals[:2], tangents[:2])
-    change = jnp.stack([*change, tangents[2]])
-    d_out, theta, _ = jax.tree.map(lambda row: jnp.sum(row * change), rows)
-    return motion, (d_out, half_product(motion[1], theta))
+    motion, rows, _ = slopes(*primals)
+    d_out, d_turn, _ = _change_along(motion, rows, _variables(primals, tangents)[3])
+    return motion[:2], (d_out, d_turn)
+
+
+def _variables(primals, tangents):
+    """Return `reciprocal` and `inputs_of`, each with its change along `tangents`."""
+    parts, changes = jax.jvp(reciprocal, primals[:2], tangents[:2])
+    return parts, changes, inputs_of(parts, *primals[1:]), inputs_of(changes, *tangents[1:])
+
+
+def _change_along(motion, rows, change):
+    """Return the change of the result `motion` of `slopes` as `inputs_of` move by `change`."""
+    out, theta, rate = (tuple(jnp.sum(row * change) for row in three) for three in rows)
+    return out, half_product(motion[1], theta), rate
 
 
 class Setting(NamedTuple):
@@ -144,17 +155,28 @@ def _in_axes(tensor: Mat3, omega: Vec3, s: Setting) -> tuple[Six, Triple]:
 @one_kernel
 def _by_body(body: Float[Array, "12"], s: Setting) -> Float[Array, "9 12"]:
     """Return the derivatives of `inputs_of` by `body`: nine entries of the tensor, then Ω(0)."""
-    return jax.jacfwd(lambda x: jnp.stack(inputs_of(*_in_axes(x[:9].reshape(3, 3), x[9:], s))))(
-        body
-    )
+    tensor, omega, axes = body[:9].reshape(3, 3), body[9:], s.axes
+    moments, momentum = _in_axes(tensor, omega, s)
+    # δK = −K δI K in principal axes: −BᵀδI B with B = A K. A batch of sums, not of products of
+    # matrices: see `_motion_jvp`.
+    k = jnp.stack(symmetric(reciprocal(moments, momentum)[1]))
+    b = jnp.sum(axes[:, :, None] * k[None], axis=1)
+    d_k = lambda i, j: -(b[:, None, i] * b[None, :, j]).ravel()  # noqa: E731
+    c1, c2, c3 = d_k(0, 0), d_k(1, 1), d_k(2, 2)
+    d_momentum = ((axes[:, None, i] * omega[None]).ravel() for i in range(3))
+    by_tensor = jnp.stack([c1 - c2, c2 - c3, d_k(0, 1), d_k(0, 2), d_k(1, 2), *d_momentum, c3])
+    by_tensor = by_tensor.reshape(9, 3, 3)
+    by_tensor = 0.5 * (by_tensor + jnp.swapaxes(by_tensor, 1, 2)).reshape(9, 9)
+    by_omega = jnp.sum(jnp.stack(symmetric(moments))[:, None] * axes[None], axis=2)
+    return jnp.concatenate([by_tensor, jnp.pad(by_omega, ((5, 1), (0, 0)))], axis=1)
 
 
 @one_kernel
 def _body_slopes(tensor: Mat3, omega: Vec3, s: Setting, t: Scalar):
-    """Return Ω(t) and the turn in body axes, and their derivatives by `inputs_of` and t."""
+    """Return Ω(t) and the turn in body axes, and their derivatives by `inputs_of`."""
     moments, momentum = _in_axes(tensor, omega, s)
-    (out, (w, *axis)), rows = slopes(moments, momentum, t)
-    rate = out_of(s.axes, times(reciprocal(moments, momentum)[1], out))
+    (_, (w, *axis), rate), rows, _ = slopes(moments, momentum, t)
+    rate = out_of(s.axes, rate)
     turn = jnp.stack([w, *out_of(s.axes, tuple(axis))])
     # Rows, not matrices: to stack them costs a batch five times what they are.
     in_body = jax.vmap(lambda *v: out_of(s.axes, v))
@@ -162,18 +184,43 @@ def _body_slopes(tensor: Mat3, omega: Vec3, s: Setting, t: Scalar):
 
 
 class Slopes(NamedTuple):
-    """Hold the derivatives of Π(t), θ and Ω(t) by `inputs_of` and t, three rows of ten each."""
+    """Hold the derivatives of Π(t), θ and Ω(t) by `inputs_of`, three rows of ten each."""
 
     momentum: Triple
     theta: Triple
     rate: Triple
 
 
+@jax.custom_jvp
 @one_kernel
-def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Four], Slopes]:
-    """Return the result of `flow`, and its derivatives."""
-    (out, turn), rows, g = first_order(moments, momentum, t)
+def slopes(moments: Six, momentum: Triple, t: Scalar):
+    """Return Π(t), the quaternion of the turn and Ω(t); `Slopes`; their parts by `_first_order`.
+
+    The parts are the derivatives of Π(t) − Π(0), and G = ∫ Π Πᵀ dt.
+    """
+    (out, turn), rows, g = _first_order(orbit(moments[:3], momentum), moments, momentum, t)
     _, k, energy2 = reciprocal(moments, momentum)
+    motion = out, turn, times(k, out)
+    return motion, _columns(k, energy2, momentum, t, motion, rows, g), (rows, g)
+
+
+# The jvp of a closed first derivative is taken from the tensor form, which is smooth to any order.
+@slopes.defjvp
+def _slopes_jvp(primals, tangents):
+    motion, rows, parts = slopes(*primals)
+    (body, *k), (_, *d_k), inputs, change = _variables(primals, tangents)
+    d_motion = _change_along(motion, rows, change)
+    d_parts = _second_order(body, inputs, change)
+    at, changes = (*k, *primals[1:], motion, *parts), (*d_k, *tangents[1:], d_motion, *d_parts)
+    return (motion, rows, parts), (d_motion, jax.jvp(_columns, at, changes)[1], d_parts)
+
+
+def _columns(k: Six, energy2: Scalar, momentum: Triple, t: Scalar, motion, rows, g: Six) -> Slopes:
+    """Return the derivatives of `motion`, the result of `slopes`.
+
+    `k`, `energy2`: of `reciprocal`; `rows`, `g`: of `_first_order`.
+    """
+    out, turn, _ = motion
     p1, p2, p3 = momentum
     h2 = p1 * p1 + p2 * p2 + p3 * p3
     most = h2 * (k[0] * k[0] + k[1] * k[1] + k[2] * k[2])
@@ -209,27 +256,25 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
         theta = tuple(jnp.where(still, a, b) for a, b in zip(near, theta, strict=True))
         return d_out, theta, plus(times(k, d_out), times(d_k, out))
 
-    return (out, turn), Slopes(*jax.vmap(column)(jnp.eye(10, dtype=t.dtype), rows))
+    return Slopes(*jax.vmap(column)(jnp.eye(10, dtype=t.dtype), rows))
 
 
-def inputs_of(moments: Six, momentum: Triple) -> tuple[Scalar, ...]:
-    """Return d12, d23, k12, k13, k23, Π(0), k33: the variables of all derivatives but t.
+def inputs_of(parts, momentum: Triple, t: Scalar) -> Float[Array, "10"]:
+    """Return d12, d23, k12, k13, k23, Π(0), k33, t, the variables of all derivatives.
 
-    k33 is the least of K: a rod's thickness moves d12 alone (k11 and d12 by 1/I₁², which cancel).
+    `parts`: of `reciprocal`, or their change. k33 is the least of K: a rod's thickness moves d12
+    alone (k11 and d12 by 1/I₁², which cancel).
     """
-    body, k, _ = reciprocal(moments, momentum)
-    return body.d12, body.d23, body.k12, body.k13, body.k23, *momentum, k[2]
-
-
-@jax.custom_jvp
-def first_order(moments: Six, momentum: Triple, t: Scalar):
-    """Return the result of `flow`, d(Π(t) − Π(0)) by `inputs_of` and t, and G = ∫ Π Πᵀ dt."""
-    return _first_order(orbit(moments[:3], momentum), moments, momentum, t)
+    body, k, _ = parts
+    return jnp.stack([body.d12, body.d23, body.k12, body.k13, body.k23, *momentum, k[2], t])
 
 
 @one_kernel
 def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
-    """Return what `first_order` does, for a motion with the constants `o`."""
+    """Return the result of `flow`, d(Π(t) − Π(0)) by `inputs_of`, and G = ∫ Π Πᵀ dt.
+
+    `o`: the constants of the motion.
+    """
     u = reduce_time(0.5 * t, o.half.time, o.modulus)
     at = integrals(u.near, o.modulus, o.mu, o.turn)
     f = at.f._replace(
@@ -243,17 +288,8 @@ def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
     return from_functions(o, at.f, u, t), rows, g
 
 
-# The jvp of a closed first derivative is taken from the tensor form, which is smooth to any order.
-@first_order.defjvp
-def _first_order_jvp(primals, tangents):
-    _, d_motion = jax.jvp(flow, primals, tangents)
-    _, (d_rows, d_g) = jax.jvp(_first_order_of_tensor, primals, tangents)
-    return first_order(*primals), (d_motion, d_rows, d_g)
-
-
-def _first_order_of_tensor(moments, momentum, t):
-    """Return the derivatives of Π(t) and G in `first_order`, from the tensor form."""
-    body, _, _ = reciprocal(moments, momentum)
+def _second_order(body: Differences, inputs, change):
+    """Return the changes of the derivatives and of G in `_first_order`, from the tensor form."""
 
     def of_inputs(x):
         d12, d23, k12, k13, k23, p1, p2, p3, _, time = x
@@ -262,8 +298,13 @@ def _first_order_of_tensor(moments, momentum, t):
             Differences(d12, d13, d23, k12, k13, k23), (p1, p2, p3), time
         )
 
-    inputs = jnp.stack([*inputs_of(moments, momentum), t])
-    return jax.jacfwd(lambda x: of_inputs(tuple(x)), has_aux=True)(inputs)
+    def columns(x):
+        # One after the other: a batch of them takes longer to compile.
+        column = lambda e: jax.jvp(of_inputs, (x,), (e,))[1]  # noqa: E731
+        return jax.lax.map(column, jnp.eye(10, dtype=x.dtype))
+
+    (_, by_inputs), (d_rows, _) = jax.jvp(columns, (inputs,), (change,))
+    return d_rows, tuple(jnp.sum(g * change) for g in by_inputs)
 
 
 def reciprocal(moments: Six, momentum: Triple):

@@ -6,8 +6,9 @@ from typing import Any, ClassVar
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, ArrayLike, Bool, PyTree
 
+from rigidjax._types import RealLike
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact.free_body import FreeBody
 from rigidjax.motion.equations import AttitudeEquations, EulerEquations
@@ -22,7 +23,9 @@ class FreeInterpolation(dfx.AbstractLocalInterpolation):
     inertia: Inertia
     direction: Any
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree[Array]:
+    def evaluate(
+        self, t0: RealLike, t1: RealLike | None = None, left: bool = True
+    ) -> PyTree[Array]:
         motion = FreeBody(self.inertia, self.y0)
         state = motion(self.direction * (t0 - self.t0))
         if t1 is None:
@@ -51,39 +54,56 @@ class FreeSolver(dfx.AbstractSolver):
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., FreeInterpolation]] = FreeInterpolation
 
-    def order(self, terms: Any) -> int | None:
+    def order(self, terms: PyTree[dfx.AbstractTerm]) -> int | None:
         # An exact step does not need it; some controllers do.
         return 1
 
-    def error_order(self, terms: Any) -> float | None:
+    def error_order(self, terms: PyTree[dfx.AbstractTerm]) -> float | None:
         return 1.0
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+    def init(
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        args: PyTree,
+    ) -> None:
         _field(terms)
         return None
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: None, made_jump: Any
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: None,
+        made_jump: Bool[ArrayLike, ""],
     ) -> tuple[Any, Any, dict[str, Any], None, dfx.RESULTS]:
         # −1 where diffrax integrates backwards, its times running as −t.
-        inertia, direction = _field(terms).inertia, jnp.asarray(field_of(terms)[1], t0.dtype)
+        inertia, direction = (
+            _field(terms).inertia,
+            jnp.asarray(field_of(terms)[1], jnp.result_type(t0)),
+        )
         y1 = FreeBody(inertia, y0)(direction * (t1 - t0))
         error = jax.tree.map(jnp.zeros_like, y0)
         dense = dict(y0=y0, inertia=inertia, direction=direction)
         return y1, error, dense, None, dfx.RESULTS.successful
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, args)
 
 
-def field_of(terms: Any) -> tuple[Any, Any]:
+def field_of(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
     """Return the vector field inside a term, and the direction of time diffrax wraps around it."""
     # `vf` and `contr`, all that diffrax promises of a wrapped term, give numbers, not the inertia.
     term = getattr(terms, "term", terms)
     return getattr(term, "vector_field", None), getattr(terms, "direction", 1)
 
 
-def _field(terms: Any) -> EulerEquations:
+def _field(terms: PyTree[dfx.AbstractTerm]) -> EulerEquations:
     """Return Euler's equations from inside a term."""
     field, _ = field_of(terms)
     euler = field.euler if isinstance(field, AttitudeEquations) else field

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, ScalarLike, Vec3
@@ -45,7 +45,7 @@ class FreeBody(eqx.Module):
         self.exponent = exponent_of(state0.omega)
         self.tensor = times_power_of_two(inertia.tensor, -exponent_of(inertia.tensor))
         self.omega = times_power_of_two(state0.omega, -self.exponent)
-        self.setting = jax.lax.stop_gradient(set_up(self.tensor, self.omega))
+        self.setting = set_up(*jax.lax.stop_gradient((self.tensor, self.omega)))
         self.state0 = state0
 
     def __call__(self, t: ScalarLike) -> HasSpin:
@@ -82,7 +82,7 @@ class FreeMotion(eqx.Module):
     state0: Any
     turning: FreeBody
 
-    def __init__(self, body: Inertia | MassProperties, state0: Any):
+    def __init__(self, body: Inertia | MassProperties, state0: PyTree):
         self.state0 = state0
         rigid = isinstance(state0, Rigid)
         turning = Attitude(state0.q, state0.omega) if rigid else state0

@@ -12,7 +12,7 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.exact import sigma_form
 from rigidjax.exact.components3 import HALF, Six, Triple, times
-from rigidjax.exact.derivatives import first_order, reciprocal
+from rigidjax.exact.derivatives import reciprocal, slopes
 from rigidjax.exact.jacobi_duplication import Modulus, half_period, is_endless
 from rigidjax.exact.principal_axes import components_along, principal_frame
 
@@ -110,7 +110,7 @@ def _precession(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
 def _precession_jvp(primals, tangents):
     moments, momentum, period = primals
     (_, _, energy2), (_, d_k, d_energy2) = jax.jvp(reciprocal, (moments, momentum), tangents[:2])
-    _, _, g = first_order(moments, momentum, period)
+    _, _, (_, g) = slopes(moments, momentum, period)
     along = 0.5 * period * d_energy2 + energy2 * tangents[2]
     along = along + sum(w * a * b for w, a, b in zip(HALF, g, d_k, strict=True))
     h = jnp.sqrt(sum(p * p for p in momentum))

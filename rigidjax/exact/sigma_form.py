@@ -32,10 +32,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from rigidjax._types import Scalar
 from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, product, times
 from rigidjax.exact.jacobi_duplication import Modulus, is_endless, limits, until_rest
+from rigidjax.rotation.barrier import barrier
 
 
 class Differences(NamedTuple):
@@ -65,10 +67,12 @@ class Invariants(NamedTuple):
 
 
 class Sigma(NamedTuple):
-    """Hold σ, T, Y at some time; T is scaled so that T₂₂ = 1."""
+    """Hold σ, T, adj T, det T and Y at some time; T is scaled so that T₂₂ = 1."""
 
     s: Scalar
     t: Six
+    adjugate: Six
+    det: Scalar
     y: Six
 
 
@@ -79,9 +83,11 @@ def invariants(body: Differences, momentum: Triple) -> Invariants:
     x1, x2, x3 = p1 * p1, p2 * p2, p3 * p3
     h2 = x1 + x2 + x3
     mixed = 2.0 * (k12 * (p1 * p2) + k13 * (p1 * p3) + k23 * (p2 * p3))
+    h2, mixed = barrier((h2, mixed))
     a1 = d12 * x2 + d13 * x3 - mixed
     a2 = d23 * x3 - d12 * x1 - mixed
     a3 = d13 * x1 + d23 * x2 + mixed
+    a1, a2, a3 = barrier((a1, a2, a3))
     s12, s13, s23 = k12 * k12, k13 * k13, k23 * k23
     return Invariants(
         h2,
@@ -97,35 +103,20 @@ def invariants(body: Differences, momentum: Triple) -> Invariants:
     )
 
 
+# Doublings beyond `limits`, so that the series of `start` have two terms.
+_MORE = 10
+
+
 def start(u: Scalar, v: Invariants) -> Sigma:
-    """Return σ, T, Y at a small u from their Taylor series."""
-    q, p, e12, e13, e23 = v.q, v.p, v.e12, v.e13, v.e23
-    uu = u * u
-    c1 = (p + q) * uu
-    c2 = (p * q - e12 * e12 - e13 * e13 - e23 * e23) * (uu * uu)
-    c3 = (2.0 * e12 * e13 * e23 - q * e23 * e23 - p * e12 * e12) * (uu * uu * uu)
-    s = u * (
-        1.0
-        + (-c1 / 6)
-        + (c1 * c1 / 120 + c2 / 10)
-        - (c1 * c1 * c1 / 5040 + c1 * c2 * (11 / 420) + c3 / 14)
-        + (c1 * c1 * (c1 * c1 / 362880 + c2 * (17 / 5040)) + c1 * c3 / 28 + c2 * c2 / 120)
-    )
-    # T = √(1 − x), x = σ²E.
-    ss = s * s
-    zero = jnp.zeros_like(u)
-    x = (ss * q, zero, ss * p, ss * e12, ss * e13, ss * e23)
-    inner = _add_scalar(_scale(x, 7 / 128), 5 / 64)
-    for c in (1 / 8, 1 / 4, 1.0):
-        inner = _add_scalar(product(x, inner), c)
-    t = _add_scalar(_scale(product(x, inner), -0.5), 1.0)
-    # Y = ⅓u³ (1 − c₁/5 + (2c₁² + 9c₂)/105 + (3/5 − 2c₁/7) x + 3x²/7), x = u²E.
-    r = u * uu / 3
-    x = (q * uu, zero, p * uu, e12 * uu, e13 * uu, e23 * uu)
-    inner = _add_scalar(_scale(x, 3 / 7), 0.6 - (2 / 7) * c1)
-    more = 1.0 + (-c1 / 5 + (2.0 * c1 * c1 + 9.0 * c2) / 105)
-    y = _scale(_add_scalar(product(x, inner), more), r)
-    return _rescale(Sigma(s, t, y))
+    """Return σ, T, Y at a minute u: T = √(1 − x), x = σ²E, to second order in x."""
+    uu, zero = u * u, jnp.zeros_like(u)
+    c1 = (v.p + v.q) * uu
+    s = barrier(u * (1.0 - c1 / 6))
+    x = barrier(_scale((v.q, zero, v.p, v.e12, v.e13, v.e23), s * s))
+    t = tuple(-0.5 * (a + 0.25 * b) for a, b in zip(x, product(x, x), strict=True))
+    # Y = ⅓u³ (1 − c₁/5 + 3x/5).
+    y = _scale(_add_scalar(_scale(x, 0.6), 1.0 - 0.2 * c1), u * uu / 3)
+    return _sigma(s, _add_scalar(t, 1.0), y)
 
 
 def double(f: Sigma, v: Invariants) -> Sigma:
@@ -138,12 +129,14 @@ def double(f: Sigma, v: Invariants) -> Sigma:
     # M = T²: its off-diagonal entries are −σ²E exactly.
     m11, m22, m33 = t1 * t1 + s12 + s13, t2 * t2 + s12 + s23, t3 * t3 + s13 + s23
     m12, m13, m23 = -ss * e12, -ss * e13, -ss * e23
-    x12, x13, x23 = m12 * m12, m13 * m13, m23 * m23
+    m11, m22, m33, m12, m13, m23 = barrier((m11, m22, m33, m12, m13, m23))
+    x12, x13, x23 = barrier((m12 * m12, m13 * m13, m23 * m23))
     n22 = 0.5 * (
         m22 * (m11 + m33)
         - (x12 + x23)
         + ss * (p * m11 + q * m33 - 2.0 * e13 * m13 + e12 * m12 + e23 * m23)
     )
+    n22 = barrier(n22)
     n11 = jnp.where(
         ss * jax.lax.stop_gradient(q) < 0.5,
         n22 - 2.0 * (m33 * (ss * q) + (x13 - x23)),
@@ -157,51 +150,65 @@ def double(f: Sigma, v: Invariants) -> Sigma:
     n12 = 2.0 * (m12 * m33 - m13 * m23)
     n13 = 2.0 * (m13 * m22 - m12 * m23)
     n23 = 2.0 * (m23 * m11 - m12 * m13)
-    det = determinant(f.t)
-    t = (n11, n22, n33, n12, n13, n23)
-    s2 = 2.0 * s * det
-    before = _scale(adjugate(f.t), s / det)
-    after = _scale(adjugate(t), s2 / determinant(t))
-    square = product(before, before)
-    y = tuple(2.0 * a + b for a, b in zip(f.y, product(square, after), strict=True))
-    return _rescale(Sigma(s2, t, y))
+    after = _sigma(2.0 * s * f.det, (n11, n22, n33, n12, n13, n23), f.y)
+    # Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u).
+    before = barrier(_scale(f.adjugate, s / f.det))
+    more = product(barrier(product(before, before)), _scale(after.adjugate, after.s / after.det))
+    return after._replace(y=barrier(tuple(2.0 * a + b for a, b in zip(f.y, more, strict=True))))
 
 
-def momentum_at(
-    body: Differences, v: Invariants, f: Sigma, momentum: Triple
-) -> tuple[Triple, Scalar]:
-    """Return Π after the time of `f`, `momentum` before it, and the factor W divided out."""
+class Divisor(NamedTuple):
+    """Hold the parts of W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²) that do not depend on Π.
+
+    `first` says whether i is 1; else it is 3. For these two i, W is a sum of positive terms. The
+    second factor is, with K without its diagonal in KΠ,
+    `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13 Π₁ Π₃ + |KΠ|² − less`, and `square` is (T²)ᵢᵢ.
+    """
+
+    first: Array
+    square: Scalar
+    d: Scalar
+    slant: Scalar
+    k: Scalar
+    less: Scalar
+
+
+def divisor(body: Differences, v: Invariants, f: Sigma) -> Divisor:
+    """Return the parts of W that do not depend on Π."""
+    one, three = (body.d12, body.d12, body.k12), (body.d23, -body.d23, -body.k23)
+    first, (t1, _, t3, t12, t13, t23) = v.gap > 0, f.t
+    d, slant, k = (jnp.where(first, a, b) for a, b in zip(one, three, strict=True))
+    t, off = jnp.where(first, t1, t3), jnp.where(first, t12, t23)
+    less = jnp.where(first, body.k23, body.k12)
+    square = t * t + off * off + t13 * t13
+    return Divisor(first, square, body.d13 * d, slant, k, v.h2 * (less * less))
+
+
+def move(body: Differences, w: Divisor, f: Sigma, momentum: Triple) -> tuple[Triple, Six]:
+    """Return Π after the time of `f`, and 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ, W that of `w`."""
     p1, p2, p3 = momentum
     d12, d13, d23, k12, k13, k23 = body
-    u1 = -d23 * p2 * p3 + p2 * (k13 * p1 + k23 * p2) - p3 * (k12 * p1 + k23 * p3)
-    u2 = d13 * p1 * p3 + p3 * (k12 * p2 + k13 * p3) - p1 * (k13 * p1 + k23 * p2)
-    u3 = -d12 * p1 * p2 + p1 * (k12 * p1 + k23 * p3) - p2 * (k12 * p2 + k13 * p3)
-    adj, turned = times(adjugate(f.t), momentum), times(f.t, (u1, u2, u3))
-    t1, _, t3, t12, t13, t23 = f.t
-    ss = f.s * f.s
-    # W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²) for each i; 1 and 3 are sums of positive terms.
-    v12, v13, v23 = k12 * (p1 * p2), k13 * (p1 * p3), k23 * (p2 * p3)
-    r1, r2, r3 = k12 * p2 + k13 * p3, k12 * p1 + k23 * p3, k13 * p1 + k23 * p2
-    more = r1 * r1 + r2 * r2 + r3 * r3
-    h2 = p1 * p1 + p2 * p2 + p3 * p3
-    z1 = d12 * d13 * (p1 * p1) + 2.0 * (d13 * v12 + d12 * v13) + (more - h2 * (k23 * k23))
-    z3 = d13 * d23 * (p3 * p3) - 2.0 * (d23 * v13 + d13 * v23) + (more - h2 * (k12 * k12))
-    w = jnp.where(
-        v.gap > 0,
-        t1 * t1 + t12 * t12 + t13 * t13 + ss * z1,
-        t3 * t3 + t13 * t13 + t23 * t23 + ss * z3,
-    )
-    r = 1.0 / w
-    return tuple((a + f.s * b) * r for a, b in zip(adj, turned, strict=True)), w
+    # K without its diagonal, times Π.
+    r1, r2, r3 = barrier((k12 * p2 + k13 * p3, k12 * p1 + k23 * p3, k13 * p1 + k23 * p2))
+    u1 = -d23 * p2 * p3 + p2 * r3 - p3 * r2
+    u2 = d13 * p1 * p3 + p3 * r1 - p1 * r3
+    u3 = -d12 * p1 * p2 + p1 * r2 - p2 * r1
+    adj, turned = barrier((times(f.adjugate, momentum), times(f.t, barrier((u1, u2, u3)))))
+    end = jnp.where(w.first, p1, p3)
+    z = w.d * (end * end) + 2.0 * (d13 * (w.k * (end * p2)) + w.slant * (k13 * (p1 * p3)))
+    z = z + (r1 * r1 + r2 * r2 + r3 * r3 - w.less)
+    r, (a1, a2, a3) = barrier(1.0 / (w.square + f.s * f.s * z)), adj
+    c = barrier(2.0 * f.s * r / f.det)
+    part = tuple(c * x for x in (a1 * a1, a2 * a2, a3 * a3, a1 * a2, a1 * a3, a2 * a3))
+    return barrier((tuple((a + f.s * b) * r for a, b in zip(adj, turned, strict=True)), part))
 
 
-def integral_about(body: Differences, v: Invariants, f: Sigma, k: Triple) -> Six:
-    """Return ∫ Π Πᵀ dt from −u to u about the moment when Π = k; `f` is at u."""
-    _, w = momentum_at(body, v, f, k)
-    alpha = times(adjugate(f.t), k)
-    r = 2.0 * f.s / (w * determinant(f.t))
-    a1, a2, a3 = alpha
-    hh = v.h2
+def quarters(
+    body: Differences, momentum: Triple, v: Invariants, span: Scalar
+) -> tuple[Triple, Six]:
+    """Return Π after `span`, and ∫ Π Πᵀ dt in four parts: T has no inverse at a quarter period."""
+    f, hh = sigma_at(0.125 * span, v), v.h2
+    w = barrier(divisor(body, v, f))
     k12, k13, k23 = (hh * c for c in body[3:])
     b = (
         -v.a2 * v.a3 - k23 * k23,
@@ -211,16 +218,20 @@ def integral_about(body: Differences, v: Invariants, f: Sigma, k: Triple) -> Six
         hh * v.e13,
         hh * v.e23,
     )
-    n = product(b, f.y)
-    return tuple(
-        r * c - 2.0 * d
-        for c, d in zip((a1 * a1, a2 * a2, a3 * a3, a1 * a2, a1 * a3, a2 * a3), n, strict=True)
-    )
+
+    def eighth(i, state):
+        # Each part about its middle.
+        point, total = state
+        point, part = move(body, w, f, point)
+        odd = i % 2 == 1
+        return point, tuple(a + jnp.where(odd, c, 0.0) for a, c in zip(total, part, strict=True))
+
+    return jax.lax.fori_loop(0, 8, eighth, (momentum, _scale(product(b, f.y), -8.0)))
 
 
 def sigma_at(u: Scalar, v: Invariants) -> Sigma:
     """Return σ, T, Y at u: the Taylor series of a small part of u, then doublings."""
-    n = limits(u.dtype).doublings + 3
+    n = limits(u.dtype).doublings + _MORE
     f = start(u * 2.0**-n, v)
     return jax.lax.fori_loop(0, n, lambda _, g: double(g, v), f)
 
@@ -247,54 +258,41 @@ def period(v: Invariants) -> Scalar:
 
     x1, x2, x3 = differences(top)
     f = x1 * x2 * x3 - x1 * off[2] - x2 * off[1] - x3 * off[0] - 2.0 * v.e12 * v.e13 * v.e23
-    x1, x2, x3 = differences(top - f / slope(x1, x2, x3))
-    root = jnp.sqrt(slope(x1, x2, x3))
+    x1, x2, x3 = barrier(differences(barrier(top - f / slope(x1, x2, x3))))
+    root = barrier(jnp.sqrt(slope(x1, x2, x3)))
     a, b = 0.5 * jnp.sqrt(x1 + x2 + x3 + 2.0 * root), jnp.sqrt(root)
-    for _ in range(limits(a.dtype).agm):
-        a, b = 0.5 * (a + b), jnp.sqrt(a * b)
+    mean = lambda _, x: (0.5 * (x[0] + x[1]), jnp.sqrt(x[0] * x[1]))  # noqa: E731
+    a, b = jax.lax.fori_loop(0, limits(a.dtype).agm, mean, (a, b))
     return 2.0 * jnp.pi / a
 
 
 def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tuple[Triple, Six]:
     """Return Π(t) and G = ∫₀ᵗ Π Πᵀ dt."""
-    v = invariants(body, momentum)
+    v = barrier(invariants(body, momentum))
     m = jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap))
     endless = is_endless(m)
     # Dummy invariants keep NaN out of the derivatives if there is no period.
     one, zero = jnp.ones_like(t), jnp.zeros_like(t)
     tame = Invariants(one, one, one, one, zero, one, one, zero, zero, zero)
     usual = jax.tree.map(lambda a, b: jnp.where(endless, b, a), v, tame)
-    count = jnp.round(t / jnp.where(endless, jnp.inf, jax.lax.stop_gradient(period(usual))))
+    count = jnp.round(t / jnp.where(endless, jnp.inf, period(jax.lax.stop_gradient(usual))))
     several = count != 0
-    usual = jax.tree.map(lambda a, b: jnp.where(several, a, b), usual, tame)
-    whole = period(usual)
+    usual = barrier(jax.tree.map(lambda a, b: jnp.where(several, a, b), v, tame))
+    whole = barrier(period(usual))
     r = 2.0 * until_rest(0.5 * (t - jnp.where(several, count * whole, 0.0)), m)
 
-    # About two points of the orbit: T has no inverse a quarter period away.
-    f = sigma_at(0.25 * r, v)
-    half = double(f, v)
-    first, _ = momentum_at(body, v, f, momentum)
-    second, _ = momentum_at(body, v, half, first)
-    out, _ = momentum_at(body, v, double(half, v), momentum)
-    parts = (integral_about(body, v, f, k) for k in (first, second))
-    g = tuple(a + b for a, b in zip(*parts, strict=True))
-
-    # A whole period: four quarters about four points of the orbit.
-    eighth = sigma_at(0.125 * whole, usual)
-    quarter = double(eighth, usual)
-    point, total = momentum, tuple(zero for _ in range(6))
-    for _ in range(4):
-        part = integral_about(body, v, eighth, point)
-        total = tuple(a + b for a, b in zip(total, part, strict=True))
-        point, _ = momentum_at(body, usual, quarter, point)
-    g = tuple(a + jnp.where(several, count * b, 0.0) for a, b in zip(g, total, strict=True))
-    return out, g
+    # The rest and a whole period.
+    both = jax.tree.map(lambda *a: jnp.stack(a), (v, r), (usual, whole))
+    out, g = jax.lax.map(lambda a: quarters(body, momentum, *a), both)
+    g = tuple(c[0] + jnp.where(several, count * c[1], 0.0) for c in g)
+    return tuple(p[0] for p in out), g
 
 
-def _rescale(f: Sigma) -> Sigma:
-    """Scale σ and T by one factor so that T₂₂ = 1 in value."""
-    r = 1.0 / jax.lax.stop_gradient(f.t[1])
-    return Sigma(f.s * r, _scale(f.t, r), f.y)
+def _sigma(s: Scalar, t: Six, y: Six) -> Sigma:
+    """Return `Sigma`, with σ and T scaled by one factor so that T₂₂ = 1 in value."""
+    r = barrier(1.0 / jax.lax.stop_gradient(t[1]))
+    s, t = barrier((s * r, _scale(t, r)))
+    return Sigma(s, t, *barrier((adjugate(t), determinant(t))), y)
 
 
 def _scale(m: Six, r) -> Six:

@@ -7,10 +7,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import Scalar, ScalarLike, Vec3
+from rigidjax._types import NumbersLike, Scalar, ScalarLike, Vec3
 from rigidjax.frames.point import Point
 
 
@@ -34,18 +34,18 @@ class AbstractScene(eqx.Module):
     """
 
     @abc.abstractmethod
-    def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
+    def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
         """Return d²x/dt² (3,), in the frame of the scene: forces per mass (notes, eq 84)."""
 
     @abc.abstractmethod
-    def conserved(self, t: ScalarLike, state: Any) -> dict[str, Scalar]:
+    def conserved(self, t: ScalarLike, state: PyTree) -> dict[str, Scalar]:
         """Return the conserved quantities of the exact motion, by name; empty if there are none."""
 
-    def field(self, t: ScalarLike, y: Any, args: object = None) -> Any:
+    def field(self, t: ScalarLike, y: PyTree, args: object = None) -> Any:
         """Return the vector field `(dx/dt, dv/dt)` as a `Point`, for `diffrax.ODETerm`."""
         return Point(y.v, self.acceleration(t, y))
 
-    def drift(self, ts: Float[Array, " times"], ys: Any) -> dict[str, Scalar]:
+    def drift(self, ts: Float[Array, " times"], ys: PyTree) -> dict[str, Scalar]:
         """Return the largest change of each conserved quantity of `ys` at `ts` (T,) from its first
         value.
 
@@ -79,16 +79,16 @@ class Force(AbstractScene):
         """Return the times, s, at which the force jumps or has a kink, by its own `jump_times`."""
         return jumps_within(self.force)
 
-    def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
+    def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
         if self.force is None:
             return jnp.zeros_like(state.x)
         return per_mass(self.force(t, state, None), self.force)
 
-    def conserved(self, t: ScalarLike, state: Any) -> dict[str, Scalar]:
+    def conserved(self, t: ScalarLike, state: PyTree) -> dict[str, Scalar]:
         return {}
 
 
-def per_mass(value: Any, force: object) -> Vec3:
+def per_mass(value: NumbersLike, force: object) -> Vec3:
     """Return the value of a force after a check of its shape: a user's force may return
     anything.
     """
@@ -96,12 +96,13 @@ def per_mass(value: Any, force: object) -> Vec3:
     return _checks.floating(value, (3,), f"force {name}", hint="force per mass, m/s²")
 
 
-def jumps_within(*laws: Any) -> Float[Array, " n"]:
+def jumps_within(*laws: object) -> Float[Array, " n"]:
     """Return the `jump_times` of the laws that have them, s.
 
     A scene or torque that contains laws must pass their times on: a solver does not see them.
     """
-    found = [jnp.asarray(law.jump_times, float) for law in laws if hasattr(law, "jump_times")]
+    jumps = (getattr(law, "jump_times", None) for law in laws)
+    found = [jnp.asarray(times, float) for times in jumps if times is not None]
     return jnp.concatenate([jnp.zeros(0), *found])
 
 

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
@@ -52,7 +52,7 @@ class InFrame(AbstractScene):
         """Return the times, s, at which a force jumps or has a kink."""
         return jumps_within(self.inside, self.outside)
 
-    def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
+    def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
         now = self.frame.at(t)
         total = now.fictitious(state.x, state.v)
         if self.inside is not None:
@@ -64,7 +64,7 @@ class InFrame(AbstractScene):
             total = total - jax.grad(self.potential)(state.x)
         return total
 
-    def conserved(self, t: ScalarLike, state: Any) -> dict[str, Scalar]:
+    def conserved(self, t: ScalarLike, state: PyTree) -> dict[str, Scalar]:
         frame = self.frame
         steady = isinstance(frame.rotation, Uniform) and frame.origin is None
         if not steady or self.inside is not None or self.outside is not None:
@@ -73,7 +73,7 @@ class InFrame(AbstractScene):
         return {"jacobi": frame.jacobi_integral(state, t, v)}
 
 
-def scene_of(force: Any) -> AbstractScene:
+def scene_of(force: object) -> AbstractScene:
     """Return the scene that `simulate` solves, made from a scene, a moving frame or a plain
     force.
     """
@@ -136,10 +136,9 @@ class BodyInFrame(eqx.Module):
         """Return the times, s, at which the torque jumps or has a kink."""
         return jumps_within(self.torque)
 
-    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | FrameWrench:
+    def __call__(self, t: ScalarLike, state: PyTree, body: _inertia.Body) -> Vec3 | FrameWrench:
         now = self.frame.at(t)
-        # `MassProperties` hold an inertia, about the centre of mass.
-        tensor, omega = getattr(body, "inertia", body).tensor, state.omega
+        tensor, omega = _inertia.tensor_of(body), state.omega
         carried = quaternion.rotate_inverse(state.q, now.rate.astype(omega.dtype))
         change = quaternion.rotate_inverse(state.q, now.rate_change.astype(omega.dtype))
         total = omega + carried
@@ -147,8 +146,10 @@ class BodyInFrame(eqx.Module):
         relative = linalg3.cross(_inertia.apply(tensor, omega), omega)
         needed = _inertia.apply(tensor, change - linalg3.cross(omega, carried))
         torque = gyroscopic - relative - needed
-        moves = hasattr(state, "x")
-        force = body.mass.astype(omega.dtype) * now.fictitious(state.x, state.v) if moves else None
+        force = None
+        if hasattr(state, "x"):
+            mass = body.mass.astype(omega.dtype)  # pyright: ignore[reportAttributeAccessIssue]
+            force = mass * now.fictitious(state.x, state.v)
         if self.torque is not None:
             real = self.torque(t, state, body)
             if hasattr(real, "force"):

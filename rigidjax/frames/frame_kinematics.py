@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+from jaxtyping import PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Vec3, Vector
@@ -29,7 +30,7 @@ class Instant(eqx.Module):
     origin_velocity: Vec3
     origin_acceleration: Vec3
 
-    def to_inertial(self, state: Any) -> Any:
+    def to_inertial(self, state: PyTree) -> Any:
         """Return a state given in S', transformed to S (notes, eqs 85, 88)."""
         _can_travel(state)
         turned = {}
@@ -45,7 +46,7 @@ class Instant(eqx.Module):
             turned["omega"] = state.omega + rate
         return _replace_fields(state, turned)
 
-    def from_inertial(self, state: Any) -> Any:
+    def from_inertial(self, state: PyTree) -> Any:
         """Return a state given in S, transformed to S' (notes, eqs 86, 88)."""
         _can_travel(state)
         turned = {}
@@ -102,7 +103,7 @@ class Instant(eqx.Module):
         return turning + self.translation().astype(x.dtype)
 
 
-def _can_travel(state: Any) -> None:
+def _can_travel(state: PyTree) -> None:
     point = hasattr(state, "x") and hasattr(state, "v")
     attitude = hasattr(state, "q") and hasattr(state, "omega")
     if not (point or attitude):
@@ -118,6 +119,6 @@ def _can_travel(state: Any) -> None:
             _checks.floating(getattr(state, name), (size,), name, hint=hint)
 
 
-def _replace_fields(state: Any, turned: dict[str, Any]) -> Any:
+def _replace_fields(state: PyTree, turned: dict[str, Any]) -> Any:
     names = list(turned)
     return eqx.tree_at(lambda s: [getattr(s, n) for n in names], state, [turned[n] for n in names])

@@ -1,9 +1,10 @@
 """Describe a body in orbit under the gravity-gradient torque: attitude in the orbital frame."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
@@ -14,7 +15,7 @@ from rigidjax.frames.rotation_models import Uniform
 from rigidjax.rotation import linalg3, quaternion
 
 
-class Tide(eqx.Module):
+class OrbitalGravityGradient(eqx.Module):
     """Compute the gravity-gradient torque 3n² u × I u, with u away from the planet (Hughes 1986,
     sec. 8.1).
     """
@@ -23,7 +24,7 @@ class Tide(eqx.Module):
     rate_free: ClassVar[bool] = True
     rate: Scalar
 
-    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3:
+    def __call__(self, t: ScalarLike, state: PyTree, body: _inertia.Inertia) -> Vec3:
         up = quaternion.rotate_inverse(state.q, jnp.eye(3, dtype=state.q.dtype)[0])
         n = self.rate.astype(up.dtype)
         return 3 * n * n * linalg3.cross(up, _inertia.apply(body.tensor, up))
@@ -46,10 +47,12 @@ def libration(rate: ScalarLike) -> BodyInFrame:
     [0.0, 0.0, 0.0]
     """
     n = _checks.finite(_checks.floating(rate, (), "rate"), "rate")
-    return BodyInFrame(MovingFrame(Uniform(n * jnp.eye(3, dtype=n.dtype)[2])), Tide(n))
+    return BodyInFrame(
+        MovingFrame(Uniform(n * jnp.eye(3, dtype=n.dtype)[2])), OrbitalGravityGradient(n)
+    )
 
 
-def libration_integral(state: Any, body: Any, rate: ScalarLike) -> Scalar:
+def libration_integral(state: PyTree, body: _inertia.Inertia, rate: ScalarLike) -> Scalar:
     """Return the Jacobi integral of `libration`, J, which is conserved: ½Ω'·IΩ' + (3/2)n² u·Iu −
     ½n² w·Iw.
 

@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vector
@@ -45,7 +46,7 @@ class MovingFrame(eqx.Module):
 
     def __init__(
         self,
-        rotation: Any,
+        rotation: PyTree,
         origin: Callable[[Any], Any] | None = None,
         rate: Callable[[Any], Any] | None = None,
     ):
@@ -89,7 +90,7 @@ class MovingFrame(eqx.Module):
         m, m_dot = jax.jvp(self.matrix, (t,), (jnp.ones_like(t),))
         return linalg3.vee(linalg3.product(m.T, m_dot))
 
-    def to_inertial(self, state: Any, t: ScalarLike) -> Any:
+    def to_inertial(self, state: PyTree, t: ScalarLike) -> Any:
         """Return a state given in S', transformed to S, of the same type.
 
         **Arguments:** `state` a `Point`, `Attitude` or `Rigid`, or any Module with `x` and `v`,
@@ -106,7 +107,7 @@ class MovingFrame(eqx.Module):
         """
         return self.at(t).to_inertial(state)
 
-    def from_inertial(self, state: Any, t: ScalarLike) -> Any:
+    def from_inertial(self, state: PyTree, t: ScalarLike) -> Any:
         """Return a state given in S, transformed to S': the inverse of `to_inertial`.
 
         **Arguments:** as for `to_inertial`. x' = Mᵀ(x − X), v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs
@@ -174,7 +175,7 @@ class MovingFrame(eqx.Module):
         """Return F = M f (3,): a force f, or any direction, in the axes of S (notes, eq 85)."""
         return linalg3.apply(self.matrix(t), _checks.floating(force, (3,), "force"))
 
-    def jacobi_integral(self, state: Any, t: ScalarLike, potential: ScalarLike = 0.0) -> Scalar:
+    def jacobi_integral(self, state: PyTree, t: ScalarLike, potential: ScalarLike = 0.0) -> Scalar:
         """Return ½|v'|² − ½|Ω × x'|² + V, m²/s²: conserved if Ω and V(x') do not depend on time.
 
         **Arguments:** `state` a `Point` in S'; `t` s; `potential` V per mass at its place, m²/s².
@@ -212,7 +213,7 @@ class MovingFrame(eqx.Module):
         return _checks.floating(self.origin(t), (3,), "origin").astype(t.dtype)
 
 
-def require_frame(frame: Any, name: str) -> Any:
+def require_frame(frame: object, name: str) -> Any:
     """Return `frame` if it is a `MovingFrame`; raise `TypeError` for anything else."""
     hint = "make one from a rotation with MovingFrame(rotation)"
     return _checks.instance(frame, MovingFrame, name, wanted="a MovingFrame", hint=hint)
@@ -222,26 +223,26 @@ class _Composed(eqx.Module):
     outer: MovingFrame
     inner: MovingFrame
 
-    def rotation(self, t: Any) -> Any:
+    def rotation(self, t: ScalarLike) -> Any:
         return linalg3.product(self.outer.matrix(t), self.inner.matrix(t))
 
-    def rate(self, t: Any) -> Any:
+    def rate(self, t: ScalarLike) -> Any:
         # Rates are added in one set of axes, which saves one derivative of the product.
         carried = linalg3.apply(self.inner.matrix(t).T, self.outer.angular_velocity(t))
         return carried + self.inner.angular_velocity(t)
 
-    def origin(self, t: Any) -> Any:
+    def origin(self, t: ScalarLike) -> Any:
         return self.outer.place(t) + linalg3.apply(self.outer.matrix(t), self.inner.place(t))
 
 
 class _Inverse(eqx.Module):
     frame: MovingFrame
 
-    def rotation(self, t: Any) -> Any:
+    def rotation(self, t: ScalarLike) -> Any:
         return self.frame.matrix(t).T
 
-    def rate(self, t: Any) -> Any:
+    def rate(self, t: ScalarLike) -> Any:
         return -linalg3.apply(self.frame.matrix(t), self.frame.angular_velocity(t))
 
-    def origin(self, t: Any) -> Any:
+    def origin(self, t: ScalarLike) -> Any:
         return -linalg3.apply(self.frame.matrix(t).T, self.frame.place(t))

@@ -4,7 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks, _show
 from rigidjax._types import Vectors
@@ -34,7 +34,7 @@ class Point(eqx.Module):
         self.x, self.v = x.astype(dtype), v.astype(dtype)
 
 
-def require_point(state: Any, name: str = "state") -> Any:
+def require_point(state: PyTree, name: str = "state") -> Any:
     """Return `state` if it has one place and one velocity; raise an error for anything else."""
     if isinstance(state, type) or not (hasattr(state, "x") and hasattr(state, "v")):
         raise TypeError(f"{name}: wanted a Point(x, v), got {_checks.kind(state)}")

@@ -7,10 +7,10 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Vec3
+from rigidjax._types import Mat3, ScalarLike, Vec3
 from rigidjax.rotation import linalg3, quaternion, so3
 from rigidjax.rotation.validation import near_unit, rotation_matrix
 
@@ -27,11 +27,11 @@ class Uniform(eqx.Module):
     def __init__(self, omega: Float[Array, "3"] | object):
         self.omega = _checks.finite(_checks.floating(omega, (3,), "omega"), "omega")
 
-    def __call__(self, t: Any) -> Mat3:
+    def __call__(self, t: ScalarLike) -> Mat3:
         t = _checks.time(t)
         return so3.exp(t * self.omega.astype(t.dtype))
 
-    def rate(self, t: Any) -> Vec3:
+    def rate(self, t: ScalarLike) -> Vec3:
         """Return Ω, which is constant."""
         return self.omega.astype(_checks.time(t).dtype)
 
@@ -54,34 +54,34 @@ class AboutAxis(eqx.Module):
         self.axis = _checks.refuse(axis, length == 0, "axis: wanted a direction, got zero") / length
         self.angle = angle
 
-    def __call__(self, t: Any) -> Mat3:
+    def __call__(self, t: ScalarLike) -> Mat3:
         t = _checks.time(t)
         return so3.exp(_checks.floating(self.angle(t), (), "angle") * self.axis.astype(t.dtype))
 
-    def rate(self, t: Any) -> Vec3:
+    def rate(self, t: ScalarLike) -> Vec3:
         """Return Ω (3,), rad/s: the axis times the angle's derivative."""
         t = _checks.time(t)
         _, speed = jax.jvp(self.angle, (t,), (jnp.ones_like(t),))
         return speed * self.axis.astype(t.dtype)
 
 
-def differentiable(rotation: Any) -> Any:
+def differentiable(rotation: PyTree) -> Any:
     """Return `rotation` with its own solves in forward mode, which dΩ/dt needs."""
 
-    def reverse(part: Any) -> bool:
+    def reverse(part: PyTree) -> bool:
         return isinstance(part, dfx.RecursiveCheckpointAdjoint)
 
     return jax.tree.map(lambda p: dfx.ForwardMode() if reverse(p) else p, rotation, is_leaf=reverse)
 
 
-def state_of(rotation: Any, t: Array) -> Any:
+def state_of(rotation: PyTree, t: Array) -> Any:
     """Return the value of `rotation` at `t`: a matrix, a quaternion, or a state with `q` and
     `omega`.
     """
     return rotation.evaluate(t) if hasattr(rotation, "evaluate") else rotation(t)
 
 
-def matrix(rotation: Any, t: Array) -> Mat3:
+def matrix(rotation: PyTree, t: Array) -> Mat3:
     """Return M(t) of the rotation of a frame: a function to (3, 3) or (4,), or a solution."""
     value = state_of(rotation, t)
     value = getattr(value, "q", value)

@@ -70,7 +70,7 @@ class LagrangeEquations(eqx.Module):
         momentum = jax.grad(self._value, argnums=1)(y.q, y.rate)
         return jnp.sum(y.rate * momentum) - self._value(y.q, y.rate)
 
-    def _value(self, q: Any, rate: Any) -> Scalar:
+    def _value(self, q: Array, rate: Array) -> Scalar:
         return _checks.floating(self.lagrangian(q, rate), (), "lagrangian", hint="one number, J")
 
 

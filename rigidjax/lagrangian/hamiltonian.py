@@ -108,7 +108,7 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
     return LiePoissonWithDirection(_checks.function(hamiltonian, "hamiltonian", _WANTED))
 
 
-def _invertible(inertia: Any) -> _inertia.Inertia:
+def _invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
     _checks.single(inertia, _inertia.Inertia, "inertia")
     return validation.check_body(inertia, inertia.tensor, None, throw=False)
 

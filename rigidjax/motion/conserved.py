@@ -4,12 +4,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3
 from rigidjax.body.energy import angular_momentum, kinetic_energy
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.torques import AbstractTorque, CentralGravity
 from rigidjax.motion.torques.base import Torque, in_precision, length_or_zero, require_scene
@@ -107,7 +107,7 @@ def conserved(
 
 def drift(
     ts: Float[Array, " times"],
-    ys: Any,
+    ys: PyTree,
     body: Inertia | MassProperties,
     torque: Torque | None = None,
 ) -> dict[str, Scalar]:
@@ -151,7 +151,9 @@ def drift(
     return found
 
 
-def _scene(body: Any, state: Any, torque: Any, t: Any) -> tuple[Any, tuple[Any, ...], Scalar]:
+def _scene(
+    body: Body, state: PyTree, torque: Torque | None, t: ScalarLike
+) -> tuple[Any, tuple[Any, ...], Scalar]:
     """Return the body's state, its torques with their own states inserted, and the time."""
     if isinstance(state, Coupled):
         state, torque = state.motion, freeze(torque, state.own)
@@ -161,7 +163,7 @@ def _scene(body: Any, state: Any, torque: Any, t: Any) -> tuple[Any, tuple[Any, 
     return state, parts, _checks.floating(t, (), "t")
 
 
-def _energy(body: Any, state: HasSpin, parts: tuple[Any, ...], t: Scalar) -> Scalar:
+def _energy(body: Body, state: HasSpin, parts: tuple[Any, ...], t: Scalar) -> Scalar:
     dtype, total = state.omega.dtype, kinetic_energy(body, state)
     for part in parts:
         value = in_precision(part, dtype).energy(t.astype(dtype), state, body)
@@ -169,7 +171,7 @@ def _energy(body: Any, state: HasSpin, parts: tuple[Any, ...], t: Scalar) -> Sca
     return total
 
 
-def _momentum(body: Any, state: HasSpin, parts: tuple[Any, ...], t: ScalarLike) -> Vec3:
+def _momentum(body: Body, state: HasSpin, parts: tuple[Any, ...], t: ScalarLike) -> Vec3:
     """Return the whole angular momentum, (3,), body frame: that of the body plus that of the
     wheels.
     """
@@ -180,7 +182,7 @@ def _momentum(body: Any, state: HasSpin, parts: tuple[Any, ...], t: ScalarLike) 
     return momentum
 
 
-def _spin_size(body: Any, state: Any, torque: Torque | None, t: ScalarLike) -> Scalar:
+def _spin_size(body: Body, state: PyTree, torque: Torque | None, t: ScalarLike) -> Scalar:
     state, parts, t = _scene(body, state, torque, t)
     return length_or_zero(_momentum(in_precision(body, state.omega.dtype), state, parts, t))
 

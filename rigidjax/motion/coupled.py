@@ -4,10 +4,11 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+from jaxtyping import PyTree
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, ScalarLike
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.motion.torques.base import in_precision
 from rigidjax.motion.torques.states import first_states, freeze, has_states, rates_of
 
@@ -29,7 +30,7 @@ class Coupled(eqx.Module):
     own: tuple[Any, ...]
 
     @staticmethod
-    def start(body: Any, state0: Any, torque: Any, t: ScalarLike = 0.0) -> "Coupled":
+    def start(body: Body | None, state0: PyTree, torque: PyTree, t: ScalarLike = 0.0) -> "Coupled":
         """Return the `Coupled` of `state0` and the initial states of `torque` (see
         `rigidjax.simulate`) at `t`, s.
         """
@@ -55,13 +56,13 @@ class CoupledEquations(eqx.Module):
         return Coupled(freeze(self.field, y.own)(t, y.motion, args), own)
 
 
-def with_own_states(body: Any, state0: Any, torque: Any, t: ScalarLike) -> Any:
+def with_own_states(body: Body | None, state0: PyTree, torque: PyTree, t: ScalarLike) -> Any:
     """Return `state0`, as a `Coupled` if the torque has states of its own."""
     if isinstance(state0, Coupled) or not has_states(torque):
         return state0
     return Coupled.start(body, state0, torque, t)
 
 
-def motion_of(y: Any) -> Any:
+def motion_of(y: PyTree) -> Any:
     """Return the body's part of the state `y`, which may be a `Coupled`."""
     return y.motion if isinstance(y, Coupled) else y

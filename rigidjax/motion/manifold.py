@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax._types import HasAttitude
 from rigidjax.rotation import quaternion
@@ -21,20 +21,20 @@ from rigidjax.rotation.kernels import quaternion_to_vector, vector_to_quaternion
 from rigidjax.rotation.linalg3 import components
 
 
-def dimension(state: Any) -> int:
+def dimension(state: PyTree) -> int:
     """Return the size of a change of `state`: the count of its numbers, less one for each
     quaternion.
     """
     return max((place.stop for place in _places(state)), default=0)
 
 
-def names(state: Any) -> tuple[str, ...]:
+def names(state: PyTree) -> tuple[str, ...]:
     """Return the names of the leaves, in the order of their numbers in a change."""
     paths = jax.tree.leaves_with_path(state)
     return tuple(jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths)
 
 
-def parts(state: Any, change: Float[Array, "*batch n"]) -> dict[str, Float[Array, "*batch _"]]:
+def parts(state: PyTree, change: Float[Array, "*batch n"]) -> dict[str, Float[Array, "*batch _"]]:
     """Return the numbers of each leaf in a change, by name; a quaternion has three numbers
     there.
     """
@@ -42,13 +42,13 @@ def parts(state: Any, change: Float[Array, "*batch n"]) -> dict[str, Float[Array
     return dict(zip(names(state), cut, strict=True))
 
 
-def turns(state: Any) -> tuple[slice, ...]:
+def turns(state: PyTree) -> tuple[slice, ...]:
     """Return the slices of the rotation vectors in a change, one for each quaternion."""
     pairs = zip(_places(state), _is_quaternion(state), strict=True)
     return tuple(place for place, turned in pairs if turned)
 
 
-def plus(state: Any, change: Float[Array, " n"]) -> Any:
+def plus(state: PyTree, change: Float[Array, " n"]) -> Any:
     """Return `state ⊕ change`: q exp(δθ) for quaternions, sums for other leaves; exactly `state` at
     0.
     """
@@ -59,7 +59,7 @@ def plus(state: Any, change: Float[Array, " n"]) -> Any:
     return _leaf_by_leaf(state, change, turned, jnp.add)
 
 
-def minus(state: Any, reference: Any) -> Float[Array, " n"]:
+def minus(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
     """Return `state ⊖ reference`: the change with `plus(reference, change) = state`, a turn of up
     to π.
     """
@@ -71,7 +71,7 @@ def minus(state: Any, reference: Any) -> Float[Array, " n"]:
     )
 
 
-def minus_small(state: Any, reference: Any) -> Float[Array, " n"]:
+def minus_small(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
     """Return `state ⊖ reference` for a near state, without an arctangent.
 
     A turn by θ gives 2 sin(θ/2), not θ.
@@ -85,12 +85,12 @@ def minus_small(state: Any, reference: Any) -> Float[Array, " n"]:
     return _vector(state, reference, turn, jnp.subtract)
 
 
-def tangent(state: Any, change: Float[Array, " n"]) -> Any:
+def tangent(state: PyTree, change: Float[Array, " n"]) -> Any:
     """Return the derivative of `plus(state, ·)` at zero along `change`: a tangent vector of JAX."""
     return _leaf_by_leaf(state, change, quaternion.rate, lambda _, part: part)
 
 
-def coordinates(state: Any, along: Any) -> Float[Array, " n"]:
+def coordinates(state: PyTree, along: PyTree) -> Float[Array, " n"]:
     """Return the change whose `tangent` at `state` is `along`: the inverse of `tangent`."""
     return _vector(
         along,
@@ -100,7 +100,7 @@ def coordinates(state: Any, along: Any) -> Float[Array, " n"]:
     )
 
 
-def _is_quaternion(state: Any) -> list[bool]:
+def _is_quaternion(state: PyTree) -> list[bool]:
     """Return, for each leaf, whether it is the quaternion of a state with an attitude."""
     out = []
     for node in jax.tree.leaves(state, is_leaf=lambda node: isinstance(node, HasAttitude)):
@@ -109,7 +109,7 @@ def _is_quaternion(state: Any) -> list[bool]:
     return out
 
 
-def _places(state: Any) -> list[slice]:
+def _places(state: PyTree) -> list[slice]:
     """Return the slice of each leaf's numbers in a change."""
     end, out = 0, []
     for leaf, turned in zip(jax.tree.leaves(state), _is_quaternion(state), strict=True):
@@ -119,7 +119,7 @@ def _places(state: Any) -> list[slice]:
 
 
 def _leaf_by_leaf(
-    state: Any,
+    state: PyTree,
     change: Array,
     of_quaternion: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
@@ -133,8 +133,8 @@ def _leaf_by_leaf(
 
 
 def _vector(
-    first: Any,
-    second: Any,
+    first: PyTree,
+    second: PyTree,
     of_quaternions: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> Array:

@@ -3,26 +3,29 @@ branches.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.orbits import differential_correction as correction
 from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing, index_of_held, orbit_of
 
+if TYPE_CHECKING:
+    from rigidjax.orbits.reversible_scene import AbstractReversible
+
 # Steps of the search for a branching.
 _MOST = 60
 
 
 def family(
-    scene: Any,
+    scene: "AbstractReversible",
     orbit: PeriodicOrbit,
     values: Float[ArrayLike, " members"] | Sequence[float],
     *,
@@ -79,7 +82,9 @@ def _orbits_or_error(
 
 
 @eqx.filter_jit
-def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: float) -> Any:
+def _at_values(
+    scene: "AbstractReversible", start: Array, held: Array, index: int, tolerance: float
+) -> Any:
     free = np.delete(np.arange(4), index)
     still = jax.tree.map(lambda n: lax.stop_gradient(n) if eqx.is_array(n) else n, scene)
 
@@ -98,7 +103,9 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
     return out
 
 
-def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> PeriodicOrbit:
+def family_slope(
+    scene: "AbstractReversible", orbit: PeriodicOrbit, *, hold: str = "x"
+) -> PeriodicOrbit:
     """Return the derivative by `hold` of an orbit's start and period along its family.
 
     **Arguments:** `orbit` a member of the family; `hold` as in `family`. **Returns** the
@@ -116,7 +123,9 @@ def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> Period
     return _checks.refuse(change, turned, words)
 
 
-def _slope_along_family(scene: Any, numbers: Array, index: int) -> Float[Array, "3"]:
+def _slope_along_family(
+    scene: "AbstractReversible", numbers: Array, index: int
+) -> Float[Array, "3"]:
     """Return the derivative of the other three numbers of an orbit by the held number, along its
     family.
     """
@@ -127,7 +136,7 @@ def _slope_along_family(scene: Any, numbers: Array, index: int) -> Float[Array, 
 
 
 @eqx.filter_jit
-def _slope(scene: Any, numbers: Array, index: int) -> PeriodicOrbit:
+def _slope(scene: "AbstractReversible", numbers: Array, index: int) -> PeriodicOrbit:
     unknown = _slope_along_family(scene, numbers, index)
     change = orbit_of(correction.insert_held(unknown, jnp.ones_like(unknown[0]), index))
     # To hold `period` means the whole period; the fourth of `numbers` is half of it.
@@ -135,7 +144,12 @@ def _slope(scene: Any, numbers: Array, index: int) -> PeriodicOrbit:
 
 
 def follow(
-    scene: Any, orbit: PeriodicOrbit, step: ScalarLike, count: int, *, rising: str = "x"
+    scene: "AbstractReversible",
+    orbit: PeriodicOrbit,
+    step: ScalarLike,
+    count: int,
+    *,
+    rising: str = "x",
 ) -> PeriodicOrbit:
     """Return the next `count` members of a family, at fixed steps of arclength, past its folds.
 
@@ -164,7 +178,9 @@ def follow(
 
 
 @eqx.filter_jit
-def _follow(scene: Any, start: Array, step: Array, count: int, index: int, tolerance: float) -> Any:
+def _follow(
+    scene: "AbstractReversible", start: Array, step: Array, count: int, index: int, tolerance: float
+) -> Any:
     def missed(numbers: Array) -> Array:
         return correction.periodicity_residual(scene, numbers)
 
@@ -174,7 +190,7 @@ def _follow(scene: Any, start: Array, step: Array, count: int, index: int, toler
         along = jnp.linalg.solve(rows, jnp.zeros(4, start.dtype).at[3].set(1))
         return along / jnp.sqrt(jnp.sum(along * along))
 
-    def forward(carry: Any, _member: Any) -> Any:
+    def forward(carry: PyTree, _member: None) -> Any:
         last, before = carry
         _, matrix = correction.value_and_jacobian(missed, last)
         along = tangent(matrix, before)
@@ -205,7 +221,7 @@ def stability_indices(monodromy: Float[Array, "6 6"]) -> Complex[Array, "2"]:
 
 
 def bifurcation(
-    scene: Any,
+    scene: "AbstractReversible",
     orbit: PeriodicOrbit,
     other: PeriodicOrbit,
     *,
@@ -253,7 +269,7 @@ def bifurcation(
     return found[root]
 
 
-def _index(scene: Any, orbit: PeriodicOrbit, index: int) -> float:
+def _index(scene: "AbstractReversible", orbit: PeriodicOrbit, index: int) -> float:
     found = np.asarray(_indices(scene, orbit))[index]
     if abs(found.imag) > 1e-9 * max(1.0, abs(found)):
         words = "the stability indices are complex at a member between the orbits"
@@ -262,5 +278,5 @@ def _index(scene: Any, orbit: PeriodicOrbit, index: int) -> float:
 
 
 @eqx.filter_jit
-def _indices(scene: Any, orbit: PeriodicOrbit) -> Array:
+def _indices(scene: "AbstractReversible", orbit: PeriodicOrbit) -> Array:
     return scene.stability_indices(orbit)

@@ -3,10 +3,10 @@ problem.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, ArrayLike, Complex, Float
 
 from rigidjax import _checks
@@ -18,7 +18,7 @@ from rigidjax.orbits.reversible_scene import AbstractReversible
 from rigidjax.rotation.linalg3 import components
 
 
-def smallest_distance(dtype: Any) -> float:
+def smallest_distance(dtype: DTypeLike) -> float:
     """Return eps^0.4, the distance r at which an attraction is known only to eps/r = eps^0.6."""
     return float(jnp.finfo(dtype).eps) ** 0.4
 

@@ -1,5 +1,6 @@
 """Find periodic orbits by Newton's method, with the derivatives of their family."""
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
@@ -42,7 +43,7 @@ class PeriodicOrbit(eqx.Module):
 
 
 def periodic_orbit(
-    scene: Any, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float | None = None
+    scene: AbstractScene, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float | None = None
 ) -> PeriodicOrbit:
     """Return the periodic orbit near `guess`, by differentiable correction.
 
@@ -149,7 +150,7 @@ def state_after(
 
 
 def transition(
-    scene: Any, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
+    scene: AbstractScene, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
 ) -> Float[Array, "6 6"]:
     """Return the state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) from `state`, by forward
     mode.
@@ -160,12 +161,12 @@ def transition(
 
 
 @eqx.filter_jit
-def _transition(scene: Any, numbers: Array, t: Array, rtol: float, atol: float) -> Array:
+def _transition(scene: AbstractScene, numbers: Array, t: Array, rtol: float, atol: float) -> Array:
     # The tangents are solved along with the motion.
     return jax.jacfwd(lambda n: state_after(scene, n, t, rtol=rtol, atol=atol))(numbers)
 
 
-def periodicity_residual(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
+def periodicity_residual(scene: AbstractScene, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
     """Return y, v_x and v_z at the half period: an orbit is periodic if they vanish."""
     orbit = orbit_of(numbers)
     tight = float(jnp.finfo(numbers.dtype).eps)
@@ -175,22 +176,22 @@ def periodicity_residual(scene: Any, numbers: Float[Array, "4"]) -> Float[Array,
     return jnp.where(out.result == dfx.RESULTS.successful, left, jnp.nan)
 
 
-def value_and_jacobian(f: Any, x: Array) -> tuple[Array, Array]:
+def value_and_jacobian(f: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
     """Return f(x) and its Jacobian from one pass in forward mode."""
     along = jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 1))
     return along(jnp.eye(x.shape[0], dtype=x.dtype))
 
 
-def newton(f: Any, x: Array, tolerance: float) -> Array:
+def newton(f: Callable[[Array], Array], x: Array, tolerance: float) -> Array:
     """Return a zero of `f` near `x`, by Newton steps until the residual is below a tenth of the
     tolerance.
     """
 
-    def keep_on(carry: Any) -> Any:
+    def keep_on(carry: tuple[Array, Array, Array]) -> Any:
         _, left, count = carry
         return (left > 0.1 * tolerance) & (count < MAX_STEPS)
 
-    def step(carry: Any) -> Any:
+    def step(carry: tuple[Array, Array, Array]) -> Any:
         x, _, count = carry
         missed, slope = value_and_jacobian(f, x)
         moved = x - jnp.linalg.solve(slope, missed)
@@ -204,12 +205,14 @@ def newton(f: Any, x: Array, tolerance: float) -> Array:
 # Newton's method itself is not differentiated. The rule below is linear in the tangents, so that
 # one rule serves jacfwd and grad, although the solves inside run in forward mode.
 @eqx.filter_jit
-def _solve(scene: Any, unknown: Array, held: Array, index: int, tolerance: float) -> Any:
+def _solve(scene: AbstractScene, unknown: Array, held: Array, index: int, tolerance: float) -> Any:
     return correct_orbit(index, float(tolerance), scene, unknown, held)
 
 
 @eqx.filter_custom_jvp
-def correct_orbit(index: int, tolerance: float, scene: Any, unknown: Array, held: Array) -> Any:
+def correct_orbit(
+    index: int, tolerance: float, scene: AbstractScene, unknown: Array, held: Array
+) -> Any:
     def missed(unknown: Array) -> Array:
         return periodicity_residual(scene, insert_held(unknown, held, index))
 
@@ -218,7 +221,7 @@ def correct_orbit(index: int, tolerance: float, scene: Any, unknown: Array, held
 
 
 @correct_orbit.def_jvp
-def _correct_orbit_jvp(primals: Any, tangents: Any) -> Any:
+def _correct_orbit_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents
     found, left = correct_orbit(index, tolerance, scene, unknown, held)

@@ -1,7 +1,7 @@
 """Compute stable and unstable manifolds of periodic orbits."""
 
 from functools import partial
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import diffrax as dfx
 import equinox as eqx
@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -17,6 +18,9 @@ from rigidjax.frames.point import Point
 from rigidjax.orbits import continuation
 from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing, integrate, state_after
 from rigidjax.solve.run import Ends
+
+if TYPE_CHECKING:
+    from rigidjax.orbits.reversible_scene import AbstractReversible
 
 # A motion backwards in time is the mirror image in y → −y: x, y, z, vx, vy, vz.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
@@ -64,7 +68,7 @@ def unstable_direction(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Ar
     near = value * (1 + jnp.finfo(value.dtype).eps ** 0.5)
     still, shift = lax.stop_gradient((monodromy, near))
 
-    def closer(_: Array, both: Any) -> Any:
+    def closer(_: Array, both: tuple[Array, Array]) -> Any:
         right, left = both
         right = jnp.linalg.solve(still - shift * eye, right)
         left = jnp.linalg.solve((still - shift * eye).T, left)
@@ -84,7 +88,12 @@ def unstable_direction(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Ar
 
 
 def manifold_point(
-    scene: Any, orbit: PeriodicOrbit, phase: Scalar, branch: Branch, side: int, distance: Scalar
+    scene: "AbstractReversible",
+    orbit: PeriodicOrbit,
+    phase: Scalar,
+    branch: Branch,
+    side: int,
+    distance: Scalar,
 ) -> tuple[Point, Scalar]:
     """Return the start of the manifold at `phase`, and the multiplier: see `manifold_start`."""
     _checks.word(branch, ("stable", "unstable"), "branch")
@@ -96,7 +105,12 @@ def manifold_point(
 
 @eqx.filter_jit
 def _manifold_point(
-    scene: Any, orbit: PeriodicOrbit, phase: Scalar, branch: Branch, side: int, distance: Scalar
+    scene: "AbstractReversible",
+    orbit: PeriodicOrbit,
+    phase: Scalar,
+    branch: Branch,
+    side: int,
+    distance: Scalar,
 ) -> tuple[Point, Scalar]:
     value, vector = unstable_direction(scene.monodromy(orbit))
     # The mirror image of the unstable manifold is the stable one, with the opposite phase.
@@ -113,7 +127,7 @@ def _manifold_point(
 
 
 def manifold(
-    scene: Any,
+    scene: "AbstractReversible",
     orbit: PeriodicOrbit,
     branch: Branch,
     *,
@@ -159,7 +173,7 @@ def manifold(
 
 
 def manifold_start(
-    scene: Any,
+    scene: "AbstractReversible",
     orbit: PeriodicOrbit,
     phase: ScalarLike,
     branch: Branch,
@@ -185,13 +199,15 @@ def manifold_start(
     return manifold_point(scene, orbit, where, branch, side, away)[0]
 
 
-def _positive(value: ScalarLike, name: str, dtype: Any) -> Array:
+def _positive(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
     found = _checks.floating(value, (), name)
     return _checks.sign(found if dtype is None else found.astype(dtype), name, "a positive number")
 
 
 @eqx.filter_jit
-def _manifold_trajectories(scene: Any, starts: Point, ts: Array, branch: Branch) -> Point:
+def _manifold_trajectories(
+    scene: "AbstractReversible", starts: Point, ts: Array, branch: Branch
+) -> Point:
     mirror = jnp.asarray(_MIRROR, ts.dtype)
     turn = branch == "stable"
 

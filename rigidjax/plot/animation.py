@@ -10,10 +10,10 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Float, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude
+from rigidjax._types import HasAttitude, NumbersLike
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.principal_axes import principal
@@ -154,7 +154,7 @@ def tumble(
     return Film(out.getvalue(), "gif", size)
 
 
-def _length(ts: Any, seconds: float | int | None, fps: float | int) -> tuple[float, int]:
+def _length(ts: NumbersLike, seconds: float | int | None, fps: float | int) -> tuple[float, int]:
     """Return the seconds of a film, and its number of pictures."""
     if seconds is None:
         when = _checks.on_host(ts, "ts")
@@ -203,7 +203,9 @@ def player(
     return Film(page.encode("utf-8"), "html", height)
 
 
-def _record(server: Any, corners: Any, tip: Any, reach: float, q: Any, seconds: float) -> str:
+def _record(
+    server: Any, corners: np.ndarray, tip: np.ndarray, reach: float, q: np.ndarray, seconds: float
+) -> str:
     scene = server.scene
     scene.set_up_direction("+z")
     server.initial_camera.position = tuple(1.8 * reach * np.array([1.0, -1.2, 0.7]))
@@ -225,7 +227,7 @@ def _record(server: Any, corners: Any, tip: Any, reach: float, q: Any, seconds: 
     return recording.as_html()
 
 
-def evenly(ts: Any, states: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
+def evenly(ts: NumbersLike, states: PyTree, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return `count` evenly spaced times, and the attitudes (count, 4) at these times, along the
     shorter arc.
     """

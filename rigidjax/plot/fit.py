@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import ArrayLike, PyTree
 
 from rigidjax.plot.style import COLOURS, RATES, TIMES, of_fit, plain, pyplot, unit
 from rigidjax.rotation import quaternion
@@ -60,7 +61,13 @@ def _fill_between_samples(found: Any, record: Any, index: int) -> tuple[np.ndarr
 
 
 def _one_sensor(
-    upper: Any, lower: Any, ts: Any, reading: Any, errors: np.ndarray, dense: Any, units: Any
+    upper: Any,
+    lower: Any,
+    ts: ArrayLike,
+    reading: Any,
+    errors: np.ndarray,
+    dense: tuple[np.ndarray, PyTree] | None,
+    units: tuple[float, float, str],
 ) -> None:
     (seconds, rate, rate_unit), seen, sensor = units, reading.seen, reading.sensor
     t = np.asarray(ts) / seconds
@@ -99,5 +106,5 @@ def _one_sensor(
             lower.plot(t[seen], errors[seen, axis] * scale, color=colour, alpha=0.7, **mark)
 
 
-def _long_axis(q: Any) -> np.ndarray:
+def _long_axis(q: ArrayLike) -> np.ndarray:
     return np.asarray(jax.vmap(lambda one: quaternion.rotate(one, jnp.eye(3)[2]))(jnp.asarray(q)))

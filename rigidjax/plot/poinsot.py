@@ -46,7 +46,12 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
 
 
 def polhode(
-    inertia: Inertia, states: HasSpin, *, energies: int = 9, title: str = "", ax: Any = None
+    inertia: Inertia,
+    states: HasSpin,
+    *,
+    energies: int = 9,
+    title: str = "",
+    ax: Any = None,
 ) -> Any:
     """Draw the path of Π = IΩ on the intersection of the sphere |Π| = h and the ellipsoid ΣΠᵢ²/Iᵢ =
     2T.

@@ -42,7 +42,7 @@ def residuals(
     return ax
 
 
-def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -> None:
+def _one_sensor(row: np.ndarray, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -> None:
     over_time, spread, memory, spectrum = row
     colours, names = COLOURS[: scaled.shape[1]], "xyz"[: scaled.shape[1]]
     everything = scaled[seen].ravel()

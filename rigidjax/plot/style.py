@@ -36,7 +36,7 @@ def unit(name: str, known: dict[str, float], what: str) -> float:
     return known[_checks.word(name, tuple(known), what)]
 
 
-def of_fit(found: Any, index: Any) -> tuple[Any, list[np.ndarray], list[np.ndarray]]:
+def of_fit(found: Any, index: object) -> tuple[Any, list[np.ndarray], list[np.ndarray]]:
     """Return a recording of a fit, its residuals and their standard deviations; raise an error if
     there is none.
     """
@@ -96,7 +96,7 @@ def legend_below(ax: Any, *entries: Any, down: float = 0.16) -> None:
     ax.legend(*entries, **place, ncols=3, fontsize=8, frameon=False)
 
 
-def times(ts: Any, count: int, what: str = "the states have") -> np.ndarray:
+def times(ts: object, count: int, what: str = "the states have") -> np.ndarray:
     """Return the times (T,) as NumPy float64. **Raises:** `ValueError` unless there are as many
     times as states.
     """
@@ -106,7 +106,7 @@ def times(ts: Any, count: int, what: str = "the states have") -> np.ndarray:
     return t
 
 
-def rows(values: Any, width: int, name: str) -> np.ndarray:
+def rows(values: object, width: int, name: str) -> np.ndarray:
     """Return values of one body over time (T, width) as NumPy float64. **Raises:** `ValueError` for
     another shape.
     """

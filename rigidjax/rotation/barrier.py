@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 Tree = TypeVar("Tree")
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -69,23 +69,23 @@ def one_kernel(function: Function) -> Function:
 
     @jax.custom_jvp
     @functools.wraps(function)
-    def call(*args: Any) -> Any:
+    def call(*args: PyTree) -> Any:
         return call_unbatched(*args)
 
     @jax.custom_batching.custom_vmap
-    def call_unbatched(*args: Any) -> Any:
+    def call_unbatched(*args: PyTree) -> Any:
         first = jax.tree.leaves(args)[0].ravel()[0]
         step = jnp.where(first == first, 1, 2)
         blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(plain, *args))
 
-        def turn(carry: Any) -> Any:
+        def turn(carry: PyTree) -> Any:
             i, args, _ = carry
             return i + step, jax.tree.map(jnp.zeros_like, args), plain(*args)
 
         return lax.while_loop(lambda c: c[0] < 1, turn, (jnp.zeros_like(step), args, blank))[2]
 
     @call_unbatched.def_vmap
-    def _call_batched(size: int, batched: Any, *args: Any) -> Any:
+    def _call_batched(size: int, batched: PyTree, *args: PyTree) -> Any:
         del size
         axes = jax.tree.map(lambda b: 0 if b else None, tuple(batched))
         # JAX before 0.12 asks for this where only tangents are batched, too, and then nothing is.
@@ -94,7 +94,7 @@ def one_kernel(function: Function) -> Function:
         return out, jax.tree.map(lambda _: is_batched, out)
 
     @call.defjvp
-    def _jvp(primals: Any, tangents: Any) -> Any:
+    def _jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
         out, change = jax.jvp(plain, primals, tangents)
         return batch_as(out, primals), change
 
@@ -102,7 +102,7 @@ def one_kernel(function: Function) -> Function:
 
 
 @jax.custom_jvp
-def batch_as(out: Any, args: Any) -> Any:
+def batch_as(out: PyTree, args: PyTree) -> Any:
     """Return `out` with every leaf batched if any leaf of `args` is batched.
 
     This repeats what the batching rule of `one_kernel` returns. Under `jit`, JAX takes the axes of
@@ -113,18 +113,18 @@ def batch_as(out: Any, args: Any) -> Any:
 
 
 @batch_as.defjvp
-def _batch_as_jvp(primals: Any, tangents: Any) -> Any:
+def _batch_as_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     return batch_as(*primals), tangents[0]
 
 
 @jax.custom_batching.custom_vmap
-def _broadcast(out: Any, args: Any) -> Any:
+def _broadcast(out: PyTree, args: PyTree) -> Any:
     del args
     return out
 
 
 @_broadcast.def_vmap
-def _broadcast_batched(size: int, batched: Any, out: Any, args: Any) -> Any:
+def _broadcast_batched(size: int, batched: PyTree, out: PyTree, args: PyTree) -> Any:
     del args
     if not any(jax.tree.leaves(batched)):
         return out, batched[0]

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3Like
@@ -202,7 +202,7 @@ def mean_quaternion(
 def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
     """Return the Karcher mean of the quaternions `q` with weights `w`, by Newton's method."""
 
-    def newton(_: Any, start: Quat, q: Array, w: Array) -> Quat:
+    def newton(_: Array | int, start: Quat, q: Array, w: Array) -> Quat:
         apart = jax.vmap(lambda each: quaternion.multiply(quaternion.conjugate(start), each))(q)
         v = jax.vmap(quaternion.log)(apart)
         slope = (w[:, None, None] * jax.vmap(left_jacobian_inverse)(v)).sum(0)
@@ -226,7 +226,7 @@ def of_order_one(x: Array) -> Array:
     return near_one(jnp.max(jnp.abs(x))) * x
 
 
-def weights_of(weights: Any, like: Array, of: str) -> Array:
+def weights_of(weights: ArrayLike | None, like: Array, of: str) -> Array:
     """Return one weight for each row of `like`, 1 where `weights` is `None`; known weights must
     have a positive sum.
     """
@@ -249,7 +249,7 @@ def _quartic(b: Mat3) -> tuple[Scalar, Scalar]:
     det, adjugate = determinant(b), cofactors(b)
     flat = 4 * (adjugate * adjugate).sum()
 
-    def newton(_: Any, root: Scalar) -> Scalar:
+    def newton(_: Array | int, root: Scalar) -> Scalar:
         excess = root * root - 1
         slope = 4 * root * excess - 8 * det
         return root - (excess * excess - 8 * det * root - flat) / jnp.where(slope > 0, slope, 1)
@@ -284,7 +284,7 @@ def nearest_rotation(b: Mat3) -> Mat3:
 
 
 @nearest_rotation.defjvp
-def _best_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _best_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
     (b,), (db,) = primals, tangents
     r = nearest_rotation(b)
     # `b` may have any size: a common factor for `b` and `db` leaves the derivative unchanged.

@@ -2,13 +2,13 @@
 `jit`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
 from rigidjax.rotation.barrier import compute_once
@@ -79,7 +79,7 @@ def _log(q: Quat) -> Vec3:
 
 
 @_log.defjvp
-def _log_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _log_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
     (q,), (dq,) = primals, tangents
     v = _log(q)
     # q may have any length: a common factor for q and dq leaves the derivative unchanged.
@@ -127,7 +127,7 @@ def square4(q: Sequence[Scalar]) -> Scalar:
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
 
 
-def product4(p: Any, q: Any) -> tuple[Any, ...]:
+def product4(p: Iterable[Any], q: Iterable[Any]) -> tuple[Any, ...]:
     """Return the quaternion product p q; p and q are four scalars each, of JAX or NumPy."""
     a, b, c, d = p
     e, f, g, h = q

@@ -8,10 +8,10 @@ range (float32: 1e-9 to 1e9).
 
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -95,7 +95,7 @@ def vee(matrix: Mat3Like) -> Vec3:
     return 0.5 * jnp.stack([h - f, c - g, d - b])
 
 
-def basis(dtype: Any = float) -> Float[Array, "3 3 3"]:
+def basis(dtype: DTypeLike = float) -> Float[Array, "3 3 3"]:
     """Return the matrices J_1, J_2, J_3: J_i y = e_i × y, ½ Tr(J_iᵀ J_j) = δ_ij (notes, eqs 41–43,
     53).
 

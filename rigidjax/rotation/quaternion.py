@@ -13,10 +13,10 @@ may have components up to 1e307 (1e37).
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
@@ -221,7 +221,7 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
     return multiply(p, vector_to_quaternion(part))
 
 
-def uniform(key: PRNGKeyArray, dtype: Any = float) -> Quat:
+def uniform(key: PRNGKeyArray, dtype: DTypeLike = float) -> Quat:
     """Return a uniformly distributed random rotation (Haar measure), four normal numbers over their
     length.
 

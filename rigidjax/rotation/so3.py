@@ -5,9 +5,8 @@ function of θ²: values and derivatives of any order are correct at θ = 0. Ran
 `rigidjax.quaternion`.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
@@ -242,7 +241,7 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     return product(a, vector_to_matrix(part))
 
 
-def uniform(key: PRNGKeyArray, dtype: Any = float) -> Mat3:
+def uniform(key: PRNGKeyArray, dtype: DTypeLike = float) -> Mat3:
     """Return a uniformly distributed random rotation (Haar measure): `key` of `jax.random`, `dtype`
     of floats.
 

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 # The largest argument of `arctan_ratio`, tan²(π/8).
 _REACH = math.tan(math.pi / 8) ** 2
@@ -46,7 +46,9 @@ def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 @stumpff.defjvp
-def _stumpff_jvp(k: int, primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _stumpff_jvp(
+    k: int, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[Any, Any]:
     (t,), (dt,) = primals, tangents
     slope = k * stumpff(k + 2, t) - stumpff(k + 1, t) if k else -stumpff(1, t)
     return stumpff(k, t), 0.5 * slope * dt

@@ -308,7 +308,7 @@ def _attempt(
         step = Step(begin, length, late, loop.y)
     there = stages(method.tableau, method.field, constants, step, dense)
     y = method.project(there.end)
-    # Which steps are taken is no thing to differentiate.
+    # Derivatives hold the chosen steps constant.
     left, right, slopes = lax.stop_gradient((loop.y, y, there.slopes))
     error = error_estimate(method.tableau, method.sizes, h, slopes)
     # NaN in a step too long says as little as infinity: a shorter one is tried.

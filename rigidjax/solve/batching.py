@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax.rotation.barrier import platform
 
@@ -112,7 +112,12 @@ def in_lanes(
 
 
 def _jvp(
-    program: Program, was: Layout, number: int, linear: int, primals: Any, tangents: Any
+    program: Program,
+    was: Layout,
+    number: int,
+    linear: int,
+    primals: tuple[PyTree, ...],
+    tangents: tuple[PyTree, ...],
 ) -> tuple[Arrays, Arrays]:
     """The result of a program of `number` constants, and its tangent, as one program in lanes."""
     constants, each = list(primals[:number]), list(primals[number:])

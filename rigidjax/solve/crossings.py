@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
@@ -305,7 +305,7 @@ def _as_found(times: Array, states: Array, jumps: Array, *scene: Any) -> tuple[A
 
 
 @_as_found.def_jvp
-def _(primals: Any, tangents: Any) -> Any:
+def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     found, jumps, scene = primals[:2], primals[2], primals[3:]
     moved, along = eqx.filter_jvp(partial(_corrected, found[0], jumps), scene, tangents[3:])
     return as_known(found, moved), along

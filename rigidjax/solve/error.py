@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from rigidjax import _checks, _show
 from rigidjax._types import ScalarLike
@@ -261,7 +261,7 @@ def _as_solved(setup: DiffraxRun, state0: Any, ts: Array, ys: Any) -> Any:
 
 
 @_as_solved.def_jvp
-def _(primals: Any, tangents: Any) -> Any:
+def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     states = lambda *args: solve(*args)[0]  # noqa: E731
     ys, along = eqx.filter_jvp(states, primals[:3], tangents[:3])
     return as_known(primals[3], ys), along

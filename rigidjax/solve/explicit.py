@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from rigidjax import _checks
+from rigidjax._types import RealLike
 from rigidjax.motion.equations import on_the_group
 from rigidjax.solve import validation
 from rigidjax.solve.runge_kutta import Step, dense_rows, error_estimate, nested, stages
@@ -25,7 +26,7 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
     y0: Any
     coefficients: Any
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+    def evaluate(self, t0: RealLike, t1: RealLike | None = None, left: bool = True) -> Any:
         if t1 is not None:
             return jax.tree.map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
         length = self.t1 - self.t0
@@ -36,7 +37,7 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
         return on_the_group(jax.tree.map(value, self.y0, self.coefficients))
 
 
-def onward(terms: Any, t0: Any, t1: Any) -> tuple[Array, Array]:
+def onward(terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike) -> tuple[Array, Array]:
     """The direction of a step, 1 or −1, and its length.
 
     Backwards diffrax counts −t, so that `t1` is above `t0` all the same; only the control is
@@ -59,14 +60,28 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
     interpolation_cls: ClassVar = NestedInterpolation
     tableau: eqx.AbstractClassVar[Tableau]
 
-    def order(self, terms: Any) -> int:
+    def order(self, terms: PyTree[dfx.AbstractTerm]) -> int:
         return self.tableau.order
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+    def init(
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        args: PyTree,
+    ) -> None:
         return None
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: Bool[ArrayLike, ""],
     ) -> Any:
         validation.one_dtype(y0, "state")
         numbers, tree = ravel_pytree(y0)
@@ -79,14 +94,14 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
         there = stages(self.tableau, field, [], step)
         # Once, after the stages: inside them it changes the order (jaxsim#192).
         y1 = on_the_group(tree(there.end))
-        # Which steps are taken is no thing to differentiate: their error is below the tolerance.
+        # Derivatives hold the chosen steps constant: the error of a step is below the tolerance.
         sizes = [leaf.size for leaf in jax.tree.leaves(y0)]
         error = lax.stop_gradient(error_estimate(self.tableau, sizes, h, there.slopes))
         rows = dense_rows(self.tableau, field, step, there.slopes)
         dense = dict(y0=y0, coefficients=jax.vmap(tree)(rows))
         return y1, tree(error), dense, None, dfx.RESULTS.successful
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, args)
 
 

@@ -15,7 +15,7 @@ from jax.core import ShapedArray
 from jax.custom_derivatives import zero_from_primal
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax.rotation.barrier import batch_as
 
@@ -52,7 +52,7 @@ def _known(known: Array, moved: Array) -> Array:
 
 
 @_known.defjvp
-def _known_jvp(primals: Any, tangents: Any) -> Any:
+def _known_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     return _known(*primals), tangents[1]
 
 
@@ -74,7 +74,7 @@ def _with_nan(count: int, *numbers: Array) -> Arrays:
 
 
 @_with_nan.defjvp
-def _(count: int, primals: Any, tangents: Any) -> Any:
+def _(count: int, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     outs = _with_nan(count, *primals)
 
     def along(*args: Array) -> Arrays:
@@ -105,7 +105,9 @@ def _abstract(*_: Any, results: Any, **__: Any) -> Any:
     return [ShapedArray(*result) for result in results]
 
 
-def _differentiated(primals: Any, tangents: Any, **params: Any) -> Any:
+def _differentiated(
+    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...], **params: Any
+) -> Any:
     number, function = params["number"], params["function"]
     out, parts = _linear_map.bind(*primals, **params), []
     moving = [not isinstance(t, ad.Zero) for t in tangents]

@@ -9,8 +9,9 @@ from typing import Any, ClassVar
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, Bool, PyTree
 
+from rigidjax._types import RealLike
 from rigidjax.exact.components3 import Four, Triple, cross, plus
 from rigidjax.exact.diffrax_solver import field_of
 from rigidjax.motion import Attitude
@@ -75,15 +76,29 @@ class Magnus4(dfx.AbstractSolver):
     term_structure: ClassVar = dfx.ODETerm
     interpolation_cls: ClassVar = NestedInterpolation
 
-    def order(self, terms: Any) -> int:
+    def order(self, terms: PyTree[dfx.AbstractTerm]) -> int:
         return 4
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+    def init(
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        args: PyTree,
+    ) -> None:
         field, _ = field_of(terms)
         require_blind(require_attitude("Magnus4", field, y0, "RungeKutta4").euler.torque)
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: Bool[ArrayLike, ""],
     ) -> Any:
         start = split(y0)
         q, omega = start[:4], start[4:]
@@ -109,11 +124,11 @@ class Magnus4(dfx.AbstractSolver):
         dense = dict(y0=y0, coefficients=jax.tree.map(rows, y0, y1, left, right))
         return y1, None, dense, None, dfx.RESULTS.successful
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, args)
 
 
-def require_attitude(name: str, field: Any, y0: Any, instead: str) -> AttitudeEquations:
+def require_attitude(name: str, field: Any, y0: PyTree, instead: str) -> AttitudeEquations:
     """`field`, if it is `AttitudeEquations` and the state an `Attitude`; else `TypeError`."""
     if isinstance(field, AttitudeEquations) and isinstance(y0, Attitude):
         return field

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.linear_map import linear_map
@@ -125,7 +125,7 @@ def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: An
     def run(*args: Array) -> Arrays:
         return end(list(args))
 
-    def run_jvp(primals: Any, tangents: Any) -> tuple[Arrays, Arrays]:
+    def run_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Arrays, Arrays]:
         both = zip(smooth, tangents, strict=True)
         moving = [s and not isinstance(t, SymbolicZero) for s, t in both]
         size = len(primals)

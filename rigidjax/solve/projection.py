@@ -1,5 +1,6 @@
 """Wrappers for diffrax: a solver kept on the group, a controller that ends at NaN or at jumps."""
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
@@ -9,9 +10,10 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from rigidjax import _checks
+from rigidjax._types import RealLike
 from rigidjax.motion.equations import on_the_group
 from rigidjax.solve.adaptive_loop import NONFINITE, before, finite, take
 
@@ -26,7 +28,7 @@ class GroupInterpolation(dfx.AbstractLocalInterpolation):
     t1: Any
     inner: dfx.AbstractLocalInterpolation
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+    def evaluate(self, t0: RealLike, t1: RealLike | None = None, left: bool = True) -> Any:
         if t1 is None:
             return on_the_group(self.inner.evaluate(t0, left=left))
         end, start = self.evaluate(t1, left=left), self.evaluate(t0, left=left)
@@ -38,7 +40,7 @@ class _Build(eqx.Module):
 
     inner_cls: Any = eqx.field(static=True)
 
-    def __call__(self, *, t0: Any, t1: Any, **dense_info: Any) -> GroupInterpolation:
+    def __call__(self, *, t0: RealLike, t1: RealLike, **dense_info: Any) -> GroupInterpolation:
         return GroupInterpolation(t0, t1, self.inner_cls(t0=t0, t1=t1, **dense_info))
 
 
@@ -77,20 +79,34 @@ class Projected(dfx.AbstractWrappedSolver):
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return _Build(self.solver.interpolation_cls)
 
-    def order(self, terms: Any) -> int | None:
+    def order(self, terms: PyTree[dfx.AbstractTerm]) -> int | None:
         return self.solver.order(terms)
 
-    def strong_order(self, terms: Any) -> Any:
+    def strong_order(self, terms: PyTree[dfx.AbstractTerm]) -> Any:
         return self.solver.strong_order(terms)
 
-    def error_order(self, terms: Any) -> Any:
+    def error_order(self, terms: PyTree[dfx.AbstractTerm]) -> Any:
         return self.solver.error_order(terms)
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+    def init(
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        args: PyTree,
+    ) -> Any:
         return self.solver.init(terms, t0, t1, y0, args)
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: Bool[ArrayLike, ""],
     ) -> Any:
         # A slope kept from the last step is the one before the projection; and diffrax computes it
         # anew for all of a batch as soon as one body needs it. True: always anew, for each alone.
@@ -102,7 +118,7 @@ class Projected(dfx.AbstractWrappedSolver):
         result = dfx.RESULTS.where(ill, NONFINITE, result)
         return on_the_group(y1), error, dense, state, result
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree) -> Any:
         return self.solver.func(terms, t0, y0, args)
 
 
@@ -121,20 +137,27 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
 
     controller: Any
 
-    def __init__(self, controller: Any):
+    def __init__(self, controller: dfx.AbstractStepSizeController):
         self.controller = controller
 
     rtol = _of("controller", "rtol")
     atol = _of("controller", "atol")
     norm = _of("controller", "norm")
 
-    def wrap(self, direction: Any) -> "Watched":
+    def wrap(self, direction: PyTree) -> "Watched":
         return Watched(self.controller.wrap(direction))
 
     def init(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any,
-        error_order: Any,
-    ) -> tuple[Any, Any]:  # fmt: skip
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        dt0: RealLike | None,
+        args: PyTree,
+        func: Callable[..., PyTree],
+        error_order: RealLike | None,
+    ) -> tuple[Any, Any]:
         slope_at = lambda t, y: func(terms, t, y, args)  # noqa: E731
         # A solver without an order of its error is refused by the inner controller.
         chosen = dt0 is None and error_order is not None
@@ -157,9 +180,16 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         return 8 * jnp.finfo(t.dtype).eps * jnp.maximum(jnp.abs(t), least)
 
     def adapt_step_size(
-        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any,
-        error_order: Any, controller_state: Any,
-    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:  # fmt: skip
+        self,
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        y1_candidate: PyTree,
+        args: PyTree,
+        y_error: PyTree,
+        error_order: RealLike | None,
+        controller_state: PyTree,
+    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
         inner, least = controller_state
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
@@ -223,7 +253,7 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
     # The index of the first stop after each.
     following: Any
 
-    def __init__(self, controller: Any, stops: Any):
+    def __init__(self, controller: dfx.AbstractStepSizeController, stops: Array):
         self.controller = controller
         self.stops = stops
         still = lax.stop_gradient(stops)
@@ -233,15 +263,22 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
     atol = _of("controller", "atol")
     norm = _of("controller", "norm")
 
-    def wrap(self, direction: Any) -> "Stopping":
+    def wrap(self, direction: PyTree) -> "Stopping":
         way = jnp.asarray(direction).astype(self.stops.dtype)
         stops = jnp.where(way < 0, -self.stops[::-1], self.stops)
         return Stopping(self.controller.wrap(direction), stops)
 
     def init(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any,
-        error_order: Any,
-    ) -> tuple[Any, Any]:  # fmt: skip
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        dt0: RealLike | None,
+        args: PyTree,
+        func: Callable[..., PyTree],
+        error_order: RealLike | None,
+    ) -> tuple[Any, Any]:
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         index = jnp.sum(self.stops <= t0, dtype=jnp.int32)
         return jnp.minimum(first, self._next(index)[1]), (inner, first - t0, index)
@@ -255,9 +292,16 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         return stop, stop + gap
 
     def adapt_step_size(
-        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any,
-        error_order: Any, controller_state: Any,
-    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:  # fmt: skip
+        self,
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        y1_candidate: PyTree,
+        args: PyTree,
+        y_error: PyTree,
+        error_order: RealLike | None,
+        controller_state: PyTree,
+    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
         inner, kept, index = controller_state
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner

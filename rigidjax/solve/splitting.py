@@ -11,8 +11,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, Bool, PyTree
 
+from rigidjax._types import RealLike
 from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, plus, times, turned_back
 from rigidjax.exact.derivatives import flow
 from rigidjax.exact.diffrax_solver import field_of
@@ -102,14 +103,28 @@ class AbstractSplitting(dfx.AbstractSolver):
     interpolation_cls: ClassVar = NestedInterpolation
     composition: eqx.AbstractClassVar[Composition]
 
-    def order(self, terms: Any) -> int:
+    def order(self, terms: PyTree[dfx.AbstractTerm]) -> int:
         return self.composition.order
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Frame:
+    def init(
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        args: PyTree,
+    ) -> Frame:
         return frame_of(field_of(terms)[0], y0)
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Frame, made_jump: Any
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealLike,
+        t1: RealLike,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: Frame,
+        made_jump: Bool[ArrayLike, ""],
     ) -> Any:
         field, way = field_of(terms)
         state, h = (y0.q, enter(solver_state, y0.omega)), jnp.asarray(t1 - t0) * way
@@ -120,7 +135,7 @@ class AbstractSplitting(dfx.AbstractSolver):
         dense = dict(y0=y0, coefficients=_dense_rows(terms, t0, t1, args, y0, y1))
         return y1, None, dense, solver_state, dfx.RESULTS.successful
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree) -> Any:
         return terms.vf(t0, y0, args)
 
 
@@ -232,7 +247,9 @@ def compose(
     return dq, change
 
 
-def _dense_rows(terms: Any, t0: Any, t1: Any, args: Any, y0: Any, y1: Any) -> Any:
+def _dense_rows(
+    terms: PyTree[dfx.AbstractTerm], t0: Any, t1: Any, args: PyTree, y0: PyTree, y1: PyTree
+) -> Any:
     """The quintic through both ends with first and second derivatives: of order 6."""
     way, length = onward(terms, t0, t1)
     h = way * length

@@ -1,15 +1,17 @@
 """The sensor of a body's brightness, whose readings are a light curve."""
 
 import math
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
+from rigidjax._types import HasAttitude, NumbersLike, Scalar, ScalarLike, Vec3
 from rigidjax.identify.sensors import base
 from rigidjax.identify.sensors.base import AbstractSensor, SensorInput
 from rigidjax.motion.torques.base import vector_at
@@ -76,15 +78,15 @@ class Brightness(AbstractSensor):
 
     def __init__(
         self,
-        sun: Any,
-        observer: Any,
+        sun: NumbersLike | Callable[..., Any],
+        observer: NumbersLike | Callable[..., Any],
         scattering: AbstractScattering | None = None,
         *,
-        noise: Any = None,
+        noise: NumbersLike | None = None,
         unit: str = "flux",
-        level: Any = None,
-        semi_axes: Any = None,
-        offset: Any = None,
+        level: NumbersLike | None = None,
+        semi_axes: NumbersLike | None = None,
+        offset: NumbersLike | None = None,
     ):
         self.sun, self.observer = _source(sun, "sun"), _source(observer, "observer")
         self.scattering, self.noise = law_of(scattering), base.deviations(1)(noise)
@@ -145,7 +147,7 @@ class Brightness(AbstractSensor):
         return wrong, words
 
 
-def directions(sensor: Brightness, t: ScalarLike, dtype: Any = None) -> list[Vec3]:
+def directions(sensor: Brightness, t: ScalarLike, dtype: DTypeLike | None = None) -> list[Vec3]:
     """Return the unit vectors to sun and observer at the time `t`, world frame."""
     vectors = vector_at(sensor.sun, t, "sun"), vector_at(sensor.observer, t, "observer")
     return [_unit(v if dtype is None else v.astype(dtype)) for v in vectors]
@@ -162,7 +164,7 @@ def _unit(v: Vec3) -> Vec3:
     return v / jnp.sqrt(dot(v, v))
 
 
-def _source(source: Any, name: str) -> Any:
+def _source(source: NumbersLike | Callable[..., Any], name: str) -> Any:
     """Return a direction as a unit vector, or a function of time as it is; else raise an error."""
     if callable(source):
         return _checks.function(source, name, "of time to (3,)")

@@ -10,9 +10,18 @@ from rigidjax.workprecision.jax_methods import diffrax_method as diffrax_method
 from rigidjax.workprecision.measurement import measure as measure
 from rigidjax.workprecision.pareto import choose as choose, table as table
 from rigidjax.workprecision.peers import methods as methods
-from rigidjax.workprecision.scene import Scene as Scene
+from rigidjax.workprecision.scene import BenchmarkScene as BenchmarkScene
 from rigidjax.workprecision.standard_scenes import scenes as scenes
 
-__all__ = ["Scene", "choose", "diffrax_method", "draw", "measure", "methods", "scenes", "table"]
+__all__ = [
+    "BenchmarkScene",
+    "choose",
+    "diffrax_method",
+    "draw",
+    "measure",
+    "methods",
+    "scenes",
+    "table",
+]
 
 show(__name__)

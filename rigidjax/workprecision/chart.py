@@ -1,11 +1,14 @@
 """Draw charts of error against time. matplotlib is imported only when a chart is asked for."""
 
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rigidjax._checks import plain
 from rigidjax.workprecision.pareto import first_answers, front
 from rigidjax.workprecision.record import Measurement, list_records
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _MARKS = "osv^<>DPX*hp8d"
 _COLOURS = {"ours": "tab20", "jax": "Set2", "peer": "Dark2"}
@@ -96,7 +99,7 @@ def _curves(
 
 
 def _draw_reached_errors(
-    axis: Any, records: list[Measurement], labels: list[tuple[str, str]]
+    axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]
 ) -> None:
     for of, how in _curves(records, labels):
         axis.plot([r.setting for r in of], [max(r.error, 1e-16) for r in of], **how)
@@ -106,7 +109,7 @@ def _draw_reached_errors(
     _dressed(axis)
 
 
-def _draw_times(axis: Any, records: list[Measurement], labels: list[tuple[str, str]]) -> None:
+def _draw_times(axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]) -> None:
     for of, how in _curves(records, labels):
         bars = [
             [max(1e3 * (r.time - r.time_low), 0.0) for r in of],
@@ -118,12 +121,12 @@ def _draw_times(axis: Any, records: list[Measurement], labels: list[tuple[str, s
         (front(r for r in records if r.group != "peer"), "tab:cyan", "front in JAX"),
     ):
         axis.plot(*_places(best), "-", color=colour, linewidth=6, alpha=0.3, zorder=0, label=what)
-    ringed = dict(color="k", markerfacecolor="none", markersize=9, zorder=5)
+    ringed: dict[str, Any] = dict(color="k", markerfacecolor="none", markersize=9, zorder=5)
     axis.plot(*_places(front(records)), "o", **ringed)
     _dressed(axis)
 
 
-def _dressed(axis: Any) -> None:
+def _dressed(axis: "Axes") -> None:
     axis.set(xscale="log", yscale="log")
     # Better is to the right and down.
     axis.invert_xaxis()

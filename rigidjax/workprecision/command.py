@@ -59,7 +59,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def add(commands: Any) -> None:
+def add(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand to an `argparse` parser's commands."""
     parser = commands.add_parser(
         "workprecision",

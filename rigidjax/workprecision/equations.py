@@ -4,14 +4,20 @@ Written apart from the rest of the library, on numbers that may be floats, `mpma
 numbers, or a peer's symbols. `sin` and `cos` come in as arguments, everything else is + − × ÷.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 Number = Any
 Torque = Callable[[Number, Any, Any], tuple[Number, Number, Number]]
 
 
-def heavy(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Torque:
+def heavy(
+    inertia: Sequence[Number],
+    constants: Sequence[Number],
+    sin: Callable[[Number], Number],
+    cos: Callable[[Number], Number],
+    into: Callable[..., tuple[Number, Number, Number]],
+) -> Torque:
     """Return the torque `τ = c m × Rᵀg`; constants m c (3) and g (3)."""
     cx, cy, cz, gx, gy, gz = constants
 
@@ -22,7 +28,13 @@ def heavy(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Torque
     return torque
 
 
-def gradient(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Torque:
+def gradient(
+    inertia: Sequence[Number],
+    constants: Sequence[Number],
+    sin: Callable[[Number], Number],
+    cos: Callable[[Number], Number],
+    into: Callable[..., tuple[Number, Number, Number]],
+) -> Torque:
     """Return the torque `τ = 3n² r × I r`, r the direction of the planet on a circular orbit;
     constants n.
     """
@@ -40,7 +52,13 @@ def gradient(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Tor
     return torque
 
 
-def gyrostat(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Torque:
+def gyrostat(
+    inertia: Sequence[Number],
+    constants: Sequence[Number],
+    sin: Callable[[Number], Number],
+    cos: Callable[[Number], Number],
+    into: Callable[..., tuple[Number, Number, Number]],
+) -> Torque:
     """Return the torque `τ = h × Ω − c Ω` of a wheel at constant speed and damping; constants h
     (3), c (3).
     """
@@ -67,7 +85,7 @@ def into_body(q, x, y, z):
     )
 
 
-def body_rates(inertia: Any, torque: Torque | None) -> Callable[[Number, Any], Any]:
+def body_rates(inertia: Sequence[Number], torque: Torque | None) -> Callable[[Number, Any], Any]:
     """Return `(t, (q, Ω)) → (q', Ω')` for an inertia (Ixx, Iyy, Izz, Ixy, Ixz, Iyz), 7 numbers."""
     ixx, iyy, izz, ixy, ixz, iyz = inertia
     kxx, kyy, kzz = iyy * izz - iyz * iyz, ixx * izz - ixz * ixz, ixx * iyy - ixy * ixy
@@ -97,7 +115,9 @@ def body_rates(inertia: Any, torque: Torque | None) -> Callable[[Number, Any], A
     return rates
 
 
-def foucault(constants: Any, sqrt: Any) -> Callable[[Number, Any], Any]:
+def foucault(
+    constants: Sequence[Number], sqrt: Callable[[Number], Number]
+) -> Callable[[Number, Any], Any]:
     """Return the rates of a pendulum on the turning Earth, axes east, north, up; constants g, Ω
     north, Ω up.
     """
@@ -116,7 +136,9 @@ def foucault(constants: Any, sqrt: Any) -> Callable[[Number, Any], Any]:
     return rates
 
 
-def three_body(constants: Any, sqrt: Any) -> Callable[[Number, Any], Any]:
+def three_body(
+    constants: Sequence[Number], sqrt: Callable[[Number], Number]
+) -> Callable[[Number, Any], Any]:
     """Return the rates of the circular restricted problem in the turning frame; constants μ."""
     (mu,) = constants
     nu = 1 - mu

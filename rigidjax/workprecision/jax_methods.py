@@ -1,18 +1,22 @@
 """Prepare the methods in JAX: ours and diffrax's solvers, on one field, each compiled once."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
+from rigidjax.body.inertia import Inertia
 from rigidjax.exact import FreeBody
 from rigidjax.solve import adaptive, equations_of_motion, fixed, simulate, solvers
-from rigidjax.workprecision.scene import Ready, Scene, TimedMethod
+from rigidjax.solve.explicit import AbstractExplicit
+from rigidjax.solve.splitting import AbstractSplitting
+from rigidjax.workprecision.scene import BenchmarkScene, Ready, TimedMethod
 
 TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 EIGHT = (40, 60, 80, 120, 170, 240, 340, 480, 680, 1000)
@@ -22,10 +26,10 @@ MODES = {"forward": jax.jacfwd, "reverse": jax.grad}
 
 # numbers, setting → the last state as a vector, steps
 Flow = Callable[[Any, Any], tuple[Any, Any]]
-Make = Callable[[Scene], Flow | None]
+Make = Callable[[BenchmarkScene], Flow | None]
 
 
-def compiled(scene: Scene, flow: Flow) -> Ready:
+def compiled(scene: BenchmarkScene, flow: Flow) -> Ready:
     """Return one compiled call for all settings.
 
     It is timed as a user would call it: only numbers go in.
@@ -48,12 +52,12 @@ def compiled(scene: Scene, flow: Flow) -> Ready:
     return Ready(run, spent, held)
 
 
-def flow_of(scene: Scene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]) -> Flow:
+def flow_of(scene: BenchmarkScene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]) -> Flow:
     """Return the flow of `run`, which takes a body, an initial state, both times and a setting to
     states over time and a number of steps.
     """
 
-    def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
+    def flow(numbers: Array, setting: Array) -> tuple[Any, Any]:
         body, start = scene.assembled(numbers)
         ys, steps = run(body, start, jnp.array([0.0, scene.end], numbers.dtype), setting)
         return scene.flat(jax.tree.map(lambda leaf: leaf[-1], ys)), steps
@@ -61,31 +65,32 @@ def flow_of(scene: Scene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]) 
     return flow
 
 
-def _closed(scene: Scene) -> Flow | None:
-    def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
+def _closed(scene: BenchmarkScene) -> Flow | None:
+    def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         end: Any = FreeBody(body, start)(ts[1])
         return jax.tree.map(lambda leaf: leaf[None], end), jnp.zeros(())
 
     return flow_of(scene, run) if scene.torque is None and scene.body is not None else None
 
 
-def _simulate(scene: Scene, accuracy: bool = False) -> Flow | None:
+def _simulate(scene: BenchmarkScene, accuracy: bool = False) -> Flow | None:
     """Return the flow of `simulate` with its defaults, except for the tolerance, which is traced so
     that one program does.
     """
 
-    def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
-        how = dict(accuracy=setting) if accuracy else dict(rtol=setting, atol=1e-3 * setting)
+    def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
+        how: dict[str, Any] = dict(rtol=setting, atol=1e-3 * setting)
+        how = dict(accuracy=setting) if accuracy else how
         out = simulate(body, start, ts, scene.torque, throw=False, max_steps=MOST, **how)
         return out.ys, out.stats["num_steps"]
 
     return None if scene.torque is None else flow_of(scene, run)
 
 
-def _adaptive(scene: Scene, solver: Any) -> Flow:
+def _adaptive(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
     """Return the flow of the loop in which `simulate` runs under a torque, in both modes."""
 
-    def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
+    def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         field = equations_of_motion(body, start, scene.torque)
         out = adaptive(solver, field, ts, start, rtol=setting, atol=1e-3 * setting, max_steps=MOST)
         return out.ys, out.num_steps
@@ -93,27 +98,31 @@ def _adaptive(scene: Scene, solver: Any) -> Flow:
     return flow_of(scene, run)
 
 
-def equal_steps(scene: Scene, solver: Any) -> Flow:
+def equal_steps(scene: BenchmarkScene, solver: AbstractExplicit | AbstractSplitting) -> Flow:
     """Return the flow of `solver` with a number of equal steps, which is the setting."""
 
-    def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
+    def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         field, count = equations_of_motion(body, start, scene.torque), setting.astype(int)
         return fixed(solver, field, ts, start, count), count
 
     return flow_of(scene, run)
 
 
-def _in_diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
+def _in_diffrax(
+    scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
+) -> Flow:
     """Return the flow of our field and state in diffrax's loop."""
 
-    def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
+    def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         field = equations_of_motion(body, start, scene.torque)
         return _solve_field(field, None, start, solver, adjoint, setting, scene.end)
 
     return flow_of(scene, run)
 
 
-def _diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
+def _diffrax(
+    scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
+) -> Flow:
     """Return the flow of a user's own code: equations written by hand, one array, constants
     computed once.
     """
@@ -121,13 +130,13 @@ def _diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
     if plain is None:
         return _in_diffrax(scene, solver, adjoint)
 
-    def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
+    def flow(numbers: Array, setting: Array) -> tuple[Any, Any]:
         start = scene.flat(scene.assembled(numbers)[1])
         rates = plain(tuple(numbers), jnp.sin, jnp.cos, jnp.sqrt)
         zero = jnp.zeros((), start.dtype)
         by_hand, constants = jax.closure_convert(lambda t, y: jnp.stack(rates(t, y)), zero, start)
 
-        def field(t: Any, y: Any, constants: Any) -> Any:
+        def field(t: Array, y: PyTree, constants: Sequence[Array]) -> Any:
             return by_hand(t, y, *constants)
 
         ys, steps = _solve_field(field, constants, start, solver, adjoint, setting, scene.end)
@@ -137,7 +146,13 @@ def _diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
 
 
 def _solve_field(
-    field: Any, args: Any, start: Any, solver: Any, adjoint: Any, setting: Any, end: float
+    field: Callable[..., PyTree],
+    args: PyTree,
+    start: PyTree,
+    solver: dfx.AbstractSolver,
+    adjoint: dfx.AbstractAdjoint | None,
+    setting: Array,
+    end: float,
 ) -> tuple[Any, Any]:
     out = dfx.diffeqsolve(
         dfx.ODETerm(field), solver, 0.0, end, None, start, args,
@@ -148,7 +163,7 @@ def _solve_field(
     return out.ys, out.stats["num_steps"]
 
 
-def _prepare(make: Make, take: Any, scene: Scene) -> Ready | None:
+def _prepare(make: Make, take: Callable[..., Any] | None, scene: BenchmarkScene) -> Ready | None:
     """Return the flow prepared for a scene, or with `take` its gradient of the scene's scalar;
     `None` if it cannot run.
     """
@@ -156,11 +171,12 @@ def _prepare(make: Make, take: Any, scene: Scene) -> Ready | None:
     if flow is None:
         return None
 
-    def slopes(numbers: Any, setting: Any) -> tuple[Any, Any]:
-        def loss(numbers: Any) -> Any:
+    def slopes(numbers: Array, setting: Array) -> tuple[Any, Any]:
+        def loss(numbers: Array) -> Any:
             end, steps = flow(numbers, setting)
             return scene.loss(end), steps
 
+        assert take is not None
         return take(loss, has_aux=True)(numbers)
 
     try:
@@ -200,7 +216,11 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Ti
 
 
 def _own_method(
-    name: str, settings: Any, make: Make, modes: Any = (), equal: bool = False
+    name: str,
+    settings: Sequence[float | int],
+    make: Make,
+    modes: Iterable[str] = (),
+    equal: bool = False,
 ) -> TimedMethod:
     slopes = {mode: partial(_prepare, make, MODES[mode]) for mode in modes}
     return TimedMethod(name, "ours", settings, partial(_prepare, make, None), slopes, equal)

@@ -9,6 +9,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia
@@ -21,7 +23,7 @@ from rigidjax.solve import fixed, solvers
 from rigidjax.workprecision import peers as known
 from rigidjax.workprecision.jax_methods import equal_steps
 from rigidjax.workprecision.record import Measurement
-from rigidjax.workprecision.scene import Ready, Reference, Scene, TimedMethod, distance
+from rigidjax.workprecision.scene import BenchmarkScene, Ready, Reference, TimedMethod, distance
 
 # Runs longer than LONG, s, are timed three times; runs shorter than SHORT are timed three times as
 # often as the others.
@@ -51,7 +53,7 @@ class _Job(NamedTuple):
 
 
 def measure(
-    scene: Scene,
+    scene: BenchmarkScene,
     methods: Iterable[TimedMethod] | None = None,
     *,
     peers: Iterable[TimedMethod] = (),
@@ -71,10 +73,10 @@ def measure(
     `gradients` whether gradients are measured, too; `thin` takes every `thin`-th setting; `rounds`
     the least number of timings of each run; `progress` is called with a line of text.
 
-    **Raises:** `TypeError` for something that is no `Scene` or `TimedMethod`.
+    **Raises:** `TypeError` for something that is no `BenchmarkScene` or `TimedMethod`.
     """
     made = 'standard ones are made by rj.workprecision.scenes()["heavy-top"]()'
-    _checks.instance(scene, Scene, "scene", wanted="a Scene", hint=made)
+    _checks.instance(scene, BenchmarkScene, "scene", wanted="a BenchmarkScene", hint=made)
     chosen = [*(known.methods() if methods is None else methods), *peers]
     for method in chosen:
         _checks.instance(
@@ -102,7 +104,7 @@ def measure(
     return found
 
 
-def worked_out(scene: Scene, gradients: bool = True) -> Reference:
+def worked_out(scene: BenchmarkScene, gradients: bool = True) -> Reference:
     """Return a reference for a scene without one: order 8 with fixed steps, compared with half as
     many steps.
 
@@ -127,13 +129,13 @@ def worked_out(scene: Scene, gradients: bool = True) -> Reference:
     return Reference(tuple(map(float, ends[0])), error, slope, off, source)
 
 
-def in_float32(scene: Scene, gradients: bool = True) -> Scene:
+def in_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
     """Return the scene in single precision; its reference is computed in double precision from the
     rounded numbers.
     """
 
-    def cast(given: Scene, dtype: Any) -> Scene:
-        def one(a: Any) -> Any:
+    def cast(given: BenchmarkScene, dtype: DTypeLike) -> BenchmarkScene:
+        def one(a: PyTree) -> Any:
             return jnp.asarray(a, dtype) if eqx.is_inexact_array(a) else a
 
         parts = {name: jax.tree.map(one, getattr(given, name)) for name in _PARTS}
@@ -145,12 +147,12 @@ def in_float32(scene: Scene, gradients: bool = True) -> Scene:
     return dataclasses.replace(low, name=f"{scene.name}, float32", reference=right, plain=None)
 
 
-def _turn(scene: Scene) -> float:
+def _turn(scene: BenchmarkScene) -> float:
     """Return the rough angle turned in the scene, rad; for a point, which has none, 50."""
     return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
 
 
-def _settings(scene: Scene, method: TimedMethod, thin: int) -> list[float]:
+def _settings(scene: BenchmarkScene, method: TimedMethod, thin: int) -> list[float]:
     found = list(method.settings)[::-1][::thin][::-1]
     if method.equal:
         return [float(round(s * _turn(scene) / 50)) for s in found]
@@ -160,7 +162,12 @@ def _settings(scene: Scene, method: TimedMethod, thin: int) -> list[float]:
 
 
 def _looked_at(
-    scene: Scene, method: TimedMethod, adjoint: str, setting: float, ready: Ready, right: Reference
+    scene: BenchmarkScene,
+    method: TimedMethod,
+    adjoint: str,
+    setting: float,
+    ready: Ready,
+    right: Reference,
 ) -> list[_Job]:
     ready.run(setting)
     begin = time.perf_counter()
@@ -176,13 +183,15 @@ def _looked_at(
     return [_Job(record, ready, [first])]
 
 
-def _errors(scene: Scene, end: Any, right: Reference) -> dict[str, float]:
+def _errors(scene: BenchmarkScene, end: np.ndarray | Array, right: Reference) -> dict[str, float]:
     error, rate = distance(scene, end, right.end)
     energy, momentum = drifts(scene, np.asarray(end))
     return {"error": error, "error_rate": rate, "energy": energy, "momentum": momentum}
 
 
-def _gradient_errors(scene: Scene, slope: Any, right: Reference) -> dict[str, float]:
+def _gradient_errors(
+    scene: BenchmarkScene, slope: np.ndarray | Array, right: Reference
+) -> dict[str, float]:
     found, wanted = np.asarray(slope, float), np.asarray(right.gradient)
 
     def off(part: slice) -> float:
@@ -193,7 +202,7 @@ def _gradient_errors(scene: Scene, slope: Any, right: Reference) -> dict[str, fl
     return {"error": off(slice(None)), **parts}
 
 
-def drifts(scene: Scene, end: Any) -> tuple[float, float]:
+def drifts(scene: BenchmarkScene, end: np.ndarray | Array) -> tuple[float, float]:
     """Return the relative drift of energy and momentum (for a point the drift of its integral, and
     NaN).
     """

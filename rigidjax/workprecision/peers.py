@@ -7,51 +7,55 @@ import importlib.util
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from types import ModuleType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.workprecision.jax_methods import methods_in_jax
-from rigidjax.workprecision.scene import Ready, Scene, TimedMethod
+from rigidjax.workprecision.scene import BenchmarkScene, Ready, TimedMethod
 
 TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
 TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
 
 
-def _rates(scene: Scene, numbers: np.ndarray, **how: Any) -> Any:
+def _rates(scene: BenchmarkScene, numbers: np.ndarray, **how: Any) -> Any:
     """Return the plain equations of a scene on Python's floats."""
     plain: Any = scene.plain
     return plain(tuple(map(float, numbers)), math.sin, math.cos, math.sqrt, **how)
 
 
-def _written_out(scene: Scene) -> bool:
+def _written_out(scene: BenchmarkScene) -> bool:
     return scene.plain is not None
 
 
-def _has_weight(scene: Scene) -> bool:
+def _has_weight(scene: BenchmarkScene) -> bool:
     return scene.notes is not None and "com" in scene.notes and scene.body is not None
 
 
-def _in_double(scene: Scene) -> bool:
+def _in_double(scene: BenchmarkScene) -> bool:
     # Importing gradsolve sets JAX to float64: it is refused for other scenes.
     return scene.plain is not None and scene.numbers.dtype == jnp.float64
 
 
-def _peer(module: str, can: Callable[[Scene], bool] = _written_out) -> Callable[[Any], Any]:
+def _peer(
+    module: str, can: Callable[[BenchmarkScene], bool] = _written_out
+) -> Callable[[Any], Any]:
     """Return a decorator that makes a method's `value` from `make(scene, numbers, start, module) →
     run`.
 
     The time to import `module` is not counted.
     """
 
-    def wrapped(make: Callable[[Scene, np.ndarray, np.ndarray, Any], Any]) -> Any:
-        def ready(scene: Scene) -> Ready | None:
+    def wrapped(make: Callable[[BenchmarkScene, np.ndarray, np.ndarray, Any], Any]) -> Any:
+        def ready(scene: BenchmarkScene) -> Ready | None:
             if not can(scene):
                 return None
             numbers, start = (np.asarray(v) for v in (scene.numbers, scene.flat(scene.state0)))
@@ -65,7 +69,9 @@ def _peer(module: str, can: Callable[[Scene], bool] = _written_out) -> Callable[
     return wrapped
 
 
-def _run_of_stepper(end: float, start: np.ndarray, f: Any) -> Any:
+def _run_of_stepper(
+    end: float, start: np.ndarray, f: Callable[[float, np.ndarray], np.ndarray]
+) -> Any:
     from scipy.integrate import DOP853
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -81,13 +87,13 @@ def _run_of_stepper(end: float, start: np.ndarray, f: Any) -> Any:
 
 
 @_peer("scipy.integrate")
-def _scipy(scene: Scene, numbers: np.ndarray, start: np.ndarray, _: Any) -> Any:
+def _scipy(scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, _: ModuleType) -> Any:
     rates = _rates(scene, numbers)
     return _run_of_stepper(scene.end, start, lambda t, y: np.array(rates(t, y)))
 
 
 @_peer("numba")
-def _numba(scene: Scene, numbers: np.ndarray, start: np.ndarray, numba: Any) -> Any:
+def _numba(scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, numba: ModuleType) -> Any:
     rates = _rates(scene, numbers, wrap=numba.njit)
 
     @numba.njit
@@ -99,7 +105,9 @@ def _numba(scene: Scene, numbers: np.ndarray, start: np.ndarray, numba: Any) -> 
 
 
 @_peer("mujoco", _has_weight)
-def _mujoco(scene: Scene, numbers: np.ndarray, start: np.ndarray, mujoco: Any) -> Any:
+def _mujoco(
+    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, mujoco: ModuleType
+) -> Any:
     """Return the run of a body on a ball joint by MuJoCo's own Runge–Kutta 4; tops and free bodies
     only.
     """
@@ -108,7 +116,7 @@ def _mujoco(scene: Scene, numbers: np.ndarray, start: np.ndarray, mujoco: Any) -
     mass, com = notes["mass"], np.asarray(notes["com"])
     about = np.asarray(body.tensor) - mass * (com @ com * np.eye(3) - np.outer(com, com))
 
-    def words(values: Any) -> str:
+    def words(values: Iterable[float]) -> str:
         return " ".join(repr(float(v)) for v in values)
 
     model: Any = mujoco.MjModel.from_xml_string(
@@ -131,7 +139,7 @@ def _mujoco(scene: Scene, numbers: np.ndarray, start: np.ndarray, mujoco: Any) -
     return run
 
 
-def _system(scene: Scene, hy: Any, numbers: Any) -> Any:
+def _system(scene: BenchmarkScene, hy: ModuleType, numbers: Sequence[Any]) -> Any:
     names = "abcdxyz" if scene.body is not None else ("px", "py", "pz", "vx", "vy", "vz")
     variables = hy.make_vars(*names)
     plain: Any = scene.plain
@@ -139,7 +147,9 @@ def _system(scene: Scene, hy: Any, numbers: Any) -> Any:
     return list(zip(variables, rates, strict=True))
 
 
-def _run_of_propagator(hy: Any, end: float, start: np.ndarray, system: Any, **how: Any) -> Any:
+def _run_of_propagator(
+    hy: ModuleType, end: float, start: np.ndarray, system: Any, **how: Any
+) -> Any:
     """Return the run tolerance → (state at the end, steps). Order and code depend on the tolerance:
     each is compiled.
     """
@@ -159,13 +169,15 @@ def _run_of_propagator(hy: Any, end: float, start: np.ndarray, system: Any, **ho
 
 
 @_peer("heyoka")
-def _taylor(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> Any:
+def _taylor(scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, hy: ModuleType) -> Any:
     system = _system(scene, hy, list(map(float, numbers)))
     return _run_of_propagator(hy, scene.end, start, system)
 
 
 @_peer("heyoka")
-def _variational(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> Any:
+def _variational(
+    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, hy: ModuleType
+) -> Any:
     """Return the run of the variational equations by initial state and inertia, contracted with the
     scalar's gradient.
     """
@@ -200,7 +212,9 @@ class _Ensemble:
 
     is_stiff, t0 = False, 0.0
 
-    def __init__(self, scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any):
+    def __init__(
+        self, scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
+    ):
         # Otherwise NumPy records a single scene, a thousand times as slowly.
         os.environ.setdefault("GRADSOLVE_RECORDER", "jax")
         self.module, self.plain = module, scene.plain
@@ -208,7 +222,7 @@ class _Ensemble:
         self.start, self.numbers = start[None], numbers[None]
         self.dim = self.start.shape[1]
 
-    def f_jax(self, t: Any, y: Any, p: Any) -> Any:
+    def f_jax(self, t: Array, y: Array, p: Array) -> Any:
         assert self.plain is not None
         return jnp.stack(self.plain(tuple(p), jnp.sin, jnp.cos, jnp.sqrt)(t, y))
 
@@ -218,7 +232,9 @@ class _Ensemble:
 
 
 @_peer("gradsolve", _in_double)
-def _solve_and_record(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any) -> Any:
+def _solve_and_record(
+    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
+) -> Any:
     ensemble = _Ensemble(scene, numbers, start, module)
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -230,7 +246,9 @@ def _solve_and_record(scene: Scene, numbers: np.ndarray, start: np.ndarray, modu
 
 
 @_peer("gradsolve", _in_double)
-def _replay(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any) -> Any:
+def _replay(
+    scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
+) -> Any:
     """Return the run of the gradient through recorded steps; the recording is made once, and not
     timed.
     """
@@ -241,7 +259,7 @@ def _replay(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any) -
         end = ensemble.call("grad_closure", setting, wrt=("y0", "params"))
         count = int(ensemble.call("solve", setting).accepted_steps[0])
 
-        def loss(numbers: Any) -> Any:
+        def loss(numbers: Array) -> Any:
             first = scene.flat(scene.assembled(numbers)[1])
             return scene.loss(end(first[None], numbers[None])[0])
 

@@ -31,7 +31,7 @@ class Measurement:
     position); `steps`; `time`, `time_low`, `time_high` median and quartiles, s; `compile` s;
     `memory` bytes of the compiled run's temporaries. A field that does not apply is NaN.
 
-    >>> Record("free-top", "closed form", "ours", "value", "", 0.0, error=1e-15).time
+    >>> Measurement("free-top", "closed form", "ours", "value", "", 0.0, error=1e-15).time
     nan
     """
 

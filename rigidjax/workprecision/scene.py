@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax.body import validation
@@ -32,7 +32,7 @@ class Reference(NamedTuple):
     method that made it; `gradient` of the scene's scalar, empty if there is none, and
     `gradient_error` of its largest number; `source` a sentence.
 
-    >>> top = stored("heavy top")
+    >>> top = stored_answer("heavy top")
     >>> top is None or top.error < 1e-12
     True
     """
@@ -59,7 +59,7 @@ def stored_answer(name: str) -> Reference | None:
     return Reference(end, float(row["error"]), slope, float(row["gradient_error"]), row["source"])
 
 
-class Scene(eqx.Module):
+class BenchmarkScene(eqx.Module):
     """Define one motion for the comparison of methods.
 
     **Fields:** `name`, `title` words; `body` an `Inertia`, `None` for a `Point`; `state0` an
@@ -70,7 +70,7 @@ class Scene(eqx.Module):
     `notes` data for a peer beyond the equations.
 
     >>> from rigidjax import Attitude, Inertia, torques
-    >>> scene = Scene("mine", "my body", Inertia(jnp.eye(3)),
+    >>> scene = BenchmarkScene("mine", "my body", Inertia(jnp.eye(3)),
     ...     Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), torques.Damping([0.1, 0.1, 0.1]), 5.0)
     >>> scene.numbers.shape
     (13,)
@@ -90,7 +90,7 @@ class Scene(eqx.Module):
     def __check_init__(self) -> None:
         if isinstance(self.state0, Point) == (self.body is not None):
             raise TypeError(
-                "Scene: wanted an Inertia with an Attitude, or None with a Point, got "
+                "BenchmarkScene: wanted an Inertia with an Attitude, or None with a Point, got "
                 f"{type(self.body).__name__} with {type(self.state0).__name__}"
             )
         hint = "errors are angles between attitudes, or distances"
@@ -127,7 +127,7 @@ class Scene(eqx.Module):
         tensor = from_components(*(numbers[i] for i in range(6)))
         return Inertia(tensor), Attitude(quaternion.normalise(numbers[9:]), numbers[6:9])
 
-    def flat(self, state: Any) -> Float[Array, " state"]:
+    def flat(self, state: PyTree) -> Float[Array, " state"]:
         """Return a state as one vector, (7,) or (6,)."""
         return jnp.concatenate(jax.tree.leaves(state))
 
@@ -149,7 +149,9 @@ class Scene(eqx.Module):
         return jnp.sum(a * quaternion.rotate(end[:4], b)) + jnp.sum(c * end[4:]) / two
 
 
-def distance(scene: Scene, end: Any, right: Any) -> tuple[float, float]:
+def distance(
+    scene: BenchmarkScene, end: ArrayLike | Sequence[float], right: ArrayLike | Sequence[float]
+) -> tuple[float, float]:
     """Return the errors of attitude (an angle, rad) and of Ω; for a point those of position and
     velocity, all relative.
     """
@@ -195,14 +197,14 @@ class TimedMethod(NamedTuple):
 
     >>> import numpy as np
     >>> ready = Ready(lambda setting: (np.ones(7), 0))
-    >>> guess = Method("a guess", "peer", (1e-3,), lambda scene: ready)
+    >>> guess = TimedMethod("a guess", "peer", (1e-3,), lambda scene: ready)
     >>> guess.gradients
     {}
     """
 
     name: str
     group: str
-    settings: Sequence[float]
-    value: Callable[[Scene], Ready | None]
-    gradients: dict[str, Callable[[Scene], Ready | None]] = {}  # noqa: RUF012
+    settings: Sequence[float | int]
+    value: Callable[[BenchmarkScene], Ready | None]
+    gradients: dict[str, Callable[[BenchmarkScene], Ready | None]] = {}  # noqa: RUF012
     equal: bool = False

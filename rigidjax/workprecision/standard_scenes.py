@@ -1,13 +1,13 @@
 """Define the standard scenes."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import orbits
 from rigidjax.body.inertia import Inertia
@@ -15,7 +15,7 @@ from rigidjax.frames import Point, scenes as places
 from rigidjax.motion import Attitude
 from rigidjax.motion.torques import Damping, Flywheel, GravityGradient, HeavyTop, Sum
 from rigidjax.workprecision import equations
-from rigidjax.workprecision.scene import Scene, stored_answer
+from rigidjax.workprecision.scene import BenchmarkScene, stored_answer
 
 # Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I, II.0.
 ARENSTORF = (0.012277471, 0.994, -2.00158510637908252240, 17.0652165601579625588917)
@@ -63,7 +63,7 @@ class Circle(eqx.Module):
     radius: Float[Array, ""]
     rate: Float[Array, ""]
 
-    def __call__(self, t: Any) -> Float[Array, "3"]:
+    def __call__(self, t: Array) -> Float[Array, "3"]:
         angle = self.rate * t
         zero = jnp.zeros_like(angle)
         return self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), zero])
@@ -73,7 +73,7 @@ def _identity(x: Any) -> Any:
     return x
 
 
-def _torque(kind: Any, constants: Any) -> Any:
+def _torque(kind: Callable[..., Any] | None, constants: Sequence[float]) -> Any:
     """Return the library's torque for an equation of `workprecision.equations`."""
     if kind is equations.heavy:
         return HeavyTop(1.0, constants[:3], constants[3:])
@@ -87,10 +87,21 @@ def _torque(kind: Any, constants: Any) -> Any:
 
 
 def _body(
-    name: str, title: str, moments: Any, omega: Any, end: float, kind: Any, constants: Any
-) -> Scene:
+    name: str,
+    title: str,
+    moments: Sequence[float],
+    omega: Sequence[float],
+    end: float,
+    kind: Callable[..., Any] | None,
+    constants: Sequence[float],
+) -> BenchmarkScene:
     def plain(
-        numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = _identity, number: Any = _identity
+        numbers: Sequence[Any],
+        sin: Callable[..., Any],
+        cos: Callable[..., Any],
+        sqrt: Callable[..., Any],
+        wrap: Callable[..., Any] = _identity,
+        number: Callable[..., Any] = _identity,
     ) -> Any:
         exact = tuple(number(c) for c in constants)
         torque = None
@@ -101,7 +112,7 @@ def _body(
     # MuJoCo can do scenes with weight alone, or without torque.
     com, gravity = (constants[:3], constants[3:]) if kind is equations.heavy else ((0.0,) * 3,) * 2
     weighs = kind in (None, equations.heavy)
-    return Scene(
+    return BenchmarkScene(
         name, title, Inertia.from_principal(*moments), Attitude(TILTED, omega),
         _torque(kind, constants), end, plain, stored_answer(name), slow=omega[2] > 1e3,
         notes={"mass": 1.0, "com": com, "gravity": gravity} if weighs else None,
@@ -109,17 +120,28 @@ def _body(
 
 
 def _point(
-    name: str, title: str, start: Point, end: float, law: Any, kind: Any, constants: Any
-) -> Scene:
+    name: str,
+    title: str,
+    start: Point,
+    end: float,
+    law: PyTree,
+    kind: Callable[..., Any],
+    constants: Sequence[float],
+) -> BenchmarkScene:
     def plain(
-        numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = _identity, number: Any = _identity
+        numbers: Sequence[Any],
+        sin: Callable[..., Any],
+        cos: Callable[..., Any],
+        sqrt: Callable[..., Any],
+        wrap: Callable[..., Any] = _identity,
+        number: Callable[..., Any] = _identity,
     ) -> Any:
         return wrap(kind(tuple(number(c) for c in constants), sqrt))
 
-    return Scene(name, title, None, start, law, end, plain, stored_answer(name))
+    return BenchmarkScene(name, title, None, start, law, end, plain, stored_answer(name))
 
 
-def _foucault() -> Scene:
+def _foucault() -> BenchmarkScene:
     """Return Foucault's pendulum, released at rest, for ten minutes."""
     law = places.foucault(0.85, 67.0)
     _, north, up = (float(w) for w in law.place.angular_velocity())
@@ -129,7 +151,7 @@ def _foucault() -> Scene:
     )  # fmt: skip
 
 
-def _arenstorf() -> Scene:
+def _arenstorf() -> BenchmarkScene:
     """Return Arenstorf's orbit about Earth and Moon, for one period."""
     mu, x, v, period = ARENSTORF
     return _point(
@@ -138,7 +160,7 @@ def _arenstorf() -> Scene:
     )  # fmt: skip
 
 
-def scenes() -> dict[str, Callable[[], Scene]]:
+def scenes() -> dict[str, Callable[[], BenchmarkScene]]:
     """Return the standard scenes: name → a function that makes the scene (in the default precision
     of JAX).
 

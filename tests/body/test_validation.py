@@ -11,7 +11,7 @@ from rigidjax import body as bodies, identify, lagrangian, torques
 from rigidjax.body import validation
 from rigidjax.frames.libration import libration, libration_integral
 from rigidjax.plot import inertia_ellipsoid, phase_portrait, polhode, tumble
-from rigidjax.workprecision import Scene
+from rigidjax.workprecision import BenchmarkScene
 
 SKEW = np.array([[2.0, 0.3, 0.0], [0.1, 2.4, -0.2], [0.0, -0.2, 2.9]])
 LONG = np.diag([0.7, 0.9, 2.0])
@@ -57,7 +57,7 @@ KNOWN = {
     "equations_of_motion": lambda b: rj.equations_of_motion(b, SPIN),
     "Known": identify.Known,
     "Entropic": lambda b: identify.Entropic(b, 1.0),
-    "Scene": lambda b: Scene("x", "x", b, TURN, None, 1.0),
+    "Scene": lambda b: BenchmarkScene("x", "x", b, TURN, None, 1.0),
     "inertia_ellipsoid": inertia_ellipsoid,
     "tumble": lambda b: tumble(b, TIMES, STATES),
     "polhode": lambda b: polhode(b, STATES),

@@ -25,6 +25,25 @@ def test_a_derivative_of_its_batch_under_jit(axes):
         np.testing.assert_array_equal(x, y)
 
 
+@pytest.mark.oldest
+@pytest.mark.parametrize("axes", [(None, 0), (0, None), (0, 0)])
+def test_a_second_derivative_of_its_batch_under_jit(axes):
+    """The derivative of a kernel repeats its values, which are differentiated in their turn."""
+    a, b = (jnp.arange(1.0, 4.0) if axis == 0 else jnp.array(0.7) for axis in axes)
+    kernel = jax.vmap(one_kernel(partly_shared), axes)
+
+    def along(a, b):
+        return jax.jvp(kernel, (a, b), (jnp.ones_like(a), jnp.ones_like(b)))
+
+    steps = 2.0 * jnp.ones_like(a), jnp.ones_like(b)
+    (value, change), (slope, second) = jax.jit(lambda: jax.jvp(along, (a, b), steps))()
+    # Of a sin b: by (1, 1), by (2, 1), and by both.
+    np.testing.assert_allclose(value[2], a * jnp.sin(b), rtol=1e-15)
+    np.testing.assert_allclose(change[2], jnp.sin(b) + a * jnp.cos(b), rtol=1e-15)
+    np.testing.assert_allclose(slope[2], 2 * jnp.sin(b) + a * jnp.cos(b), rtol=1e-15)
+    np.testing.assert_allclose(second[2], 3 * jnp.cos(b) - a * jnp.sin(b), rtol=1e-14)
+
+
 def test_a_constant_with_a_derivative():
     """As entries that are zero by choice of the axes; all is linear: the slope is 4 exactly."""
 

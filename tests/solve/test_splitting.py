@@ -181,6 +181,7 @@ def test_derivatives_of_a_run():
 
 
 @pytest.mark.long
+@pytest.mark.oldest
 def test_derivatives_by_the_whole_tensor():
     """A change that turns the principal axes, too: beside central differences of the same steps."""
     change = jnp.array([[0.3, -1.0, 0.7], [-1.0, 0.2, 0.4], [0.7, 0.4, -0.5]])

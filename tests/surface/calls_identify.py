@@ -87,7 +87,7 @@ row("identify.Tolerance", dict(scale=0.01, cross_axis=0.02, bias=0.1, clock=1e-3
 row("identify.Descent", lambda: dict(optimiser=optax.adam(1e-2), steps=3, batch=1), transforms=())
 row(
     "identify.descend",
-    lambda: dict(model=s.model(), descent=identify.Descent(optax.adam(1e-2), steps=1, batch=1)),
+    lambda: dict(model=s.model(), descent=rj.identify.Descent(optax.adam(1e-2), steps=1, batch=1)),
     groups=("stranger",),
     transforms=(),
 )
@@ -336,7 +336,7 @@ leave_out("tumble and player return it", "plot.Film")
 # Work and precision.
 wp = rj.workprecision
 row(
-    "workprecision.Scene",
+    "workprecision.BenchmarkScene",
     lambda: dict(
         name="mine",
         title="words",

@@ -154,11 +154,11 @@ def found() -> rj.identify.Fit:
 @functools.cache
 def scene() -> Any:
     """A scene of work and precision, with a reference of its own."""
-    from rigidjax.workprecision import Scene
+    from rigidjax.workprecision import BenchmarkScene
     from rigidjax.workprecision.scene import Reference
 
     end = tuple(float(x) for x in [*Q, *W])
-    return Scene(
+    return BenchmarkScene(
         "mine", "a body slowed down", inertia(), attitude(), damping(), 1.0,
         reference=Reference(end, 1e-15, (), 0.0, "typed in"),
     )  # fmt: skip
@@ -166,9 +166,10 @@ def scene() -> Any:
 
 @functools.cache
 def records() -> tuple:
+    from rigidjax.workprecision.record import Measurement
 
     return tuple(
-        Record("s", name, "ours", "value", "", 10.0**-k, error=10.0**-k, time=float(k))
+        Measurement("s", name, "ours", "value", "", 10.0**-k, error=10.0**-k, time=float(k))
         for name in ("a", "b")
         for k in (3, 6, 9)
     )

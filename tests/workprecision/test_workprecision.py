@@ -15,7 +15,7 @@ from systems import free_body_mp, tops_mp
 import rigidjax as rj
 from rigidjax.cli.command import main
 from rigidjax.workprecision import (
-    Scene,
+    BenchmarkScene,
     choose,
     diffrax_method,
     draw,
@@ -114,7 +114,7 @@ def test_the_defaults_of_simulate_keep_what_the_table_promises(name):
 
 def test_a_scene_and_a_method_of_ones_own():
     """A ball slowed by damping, whose rate is exp(−ct/I): reference worked out, a peer given."""
-    scene = Scene(
+    scene = BenchmarkScene(
         "ball", "a ball slowed down", rj.Inertia.from_principal(2.0, 2.0, 2.0),
         rj.Attitude([1.0, 0, 0, 0], [0.3, -0.4, 0.5]), rj.torques.Damping([0.1] * 3), 6.0,
     )  # fmt: skip
@@ -227,11 +227,11 @@ def test_files_and_charts(tmp_path):
 def test_mistakes_are_named(capsys, tmp_path):
     body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0, 1])
     with pytest.raises(TypeError, match="wanted an Attitude or a Point, got Spin"):
-        Scene("x", "x", body, start, None, 1.0)
+        BenchmarkScene("x", "x", body, start, None, 1.0)
     with pytest.raises(TypeError, match="an Inertia with an Attitude, or None with a Point"):
-        Scene("x", "x", None, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), None, 1.0)
+        BenchmarkScene("x", "x", None, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), None, 1.0)
     with pytest.raises(ValueError, match="wanted an end > 0"):
-        Scene("x", "x", body, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), None, 0.0)
+        BenchmarkScene("x", "x", body, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), None, 0.0)
     with pytest.raises(TypeError, match=r'scenes\(\)\["heavy-top"\]\(\)'):
         measure("heavy-top")
     with pytest.raises(TypeError, match=r"wanted methods of workprecision.methods\(\), got str"):

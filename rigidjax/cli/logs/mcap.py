@@ -49,12 +49,12 @@ _ENOUGH = 2000
 class _Json:
     """The decoder of messages in JSON, by mcap's interface."""
 
-    def decoder_for(self, encoding: str, schema: Any) -> Callable[[bytes], Any] | None:
+    def decoder_for(self, encoding: str, schema: object) -> Callable[[bytes], Any] | None:
         """Return the decoder of an encoding, `None` for another one than JSON."""
         return json.loads if encoding == "json" else None
 
 
-def _numbers_in(content: Any, name: str = "") -> Iterator[tuple[str, float]]:
+def _numbers_in(content: object, name: str = "") -> Iterator[tuple[str, float]]:
     """Yield the numbers in a message, each after the name of its place, such as `.gyro.x`."""
     if isinstance(content, bool | int | float | np.number):
         yield name, float(content)

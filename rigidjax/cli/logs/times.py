@@ -25,7 +25,7 @@ def mask_of_increasing(t: np.ndarray) -> np.ndarray:
     They are a longest increasing subsequence, found by patience sorting. A time that is repeated,
     backward, far too large or missing (NaN) therefore costs its own row only.
 
-    >>> increasing(np.array([0.0, 1.0, 1.0, 90.0, 2.0, np.nan, 3.0])).tolist()
+    >>> mask_of_increasing(np.array([0.0, 1.0, 1.0, 90.0, 2.0, np.nan, 3.0])).tolist()
     [True, True, False, False, True, False, True]
     """
     if (np.diff(t) > 0).all() and np.isfinite(t).all():

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,7 @@ from rigidjax.identify.answer.answers import (
 )
 from rigidjax.identify.answer.causes import clock
 from rigidjax.identify.answer.result import Fit, Start
+from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.model import Model, words_on_delays
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.search.noise import median_of_chi2
@@ -107,7 +107,7 @@ def goodness(
 
 def _in_words(
     model: Model,
-    reading: Any,
+    reading: Reading,
     error: np.ndarray,
     kept: np.ndarray,
     factor: float,
@@ -156,7 +156,7 @@ def _describe_interval(model: Model, error: np.ndarray, kept: np.ndarray) -> str
     return f"half of the squared ones from {times} s{of}"
 
 
-def _sizes(reading: Any, error: np.ndarray, kept: np.ndarray) -> tuple[float, float, float]:
+def _sizes(reading: Reading, error: np.ndarray, kept: np.ndarray) -> tuple[float, float, float]:
     """Return three sums of squares: of errors, of readings about their mean, and of round-off."""
     values = np.asarray(reading.values)[reading.seen]
     varies = float(np.sum((values - values.mean(axis=0)) ** 2))

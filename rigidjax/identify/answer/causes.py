@@ -24,6 +24,7 @@ from rigidjax.identify.search.starts import balance, depends_on_rate_only, tenso
 from rigidjax.identify.sensors import AbstractSensor, Gyro
 from rigidjax.identify.uncertainty.considered import slope_in_time
 from rigidjax.identify.uncertainty.covariance import Linearised
+from rigidjax.motion.torques.base import Torque
 
 # A correction of the rates counts if it leaves less than the share BETTER of the error of the rates
 # as they were read, and less than the share LITTLE of the whole signal.
@@ -52,7 +53,7 @@ ATTITUDES = {
 }
 
 
-def misreading(recordings: Sequence[Recording], torque: Any) -> Cause | None:
+def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause | None:
     """Return the mistake made when the rates of one body were read, `None` if there is none.
 
     The rates are compared with the rates between attitudes or, without attitudes, with Euler's
@@ -94,7 +95,7 @@ def misreading(recordings: Sequence[Recording], torque: Any) -> Cause | None:
 
 
 def _of_euler(
-    recordings: Sequence[Recording], torque: Any, turn: np.ndarray, sign: float = 1.0
+    recordings: Sequence[Recording], torque: Torque | None, turn: np.ndarray, sign: float = 1.0
 ) -> tuple[float, float]:
     """Return the relative residual of Euler's equations and the best body's margin of being real.
 

@@ -8,14 +8,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax.identify.answer import answers, undetermined as identifiability
 from rigidjax.identify.answer.answers import Answer, Cause
 from rigidjax.identify.answer.causes import causes
 from rigidjax.identify.answer.undetermined import Combination, undetermined
-from rigidjax.identify.model.model import Model, Unpacked, unpack_numbers
+from rigidjax.identify.model.model import Model, Unpacked, unpack_with_slopes
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.uncertainty.considered import Consideration
 from rigidjax.identify.uncertainty.covariance import Linearised
@@ -264,13 +264,20 @@ class Fit(eqx.Module):
                 "interval_of outside of jax.jit, jax.grad and jax.vmap"
             )
 
-        def value(x: Array) -> Array:
-            point = unpack_numbers(self.model, x)
+        def value(point: Unpacked) -> Array:
             point = dataclasses.replace(point, noise=self.noises)
             return _checks.numbers(of(point), "of(point)")
 
-        middle = np.asarray(_checks.finite(value(self.x), "of(point)"))
-        slope = np.asarray(jax.jacfwd(value)(self.derivative_point))
+        # Compile one program for what x represents: outside of a trace each operation of JAX is a
+        # program of its own, and some ninety of them took seconds to compile.
+        point, slopes = unpack_with_slopes(self.model, self.derivative_point)
+        best = point if self.near is None else unpack_with_slopes(self.model, self.x)[0]
+
+        def change(step: Unpacked) -> Array:
+            return jax.jvp(value, (point,), (step,))[1]
+
+        middle = np.asarray(_checks.finite(value(best), "of(point)"))
+        slope = np.asarray(jax.vmap(change, in_axes=-1, out_axes=-1)(slopes))
         seen, null = np.asarray(self.seen), np.asarray(self.null_directions)
         if self.hidden is not None:
             null = np.concatenate([null, np.asarray(self.hidden)])
@@ -299,7 +306,7 @@ class Fit(eqx.Module):
         return identifiability.identifiability(self)
 
 
-def require_one_fit(fit: Any, name: str = "fit") -> Fit:
+def require_one_fit(fit: PyTree, name: str = "fit") -> Fit:
     """Return the `fit`; raise `TypeError` or `ValueError` unless it is one `Fit`, not a batch."""
     _checks.instance(fit, Fit, name)
     if np.shape(fit.chi2) != ():

@@ -14,10 +14,12 @@ from rigidjax.identify.answer.answers import FAILS, NOT_ENDED
 from rigidjax.identify.data.full_scale import in_words
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, as_list
-from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.model import Model, without_samples
+from rigidjax.identify.model.terms import with_jacobian
 from rigidjax.identify.search.stages import errors_and_slopes
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
+from rigidjax.identify.uncertainty.flat_limit import bodies_of
 from rigidjax.identify.uncertainty.quantities import (
     Quantity,
     charts,
@@ -115,7 +117,7 @@ def undetermined(fit: "Fit") -> tuple[Combination, ...]:
     if not null.size:
         return ()
     best = basis = None
-    slopes, values = map(np.asarray, _slopes(fit.model, fit.derivative_point))
+    slopes, values = map(np.asarray, _slopes(without_samples(fit.model), fit.derivative_point))
     names, many = _names(fit.model), len(charts(fit.model))
     first, turns = len(labels(fit.model)), 3 * fit.model.count
     for other in (1, 0):
@@ -232,7 +234,7 @@ def _slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
             numbers += initial_states(x)
         return jnp.concatenate([part.reshape(-1) for part in numbers])
 
-    return jax.jacfwd(value)(point), value(point)
+    return with_jacobian(value, point)
 
 
 def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
@@ -240,7 +242,7 @@ def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.nda
 
     A body's tensor is reported by its moments, or by its components if changes turn its axes.
     """
-    rows = as_list(fit.model.bodies(fit.derivative_point))
+    rows = bodies_of(fit.model, fit.derivative_point)
     mask = np.ones(len(names), bool)
     for (where, chart), body in zip(charts(fit.model), rows, strict=True):
         # A chart may report the components itself; the last entries of the name are ours.
@@ -377,7 +379,9 @@ def scale_is_unseen(fit: "Fit") -> bool:
     if not len(null) or isinstance(fit.model.chart, Bodies):
         return False
     first = len(labels(fit.model))
-    slopes, values = (np.asarray(a) for a in _slopes(fit.model, fit.derivative_point))
+    slopes, values = (
+        np.asarray(a) for a in _slopes(without_samples(fit.model), fit.derivative_point)
+    )
     here, moved = values[first : first + 6], slopes[first : first + 6] @ null.T
     wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)
     return bool(np.linalg.norm(moved @ wanted - here) < 1e-3 * np.linalg.norm(here))

@@ -7,9 +7,10 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from rigidjax import _checks, _show
+from rigidjax._types import NumbersLike
 from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.motion.torques import Held
 
@@ -63,7 +64,7 @@ class Reading(eqx.Module):
         changes quickly, and the search would prefer such motions.
         """
 
-        def parts(reading: Any) -> Any:
+        def parts(reading: PyTree) -> Any:
             return reading.late, reading.sensor.jitter.deviation
 
         return eqx.tree_at(parts, self, (late, deviation))
@@ -105,7 +106,7 @@ class Recording(eqx.Module):
     inputs: dict[str, Any]
     dropped: int = eqx.field(static=True)
 
-    def __init__(self, t: Any, *readings: tuple, inputs: Mapping[str, Any] | None = None):
+    def __init__(self, t: NumbersLike, *readings: tuple, inputs: Mapping[str, Any] | None = None):
         for pair in readings:
             if not isinstance(pair, tuple) or len(pair) not in (2, 3):
                 raise TypeError(
@@ -247,7 +248,7 @@ def _require_digits(t: np.ndarray, dtype: np.dtype) -> None:
 
 
 def _reading(
-    t: np.ndarray, sensor: AbstractSensor, values: Any, mask: Any = None
+    t: np.ndarray, sensor: AbstractSensor, values: Any, mask: NumbersLike | None = None
 ) -> tuple[AbstractSensor, np.ndarray, np.ndarray, np.ndarray]:
     """Return the sensor, its checked values and mask, and the rows that a masked array hides."""
     name = type(sensor).__name__

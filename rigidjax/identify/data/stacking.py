@@ -36,12 +36,12 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
     return eqx.combine(jax.tree.map(_stack_leaves, *numbers), others[0]), counts
 
 
-def _is_number(leaf: Any) -> bool:
+def _is_number(leaf: PyTree) -> bool:
     """Return whether a leaf is an array or a real number of Python, which may be stacked."""
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | complex)
 
 
-def of_few_lengths(model: Any) -> Any:
+def of_few_lengths(model: PyTree) -> Any:
     """Return the model with its recordings padded by masked readings to one of few lengths.
 
     There are four such lengths an octave, so that few programs are compiled. Windows are all of one
@@ -70,7 +70,7 @@ def _length(count: int) -> int:
     return int(lengths[0] if lengths[0] >= count else lengths[1])
 
 
-def _stack_leaves(*leaves: Any) -> Any:
+def _stack_leaves(*leaves: PyTree) -> Any:
     """Stack leaves along a new first axis."""
     # Use NumPy if the numbers are known: JAX would compile a program for each shape.
     if _checks.known(leaves):
@@ -81,7 +81,7 @@ def _stack_leaves(*leaves: Any) -> Any:
 def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "*rows"]) -> PyTree:
     """Return the tree of arrays at one index of their leading axis, or at several."""
 
-    def pick(leaf: Any) -> Any:
+    def pick(leaf: PyTree) -> Any:
         if not eqx.is_array(leaf):
             return leaf
         known = _checks.known((leaf, index))
@@ -105,24 +105,28 @@ def on_host(records: Recording, counts: Int[ArrayLike, " records"]) -> tuple[Rec
     )
 
 
-def cut(recording: Recording, end: int, begin: int = 0) -> Recording:
-    """Return the rows of a recording from `begin` to before `end`."""
-    if recording.t.shape[0] == end - begin:
+def cut(recording: Recording, end: int, begin: int = 0, axis: int = 0) -> Recording:
+    """Return the rows of a recording from `begin` to before `end`.
+
+    Times are along `axis`: 0 for one recording, 1 for several with a leading axis.
+    """
+    if recording.t.shape[axis] == end - begin:
         return recording
+    rows = (slice(None),) * axis + (slice(begin, end),)
 
     def long(r: Recording) -> list[Any]:
         parts = [(reading.values, reading.mask, reading.late) for reading in r.readings]
         return jax.tree.leaves((r.t, parts))
 
-    shorter = eqx.tree_at(long, recording, [leaf[begin:end] for leaf in long(recording)])
+    shorter = eqx.tree_at(long, recording, [leaf[rows] for leaf in long(recording)])
     inputs = {
-        name: source[begin:end] if eqx.is_array(source) else source
+        name: source[rows] if eqx.is_array(source) else source
         for name, source in recording.inputs.items()
     }
     return eqx.tree_at(lambda r: r.inputs, shorter, inputs) if inputs else shorter
 
 
-def _is_table(node: Any) -> bool:
+def _is_table(node: PyTree) -> bool:
     """Return whether a node of a tree is a table of time."""
     return isinstance(node, Linear | Series)
 

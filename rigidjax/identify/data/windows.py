@@ -11,10 +11,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import HasSpin
+from rigidjax._types import HasSpin, Numbers
 from rigidjax.identify.data.recording import Reading, Recording, recording_of
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.sensors.states import StateSensor
@@ -177,8 +177,8 @@ class Windows(eqx.Module):
 
 
 def windows(
-    t: Float[ArrayLike, " times"] | Any,
-    states: Any,
+    t: Float[ArrayLike, " times"] | Numbers,
+    states: PyTree,
     inputs: Mapping[str, Any] | None = None,
     *,
     length: int,
@@ -262,16 +262,16 @@ def windows(
 
 
 def _by_kind(
-    numbers: Any, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
+    numbers: object, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
 ) -> dict[str, float]:
     """Return the numbers of a mapping whose keys are `kinds`, each one checked by `check`."""
-    _checks.instance(numbers, Mapping, name, wanted="numbers by kind")
-    if set(numbers) != set(kinds):
-        raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(numbers)}")
-    return {kind: float(check(numbers[kind], f"{name}[{kind!r}]")) for kind in kinds}
+    by_kind = _checks.instance(numbers, Mapping, name, wanted="numbers by kind")
+    if set(by_kind) != set(kinds):
+        raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(by_kind)}")
+    return {kind: float(check(by_kind[kind], f"{name}[{kind!r}]")) for kind in kinds}
 
 
-def _deviation(value: Any, name: str) -> float:
+def _deviation(value: object, name: str) -> float:
     """Return the deviation of a start; raise `ValueError` unless it is positive, maybe infinite."""
     number = _checks.number(value, name)
     if not number > 0:
@@ -282,7 +282,7 @@ def _deviation(value: Any, name: str) -> float:
     return number
 
 
-def _require_rows(times: np.ndarray, states: Any, inputs: Mapping[str, Any]) -> None:
+def _require_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) -> None:
     """Raise `ValueError` unless states and inputs are finite, with one row for each time."""
     rows = dict(zip(names(states), jax.tree.leaves(states), strict=True))
     rows |= {f"inputs[{k!r}]": v for k, v in inputs.items()}
@@ -322,7 +322,7 @@ def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
     return h, even
 
 
-def require_windows(windows: Any) -> None:
+def require_windows(windows: PyTree) -> None:
     """Raise `TypeError` or `ValueError` unless these are several windows of finite numbers."""
     _checks.instance(windows, Windows, "windows", wanted="what identify.windows returns")
     for name, wanted in (("starts", 2), ("wanted", 3)):
@@ -334,7 +334,7 @@ def require_windows(windows: Any) -> None:
             _checks.finite(leaf, f"windows: {name}")
 
 
-def mistakes_of_delays(law: Any, known: float, length: float) -> list[str]:
+def mistakes_of_delays(law: PyTree, known: float, length: float) -> list[str]:
     """Describe each delay of a torque that reads an input outside of the samples of a window.
 
     **Arguments:**

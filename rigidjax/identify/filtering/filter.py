@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasSpin, Scalar, ScalarLike
+from rigidjax._types import HasAttitude, HasSpin, NumbersLike, Scalar, ScalarLike
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.data.reference_states import attitudes
@@ -84,10 +84,10 @@ def first_belief(
     x: Float[Array, " n"] | None = None,
     *,
     state: Spin | Attitude | Rigid | None = None,
-    rate: Any,
-    attitude: Any = None,
-    position: Any = None,
-    velocity: Any = None,
+    rate: NumbersLike,
+    attitude: NumbersLike | None = None,
+    position: NumbersLike | None = None,
+    velocity: NumbersLike | None = None,
 ) -> Belief:
     """Return the belief before the first reading.
 
@@ -400,7 +400,7 @@ def step(
     model: Model,
     belief: Belief,
     t: ScalarLike,
-    *readings: Any,
+    *readings: NumbersLike,
     seen: Sequence[Any] | None = None,
     x: Float[Array, " n"] | None = None,
 ) -> Belief:

@@ -250,7 +250,7 @@ def linearise_readings(
         def error(y: Extended, index: int = index, value: Array = value) -> Array:
             drifted = in_precision(dynamics.sensors_at(y.walks)[index], dtype)
 
-            def field(t: Array, state: PyTree, args: Any = None) -> PyTree:
+            def field(t: Array, state: PyTree, args: object = None) -> PyTree:
                 return dynamics.with_torques(dynamics.field(t, state, args), y.torques)
 
             motion, when = y.motion, t
@@ -295,8 +295,8 @@ MEMORY_A_STEP = 0.25
 
 def steps_of(
     process: Process | None,
-    ts: Any,
-    state: Any,
+    ts: Array | np.ndarray,
+    state: HasSpin,
     substeps: int | None,
     recording: Recording | None = None,
 ) -> np.ndarray:

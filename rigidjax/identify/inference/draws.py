@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
@@ -69,7 +69,7 @@ class Nuts(eqx.Module):
         _checks.whole(self.warmup, "warmup", 1)
         _checks.fraction(self.acceptance, "acceptance")
 
-    def __call__(self, key: Any, density: Callable[[Array], Array], start: Array) -> Array:
+    def __call__(self, key: PRNGKeyArray, density: Callable[[Array], Array], start: Array) -> Array:
         """Return the draws (samples, n) of one chain that begins at `start` (n,)."""
         blackjax = _checks.library(*_BLACKJAX)
         adaptation = blackjax.adaptation
@@ -80,7 +80,7 @@ class Nuts(eqx.Module):
         metric_begin, metric_add, metric_end = metric
         kernel = blackjax.nuts.build_kernel()
 
-        def warm(tuning: tuple, state: Any, accepted: Array, slow: Array, ends: Array) -> tuple:
+        def warm(tuning: tuple, state: PyTree, accepted: Array, slow: Array, ends: Array) -> tuple:
             steps, scale, _ = tuning
             steps = tune(steps, accepted)
             scale = lax.cond(slow, lambda: metric_add(scale, state.position), lambda: scale)
@@ -179,7 +179,7 @@ def _identity(point: Unpacked) -> Unpacked:
 
 
 def posterior(
-    density: LogDensity, key: Any, *, sampler: Sampler | None = None, chains: int = 4
+    density: LogDensity, key: PRNGKeyArray, *, sampler: Sampler | None = None, chains: int = 4
 ) -> Posterior:
     """Draw body, initial states, all `Free`s, noise and process, given all readings.
 
@@ -207,16 +207,16 @@ def posterior(
     _checks.instance(density, LogDensity, "density", hint="identify.LogDensity(fit) makes one")
     _checks.key(key)
     chains = _checks.whole(chains, "chains", 2)
-    sampler = Nuts() if sampler is None else _checks.function(sampler, "sampler", "of a key")
-    if isinstance(sampler, Nuts):
+    sample = Nuts() if sampler is None else _checks.function(sampler, "sampler", "of a key")
+    if isinstance(sample, Nuts):
         _checks.library(*_BLACKJAX)
     root = jnp.linalg.cholesky(density.covariance)
-    x = _draw(density, root, jax.random.split(key, chains), sampler)
+    x = _draw(density, root, jax.random.split(key, chains), sample)
     return Posterior(density, x)
 
 
 @eqx.filter_jit
-def _draw(density: LogDensity, root: Array, keys: Array, sampler: Any) -> Array:
+def _draw(density: LogDensity, root: Array, keys: Array, sampler: Sampler) -> Array:
     """Return the draws (chains, samples, n) of one chain for each of the `keys`, as one program.
 
     Chains are sampled in the vector z with `x = x0 + root z`.
@@ -326,7 +326,7 @@ class Refit(eqx.Module):
 
 
 def refit(
-    density: LogDensity, *, max_steps: int = 200, draws: int = 1000, key: Any = None
+    density: LogDensity, *, max_steps: int = 200, draws: int = 1000, key: PRNGKeyArray | None = None
 ) -> Refit:
     """Find the maximum of a posterior density, and draw around it for intervals.
 
@@ -365,12 +365,12 @@ def refit(
     """
     _checks.instance(density, LogDensity, "density", hint="identify.LogDensity(fit) makes one")
     steps, count = _checks.whole(max_steps, "max_steps", 1), _checks.whole(draws, "draws", 1)
-    key = jax.random.key(0) if key is None else _checks.key(key)
-    return _refit(density, Settings(_SMALL, _DAMPING, steps), key, count)
+    drawing = jax.random.key(0) if key is None else _checks.key(key)
+    return _refit(density, Settings(_SMALL, _DAMPING, steps), drawing, count)
 
 
 @eqx.filter_jit
-def _refit(density: LogDensity, settings: Settings, key: Any, count: int) -> Refit:
+def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: int) -> Refit:
     """Return the result of `refit` with `count` draws, as one program."""
 
     def evaluate(x: Array) -> tuple[None, Array, Normal, Array]:
@@ -386,7 +386,7 @@ def _refit(density: LogDensity, settings: Settings, key: Any, count: int) -> Ref
 
 
 def _weighted_draws(
-    density: LogDensity, top: Array, covariance: Array, key: Any, count: int
+    density: LogDensity, top: Array, covariance: Array, key: PRNGKeyArray, count: int
 ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
     """Return `count` draws of Student's t about the maximum `top`, and their weights."""
     size, kind = top.size, top.dtype

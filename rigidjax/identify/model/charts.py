@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from rigidjax import _checks
 from rigidjax.body import parameters as charts, validation
@@ -65,7 +65,7 @@ class AbstractBodyChart(eqx.Module):
         """Return the body of the numbers `vector`."""
 
     @abc.abstractmethod
-    def vector(self, body: Any) -> Numbers:
+    def vector(self, body: PyTree) -> Numbers:
         """Return the numbers of a `body`, such as the initial guess of a fit."""
 
     def bend(self, vector: Numbers, slope: Numbers) -> Rows:
@@ -78,10 +78,10 @@ class AbstractBodyChart(eqx.Module):
         return jnp.zeros((0, self.size), vector.dtype)
 
     @abc.abstractmethod
-    def logs(self, body: Any) -> Float[Array, " logs"]:
+    def logs(self, body: PyTree) -> Float[Array, " logs"]:
         """Return the logarithms of the positive quantities that are reported."""
 
-    def plain(self, body: Any) -> Float[Array, " plain"]:
+    def plain(self, body: PyTree) -> Float[Array, " plain"]:
         """Return the reported quantities of either sign."""
         return jnp.zeros(0)
 
@@ -143,7 +143,7 @@ class PrincipalRatios(AbstractBodyChart):
         return jnp.log(i[:2] / i[2])
 
 
-def _typical_moments(value: Any) -> Array:
+def _typical_moments(value: object) -> Array:
     """Return the rough size of the moments as an array; raise an error unless it is positive."""
     if isinstance(value, Inertia | MassProperties):
         raise TypeError(
@@ -328,7 +328,7 @@ class Known(AbstractBodyChart):
     def vector(self, body: Inertia) -> Numbers:
         return jnp.zeros(0, body.tensor.dtype)
 
-    def logs(self, body: Any) -> Float[Array, "0"]:
+    def logs(self, body: PyTree) -> Float[Array, "0"]:
         return jnp.zeros(0)
 
 
@@ -443,13 +443,13 @@ def charts_of(body: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...]
     return body.charts if isinstance(body, Bodies) else (body,)
 
 
-def numbers_of(body: AbstractBodyChart | Bodies, vector: Any) -> list[Any]:
+def numbers_of(body: AbstractBodyChart | Bodies, vector: Array | np.ndarray) -> list[Any]:
     """Split the numbers `vector` of one body or of several into those of each chart."""
     sizes = [chart.size for chart in charts_of(body)]
     return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
 
 
-def as_list(bodies: Any) -> list[Any]:
+def as_list(bodies: PyTree) -> list[Any]:
     """Return the result of `Model.bodies`, one body or a dict of several, as a list."""
     return list(bodies.values()) if isinstance(bodies, dict) else [bodies]
 

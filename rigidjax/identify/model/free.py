@@ -84,7 +84,7 @@ class Free(eqx.Module):
             )
 
 
-def checked_labels(each: Any, name: str) -> bool | str | tuple[Any, ...]:
+def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
     """Return `each` of a `Free` if it is valid, labels as a tuple; else raise an error."""
     if isinstance(each, bool):
         return each

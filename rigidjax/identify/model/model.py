@@ -10,12 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasPose, Scalar
+from rigidjax._types import HasAttitude, HasPose, NumbersLike, Scalar
 from rigidjax.body import validation
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.identify.data import stacking
 from rigidjax.identify.data.full_scale import with_limits
 from rigidjax.identify.data.recording import Recording
@@ -45,6 +45,7 @@ from rigidjax.identify.model.terms import (
     over_records,
     scene_of,
     template,
+    with_jacobian,
 )
 from rigidjax.identify.model.walks import Drift, Walk, find_drifts
 from rigidjax.identify.sensors import AbstractSensor
@@ -267,7 +268,7 @@ class Model(eqx.Module):
         """
         return self.reference.rate[0]
 
-    def start(self, body: Any = None, omega: Any = None) -> Float[Array, " n"]:
+    def start(self, body: PyTree = None, omega: NumbersLike | None = None) -> Float[Array, " n"]:
         """Return free numbers with which a fit may start, or those of a planned motion.
 
         Numbers of `Free`s have their starting values.
@@ -345,7 +346,7 @@ class Model(eqx.Module):
         """
         x = require_numbers(self, x)
 
-        def of_one(row: Array, record: Recording, *rest: Any) -> Any:
+        def of_one(row: Array, record: Recording, *rest: PyTree) -> Any:
             scene = scene_of(self, row, record, *rest)
             return motion_of(motion_of_scene(self, scene, record)[0])
 
@@ -381,7 +382,9 @@ class _Data(NamedTuple):
     widest: float
 
 
-def _data_of_recordings(recordings: list[Recording], torque: Any, charts: Any) -> _Data:
+def _data_of_recordings(
+    recordings: list[Recording], torque: Torque | None, charts: AbstractBodyChart | Bodies
+) -> _Data:
     """Return the data of recordings, each of which starts in a free state."""
     _require_recordings(recordings)
     recordings = with_limits(recordings)
@@ -399,7 +402,9 @@ def _data_of_recordings(recordings: list[Recording], torque: Any, charts: Any) -
     return _Data(records, counts, sensors, state_kind, reference, None, None, kinds, widest)
 
 
-def _data_of_windows(windows: Windows, torque: Any, charts: Any, stretches: int) -> _Data:
+def _data_of_windows(
+    windows: Windows, torque: Torque | None, charts: AbstractBodyChart | Bodies, stretches: int
+) -> _Data:
     """Return the data of windows: each starts in its measured state, or in a free one about it."""
     require_inputs_of_windows(torque, windows)
     records = windows.records()
@@ -414,7 +419,13 @@ def _data_of_windows(windows: Windows, torque: Any, charts: Any, stretches: int)
     )
 
 
-def _require_parts(charts: Any, free: Any, loss: Any, prior: Any, integrator: Any) -> None:
+def _require_parts(
+    charts: AbstractBodyChart | Bodies,
+    free: object,
+    loss: object,
+    prior: object,
+    integrator: object,
+) -> None:
     """Raise `TypeError` unless the parts of a model are of their types."""
     for one in charts_of(charts):
         known = isinstance(one, Inertia | MassProperties)
@@ -432,7 +443,7 @@ def _require_parts(charts: Any, free: Any, loss: Any, prior: Any, integrator: An
             _checks.instance(value, kind, name)
 
 
-def _require_own_names(slots: Sequence[Slot], charts: Any) -> None:
+def _require_own_names(slots: Sequence[Slot], charts: AbstractBodyChart | Bodies) -> None:
     """Raise `ValueError` for a `Free` with the name of a quantity of the body."""
     taken = {name for one in charts_of(charts) for name in (*one.log_names, *one.plain_names)}
     for slot in slots:
@@ -448,10 +459,32 @@ def unpack_numbers(model: Model, x: Float[Array, " n"]) -> Unpacked:
     return Unpacked(x, model.bodies(x), state0, values_of(model, x))
 
 
+def unpack_with_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
+    """Return what x represents, and its derivatives by x along a new last axis of each array."""
+    slopes, point = _unpack_with_jacobian(without_samples(model), x)
+    return point, slopes
+
+
+@eqx.filter_jit
+def _unpack_with_jacobian(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
+    """Return the derivatives of `unpack_numbers` and its result, as one program."""
+    return with_jacobian(lambda x: unpack_numbers(model, x), x)
+
+
+def without_samples(model: Model) -> Model:
+    """Return a model of known numbers with the first time of each recording alone.
+
+    What x represents depends on no reading. A program that computes it from this model is compiled
+    once, and not again for recordings of another length.
+    """
+    records = jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, model.records)
+    return with_parts(model, records=stacking.cut(records, 1, axis=1))
+
+
 def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
     """Return the result of `Model.scenes`, without a check of x."""
 
-    def of_one(row: Array, *rest: Any) -> Scene:
+    def of_one(row: Array, *rest: PyTree) -> Scene:
         return scene_of(model, row, *rest)
 
     rows = model.index.rows(x)
@@ -498,7 +531,7 @@ def filter_steps_of(model: Model) -> int:
     return math.ceil(steps) if 1.0 < steps < math.inf else 1
 
 
-def require_one(model: Any) -> Model:
+def require_one(model: PyTree) -> Model:
     """Return `model`; raise `TypeError` or `ValueError` unless it is one `Model`, not a batch."""
     _checks.instance(model, Model, "model")
     records, rate = model.records, model.reference.rate
@@ -514,7 +547,7 @@ def require_one(model: Any) -> Model:
     return model
 
 
-def require_numbers(model: Model, x: Any) -> Float[Array, " n"]:
+def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
     """Return the free numbers x; raise an error unless they are numbers of this model."""
     require_one(model)
     hint = "model.start(body) makes them"
@@ -615,7 +648,7 @@ def _require_even_times(torque: Torque | None, recording: Recording, number: int
         )
 
 
-def _require_held_steps(integrator: Any) -> None:
+def _require_held_steps(integrator: object) -> None:
     """Raise `ValueError` for an integrator that does not hold samples in its steps."""
     if integrator is not None and not isinstance(integrator, HeldSteps):
         raise ValueError(
@@ -675,14 +708,14 @@ def _require_recordings(recordings: Sequence[Any]) -> None:
         _checks.numbers(item.t, "recording")
 
 
-def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
+def _numbers(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " chart"]:
     """Return the numbers of a body in a chart; zeros, the start of the chart, for `None`."""
     if body is None:
         return _zeros(chart.size)
-    body = validation.single(body, (Inertia, MassProperties), "body")
-    if _checks.known(body):
-        jax.tree.map(lambda leaf: _checks.finite(leaf, "body"), body)
-    vector = eqx.filter_jit(chart.vector)(body)
+    one = validation.single(body, (Inertia, MassProperties), "body")
+    if _checks.known(one):
+        jax.tree.map(lambda leaf: _checks.finite(leaf, "body"), one)
+    vector = eqx.filter_jit(chart.vector)(one)
     if _checks.known(vector):
         _checks.refuse(
             vector,
@@ -698,7 +731,9 @@ def _zeros(*shape: int) -> Array:
     return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
 
 
-def _state_kind(sensors: Any, torque: Any, body: AbstractBodyChart | Bodies) -> type:
+def _state_kind(
+    sensors: Sequence[AbstractSensor], torque: Torque | None, body: AbstractBodyChart | Bodies
+) -> type:
     """Return the smallest type of state that sensors and torque need.
 
     Raise `ValueError` if the body needs a mass and has none.

@@ -11,11 +11,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.identify.sensors import AbstractSensor, SensorInput
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -40,7 +40,6 @@ FINEST = 32
 _LEAST, _CLOSER = 2.5e-14, 1e-2
 
 
-Body = Inertia | MassProperties
 State = Spin | Attitude | Rigid
 
 
@@ -337,7 +336,7 @@ def simulate_readings(
     ts: Float[ArrayLike, " times"] | Sequence[float],
     torque: Torque | None = None,
     *,
-    key: Any = None,
+    key: PRNGKeyArray | None = None,
 ) -> Any:
     """Return the readings of a sensor along a known motion, with noise: data to test a fit.
 
@@ -393,7 +392,7 @@ def _readings(
     state0: State,
     states: PyTree,
     *,
-    key: Any,
+    key: PRNGKeyArray | None,
 ) -> Float[Array, "times ..."]:
     """Return the readings of one sensor along a motion, as one program."""
     jitter, late = getattr(sensor, "jitter", None), None
@@ -416,7 +415,7 @@ def _readings(
     return values if limit is None else jnp.clip(values, -limit[None], limit[None])
 
 
-def _require_sensor(sensor: Any, state0: State, key: Any) -> None:
+def _require_sensor(sensor: PyTree, state0: State, key: object) -> None:
     """Raise an error for anything but a sensor that can read this state, with noise for a key."""
     name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
     _checks.instance(sensor, AbstractSensor, "sensor", wanted=wanted)

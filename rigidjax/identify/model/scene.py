@@ -1,8 +1,7 @@
 """The scene of a recording: everything that its readings depend on."""
 
-from typing import Any
-
 import equinox as eqx
+from jaxtyping import PyTree
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
@@ -43,7 +42,7 @@ class Scene(eqx.Module):
     start: Spin | Attitude | Rigid | None
 
 
-def require_process(process: Any) -> None:
+def require_process(process: PyTree) -> None:
     """Raise `TypeError` unless `process` is an unknown torque or a `Sum` of them."""
     wanted = "a RandomTorque, a CorrelatedTorque or a Sum of them"
     for part in parts_of(process) or (process,):

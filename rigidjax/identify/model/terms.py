@@ -108,7 +108,7 @@ def errors_of_scene(
     return tuple(out)
 
 
-def over_records(function: Any, model: "Model", *rows: Any) -> Any:
+def over_records(function: Callable[..., PyTree], model: "Model", *rows: PyTree) -> Any:
     """Return `function(*rows, record, reference, which)` of every recording.
 
     On a CPU the recordings follow one after another: XLA makes one kernel of a loop over a few
@@ -137,13 +137,15 @@ def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
 
 
 @eqx.filter_custom_jvp
-def by_recording(rows: Float[Array, "records columns"], model: "Model", function: Any) -> Any:
+def by_recording(
+    rows: Float[Array, "records columns"], model: "Model", function: Callable[..., PyTree]
+) -> Any:
     """Return `function(model, row, record, reference, which)` of every recording.
 
     Only derivatives by the rows are defined; they are those of `blocks`.
     """
 
-    def of_one(row: Row, *rest: Any) -> Any:
+    def of_one(row: Row, *rest: PyTree) -> Any:
         return function(model, row, *rest)
 
     return batch_as(over_records(of_one, model, rows), rows)
@@ -163,7 +165,9 @@ def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree
     return batch_as(out, rows), along
 
 
-def blocks(model: "Model", x: Float[Array, " n"], function: Any = errors_of_one) -> tuple[Any, Any]:
+def blocks(
+    model: "Model", x: Float[Array, " n"], function: Callable[..., PyTree] = errors_of_one
+) -> tuple[Any, Any]:
     """Return `function` of every recording, and its derivatives (R, …, m) by the free numbers.
 
     The m derivatives are in the columns of `model.index`. No other place differentiates readings by
@@ -193,7 +197,7 @@ def _with_slopes(
 def changes(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
     """Return the derivative (R, T, k) of the errors of each sensor by a delay of its clock."""
 
-    def of_one(row: Row, *rest: Any) -> Any:
+    def of_one(row: Row, *rest: PyTree) -> Any:
         now = jnp.zeros((), model.records.t.dtype)
         return jax.jvp(lambda s: errors_of_one(model, row, *rest, late=s), (now,), (now + 1,))[1]
 
@@ -236,7 +240,7 @@ def independent(
 
 
 def in_deviations(
-    x: Any, sigma: Array | np.ndarray, late: Array | None
+    x: Array | np.ndarray, sigma: Array | np.ndarray, late: Array | None
 ) -> Float[Array, "..."] | Float[np.ndarray, "..."]:
     """Return changes x (R, T, k, n) of a sensor's errors in standard deviations.
 
@@ -358,6 +362,6 @@ def weights_of(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array
     return tuple(jnp.where(mask, weight(e), 0.0) for mask, e in zip(masks, scaled, strict=True))
 
 
-def half_sum(tree: Any) -> Float[Array, ""]:
+def half_sum(tree: PyTree) -> Float[Array, ""]:
     """Return half the sum of the squares of all leaves."""
     return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
+from rigidjax._types import NumbersLike
 from rigidjax.identify.model.free import leaf_at, leaves_at
 from rigidjax.identify.model.scene import Scene
 
@@ -34,7 +35,9 @@ class Walk(eqx.Module):
     deviation: Array
     density: Array
 
-    def __init__(self, where: Callable[[Scene], Any], deviation: Any, density: Any = 0.0):
+    def __init__(
+        self, where: Callable[[Scene], Any], deviation: NumbersLike, density: NumbersLike = 0.0
+    ):
         words = "of a scene, such as lambda s: s.sensors[0].bias"
         self.where = _checks.function(where, "where", words)
         self.deviation = not_negative(deviation, "deviation")
@@ -84,7 +87,7 @@ def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
     return leaves_at(scene, [drift.path for drift in drifts])
 
 
-def not_negative(value: Any, name: str) -> Array:
+def not_negative(value: NumbersLike, name: str) -> Array:
     """Return finite numbers, if none is below zero; else raise `ValueError`."""
     array, wanted = _checks.numbers(value, name), "a finite number that is not below zero"
     if not array.size:
@@ -92,7 +95,7 @@ def not_negative(value: Any, name: str) -> Array:
     return _checks.sign(array, name, wanted, zero=True)
 
 
-def in_shape(value: Any, shape: tuple[int, ...], name: str) -> Array:
+def in_shape(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
     """Return one number, or numbers of this `shape`, as an array of this shape.
 
     Raise `ValueError` for another shape, or for a number below zero.

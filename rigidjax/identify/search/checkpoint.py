@@ -14,6 +14,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from rigidjax.identify.search.stages import Attempt
 
@@ -48,7 +49,7 @@ def require_folder(path: str | Path) -> None:
         raise ValueError(f"checkpoint {path}: wanted a file, got a folder")
 
 
-def fingerprint(*trees: Any) -> str:
+def fingerprint(*trees: PyTree) -> str:
     """Return a hash of the numbers and the structure of trees, the same in every process.
 
     A function counts by its name.

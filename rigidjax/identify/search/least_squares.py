@@ -115,7 +115,7 @@ def minimise(
     start: Float[Array, " n"],
     order_one: Float[Array, " n"],
     settings: Settings,
-    nothing: Any,
+    nothing: PyTree,
     empty: Normal | None = None,
     gain_of_noise: Callable[[Any, Normal], Array] | None = None,
 ) -> LMState:

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.data.recording import Reading, count_of
@@ -169,7 +170,7 @@ def _gain_of_noise(model: Model, kept: Kept, normal: Normal) -> Float[Array, ""]
     return 0.5 * jnp.sum(scaled * definite.solve(scaled.T).T)
 
 
-def is_order_one(model: Model, kind: Any) -> Float[Array, " n"]:
+def is_order_one(model: Model, kind: DTypeLike) -> Float[Array, " n"]:
     """Return one for free numbers that are of order one, and zero for those of a `Free`.
 
     The unit of a `Free` is chosen by a user.
@@ -201,7 +202,7 @@ def _until_last_weight(model: Model, weights: Float[Array, "records times"]) -> 
     return eqx.tree_at(lambda m: m.integrator, model, shorter)
 
 
-def _zeros_of_kept(model: Model, kind: Any) -> Kept:
+def _zeros_of_kept(model: Model, kind: DTypeLike) -> Kept:
     """Return zeros of the shapes that are kept: to trace `terms.blocks` once more takes seconds."""
     count, times = model.records.t.shape
     columns = model.index.places.shape[1]

@@ -1,7 +1,5 @@
 """The starting points of a fit: a linear regression if the data allow it, and scattered points."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -53,7 +51,7 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
     return out
 
 
-def regress_inertia(recordings: tuple[Recording, ...], torque: Any) -> Inertia | None:
+def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) -> Inertia | None:
     """Return the inertia by a regression on Euler's equations in integral form.
 
     `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. With a torque τ they are

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasPose, Scalar, Vec3
+from rigidjax._types import HasAttitude, HasPose, NumbersLike, Scalar, Vec3
 from rigidjax.identify.sensors import base
 from rigidjax.identify.sensors.base import ClockedSensor, SensorInput
 from rigidjax.rotation import quaternion
@@ -86,7 +86,7 @@ def _mounted_attitude(q: Array, mounting: Vec3 | None) -> Array:
     return q if mounting is None else quaternion.multiply(q, quaternion.exp(mounting))
 
 
-def _unit(world: Any) -> Vec3:
+def _unit(world: NumbersLike) -> Vec3:
     """Return the unit vector along `world`; raise `ValueError` for a length of zero."""
     vector = base.required("world")(world)
     length = jnp.sqrt(dot(vector, vector))

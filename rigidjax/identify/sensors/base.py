@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import Scalar, Vec3
+from rigidjax._types import NumbersLike, Scalar, Vec3
 from rigidjax.body.inertia import MassProperties
 
 
@@ -101,7 +101,7 @@ def required(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]
     The numbers are an array, so that a fit may move them.
     """
 
-    def converted(value: Any) -> Array:
+    def converted(value: NumbersLike) -> Array:
         if value is None:
             raise ValueError(f"{name}: wanted three numbers, got None")
         return _checks.finite(_checks.floating(value, shape, name), name)
@@ -123,7 +123,7 @@ def deviations(size: int = 3) -> Callable[[Any], Array | None]:
     return lambda value: positive(value, "noise", "a positive standard deviation", size)
 
 
-def positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
+def positive(value: NumbersLike | None, name: str, wanted: str, size: int) -> Array | None:
     """Return one number, or `size` numbers, as an array (size,) of positive numbers.
 
     `None` stays `None`; `name` and `wanted` are words of the error that is raised for others.
@@ -148,7 +148,7 @@ class Jitter(eqx.Module):
     estimated: bool = eqx.field(static=True)
 
 
-def jitter_of(jitter: Any) -> Jitter | None:
+def jitter_of(jitter: object) -> Jitter | None:
     """Return the `Jitter` of a positive number, s, or of `"estimated"`; `None` stays `None`."""
     if jitter is None or isinstance(jitter, Jitter):
         return jitter

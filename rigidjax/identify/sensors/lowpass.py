@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 from functools import partial
 from types import NoneType
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -95,7 +94,7 @@ class LowPass(eqx.Module):
         return _solve(begin, y0, y1, partial(_propagator, self.order, w), gaps, fresh)
 
 
-def lowpass_of(lowpass: Any) -> LowPass | None:
+def lowpass_of(lowpass: object) -> LowPass | None:
     """Return `lowpass` if it is a `LowPass` or `None`; raise `TypeError` for others."""
     wanted = "LowPass(cutoff in Hz) or None"
     return _checks.instance(lowpass, (LowPass, NoneType), "lowpass", wanted=wanted)

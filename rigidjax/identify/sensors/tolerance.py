@@ -1,16 +1,14 @@
 """Tolerances of a sensor: how far its scale, axes, bias and clock may be off."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax._types import Scalar
+from rigidjax._types import NumbersLike, Scalar
 
 
-def _deviation(value: Any) -> Scalar | None:
+def _deviation(value: NumbersLike | None) -> Scalar | None:
     """Return a positive standard deviation as an array; `None` stays `None`."""
     if value is None:
         return None

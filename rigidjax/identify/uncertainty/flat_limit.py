@@ -5,12 +5,12 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import swap_trace
 from rigidjax.identify.model.charts import AbstractBodyChart, as_list, charts_of, numbers_of
-from rigidjax.identify.model.model import Model
+from rigidjax.identify.model.model import Model, without_samples
 
 # Derivatives are taken at a body whose least second moment is at least this share of the trace.
 THIN = 1e-4
@@ -90,9 +90,14 @@ def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     return jnp.concatenate([*vectors, x[model.index.bodies :]])
 
 
-@eqx.filter_jit
 def bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
     """Return the bodies of a fit, in the order of their charts."""
+    return _bodies_of(without_samples(model), x)
+
+
+@eqx.filter_jit
+def _bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
+    """Return the result of `bodies_of`, as one program."""
     # Compile one program: outside of a trace each operation of JAX takes as long as 100 steps.
     return as_list(model.bodies(x))
 
@@ -166,7 +171,7 @@ def limits(
     )
 
 
-def why_unreal(body: Any) -> str | None:
+def why_unreal(body: PyTree) -> str | None:
     """Say why no real body has the numbers of `body`; return `None` for a real body."""
     try:
         if isinstance(body, MassProperties):

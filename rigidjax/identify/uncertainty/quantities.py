@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax.identify.model.charts import AbstractBodyChart, Bodies, Ratios, as_list
-from rigidjax.identify.model.model import Model, values_of
+from rigidjax.identify.model.model import Model, values_of, without_samples
+from rigidjax.identify.model.terms import with_jacobian
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
@@ -154,14 +154,20 @@ def vector(model: Model, x: Float[Array, " n"]) -> Array:
     return jnp.concatenate([part.astype(x.dtype) for part in parts])
 
 
-@eqx.filter_jit
 def value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
     """Return the reported quantities and the flatness of each body, and their derivatives."""
+    return _value_and_slope(without_samples(model), x)
+
+
+@eqx.filter_jit
+def _value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Return the result of `value_and_slope`, as one program."""
 
     def value(x: Array) -> Array:
         return jnp.concatenate([vector(model, x), flat_limit.flatness(model, x)])
 
-    return value(x), jax.jacfwd(value)(x)
+    slope, values = with_jacobian(value, x)
+    return values, slope
 
 
 def values_and_slopes(

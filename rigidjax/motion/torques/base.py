@@ -9,11 +9,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3, Vector
-from rigidjax.body.inertia import Inertia, MassProperties, tensor_of as tensor_of
+from rigidjax._types import (
+    HasAttitude,
+    HasPose,
+    HasSpin,
+    NumbersLike,
+    Scalar,
+    ScalarLike,
+    Vec3,
+    Vector,
+)
+from rigidjax.body.inertia import Body, Inertia, MassProperties, tensor_of as tensor_of
 from rigidjax.motion.torques.states import Frozen, require_frozen
 
 
@@ -74,7 +84,7 @@ class AbstractTorque(eqx.Module):
     feels: eqx.AbstractVar[type]
 
     @abc.abstractmethod
-    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3:
+    def __call__(self, t: ScalarLike, state: PyTree, body: Body) -> Vec3:
         """Return the torque (3,), N m, body frame."""
 
 
@@ -86,7 +96,7 @@ class AbstractForce(eqx.Module):
     feels: eqx.AbstractVar[type]
 
     @abc.abstractmethod
-    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Wrench:
+    def __call__(self, t: ScalarLike, state: PyTree, body: MassProperties) -> Wrench:
         """Return the force (3,), N, world frame, and the torque (3,), N m, body frame, about the
         centre of mass.
         """
@@ -234,13 +244,13 @@ def missing_state_message(who: str, wrong: AttributeError) -> str | None:
     return f"{who} looks at state.{wrong.name}, {has_none}: start from {higher}"
 
 
-def one_law(law: Any) -> None:
+def one_law(law: Torque) -> None:
     """Raise `ValueError` for a field whose shape is not that of one torque, such as a batch made by
     `jax.vmap`.
     """
     if not type(law).__module__.startswith(__package__ or ""):
         return
-    for field in dataclasses.fields(law):
+    for field in dataclasses.fields(law):  # pyright: ignore[reportArgumentType]
         value, kind = getattr(law, field.name), field.type
         if eqx.is_array(value) and not isinstance(value, kind):  # pyright: ignore[reportArgumentType]
             raise ValueError(
@@ -250,10 +260,10 @@ def one_law(law: Any) -> None:
             )
 
 
-def in_precision(tree: Any, dtype: Any) -> Any:
+def in_precision(tree: PyTree, dtype: DTypeLike) -> Any:
     """Return the tree with every floating array in `dtype`."""
 
-    def cast(leaf: Any) -> Any:
+    def cast(leaf: PyTree) -> Any:
         if eqx.is_array_like(leaf) and hasattr(leaf, "dtype"):
             return leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
         return leaf
@@ -261,7 +271,7 @@ def in_precision(tree: Any, dtype: Any) -> Any:
     return jax.tree.map(cast, tree)
 
 
-def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:
+def vector_at(source: PyTree, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:
     """Return `source`, a constant vector, or its value at `t` if it is a function of time."""
     return _checks.floating(source(t), (size,), f"{name}(t)") if callable(source) else source
 
@@ -281,7 +291,7 @@ def source(name: str) -> Callable[[Any], Any]:
     return lambda value: constant_or_callable(value, name)
 
 
-def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
+def constant_or_callable(source: object, name: str, size: int = 3) -> Any:
     """Return `source` unchanged if it can be called with a time; otherwise as a vector (size,)."""
     if callable(source):
         return _checks.function(source, name, f"of time to ({size},)")
@@ -310,7 +320,7 @@ def jumps_of_parts(law: object) -> Float[Array, " n"]:
     return jumps_in(*vars(law).values())
 
 
-def unit_rows(value: Any, name: str, count: int) -> Float[Array, "n 3"]:
+def unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array, "n 3"]:
     """Return directions (count, 3); known directions must be unit vectors."""
     rows = _checks.finite_floating(value, (count, 3), name)
     if _checks.known(rows):
@@ -320,7 +330,7 @@ def unit_rows(value: Any, name: str, count: int) -> Float[Array, "n 3"]:
     return rows
 
 
-def count_of(value: Any, name: str, one: str) -> int:
+def count_of(value: NumbersLike, name: str, one: str) -> int:
     """Return the number of rows (x, y, z) in `value`, one row for each `one`; at least one row is
     wanted.
     """
@@ -330,7 +340,7 @@ def count_of(value: Any, name: str, one: str) -> int:
     return shape[0]
 
 
-def one_or_each(value: Any, count: int, name: str) -> Array:
+def one_or_each(value: NumbersLike, count: int, name: str) -> Array:
     """Return one number for all, or one number for each of `count`, by the shape of `value`."""
     return _checks.finite_floating(
         value, (count,) if _checks.numbers(value, name).ndim else (), name

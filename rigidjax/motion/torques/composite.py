@@ -6,11 +6,11 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin, Mat3, Scalar, ScalarLike, Vec3
-from rigidjax.body.inertia import Inertia, tensor_of, with_tensor
+from rigidjax.body.inertia import Body, Inertia, tensor_of, with_tensor
 from rigidjax.body.symmetric3 import from_components
 from rigidjax.body.validation import is_real
 from rigidjax.motion.torques import base
@@ -61,7 +61,7 @@ class Sum(eqx.Module):
         """Return the jump times of all parts, s, in order."""
         return base.jumps_in(*self.parts)
 
-    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | base.Wrench:
+    def __call__(self, t: ScalarLike, state: PyTree, body: Body) -> Vec3 | base.Wrench:
         forces, torque = [], None
         for part in self.parts:
             force, more = base.force_and_torque(part, t, state, body)
@@ -129,19 +129,19 @@ class ChangingInertia(eqx.Module):
 
     jump_times = property(base.jumps_of_parts)
 
-    def tensor(self, t: ScalarLike, state: Any = None, body: Any = None) -> Mat3:
+    def tensor(self, t: ScalarLike, state: PyTree = None, body: Body | None = None) -> Mat3:
         """Return I, (3, 3), kg m²; a function of time needs no `state` and `body`."""
         seen = (t, state, body) if hasattr(self.inertia, "feels") else (t,)
         found = self.inertia(*seen)
         found = found.tensor if isinstance(found, Inertia) else found
         return _checks.floating(found, (3, 3), "inertia(t)")
 
-    def __call__(self, t: ScalarLike, state: HasSpin, body: Any) -> Vec3 | base.Wrench:
+    def __call__(self, t: ScalarLike, state: HasSpin, body: Body) -> Vec3 | base.Wrench:
         omega = state.omega
         t = jnp.asarray(t, omega.dtype)
         q = state.q if isinstance(state, HasAttitude) else None
 
-        def momentum(t: Any, q: Any, omega: Any) -> tuple[Vec3, Mat3]:
+        def momentum(t: Array, q: Array, omega: Array) -> tuple[Vec3, Mat3]:
             here = eqx.tree_at(lambda s: s.omega, state, omega)
             here = here if q is None else eqx.tree_at(lambda s: s.q, here, q)
             now = real_or_nan(self.tensor(t, here, body).astype(omega.dtype))
@@ -202,7 +202,7 @@ class Tide(eqx.Module):
     position: Any = eqx.field(converter=base.source("position"))
     mean_rate: Scalar = eqx.field(converter=base.number("mean_rate"), default=0.0)
 
-    def __call__(self, t: ScalarLike, state: HasAttitude, body: Any) -> Mat3:
+    def __call__(self, t: ScalarLike, state: HasAttitude, body: Body) -> Mat3:
         before = quaternion.multiply(state.q, quaternion.exp(-self.delay * state.omega))
         r = base.vector_at(self.position, t - self.delay, "position")
         distance = jnp.sqrt(dot(r, r))

@@ -1,14 +1,15 @@
 """Define forces on a body that moves: gravity, a centre of attraction, drag, rotors."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasPose, Mat3, Scalar, ScalarLike, Vec3
+from rigidjax._types import HasPose, Mat3, NumbersLike, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import MassProperties
 from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
@@ -139,12 +140,12 @@ class Rotors(base.AbstractForce):
 
     def __init__(
         self,
-        positions: Float[ArrayLike, "rotors 3"] | Any,
-        directions: Float[ArrayLike, "rotors 3"] | Any,
-        spins: Float[ArrayLike, " rotors"] | Any,
-        thrust: Float[ArrayLike, "*rotors"] | Any,
-        drag: Float[ArrayLike, "*rotors"] | Any,
-        speeds: Any,
+        positions: NumbersLike,
+        directions: NumbersLike,
+        spins: NumbersLike,
+        thrust: NumbersLike,
+        drag: NumbersLike,
+        speeds: NumbersLike | Callable[..., Any],
     ):
         count = base.count_of(positions, "positions", "rotor")
         self.positions = _checks.finite_floating(positions, (count, 3), "positions")

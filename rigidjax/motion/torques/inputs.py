@@ -6,10 +6,11 @@ from typing import Any, NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rigidjax import _checks
-from rigidjax._types import ScalarLike
+from rigidjax._types import NumbersLike, ScalarLike
+from rigidjax.body.inertia import Body
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.motion.torques.piecewise import Held
 from rigidjax.motion.torques.states import has_states
@@ -70,7 +71,7 @@ class Delayed(eqx.Module):
     source: Any
     delay: Float[Array, ""]
 
-    def __init__(self, source: Any, delay: ScalarLike):
+    def __init__(self, source: object, delay: ScalarLike):
         source = _checks.function(source, "source", "of time")
         if has_states(source):
             words = "has states, whose past is not kept; delay its input"
@@ -121,7 +122,7 @@ class Lagged(eqx.Module):
     time: Float[Array, "*k"]
     start: Array | None
 
-    def __init__(self, source: Any, time: Any, start: Any = None):
+    def __init__(self, source: object, time: NumbersLike, start: NumbersLike | None = None):
         self.source = _checks.function(source, "source", "of time")
         kind = jnp.result_type(float)
         time = _checks.if_known(_checks.sign, _channels(time, "time"), "time", "a positive time, s")
@@ -133,11 +134,11 @@ class Lagged(eqx.Module):
         """Return the times, s, at which the source jumps: the value has a kink there."""
         return jumps_of(self.source)
 
-    def state0(self, t: ScalarLike, state: Any, body: Any) -> Array:
+    def state0(self, t: ScalarLike, state: PyTree, body: Body) -> Array:
         """Return the value at the start."""
         return self.source(t) if self.start is None else self.start
 
-    def rate(self, t: ScalarLike, own: Array, state: Any, body: Any) -> Array:
+    def rate(self, t: ScalarLike, own: Array, state: PyTree, body: Body) -> Array:
         """Return dy/dt, in the source's unit per second."""
         wanted = _checks.numbers(self.source(t), "source(t)").astype(own.dtype)
         if wanted.shape != own.shape:
@@ -148,7 +149,7 @@ class Lagged(eqx.Module):
         return own
 
 
-def require_no_jumps(source: Any, name: str) -> None:
+def require_no_jumps(source: PyTree, name: str) -> None:
     """Raise `TypeError` for held samples, which a torque with their derivative cannot use: it loses
     the jumps.
 
@@ -165,7 +166,7 @@ def require_no_jumps(source: Any, name: str) -> None:
             )
 
 
-def _channels(value: Any, name: str) -> Array:
+def _channels(value: NumbersLike, name: str) -> Array:
     array = _checks.numbers(value, name)
     if not array.size:
         raise ValueError(f"{name}: wanted one number, or one a channel, got none")
@@ -197,7 +198,7 @@ def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
     values, later = inputs if isinstance(inputs, Row) else (inputs, None)
     queue = list(later or ())
 
-    def value(node: Any) -> Any:
+    def value(node: PyTree) -> Any:
         if _is_delayed(node):
             if later is not None:
                 return _Now(jnp.asarray(queue.pop(0)))
@@ -214,23 +215,23 @@ def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
     return jax.tree.map(value, law, is_leaf=lambda n: isinstance(n, Input) or _is_delayed(n))
 
 
-def _is_delayed(node: Any) -> bool:
+def _is_delayed(node: PyTree) -> bool:
     return isinstance(node, Delayed) and isinstance(node.source, Input)
 
 
-def delays_of(law: Any) -> list[tuple[str, Array]]:
+def delays_of(law: PyTree) -> list[tuple[str, Array]]:
     """Return the name and the delay of each delayed input, in their order in the torque."""
     nodes = jax.tree.leaves(law, is_leaf=_is_delayed)
     return [(node.source.name, node.delay) for node in nodes if _is_delayed(node)]
 
 
-def inputs_of(law: Any) -> list[str]:
+def inputs_of(law: PyTree) -> list[str]:
     """Return the names of the inputs that a torque reads."""
     nodes = jax.tree.leaves(law, is_leaf=lambda node: isinstance(node, Input))
     return list(dict.fromkeys(node.name for node in nodes if isinstance(node, Input)))
 
 
-def require_inputs(law: Any, inputs: Any) -> Mapping[str, Any]:
+def require_inputs(law: PyTree, inputs: object) -> Mapping[str, Any]:
     """Return `inputs` as a mapping, empty for `None`. **Raises:** `ValueError` unless they are
     exactly those that the torque reads.
     """

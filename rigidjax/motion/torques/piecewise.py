@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
+from rigidjax._types import HasSpin, NumbersLike, Scalar, ScalarLike, Vec3
 from rigidjax.motion.torques.base import AbstractTorque
 
 Times = Float[ArrayLike, " times"] | Sequence[Any]
@@ -164,18 +164,18 @@ def _line(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar) -> A
 
 
 def _rows(
-    name: str, times: Any, other: str, values: Any, extra: int | None = None
+    name: str, times: NumbersLike, other: str, values: NumbersLike, extra: int | None = None
 ) -> tuple[Array, Array]:
     """Return the times and rows after checks.
 
     `extra` is the number of times beyond the number of rows, of 3 numbers each; with `None` both
     numbers are equal and rows may have any shape.
     """
-    times, rows = _checks.rows(times, (), name), _checks.numbers(values, other)
-    count = times.shape[0]
+    edges, rows = _checks.rows(times, (), name), _checks.numbers(values, other)
+    count = edges.shape[0]
     if count < 2:
-        raise ValueError(f"{name}: wanted at least 2 times, shape (n,), got {times.shape}")
-    if extra is None and rows.shape[:1] != times.shape:
+        raise ValueError(f"{name}: wanted at least 2 times, shape (n,), got {edges.shape}")
+    if extra is None and rows.shape[:1] != edges.shape:
         raise ValueError(f"{other}: wanted a row for each of {count} times, got {rows.shape}")
     if extra is not None and rows.shape != (count - extra, 3):
         lines = "n times go with n rows (constant pieces: Pulses)"
@@ -183,12 +183,12 @@ def _rows(
         advice = pieces if extra else lines
         words = f"{other}: wanted {count - extra} rows of 3"
         raise ValueError(f"{words}, got shape {rows.shape}; {advice}")
-    times, rows = _checks.finite(times, name), _checks.finite(rows, other)
-    ordered = _checks.namespace(times).asarray(times)
+    edges, rows = _checks.finite(edges, name), _checks.finite(rows, other)
+    ordered = _checks.namespace(edges).asarray(edges)
     falling = ordered[1:] <= ordered[:-1]
     where = ""
     if _checks.known(falling) and falling.any():
         where = f"; {name}[{int(np.argmax(falling)) + 1}] is not above the one before"
-    times = _checks.refuse(times, falling.any(), f"{name}: wanted increasing times, s{where}")
-    dtype = jnp.result_type(times, rows)
-    return times.astype(dtype), rows.astype(dtype)
+    edges = _checks.refuse(edges, falling.any(), f"{name}: wanted increasing times, s{where}")
+    dtype = jnp.result_type(edges, rows)
+    return edges.astype(dtype), rows.astype(dtype)

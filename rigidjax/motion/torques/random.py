@@ -1,12 +1,12 @@
 """Define random torques, of which only the statistics are known."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
+from rigidjax._types import HasSpin, NumbersLike, Scalar, ScalarLike, Vec3
 from rigidjax.motion.torques.base import AbstractTorque
 
 
@@ -30,7 +30,7 @@ class RandomTorque(AbstractTorque):
     steady: ClassVar[bool] = True
     density: Float[Array, "3"]
 
-    def __init__(self, density: Any):
+    def __init__(self, density: NumbersLike):
         self.density = density_of(density)
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
@@ -57,7 +57,7 @@ class CorrelatedTorque(AbstractTorque):
     density: Float[Array, "3"]
     time: Scalar
 
-    def __init__(self, density: Any, time: Any):
+    def __init__(self, density: NumbersLike, time: NumbersLike):
         self.density = density_of(density)
         number = _checks.floating(time, (), "time").astype(self.density.dtype)
         self.time = _checks.sign(number, "time", "a positive correlation time, s")
@@ -71,7 +71,7 @@ class CorrelatedTorque(AbstractTorque):
         return jnp.zeros_like(self.density)
 
 
-def density_of(value: Any, name: str = "density", size: int = 3) -> Array:
+def density_of(value: NumbersLike, name: str = "density", size: int = 3) -> Array:
     """Return a spectral density (size,) from one number or `size` numbers, none of them
     negative.
     """

@@ -2,7 +2,7 @@
 samples.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +12,7 @@ from jax.lax import linalg
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import Scalar, ScalarLike, Vec3
+from rigidjax._types import NumbersLike, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.linalg3 import cross, dot
 
@@ -77,7 +77,7 @@ class Series(eqx.Module):
         return left + s * (out + s * (bend + s * twist))
 
 
-def _numbers(value: Any, name: str) -> Any:
+def _numbers(value: NumbersLike, name: str) -> Any:
     """Return the numbers, as NumPy's float64 if they are known: times of a log have more than seven
     digits.
     """
@@ -131,21 +131,21 @@ class Wheel(eqx.Module):
     def __init__(
         self,
         inertia: ScalarLike,
-        axis: Any,
-        speed: Any,
+        axis: Vector,
+        speed: Callable[..., Any],
         *,
         delay: ScalarLike | None = None,
-        tilt: Any = None,
+        tilt: NumbersLike | None = None,
     ):
-        axis = _checks.floating(axis, (3,), "axis")
-        x, y, z = _checks.namespace(axis).asarray(axis)
-        found = f", got {np.asarray(axis)}" if _checks.known(axis) else ""
+        direction = _checks.floating(axis, (3,), "axis")
+        x, y, z = _checks.namespace(direction).asarray(direction)
+        found = f", got {np.asarray(direction)}" if _checks.known(direction) else ""
         off = ~(abs(x * x + y * y + z * z - 1) < 2e-6)
-        axis = _checks.refuse(axis, off, f"axis: wanted a unit vector (3,){found}")
+        direction = _checks.refuse(direction, off, f"axis: wanted a unit vector (3,){found}")
         _checks.function(speed, "speed", "of time to rad/s")
         kind = jnp.result_type(float)
         self.inertia = _checks.finite_floating(inertia, (), "inertia").astype(kind)
-        self.axis, self.speed = axis.astype(kind), speed
+        self.axis, self.speed = direction.astype(kind), speed
         self.delay = (
             None if delay is None else _checks.finite_floating(delay, (), "delay").astype(kind)
         )

@@ -11,9 +11,12 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
+from jaxtyping import PyTree
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
+from rigidjax.body.inertia import Body
 
 Tree = TypeVar("Tree")
 # The members of a torque that depend on its states.
@@ -42,12 +45,12 @@ def has_own(node: object) -> bool:
     return not isinstance(node, type) and hasattr(node, "state0") and hasattr(node, "rate")
 
 
-def has_states(law: Any) -> bool:
+def has_states(law: PyTree) -> bool:
     """Return whether a torque, or any part of it, has states of its own."""
     return any(map(has_own, jax.tree.leaves(law, is_leaf=_stop)))
 
 
-def require_stateless(law: Any, what: str) -> None:
+def require_stateless(law: PyTree, what: str) -> None:
     """Raise `ValueError` for a torque with states: `what` does not integrate them."""
     if has_states(law):
         raise ValueError(
@@ -66,7 +69,7 @@ def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
     if not queue and not has_states(law):
         return law
 
-    def own_of(node: Any) -> Any:
+    def own_of(node: PyTree) -> Any:
         if not queue:
             raise ValueError(f"own: no states for {type(node).__name__}")
         return queue.pop(0)
@@ -77,11 +80,11 @@ def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
     return frozen
 
 
-def first_states(law: Any, t: ScalarLike, state: Any, body: Any) -> tuple[Any, ...]:
+def first_states(law: PyTree, t: ScalarLike, state: PyTree, body: Body) -> tuple[Any, ...]:
     """Return the initial states of a torque, in the precision of the body's state: see `freeze`."""
     found: list[Any] = []
 
-    def begin(node: Any) -> Any:
+    def begin(node: PyTree) -> Any:
         here = node.state0(t, state, body) if callable(node.state0) else node.state0
         own = _numbers(here, f"state0 of {type(node).__name__}", state.omega.dtype)
         if not jax.tree.leaves(own):
@@ -94,14 +97,14 @@ def first_states(law: Any, t: ScalarLike, state: Any, body: Any) -> tuple[Any, .
 
 
 def rates_of(
-    law: Any, t: ScalarLike, own: tuple[Any, ...], state: Any, body: Any
+    law: PyTree, t: ScalarLike, own: tuple[Any, ...], state: PyTree, body: Body
 ) -> tuple[Any, ...]:
     """Return the derivative of each state in `own`. **Raises:** `ValueError` for a shape other than
     that of `state0`.
     """
     queue, found = list(own), []
 
-    def one(node: Any) -> Any:
+    def one(node: PyTree) -> Any:
         here = queue.pop(0)
         name = f"rate of {type(node).__name__}"
         rate = _numbers(node.rate(t, here, state, body), name, state.omega.dtype)
@@ -115,7 +118,7 @@ def rates_of(
     return tuple(found)
 
 
-def require_frozen(law: Any) -> None:
+def require_frozen(law: PyTree) -> None:
     """Raise `TypeError` for a torque with states that is called without them."""
     if has_own(law):
         words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate and "
@@ -123,22 +126,22 @@ def require_frozen(law: Any) -> None:
         raise TypeError(f"{type(law).__name__} {words}: law(t, state, body, own)")
 
 
-def _visit(tree: Any, own_of: Callable[[Any], Any]) -> Any:
+def _visit(tree: PyTree, own_of: Callable[[Any], Any]) -> Any:
     """Return the tree with all states inserted; `own_of(node)` gives them, inner parts first."""
 
-    def stop(node: Any) -> bool:
+    def stop(node: PyTree) -> bool:
         return node is not tree and _stop(node)
 
-    def inside(node: Any) -> Any:
+    def inside(node: PyTree) -> Any:
         return _visit(node, own_of) if node is not tree and has_own(node) else node
 
     within = jax.tree.map(inside, tree, is_leaf=stop)
     return Frozen(within, (own_of(within),)) if has_own(tree) else within
 
 
-def _stop(node: Any) -> bool:
+def _stop(node: PyTree) -> bool:
     return isinstance(node, Frozen) or has_own(node)
 
 
-def _numbers(tree: Any, name: str, dtype: Any) -> Any:
+def _numbers(tree: PyTree, name: str, dtype: DTypeLike) -> Any:
     return jax.tree.map(lambda leaf: _checks.numbers(leaf, name).astype(dtype), tree)

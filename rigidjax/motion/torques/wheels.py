@@ -8,19 +8,18 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
+from rigidjax._types import HasSpin, NumbersLike, Scalar, ScalarLike, Vec3
 from rigidjax.body import validation
-from rigidjax.body.inertia import Body, Inertia, MassProperties, tensor_of, with_tensor
+from rigidjax.body.inertia import Inertia, MassProperties, OneBody, tensor_of, with_tensor
 from rigidjax.body.symmetric3 import outer
 from rigidjax.motion.torques import base
 from rigidjax.motion.torques.inputs import require_no_jumps
 from rigidjax.motion.torques.states import has_states
 from rigidjax.rotation.linalg3 import cross
 
-Numbers = Float[ArrayLike, "*wheels"] | Any
 # The motor's torque falls to zero near a wheel's top speed.
 _FADE = 0.05
 
@@ -126,16 +125,16 @@ class ReactionWheels(base.AbstractTorque):
 
     def __init__(
         self,
-        axes: Float[ArrayLike, "wheels 3"] | Any,
-        inertia: Numbers,
-        speeds: Numbers,
-        motor: Any = None,
+        axes: NumbersLike,
+        inertia: NumbersLike,
+        speeds: NumbersLike,
+        motor: NumbersLike | Callable[..., Any] | None = None,
         *,
-        feedback: Any = None,
-        max_torque: Numbers = None,
-        max_speed: Numbers = None,
-        viscous: Numbers = None,
-        coulomb: Numbers = None,
+        feedback: object = None,
+        max_torque: NumbersLike | None = None,
+        max_speed: NumbersLike | None = None,
+        viscous: NumbersLike | None = None,
+        coulomb: NumbersLike | None = None,
         turn_over: ScalarLike = 1.0,
     ):
         count = base.count_of(axes, "axes", "wheel")
@@ -144,10 +143,8 @@ class ReactionWheels(base.AbstractTorque):
         self.inertia = _checks.if_known(_checks.sign, inertia, "inertia", "> 0")
         self.speeds = _checks.finite_floating(speeds, (count,), "speeds")
         self.motor = None if motor is None else base.constant_or_callable(motor, "motor", count)
-        if feedback is not None:
-            words = "(t, state, speeds) → torques (R,), N m"
-            feedback = _checks.function(feedback, "feedback", words)
-        self.feedback = feedback
+        words = "(t, state, speeds) → torques (R,), N m"
+        self.feedback = None if feedback is None else _checks.function(feedback, "feedback", words)
         self.max_torque = _one_or_each(max_torque, count, "max_torque", "> 0")
         self.max_speed = _one_or_each(max_speed, count, "max_speed", "> 0")
         self.viscous = _one_or_each(viscous, count, "viscous", "≥ 0")
@@ -163,7 +160,7 @@ class ReactionWheels(base.AbstractTorque):
 
     jump_times = property(base.jumps_of_parts)
 
-    def without_wheels(self, body: Body) -> Body:
+    def without_wheels(self, body: OneBody) -> OneBody:
         """Return the `body`, an `Inertia` or `MassProperties` with locked wheels, minus `Σ J a
         aᵀ`.
         """
@@ -237,7 +234,7 @@ def _smooth(x: Array) -> Array:
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))
 
 
-def _one_or_each(value: Any, count: int, name: str, wanted: str) -> Array | None:
+def _one_or_each(value: NumbersLike | None, count: int, name: str, wanted: str) -> Array | None:
     """Return one number for all wheels, or one number for each, checked to be "> 0" or "≥ 0";
     `None` for `None`.
     """
