@@ -158,6 +158,7 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         func: Callable[..., PyTree],
         error_order: RealLike | None,
     ) -> tuple[Any, Any]:
+        t0 = jnp.asarray(t0)
         slope_at = lambda t, y: func(terms, t, y, args)  # noqa: E731
         # A solver without an order of its error is refused by the inner controller.
         chosen = dt0 is None and error_order is not None
@@ -175,9 +176,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         first = jnp.where(sound, jnp.maximum(first, t0 + self._unit(t0, least)), jnp.nan)
         return first.astype(t0.dtype), (inner, least)
 
-    def _unit(self, t: Any, least: Any) -> Any:
+    def _unit(self, t: ArrayLike, least: ArrayLike) -> Array:
         """Return the shortest step at the time t, some units of round-off."""
-        return 8 * jnp.finfo(t.dtype).eps * jnp.maximum(jnp.abs(t), least)
+        return 8 * jnp.finfo(jnp.result_type(t)).eps * jnp.maximum(jnp.abs(t), least)
 
     def adapt_step_size(
         self,
