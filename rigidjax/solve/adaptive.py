@@ -51,6 +51,11 @@ class _FieldOfNumbers(eqx.Module):
         return self.tree(self.field(self.constants, t, ravel_pytree(y)[0]))
 
 
+def _numbers(t: Any, y: Any, args: object) -> Array:
+    """Return the numbers of a state in a row."""
+    return ravel_pytree(y)[0]
+
+
 def integrated(
     solver: dfx.AbstractSolver,
     field: Callable[..., Any],
@@ -80,8 +85,8 @@ def integrated(
         if program.stops.size:
             controller = Stopping(controller, program.stops)
     # The last state needs no dense output.
-    subs = [dfx.SubSaveAt(t1=True)]
-    subs += [dfx.SubSaveAt(ts=ts[1:-1])] if ts.shape[0] > 2 else []
+    subs = [dfx.SubSaveAt(t1=True, fn=_numbers)]
+    subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=_numbers)] if ts.shape[0] > 2 else []
     out = dfx.diffeqsolve(
         dfx.ODETerm(field), solver, ts[0], ts[-1], dt0, y0,
         saveat=dfx.SaveAt(subs=subs), stepsize_controller=controller, adjoint=adjoint,
@@ -89,18 +94,15 @@ def integrated(
         max_steps=max_steps, throw=False, progress_meter=progress_meter,
     )  # fmt: skip
     saved: Any = (out.ts, out.ys)
-    (ends, *times), (states, *between) = saved
-    last_time, last = jax.tree.map(lambda leaf: leaf[0], (ends, states))
+    ((last_time,), *times), (last, *between) = saved
     done = jnp.where(ts[0] > ts[-1], last_time <= ts[-1], last_time >= ts[-1])
-    # Where nothing was saved, diffrax says t = inf: not to be taken for a state.
-    there = jnp.concatenate([jnp.ones(1, bool), *(jnp.isfinite(t) for t in times), done[None]])
-
-    def joined(first: Array, end: Array, *between: Array) -> Array:
-        leaf = jnp.concatenate([first[None], *between, end])[: ts.shape[0]]
-        known = there[: ts.shape[0]].reshape(-1, *[1] * (leaf.ndim - 1))
-        return jnp.where(known, leaf, jnp.full_like(leaf, jnp.nan))
-
-    ys = jax.tree.map(joined, y0, states, *between)
+    rows = [jnp.where(done, last, jnp.nan)][: ts.shape[0] - 1]
+    if between:
+        # Where nothing was saved, diffrax says t = inf: not to be taken for a state.
+        there = jnp.isfinite(times[0])[:, None]
+        rows = [jnp.where(there, between[0], jnp.nan), *rows]
+    numbers, tree = ravel_pytree(y0)
+    ys = jax.vmap(tree)(jnp.concatenate([numbers[None], *rows]))
     ill = ~done
     if not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
         # Equal steps look at no error, and would go on with NaN.
@@ -109,7 +111,7 @@ def integrated(
     result = dfx.RESULTS.where(ill, NONFINITE, out.result)
     following = out.stats.get("next_step", jnp.full_like(last_time, jnp.nan))
     counts = out.stats["num_steps"], out.stats["num_rejected_steps"]
-    return AdaptiveRun(ys, *counts, result, last_time, last, following, missed)
+    return AdaptiveRun(ys, *counts, result, last_time, tree(last[0]), following, missed)
 
 
 def adaptive(

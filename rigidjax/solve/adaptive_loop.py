@@ -176,6 +176,22 @@ def finite(tree: Any) -> Bool[Array, ""]:
     return good
 
 
+def starting_step(size: Array, rate: Array, order: Any) -> Array:
+    """Return a first step from the norms, over the tolerance, of a state and of its derivative.
+
+    As Hairer, Nørsett and Wanner (1993), II.4, but that the second derivative is that of an
+    oscillation, rate²/size: to measure it the field would be compiled once more.
+    """
+    small = (size < 1e-5) | (rate < 1e-5)
+    one = jnp.ones_like(size)
+    size, quick = jnp.where(small, one, size), jnp.where(small, one, rate)
+    most = jnp.where(small, 1e-4, size / quick)
+    largest = jnp.maximum(rate, jnp.where(small, 0, quick * (quick / size)))
+    flat = largest <= 1e-15
+    guess = (0.01 / jnp.where(flat, one, largest)) ** (1 / order)
+    return jnp.where(flat, 1e-6, jnp.minimum(most, guess)).astype(size.dtype)
+
+
 def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
     """Return the result of a run; `nonfinite_input` where the body is NaN, as no body is."""
     return dfx.RESULTS.where(finite(body), result, dfx.RESULTS.nonfinite_input)  # pyright: ignore

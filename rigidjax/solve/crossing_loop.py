@@ -12,11 +12,10 @@ from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve.adaptive_loop import NONFINITE, before, take
+from rigidjax.solve.adaptive_loop import NONFINITE, before, starting_step, take
 from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
 from rigidjax.solve.tableaus import Tableau
@@ -295,7 +294,7 @@ def step_with_error(
     """Return the state a step later, and the root mean square of its error over the tolerance."""
     there = stages(method.tableau, method.field, constants, step)
     right = method.project(there.end)
-    # Which steps are taken is no thing to differentiate.
+    # Derivatives hold the chosen steps constant.
     left, after, h, slopes = lax.stop_gradient((step.y, right, step.h, there.slopes))
     error = error_estimate(method.tableau, method.sizes, h, slopes)
     largest = jnp.maximum(jnp.abs(left), jnp.abs(after))
@@ -340,31 +339,9 @@ def outcome(h: Array, t: Array, end: Array, met: Array) -> dfx.RESULTS:
 
 
 def first_step(method: Method, constants: Arrays, run: Path) -> Array:
-    """Return the starting step of Hairer, Nørsett and Wanner (1993), II.4."""
-    y0, t0 = run.y0, run.t0
+    """Return the first step of a search."""
+    y0 = run.y0
     scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
-
-    def norm(a: Array) -> Array:
-        return jnp.sqrt(jnp.mean((a / scale) ** 2, 0))
-
-    d0 = norm(y0)
-
-    def slope(_: Array, state: Any) -> Any:
-        # At the start, then after a short step of Euler's: one field to compile.
-        h, first, _ = state
-        now = method.field(constants, t0 + h.astype(t0.dtype), y0 + lift(h, y0) * first)
-        d1 = norm(now)
-        small = (d0 < 1e-5) | (d1 < 1e-5)
-        short = jnp.where(small, 1e-6, 0.01 * d0 / jnp.where(small, 1.0, d1)).astype(d0.dtype)
-        begun = h != 0
-        return jnp.where(begun, h, short), jnp.where(lift(begun, y0), first, now), now
-
-    h = jnp.zeros_like(d0)
-    state = (h, jnp.zeros_like(y0), jnp.zeros_like(y0))
-    h, first, last = lax.fori_loop(np.int32(0), np.int32(2), slope, state)
-    d2 = norm(last - first) / h
-    largest = jnp.maximum(norm(first), d2)
-    flat = largest <= 1e-15
-    guess = (0.01 / jnp.where(flat, 1.0, largest)) ** (1 / method.tableau.order)
-    h = jnp.minimum(100 * h, jnp.where(flat, jnp.maximum(1e-6, 1e-3 * h), guess))
-    return h.astype(t0.dtype)
+    slope = method.field(constants, run.t0, y0)
+    size, rate = (jnp.sqrt(jnp.mean((a / scale) ** 2, 0)) for a in (y0, slope))
+    return starting_step(size, rate, method.tableau.order).astype(run.t0.dtype)

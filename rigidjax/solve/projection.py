@@ -7,7 +7,6 @@ import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, PyTree
@@ -15,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, PyTree
 from rigidjax import _checks
 from rigidjax._types import RealLike
 from rigidjax.motion.equations import on_the_group
-from rigidjax.solve.adaptive_loop import NONFINITE, before, finite, take
+from rigidjax.solve.adaptive_loop import NONFINITE, before, finite, starting_step, take
 
 # The norm of an error by default: that of the numbers of a state in a row.
 NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
@@ -159,22 +158,35 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         error_order: RealLike | None,
     ) -> tuple[Any, Any]:
         t0 = jnp.asarray(t0)
-        slope_at = lambda t, y: func(terms, t, y, args)  # noqa: E731
+        # Neither the first step nor whether there is one has a derivative: none is traced.
+        arrays, rest = eqx.partition((terms, t0, t1, y0, dt0, args), eqx.is_array)
+        terms, t0, t1, y0, dt0, args = eqx.combine(lax.stop_gradient(arrays), rest)
+        slope = func(terms, t0, y0, args)
         # A solver without an order of its error is refused by the inner controller.
-        chosen = dt0 is None and error_order is not None
-        if chosen:
-            h = _first_step(self.controller, slope_at, t0, y0, error_order)
+        if dt0 is None and error_order is not None:
+            # diffrax takes 0.01 for any field that runs in a direction of time, as in `diffeqsolve`
+            # all do.
+            h = self._first_step(y0, slope, error_order).astype(t0.dtype)
             # After NaN or infinity it is not positive; the inner controller gets any other.
             sound = h > 0
             dt0 = jnp.where(sound, h, jnp.ones_like(h))
         else:
-            sound = finite((y0, dt0, slope_at(t0, y0)))
+            sound = finite((y0, dt0, slope))
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         # At t = 0 the round-off of t vanishes: that of the length of the run is taken.
         least = jnp.finfo(t0.dtype).eps * jnp.abs(t1 - t0)
         # A step of length 0 would be accepted for ever; one of length NaN ends the run.
         first = jnp.where(sound, jnp.maximum(first, t0 + self._unit(t0, least)), jnp.nan)
         return first.astype(t0.dtype), (inner, least)
+
+    def _first_step(self, y: PyTree, slope: PyTree, order: RealLike) -> Array:
+        """Return the first step from the state y and its derivative; 0 or NaN if either is lost."""
+        y, tree = ravel_pytree(y)
+        scale = self.atol + self.rtol * jnp.abs(y)
+        # The norm of a state, or the same of its numbers in a row.
+        of_state = (lambda numbers: numbers) if self.norm is NORM else tree
+        size, rate = (self.norm(of_state(a / scale)) for a in (y, ravel_pytree(slope)[0]))
+        return starting_step(size, rate, order)
 
     def _unit(self, t: ArrayLike, least: ArrayLike) -> Array:
         """Return the shortest step at the time t, some units of round-off."""
@@ -195,45 +207,13 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
-        stuck = ~keep & ~(right - left > self._unit(left, least))
-        why = dfx.RESULTS.where(finite(y_error), dfx.RESULTS.dt_min_reached, NONFINITE)
+        unit = self._unit(left, least)
+        stuck = ~keep & ~(right - left > unit)
+        # NaN in the shortest step that the times can tell apart may be absent in a shorter one.
+        short = finite(y_error) | (t1 - t0 <= unit)
+        why = dfx.RESULTS.where(short, dfx.RESULTS.dt_min_reached, NONFINITE)
         why = dfx.RESULTS.where(stuck & (result == dfx.RESULTS.successful), why, result)
         return keep, left, right, jumped, (inner, least), why
-
-
-def _first_step(controller: Any, slope_at: Any, t0: Array, y0: Any, order: Any) -> Array:
-    """Return the starting step of Hairer, Nørsett and Wanner (1993), II.4; 0 or NaN if f is not
-    finite.
-
-    diffrax takes 0.01 for any field that runs in a direction of time, as in `diffeqsolve` all do.
-    """
-    y, tree = ravel_pytree(lax.stop_gradient(y0))
-    t0 = lax.stop_gradient(t0)
-    scale = controller.atol + controller.rtol * jnp.abs(y)
-    # The norm of a state, or the same of its numbers in a row.
-    of_state = (lambda a: a) if controller.norm is NORM else tree
-    norm = lambda a: controller.norm(of_state(a / scale))  # noqa: E731
-    d0 = norm(y)
-
-    def slope(_: Array, state: Any) -> Any:
-        # At the start, then after a short step of Euler's: one field to compile.
-        h, first, _ = state
-        now = slope_at(t0 + h.astype(t0.dtype), tree(y + h * first))
-        now = ravel_pytree(lax.stop_gradient(now))[0]
-        d1 = norm(now)
-        small = (d0 < 1e-5) | (d1 < 1e-5)
-        short = jnp.where(small, 1e-6, 0.01 * d0 / jnp.where(small, 1.0, d1)).astype(d0.dtype)
-        begun = h != 0
-        return jnp.where(begun, h, short), jnp.where(begun, first, now), now
-
-    state = (jnp.zeros_like(d0), jnp.zeros_like(y), jnp.zeros_like(y))
-    h, first, last = lax.fori_loop(np.int32(0), np.int32(2), slope, state)
-    d2 = norm(last - first) / h
-    largest = jnp.maximum(norm(first), d2)
-    flat = largest <= 1e-15
-    guess = (0.01 / jnp.where(flat, 1.0, largest)) ** (1 / order)
-    h = jnp.minimum(100 * h, jnp.where(flat, jnp.maximum(1e-6, 1e-3 * h), guess))
-    return h.astype(t0.dtype)
 
 
 class Stopping(dfx.AbstractAdaptiveStepSizeController):
