@@ -182,14 +182,10 @@ def starting_step(size: Array, rate: Array, order: Any) -> Array:
     As Hairer, Nørsett and Wanner (1993), II.4, but that the second derivative is that of an
     oscillation, rate²/size: to measure it the field would be compiled once more.
     """
-    small = (size < 1e-5) | (rate < 1e-5)
-    one = jnp.ones_like(size)
-    size, quick = jnp.where(small, one, size), jnp.where(small, one, rate)
-    most = jnp.where(small, 1e-4, size / quick)
-    largest = jnp.maximum(rate, jnp.where(small, 0, quick * (quick / size)))
-    flat = largest <= 1e-15
-    guess = (0.01 / jnp.where(flat, one, largest)) ** (1 / order)
-    return jnp.where(flat, 1e-6, jnp.minimum(most, guess)).astype(size.dtype)
+    # A state of zeros says nothing about the time in which it changes.
+    quickness = rate / jnp.maximum(size, 1e-4 * rate)
+    guess = (0.01 / (rate * jnp.maximum(quickness, 1))) ** (1 / order)
+    return jnp.where(rate < 1e-5, 1e-4, jnp.minimum(1 / quickness, guess)).astype(size.dtype)
 
 
 def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
