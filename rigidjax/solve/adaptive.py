@@ -13,8 +13,8 @@ from jaxtyping import Array
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive_loop import NONFINITE, finite
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.projection import Stopping, Watched
 from rigidjax.solve.replay_adjoint import ReplayAdjoint
+from rigidjax.solve.step_control import StandardController, Stopping, Watched
 from rigidjax.solve.stops import stopped
 
 REPLAY, NO_METER = ReplayAdjoint(), dfx.NoProgressMeter()
@@ -128,7 +128,7 @@ def adaptive(
     jumps: Array | Sequence[Array] | None = None,
     halt: Callable[..., Any] | None = None,
 ) -> AdaptiveRun:
-    """Return the states at `ts` with adaptive steps, controlled by `diffrax.PIDController`.
+    """Return the states at `ts` with adaptive steps.
 
     **Arguments:** `solver` an explicit method of this package; `field` a vector field
     `f(t, y, args)` as of `equations_of_motion`; `ts` (T,) s; `y0` the state at `ts[0]`; `rtol`,
@@ -153,6 +153,6 @@ def adaptive(
     declared: Any = [] if jumps is None else jumps
     declared = list(declared) if isinstance(declared, list | tuple) else [declared]
     rtol, atol = (jnp.asarray(a, ts.dtype) for a in (rtol, atol))
-    controller = Watched(dfx.PIDController(rtol=rtol, atol=atol, dtmax=max_step))
+    controller = Watched(StandardController(rtol, atol, max_step))
     how = dict(jumps=declared, halt=halt, dt0=dt0, max_steps=max_steps)
     return integrated(solver, field, ts, y0, controller, **how)

@@ -29,6 +29,7 @@ _MORE = 64
 # into a block that small, and blocks into the record. (Written row by row, second derivatives of
 # several blocks of bodies with segments run again were wrong, on jaxlib 0.12.0.1.)
 _BLOCK, _MOST = 560, 8
+_SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 # Times of one body that are taken together.
 _TOGETHER = 16
 
@@ -186,6 +187,19 @@ def starting_step(size: Array, rate: Array, order: Any) -> Array:
     quickness = rate / jnp.maximum(size, 1e-4 * rate)
     guess = (0.01 / (rate * jnp.maximum(quickness, 1))) ** (1 / order)
     return jnp.where(rate < 1e-5, 1e-4, jnp.minimum(1 / quickness, guess)).astype(size.dtype)
+
+
+def next_step(norm: Array, order: Any, h: Any) -> tuple[Array, Array]:
+    """Return whether a step of length h is accepted, and the length of the next one.
+
+    `norm` is that of its error over the tolerance, `order` that of its error. The limits are the
+    defaults of `diffrax.PIDController`.
+    """
+    norm, h = lax.stop_gradient((norm, h))
+    # NaN in a step too long says as little as infinity: a shorter one is tried.
+    norm = jnp.where(jnp.isnan(norm), jnp.inf, norm)
+    factor = jnp.clip(_SAFETY * norm ** (-1 / order), _SMALLEST, _LARGEST)
+    return norm < 1, h * factor.astype(jnp.result_type(h))
 
 
 def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:

@@ -15,13 +15,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve.adaptive_loop import NONFINITE, before, starting_step, take
+from rigidjax.solve.adaptive_loop import NONFINITE, before, next_step, starting_step, take
 from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
 from rigidjax.solve.tableaus import Tableau
 
-# The defaults of diffrax.PIDController.
-_SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 # Newton's guesses in a step, from then on halves; and how often a step is taken again for a turn.
 _GUESSES = 8
 _MOST = 70
@@ -300,9 +298,7 @@ def step_with_error(
     largest = jnp.maximum(jnp.abs(left), jnp.abs(after))
     scale = lift(run.atol, left) + lift(run.rtol, left) * largest
     tiny = float(jnp.finfo(error.dtype).tiny)
-    norm = jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
-    # NaN in a step too long says as little as infinity: try a shorter one.
-    return right, jnp.where(jnp.isnan(norm), jnp.inf, norm)
+    return right, jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
 
 
 def controlled(
@@ -313,10 +309,8 @@ def controlled(
     `norm` as of `step_with_error`; `kept` the step wanted before it was cut short as the `last`
     before a stop; `length` of the run, whose round-off counts where that of `t` vanishes.
     """
-    norm, h, kept = lax.stop_gradient((norm, h, kept))
-    good = norm < 1
-    factor = jnp.clip(_SAFETY * norm ** (-1 / order), _SMALLEST, _LARGEST)
-    following = h * factor.astype(h.dtype)
+    good, following = next_step(norm, order, h)
+    kept = lax.stop_gradient(kept)
     eps = jnp.finfo(h.dtype).eps
     unit = 8 * eps * jnp.maximum(jnp.abs(t), eps * length)
     why = jnp.where(jnp.isfinite(norm), 0.0, jnp.nan).astype(h.dtype)

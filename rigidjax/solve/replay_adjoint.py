@@ -18,14 +18,14 @@ from rigidjax.motion.equations import on_the_group
 from rigidjax.solve.adaptive_loop import LoopState, Method, Run
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.projection import NORM, Stopping, Watched
 from rigidjax.solve.recorded_run import states_of
+from rigidjax.solve.step_control import NORM, StandardController, Stopping, Watched
 from rigidjax.solve.stops import traced
 
 # Controllers that do not look at `args`: these may be large, and each body would have its own.
 _WITHOUT_ARGS = (
-    dfx.PIDController, dfx.ClipStepSizeController, dfx.ConstantStepSize, dfx.StepTo, Stopping,
-    Watched,
+    dfx.PIDController, dfx.ClipStepSizeController, dfx.ConstantStepSize, dfx.StepTo,
+    StandardController, Stopping, Watched,
 )  # fmt: skip
 
 # diffrax rounds a step up to the end of a run that is nearer than so many units of round-off.

@@ -34,10 +34,10 @@ from rigidjax.solve.adaptive_loop import NONFINITE, finite, of_body
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.momentum import by_momentum, changing, with_body_rates
-from rigidjax.solve.projection import Watched
 from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.sides import declared_jumps, on_sides
 from rigidjax.solve.splitting import AbstractSplitting
+from rigidjax.solve.step_control import StandardController, Watched
 from rigidjax.solve.stops import traced
 from rigidjax.solve.switching import MOST, analysis_of
 
@@ -86,7 +86,7 @@ class DiffraxRun(eqx.Module):
         """Return the controller of the steps, which ends a run that cannot go on."""
         control = self.controller
         if control is None:
-            control = dfx.PIDController(rtol=self.rtol, atol=self.atol, dtmax=self.max_step)
+            control = StandardController(self.rtol, self.atol, self.max_step)
         if isinstance(control, dfx.AbstractAdaptiveStepSizeController):
             control = Watched(control)
         if self.cuts is not None and not self.seeks_stops:

@@ -17,8 +17,8 @@ from rigidjax.solve.splitting import (
 )
 
 __all__ = [
-    "DormandPrince8", "FreeSolver", "Magnus4", "Projected", "RungeKutta4", "Splitting2",
-    "Splitting4", "Splitting6", "Tsitouras5",
+    "DormandPrince8", "FreeSolver", "Magnus4", "Projected", "ReplayAdjoint", "RungeKutta4",
+    "Splitting2", "Splitting4", "Splitting6", "Tsitouras5",
 ]  # fmt: skip
 
 show(__name__)

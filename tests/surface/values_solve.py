@@ -338,7 +338,7 @@ leave_out(
       "DormandPrince8", "Splitting2", "Splitting4", "Splitting6")
       for what in ("order", "init", "step", "func")),
     *(f"solve.solvers.FreeSolver.{what}" for what in ("error_order", "func", "init", "order", "step")),
-    "solve.solvers.ReplayAdjoint.loop",
+    "solve.solvers.ReplayAdjoint", "solve.solvers.ReplayAdjoint.loop",
     *(f"solve.solvers.Projected.{what}" for what in (
         "error_order", "func", "init", "order", "step", "strong_order", "term_structure",
         "interpolation_cls", "term_compatible_contr_kwargs", "scan_kind", "root_finder",
