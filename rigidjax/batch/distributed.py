@@ -124,7 +124,7 @@ def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
     ...     save(jnp.arange(2), folder).name
     'share-0.npz'
     """
-    folder = _checks.path(folder, "folder")
+    folder = _checks.file_path(folder, "folder")
     leaves = {f"leaf{i}": leaf for i, leaf in enumerate(jax.tree.leaves(_on_host(tree, "save")))}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"share-{jax.process_index()}.npz"
@@ -154,7 +154,7 @@ def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
     ...     recover(jnp.zeros(2), folder)[0].tolist()
     [0, 1]
     """
-    folder = _checks.path(folder, "folder")
+    folder = _checks.file_path(folder, "folder")
     paths = sorted(folder.glob("share-*.npz"), key=lambda p: int(p.stem.split("-")[1]))
     if not paths:
         raise FileNotFoundError(f"recover: no share-*.npz in {folder}")
@@ -177,7 +177,7 @@ def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
 
 def _on_host(tree: PyTree, name: str) -> PyTree:
     """Return the tree in host memory; refuse a traced tree, with the `name` of the function."""
-    if not _checks.known(tree):
+    if not _checks.is_known(tree):
         raise TypeError(
             f"{name}: wanted a tree of known arrays, got one that is traced; {name} sends arrays "
             "between processes: call it outside of jax.jit, jax.grad and jax.vmap"

@@ -161,7 +161,7 @@ def rollout(
     if not isinstance(every, int) or every < 1 or count % every:
         raise ValueError(f"save_every: wanted a divisor of num_steps = {count}, got {save_every!r}")
     start = jax.tree.map(jnp.asarray, initial)
-    begin = _checks.time(t0, "t0").astype(batch.dtype)
+    begin = _checks.checked_time(t0, "t0").astype(batch.dtype)
     numbers = (batch.shared, (batch.per_body, samples), start, h, begin)
     steps = solver, count, every, save_every is not None and reduce is None
     division = chunk_of(chunk, batch.dtype, batch.num_bodies), mesh_of(devices)

@@ -123,7 +123,7 @@ def simulate(
         batch = check_batch(bodies, states0, torque, torque_axes)
         h, count = step_of(size, number, batch.dtype)
         ts = h * jnp.arange(every, count + 1, every).astype(h.dtype)
-        ts = _checks.time(t0, "t0").astype(h.dtype) + ts
+        ts = _checks.checked_time(t0, "t0").astype(h.dtype) + ts
         num_steps = jnp.full(batch.num_bodies, count, jnp.int32)
         own = ys.own if isinstance(ys, Coupled) else None
         return Batch(ts, motion_of(ys), _statuses(batch._replace(checks=()), ys), num_steps, own)
@@ -137,7 +137,7 @@ def simulate(
     batch = check_batch(bodies, states0, torque, torque_axes)
     ts = validation.times(ts_or_steps, True).astype(batch.dtype)
     if torque is not None or solver is not None:
-        max_steps = _checks.whole(max_steps, "max_steps", 1)
+        max_steps = _checks.integer(max_steps, "max_steps", 1)
         rtol, atol = validation.tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if solver is None else solver
     options = dict(solver=solver, rtol=rtol, atol=atol, max_steps=max_steps, adjoint=adjoint)

@@ -37,7 +37,7 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     Traceback (most recent call last):
     ValueError: missing.urdf: no such file
     """
-    path = _checks.path(path)
+    path = _checks.file_path(path)
     root, nodes = _open_file(path)
     read = _from_urdf if root.tag == "robot" else _from_mujoco
     bodies: dict[str, MassProperties] = {}
@@ -110,14 +110,14 @@ def write_inertials(
     Traceback (most recent call last):
     ValueError: bodies: wanted at least one name → MassProperties, got none
     """
-    path, source = _checks.path(path), _checks.path(source, "source")
-    _checks.instance(bodies, Mapping, "bodies", wanted="a dict of name → MassProperties")
+    path, source = _checks.file_path(path), _checks.file_path(source, "source")
+    _checks.require_instance(bodies, Mapping, "bodies", wanted="a dict of name → MassProperties")
     if not bodies:
         raise ValueError("bodies: wanted at least one name → MassProperties, got none")
     root, nodes = _open_file(source)
     write = _to_urdf if root.tag == "robot" else _to_mujoco
     for name, body in bodies.items():
-        _checks.single(body, MassProperties, f"bodies[{name!r}]")
+        _checks.require_single(body, MassProperties, f"bodies[{name!r}]")
         if name not in nodes:
             raise ValueError(f"{source}: no body {name!r}; there are {', '.join(nodes)}")
         inertial = nodes[name].find("inertial")

@@ -38,7 +38,7 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     2.0
     """
     hint = "for an Inertia use pack_second_moment(body.second_moment), or pack_shape"
-    _checks.single(body, MassProperties, "body", hint=hint)
+    _checks.require_single(body, MassProperties, "body", hint=hint)
     alpha = _hold(0.5 * jnp.log(body.mass), jnp.expm1)
     shape = _factors(body.second_moment / body.mass)
     return jnp.concatenate([alpha[None], shape, body.com])
@@ -54,7 +54,7 @@ def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     >>> unpack(jnp.zeros(10)).inertia.moments
     Array([2., 2., 2.], dtype=float64)
     """
-    v = _checks.floating(vector, (10,), "vector")
+    v = _checks.array_of_shape(vector, (10,), "vector")
     alpha = _hold(v[0])
     size = 3.0 * jnp.exp(2.0 * _hold(alpha + v[1]))
     return MassProperties(jnp.exp(2.0 * alpha), v[7:10], size * _shape(v[2:7]))
@@ -70,7 +70,7 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
     >>> pack_second_moment(jnp.eye(3))
     Array([0., 0., 0., 0., 0., 0.], dtype=float64)
     """
-    return _factors(_checks.floating(second_moment, (3, 3), "second_moment"))
+    return _factors(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))
 
 
 def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
@@ -80,7 +80,7 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
     >>> unpack_second_moment(jnp.zeros(6))[0]
     Array([1., 0., 0.], dtype=float64)
     """
-    v = _checks.floating(vector, (6,), "vector")
+    v = _checks.array_of_shape(vector, (6,), "vector")
     return 3.0 * jnp.exp(2.0 * _hold(v[0])) * _shape(v[1:])
 
 
@@ -96,7 +96,7 @@ def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
     >>> pack_shape(jnp.diag(jnp.array([4.0, 4.0, 0.0])))  # a plate
     Array([0.5, 0.5, 0. , 0. , 0. ], dtype=float64)
     """
-    return _factors(_checks.floating(second_moment, (3, 3), "second_moment"))[1:]
+    return _factors(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))[1:]
 
 
 def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
@@ -106,7 +106,7 @@ def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
     >>> float(jnp.trace(unpack_shape(jnp.ones(5))))
     1.0
     """
-    return _shape(_checks.floating(vector, (5,), "vector"))
+    return _shape(_checks.array_of_shape(vector, (5,), "vector"))
 
 
 def pack_moments(moments: Vector) -> Float[Array, "3"]:
@@ -119,7 +119,7 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
     >>> pack_moments([2.0, 2.0, 2.0])
     Array([0., 0., 0.], dtype=float64)
     """
-    i = real_moments(_checks.floating(moments, (3,), "moments"))
+    i = real_moments(_checks.array_of_shape(moments, (3,), "moments"))
     s = 0.5 * jnp.stack([(i[1] - i[0]) + i[2], (i[2] - i[1]) + i[0], (i[0] - i[2]) + i[1]])
     total = _not_a_point(s[0] + s[1] + s[2])
     root = jnp.sqrt(jnp.maximum(_quotient(s, total), 0.0))
@@ -134,7 +134,7 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
     >>> unpack_moments([0.0, 0.0, 0.0])
     Array([2., 2., 2.], dtype=float64)
     """
-    v = _checks.floating(vector, (3,), "vector")
+    v = _checks.array_of_shape(vector, (3,), "vector")
     root = jnp.stack([1.0 + v[1], 1.0 + v[2], 1.0 - v[1] - v[2]])
     root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
     a, b, c = root * root / jnp.sum(root * root)
@@ -160,8 +160,8 @@ def flat_bend(
     >>> flat_bend(plate, -1e-6 * jnp.ones(5)).shape
     (3, 5)
     """
-    shape = _checks.floating(shape, (5,), "shape")
-    slope = _checks.floating(slope, (5,), "slope")
+    shape = _checks.array_of_shape(shape, (5,), "shape")
+    slope = _checks.array_of_shape(slope, (5,), "slope")
     root = _root_of(shape)
     # The columns of a flat body's adjugate are along n: this is cheaper than eigenvectors, in every
     # step of a fit.
@@ -230,7 +230,7 @@ def _root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
 
 def _not_a_point(total: Scalar) -> Scalar:
     words = "pack: the second moment is zero (a point has no shape) or beyond the dtype"
-    return _checks.refuse(total, ~((total > 0) & (total < jnp.inf)), words)
+    return _checks.error_if(total, ~((total > 0) & (total < jnp.inf)), words)
 
 
 def _quotient(part: Array, total: Scalar) -> Array:

@@ -55,7 +55,7 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
     (Array([1., 2., 3.], dtype=float64), Array([1., 0., 0., 0.], dtype=float64))
     """
     moments, axes = eigensystem(
-        validation.check_symmetric(_checks.floating(tensor, (3, 3), "tensor"), "tensor")
+        validation.check_symmetric(_checks.array_of_shape(tensor, (3, 3), "tensor"), "tensor")
     )
     return moments, _quaternion_near_identity(axes)
 
@@ -157,15 +157,15 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     >>> matrix_function(jnp.sqrt, 4.0 * jnp.eye(3))[0]
     Array([2., 0., 0.], dtype=float64)
     """
-    a = validation.check_symmetric(_checks.floating(tensor, (3, 3), "tensor"), "tensor")
-    _checks.function(function, "function", "number → number, written in jax.numpy")
+    a = validation.check_symmetric(_checks.array_of_shape(tensor, (3, 3), "tensor"), "tensor")
+    _checks.require_function(function, "function", "number → number, written in jax.numpy")
     # The unit is a power of two near the largest entry: no product leaves the dtype's range. It is
     # one power smaller, since for the largest number of the dtype the next power is infinite.
     unit = times_power_of_two(jnp.ones((), a.dtype), exponent_of(a) - 1)
     a = 0.5 * (a + a.T) / unit
 
     def scaled(value):
-        return _checks.floating(function(unit * value), (), "function(λ)", hint="one number")
+        return _checks.array_of_shape(function(unit * value), (), "function(λ)", hint="one number")
 
     values, axes = eigensystem(jax.lax.stop_gradient(a))
     change = product(axes.T, product(a - jax.lax.stop_gradient(a), axes))

@@ -172,14 +172,16 @@ def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProper
 
 
 def _lengths(value, shape, name):
-    lengths = _checks.finite_floating(value, shape, name, unit="m")
-    return _checks.if_known(_checks.sign, lengths, name, "lengths ≥ 0 (m)", zero=True)
+    lengths = _checks.finite_array(value, shape, name, unit="m")
+    return _checks.check_if_known(_checks.require_sign, lengths, name, "lengths ≥ 0 (m)", zero=True)
 
 
 def _require_nested(inner, outer, names=("inner", "outer")):
     r, R = _lengths(inner, (), names[0]), _lengths(outer, (), names[1])
-    if _checks.known((r, R)):
-        _checks.refuse(r, r > R, f"{names[0]}: wanted {names[0]} ≤ {names[1]}, got {r} and {R} (m)")
+    if _checks.is_known((r, R)):
+        _checks.error_if(
+            r, r > R, f"{names[0]}: wanted {names[0]} ≤ {names[1]}, got {r} and {R} (m)"
+        )
     return r, R
 
 
@@ -188,7 +190,7 @@ def _round(across, along):
 
 
 def _body_at_centre(mass, per_mass):
-    m = _checks.floating(mass, (), "mass")
+    m = _checks.array_of_shape(mass, (), "mass")
     return MassProperties(m, jnp.zeros_like(per_mass), jnp.diag(m * per_mass))
 
 

@@ -26,33 +26,33 @@ _FORGIVEN = 64.0
 
 def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Refuse a mass that is not positive and finite."""
-    return _checks.sign(mass, "mass", "a positive mass (kg)")
+    return _checks.require_sign(mass, "mass", "a positive mass (kg)")
 
 
 def real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Refuse an inertia tensor that is not symmetric, or whose moments no real body has."""
-    tensor = _require_symmetric(_checks.finite(tensor, "inertia tensor"), "inertia tensor")
+    tensor = _require_symmetric(_checks.require_finite(tensor, "inertia tensor"), "inertia tensor")
     return _moments_of_a_body(tensor, _eigenvalues(tensor))
 
 
 def real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
     """Refuse principal moments, in any order, that no real body has."""
-    if not _checks.known(moments) and _checks.known(plain := lax.stop_gradient(moments)):
+    if not _checks.is_known(moments) and _checks.is_known(plain := lax.stop_gradient(moments)):
         # The numbers are known and only differentiated: one check by NumPy instead of twenty
         # programs.
         real_moments(plain)
         return moments
-    moments = _checks.finite(moments, "principal moments")
-    xp = np if _checks.known(moments) else jnp
+    moments = _checks.require_finite(moments, "principal moments")
+    xp = np if _checks.is_known(moments) else jnp
     return _moments_of_a_body(moments, xp.sort(_values(moments)))
 
 
 def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Refuse a second moment that is not symmetric and positive semi-definite."""
-    s = _require_symmetric(_checks.finite(s, "second moment"), "second moment")
+    s = _require_symmetric(_checks.require_finite(s, "second moment"), "second moment")
     least, largest = (e := _eigenvalues(s))[..., 0], e[..., 2]
-    found = f", got principal second moments {_show(e)} kg m²" if _checks.known(s) else ""
-    return _checks.refuse(
+    found = f", got principal second moments {_show(e)} kg m²" if _checks.is_known(s) else ""
+    return _checks.error_if(
         s,
         (least < -_slack(s) * largest).any() | (largest < 0).any(),
         "second moment 𝔖 = ∫ r rᵀ dm: wanted a positive semi-definite matrix (mass is not "
@@ -68,7 +68,7 @@ def single(
     Known numbers that no real body has are refused; a traced body with such numbers becomes NaN. A
     moment may be zero: a function that divides by the moments calls `check_body`.
     """
-    body = _checks.single(value, kinds, name, wanted=wanted, hint=hint)
+    body = _checks.require_single(value, kinds, name, wanted=wanted, hint=hint)
     has_mass = hasattr(body, "mass")
     tensor = body.inertia.tensor if has_mass else body.tensor
     return check_body(body, tensor, body.mass if has_mass else None, throw=False, thin=True)
@@ -78,7 +78,7 @@ def check_symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
     """Return a symmetric matrix; refuse a known one that is not symmetric, and make a traced one
     NaN.
     """
-    if _checks.known(a):
+    if _checks.is_known(a):
         return _require_symmetric(a, name)
     return jnp.where(_asymmetry(a)[1], jnp.nan, a)
 
@@ -96,9 +96,9 @@ def check_body(
     `mass` may be `None`. Other numbers are refused if they are known, or if `throw` is true; else
     the traced body becomes NaN.
     """
-    tensor = _checks.numbers(tensor, "inertia tensor")
-    is_known = _checks.known((tensor, mass))
-    if not is_known and _checks.known(plain := lax.stop_gradient((tensor, mass))):
+    tensor = _checks.numeric_array(tensor, "inertia tensor")
+    is_known = _checks.is_known((tensor, mass))
+    if not is_known and _checks.is_known(plain := lax.stop_gradient((tensor, mass))):
         # The numbers are known and only differentiated: one check by NumPy instead of thirty
         # programs.
         faults = _faults(np, plain[0], thin)
@@ -113,7 +113,7 @@ def check_body(
             if mass is not None:
                 real_mass(mass)
             real_inertia(tensor)
-            _checks.refuse(body, True, f"{_FLAT} {_show(_eigenvalues(tensor))} kg m²{_THIN}")
+            _checks.error_if(body, True, f"{_FLAT} {_show(_eigenvalues(tensor))} kg m²{_THIN}")
         return body
     if not throw:
         nan = lambda a: jnp.where(bad.reshape(bad.shape + (1,) * (a.ndim - bad.ndim)), jnp.nan, a)  # noqa: E731
@@ -128,7 +128,7 @@ def first_impossible(tensors: Float[Array, "n 3 3"]) -> Any:
 
     A tensor with a NaN is skipped: in a batch of bodies it gets a status of its own.
     """
-    return _checks.first_bad(_impossible, tensors)
+    return _checks.first_bad_row(_impossible, tensors)
 
 
 def _impossible(xp: ModuleType, tensors: Array | np.ndarray) -> Any:
@@ -197,22 +197,22 @@ def unit_quaternion(q: Quaternion) -> Quat:
     """Return a unit quaternion (w, x, y, z), normalised if it is off by round-off; refuse any
     other.
     """
-    q = _checks.finite_floating(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
+    q = _checks.finite_array(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
     return quaternion.normalise(near_unit(q, "q", tolerance(q.dtype)))
 
 
 def _moments_of_a_body(value, moments):
     m1, m2, m3 = moments[..., 0], moments[..., 1], moments[..., 2]
-    found = f" {_show(moments)} kg m²" if _checks.known(value) else ""
+    found = f" {_show(moments)} kg m²" if _checks.is_known(value) else ""
     slack = _slack(value) * abs(m3)
-    value = _checks.refuse(
+    value = _checks.error_if(
         value,
         (m1 < -slack).any() | (m3 < 0).any(),
         f"inertia: wanted moments that are not negative, got{found or ' a negative one'}; "
         "possible causes: an inside-out mesh, or a product of inertia with the wrong sign",
     )
-    short = f" ({float(np.max(m3 - m1 - m2)):.3g} too large)" if _checks.known(value) else ""
-    return _checks.refuse(
+    short = f" ({float(np.max(m3 - m1 - m2)):.3g} too large)" if _checks.is_known(value) else ""
+    return _checks.error_if(
         value,
         (m3 - m1 - m2 > slack).any(),
         f"inertia: the moments{found} break the triangle inequality I1 + I2 ≥ I3: the largest may "
@@ -229,8 +229,8 @@ def _asymmetry(a):
 
 def _require_symmetric(a, name):
     difference, bad = _asymmetry(a)
-    found = f" (largest difference {float(difference.max()):.3g})" if _checks.known(a) else ""
-    return _checks.refuse(
+    found = f" (largest difference {float(difference.max()):.3g})" if _checks.is_known(a) else ""
+    return _checks.error_if(
         a,
         bad,
         f"{name}{_SKEW}{found}{_CAUSE}",
@@ -241,11 +241,11 @@ def _values(a):
     """Return the numbers without derivatives, by NumPy if they are known: a check then costs
     microseconds.
     """
-    return np.asarray(a) if _checks.known(a) else lax.stop_gradient(a)
+    return np.asarray(a) if _checks.is_known(a) else lax.stop_gradient(a)
 
 
 def _eigenvalues(a):
-    if _checks.known(a):
+    if _checks.is_known(a):
         return np.linalg.eigvalsh(np.asarray(a))
     scale = jnp.abs(a).max(axis=(-1, -2), keepdims=True)
     scale = lax.stop_gradient(jnp.where(scale > 0, scale, 1))

@@ -138,7 +138,7 @@ def _keep_compiled_programs() -> None:
         if hasattr(os, "getuid"):
             if held.st_uid != os.getuid() or held.st_mode & 0o022:
                 words = "is not yours alone: it is not used, and starts are slower; delete it"
-                print(_checks.printable(f"{folder} {words}"), file=sys.stderr)
+                print(_checks.escape_controls(f"{folder} {words}"), file=sys.stderr)
                 return
             folder.chmod(0o700)
     except (OSError, RuntimeError):
@@ -164,7 +164,7 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the message, made printable, and end the program with exit code 2."""
-        super().error(_checks.printable(message))
+        super().error(_checks.escape_controls(message))
 
 
 _FLAG: dict[str, Any] = {"action": "store_true"}
@@ -373,7 +373,7 @@ def _logs(options: argparse.Namespace) -> int:
         print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
     print()
     print(rj.identify.report.verdict(fit))
-    names = [_checks.printable(Path(path).name) for path in options.logs]
+    names = [_checks.escape_controls(Path(path).name) for path in options.logs]
     title = f"Identification of {', '.join(names[:3])}{' …' if names[3:] else ''}"
     return _write(fit, options, title, names, names, {"rate_unit": rate_unit})
 
@@ -475,7 +475,7 @@ def _matplotlib() -> bool:
 def _print_line(line: str) -> None:
     """Print a line, made printable."""
     try:
-        print(_checks.printable(line), flush=True)
+        print(_checks.escape_controls(line), flush=True)
     except OSError:
         # The reader has stopped, as `head` does, or a disk is full. Go on without output: the files
         # are still to be written.
@@ -484,5 +484,5 @@ def _print_line(line: str) -> None:
 
 def _error(what: object) -> int:
     """Print the error `what` in one line, and return the exit code 2."""
-    print(f"error: {_checks.printable(what)}", file=sys.stderr)
+    print(f"error: {_checks.escape_controls(what)}", file=sys.stderr)
     return 2

@@ -139,8 +139,8 @@ _jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0).at(t))
 
 def _time(t: ScalarLike, omega: Array) -> Scalar:
     """Check the time: a number in whose dtype the turn of the body has digits."""
-    t = _checks.time(t)
-    if not _checks.known((t, omega)):
+    t = _checks.checked_time(t)
+    if not _checks.is_known((t, omega)):
         return t
     dtype = jnp.promote_types(t.dtype, omega.dtype)
     with np.errstate(over="ignore"):
@@ -160,19 +160,21 @@ def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
             f"state0: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
             "also moves is free in both: add x + v t yourself, or use simulate"
         )
-    _checks.single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
+    _checks.require_single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     tensor = inertia.tensor
-    arrays = {"omega": _checks.floating(state0.omega, (3,), "omega")}
+    arrays = {"omega": _checks.array_of_shape(state0.omega, (3,), "omega")}
     if isinstance(state0, HasAttitude):
-        arrays["q"] = _checks.floating(state0.q, (4,), "q", hint="a quaternion is (w, x, y, z)")
+        arrays["q"] = _checks.array_of_shape(
+            state0.q, (4,), "q", hint="a quaternion is (w, x, y, z)"
+        )
     for name, array in arrays.items():
         if array.dtype != tensor.dtype:
             raise TypeError(f"{name} is {array.dtype}, but the inertia tensor is {tensor.dtype}")
     inertia = validation.check_body(inertia, tensor, None, throw=False)
-    if not _checks.known((tensor, arrays)):
+    if not _checks.is_known((tensor, arrays)):
         return inertia
     for name, array in arrays.items():
-        _checks.finite(array, name)
+        _checks.require_finite(array, name)
     if "q" in arrays:
         near_unit(arrays["q"], "q", tolerance(tensor.dtype))
     return inertia

@@ -62,9 +62,9 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
 def _checked_arguments(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
     """Check body and rate; return the tensor and Ω in its dtype."""
-    _checks.single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
+    _checks.require_single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     tensor = validation.check_body(inertia, inertia.tensor, None, throw=False).tensor
-    return tensor, _checks.floating(omega0, (3,), "omega0").astype(tensor.dtype)
+    return tensor, _checks.array_of_shape(omega0, (3,), "omega0").astype(tensor.dtype)
 
 
 @jax.jit

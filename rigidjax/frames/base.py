@@ -72,7 +72,7 @@ class Force(AbstractScene):
 
     def __check_init__(self) -> None:
         if self.force is not None:
-            _checks.function(self.force, "force", "(t, state, body) → (3,) per mass")
+            _checks.require_function(self.force, "force", "(t, state, body) → (3,) per mass")
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -93,7 +93,7 @@ def per_mass(value: NumbersLike, force: object) -> Vec3:
     anything.
     """
     name = getattr(force, "__name__", type(force).__name__)
-    return _checks.floating(value, (3,), f"force {name}", hint="force per mass, m/s²")
+    return _checks.array_of_shape(value, (3,), f"force {name}", hint="force per mass, m/s²")
 
 
 def jumps_within(*laws: object) -> Float[Array, " n"]:

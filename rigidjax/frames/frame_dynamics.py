@@ -43,9 +43,11 @@ class InFrame(AbstractScene):
         require_frame(self.frame, "InFrame")
         for name in ("inside", "outside"):
             if getattr(self, name) is not None:
-                _checks.function(getattr(self, name), name, "(t, state) → (3,)")
+                _checks.require_function(getattr(self, name), name, "(t, state) → (3,)")
         if self.potential is not None:
-            _checks.function(self.potential, "potential", "of a place (3,) to a number, m²/s²")
+            _checks.require_function(
+                self.potential, "potential", "of a place (3,) to a number, m²/s²"
+            )
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -129,7 +131,9 @@ class BodyInFrame(eqx.Module):
     def __check_init__(self) -> None:
         require_frame(self.frame, "BodyInFrame")
         if self.torque is not None:
-            _checks.function(self.torque, "torque", "(t, state, body) → (3,), N m, or a law")
+            _checks.require_function(
+                self.torque, "torque", "(t, state, body) → (3,), N m, or a law"
+            )
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -159,6 +163,6 @@ class BodyInFrame(eqx.Module):
                         f"Rigid state, got {type(state).__name__}, which has no position"
                     )
                 force, real = force + real.force.astype(omega.dtype), real.torque
-            real = _checks.floating(real, (3,), "torque", hint="body-frame N m")
+            real = _checks.array_of_shape(real, (3,), "torque", hint="body-frame N m")
             torque = torque + real.astype(omega.dtype)
         return torque if force is None else FrameWrench(force, torque)

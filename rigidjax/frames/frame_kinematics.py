@@ -66,30 +66,30 @@ class Instant(eqx.Module):
         """Return the components in S, M y', of a vector given in S' (notes, eq 85): a force, a
         direction.
         """
-        y = _checks.floating(y, (3,), "y")
+        y = _checks.array_of_shape(y, (3,), "y")
         return linalg3.apply(self.rotation.astype(y.dtype), y)
 
     def inward(self, y: Vector) -> Vec3:
         """Return the components in S', Mᵀ y, of a vector given in S (notes, eq 86; f = MᵀF of eq
         91).
         """
-        y = _checks.floating(y, (3,), "y")
+        y = _checks.array_of_shape(y, (3,), "y")
         return linalg3.apply(self.rotation.T.astype(y.dtype), y)
 
     def centrifugal(self, x: Vector) -> Vec3:
         """Return the centrifugal acceleration −Ω × (Ω × x')."""
-        x = _checks.floating(x, (3,), "x")
+        x = _checks.array_of_shape(x, (3,), "x")
         rate = self.rate.astype(x.dtype)
         return linalg3.cross(linalg3.cross(rate, x), rate)
 
     def coriolis(self, v: Vector) -> Vec3:
         """Return the Coriolis acceleration −2 Ω × v'."""
-        v = _checks.floating(v, (3,), "v")
+        v = _checks.array_of_shape(v, (3,), "v")
         return 2 * linalg3.cross(v, self.rate.astype(v.dtype))
 
     def euler_acceleration(self, x: Vector) -> Vec3:
         """Return the Euler acceleration −dΩ/dt × x'."""
-        x = _checks.floating(x, (3,), "x")
+        x = _checks.array_of_shape(x, (3,), "x")
         return linalg3.cross(x, self.rate_change.astype(x.dtype))
 
     def translation(self) -> Vec3:
@@ -98,7 +98,7 @@ class Instant(eqx.Module):
 
     def fictitious(self, x: Vector, v: Vector) -> Vec3:
         """Return the sum of the four inertial accelerations (notes, eq 91)."""
-        x, v = _checks.floating(x, (3,), "x"), _checks.floating(v, (3,), "v")
+        x, v = _checks.array_of_shape(x, (3,), "x"), _checks.array_of_shape(v, (3,), "v")
         turning = self.centrifugal(x) + self.coriolis(v) + self.euler_acceleration(x)
         return turning + self.translation().astype(x.dtype)
 
@@ -116,7 +116,7 @@ def _can_travel(state: PyTree) -> None:
     hint = "one state at one time; batch with jax.vmap(frame.to_inertial)(states, times)"
     for name, size in (("x", 3), ("v", 3), ("q", 4), ("omega", 3)):
         if hasattr(state, name):
-            _checks.floating(getattr(state, name), (size,), name, hint=hint)
+            _checks.array_of_shape(getattr(state, name), (size,), name, hint=hint)
 
 
 def _replace_fields(state: PyTree, turned: dict[str, Any]) -> Any:

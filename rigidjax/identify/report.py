@@ -33,7 +33,7 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
     ('Ix/Iz', 3.1, True)
     """
     require_one_fit(fit)
-    scale = _UNITS[_checks.word(rate_unit, tuple(_UNITS), "rate_unit")]
+    scale = _UNITS[_checks.require_option(rate_unit, tuple(_UNITS), "rate_unit")]
     bounds = fit.interval(0.95)
     out: list[Row] = []
     for quantity in fit.quantities:
@@ -56,7 +56,7 @@ def table(lines: list[Row]) -> str:
                  value  95 % interval
     I1          1.2346  1.2000 … 1.2700 kg m²
     """
-    for line in _checks.instance(lines, (list, tuple), "lines", wanted="a list of rows"):
+    for line in _checks.require_instance(lines, (list, tuple), "lines", wanted="a list of rows"):
         if not isinstance(line, tuple) or len(line) != 5:
             raise TypeError(f"lines: wanted rows (name, value, low, high, unit), got {line!r}")
     if not lines:
@@ -77,8 +77,8 @@ def numbers(value: float, low: float, high: float) -> list[str]:
     >>> numbers(1.23456, 1.2, 1.27)
     ['1.2346', '1.2000', '1.2700']
     """
-    value = _checks.number(value, "value")
-    low, high = _checks.number(low, "low"), _checks.number(high, "high")
+    value = _checks.known_float(value, "value")
+    low, high = _checks.known_float(low, "low"), _checks.known_float(high, "high")
     wholes = [abs(number) for number in (value, low, high) if np.isfinite(number)]
     size, gaps = max(wholes, default=0.0), (value - low, high - value)
     fixed = size == 0 or 1e-3 <= size < 1e6

@@ -29,7 +29,7 @@ class Momentum(eqx.Module):
     pi: Float[Array, "*batch 3"]
 
     def __init__(self, pi: Vectors):
-        self.pi = _checks.floating(pi, (3,), "pi", batched=True)
+        self.pi = _checks.array_of_shape(pi, (3,), "pi", batched=True)
 
 
 class MomentumAndDirection(eqx.Module):
@@ -46,9 +46,9 @@ class MomentumAndDirection(eqx.Module):
     gamma: Float[Array, "*batch 3"]
 
     def __init__(self, pi: Vectors, gamma: Vectors):
-        self.pi = _checks.floating(pi, (3,), "pi", batched=True)
-        self.gamma = _checks.floating(gamma, (3,), "gamma", batched=True)
-        _checks.same_batch(pi=(self.pi, 1), gamma=(self.gamma, 1))
+        self.pi = _checks.array_of_shape(pi, (3,), "pi", batched=True)
+        self.gamma = _checks.array_of_shape(gamma, (3,), "gamma", batched=True)
+        _checks.require_same_batch(pi=(self.pi, 1), gamma=(self.gamma, 1))
 
 
 class LiePoisson(eqx.Module):
@@ -89,7 +89,7 @@ def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
     >>> lie_poisson(H)(0.0, Momentum([1.0, 1.0, 1.0])).pi
     Array([ 0. ,  0.5, -0.5], dtype=float64)
     """
-    return LiePoisson(_checks.function(hamiltonian, "hamiltonian", _WANTED))
+    return LiePoisson(_checks.require_function(hamiltonian, "hamiltonian", _WANTED))
 
 
 def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoissonWithDirection:
@@ -105,11 +105,11 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
     >>> field(0.0, MomentumAndDirection([0.0, 0, 1], [1.0, 0, 0])).pi.tolist()
     [0.0, 1.0, 0.0]
     """
-    return LiePoissonWithDirection(_checks.function(hamiltonian, "hamiltonian", _WANTED))
+    return LiePoissonWithDirection(_checks.require_function(hamiltonian, "hamiltonian", _WANTED))
 
 
 def _invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
-    _checks.single(inertia, _inertia.Inertia, "inertia")
+    _checks.require_single(inertia, _inertia.Inertia, "inertia")
     return validation.check_body(inertia, inertia.tensor, None, throw=False)
 
 
@@ -129,7 +129,7 @@ class RotationalHamiltonian(eqx.Module):
         self.inverse = _inertia.inverse(_invertible(inertia).tensor)
 
     def __call__(self, pi: Float[ArrayLike, "3"] | list[float]) -> Scalar:
-        pi = _checks.floating(pi, (3,), "pi")
+        pi = _checks.array_of_shape(pi, (3,), "pi")
         return 0.5 * dot(pi, apply(self.inverse, pi))
 
 
@@ -153,13 +153,16 @@ class HeavyTopHamiltonian(eqx.Module):
     def __init__(self, inertia: _inertia.Inertia, top: HeavyTop):
         self.inertia = _invertible(inertia)
         hint = "this Hamiltonian is for gravity alone"
-        self.top = _checks.instance(top, HeavyTop, "top", hint=hint)
+        self.top = _checks.require_instance(top, HeavyTop, "top", hint=hint)
         self.inverse = _inertia.inverse(self.inertia.tensor)
 
     def __call__(
         self, pi: Float[ArrayLike, "3"] | list[float], gamma: Float[ArrayLike, "3"] | list[float]
     ) -> Scalar:
-        pi, gamma = _checks.floating(pi, (3,), "pi"), _checks.floating(gamma, (3,), "gamma")
+        pi, gamma = (
+            _checks.array_of_shape(pi, (3,), "pi"),
+            _checks.array_of_shape(gamma, (3,), "gamma"),
+        )
         return 0.5 * dot(pi, apply(self.inverse, pi)) - self.top.mass * dot(self.top.com, gamma)
 
     def start(self, state: HasAttitude) -> MomentumAndDirection:
@@ -169,4 +172,4 @@ class HeavyTopHamiltonian(eqx.Module):
 
 
 def _number(value):
-    return _checks.floating(value, (), "hamiltonian", hint="one number, J")
+    return _checks.array_of_shape(value, (), "hamiltonian", hint="one number, J")

@@ -125,11 +125,11 @@ def drift(
     >>> bool(drift(ts, ys, body)["energy"] < 1e-8)
     True
     """
-    ts = _checks.rows(ts, (), "ts")
+    ts = _checks.array_of_rows(ts, (), "ts")
     if not ts.size:
         raise ValueError("ts: wanted at least one time, got none")
     turning = motion_of(ys)
-    _checks.instance(turning, HasSpin, "ys", wanted="states with a leading time axis")
+    _checks.require_instance(turning, HasSpin, "ys", wanted="states with a leading time axis")
     for leaf in jax.tree.leaves(ys):
         if leaf.shape[:1] != ts.shape:
             words = f"ys: wanted one row for each of {ts.shape[0]} times"
@@ -160,7 +160,7 @@ def _scene(
     parts = parts_of(torque)
     for part in parts or (None,):
         require_scene(part, state, body)
-    return state, parts, _checks.floating(t, (), "t")
+    return state, parts, _checks.array_of_shape(t, (), "t")
 
 
 def _energy(body: Body, state: HasSpin, parts: tuple[Any, ...], t: Scalar) -> Scalar:

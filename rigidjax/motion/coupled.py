@@ -34,10 +34,10 @@ class Coupled(eqx.Module):
         """Return the `Coupled` of `state0` and the initial states of `torque` (see
         `rigidjax.simulate`) at `t`, s.
         """
-        _checks.single(body, (Inertia, MassProperties), "body")
-        _checks.single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
+        _checks.require_single(body, (Inertia, MassProperties), "body")
+        _checks.require_single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
         dtype = state0.omega.dtype
-        t = _checks.floating(t, (), "t").astype(dtype)
+        t = _checks.array_of_shape(t, (), "t").astype(dtype)
         own = first_states(in_precision(torque, dtype), t, state0, in_precision(body, dtype))
         return Coupled(state0, own)
 
@@ -50,7 +50,7 @@ class CoupledEquations(eqx.Module):
 
     def __call__(self, t: ScalarLike, y: Coupled, args: object = None) -> Coupled:
         dtype = y.motion.omega.dtype
-        time = _checks.floating(t, (), "t").astype(dtype)
+        time = _checks.array_of_shape(t, (), "t").astype(dtype)
         law, body = in_precision(self.field, dtype), in_precision(self.body, dtype)
         own = rates_of(law, time, y.own, y.motion, body)
         return Coupled(freeze(self.field, y.own)(t, y.motion, args), own)

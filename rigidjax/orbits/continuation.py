@@ -53,7 +53,7 @@ def family(
     length = np.shape(values)
     if len(length) != 1 or length[0] < 1:
         raise ValueError(f"values: wanted shape (N,), values of {hold}, got shape {length}")
-    values = _checks.finite(_checks.floating(values, length, "values"), "values")
+    values = _checks.require_finite(_checks.array_of_shape(values, length, "values"), "values")
     values = values.astype(start.dtype)
     held = 0.5 * values if hold == "period" else values
     numbers, left = _at_values(scene, start, held, index, correction.usual_tolerance(start))
@@ -76,9 +76,9 @@ def _orbits_or_error(
     """Return the members as orbits; raise an error if one was lost, with `where` of its number if
     it is known.
     """
-    known = _checks.known(lost) and bool(lost.any())
+    known = _checks.is_known(lost) and bool(lost.any())
     words = what + (where(int(np.argmax(np.asarray(lost)))) if known else "") + advice
-    return jax.vmap(orbit_of)(_checks.refuse(numbers, lost.any(), words))
+    return jax.vmap(orbit_of)(_checks.error_if(numbers, lost.any(), words))
 
 
 @eqx.filter_jit
@@ -120,7 +120,7 @@ def family_slope(
     change = _slope(scene, crossing(orbit), index_of_held(hold))
     turned = ~jnp.isfinite(change.period)
     words = f"family_slope: the family has a fold in {hold} here; take another of x, z, vy, period"
-    return _checks.refuse(change, turned, words)
+    return _checks.error_if(change, turned, words)
 
 
 def _slope_along_family(
@@ -163,9 +163,9 @@ def follow(
     family was lost.
     """
     start, index = crossing(orbit), index_of_held(rising)
-    length = _checks.floating(step, (), "step").astype(start.dtype)
+    length = _checks.array_of_shape(step, (), "step").astype(start.dtype)
     bad = ~(jnp.isfinite(length) & (length != 0))
-    length = _checks.refuse(length, bad, "step: wanted a number that is not 0")
+    length = _checks.error_if(length, bad, "step: wanted a number that is not 0")
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"count: wanted the number of members, an integer ≥ 1, got {count!r}")
     tolerance = correction.usual_tolerance(start)
@@ -246,7 +246,7 @@ def bifurcation(
     place = index_of_held(hold)
     if isinstance(index, bool) or index not in (0, 1):
         raise ValueError(f"index: wanted 0 or 1, which of the two stability indices, got {index!r}")
-    value = _checks.number(value, "value")
+    value = _checks.known_float(value, "value")
     if not np.isfinite(value):
         raise ValueError(f"value: wanted a finite number, got {value}")
     a, b = (float(crossing(one)[place]) for one in (orbit, other))

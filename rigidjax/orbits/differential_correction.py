@@ -35,10 +35,10 @@ class PeriodicOrbit(eqx.Module):
     period: Float[Array, "*batch"]
 
     def __init__(self, state: Point, period: ScalarLike):
-        self.state = _checks.instance(state, Point, "state", wanted="a Point(x, v)")
-        _checks.floating(state.x, (3,), "state.x", batched=True)
-        period = _checks.floating(period, (), "period", batched=True)
-        _checks.same_batch(state=(state.x, 1), period=(period, 0))
+        self.state = _checks.require_instance(state, Point, "state", wanted="a Point(x, v)")
+        _checks.array_of_shape(state.x, (3,), "state.x", batched=True)
+        period = _checks.array_of_shape(period, (), "period", batched=True)
+        _checks.require_same_batch(state=(state.x, 1), period=(period, 0))
         self.period = period.astype(state.x.dtype)
 
 
@@ -72,37 +72,37 @@ def periodic_orbit(
         tolerance = usual_tolerance(numbers)
     unknown, left = _solve(scene, numbers[free], numbers[index], index, tolerance)
     bad = ~(left <= tolerance)
-    said = f" ({float(left):.1e} left at half period)" if _checks.known(left) else ""
+    said = f" ({float(left):.1e} left at half period)" if _checks.is_known(left) else ""
     words = f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
     words += "hold another of x, z, vy, period, or loosen the tolerance"
-    unknown = _checks.refuse(unknown, bad, words)
+    unknown = _checks.error_if(unknown, bad, words)
     found = insert_held(unknown, numbers[index], index)
     # A half period of zero solves the equations of every start.
     ratio = found[3] / numbers[3]
     words = "periodic_orbit: Newton's method went from the guess to an orbit of less than half or "
     words += "more than twice its period; start nearer"
-    found = _checks.refuse(found, ~((ratio > 0.5) & (ratio < 2)), words)
+    found = _checks.error_if(found, ~((ratio > 0.5) & (ratio < 2)), words)
     return orbit_of(found)
 
 
 def index_of_held(hold: str) -> int:
     """Return the index of `hold` among the four numbers of a crossing."""
-    return _NAMES.index(_checks.word(hold, _NAMES, "hold"))
+    return _NAMES.index(_checks.require_option(hold, _NAMES, "hold"))
 
 
 def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
     """Return the four numbers of an orbit that crosses y = 0 at a right angle: x, z, v_y, T/2."""
     made = "lyapunov_guess and halo_guess make one"
     wanted = "a PeriodicOrbit(state, period)"
-    _checks.instance(guess, PeriodicOrbit, "guess", wanted=wanted, hint=made)
+    _checks.require_instance(guess, PeriodicOrbit, "guess", wanted=wanted, hint=made)
     x, v = guess.state.x, guess.state.v
     if x.ndim != 1:
         raise ValueError(f"guess: wanted one orbit, x of shape (3,), got {x.shape}; use jax.vmap")
     slant = jnp.maximum(jnp.abs(x[1]), jnp.maximum(jnp.abs(v[0]), jnp.abs(v[2])))
     right = "guess: wanted a start that crosses y = 0 at a right angle: y = vx = vz = 0"
-    x, period = _checks.refuse(x, slant > 1e-6, right), guess.period
-    period = _checks.refuse(period, ~(period > 0), "guess: wanted a period that is positive")
-    return _checks.finite(jnp.stack([x[0], x[2], v[1], 0.5 * period]), "guess")
+    x, period = _checks.error_if(x, slant > 1e-6, right), guess.period
+    period = _checks.error_if(period, ~(period > 0), "guess: wanted a period that is positive")
+    return _checks.require_finite(jnp.stack([x[0], x[2], v[1], 0.5 * period]), "guess")
 
 
 def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
@@ -155,8 +155,8 @@ def transition(
     """Return the state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) from `state`, by forward
     mode.
     """
-    _checks.instance(state, Point, "state", wanted="a Point(x, v)")
-    t = _checks.finite(_checks.floating(t, (), "t"), "t")
+    _checks.require_instance(state, Point, "state", wanted="a Point(x, v)")
+    t = _checks.require_finite(_checks.array_of_shape(t, (), "t"), "t")
     return _transition(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
 
 

@@ -96,7 +96,7 @@ def manifold_point(
     distance: Scalar,
 ) -> tuple[Point, Scalar]:
     """Return the start of the manifold at `phase`, and the multiplier: see `manifold_start`."""
-    _checks.word(branch, ("stable", "unstable"), "branch")
+    _checks.require_option(branch, ("stable", "unstable"), "branch")
     if isinstance(side, bool) or side not in (1, -1):
         raise ValueError(f"side: wanted 1 (to larger x at the orbit's start) or -1, got {side!r}")
     crossing(orbit)
@@ -156,7 +156,7 @@ def manifold(
     >>> moon.manifold(orbit, "unstable", count=3, samples=5).states.x.shape
     (3, 5, 3)
     """
-    count, samples = _checks.whole(count, "count", 1), _checks.whole(samples, "samples", 2)
+    count, samples = _checks.integer(count, "count", 1), _checks.integer(samples, "samples", 2)
     dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
     distance = _positive(distance, "distance", dtype)
     phases = jnp.arange(count).astype(distance.dtype) / count
@@ -165,7 +165,7 @@ def manifold(
     )
     words = "manifold: the orbit has no multiplier that is real and larger than 1: it is stable to "
     words += "first order, or spirals"
-    value = _checks.refuse(value[0], jnp.isnan(value[0]), words)
+    value = _checks.error_if(value[0], jnp.isnan(value[0]), words)
     length = 2 * orbit.period if time is None else _positive(time, "time", dtype)
     ts = jnp.linspace(jnp.zeros_like(length), length, samples)
     states = _manifold_trajectories(scene, starts, ts, branch)
@@ -194,14 +194,16 @@ def manifold_start(
     True
     """
     dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
-    where = _checks.time(phase, "phase").astype(dtype)
-    away = _checks.floating(distance, (), "distance").astype(dtype)
+    where = _checks.checked_time(phase, "phase").astype(dtype)
+    away = _checks.array_of_shape(distance, (), "distance").astype(dtype)
     return manifold_point(scene, orbit, where, branch, side, away)[0]
 
 
 def _positive(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
-    found = _checks.floating(value, (), name)
-    return _checks.sign(found if dtype is None else found.astype(dtype), name, "a positive number")
+    found = _checks.array_of_shape(value, (), name)
+    return _checks.require_sign(
+        found if dtype is None else found.astype(dtype), name, "a positive number"
+    )
 
 
 @eqx.filter_jit

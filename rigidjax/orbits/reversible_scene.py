@@ -44,7 +44,7 @@ class AbstractReversible(AbstractScene):
     def end_words(self, t: ScalarLike, state: Point) -> str:
         """Return a sentence about a collision: the body, the time, and the distance."""
         gaps = self.approach(t, state)[0]
-        if not _checks.known(gaps):
+        if not _checks.is_known(gaps):
             return "the particle collided with one of the scene's bodies"
         near, when = np.asarray(gaps), float(np.asarray(t))
         which = f"body {int(near.argmin()) + 1} of the scene"

@@ -106,7 +106,7 @@ def guess(
         a2 = 1.5 * c3 * (a24 - 2 * a22) + 1.125 * c4
         square = -((a2 + 2 * w2 * s2) * az * az + w2 - c2) / (a1 + 2 * w2 * s1)
         words = "halo_guess: no halo orbit of this amplitude by the expansion"
-        square = _checks.refuse(square, ~(square > 0), words)
+        square = _checks.error_if(square, ~(square > 0), words)
         ax = jnp.sqrt(square)
     x2, z2 = ax * ax, az * az
     sweep = w * (1 + s1 * x2 + s2 * z2)
@@ -120,7 +120,7 @@ def guess(
 
 
 def _amplitude(value: ScalarLike | None) -> Scalar:
-    return _checks.finite(_checks.floating(value, (), "amplitude"), "amplitude")
+    return _checks.require_finite(_checks.array_of_shape(value, (), "amplitude"), "amplitude")
 
 
 def _legendre(mu: Scalar, unit: Scalar, point: int, n: int) -> Scalar:

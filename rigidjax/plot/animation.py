@@ -17,7 +17,7 @@ from rigidjax._types import HasAttitude, NumbersLike
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.principal_axes import principal
-from rigidjax.plot.style import COLOURS, attitudes, cube, matrices, plain, pyplot, times
+from rigidjax.plot.style import COLOURS, attitudes, cube, escape_formulas, matrices, pyplot, times
 
 # Corners of the cube, and its faces in pairs across x, y, z, seen from outside counter-clockwise.
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
@@ -114,7 +114,7 @@ def tumble(
     seconds, pictures = _length(ts, seconds, fps)
     body = validation.single(body, (Inertia, MassProperties), "body")
     moments, q = evenly(ts, states, pictures)
-    size = _checks.whole(size, "size", 64)
+    size = _checks.integer(size, "size", 64)
     corners, tip, reach = _box(body)
     pyplot()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -139,7 +139,7 @@ def tumble(
         solid.set_verts([placed[list(face)] for face in FACES])
         solid.set_facecolor(SHADES)
         trail.set_data_3d(*tips[when <= moment].T)
-        ax.set_title(plain(f"{title}  t = {moment:.3g} s".strip()), fontsize=10)
+        ax.set_title(escape_formulas(f"{title}  t = {moment:.3g} s".strip()), fontsize=10)
         canvas.draw()
         shots.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     # All pictures share one palette, or the grey of the panes flickers. It is made from a dozen of
@@ -157,10 +157,10 @@ def tumble(
 def _length(ts: NumbersLike, seconds: float | int | None, fps: float | int) -> tuple[float, int]:
     """Return the seconds of a film, and its number of pictures."""
     if seconds is None:
-        when = _checks.on_host(ts, "ts")
+        when = _checks.host_array(ts, "ts")
         seconds = min(abs(float(when[-1] - when[0])), 20.0) if when.ndim == 1 and when.size else 1.0
-    seconds = _checks.positive(seconds, "seconds")
-    return seconds, max(round(seconds * _checks.positive(fps, "fps")), 2)
+    seconds = _checks.positive_float(seconds, "seconds")
+    return seconds, max(round(seconds * _checks.positive_float(fps, "fps")), 2)
 
 
 def player(

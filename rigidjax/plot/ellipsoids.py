@@ -9,7 +9,7 @@ import numpy as np
 from rigidjax import _checks
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.plot.style import AXES, COLOURS, plain, several_axes
+from rigidjax.plot.style import AXES, COLOURS, escape_formulas, several_axes
 
 _PLANES = ((0, 1), (0, 2), (1, 2))
 
@@ -38,7 +38,7 @@ def inertia_ellipsoid(
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
     ['x, m', 'x, m', 'y, m']
     """
-    best, drawn = _body_and_samples(body, _checks.whole(samples, "samples", 0))
+    best, drawn = _body_and_samples(body, _checks.integer(samples, "samples", 0))
     solid = isinstance(best, MassProperties)
     size = 1.0 if solid else float(np.trace(np.asarray(best.second_moment)))
     if not size > 0:
@@ -56,7 +56,7 @@ def inertia_ellipsoid(
     if len(shapes) > 1:
         how = dict(loc="outside lower center", ncols=3, frameon=False)
         ax[0].figure.legend(*ax[0].get_legend_handles_labels(), **how)
-    ax[1].set_title(plain(title) or "outline of the body's ellipsoid, body frame")
+    ax[1].set_title(escape_formulas(title) or "outline of the body's ellipsoid, body frame")
     return ax
 
 
@@ -68,7 +68,7 @@ def _body_and_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties
         return validation.single(body, (Inertia, MassProperties), "body"), None
     if not hasattr(body, "x") or not hasattr(body, "model"):
         words = "inertia_ellipsoid: wanted an Inertia, a MassProperties or a Fit, got "
-        raise TypeError(words + _checks.kind(body))
+        raise TypeError(words + _checks.type_name(body))
     if isinstance(body.body, dict):
         words = "wanted one body, got a Fit of several: give fit.body[name]"
         raise ValueError(f"inertia_ellipsoid: {words}")

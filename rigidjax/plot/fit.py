@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from rigidjax.plot.style import COLOURS, RATES, TIMES, of_fit, plain, pyplot, unit
+from rigidjax.plot.style import COLOURS, RATES, TIMES, escape_formulas, of_fit, pyplot, unit
 from rigidjax.rotation import quaternion
 from rigidjax.solve import simulate
 
@@ -41,7 +41,7 @@ def fit(
         upper.legend(loc="upper right", ncols=3, fontsize="small")
         upper.set_title(f"{type(reading.sensor).__name__}: points read, lines fitted", fontsize=10)
     if title:
-        figure.suptitle(plain(title))
+        figure.suptitle(escape_formulas(title))
     return figure
 
 

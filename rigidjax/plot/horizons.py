@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax.plot.style import COLOURS, plain, several_axes
+from rigidjax.plot.style import COLOURS, escape_formulas, several_axes
 
 _KINDS = {"x": "position, m", "v": "velocity, m/s", "q": "attitude, rad"}
 _KINDS["omega"] = "body rate, rad/s"
@@ -46,9 +46,9 @@ def horizons(
     for one in named.values():
         if not all(hasattr(one, name) for name in ("steps", *_MEASURES)) or isinstance(one, type):
             words = "found: wanted a Horizons of rigidjax.identify, or some by name, got "
-            raise TypeError(words + _checks.kind(one))
-    _checks.word(measure, tuple(_MEASURES), "measure")
-    scale = 1.0 if step is None else _checks.positive(step, "step", "a positive time, s")
+            raise TypeError(words + _checks.type_name(one))
+    _checks.require_option(measure, tuple(_MEASURES), "measure")
+    scale = 1.0 if step is None else _checks.positive_float(step, "step", "a positive time, s")
     kinds = [kind for kind in _KINDS if kind in getattr(next(iter(named.values())), measure)]
     for name, one in named.items():
         if sorted(getattr(one, measure)) != sorted(kinds):
@@ -58,10 +58,10 @@ def horizons(
     ax = several_axes(ax, (count,), ncols=count, figsize=(3.4 * count + 0.6, 3.2))
     for one_ax, kind in zip(ax, kinds, strict=True):
         for (name, one), colour in zip(named.items(), COLOURS * len(named), strict=False):
-            errors = _checks.on_host(getattr(one, measure)[kind], f"found: {kind}")
-            ahead = np.concatenate([[0.0], scale * _checks.on_host(one.steps, "found: steps")])
+            errors = _checks.host_array(getattr(one, measure)[kind], f"found: {kind}")
+            ahead = np.concatenate([[0.0], scale * _checks.host_array(one.steps, "found: steps")])
             line = np.concatenate([[0.0], errors])
-            one_ax.plot(ahead, line, color=colour, lw=1.4, label=plain(name) or None)
+            one_ax.plot(ahead, line, color=colour, lw=1.4, label=escape_formulas(name) or None)
         one_ax.set(xlabel="steps ahead" if step is None else "time ahead, s", ylabel=_KINDS[kind])
         one_ax.margins(x=0)
         one_ax.set_ylim(bottom=0.0)
@@ -69,5 +69,5 @@ def horizons(
     if any(named):
         ax[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     said = _MEASURES[measure]
-    ax[0].set_title(plain(f"{title}: {said}" if title else said), loc="left")
+    ax[0].set_title(escape_formulas(f"{title}: {said}" if title else said), loc="left")
     return ax

@@ -13,7 +13,7 @@ from rigidjax._types import HasAttitude, HasSpin
 from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.plot import style
-from rigidjax.plot.style import COLOURS, plain, rows
+from rigidjax.plot.style import COLOURS, escape_formulas, rows
 
 
 def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
@@ -41,7 +41,7 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
         ax.plot([], [], [], color="0.4", marker=mark, ms=6, ls="", label=name)
     style.cube(ax, 1.0, ("x", "y", "z"))
     style.legend_below(ax, down=0.06)
-    ax.set_title(plain(title) or "body axes on the unit sphere, world frame")
+    ax.set_title(escape_formulas(title) or "body axes on the unit sphere, world frame")
     return ax
 
 
@@ -70,9 +70,9 @@ def polhode(
     >>> polhode(body, sol.ys).get_zlabel()
     'Π₃ / h'
     """
-    _checks.single(inertia, Inertia, "inertia")
-    _checks.instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
-    energies = _checks.whole(energies, "energies", 0)
+    _checks.require_single(inertia, Inertia, "inertia")
+    _checks.require_instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
+    energies = _checks.integer(energies, "energies", 0)
     moments, q = inertia.invertible().principal()
     i = np.asarray(moments, dtype=float)
     turn = style.matrices(np.asarray(q, dtype=float)[None])[0]
@@ -107,7 +107,7 @@ def polhode(
     handles += [Patch(color=COLOURS[5], alpha=0.4), Line2D([], [], color=COLOURS[4], lw=0.8)]
     names += ["momentum sphere", "energy ellipsoid"]
     style.legend_below(ax, handles, names, down=0.06)
-    ax.set_title(plain(title) or "polhode, principal axes of the body")
+    ax.set_title(escape_formulas(title) or "polhode, principal axes of the body")
     return ax
 
 
@@ -177,6 +177,6 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     ax.plot(0, 0, color="0.2", marker="+", ms=8, ls="", label="momentum")
     ax.set_aspect("equal")
     ax.set(xlabel="ω along e₁, rad/s", ylabel="ω along e₂, rad/s")
-    ax.set_title(plain(title) or "herpolhode, across the angular momentum")
+    ax.set_title(escape_formulas(title) or "herpolhode, across the angular momentum")
     style.legend_below(ax)
     return ax

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidjax.plot.style import COLOURS, TIMES, of_fit, plain, several_axes, unit
+from rigidjax.plot.style import COLOURS, TIMES, escape_formulas, of_fit, several_axes, unit
 
 # Frequencies of an uneven record, at most.
 _MOST = 2000
@@ -38,7 +38,7 @@ def residuals(
         row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
         row[0].set_xlabel(f"time, {time_unit}")
         row[3].set_xlabel(f"frequency, {'Hz' if time_unit == 's' else f'1/{time_unit}'}")
-    ax[0, 0].set_title(plain(title) or "residuals of the fit", loc="left")
+    ax[0, 0].set_title(escape_formulas(title) or "residuals of the fit", loc="left")
     return ax
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax._checks import plain as plain
+from rigidjax._checks import escape_formulas as escape_formulas
 from rigidjax.rotation import quaternion
 
 # Okabe and Ito's colours, distinct also for colour-blind readers (2008, "Color Universal Design").
@@ -33,7 +33,7 @@ def unit(name: str, known: dict[str, float], what: str) -> float:
     """Return the factor of a unit to or from SI, by its name; the error for other names lists the
     known names.
     """
-    return known[_checks.word(name, tuple(known), what)]
+    return known[_checks.require_option(name, tuple(known), what)]
 
 
 def of_fit(found: Any, index: object) -> tuple[Any, list[np.ndarray], list[np.ndarray]]:
@@ -45,7 +45,7 @@ def of_fit(found: Any, index: object) -> tuple[Any, list[np.ndarray], list[np.nd
     wanted = ("model", "x", "residuals")
     if isinstance(found, type) or not all(hasattr(found, name) for name in wanted):
         raise TypeError(f"found: wanted a Fit of rigidjax.identify, got {type(found).__name__}")
-    index, count = _checks.whole(index, "index", 0), found.model.count
+    index, count = _checks.integer(index, "index", 0), found.model.count
     if index >= count:
         raise ValueError(f"index: wanted one of {count} recordings, from 0, got {index}")
     record, which = found.model.recordings[index], ... if count == 1 else index
@@ -100,7 +100,7 @@ def times(ts: object, count: int, what: str = "the states have") -> np.ndarray:
     """Return the times (T,) as NumPy float64. **Raises:** `ValueError` unless there are as many
     times as states.
     """
-    t = _checks.on_host(ts, "ts")
+    t = _checks.host_array(ts, "ts")
     if t.shape != (count,):
         raise ValueError(f"ts: wanted ({count},) as {what}, got {t.shape}")
     return t
@@ -110,7 +110,7 @@ def rows(values: object, width: int, name: str) -> np.ndarray:
     """Return values of one body over time (T, width) as NumPy float64. **Raises:** `ValueError` for
     another shape.
     """
-    out = _checks.on_host(values, name)
+    out = _checks.host_array(values, name)
     if out.ndim != 2 or out.shape[1] != width:
         hint = "; draw one body of a batch at a time" if out.ndim == 3 else ""
         raise ValueError(f"{name}: wanted shape (times, {width}), got {out.shape}{hint}")

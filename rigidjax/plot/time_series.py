@@ -10,7 +10,7 @@ from jaxtyping import ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import HasSpin
 from rigidjax.plot import style
-from rigidjax.plot.style import COLOURS, RATES, TIMES, plain, rows
+from rigidjax.plot.style import COLOURS, RATES, TIMES, escape_formulas, rows
 from rigidjax.rotation import euler
 
 
@@ -39,7 +39,7 @@ def motion(
     """
     turned = style.unit(rate_unit, RATES, "rate_unit")
     seconds = style.unit(time_unit, TIMES, "time_unit")
-    _checks.instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
+    _checks.require_instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
     omega = rows(states.omega, 3, "states.omega") * turned
     t = style.times(ts, omega.shape[0]) / seconds
     both = hasattr(states, "q")
@@ -56,12 +56,12 @@ def motion(
         # The legend is beside the picture: inside it would cover a line.
         one.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     if title:
-        ax[0].set_title(plain(title))
+        ax[0].set_title(escape_formulas(title))
     return ax
 
 
 def _attitude(ax: Any, t: np.ndarray, q: np.ndarray, how: str) -> None:
-    _checks.word(how, ("quaternion", "axes", "angles"), "attitude")
+    _checks.require_option(how, ("quaternion", "axes", "angles"), "attitude")
     if how == "quaternion":
         names, lines, label = [f"q{n}" for n in "wxyz"], q.T, "attitude q"
     elif how == "axes":

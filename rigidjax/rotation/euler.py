@@ -82,7 +82,7 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     [0.0, 0.0, 0.0]
     """
     (i, j, k), reverse = _axes(sequence)
-    q = quaternion.canonical(direction(_checks.floating(q, (4,), "q"), "q"))
+    q = quaternion.canonical(direction(_checks.array_of_shape(q, (4,), "q"), "q"))
     q = near_one(*components(q)) * q
     symmetric = i == k
     last = 3 - i - j
@@ -138,9 +138,9 @@ def rates_to_omega(
     >>> rates_to_omega(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 2.0]
     """
-    _checks.word(frame, ("body", "world"), "frame")
+    _checks.require_option(frame, ("body", "world"), "frame")
     axes, reverse = _axes(sequence)
-    angles, rates = _angles(angles), _checks.floating(rates, (3,), "rates")
+    angles, rates = _angles(angles), _checks.array_of_shape(rates, (3,), "rates")
     first, second, third = _turning_axes(axes, _in_order(angles, reverse))
     a, b, c = _in_order(rates, reverse)
     omega = a * first + b * second + c * third
@@ -163,9 +163,9 @@ def omega_to_rates(
     >>> omega_to_rates(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 2.0]
     """
-    _checks.word(frame, ("body", "world"), "frame")
+    _checks.require_option(frame, ("body", "world"), "frame")
     axes, reverse = _axes(sequence)
-    angles, omega = _angles(angles), _checks.floating(omega, (3,), "omega")
+    angles, omega = _angles(angles), _checks.array_of_shape(omega, (3,), "omega")
     if frame == "world":
         omega = apply(to_matrix(angles, sequence).T, omega)
     first, second, third = _turning_axes(axes, _in_order(angles, reverse))
@@ -201,8 +201,8 @@ def _unknown_sequence(sequence: object, reason: str) -> str:
 
 
 def _angles(angles: Vec3Like) -> Vec3:
-    angles = turn(_checks.floating(angles, (3,), "angles"), "angles")
-    if _checks.known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
+    angles = turn(_checks.array_of_shape(angles, (3,), "angles"), "angles")
+    if _checks.is_known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
         words = "are over four turns: are they degrees? use jnp.deg2rad"
         warnings.warn(f"angles {angles.tolist()} rad {words}", stacklevel=3)
     return angles

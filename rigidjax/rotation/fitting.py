@@ -47,9 +47,9 @@ def project(matrix: Mat3Like) -> Mat3:
     >>> project(2.0 * jnp.eye(3)).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    matrix = _checks.floating(matrix, (3, 3), "matrix")
-    if _checks.known(matrix):
-        _checks.finite(matrix, "matrix")
+    matrix = _checks.array_of_shape(matrix, (3, 3), "matrix")
+    if _checks.is_known(matrix):
+        _checks.require_finite(matrix, "matrix")
         direction(matrix.reshape(9), "matrix")
         size = np.max(np.abs(np.asarray(matrix)))
         # For the matrix over its largest entry: its own determinant may overflow.
@@ -79,8 +79,8 @@ def wahba(
     >>> wahba(jnp.eye(3)[:2], jnp.eye(3)[:2]).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    body = _checks.rows(body, (3,), "body")
-    world = _checks.floating(world, body.shape, "world")
+    body = _checks.array_of_rows(body, (3,), "body")
+    world = _checks.array_of_shape(world, body.shape, "world")
     w = weights_of(weights, body[:, 0], "body")
     for name, rows in (("body", body), ("world", world)):
         direction(rows.reshape(-1), name)
@@ -110,7 +110,7 @@ def wahba(
     ):
         firmness = determinant(_curvature(turn, b / jnp.sqrt((b * b).sum())))
         loose = loose | ~(firmness > least)
-    return _checks.refuse(best, loose, words)
+    return _checks.error_if(best, loose, words)
 
 
 def _weighted_sum(
@@ -148,7 +148,7 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     >>> align(jnp.array([1.0, 0, 0]), jnp.array([0, 2.0, 0])).round(12)[:, 0].tolist()
     [0.0, 1.0, 0.0]
     """
-    a, b = _checks.floating(a, (3,), "a"), _checks.floating(b, (3,), "b")
+    a, b = _checks.array_of_shape(a, (3,), "a"), _checks.array_of_shape(b, (3,), "b")
     a, b = (of_order_one(direction(x, name)) for x, name in ((a, "a"), (b, "b")))
     a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
     middle = a + b
@@ -175,8 +175,8 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
     >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    matrices = _checks.rows(matrices, (3, 3), "matrices")
-    _checks.if_known(rotation_matrix, matrices, "matrices")
+    matrices = _checks.array_of_rows(matrices, (3, 3), "matrices")
+    _checks.check_if_known(rotation_matrix, matrices, "matrices")
     weights_of(weights, matrices[:, 0, 0], "matrices")
     return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
 
@@ -192,8 +192,8 @@ def mean_quaternion(
     >>> mean_quaternion(jnp.array([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]])).tolist()
     [1.0, 0.0, 0.0, 0.0]
     """
-    q = _checks.rows(quaternions, (4,), "quaternions")
-    _checks.if_known(unit_quaternion, q, "quaternions")
+    q = _checks.array_of_rows(quaternions, (4,), "quaternions")
+    _checks.check_if_known(unit_quaternion, q, "quaternions")
     return _karcher(q, of_order_one(weights_of(weights, q[:, 0], "quaternions")))
 
 
@@ -234,11 +234,11 @@ def weights_of(weights: ArrayLike | None, like: Array, of: str) -> Array:
         raise ValueError(f"{of}: wanted at least one row, got none")
     if weights is None:
         return jnp.ones_like(like)
-    w = _checks.floating(weights, like.shape, "weights")
-    if _checks.known(w):
+    w = _checks.array_of_shape(weights, like.shape, "weights")
+    if _checks.is_known(w):
         words = "numbers ≥ 0, at least one of them positive"
-        _checks.sign(_checks.finite(w, "weights"), "weights", words, zero=True)
-        _checks.refuse(w, ~(w > 0).any(), f"weights: wanted {words}")
+        _checks.require_sign(_checks.require_finite(w, "weights"), "weights", words, zero=True)
+        _checks.error_if(w, ~(w > 0).any(), f"weights: wanted {words}")
     return w
 
 

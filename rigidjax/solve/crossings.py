@@ -90,16 +90,18 @@ class Event(eqx.Module):
     def __init__(
         self, condition: Callable[..., Any], direction: int = 0, max_step: ScalarLike | None = None
     ):
-        self.condition = _checks.function(condition, "condition", "(t, state, body) → scalar")
+        self.condition = _checks.require_function(
+            condition, "condition", "(t, state, body) → scalar"
+        )
         if isinstance(direction, bool) or direction not in (-1, 0, 1):
             words = "direction: wanted 1 (on the way up), -1 (on the way down) or 0 (both), got "
             raise ValueError(f"{words}{direction!r}")
         self.direction = int(direction)
         self.max_step = max_step
         if max_step is not None:
-            step = _checks.floating(max_step, (), "max_step")
+            step = _checks.array_of_shape(max_step, (), "max_step")
             words = "max_step: wanted a positive step, s"
-            self.max_step = _checks.refuse(step, ~(step > 0), words)
+            self.max_step = _checks.error_if(step, ~(step > 0), words)
 
 
 class Crossings(eqx.Module, Generic[State]):
@@ -179,11 +181,11 @@ def crossings(
     >>> int(flips.count), bool(flips.full)
     (2, False)
     """
-    many = _checks.whole(max_crossings, "max_crossings", 1)
-    max_steps = _checks.whole(max_steps, "max_steps", 1)
+    many = _checks.integer(max_crossings, "max_crossings", 1)
+    max_steps = _checks.integer(max_steps, "max_steps", 1)
     event = Event(condition, direction, max_step)
-    begin, end = _checks.time(t0, "t0"), _checks.time(t1, "t1")
-    if _checks.known((begin, end)) and float(begin) == float(end):
+    begin, end = _checks.checked_time(t0, "t0"), _checks.checked_time(t1, "t1")
+    if _checks.is_known((begin, end)) and float(begin) == float(end):
         raise ValueError(f"t1: wanted another time than t0, got {float(end):g} for both")
     ts = jnp.stack([begin, end])
     body, state0, times = validation.scene(body, state0, ts, torque, throw=False)
@@ -207,7 +209,9 @@ def ready(event: Event, body: Any, state0: Any, torque: Any, t: Array) -> Any:
         if told is None:
             raise
         raise TypeError(told) from wrong
-    if _checks.known((event, body, t, state0)) and bool(jnp.isnan(_value(event, body, t, state0))):
+    if _checks.is_known((event, body, t, state0)) and bool(
+        jnp.isnan(_value(event, body, t, state0))
+    ):
         words = "condition: wanted a number wherever the motion goes, got NaN at the start, t = "
         raise ValueError(f"{words}{float(t):g}")
     return state0
@@ -221,7 +225,7 @@ def value(event: Event, body: Any, t: Any, y: Any) -> Array:
             "condition: wanted one real number, zero at the event, got a truth value; give the "
             "difference, not its sign"
         )
-    return _checks.floating(found, (), "condition", hint="one real number, zero at the event")
+    return _checks.array_of_shape(found, (), "condition", hint="one real number, zero at the event")
 
 
 _value = eqx.filter_jit(value)

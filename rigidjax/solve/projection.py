@@ -60,7 +60,7 @@ class Projected(dfx.AbstractWrappedSolver):
     solver: dfx.AbstractSolver
 
     def __check_init__(self) -> None:
-        _checks.instance(self.solver, dfx.AbstractSolver, "solver")
+        _checks.require_instance(self.solver, dfx.AbstractSolver, "solver")
 
     term_structure = _of("solver", "term_structure")
     term_compatible_contr_kwargs = _of("solver", "term_compatible_contr_kwargs")

@@ -122,7 +122,7 @@ def direction(times: Array) -> Int[Array, ""] | None:
     """`None` for times known to increase; else the sign of t's change, known or traced."""
     ends = _checks.namespace(times).asarray(times)
     change = ends[-1] - ends[0]
-    if _checks.known(times) and change > 0:
+    if _checks.is_known(times) and change > 0:
         return None
     # A whole number: derivatives do not carry it along.
     return jnp.asarray(jnp.sign(change), jnp.int32)
@@ -277,7 +277,7 @@ def _shortest_step_words(dtype: Any) -> str:
     return (
         "simulate: no step is short enough: the minimum step size, some units of round-off of the "
         f"time, was reached. Does the torque jump or grow without bound? In {np.dtype(dtype)} the "
-        f"times near 1e9 s are {gap:.2g} s apart: {_checks.later_origin(dtype)}"
+        f"times near 1e9 s are {gap:.2g} s apart: {_checks.advice_for_large_times(dtype)}"
     )
 
 
@@ -300,7 +300,7 @@ def refuse(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
 def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) -> None:
     """Warn if a law switches by the time more often than steps can end at its switches."""
     missed = stats.get("switches_missed", False)
-    if not _checks.known((missed, state0, ts)) or not np.any(np.asarray(missed)):
+    if not _checks.is_known((missed, state0, ts)) or not np.any(np.asarray(missed)):
         return
     state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
     form = by_momentum(setup.body, state0, setup.torque)
@@ -330,7 +330,7 @@ _STUCK = 1e-2
 def words_of_steps(loop: Loop, state0: Any, ts: Array, error: RuntimeError) -> RuntimeError:
     """The same error; if a run has taken all its steps, with what they were spent on."""
     numbers = (loop, state0, ts)
-    if _MANY_STEPS not in str(error) or not isinstance(loop, Loop) or not _checks.known(numbers):
+    if _MANY_STEPS not in str(error) or not isinstance(loop, Loop) or not _checks.is_known(numbers):
         return error
     t, state, step, count = _end_of(dataclasses.replace(loop, throw=False), state0, ts)
     begun, end, t = float(ts[0]), float(ts[-1]), float(t)
@@ -371,10 +371,10 @@ def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
 def refuse_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
     """The states `ys` saved at `ts`, unless the scene has ended the run: an error in its words."""
     ended, advice = stats["ended"], "; give throw=False to keep what came before it"
-    if _checks.known(ended) and not np.any(np.asarray(ended)):
+    if _checks.is_known(ended) and not np.any(np.asarray(ended)):
         return ys
     words = "simulate: " + scene.end_words(stats["end_time"], stats["end_state"])
-    if not _checks.known(ended):
+    if not _checks.is_known(ended):
         return eqx.error_if(ys, ended, words + advice)
     before = np.asarray(ts)[np.asarray(ts) < float(stats["end_time"])]
     last = f"the last of ts before it is {before[-1]:.9g}{advice}" if len(before) else "the start"

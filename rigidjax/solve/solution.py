@@ -57,10 +57,12 @@ class Solution(eqx.Module, Generic[State]):
     _error: Error | None = None
 
     def __repr__(self) -> str:
-        if not _checks.known((self.ts, self.stats, self.result)) or np.ndim(self.ts) != 1:
+        if not _checks.is_known((self.ts, self.stats, self.result)) or np.ndim(self.ts) != 1:
             return eqx.tree_pformat(self)
         count, t = self.ts.shape[0], np.asarray(self.ts)
-        ends = " … ".join(_show.time(end, abs(t[-1] - t[0])) for end in (t[0], t[-1])) + " s"
+        ends = (
+            " … ".join(_show.time_as_text(end, abs(t[-1] - t[0])) for end in (t[0], t[-1])) + " s"
+        )
         steps = "".join(
             f", {int(self.stats[name])} {words}"
             for name, words in (("num_steps", "steps"), ("num_rejected_steps", "rejected"))
@@ -100,7 +102,7 @@ class Solution(eqx.Module, Generic[State]):
         rtol = getattr(how, "rtol", None)
         if rtol is None:
             rtol = 100 * float(jnp.finfo(self.ts.dtype).eps)
-        if _checks.known((found, rtol, self.ts)):
+        if _checks.is_known((found, rtol, self.ts)):
             lost = np.flatnonzero(np.asarray(found) * float(rtol) > 1)
             if lost.size:
                 i = lost[0]
@@ -159,11 +161,11 @@ class Solution(eqx.Module, Generic[State]):
 
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if `t` is outside.
         """
-        t = _checks.floating(t, (), "t").astype(self.ts.dtype)
+        t = _checks.array_of_shape(t, (), "t").astype(self.ts.dtype)
         way = jnp.sign(self.ts[-1] - self.ts[0])
         along, since = way * self.ts, way * t
         outside = ~((since >= along[0]) & (since <= along[-1]))
-        t = _checks.refuse(t, outside, "evaluate: t lies outside the times that were simulated")
+        t = _checks.error_if(t, outside, "evaluate: t lies outside the times that were simulated")
         index = jnp.searchsorted(along, since, side="right") - 1
         index = jnp.clip(index, 0, self.ts.shape[0] - 1)
         start = jax.tree.map(lambda leaf: leaf[index], self._states)
@@ -186,7 +188,7 @@ def told(sol: Solution, error: Error, accuracy: Any) -> Solution:
 
 
 def _say(error: Error, most: Any, words: str) -> None:
-    if not _checks.known((error, most)) or not np.any(np.asarray(error.relative) > most):
+    if not _checks.is_known((error, most)) or not np.any(np.asarray(error.relative) > most):
         return
     i = int(np.argmax(np.asarray(error.relative) > most))
     steps, off = (

@@ -46,8 +46,8 @@ def ellipsoid(
     6.0
     """
     law = law_of(scattering)
-    a = _checks.floating(semi_axes, (3,), "semi_axes", unit="m")
-    a = _checks.sign(a, "semi_axes", "three positive lengths, m")
+    a = _checks.array_of_shape(semi_axes, (3,), "semi_axes", unit="m")
+    a = _checks.require_sign(a, "semi_axes", "three positive lengths, m")
     s, o = direction(sun, "sun").astype(a.dtype), direction(observer, "observer").astype(a.dtype)
     # The fourth power of the axes would overflow: scale them by a power of two.
     size = exponent_of(a)
@@ -78,9 +78,9 @@ def mesh(
     0.5
     """
     law = law_of(scattering)
-    corners = _checks.rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
-    if _checks.known(corners):
-        _checks.finite(corners, "vertices")
+    corners = _checks.array_of_rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
+    if _checks.is_known(corners):
+        _checks.require_finite(corners, "vertices")
     table = faces_of(faces, corners.shape[0])
     s = direction(sun, "sun").astype(corners.dtype)
     o = direction(observer, "observer").astype(corners.dtype)

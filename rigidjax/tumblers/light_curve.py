@@ -159,11 +159,11 @@ def fit_light_curve(
     sensors, several recordings or a torque; `TypeError` under a trace.
     """
     reading = _only_reading(model)
-    _checks.whole(count, "count", 1)
-    _checks.positive(tolerance, "tolerance")
+    _checks.integer(count, "count", 1)
+    _checks.positive_float(tolerance, "tolerance")
     say = lambda line: None  # noqa: E731
     if progress is not None:
-        say = _checks.function(progress, "progress", "of a line of text, such as print")
+        say = _checks.require_function(progress, "progress", "of a line of text, such as print")
     t, flux, noise = relative_flux(model, reading)
     squares, sigma = flux**2, None if noise is None else 2.0 * flux * noise
     pairs = two_frequencies(t, squares, sigma, shortest=shortest, count=count)
@@ -187,7 +187,7 @@ def fit_light_curve(
 def _only_reading(model: Model) -> Reading:
     """Return the reading of the model's only sensor; raise an error for another kind of model."""
     require_one(model)
-    if not _checks.known(model):
+    if not _checks.is_known(model):
         words = "got traced ones; call it outside of jax.jit, jax.grad and jax.vmap"
         raise TypeError(f"model: wanted known numbers, {words}")
     readings = model.records.readings

@@ -119,7 +119,7 @@ def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
     if scattering is None:
         return LommelSeeliger()
     wanted = "LommelSeeliger(), Geometric() or Lambert()"
-    return _checks.instance(scattering, AbstractScattering, "scattering", wanted=wanted)
+    return _checks.require_instance(scattering, AbstractScattering, "scattering", wanted=wanted)
 
 
 def direction(value: Vec3Like | Numbers, name: str) -> Vec3:
@@ -127,9 +127,9 @@ def direction(value: Vec3Like | Numbers, name: str) -> Vec3:
 
     Raise `ValueError` for a length of zero, NaN or a wrong shape.
     """
-    v = _checks.finite(_checks.floating(value, (3,), name), name)
+    v = _checks.require_finite(_checks.array_of_shape(value, (3,), name), name)
     words = f"{name}: wanted a direction, got a vector of length zero"
-    v = _checks.refuse(v, ~(jnp.abs(v) > 0).any(), words)
+    v = _checks.error_if(v, ~(jnp.abs(v) > 0).any(), words)
     # The square of a distance of 1e200 m would overflow: scale it by a power of two.
     v = times_power_of_two(v, -exponent_of(v))
     return v / jnp.sqrt(dot(v, v))

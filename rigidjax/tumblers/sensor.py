@@ -90,16 +90,16 @@ class Brightness(AbstractSensor):
     ):
         self.sun, self.observer = _source(sun, "sun"), _source(observer, "observer")
         self.scattering, self.noise = law_of(scattering), base.deviations(1)(noise)
-        self.unit = _checks.word(unit, UNITS, "unit")
+        self.unit = _checks.require_option(unit, UNITS, "unit")
         usual = 1.0 if unit == "flux" else 0.0
         checked_level = base.required("level", ())(usual if level is None else level)
         if unit == "flux":
             words = "level: wanted a positive flux"
-            checked_level = _checks.refuse(checked_level, ~(checked_level > 0), words)
+            checked_level = _checks.error_if(checked_level, ~(checked_level > 0), words)
         self.level = checked_level
         if semi_axes is not None:
-            semi_axes = _checks.floating(semi_axes, (3,), "semi_axes").astype(float)
-            semi_axes = _checks.sign(semi_axes, "semi_axes", "three positive lengths")
+            semi_axes = _checks.array_of_shape(semi_axes, (3,), "semi_axes").astype(float)
+            semi_axes = _checks.require_sign(semi_axes, "semi_axes", "three positive lengths")
         self.semi_axes = semi_axes
         self.offset = base.optional("offset", ())(offset)
 
@@ -167,8 +167,8 @@ def _unit(v: Vec3) -> Vec3:
 def _source(source: NumbersLike | Callable[..., Any], name: str) -> Any:
     """Return a direction as a unit vector, or a function of time as it is; else raise an error."""
     if callable(source):
-        return _checks.function(source, name, "of time to (3,)")
-    shape = _checks.numbers(source, name).shape
+        return _checks.require_function(source, name, "of time to (3,)")
+    shape = _checks.numeric_array(source, name).shape
     if len(shape) == 2 and shape[1] == 3:
         raise ValueError(
             f"{name}: wanted a direction (3,) or a function of time, got shape {shape}; one row "

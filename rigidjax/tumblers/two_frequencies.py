@@ -104,8 +104,8 @@ def two_frequencies(
     >>> bool(pairs.misfits[0] < 0.1)
     True
     """
-    t, y = _checks.on_host(t, "t"), _checks.on_host(values, "values")
-    order, count = _checks.whole(order, "order", 1), _checks.whole(count, "count", 1)
+    t, y = _checks.host_array(t, "t"), _checks.host_array(values, "values")
+    order, count = _checks.integer(order, "order", 1), _checks.integer(count, "count", 1)
     unknowns = (2 * FIRST + 1) * (2 * order + 1) + 2
     if t.ndim != 1 or y.shape != t.shape:
         raise ValueError(f"values: wanted (T,) as t has, got shapes {t.shape} and {y.shape}")
@@ -117,7 +117,7 @@ def two_frequencies(
         raise ValueError("t: wanted increasing times")
     sigma = np.ones(t.shape)
     if noise is not None:
-        sigma = _checks.on_host(noise, "noise")
+        sigma = _checks.host_array(noise, "noise")
         if sigma.shape not in ((), t.shape):
             raise ValueError(f"noise: wanted one number or (T,) as t has, got shape {sigma.shape}")
         if not (np.isfinite(sigma) & (sigma > 0)).all():
@@ -131,7 +131,7 @@ def two_frequencies(
             f"squares are added, got {worst:.3g}; give both in another unit"
         )
     span, typical = float(t[-1] - t[0]), float(np.median(np.diff(t)))
-    least = 4.0 * typical if shortest is None else _checks.positive(shortest, "shortest")
+    least = 4.0 * typical if shortest is None else _checks.positive_float(shortest, "shortest")
     if span / least > MOST:
         words = f"{least:.3g} s, and a light curve of {span:.3g} s"
         raise ValueError(f"shortest: {words}: wanted at most {MOST:.0e} periods in it")

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from rigidjax._checks import plain
+from rigidjax._checks import escape_formulas
 from rigidjax.workprecision.pareto import first_answers, front
 from rigidjax.workprecision.record import Measurement, list_records
 
@@ -52,7 +52,7 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
     for row, name in zip(axes, names, strict=True):
         if asked:
             _draw_reached_errors(row[-1], [r for r in asked if r.scene == name], labels)
-            row[-1].set_title(plain(f"{name}: asked and reached"), fontsize=10)
+            row[-1].set_title(escape_formulas(f"{name}: asked and reached"), fontsize=10)
         for axis, (kind, words, times) in zip(row, panels, strict=False):
             of = [r for r in times if (r.scene, r.kind) == (name, kind)]
             if not of:
@@ -63,9 +63,9 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
             if name in ("foucault", "arenstorf") and kind == "value":
                 what = "relative error of the place"
             axis.set(xlabel=what, ylabel="compile and run, ms" if words else "time, ms")
-            axis.set_title(plain(f"{name}: {kind}{words}"), fontsize=10)
+            axis.set_title(escape_formulas(f"{name}: {kind}{words}"), fontsize=10)
     if title:
-        figure.suptitle(plain(title))
+        figure.suptitle(escape_formulas(title))
     return figure
 
 
@@ -90,7 +90,7 @@ def _curves(
         yield (
             of,
             dict(
-                label=plain(label), color=colours(same.index(label) % colours.N),
+                label=escape_formulas(label), color=colours(same.index(label) % colours.N),
                 marker=_MARKS[i % len(_MARKS)], markersize=4,
                 linewidth=1.6 if group == "ours" else 0.9,
                 linestyle="-" if group == "ours" else "--" if group == "jax" else ":",

@@ -76,10 +76,10 @@ def measure(
     **Raises:** `TypeError` for something that is no `BenchmarkScene` or `TimedMethod`.
     """
     made = 'standard ones are made by rj.workprecision.scenes()["heavy-top"]()'
-    _checks.instance(scene, BenchmarkScene, "scene", wanted="a BenchmarkScene", hint=made)
+    _checks.require_instance(scene, BenchmarkScene, "scene", wanted="a BenchmarkScene", hint=made)
     chosen = [*(known.methods() if methods is None else methods), *peers]
     for method in chosen:
-        _checks.instance(
+        _checks.require_instance(
             method, TimedMethod, "methods", wanted="methods of workprecision.methods()"
         )
     right = scene.reference if scene.reference is not None else worked_out(scene, gradients)

@@ -49,7 +49,7 @@ def time_to(records: Iterable[Measurement], error: float) -> float:
     This is the time of the coarsest setting if its error is already smaller, and NaN if no setting
     reaches the error.
     """
-    error = _checks.positive(error, "error")
+    error = _checks.positive_float(error, "error")
     rungs = sorted((r for r in list_records(records) if r.error == r.error), key=lambda r: r.time)
     # Errors need not fall with every setting: only the least error up to a time counts.
     least, seen = math.inf, []
@@ -147,7 +147,7 @@ def table(lines: Iterable[Choice]) -> str:
     if isinstance(lines, str) or not isinstance(lines, Iterable):
         raise TypeError(f"lines: wanted what choose returns, got {type(lines).__name__}")
     for c in lines:
-        _checks.instance(c, Choice, "lines", wanted="lines of choose")
+        _checks.require_instance(c, Choice, "lines", wanted="lines of choose")
         peer = f"{c.peer}, {_micro(c.peer_time)}" if c.peer else ""
         rows.append(
             f"| {c.scene} | {c.wanted:.0e} | {c.method or 'none'} | {_micro(c.time)} | "

@@ -305,6 +305,6 @@ def methods(group: str | None = None) -> list[TimedMethod]:
     ['closed form', 'simulate']
     """
     if group is not None:
-        _checks.word(group, ("ours", "jax", "peer"), "group")
+        _checks.require_option(group, ("ours", "jax", "peer"), "group")
     found = [*methods_in_jax(), *methods_outside()]
     return [method for method in found if group in (None, method.group)]

@@ -66,10 +66,10 @@ _WORDS = ("scene", "method", "group", "kind", "adjoint")
 
 def list_records(records: Iterable[Measurement], name: str = "records") -> list[Measurement]:
     """Return the records as a list. **Raises:** `TypeError` if something else is among them."""
-    _checks.instance(records, Iterable, name, wanted="records")
+    _checks.require_instance(records, Iterable, name, wanted="records")
     found = list(records)
     for record in found:
-        _checks.instance(record, Measurement, name)
+        _checks.require_instance(record, Measurement, name)
     return found
 
 

@@ -95,10 +95,10 @@ class BenchmarkScene(eqx.Module):
             )
         hint = "errors are angles between attitudes, or distances"
         wanted = "an Attitude or a Point"
-        _checks.instance(self.state0, (Attitude, Point), "state0", wanted=wanted, hint=hint)
+        _checks.require_instance(self.state0, (Attitude, Point), "state0", wanted=wanted, hint=hint)
         if self.body is not None:
             validation.single(self.body, Inertia, "body", hint="or None with a Point")
-        _checks.positive(self.end, "end", "an end > 0, s")
+        _checks.positive_float(self.end, "end", "an end > 0, s")
 
     @property
     def numbers(self) -> Float[Array, " parameters"]:

@@ -126,9 +126,9 @@ def test_many_rows_are_checked_where_they_are():
     with pytest.raises(ValueError, match="for body 4321"):
         jax.jit(lambda h: rj.batch.rollout(bodies, rj.Attitude(bad, start.omega), h, 1))(0.1)
     for rows in (jnp.ones((count, 3)), jnp.ones((5, 3))):
-        assert _checks.finite(rows, "rows") is rows
+        assert _checks.require_finite(rows, "rows") is rows
         with pytest.raises(ValueError, match=r"rows: contains NaN or infinity at index \(4, 1\)"):
-            _checks.finite(rows.at[4, 1].set(jnp.nan), "rows")
+            _checks.require_finite(rows.at[4, 1].set(jnp.nan), "rows")
 
 
 def test_a_small_fit_on_a_machine_with_a_gpu(monkeypatch):

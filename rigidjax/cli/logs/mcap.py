@@ -18,8 +18,8 @@ def mcap(path: Path, columns: Sequence[str]) -> Columns:
     The times `topic.log_time` and `topic.stamp` (the latter of the header of a message) are in s
     from the first message of the file.
     """
-    make_reader = _checks.library("mcap.reader", "mcap", str(path)).make_reader
-    ros = _checks.library("mcap_ros2.decoder", "mcap", str(path)).DecoderFactory
+    make_reader = _checks.import_library("mcap.reader", "mcap", str(path)).make_reader
+    ros = _checks.import_library("mcap_ros2.decoder", "mcap", str(path)).DecoderFactory
     names: dict[str, None] = {}
     arrays: dict[str, array] = {name: array("d") for name in columns}
     first = None

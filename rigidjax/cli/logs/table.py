@@ -57,8 +57,8 @@ def read_table(
     Traceback (most recent call last):
     rigidjax.cli.logs.errors.LogError: missing.csv: no such file
     """
-    path = _checks.path(path)
-    _checks.instance(columns, Sequence, "columns", wanted="a sequence of names")
+    path = _checks.file_path(path)
+    _checks.require_instance(columns, Sequence, "columns", wanted="a sequence of names")
     if isinstance(columns, str) or not columns or not all(isinstance(c, str) for c in columns):
         raise TypeError(f"columns: wanted a sequence of names, got {columns!r}")
     twice = [name for name in columns if columns.count(name) > 1]

@@ -12,7 +12,7 @@ def ulog(path: Path, columns: Sequence[str]) -> Columns:
 
     The fields of a second instance of a topic are `topic#1.field`; times are in µs.
     """
-    reader, arrays = _checks.library("pyulog", "ulog", str(path)).ULog, {}
+    reader, arrays = _checks.import_library("pyulog", "ulog", str(path)).ULog, {}
     # Open the file here: the library does not close a file that it opened and cannot read.
     with path.open("rb") as file:
         topics = reader(file).data_list

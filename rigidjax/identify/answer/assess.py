@@ -152,7 +152,7 @@ def _describe_interval(model: Model, error: np.ndarray, kept: np.ndarray) -> str
     if end - begin > 0.4 * (t[-1] - t[0]):
         return "all along"
     of = f" of recording {row}" if model.count > 1 else ""
-    times = " to ".join(_show.time(when, t[-1] - t[0], 4) for when in (begin, end))
+    times = " to ".join(_show.time_as_text(when, t[-1] - t[0], 4) for when in (begin, end))
     return f"half of the squared ones from {times} s{of}"
 
 

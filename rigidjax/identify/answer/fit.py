@@ -112,19 +112,19 @@ def fit(
     ...                                  jnp.diag(jnp.array([1.0, 2.0, 2.5])), atol=1e-6))
     ('ok', True)
     """
-    _checks.instance(model, Model, "fit", wanted="a Model")
-    starts = _checks.whole(starts, "starts", 1)
-    max_steps = _checks.whole(max_steps, "max_steps", 1)
-    tolerance = _checks.positive(tolerance, "tolerance")
-    key = None if key is None else _checks.key(key)
+    _checks.require_instance(model, Model, "fit", wanted="a Model")
+    starts = _checks.integer(starts, "starts", 1)
+    max_steps = _checks.integer(max_steps, "max_steps", 1)
+    tolerance = _checks.positive_float(tolerance, "tolerance")
+    key = None if key is None else _checks.random_key(key)
     if initial is not None:
         initial = require_numbers(model, initial)
     if progress is not None:
-        _checks.function(progress, "progress", "of a line of text, such as print")
+        _checks.require_function(progress, "progress", "of a line of text, such as print")
     if checkpoint is not None:
         require_folder(checkpoint)
     wanted = "a Descent(optimiser, …) or None"
-    _checks.instance(descent, (Descent, NoneType), "fit", wanted=wanted)
+    _checks.require_instance(descent, (Descent, NoneType), "fit", wanted=wanted)
     shared = model.size - len(model.index.alone) * model.count
     if shared > MOST_SHARED:
         raise ValueError(

@@ -257,8 +257,8 @@ class Fit(eqx.Module):
 
         **Raises** as `interval`.
         """
-        _checks.function(of, "of", "of `Unpacked` to an array")
-        if not _checks.known(self.x):
+        _checks.require_function(of, "of", "of `Unpacked` to an array")
+        if not _checks.is_known(self.x):
             raise TypeError(
                 "Fit: wanted known numbers, got traced ones; intervals are made on the host: call "
                 "interval_of outside of jax.jit, jax.grad and jax.vmap"
@@ -266,7 +266,7 @@ class Fit(eqx.Module):
 
         def value(point: Unpacked) -> Array:
             point = dataclasses.replace(point, noise=self.noises)
-            return _checks.numbers(of(point), "of(point)")
+            return _checks.numeric_array(of(point), "of(point)")
 
         # Compile one program for what x represents: outside of a trace each operation of JAX is a
         # program of its own, and some ninety of them took seconds to compile.
@@ -276,7 +276,7 @@ class Fit(eqx.Module):
         def change(step: Unpacked) -> Array:
             return jax.jvp(value, (point,), (step,))[1]
 
-        middle = np.asarray(_checks.finite(value(best), "of(point)"))
+        middle = np.asarray(_checks.require_finite(value(best), "of(point)"))
         slope = np.asarray(jax.vmap(change, in_axes=-1, out_axes=-1)(slopes))
         seen, null = np.asarray(self.seen), np.asarray(self.null_directions)
         if self.hidden is not None:
@@ -308,7 +308,7 @@ class Fit(eqx.Module):
 
 def require_one_fit(fit: PyTree, name: str = "fit") -> Fit:
     """Return the `fit`; raise `TypeError` or `ValueError` unless it is one `Fit`, not a batch."""
-    _checks.instance(fit, Fit, name)
+    _checks.require_instance(fit, Fit, name)
     if np.shape(fit.chi2) != ():
         raise ValueError(
             f"{name}: wanted one Fit, as identify.fit returns it, got a batch with a chi2 of shape "

@@ -113,12 +113,12 @@ class Recording(eqx.Module):
                     "Recording: wanted pairs (sensor, values) or (sensor, values, mask) after the "
                     f"times, got {type(pair).__name__}; as in Recording(t, (sensor, values))"
                 )
-        if not _checks.known((t, [reading[1:] for reading in readings])):
+        if not _checks.is_known((t, [reading[1:] for reading in readings])):
             raise TypeError(
                 "Recording: wanted known numbers for t and the readings, got traced ones; make the "
                 "recording outside of jit, vmap and grad, and give it to them as an argument"
             )
-        t = _checks.on_host(t, "t")
+        t = _checks.host_array(t, "t")
         if t.ndim != 1 or t.size < 2:
             raise ValueError(f"t: wanted at least two times, shape (T,), got shape {t.shape}")
         if not np.isfinite(t).all():
@@ -153,10 +153,10 @@ class Recording(eqx.Module):
         )
 
     def __repr__(self) -> str:
-        if not _checks.known(self) or np.ndim(self.t) != 1:
+        if not _checks.is_known(self) or np.ndim(self.t) != 1:
             return eqx.tree_pformat(self)
         t = np.asarray(self.t)
-        ends = " … ".join(_show.time(end, t[-1] - t[0]) for end in (t[0], t[-1])) + " s"
+        ends = " … ".join(_show.time_as_text(end, t[-1] - t[0]) for end in (t[0], t[-1])) + " s"
         parts = [f"{self.t.shape[0]} times {ends}"]
         for reading in self.readings:
             first = _show.as_text(np.asarray(reading.values)[int(np.argmax(reading.seen))])
@@ -211,19 +211,21 @@ def count_of(reading: Reading) -> int:
 
 def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
     """Return the inputs by name: functions of time unchanged, checked samples (T, …) as arrays."""
-    _checks.instance(inputs, Mapping, "inputs", wanted="samples or functions of time by name")
+    _checks.require_instance(
+        inputs, Mapping, "inputs", wanted="samples or functions of time by name"
+    )
     out = {}
     for name, source in inputs.items():
-        _checks.instance(name, str, "inputs: name")
+        _checks.require_instance(name, str, "inputs: name")
         if not callable(source):
-            samples = _checks.on_host(source, f"inputs[{name!r}]")
+            samples = _checks.host_array(source, f"inputs[{name!r}]")
             if samples.shape[:1] != t.shape:
                 raise ValueError(
                     f"inputs[{name!r}]: wanted a sample for each of {t.size} times, got shape "
                     f"{samples.shape}; for samples at other times give a function of time such as "
                     "rigidjax.torques.Series(times, samples)"
                 )
-            source = jnp.asarray(_checks.finite(samples, f"inputs[{name!r}]"))
+            source = jnp.asarray(_checks.require_finite(samples, f"inputs[{name!r}]"))
         out[name] = source
     return out
 
@@ -239,7 +241,7 @@ def _require_digits(t: np.ndarray, dtype: np.dtype) -> None:
     index = int(np.argmax(off))
     words = (
         f"t: {dtype} changes the step of {steps[index]:.3g} s after {t[index]} s to "
-        f"{held[index]:.3g} s; {_checks.later_origin(dtype)}"
+        f"{held[index]:.3g} s; {_checks.advice_for_large_times(dtype)}"
     )
     if off[index] >= 1:
         raise ValueError(words)
@@ -260,7 +262,7 @@ def _reading(
             f"for each component of the error, or None, got shape {np.shape(sensor.noise)}"
         )
     values, no_value = _checks.data_and_mask(values)
-    values = _checks.on_host(values, f"{name}: readings")
+    values = _checks.host_array(values, f"{name}: readings")
     rows_hidden = None if no_value is None else no_value.reshape(len(no_value), -1).any(axis=1)
     if rows_hidden is not None:
         values[rows_hidden] = np.nan

@@ -251,10 +251,10 @@ def first_rates(
     The rates that a gyro reads are returned for traced recordings, too.
     """
     for reading in readings_of(records, Gyro):
-        xp: Any = np if _checks.known(reading) else jnp
+        xp: Any = np if _checks.is_known(reading) else jnp
         first = xp.argmax(xp.asarray(reading.mask), axis=1)[:, None, None]
         return jnp.asarray(xp.take_along_axis(xp.asarray(reading.values), first, axis=1)[:, 0])
-    if not _checks.known(records):
+    if not _checks.is_known(records):
         return jnp.zeros((len(counts), 3), records.t.dtype)
     each = [first_rate(recording) for recording in stacking.on_host(records, counts)]
     return jnp.asarray(np.stack(each), records.t.dtype)

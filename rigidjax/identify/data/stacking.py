@@ -73,7 +73,7 @@ def _length(count: int) -> int:
 def _stack_leaves(*leaves: PyTree) -> Any:
     """Stack leaves along a new first axis."""
     # Use NumPy if the numbers are known: JAX would compile a program for each shape.
-    if _checks.known(leaves):
+    if _checks.is_known(leaves):
         return _constant(np.stack([np.asarray(leaf) for leaf in leaves]))
     return jnp.stack(leaves)
 
@@ -84,7 +84,7 @@ def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "
     def pick(leaf: PyTree) -> Any:
         if not eqx.is_array(leaf):
             return leaf
-        known = _checks.known((leaf, index))
+        known = _checks.is_known((leaf, index))
         return _constant(np.asarray(leaf)[index]) if known else leaf[index]
 
     return jax.tree.map(pick, records)
@@ -188,7 +188,7 @@ def _repeat_last(
 ) -> Array:
     """Append the last entry along `axis`, or the number `last`, `count` times to `values`."""
     # Use NumPy where the numbers are known: JAX would compile a program for each shape.
-    xp: Any = np if _checks.known(values) else jnp
+    xp: Any = np if _checks.is_known(values) else jnp
     array = xp.asarray(values)
     edge = array[(slice(None),) * axis + (slice(-1, None),)]
     more = xp.repeat(edge if last is None else xp.full_like(edge, last), count, axis)

@@ -213,10 +213,10 @@ def windows(
     >>> windows(t, Spin(np.ones((6, 3))), length=2, stride=2).count
     2
     """
-    times = _checks.on_host(t, "t")
-    length, stride = _checks.whole(length, "length", 1), _checks.whole(stride, "stride", 1)
-    before = _checks.whole(before, "before", 0)
-    _checks.instance(states, (Spin, Attitude, Rigid), "states")
+    times = _checks.host_array(t, "t")
+    length, stride = _checks.integer(length, "length", 1), _checks.integer(stride, "stride", 1)
+    before = _checks.integer(before, "before", 0)
+    _checks.require_instance(states, (Spin, Attitude, Rigid), "states")
     if times.ndim != 1 or times.size < length + 1:
         raise ValueError(
             f"t: wanted at least length + 1 = {length + 1} times (T,), got shape {times.shape}"
@@ -242,7 +242,7 @@ def windows(
     samples = {k: np.asarray(v, kind) for k, v in inputs.items()}
     kinds = names(states)
     if noise is not None:
-        noise = _by_kind(noise, kinds, "noise", _checks.positive)
+        noise = _by_kind(noise, kinds, "noise", _checks.positive_float)
     if starts is not None:
         if noise is None:
             raise ValueError(
@@ -265,7 +265,7 @@ def _by_kind(
     numbers: object, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
 ) -> dict[str, float]:
     """Return the numbers of a mapping whose keys are `kinds`, each one checked by `check`."""
-    by_kind = _checks.instance(numbers, Mapping, name, wanted="numbers by kind")
+    by_kind = _checks.require_instance(numbers, Mapping, name, wanted="numbers by kind")
     if set(by_kind) != set(kinds):
         raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(by_kind)}")
     return {kind: float(check(by_kind[kind], f"{name}[{kind!r}]")) for kind in kinds}
@@ -273,7 +273,7 @@ def _by_kind(
 
 def _deviation(value: object, name: str) -> float:
     """Return the deviation of a start; raise `ValueError` unless it is positive, maybe infinite."""
-    number = _checks.number(value, name)
+    number = _checks.known_float(value, name)
     if not number > 0:
         raise ValueError(
             f"{name}: wanted a positive deviation, or infinity for a start that is free, got "
@@ -324,14 +324,14 @@ def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
 
 def require_windows(windows: PyTree) -> None:
     """Raise `TypeError` or `ValueError` unless these are several windows of finite numbers."""
-    _checks.instance(windows, Windows, "windows", wanted="what identify.windows returns")
+    _checks.require_instance(windows, Windows, "windows", wanted="what identify.windows returns")
     for name, wanted in (("starts", 2), ("wanted", 3)):
         for leaf in jax.tree.leaves(getattr(windows, name)):
             if leaf.ndim != wanted or not leaf.shape[0]:
                 raise ValueError(
                     f"windows: wanted a row for each of N windows in {name}, got {leaf.shape}"
                 )
-            _checks.finite(leaf, f"windows: {name}")
+            _checks.require_finite(leaf, f"windows: {name}")
 
 
 def mistakes_of_delays(law: PyTree, known: float, length: float) -> list[str]:

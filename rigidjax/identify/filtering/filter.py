@@ -117,7 +117,7 @@ def first_belief(
     start: Any = scene.start if state is None else state
     if state is None and x is None:
         _require_shown_attitude(record, start)
-    _checks.single(start, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
+    _checks.require_single(start, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
     start = on_the_group(start)
     deviations = {"attitude": attitude, "rate": rate, "position": position, "velocity": velocity}
     words = {"x": "position", "v": "velocity", "q": "attitude", "omega": "rate"}
@@ -156,7 +156,7 @@ def belief_at(
 
 def _require_shown_attitude(recording: Recording, state: HasSpin | None) -> None:
     """Raise an error if the state has an attitude that the readings do not show."""
-    if not _checks.known(recording):
+    if not _checks.is_known(recording):
         raise TypeError("state: wanted a state; a traced recording shows none")
     if isinstance(state, HasAttitude) and not len(attitudes(recording)[1]):
         raise ValueError(
@@ -233,7 +233,7 @@ def grid_of(
             f"recording: readings are out of order: the first is at {t[0]:g} s, before the time "
             f"of the belief it starts from, {t0:g} s"
         )
-        _checks.refuse(t, t[0] < t0, words)
+        _checks.error_if(t, t[0] < t0, words)
     ends = xp.concatenate([t0[None], t])
     counts = steps.steps_of(process, ends, first.x.motion, substeps, recording)
     index = np.repeat(np.arange(counts.size), counts)
@@ -362,12 +362,12 @@ def filter(
 def raise_if_lost(run: Any) -> Any:
     """Return the run of a filter; raise `ValueError` if it was lost or stopped."""
     status = run.status
-    at = f" (at {float(run.lost_at):g} s)" if _checks.known(run.lost_at) else ""
+    at = f" (at {float(run.lost_at):g} s)" if _checks.is_known(run.lost_at) else ""
     advice = (
         "; is the noise or density too small, or the initial state far off? throw=False returns it"
     )
-    run = _checks.refuse(run, status == 1, f"filter: {WORDS[1]}{at}{advice}")
-    return _checks.refuse(run, status == 2, f"filter: {WORDS[2]}{advice}")
+    run = _checks.error_if(run, status == 1, f"filter: {WORDS[1]}{at}{advice}")
+    return _checks.error_if(run, status == 2, f"filter: {WORDS[2]}{advice}")
 
 
 def log_likelihood(
@@ -430,15 +430,15 @@ def step(
     Array(0.1, dtype=float64)
     """
     scene, _ = scene_at(model, x)
-    _checks.instance(belief, Belief, "belief", hint="identify.first_belief makes it")
+    _checks.require_instance(belief, Belief, "belief", hint="identify.first_belief makes it")
     if belief.t.shape != ():
         raise ValueError(
             f"belief: wanted one, got times of shape {belief.t.shape}; for many use jax.vmap"
         )
-    when = _checks.time(t).astype(belief.t.dtype)
-    if _checks.known((when, belief.t)):
+    when = _checks.checked_time(t).astype(belief.t.dtype)
+    if _checks.is_known((when, belief.t)):
         words = f"t: readings are out of order: {float(when):g} s is before {float(belief.t):g} s"
-        _checks.refuse(when, when < belief.t, words)
+        _checks.error_if(when, when < belief.t, words)
     flags = (True,) * len(readings) if seen is None else tuple(seen)
     for name, items in (("readings", readings), ("seen", flags)):
         if len(items) != len(scene.sensors):
@@ -447,11 +447,11 @@ def step(
     values, masks = [], []
     for sensor, reading, flag in zip(scene.sensors, readings, flags, strict=True):
         name = type(sensor).__name__
-        value = _checks.floating(reading, sensor.reading_shape, f"{name}: reading")
+        value = _checks.array_of_shape(reading, sensor.reading_shape, f"{name}: reading")
         mask = jnp.asarray(flag)
-        if _checks.known((value, mask)) and bool(mask):
+        if _checks.is_known((value, mask)) and bool(mask):
             words = f"{name}: the reading contains NaN; give seen=(…, False, …) if it is a gap"
-            _checks.refuse(value, not np.isfinite(np.asarray(value)).all(), words)
+            _checks.error_if(value, not np.isfinite(np.asarray(value)).all(), words)
         values.append(value)
         masks.append(mask)
     return _step(scene, model.walks, belief, Stops(when, tuple(values), tuple(masks)))
@@ -545,7 +545,7 @@ def checked_input(
 ) -> FilterInput:
     """Return the checked arguments of `filter` and `smooth`."""
     scene, recording = scene_at(model, x)
-    _checks.instance(first, Belief, "first", hint="identify.first_belief makes it")
+    _checks.require_instance(first, Belief, "first", hint="identify.first_belief makes it")
     for sensor in scene.sensors:
         if not isinstance(first.x.motion, sensor.feels):
             kind, got = sensor.feels.__name__, type(first.x.motion).__name__

@@ -58,16 +58,19 @@ class LinearModel(eqx.Module):
         push: Parameter | None = None,
         offset: Parameter | None = None,
     ):
-        self.transition = _checks.numbers(transition, "transition")
-        self.noise, self.matrix = _checks.numbers(noise, "noise"), _checks.numbers(matrix, "matrix")
-        sigma = _checks.numbers(deviation, "deviation")
+        self.transition = _checks.numeric_array(transition, "transition")
+        self.noise, self.matrix = (
+            _checks.numeric_array(noise, "noise"),
+            _checks.numeric_array(matrix, "matrix"),
+        )
+        sigma = _checks.numeric_array(deviation, "deviation")
         words = (
             "deviation: wanted positive standard deviations; a measurement without noise is "
             "singular: leave the numbers that it fixes out of the state"
         )
-        self.deviation = _checks.refuse(sigma, ~(sigma > 0).all(), words)
-        self.push = None if push is None else _checks.numbers(push, "push")
-        self.offset = None if offset is None else _checks.numbers(offset, "offset")
+        self.deviation = _checks.error_if(sigma, ~(sigma > 0).all(), words)
+        self.push = None if push is None else _checks.numeric_array(push, "push")
+        self.offset = None if offset is None else _checks.numeric_array(offset, "offset")
         if self.transition.ndim < 2:
             got = self.transition.shape
             raise ValueError(f"transition: wanted a matrix (n, n), got shape {got}")
@@ -186,10 +189,13 @@ def _checked_arguments(
     model: LinearModel, readings: Readings, mean: Mean, root: Root, seen: Mask
 ) -> tuple[Parts, Array, Array, Array, Array]:
     """Return the parts of the model, and the other arguments as checked arrays."""
-    _checks.instance(model, LinearModel, "model")
+    _checks.require_instance(model, LinearModel, "model")
     n, k = model.size, model.deviation.shape[-1]
-    readings = _checks.rows(readings, (k,), "readings")
-    mean, root = _checks.floating(mean, (n,), "mean"), _checks.floating(root, (n, n), "root")
+    readings = _checks.array_of_rows(readings, (k,), "readings")
+    mean, root = (
+        _checks.array_of_shape(mean, (n,), "mean"),
+        _checks.array_of_shape(root, (n, n), "root"),
+    )
     times = readings.shape[0]
     if not times:
         raise ValueError("readings: wanted at least one row, got none")
@@ -200,7 +206,7 @@ def _checked_arguments(
         raise ValueError(f"seen: wanted truth values {readings.shape}, got {seen.shape}")
     bad = seen & ~jnp.isfinite(readings)
     words = "readings: contains NaN or infinity; mask it by `seen` if it is a gap"
-    readings = jnp.where(seen, _checks.refuse(readings, bad.any(), words), 0)
+    readings = jnp.where(seen, _checks.error_if(readings, bad.any(), words), 0)
     parts = {name: getattr(model, name) for name in _AXES}
     for name, part in _time_varying(parts).items():
         wanted = times - 1 if name in _STEPS else times

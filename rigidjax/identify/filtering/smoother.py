@@ -114,8 +114,8 @@ def smooth(
     >>> best.pushes[0].mean.shape, best.rows.tolist()  # of three stops two are readings
     ((3, 3), [0, 2])
     """
-    _checks.whole(iterations, "iterations", 1)
-    _checks.positive(tolerance, "tolerance")
+    _checks.integer(iterations, "iterations", 1)
+    _checks.positive_float(tolerance, "tolerance")
     run = _smooth(checked_input(model, first, x, substeps), iterations, tolerance)
     if not throw:
         return run
@@ -124,7 +124,7 @@ def smooth(
         "more iterations, a better initial state, or a model that the readings fit; throw=False "
         "returns it"
     )
-    return _checks.refuse(raise_if_lost(run), run.change > 1, words)
+    return _checks.error_if(raise_if_lost(run), run.change > 1, words)
 
 
 @eqx.filter_jit

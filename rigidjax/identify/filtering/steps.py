@@ -306,9 +306,9 @@ def steps_of(
     by the correlation times of the process; it is one if these are traced.
     """
     if substeps is not None:
-        return np.full(ts.shape[0] - 1, _checks.whole(substeps, "substeps", 1))
+        return np.full(ts.shape[0] - 1, _checks.integer(substeps, "substeps", 1))
     coloured = coloured_parts(process)
-    if not _checks.known((ts, state.omega, coloured)):
+    if not _checks.is_known((ts, state.omega, coloured)):
         return np.ones(ts.shape[0] - 1, int)
     rate = float(np.linalg.norm(np.asarray(state.omega, float)))
     for reading in () if recording is None else recording.readings:
@@ -370,19 +370,19 @@ def sample(
     >>> drawn.states.omega.shape, drawn.torques  # white noise has no value at a time
     ((3, 3), ())
     """
-    _checks.key(key)
+    _checks.random_key(key)
     body = validation.single(body, (Inertia, MassProperties), "body")
-    _checks.single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
+    _checks.require_single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
     require_process(process)
     if torque is not None:
         require_law(torque)
     require_known_torque(torque)
-    times = _checks.rows(ts, (), "ts")
+    times = _checks.array_of_rows(ts, (), "ts")
     if times.shape[0] < 2:
         raise ValueError(f"ts: wanted at least two times, got {times.shape[0]}")
-    if _checks.known(times):
+    if _checks.is_known(times):
         words = "ts: wanted increasing times"
-        _checks.refuse(times, not (np.diff(np.asarray(times)) > 0).all(), words)
+        _checks.error_if(times, not (np.diff(np.asarray(times)) > 0).all(), words)
     pieces = int(steps_of(process, times, state0, substeps).max())
     scene = Scene(body, torque, process, (), on_the_group(state0))
     return _sample(key, scene, times, pieces)

@@ -58,9 +58,9 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     >>> best.name, best.free, best.information  # free: two ratios, initial attitude and rate
     ('one', 8, 0.0)
     """
-    _checks.instance(fits, Mapping, "fits", wanted="a dict of name → Fit")
+    _checks.require_instance(fits, Mapping, "fits", wanted="a dict of name → Fit")
     for name, one in fits.items():
-        _checks.instance(one, Fit, f"fits[{name!r}]")
+        _checks.require_instance(one, Fit, f"fits[{name!r}]")
     if not fits:
         raise ValueError("compare: wanted at least one fit")
     readings = {name: one.model.records.readings for name, one in fits.items()}
@@ -125,10 +125,10 @@ def cross_validate(
     Traceback (most recent call last):
     ValueError: cross_validate: wanted at least two recordings, got 0
     """
-    _checks.function(build, "build", "of a sequence of recordings → Model")
-    _checks.instance(recordings, Sequence, "recordings", wanted="a sequence of Recording")
+    _checks.require_function(build, "build", "of a sequence of recordings → Model")
+    _checks.require_instance(recordings, Sequence, "recordings", wanted="a sequence of Recording")
     for item in recordings:
-        _checks.instance(item, Recording, "recordings")
+        _checks.require_instance(item, Recording, "recordings")
     if len(recordings) < 2:
         raise ValueError(f"cross_validate: wanted at least two recordings, got {len(recordings)}")
     out = []

@@ -97,7 +97,7 @@ class LogDensity(eqx.Module):
         *,
         deviation: float | None = 2.0,
     ):
-        _checks.instance(fit, Fit, "LogDensity: fit", wanted="what identify.fit returns")
+        _checks.require_instance(fit, Fit, "LogDensity: fit", wanted="what identify.fit returns")
         model = fit.model
         process = model.process if process is None else process
         if process is not None:
@@ -115,7 +115,7 @@ class LogDensity(eqx.Module):
                 f"posterior; give a prior or fewer free numbers{hint}. {what}".rstrip()
             )
         known = process is None or deviation is None
-        prior = None if known else jnp.asarray(_checks.positive(deviation, "deviation"))
+        prior = None if known else jnp.asarray(_checks.positive_float(deviation, "deviation"))
         noise_slots, variances = _noise_slots(model)
         process_slots = [] if prior is None else _process_slots(process, prior)
         total = sum(int(reading.seen.sum()) for reading in model.records.readings)
@@ -139,7 +139,7 @@ class LogDensity(eqx.Module):
         return self.x0.size
 
     def __call__(self, x: Float[Array, " n"]) -> Scalar:
-        return log_density(self.model, _checks.floating(x, self.x0.shape, "x"))
+        return log_density(self.model, _checks.array_of_shape(x, self.x0.shape, "x"))
 
     def unpack(self, x: Float[Array, " n"]) -> Unpacked:
         """Return the quantities that x (n,) represents.
@@ -147,7 +147,7 @@ class LogDensity(eqx.Module):
         These are the body, the initial states, the values of the `Free`s, the noise (R, k) of each
         sensor, and the process.
         """
-        x = _checks.floating(x, self.x0.shape, "x")
+        x = _checks.array_of_shape(x, self.x0.shape, "x")
         scenes, point = scenes_of(self.model, x), unpack_numbers(self.model, x)
         noise: Any = tuple(sensor.noise for sensor in scenes.sensors)
         process = stacking.pick_records(scenes.process, 0)

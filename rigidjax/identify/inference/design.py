@@ -98,7 +98,7 @@ def _require_noise(model: Model, x: Float[Array, " n"]) -> None:
 
 def _require_known(model: Model, motion: PyTree) -> None:
     """Raise `TypeError` for a model or a motion of traced numbers."""
-    if not _checks.known((model, motion)):
+    if not _checks.is_known((model, motion)):
         raise TypeError(
             "model, x, body, omega: wanted known numbers, got traced ones; call it outside of "
             "jax.jit, jax.grad and jax.vmap, or differentiate identify.fisher"
@@ -128,10 +128,10 @@ def best_first_rate(
     **Returns** the rate (3,), and the result of `expected` for it. **Raises:** as `fisher`.
     """
     require_one(model)
-    max_steps = _checks.whole(max_steps, "max_steps", 1)
+    max_steps = _checks.integer(max_steps, "max_steps", 1)
     _require_known(model, (body, omega))
     _require_noise(model, model.start(body, omega))
-    start = _checks.floating(omega, (3,), "omega").astype(model.records.t.dtype)
+    start = _checks.array_of_shape(omega, (3,), "omega").astype(model.records.t.dtype)
     size = jnp.sqrt(jnp.sum(start**2))
     best = _best_direction(model, body, start / size, size, max_steps)
     rate = size * best / jnp.sqrt(jnp.sum(best**2))

@@ -30,7 +30,7 @@ from rigidjax.motion.torques.composite import parts_of
 # A sampler: a function of a key, a log-density of z, and a first z (n,) to draws (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 
-# The arguments of `_checks.library`: the module, the extra that installs it, the function.
+# The arguments of `_checks.import_library`: the module, the extra that installs it, the function.
 _BLACKJAX = ("blackjax", "posterior", "posterior")
 
 # The weight of the first mass matrix, in draws. It counts, since Laplace's method made it.
@@ -65,13 +65,13 @@ class Nuts(eqx.Module):
     acceptance: float = eqx.field(static=True, default=0.8)
 
     def __check_init__(self):
-        _checks.whole(self.samples, "samples", 1)
-        _checks.whole(self.warmup, "warmup", 1)
+        _checks.integer(self.samples, "samples", 1)
+        _checks.integer(self.warmup, "warmup", 1)
         _checks.fraction(self.acceptance, "acceptance")
 
     def __call__(self, key: PRNGKeyArray, density: Callable[[Array], Array], start: Array) -> Array:
         """Return the draws (samples, n) of one chain that begins at `start` (n,)."""
-        blackjax = _checks.library(*_BLACKJAX)
+        blackjax = _checks.import_library(*_BLACKJAX)
         adaptation = blackjax.adaptation
         # Do the warm-up of `blackjax.window_adaptation` in one loop with the draws. In a loop of
         # its own it compiles the density once more, which takes longer than the draws.
@@ -132,12 +132,12 @@ class Posterior(eqx.Module):
     @property
     def rhat(self) -> Float[Array, " n"]:
         """Return the potential scale reduction of the chains, near 1 if they agree (blackjax)."""
-        return _checks.library(*_BLACKJAX).diagnostics.potential_scale_reduction(self.x)
+        return _checks.import_library(*_BLACKJAX).diagnostics.potential_scale_reduction(self.x)
 
     @property
     def ess(self) -> Float[Array, " n"]:
         """Return the effective number of independent draws (blackjax)."""
-        return _checks.library(*_BLACKJAX).diagnostics.effective_sample_size(self.x)
+        return _checks.import_library(*_BLACKJAX).diagnostics.effective_sample_size(self.x)
 
     @property
     def points(self) -> Unpacked:
@@ -150,7 +150,9 @@ class Posterior(eqx.Module):
         An example is `drawn.of(lambda point: point.body.moments)`. **Raises** `TypeError` for
         anything but a `function`.
         """
-        _checks.function(function, "function", "of `Unpacked`, such as lambda point: point.body")
+        _checks.require_function(
+            function, "function", "of `Unpacked`, such as lambda point: point.body"
+        )
         rows = of_draws(function, self.density, self.x.reshape(-1, self.x.shape[-1]))
         return jax.tree.map(lambda leaf: leaf.reshape(*self.x.shape[:2], *leaf.shape[1:]), rows)
 
@@ -159,7 +161,7 @@ class Posterior(eqx.Module):
 
         **Raises:** `ImportError` without arviz, which needs Python 3.12.
         """
-        arviz = _checks.library("arviz", "posterior", "to_arviz (Python 3.12)")
+        arviz = _checks.import_library("arviz", "posterior", "to_arviz (Python 3.12)")
         points = self.points
         out = dict(points.values)
         out["omega0"] = points.state0.omega
@@ -204,12 +206,14 @@ def posterior(
     >>> drawn.x.shape, bool((drawn.rhat < 1.05).all())  # four chains that agree
     ((4, 200, 8), True)
     """
-    _checks.instance(density, LogDensity, "density", hint="identify.LogDensity(fit) makes one")
-    _checks.key(key)
-    chains = _checks.whole(chains, "chains", 2)
-    sample = Nuts() if sampler is None else _checks.function(sampler, "sampler", "of a key")
+    _checks.require_instance(
+        density, LogDensity, "density", hint="identify.LogDensity(fit) makes one"
+    )
+    _checks.random_key(key)
+    chains = _checks.integer(chains, "chains", 2)
+    sample = Nuts() if sampler is None else _checks.require_function(sampler, "sampler", "of a key")
     if isinstance(sample, Nuts):
-        _checks.library(*_BLACKJAX)
+        _checks.import_library(*_BLACKJAX)
     root = jnp.linalg.cholesky(density.covariance)
     x = _draw(density, root, jax.random.split(key, chains), sample)
     return Posterior(density, x)
@@ -297,7 +301,7 @@ class Refit(eqx.Module):
         if too few draws are independent and the search did not converge either.
         """
         level = _checks.fraction(level, "level", "a probability between 0 and 1")
-        _checks.function(of, "of", "of `Unpacked` to an array")
+        _checks.require_function(of, "of", "of `Unpacked` to an array")
         if not (float(self.effective) >= _LEAST or bool(self.converged)):
             raise ValueError(
                 "interval_of: the search did not reach the maximum of the density, and fewer than "
@@ -363,9 +367,11 @@ def refit(
     >>> bool((low < high).all())
     True
     """
-    _checks.instance(density, LogDensity, "density", hint="identify.LogDensity(fit) makes one")
-    steps, count = _checks.whole(max_steps, "max_steps", 1), _checks.whole(draws, "draws", 1)
-    drawing = jax.random.key(0) if key is None else _checks.key(key)
+    _checks.require_instance(
+        density, LogDensity, "density", hint="identify.LogDensity(fit) makes one"
+    )
+    steps, count = _checks.integer(max_steps, "max_steps", 1), _checks.integer(draws, "draws", 1)
+    drawing = jax.random.key(0) if key is None else _checks.random_key(key)
     return _refit(density, Settings(_SMALL, _DAMPING, steps), drawing, count)
 
 

@@ -51,7 +51,7 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
             "predict_windows: wanted a fit whose numbers all windows share, got a Free with a "
             "value for each window, which other windows do not have"
         )
-    _checks.instance(windows.starts, type(model.reference.state), "windows.starts")
+    _checks.require_instance(windows.starts, type(model.reference.state), "windows.starts")
     require_inputs_of_windows(model.torque, windows)
     model_on_windows, x = _on_windows(model, fit.x, windows)
     errors = _errors(model_on_windows, x)[0]

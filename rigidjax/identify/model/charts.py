@@ -151,7 +151,7 @@ def _typical_moments(value: object) -> Array:
             f"{type(value).__name__}; give a known body as Known(body), an initial guess by "
             "fit(initial=model.start(body))"
         )
-    size = _checks.positive(value, "typical", "a positive moment of inertia, kg m²")
+    size = _checks.positive_float(value, "typical", "a positive moment of inertia, kg m²")
     return jnp.asarray(size, jnp.result_type(float))
 
 
@@ -250,12 +250,12 @@ class Mass(AbstractBodyChart):
     unit: ClassVar[str] = "SI"
 
     def __init__(self, guess: MassProperties, free: Sequence[str] = tuple(_PARTS)):
-        self.guess = _checks.single(guess, MassProperties, "guess")
+        self.guess = _checks.require_single(guess, MassProperties, "guess")
         wanted = "some of mass, inertia, com"
-        _checks.instance(free, Sequence, "free", wanted=wanted)
+        _checks.require_instance(free, Sequence, "free", wanted=wanted)
         chosen = [free] if isinstance(free, str) else list(free)
         for name in chosen:
-            _checks.word(name, tuple(_PARTS), "free")
+            _checks.require_option(name, tuple(_PARTS), "free")
         if not chosen:
             raise ValueError("free: wanted mass, inertia or com, got none; see Known")
         self.free = tuple(name for name in _PARTS if name in chosen)

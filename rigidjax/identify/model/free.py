@@ -64,18 +64,20 @@ class Free(eqx.Module):
         spread: float | str | None = None,
         unit: str | None = None,
     ):
-        _checks.function(where, "where", "of a scene, such as lambda s: s.torque.coefficient")
-        _checks.instance(name, str, "name")
+        _checks.require_function(
+            where, "where", "of a scene, such as lambda s: s.torque.coefficient"
+        )
+        _checks.require_instance(name, str, "name")
         self.where, self.name = where, name
         here = f"Free {name!r}"
-        self.unit = None if unit is None else _checks.instance(unit, str, f"{here}: unit")
-        self.scale = _checks.positive(scale, f"{here}: scale")
+        self.unit = None if unit is None else _checks.require_instance(unit, str, f"{here}: unit")
+        self.scale = _checks.positive_float(scale, f"{here}: scale")
         self.each = checked_labels(each, f"{here}: each")
         self.positive = positive
-        self.prior = None if prior is None else _checks.positive(prior, f"{here}: prior")
+        self.prior = None if prior is None else _checks.positive_float(prior, f"{here}: prior")
         if spread is not None and spread != "estimated":
             wanted = 'a positive number or "estimated"'
-            spread = _checks.positive(spread, f"{here}: spread", wanted)
+            spread = _checks.positive_float(spread, f"{here}: spread", wanted)
         self.spread = spread
         if each is True and spread is not None:
             raise ValueError(
@@ -89,9 +91,9 @@ def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
     if isinstance(each, bool):
         return each
     if isinstance(each, str):
-        return _checks.word(each, ("body",), name)
+        return _checks.require_option(each, ("body",), name)
     wanted = 'True, False, "body", or a sequence of labels, one for each recording'
-    return tuple(_checks.instance(each, Sequence, name, wanted=wanted))
+    return tuple(_checks.require_instance(each, Sequence, name, wanted=wanted))
 
 
 class Slot(eqx.Module):
@@ -171,7 +173,7 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
     """Return the slot of each `Free` in a scene; `bodies` (R,) names each recording's body."""
     slots: list[Slot] = []
     for item in free:
-        _checks.instance(item, Free, "free", wanted="Free(where, name)")
+        _checks.require_instance(item, Free, "free", wanted="Free(where, name)")
         here = f"Free {item.name!r}"
         path, value = leaf_at(item.where, scene, here, "it")
         if any(slot.path == path for slot in slots):

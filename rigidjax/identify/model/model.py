@@ -299,8 +299,8 @@ class Model(eqx.Module):
         elif omega is None:
             rates = first_rates(self.records, self.counts)
         else:
-            rates = _checks.floating(omega, (3,), "omega").astype(kind)[None]
-        xp: Any = np if _checks.known((vector, rates, self.reference.rate)) else jnp
+            rates = _checks.array_of_shape(omega, (3,), "omega").astype(kind)[None]
+        xp: Any = np if _checks.is_known((vector, rates, self.reference.rate)) else jnp
         spin = xp.asarray(rates) / xp.asarray(self.reference.rate)[:, None]
         spin = xp.broadcast_to(spin, (self.count, 3)).astype(kind)
         spin = spin if self.index.start.size else spin[:, :0]
@@ -410,7 +410,7 @@ def _data_of_windows(
     records = windows.records()
     counts = np.full(windows.count, windows.length + 1, np.int32)
     state_kind = _state_kind(records.sensors, torque, charts)
-    stretches = _checks.whole(stretches, "stretches", 2)
+    stretches = _checks.integer(stretches, "stretches", 2)
     reference, weight, clusters = starts_of_windows(windows, stretches)
     _require_states(windows, state_kind)
     kinds = 0 if weight is None else dimension(stacking.pick_records(reference.state, 0)) // 3
@@ -432,15 +432,15 @@ def _require_parts(
         hint = "give a known body as Known(body)" if known else ""
         hint = "was () forgotten?" if isinstance(one, type) else hint
         wanted = "what of the body is free, such as Ratios() or PrincipalRatios()"
-        _checks.instance(one, AbstractBodyChart, "Model", wanted=wanted, hint=hint)
-    _checks.instance(free, Sequence, "free", wanted="a sequence of Free(where, name)")
+        _checks.require_instance(one, AbstractBodyChart, "Model", wanted=wanted, hint=hint)
+    _checks.require_instance(free, Sequence, "free", wanted="a sequence of Free(where, name)")
     for name, value, kind in (
         ("loss", loss, AbstractLoss),
         ("prior", prior, Entropic),
         ("integrator", integrator, AbstractIntegrator),
     ):
         if value is not None:
-            _checks.instance(value, kind, name)
+            _checks.require_instance(value, kind, name)
 
 
 def _require_own_names(slots: Sequence[Slot], charts: AbstractBodyChart | Bodies) -> None:
@@ -533,7 +533,7 @@ def filter_steps_of(model: Model) -> int:
 
 def require_one(model: PyTree) -> Model:
     """Return `model`; raise `TypeError` or `ValueError` unless it is one `Model`, not a batch."""
-    _checks.instance(model, Model, "model")
+    _checks.require_instance(model, Model, "model")
     records, rate = model.records, model.reference.rate
     shapes = {records.t.shape, *(reading.mask.shape for reading in records.readings)}
     if len(shapes) > 1 or records.t.ndim != 2 or rate.shape != records.t.shape[:1]:
@@ -541,9 +541,9 @@ def require_one(model: PyTree) -> Model:
             "model: wanted one, as Model(recording, …) makes it, got times and masks of shapes "
             f"{sorted(shapes)}; give many one by one"
         )
-    _checks.numbers(records.t, "model")
-    if _checks.known(rate):
-        _checks.finite(rate, "model: its typical rate")
+    _checks.numeric_array(records.t, "model")
+    if _checks.is_known(rate):
+        _checks.require_finite(rate, "model: its typical rate")
     return model
 
 
@@ -551,7 +551,7 @@ def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
     """Return the free numbers x; raise an error unless they are numbers of this model."""
     require_one(model)
     hint = "model.start(body) makes them"
-    numbers = _checks.numbers(x, "x")
+    numbers = _checks.numeric_array(x, "x")
     if numbers.shape != (model.size,):
         raise ValueError(
             f"x: wanted the {model.size} free numbers of this model, got shape {numbers.shape}; "
@@ -561,8 +561,8 @@ def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
         raise TypeError(
             f"x: wanted {model.records.t.dtype}, as the recordings have, got {numbers.dtype}"
         )
-    if _checks.known(numbers):
-        _checks.finite(numbers, "x")
+    if _checks.is_known(numbers):
+        _checks.require_finite(numbers, "x")
     return numbers
 
 
@@ -672,7 +672,9 @@ def _by_body(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str
                 f"charts of {sorted(body)}"
             )
         for chart in body.values():
-            _checks.instance(chart, AbstractBodyChart, "body", wanted="a chart such as Tensor()")
+            _checks.require_instance(
+                chart, AbstractBodyChart, "body", wanted="a chart such as Tensor()"
+            )
         rows, of = [], []
         for name in body:
             of_body = recording[name]
@@ -693,8 +695,8 @@ def _require_recordings(recordings: Sequence[Any]) -> None:
     if not recordings:
         raise ValueError("Model: wanted at least one Recording, got an empty sequence")
     for item in recordings:
-        _checks.instance(item, Recording, "Model", wanted="a Recording")
-        if not _checks.known((item.t, [reading.values for reading in item.readings])):
+        _checks.require_instance(item, Recording, "Model", wanted="a Recording")
+        if not _checks.is_known((item.t, [reading.values for reading in item.readings])):
             raise TypeError(
                 "recording: wanted known readings, got traced ones; make the Model outside "
                 "of jax.jit, jax.grad and jax.vmap, and give it to them as an argument"
@@ -705,7 +707,7 @@ def _require_recordings(recordings: Sequence[Any]) -> None:
                 "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
                 f"shapes {sorted(lengths)}; for many give a sequence"
             )
-        _checks.numbers(item.t, "recording")
+        _checks.numeric_array(item.t, "recording")
 
 
 def _numbers(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " chart"]:
@@ -713,11 +715,11 @@ def _numbers(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " char
     if body is None:
         return _zeros(chart.size)
     one = validation.single(body, (Inertia, MassProperties), "body")
-    if _checks.known(one):
-        jax.tree.map(lambda leaf: _checks.finite(leaf, "body"), one)
+    if _checks.is_known(one):
+        jax.tree.map(lambda leaf: _checks.require_finite(leaf, "body"), one)
     vector = eqx.filter_jit(chart.vector)(one)
-    if _checks.known(vector):
-        _checks.refuse(
+    if _checks.is_known(vector):
+        _checks.error_if(
             vector,
             not np.isfinite(vector).all(),
             f"body: {type(chart).__name__} has no finite numbers for it; wanted principal "

@@ -90,8 +90,10 @@ class FixedSteps(AbstractIntegrator):
     last: Int[Array, ""] | None = eqx.field(default=None, repr=False)
 
     def __check_init__(self):
-        _checks.whole(self.substeps, "substeps", 1)
-        _checks.instance(self.solver, AbstractExplicit, "solver", wanted="one of rigidjax.solvers")
+        _checks.integer(self.substeps, "substeps", 1)
+        _checks.require_instance(
+            self.solver, AbstractExplicit, "solver", wanted="one of rigidjax.solvers"
+        )
 
     def states(
         self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
@@ -108,7 +110,7 @@ class FixedSteps(AbstractIntegrator):
 
 def _tolerance(name: str) -> Callable[[ScalarLike], Array]:
     """Return a converter of a field to an array, so that another value compiles no new program."""
-    return lambda value: jnp.asarray(_checks.number(value, name), jnp.result_type(float))
+    return lambda value: jnp.asarray(_checks.known_float(value, name), jnp.result_type(float))
 
 
 class Adaptive(AbstractIntegrator):
@@ -125,8 +127,8 @@ class Adaptive(AbstractIntegrator):
     atol: Float[Array, ""] = eqx.field(converter=_tolerance("atol"), default=1e-12)
 
     def __check_init__(self):
-        _checks.positive(self.rtol, "rtol")
-        _checks.not_negative(self.atol, "atol")
+        _checks.positive_float(self.rtol, "rtol")
+        _checks.nonnegative_float(self.atol, "atol")
 
     def states(
         self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
@@ -366,7 +368,7 @@ def simulate_readings(
     (2, 3)
     """
     order = "the order is sensor, body, state0, ts"
-    _checks.instance(state0, (Spin, Attitude, Rigid), "state0", hint=order)
+    _checks.require_instance(state0, (Spin, Attitude, Rigid), "state0", hint=order)
     several = isinstance(sensor, Sequence)
     sensors = tuple(sensor) if several else (sensor,)
     if not sensors:
@@ -377,7 +379,7 @@ def simulate_readings(
     sol = simulate(body_of_equations(body, type(state0)), start, ts, torque)
     states = sol.ys if sol.own is None else Coupled(sol.ys, sol.own)
     count = len(sensors)
-    keys = [None] * count if key is None else jax.random.split(_checks.key(key), count)
+    keys = [None] * count if key is None else jax.random.split(_checks.random_key(key), count)
     motion = body, torque, sol.ts, start, states
     out = tuple(_readings(one, *motion, key=own) for one, own in zip(sensors, keys, strict=True))
     return out if several else out[0]
@@ -418,7 +420,7 @@ def _readings(
 def _require_sensor(sensor: PyTree, state0: State, key: object) -> None:
     """Raise an error for anything but a sensor that can read this state, with noise for a key."""
     name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
-    _checks.instance(sensor, AbstractSensor, "sensor", wanted=wanted)
+    _checks.require_instance(sensor, AbstractSensor, "sensor", wanted=wanted)
     if not isinstance(state0, sensor.feels):
         raise TypeError(
             f"{name} needs a state with {sensor.feels.__name__}, got {type(state0).__name__}; take "

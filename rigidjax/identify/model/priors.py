@@ -36,7 +36,7 @@ class AbstractLoss(eqx.Module):
         """Return dρ/ds, the weight of the reading in the normal equations: 1 for a small error."""
 
 
-_scale = partial(_checks.positive, name="scale")
+_scale = partial(_checks.positive_float, name="scale")
 
 
 class SoftL1(AbstractLoss):
@@ -89,7 +89,7 @@ class Huber(AbstractLoss):
 
 def _weight(value: float) -> Scalar:
     """Return the weight of a prior as an array; raise `ValueError` unless it is positive."""
-    return jnp.asarray(_checks.positive(value, "weight"), jnp.result_type(float))
+    return jnp.asarray(_checks.positive_float(value, "weight"), jnp.result_type(float))
 
 
 class Entropic(eqx.Module):

@@ -39,7 +39,7 @@ class Walk(eqx.Module):
         self, where: Callable[[Scene], Any], deviation: NumbersLike, density: NumbersLike = 0.0
     ):
         words = "of a scene, such as lambda s: s.sensors[0].bias"
-        self.where = _checks.function(where, "where", words)
+        self.where = _checks.require_function(where, "where", words)
         self.deviation = not_negative(deviation, "deviation")
         self.density = not_negative(density, "density")
 
@@ -61,10 +61,10 @@ class Drift(eqx.Module):
 def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]:
     """Return the drift of each `Walk` in a scene."""
     wanted = "a sequence of Walk(where, deviation)"
-    _checks.instance(walks, (Walk, Sequence), "walks", wanted=wanted)
+    _checks.require_instance(walks, (Walk, Sequence), "walks", wanted=wanted)
     drifts: list[Drift] = []
     for walk in (walks,) if isinstance(walks, Walk) else tuple(walks):
-        _checks.instance(walk, Walk, "walks", wanted=wanted)
+        _checks.require_instance(walk, Walk, "walks", wanted=wanted)
         path, value = leaf_at(walk.where, scene, "Walk", "the sensor")
         if path[0].name != "sensors":
             raise ValueError(
@@ -89,10 +89,10 @@ def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
 
 def not_negative(value: NumbersLike, name: str) -> Array:
     """Return finite numbers, if none is below zero; else raise `ValueError`."""
-    array, wanted = _checks.numbers(value, name), "a finite number that is not below zero"
+    array, wanted = _checks.numeric_array(value, name), "a finite number that is not below zero"
     if not array.size:
         raise ValueError(f"{name}: wanted {wanted}, got none")
-    return _checks.sign(array, name, wanted, zero=True)
+    return _checks.require_sign(array, name, wanted, zero=True)
 
 
 def in_shape(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:

@@ -59,9 +59,12 @@ class Descent(eqx.Module):
         import optax
 
         wanted = "an optimiser of optax such as optax.adam(1e-2)"
-        _checks.instance(optimiser, optax.GradientTransformation, "Descent", wanted=wanted)
+        _checks.require_instance(optimiser, optax.GradientTransformation, "Descent", wanted=wanted)
         self.optimiser = optimiser
-        self.steps, self.batch = _checks.whole(steps, "steps", 1), _checks.whole(batch, "batch", 1)
+        self.steps, self.batch = (
+            _checks.integer(steps, "steps", 1),
+            _checks.integer(batch, "batch", 1),
+        )
 
 
 def descend(
@@ -104,12 +107,14 @@ def descend(
     >>> bool(jnp.abs(model.values(x)["drag"] - 0.3).max() < 0.02)
     True
     """
-    _checks.instance(model, Model, "descend", wanted="a Model")
-    _checks.instance(descent, Descent, "descend", wanted="a Descent(optimiser, steps=…, batch=…)")
+    _checks.require_instance(model, Model, "descend", wanted="a Model")
+    _checks.require_instance(
+        descent, Descent, "descend", wanted="a Descent(optimiser, steps=…, batch=…)"
+    )
     x = model.start() if initial is None else require_numbers(model, initial)
-    random: Any = jax.random.key(0) if key is None else _checks.key(key)
+    random: Any = jax.random.key(0) if key is None else _checks.random_key(key)
     if progress is not None:
-        _checks.function(progress, "progress", "of a line of text, such as print")
+        _checks.require_function(progress, "progress", "of a line of text, such as print")
     return descend_from(x, model, first_noise(model), descent, random, progress)[0]
 
 

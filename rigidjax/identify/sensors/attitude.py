@@ -91,7 +91,7 @@ def _unit(world: NumbersLike) -> Vec3:
     vector = base.required("world")(world)
     length = jnp.sqrt(dot(vector, vector))
     words = "world: wanted a direction, got a vector of length zero"
-    return vector / _checks.refuse(length, ~(length > 0), words)
+    return vector / _checks.error_if(length, ~(length > 0), words)
 
 
 class Direction(ClockedSensor):

@@ -104,7 +104,7 @@ def required(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]
     def converted(value: NumbersLike) -> Array:
         if value is None:
             raise ValueError(f"{name}: wanted three numbers, got None")
-        return _checks.finite(_checks.floating(value, shape, name), name)
+        return _checks.require_finite(_checks.array_of_shape(value, shape, name), name)
 
     return converted
 
@@ -130,12 +130,12 @@ def positive(value: NumbersLike | None, name: str, wanted: str, size: int) -> Ar
     """
     if value is None:
         return None
-    numbers = _checks.numbers(value, name).astype(jnp.result_type(float))
+    numbers = _checks.numeric_array(value, name).astype(jnp.result_type(float))
     if numbers.shape not in ((), (size,)):
         count = {1: "one", 2: "two", 3: "three"}.get(size, str(size))
         raise ValueError(f"{name}: wanted one number or {count}, got shape {numbers.shape}")
     numbers = jnp.broadcast_to(numbers, (size,))
-    return _checks.refuse(numbers, ~(numbers > 0), f"{name}: wanted {wanted}")
+    return _checks.error_if(numbers, ~(numbers > 0), f"{name}: wanted {wanted}")
 
 
 class Jitter(eqx.Module):
@@ -157,7 +157,7 @@ def jitter_of(jitter: object) -> Jitter | None:
         if jitter != "estimated":
             raise ValueError(f"jitter: wanted {wanted}, got {jitter!r}")
         return Jitter(jnp.zeros(()), True)
-    return Jitter(jnp.asarray(_checks.positive(jitter, "jitter", wanted)), False)
+    return Jitter(jnp.asarray(_checks.positive_float(jitter, "jitter", wanted)), False)
 
 
 class ClockedSensor(AbstractSensor):

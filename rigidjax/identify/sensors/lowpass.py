@@ -46,10 +46,10 @@ class LowPass(eqx.Module):
     order: int = eqx.field(static=True)
 
     def __init__(self, cutoff: ScalarLike, order: int = 1):
-        cutoff = _checks.floating(cutoff, (), "cutoff")
-        cutoff = _checks.sign(cutoff, "cutoff", "a positive frequency, Hz")
+        cutoff = _checks.array_of_shape(cutoff, (), "cutoff")
+        cutoff = _checks.require_sign(cutoff, "cutoff", "a positive frequency, Hz")
         self.cutoff = cutoff.astype(jnp.result_type(float))
-        if _checks.whole(order, "order", 1) > 2:
+        if _checks.integer(order, "order", 1) > 2:
             raise ValueError(f"order: wanted 1 or 2, got {order}")
         self.order = order
 
@@ -62,12 +62,12 @@ class LowPass(eqx.Module):
         `ValueError` for times that do not increase, NaN, and numbers whose cubes overflow, if they
         are known.
         """
-        values = _checks.numbers(values, "values")
+        values = _checks.numeric_array(values, "values")
         if values.ndim != 2:
             raise ValueError(f"values: wanted (T, k), got shape {values.shape}")
-        t = _checks.floating(t, values.shape[:1], "t", hint="a time for each row of values")
+        t = _checks.array_of_shape(t, values.shape[:1], "t", hint="a time for each row of values")
         t = t.astype(values.dtype)
-        if _checks.known((t, values)):
+        if _checks.is_known((t, values)):
             _require_in_range(np.asarray(t, float), np.asarray(values, float))
         if values.shape[0] < 2:
             return values
@@ -97,7 +97,7 @@ class LowPass(eqx.Module):
 def lowpass_of(lowpass: object) -> LowPass | None:
     """Return `lowpass` if it is a `LowPass` or `None`; raise `TypeError` for others."""
     wanted = "LowPass(cutoff in Hz) or None"
-    return _checks.instance(lowpass, (LowPass, NoneType), "lowpass", wanted=wanted)
+    return _checks.require_instance(lowpass, (LowPass, NoneType), "lowpass", wanted=wanted)
 
 
 def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:

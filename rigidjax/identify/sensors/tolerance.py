@@ -13,7 +13,7 @@ def _deviation(value: NumbersLike | None) -> Scalar | None:
     if value is None:
         return None
     wanted = "a positive standard deviation"
-    return jnp.asarray(np.asarray(_checks.positive(value, "tolerance", wanted)))
+    return jnp.asarray(np.asarray(_checks.positive_float(value, "tolerance", wanted)))
 
 
 class Tolerance(eqx.Module):

@@ -114,7 +114,7 @@ class ChangingInertia(eqx.Module):
         if hasattr(inertia, "feels"):
             base.require_law(inertia, "inertia")
         else:
-            _checks.function(inertia, "inertia", "of time to (3, 3), kg m²")
+            _checks.require_function(inertia, "inertia", "of time to (3, 3), kg m²")
             require_no_jumps(inertia, "inertia")
         self.inertia = inertia
         if torque is not None:
@@ -134,7 +134,7 @@ class ChangingInertia(eqx.Module):
         seen = (t, state, body) if hasattr(self.inertia, "feels") else (t,)
         found = self.inertia(*seen)
         found = found.tensor if isinstance(found, Inertia) else found
-        return _checks.floating(found, (3, 3), "inertia(t)")
+        return _checks.array_of_shape(found, (3, 3), "inertia(t)")
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: Body) -> Vec3 | base.Wrench:
         omega = state.omega

@@ -148,10 +148,10 @@ class Rotors(base.AbstractForce):
         speeds: NumbersLike | Callable[..., Any],
     ):
         count = base.count_of(positions, "positions", "rotor")
-        self.positions = _checks.finite_floating(positions, (count, 3), "positions")
+        self.positions = _checks.finite_array(positions, (count, 3), "positions")
         self.directions = base.unit_rows(directions, "directions", count)
-        self.spins = _checks.finite_floating(spins, (count,), "spins")
-        if _checks.known(self.spins) and (abs(np.asarray(self.spins)) != 1).any():
+        self.spins = _checks.finite_array(spins, (count,), "spins")
+        if _checks.is_known(self.spins) and (abs(np.asarray(self.spins)) != 1).any():
             raise ValueError(f"spins: wanted 1 or -1 for each rotor, got {np.asarray(self.spins)}")
         self.thrust, self.drag = (
             base.one_or_each(thrust, count, "thrust"),

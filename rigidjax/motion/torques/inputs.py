@@ -72,12 +72,12 @@ class Delayed(eqx.Module):
     delay: Float[Array, ""]
 
     def __init__(self, source: object, delay: ScalarLike):
-        source = _checks.function(source, "source", "of time")
+        source = _checks.require_function(source, "source", "of time")
         if has_states(source):
             words = "has states, whose past is not kept; delay its input"
             words += ": Lagged(Delayed(source, delay), time)"
             raise TypeError(f"Delayed: {type(source).__name__} {words}")
-        self.delay = _checks.finite_floating(delay, (), "delay").astype(jnp.result_type(float))
+        self.delay = _checks.finite_array(delay, (), "delay").astype(jnp.result_type(float))
         if isinstance(source, Delayed):
             source, self.delay = source.source, self.delay + source.delay
         if not isinstance(source, Input) and inputs_of(source):
@@ -85,7 +85,7 @@ class Delayed(eqx.Module):
             raise TypeError(f"Delayed: {type(source).__name__} {words}")
         self.source = source
         times = getattr(source, "times", None)
-        if times is not None and _checks.known((times, self.delay)):
+        if times is not None and _checks.is_known((times, self.delay)):
             length = float(times[-1] - times[0])
             if abs(float(self.delay)) >= length:
                 words = f"{float(self.delay):.6g} s is as long as the record of {length:.6g} s"
@@ -123,9 +123,11 @@ class Lagged(eqx.Module):
     start: Array | None
 
     def __init__(self, source: object, time: NumbersLike, start: NumbersLike | None = None):
-        self.source = _checks.function(source, "source", "of time")
+        self.source = _checks.require_function(source, "source", "of time")
         kind = jnp.result_type(float)
-        time = _checks.if_known(_checks.sign, _channels(time, "time"), "time", "a positive time, s")
+        time = _checks.check_if_known(
+            _checks.require_sign, _channels(time, "time"), "time", "a positive time, s"
+        )
         self.time = time.astype(kind)
         self.start = None if start is None else _channels(start, "start").astype(kind)
 
@@ -140,7 +142,7 @@ class Lagged(eqx.Module):
 
     def rate(self, t: ScalarLike, own: Array, state: PyTree, body: Body) -> Array:
         """Return dy/dt, in the source's unit per second."""
-        wanted = _checks.numbers(self.source(t), "source(t)").astype(own.dtype)
+        wanted = _checks.numeric_array(self.source(t), "source(t)").astype(own.dtype)
         if wanted.shape != own.shape:
             raise ValueError(f"Lagged: start has the shape {own.shape}, the source {wanted.shape}")
         return (wanted - own) / self.time
@@ -167,10 +169,10 @@ def require_no_jumps(source: PyTree, name: str) -> None:
 
 
 def _channels(value: NumbersLike, name: str) -> Array:
-    array = _checks.numbers(value, name)
+    array = _checks.numeric_array(value, name)
     if not array.size:
         raise ValueError(f"{name}: wanted one number, or one a channel, got none")
-    return _checks.if_known(_checks.finite, array, name)
+    return _checks.check_if_known(_checks.require_finite, array, name)
 
 
 class Row(NamedTuple):

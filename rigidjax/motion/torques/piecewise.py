@@ -171,7 +171,7 @@ def _rows(
     `extra` is the number of times beyond the number of rows, of 3 numbers each; with `None` both
     numbers are equal and rows may have any shape.
     """
-    edges, rows = _checks.rows(times, (), name), _checks.numbers(values, other)
+    edges, rows = _checks.array_of_rows(times, (), name), _checks.numeric_array(values, other)
     count = edges.shape[0]
     if count < 2:
         raise ValueError(f"{name}: wanted at least 2 times, shape (n,), got {edges.shape}")
@@ -183,12 +183,12 @@ def _rows(
         advice = pieces if extra else lines
         words = f"{other}: wanted {count - extra} rows of 3"
         raise ValueError(f"{words}, got shape {rows.shape}; {advice}")
-    edges, rows = _checks.finite(edges, name), _checks.finite(rows, other)
+    edges, rows = _checks.require_finite(edges, name), _checks.require_finite(rows, other)
     ordered = _checks.namespace(edges).asarray(edges)
     falling = ordered[1:] <= ordered[:-1]
     where = ""
-    if _checks.known(falling) and falling.any():
+    if _checks.is_known(falling) and falling.any():
         where = f"; {name}[{int(np.argmax(falling)) + 1}] is not above the one before"
-    edges = _checks.refuse(edges, falling.any(), f"{name}: wanted increasing times, s{where}")
+    edges = _checks.error_if(edges, falling.any(), f"{name}: wanted increasing times, s{where}")
     dtype = jnp.result_type(edges, rows)
     return edges.astype(dtype), rows.astype(dtype)

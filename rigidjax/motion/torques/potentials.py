@@ -91,14 +91,14 @@ class GravityGradient(base.OfTime):
     harmonics: tuple[Float[Array, " orders"], ...]
 
     def __init__(self, mu: ScalarLike, position: object, harmonics: Sequence[ArrayLike] = ()):
-        self.mu = _checks.finite_floating(mu, (), "mu")
+        self.mu = _checks.finite_array(mu, (), "mu")
         self.position = base.constant_or_callable(position, "position")
         self.harmonics = tuple(
-            _checks.finite_floating(row, (2 * n + 1,), f"harmonics: degree {n}")
+            _checks.finite_array(row, (2 * n + 1,), f"harmonics: degree {n}")
             for n, row in enumerate(harmonics, 3)
         )
         at: Any = self.position
-        if not callable(at) and _checks.known(at) and not np.asarray(at).any():
+        if not callable(at) and _checks.is_known(at) and not np.asarray(at).any():
             words = "the vector between the body and the central body"
             raise ValueError(f"position: wanted {words}, got zero")
 
@@ -236,7 +236,7 @@ class FromPotential(base.AbstractTorque):
     potential: Callable[[Any], Any]
 
     def __init__(self, potential: Callable[[Any], Any]):
-        self.potential = _checks.function(potential, "potential", "q → U, J")
+        self.potential = _checks.require_function(potential, "potential", "q → U, J")
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
         """Return the potential energy, J."""
@@ -247,4 +247,4 @@ class FromPotential(base.AbstractTorque):
         return -0.5 * quaternion.multiply(quaternion.conjugate(state.q), slope)[1:]
 
     def _value(self, q):
-        return _checks.floating(self.potential(q), (), "potential", hint="one number, J")
+        return _checks.array_of_shape(self.potential(q), (), "potential", hint="one number, J")

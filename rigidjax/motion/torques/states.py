@@ -144,4 +144,4 @@ def _stop(node: PyTree) -> bool:
 
 
 def _numbers(tree: PyTree, name: str, dtype: DTypeLike) -> Any:
-    return jax.tree.map(lambda leaf: _checks.numbers(leaf, name).astype(dtype), tree)
+    return jax.tree.map(lambda leaf: _checks.numeric_array(leaf, name).astype(dtype), tree)
