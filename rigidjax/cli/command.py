@@ -355,7 +355,7 @@ def _logs(options: argparse.Namespace) -> int:
     except LogWarning as warning:
         return _error(f"{warning} (--strict)")
     for path, record in zip(options.logs, records, strict=True):
-        gaps = sum(int((~reading.seen).sum()) for reading in record.readings) + record.dropped
+        gaps = sum(int((~reading.host_mask).sum()) for reading in record.readings) + record.dropped
         words = f", {gaps} gap{'s' if gaps > 1 else ''}" if gaps else ""
         count, span = record.t.shape[0] + record.dropped, record.t[-1] - record.t[0]
         _print_line(f"{path}: {count} samples over {span:.4g} s{words}")

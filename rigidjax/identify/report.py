@@ -193,7 +193,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
                     )
                 },
             }
-            for one in fit.undetermined
+            for one in fit.undetermined_combinations
         ],
     }
 
@@ -205,9 +205,9 @@ def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
     """
     out = []
     for error, reading in zip(fit.residuals, fit.model.records.readings, strict=True):
-        kept = reading.kept
-        squares = np.where(kept, np.asarray(error).reshape(kept.shape) ** 2, 0.0)
-        mean = squares.sum(axis=(0, 1)) / np.maximum(kept.sum(axis=(0, 1)), 1)
+        mask = reading.channel_mask
+        squares = np.where(mask, np.asarray(error).reshape(mask.shape) ** 2, 0.0)
+        mean = squares.sum(axis=(0, 1)) / np.maximum(mask.sum(axis=(0, 1)), 1)
         sensor = reading.sensor
         out.append((type(sensor).__name__, [float(x) for x in np.sqrt(mean)], sensor.unit))
     return out

@@ -73,7 +73,7 @@ def _body_and_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties
         words = "wanted one body, got a Fit of several: give fit.body[name]"
         raise ValueError(f"inertia_ellipsoid: {words}")
     x = body.derivative_point
-    values, vectors = np.linalg.eigh(np.asarray(body.seen))
+    values, vectors = np.linalg.eigh(np.asarray(body.determined_covariance))
     # With a fixed seed one fit always gives one picture.
     steps = np.random.default_rng(0).standard_normal((samples, values.size))
     steps = jnp.asarray(steps * np.sqrt(np.maximum(values, 0.0)) @ vectors.T, x.dtype)

@@ -69,7 +69,7 @@ def _one_sensor(
     dense: tuple[np.ndarray, PyTree] | None,
     units: tuple[float, float, str],
 ) -> None:
-    (seconds, rate, rate_unit), seen, sensor = units, reading.seen, reading.sensor
+    (seconds, rate, rate_unit), seen, sensor = units, reading.host_mask, reading.sensor
     t = np.asarray(ts) / seconds
     values = np.asarray(reading.values).reshape(len(t), -1)
     names: tuple[str, ...] = ("x", "y", "z")[: values.shape[1]]

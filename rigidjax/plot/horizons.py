@@ -27,17 +27,17 @@ def horizons(
 ) -> Any:
     """Draw open-loop errors against the horizon, one picture for each kind of state.
 
-    **Arguments:** `found` a `Horizons`, as `identify.predict_windows` and `Windows.held` return
-    them, or several by name, to compare models, windows, or a prediction that holds the start;
-    `step` s between samples, for a scale of time instead of steps; `measure` `mean_absolute` (of a
-    component), `mean_norm` or `rms` (of the vector); `title`; `ax` one for each kind. Both scales
-    are linear, since errors start at zero. **Returns** the axes, one for each of position,
+    **Arguments:** `found` a `Horizons`, as `identify.predict_windows` and `Windows.held_horizons`
+    return them, or several by name, to compare models, windows, or a prediction that holds the
+    start; `step` s between samples, for a scale of time instead of steps; `measure` `mean_absolute`
+    (of a component), `mean_norm` or `rms` (of the vector); `title`; `ax` one for each kind. Both
+    scales are linear, since errors start at zero. **Returns** the axes, one for each of position,
     velocity, attitude, body rate in the state. **Raises** `ValueError` for no `Horizons`, for kinds
     that differ, and for a step that is not positive.
 
     >>> t = np.arange(8.0)
     >>> cut = rj.identify.windows(t, rj.Spin(np.ones((8, 3)) * t[:, None]), length=3)
-    >>> horizons({"held": cut.held()})[0].get_ylabel()
+    >>> horizons({"held": cut.held_horizons()})[0].get_ylabel()
     'body rate, rad/s'
     """
     named = dict(found) if isinstance(found, Mapping) else {"": found}

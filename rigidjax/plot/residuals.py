@@ -34,7 +34,7 @@ def residuals(
     ax = several_axes(ax, (count, 4), nrows=count, ncols=4, figsize=(14, 3.1 * count))
     t = np.asarray(record.t) / seconds
     for row, reading, errors, noise in zip(ax, record.readings, left, noises, strict=True):
-        _one_sensor(row, t, errors / noise, np.asarray(reading.seen))
+        _one_sensor(row, t, errors / noise, np.asarray(reading.host_mask))
         row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
         row[0].set_xlabel(f"time, {time_unit}")
         row[3].set_xlabel(f"frequency, {'Hz' if time_unit == 's' else f'1/{time_unit}'}")

@@ -50,7 +50,9 @@ def of_fit(found: Any, index: object) -> tuple[Any, list[np.ndarray], list[np.nd
         raise ValueError(f"index: wanted one of {count} recordings, from 0, got {index}")
     record, which = found.model.recordings[index], ... if count == 1 else index
     errors = [np.asarray(e[which])[: record.t.shape[0]] for e in found.residuals]
-    lates = [0.0 if reading.late is None else reading.late for reading in record.readings]
+    lates = [
+        0.0 if reading.jitter_error is None else reading.jitter_error for reading in record.readings
+    ]
     noises = zip(found.noise, lates, strict=True)
     return record, errors, [np.hypot(noise[which], late) for noise, late in noises]
 

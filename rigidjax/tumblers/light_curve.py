@@ -172,7 +172,7 @@ def fit_light_curve(
     starts = starts_of(model, reading, t, squares, sigma, pairs.frequencies[:used])
     say(f"{used} pairs of frequencies, χ² {pairs.misfits[0]:.6g} of {pairs.dof}")
     say(f"{len(starts)} starts")
-    whole = stacking.of_few_lengths(model)
+    whole = stacking.pad_to_few_lengths(model)
     ends = search_from(whole, starts, noise_of(reading, flux, pairs.scatter), tolerance)
     aliases = _aliases(whole, ends)
     say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
@@ -286,14 +286,16 @@ def _with_shape(best: Fit) -> Fit:
     kept = weight > 0
     white = uncertainty.white_covariance(linear).covariance
     shift = white @ slopes[kept].T @ change[kept].reshape(-1, 9)
-    covariance, seen = (np.asarray(c) + shift @ shift.T for c in (best.covariance, best.seen))
+    covariance, seen = (
+        np.asarray(c) + shift @ shift.T for c in (best.covariance, best.determined_covariance)
+    )
     null = np.asarray(best.null_directions)
     numbers = values_and_slopes(best.model, best.x, best.near)
-    freedom = best.degrees(numbers[1])
+    freedom = best.degrees_of_freedom(numbers[1])
     return dataclasses.replace(
         best,
         covariance=jnp.asarray(covariance),
-        seen=jnp.asarray(seen),
+        determined_covariance=jnp.asarray(seen),
         covariance_kind=f"sandwich: a shape {SHAPE:.0%} off the ellipsoid; {best.covariance_kind}",
         quantities=quantities(best.model, numbers, seen, null, best.limits, freedom),
     )
@@ -303,7 +305,9 @@ def _result(best: Fit, aliases: list[Alias], pairs: TwoFrequencies, cut: bool) -
     """Return the result from the `best` fit and all motions; `cut` if not all pairs were tried."""
     slopes, wider = np.asarray(_slopes(best.derivative_point, best.model)), _with_shape(best)
     own, deviations = (
-        standard_deviations(slopes, np.asarray(one.seen), np.asarray(one.null_directions))
+        standard_deviations(
+            slopes, np.asarray(one.determined_covariance), np.asarray(one.null_directions)
+        )
         for one in (best, wider)
     )
     # A search that stopped on its way to the best motion is no rival.
@@ -312,7 +316,7 @@ def _result(best: Fit, aliases: list[Alias], pairs: TwoFrequencies, cut: bool) -
     first = _alias(best.model, best.x, aliases[0].cost)
     others = [alias for alias in aliases if not _is_same_motion(alias, first, near)]
     # Misfits count for less if the errors are larger than the noise, or autocorrelated.
-    count = int(best.model.records.readings[0].seen.sum())
+    count = int(best.model.records.readings[0].host_mask.sum())
     margin = MARGIN * max(1.0, 2.0 * first.cost / count) * max(best.correlation, 1.0)
     marked = tuple(
         eqx.tree_at(lambda a: a.explains, alias, alias.cost <= first.cost + margin)

@@ -38,7 +38,7 @@ def relative_flux(
     The noise is `None` if it is not known.
     """
     t = np.asarray(model.records.t[0])
-    mask: np.ndarray = reading.seen
+    mask: np.ndarray = reading.host_mask
     sensor: Any = reading.sensor
     values = np.asarray(reading.values, float)[mask]
     noise = None if sensor.noise is None else float(np.asarray(sensor.noise)[0])

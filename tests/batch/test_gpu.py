@@ -137,15 +137,15 @@ def test_a_small_fit_on_a_machine_with_a_gpu(monkeypatch):
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), jnp.ones((9, 3))))
     model = rj.identify.Model(record, rj.identify.PrincipalRatios())
     cpu = jax.devices("cpu")[0]
-    assert fits._quicker_place(model) is None
+    assert fits._faster_device(model) is None
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert platform() == "gpu"
-    assert fits._quicker_place(model) == cpu
+    assert fits._faster_device(model) == cpu
     with jax.default_device(cpu):
         assert platform() == "cpu"
-        assert fits._quicker_place(model) is None
+        assert fits._faster_device(model) is None
     monkeypatch.setattr(fits, "_FEW", 10)
-    assert fits._quicker_place(model) is None
+    assert fits._faster_device(model) is None
 
 
 def test_the_benchmark_in_small():

@@ -97,7 +97,7 @@ def test_a_known_jitter_widens_what_is_expected():
         record = identify.Recording(TS, (identify.Gyro(SIGMA, jitter=jitter), np.ones((101, 3))))
         problem = identify.Model(record, identify.PrincipalRatios())
         plan = problem.start(BODY, [5.0, 4.0, 4.0])
-        return identify.expected(problem, plan)[0].deviation
+        return identify.expected_quantities(problem, plan)[0].deviation
 
     assert 1.05 * deviation(None) < deviation(TAU)
     with pytest.raises(ValueError, match="known jitter"):
@@ -136,7 +136,7 @@ def test_where_jitter_has_no_meaning_it_is_refused_in_words():
 def test_the_log_density_is_that_of_the_full_covariance():
     found = fitted(identify.Gyro(SIGMA, jitter="estimated"), throw(3))
     wanted = 0.0
-    late = np.asarray(found.model.records.readings[0].late[0])
+    late = np.asarray(found.model.records.readings[0].jitter_error[0])
     for e, v in zip(np.asarray(found.residuals[0]), late, strict=True):
         covariance = SIGMA**2 * np.eye(3) + np.outer(v, v)
         wanted -= 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]

@@ -167,7 +167,7 @@ def stand_in():
     errors = 0.01 * np.random.default_rng(2).standard_normal((101, 3))
     errors[7] = 1.0
     reading = SimpleNamespace(
-        sensor=rj.identify.Gyro(0.01), seen=np.ones(101, dtype=bool), late=None
+        sensor=rj.identify.Gyro(0.01), host_mask=np.ones(101, dtype=bool), jitter_error=None
     )
     shaped = lambda p: rj.Inertia.from_second_moment(jnp.diag(jnp.exp(p)))
     return SimpleNamespace(
@@ -181,7 +181,7 @@ def stand_in():
         noise=(np.full(3, 0.01),),
         x=jnp.zeros(3),
         derivative_point=jnp.zeros(3),
-        seen=0.01 * np.eye(3),
+        determined_covariance=0.01 * np.eye(3),
         body=shaped(jnp.zeros(3)),
     )
 

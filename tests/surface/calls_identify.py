@@ -125,7 +125,7 @@ row(
     transforms=("jit", "grad"),
 )
 row(
-    "identify.expected",
+    "identify.expected_quantities",
     lambda: dict(model=s.model(), x=plan()),
     groups=("stranger", "nan"),
     **HOST,

@@ -88,7 +88,7 @@ def test_a_fit_and_a_design():
     assert fit.ok and abs(fit.chi2 - fit.dof) < 5 * np.sqrt(2 * fit.dof)
     moments = np.asarray(BODY.moments)
     truth = {"Ix/Iz": moments[0] / moments[2], "Iy/Iz": moments[1] / moments[2], "level": 0.0}
-    planned = identify.expected(problem, fit.x)
+    planned = identify.expected_quantities(problem, fit.x)
     for quantity, bound in zip(fit.quantities, planned, strict=True):
         np.testing.assert_allclose(quantity.deviation, bound.deviation, rtol=0.2)
         if quantity.name in truth:

@@ -309,7 +309,7 @@ class Filtered(eqx.Module):
         (Bar-Shalom, Li and Kirubarajan, Estimation (2001), §5.4).
         """
         return tuple(
-            jnp.sum(jnp.where(r.seen, r.innovation**2 / r.variance, 0), -1) for r in self.readings
+            jnp.sum(jnp.where(r.mask, r.innovation**2 / r.variance, 0), -1) for r in self.readings
         )
 
 
@@ -526,8 +526,8 @@ def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Arra
     t, times = beliefs.t, jnp.arange(beliefs.t.shape[0])
     lost = jnp.zeros(t.shape, bool)
     for read in reads:
-        size = jnp.where(read.seen, read.innovation**2, 0) > LOST_BEYOND**2 * read.variance
-        seen = read.seen.any(-1)
+        size = jnp.where(read.mask, read.innovation**2, 0) > LOST_BEYOND**2 * read.variance
+        seen = read.mask.any(-1)
         bad = seen & size.any(-1)
         good = seen & ~bad
         since = lax.cummax(jnp.where(good, t, jnp.where(times == 0, t0, -jnp.inf)))

@@ -162,7 +162,7 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
         variance = jnp.diagonal(estimate.kick_covariance, axis1=1, axis2=2)[:, mine]
         pushes.append(Push(size * estimate.kicks[:, mine], size * jnp.sqrt(variance)))
     belief = Belief(stops.t, jax.tree.map(lambda leaf: leaf[1:], path), estimate.root[1:])
-    last_read = Read(estimate.innovation[1:], estimate.variance[1:], kept[1].seen)
+    last_read = Read(estimate.innovation[1:], estimate.variance[1:], kept[1].mask)
     reads = steps.by_sensor(sensors, last_read)
     status = jnp.where(jnp.isfinite(change), status, 2)
     total = estimate.log_likelihood

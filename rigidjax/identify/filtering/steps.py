@@ -275,12 +275,12 @@ class Read(NamedTuple):
     """The numbers that a filter read of one sensor.
 
     **Fields:** `innovation` each number minus its prediction from all numbers read before;
-    `variance` of the innovation; `seen` whether the number was read.
+    `variance` of the innovation; `mask` whether the number was read.
     """
 
     innovation: Float[Array, "*times k"]
     variance: Float[Array, "*times k"]
-    seen: Bool[Array, "*times k"]
+    mask: Bool[Array, "*times k"]
 
 
 def by_sensor(sensors: Sequence[AbstractSensor], read: Read) -> tuple[Read, ...]:
@@ -313,7 +313,7 @@ def steps_of(
     rate = float(np.linalg.norm(np.asarray(state.omega, float)))
     for reading in () if recording is None else recording.readings:
         if isinstance(reading.sensor, Gyro):
-            values = np.asarray(reading.values, float)[reading.seen]
+            values = np.asarray(reading.values, float)[reading.host_mask]
             rate = max(rate, float(np.quantile(np.linalg.norm(values, axis=1), 0.99)))
     times = [MEMORY_A_STEP * float(law.time) for law in coloured]
     longest = min([TURN_OF_A_FILTER_STEP / rate if rate > 0 else math.inf, *times])

@@ -65,7 +65,7 @@ def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
         limit: Any = getattr(sensor, "limit", None)
         noise: Any = sensor.noise
         one, full, wider = standardised(
-            reading.values, reading.mask, error, noise, limit, reading.late
+            reading.values, reading.mask, error, noise, limit, reading.jitter_error
         )
         scaled.append(one)
         # A channel at its limit counts by a probability, which has no logarithm of a variance.

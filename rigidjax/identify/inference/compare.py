@@ -97,9 +97,11 @@ def _log_squares(fit: Fit) -> np.ndarray:
     for index, (reading, e, sigma) in enumerate(
         zip(model.records.readings, white, fit.noises, strict=True)
     ):
-        if reading.late is not None:
-            wider = np.asarray(independent(e, reading.late / sigma[:, None])[1])[reading.seen]
-            squares = np.sum(np.asarray(e * sigma[:, None])[reading.seen] ** 2, axis=-1)
+        if reading.jitter_error is not None:
+            wider = np.asarray(independent(e, reading.jitter_error / sigma[:, None])[1])[
+                reading.host_mask
+            ]
+            squares = np.sum(np.asarray(e * sigma[:, None])[reading.host_mask] ** 2, axis=-1)
             out[index] = np.log(squares.mean()) + wider.mean()
     return out
 

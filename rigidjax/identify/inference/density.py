@@ -108,7 +108,7 @@ class LogDensity(eqx.Module):
                 f"{type(model.loss).__name__}; fit with loss=None"
             )
         if not np.isfinite(np.asarray(fit.covariance)).all():
-            what = " ".join(one.in_words for one in fit.undetermined)
+            what = " ".join(one.in_words for one in fit.undetermined_combinations)
             hint = "" if process is None else _GUESS
             raise ValueError(
                 "fit: neither the data nor a prior determine some direction, so there is no "
@@ -118,7 +118,7 @@ class LogDensity(eqx.Module):
         prior = None if known else jnp.asarray(_checks.positive_float(deviation, "deviation"))
         noise_slots, variances = _noise_slots(model)
         process_slots = [] if prior is None else _process_slots(process, prior)
-        total = sum(int(reading.seen.sum()) for reading in model.records.readings)
+        total = sum(int(reading.host_mask.sum()) for reading in model.records.readings)
         variances += [np.full(1, 1 / math.sqrt(total)) for _ in process_slots]
         new_slots = [*noise_slots, *process_slots]
         self.model, places = _with_slots(model, fit.noises, process, new_slots)
@@ -155,7 +155,7 @@ class LogDensity(eqx.Module):
 
 
 @eqx.filter_jit
-def of_draws(
+def map_draws(
     function: Callable[[Unpacked], Any], density: LogDensity, x: Float[Array, "m n"]
 ) -> Any:
     """Return `function(point)` of each draw x (m, n), as one program for densities of one form."""
@@ -171,7 +171,7 @@ def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
     for index, reading in enumerate(model.records.readings):
         if reading.sensor.noise is not None:
             continue
-        rows = np.bincount(groups, np.asarray(reading.seen.sum(axis=1)))
+        rows = np.bincount(groups, np.asarray(reading.host_mask.sum(axis=1)))
         # The logarithm of a standard deviation has the variance 1/(2n) for n numbers read.
         variances.append(0.5 / np.maximum(rows * reading.sensor.components, 1))
         path = _path_of(model, lambda s, index=index: s.sensors[index].noise)

@@ -20,7 +20,7 @@ from rigidjax.identify.uncertainty.covariance import covariance_root
 from rigidjax.identify.uncertainty.quantities import Quantity, quantities, values_and_slopes
 
 
-def expected(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, ...]:
+def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, ...]:
     """Return the quantities that a fit of planned recordings would report, with deviations.
 
     **Arguments:**
@@ -125,7 +125,8 @@ def best_first_rate(
       the rate, that is how fast the body can be thrown.
     - `max_steps`: the largest number of steps of the search.
 
-    **Returns** the rate (3,), and the result of `expected` for it. **Raises:** as `fisher`.
+    **Returns** the rate (3,), and the result of `expected_quantities` for it. **Raises:** as
+    `fisher`.
     """
     require_one(model)
     max_steps = _checks.integer(max_steps, "max_steps", 1)
@@ -135,7 +136,7 @@ def best_first_rate(
     size = jnp.sqrt(jnp.sum(start**2))
     best = _best_direction(model, body, start / size, size, max_steps)
     rate = size * best / jnp.sqrt(jnp.sum(best**2))
-    return rate, expected(model, model.start(body, rate))
+    return rate, expected_quantities(model, model.start(body, rate))
 
 
 @eqx.filter_jit

@@ -251,7 +251,7 @@ class Model(eqx.Module):
     def recordings(self) -> tuple[Recording, ...]:
         """Return the recordings, one by one."""
         return tuple(
-            stacking.cut(stacking.pick_records(self.records, index), count)
+            stacking.take_rows(stacking.pick_records(self.records, index), count)
             for index, count in enumerate(np.asarray(self.counts).tolist())
         )
 
@@ -478,7 +478,7 @@ def without_samples(model: Model) -> Model:
     once, and not again for recordings of another length.
     """
     records = jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, model.records)
-    return with_parts(model, records=stacking.cut(records, 1, axis=1))
+    return with_parts(model, records=stacking.take_rows(records, 1, axis=1))
 
 
 def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:

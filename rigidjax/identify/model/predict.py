@@ -65,7 +65,7 @@ class AbstractIntegrator(eqx.Module):
         They are a `motion.Coupled` if the torque has states of its own.
         """
 
-    def finer(self) -> "AbstractIntegrator | None":
+    def refine(self) -> "AbstractIntegrator | None":
         """Return an integrator of shorter steps, for comparison; `None` if there is none."""
         return None
 
@@ -102,7 +102,7 @@ class FixedSteps(AbstractIntegrator):
         field = equations_of_motion(body, y0, torque)
         return fixed(in_a_loop(self.solver), field, ts, y0, self.substeps, self.last)
 
-    def finer(self) -> AbstractIntegrator:
+    def refine(self) -> AbstractIntegrator:
         if self.substeps > FINEST:
             return Adaptive()
         return FixedSteps(2 * self.substeps, self.solver, self.last)
@@ -149,7 +149,7 @@ class Adaptive(AbstractIntegrator):
         )
         return out.ys if out.own is None else Coupled(out.ys, out.own)
 
-    def finer(self) -> "Adaptive | None":
+    def refine(self) -> "Adaptive | None":
         if self.rtol <= _LEAST:
             return None
         rtol = jnp.maximum(_CLOSER * self.rtol, _LEAST)
@@ -256,7 +256,7 @@ def sensor_inputs(
     ts: Array,
     state0: State,
     states: PyTree,
-    late: Array | None = None,
+    delay: Array | None = None,
 ) -> tuple[Array, PyTree, Callable[[Array, PyTree], SensorInput]]:
     """Return the times and states that a sensor reads, and a function to its input at one time.
 
@@ -267,13 +267,13 @@ def sensor_inputs(
     - `ts`: (T,) the times of the readings.
     - `state0`, `states`: the initial state, and the states at `ts`; `Coupled` if a torque has
       states of its own.
-    - `late`: s, a further delay, one number or (T,).
+    - `delay`: s, a further delay, one number or (T,).
     """
     turned = body_of_equations(body, type(state0))
     field = equations_of_motion(turned, state0, torque)
     offset, times = getattr(sensor, "offset", None), ts
-    if late is not None:
-        offset = late if offset is None else offset + late
+    if delay is not None:
+        offset = delay if offset is None else offset + delay
     if offset is not None:
         times = ts + offset
         if torque is None:

@@ -80,7 +80,7 @@ def errors_of_one(
     record: Recording,
     reference: ReferenceStates,
     body_index: BodyIndex,
-    late: Array | None = None,
+    delay: Array | None = None,
 ) -> tuple[Array, ...]:
     """Return the errors (T, k) of each sensor in one recording, in its unit; zero where masked.
 
@@ -89,21 +89,21 @@ def errors_of_one(
     - `row`: the free numbers of the recording.
     - `record`, `reference`: its readings, and its reference state.
     - `body_index`: the index of its body.
-    - `late`: s, by which all clocks are behind, in addition to their offsets.
+    - `delay`: s, by which all clocks are behind, in addition to their offsets.
     """
     scene = scene_of(model, row, record, reference, body_index)
-    return errors_of_scene(model, scene, record, late)
+    return errors_of_scene(model, scene, record, delay)
 
 
 def errors_of_scene(
-    model: "Model", scene: Scene, record: Recording, late: Array | None = None
+    model: "Model", scene: Scene, record: Recording, delay: Array | None = None
 ) -> tuple[Array, ...]:
     """Return the errors of `errors_of_one` from the scene of the recording."""
     states, torque = motion_of_scene(model, scene, record)
     assert scene.body is not None and scene.start is not None
     out, motion = [], (scene.body, torque, record.t, scene.start, states)
     for reading, sensor in zip(record.readings, scene.sensors, strict=True):
-        errors = errors_along(sensor, reading.values, *sensor_inputs(sensor, *motion, late))
+        errors = errors_along(sensor, reading.values, *sensor_inputs(sensor, *motion, delay))
         out.append(jnp.where(reading.mask[:, None], errors, 0.0))
     return tuple(out)
 
@@ -199,7 +199,7 @@ def changes(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, "..."],
 
     def of_one(row: Row, *rest: PyTree) -> Any:
         now = jnp.zeros((), model.records.t.dtype)
-        return jax.jvp(lambda s: errors_of_one(model, row, *rest, late=s), (now,), (now + 1,))[1]
+        return jax.jvp(lambda s: errors_of_one(model, row, *rest, delay=s), (now,), (now + 1,))[1]
 
     return over_records(of_one, model, model.index.rows(x))
 
@@ -219,7 +219,7 @@ def whiten(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, ".
     out = []
     for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
         limit = getattr(reading.sensor, "limit", None)
-        parts = reading.values, reading.mask, error, sigma, limit, reading.late
+        parts = reading.values, reading.mask, error, sigma, limit, reading.jitter_error
         out.append(jax.vmap(standardised)(*parts)[0])
     return tuple(out)
 
@@ -240,17 +240,17 @@ def independent(
 
 
 def in_deviations(
-    x: Array | np.ndarray, sigma: Array | np.ndarray, late: Array | None
+    x: Array | np.ndarray, sigma: Array | np.ndarray, jitter_error: Array | None
 ) -> Float[Array, "..."] | Float[np.ndarray, "..."]:
     """Return changes x (R, T, k, n) of a sensor's errors in standard deviations.
 
     They are scaled as `standardised` scales the errors, with the noise `sigma` (R, k) and the error
-    `late` (R, T, k) by a time stamp.
+    `jitter_error` (R, T, k) by a time stamp.
     """
     x = x / sigma[:, None, :, None]
-    if late is None:
+    if jitter_error is None:
         return x
-    return jax.vmap(lambda e: independent(e, late / sigma[:, None])[0], -1, -1)(x)
+    return jax.vmap(lambda e: independent(e, jitter_error / sigma[:, None])[0], -1, -1)(x)
 
 
 def standardised(
@@ -259,7 +259,7 @@ def standardised(
     error: Float[Array, "times k"],
     sigma: Float[Array, " k"],
     limit: Float[Array, " k"] | None,
-    late: Float[Array, "times k"] | None,
+    jitter_error: Float[Array, "times k"] | None,
 ) -> tuple[Float[Array, "times k"], Bool[Array, "times k"], Float[Array, "times k"] | None]:
     """Return errors of one sensor in standard deviations, and a mask of saturated channels.
 
@@ -273,15 +273,15 @@ def standardised(
     - `error`: (T, k) in the unit of the sensor.
     - `sigma`: (k,) the noise.
     - `limit`: (k,) the full scale, or `None`.
-    - `late`: (T, k) the error that a time stamp makes if it is one standard deviation late, or
-      `None`.
+    - `jitter_error`: (T, k) the error that a time stamp makes if it is one standard deviation late,
+      or `None`.
     """
     scaled, wider = error / sigma[None], None
     full = jnp.zeros(scaled.shape, bool)
     if limit is not None:
         full = (jnp.abs(values) >= limit[None] * (1 - 1e-6)) & mask[:, None]
-    if late is not None:
-        v = late / sigma[None]
+    if jitter_error is not None:
+        v = jitter_error / sigma[None]
         # The reading of a channel at full scale does not tell the error of its time stamp.
         white, wider = independent(scaled, jnp.where(full, 0.0, v))
         scaled = jnp.where(full, scaled / jnp.sqrt(1.0 + v * v), white)

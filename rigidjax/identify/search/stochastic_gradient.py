@@ -20,7 +20,7 @@ from rigidjax.identify.model.terms import (
     reading_residuals,
 )
 from rigidjax.identify.search.checkpoint import report_progress
-from rigidjax.identify.search.noise import first_noise
+from rigidjax.identify.search.noise import initial_noise
 
 if TYPE_CHECKING:
     import optax
@@ -115,7 +115,7 @@ def descend(
     random: Any = jax.random.key(0) if key is None else _checks.random_key(key)
     if progress is not None:
         _checks.require_function(progress, "progress", "of a line of text, such as print")
-    return descend_from(x, model, first_noise(model), descent, random, progress)[0]
+    return descend_from(x, model, initial_noise(model), descent, random, progress)[0]
 
 
 def descend_from(
@@ -140,7 +140,7 @@ def descend_from(
         for first in range(0, descent.steps, STRIDE):
             key, own = jax.random.split(key)
             keys = jax.random.split(own, min(STRIDE, descent.steps - first))
-            after, memory, costs = _make_steps(x, memory, model, noise, descent, keys)
+            after, memory, costs = _take_steps(x, memory, model, noise, descent, keys)
             if not np.isfinite(np.asarray(costs)).all():
                 break
             x = after
@@ -153,7 +153,7 @@ def descend_from(
 
 
 @eqx.filter_jit
-def _make_steps(
+def _take_steps(
     x: Float[Array, " n"], memory: PyTree, model: Model, noise: Noise, descent: Descent, keys: Array
 ) -> tuple[Float[Array, " n"], PyTree, Float[Array, " steps"]]:
     """Return point, memory of the optimiser and misfits after one step for each of the `keys`."""

@@ -50,7 +50,7 @@ class Limit(eqx.Module):
 
 
 def interval_ends(
-    reach: np.ndarray | float, correlation: np.ndarray | float, away: float
+    reach: np.ndarray | float, correlation: np.ndarray | float, flatness: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends of an interval that ends at a flat body, in standard deviations.
 
@@ -61,17 +61,17 @@ def interval_ends(
 
     - `reach`: the quantile of the interval.
     - `correlation`: of the number y with the flatness z.
-    - `away`: the flatness at the minimum of the linear model, over its standard deviation.
+    - `flatness`: the flatness at the minimum of the linear model, over its standard deviation.
     """
     rho = np.clip(np.asarray(correlation), -1.0, 1.0)
-    past = min(away, 0.0)
+    past = min(flatness, 0.0)
     middle, square = rho * past, reach**2 + past**2
 
     def end(side: float) -> np.ndarray:
         free = middle + side * np.sqrt(square)
-        held = middle - rho * away
-        held = held + side * np.sqrt((1.0 - rho**2) * np.maximum(square - away**2, 0.0))
-        return np.where(away + rho * (free - middle) >= 0, free, held)
+        held = middle - rho * flatness
+        held = held + side * np.sqrt((1.0 - rho**2) * np.maximum(square - flatness**2, 0.0))
+        return np.where(flatness + rho * (free - middle) >= 0, free, held)
 
     return end(-1.0), end(1.0)
 
@@ -149,7 +149,7 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
     return jnp.stack(out)
 
 
-def limits(
+def flat_limits(
     model: Model, numbers: tuple[np.ndarray, np.ndarray], step: np.ndarray, names: list[str]
 ) -> tuple[Limit, ...]:
     """Return the limit of each body whose moments are free.

@@ -264,7 +264,7 @@ def test_a_channel_at_its_full_scale_is_left_out(tumbling):
     rest = [(r.sensor, r.values) for r in record.readings[1:]]
     limited = identify.Recording(record.t, (gyro, clipped), *rest)
     found = identify.filter(records.known(limited, model.process), first)
-    np.testing.assert_array_equal(found.readings[0].seen, ~full)
+    np.testing.assert_array_equal(found.readings[0].mask, ~full)
     assert found.words == "followed"
     told = identify.Recording(record.t, (identify.Gyro(1e-4), clipped), *rest)
     with pytest.raises(ValueError, match=r"lost|broken"):

@@ -109,7 +109,7 @@ def test_the_truth_has_any_rank_among_draws_by_nuts(process):
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
             found = identify.posterior(density, mine[2], sampler=SAMPLER, chains=2)
         effective.append(float(jnp.min(found.ess)))
-        draws = found.of(numbers)
+        draws = found.map(numbers)
         # 99 draws: 100 ranks.
         few = {name: np.concatenate(np.asarray(d)[:, ::THIN])[1:] for name, d in draws.items()}
         ranks.append({name: np.sum(d < np.asarray(truth[name]), axis=0) for name, d in few.items()})
