@@ -12,8 +12,8 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.free import leaf_at
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.normal import Normal
-from rigidjax.identify.model.terms import Noise, template
+from rigidjax.identify.model.normal import NormalMatrix
+from rigidjax.identify.model.terms import Noise, scene_template
 from rigidjax.identify.search.least_squares import CAREFUL, Settings, minimise
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.rotation import quaternion
@@ -166,12 +166,12 @@ def _search_from_each(
         def errors(point: Array) -> Array:
             return model.errors(point)[0][:, 0] / noise[0][0, 0]
 
-        def evaluate(point: Array) -> tuple[tuple[()], Array, Normal, Array]:
+        def evaluate(point: Array) -> tuple[tuple[()], Array, NormalMatrix, Array]:
             steps = jnp.concatenate([jnp.zeros((1, start.size)), jnp.eye(start.size)])
             moved = point[None] + DIFFERENCE * steps
             e = jax.lax.map(errors, moved)
             rows = (e[1:] - e[:1]) / DIFFERENCE
-            return (), 0.5 * jnp.sum(e[0] ** 2), Normal(rows @ rows.T), rows @ e[0]
+            return (), 0.5 * jnp.sum(e[0] ** 2), NormalMatrix(rows @ rows.T), rows @ e[0]
 
         steps = jnp.where(number < jnp.asarray(count), settings.steps, 0)
         mine = eqx.tree_at(lambda s: s.steps, settings, steps)
@@ -184,7 +184,7 @@ def _search_from_each(
 @eqx.filter_jit
 def _with_best_level(starts: Float[Array, "starts n"], model: Model) -> Float[Array, "starts n"]:
     """Return the starts, each with the level of brightness that fits it best, if that is free."""
-    scene = template(model, model.records)
+    scene = scene_template(model, model.records)
     path = leaf_at(lambda s: s.sensors[0].level, scene, "level", "the sensor")[0]
     mine = [slot for slot in model.slots if slot.path == path and slot.shared is not None]
     if not mine:

@@ -89,10 +89,10 @@ class Brightness(AbstractSensor):
         offset: NumbersLike | None = None,
     ):
         self.sun, self.observer = _source(sun, "sun"), _source(observer, "observer")
-        self.scattering, self.noise = law_of(scattering), base.deviations(1)(noise)
+        self.scattering, self.noise = law_of(scattering), base.deviations_field(1)(noise)
         self.unit = _checks.require_option(unit, UNITS, "unit")
         usual = 1.0 if unit == "flux" else 0.0
-        checked_level = base.required("level", ())(usual if level is None else level)
+        checked_level = base.array_field("level", ())(usual if level is None else level)
         if unit == "flux":
             words = "level: wanted a positive flux"
             checked_level = _checks.error_if(checked_level, ~(checked_level > 0), words)
@@ -101,19 +101,21 @@ class Brightness(AbstractSensor):
             semi_axes = _checks.array_of_shape(semi_axes, (3,), "semi_axes").astype(float)
             semi_axes = _checks.require_sign(semi_axes, "semi_axes", "three positive lengths")
         self.semi_axes = semi_axes
-        self.offset = base.optional("offset", ())(offset)
+        self.offset = base.optional_array_field("offset", ())(offset)
 
-    def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
-        return (reading - self.predicted(now))[None]
+    def error(self, motion: SensorInput, reading: Array) -> Float[Array, "1"]:
+        return (reading - self.predicted(motion))[None]
 
-    def predicted(self, now: SensorInput) -> Scalar:
+    def predicted(self, motion: SensorInput) -> Scalar:
         """Return the reading of a state without noise."""
-        shape = now.body.second_moment
+        shape = motion.body.second_moment
         if self.semi_axes is not None:
             shape = jnp.diag(self.semi_axes * self.semi_axes)
         shape = shape / jnp.trace(shape)
-        q = now.state.q
-        sun, observer = (quaternion.rotate_inverse(q, v) for v in directions(self, now.t, q.dtype))
+        q = motion.state.q
+        sun, observer = (
+            quaternion.rotate_inverse(q, v) for v in directions(self, motion.t, q.dtype)
+        )
         area = self.scattering.of_ellipsoid(shape, sun, observer)
         relative = area / (math.pi * jnp.cbrt(determinant(shape)))
         if self.unit == "flux":

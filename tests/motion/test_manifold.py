@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rigidjax as rj
-from rigidjax.identify.filtering.steps import Extended
+from rigidjax.identify.filtering.steps import ExtendedState
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.manifold import (
     coordinates,
@@ -41,8 +41,8 @@ STATES = {
         0,
         ("motion.q", "motion.omega", "own.0", "own.1"),
     ),
-    "Extended": (
-        Extended(ATTITUDE, (jnp.ones(3),), (jnp.ones((2, 2)),)),
+    "ExtendedState": (
+        ExtendedState(ATTITUDE, (jnp.ones(3),), (jnp.ones((2, 2)),)),
         13,
         0,
         ("motion.q", "motion.omega", "torques.0", "walks.0"),

@@ -168,7 +168,7 @@ row(
 row("identify.Fit.interval", lambda: dict(self=s.found(), level=0.9), arguments=("level",), **HOST)
 row(
     "identify.Fit.interval_of",
-    lambda: dict(self=s.found(), of=lambda point: point.state0.omega, level=0.9),
+    lambda: dict(self=s.found(), function=lambda point: point.state0.omega, level=0.9),
     arguments=("of", "level"),
     **HOST,
 )
@@ -181,7 +181,7 @@ records = (
     "Comparison",
     "Limit",
     "Freedom",
-    "Linearised",
+    "Linearisation",
     "Scene",
     "Unpacked",
     "Consideration",

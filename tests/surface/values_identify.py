@@ -677,7 +677,7 @@ leave_out(
 leave_out(
     "holds what it was given, or numbers of a row above",
     "identify.Belief.torques", "identify.Belief.walks", "identify.Filtered.t",
-    "identify.Smoothed.t", "identify.Walk", "identify.Push", "identify.Extended", "identify.Start",
+    "identify.Smoothed.t", "identify.Walk", "identify.Push", "identify.ExtendedState", "identify.Start",
     "identify.Model.recording", "identify.Model.recordings", "identify.Scene",
     "identify.Model.bodies", "identify.Model.scenes", "identify.Tolerance",
     "identify.Windows.records", "identify.Windows.scales",
@@ -697,19 +697,19 @@ leave_out(
     "errors that are considered, against refits of readings that are off: "
     "tests/identify/uncertainty/test_considered.py",
     "identify.Consideration",
-    "identify.Freedom.of_estimated",
+    "identify.Freedom.estimated_degrees",
 )
 leave_out(
     "the errors and derivatives of a fit, from which its covariance follows: "
     "tests/identify/test_uncertainty.py",
-    "identify.Linearised",
-    *(f"identify.Linearised.{name}" for name in (
+    "identify.Linearisation",
+    *(f"identify.Linearisation.{name}" for name in (
         "squared_change", "blocks", "dense", "first_times", "information", "rows", "scores", "size",
         "slope", "to_all_numbers")),
 )  # fmt: skip
 leave_out(
     "compared with the intervals of Welch and Student: tests/identify/test_freedom.py",
-    "identify.Fit.degrees", "identify.Freedom", "identify.Freedom.degrees",
+    "identify.Fit.degrees_of_freedom", "identify.Freedom", "identify.Freedom.degrees",
 )  # fmt: skip
 leave_out(
     "abstract: made by subclassing",
@@ -728,7 +728,7 @@ leave_out(
     "identify.Nuts", "identify.refit", "identify.Refit", "identify.Refit.effective_count",
     "identify.Refit.interval_of", "identify.Refit.point", "identify.LogDensity",
     "identify.LogDensity.unpack", "identify.Unpacked",
-    "identify.Filtered.nis", "identify.Read",
+    "identify.Filtered.nis", "identify.ReadNumbers",
 )  # fmt: skip
 leave_out(
     "searches of many fits, tens of seconds each: tests/identify hold them against motions known",

@@ -17,7 +17,7 @@ from rigidjax.identify.model.charts import Known, places_of
 from rigidjax.identify.model.free import with_steps
 from rigidjax.identify.model.index import index_of
 from rigidjax.identify.model.model import Model, with_parts
-from rigidjax.identify.model.terms import independent, template, whiten
+from rigidjax.identify.model.terms import decorrelate, scene_template, whiten
 from rigidjax.identify.search.stages import errors_and_slopes
 
 
@@ -98,7 +98,7 @@ def _log_squares(fit: Fit) -> np.ndarray:
         zip(model.records.readings, white, fit.noises, strict=True)
     ):
         if reading.jitter_error is not None:
-            wider = np.asarray(independent(e, reading.jitter_error / sigma[:, None])[1])[
+            wider = np.asarray(decorrelate(e, reading.jitter_error / sigma[:, None])[1])[
                 reading.host_mask
             ]
             squares = np.sum(np.asarray(e * sigma[:, None])[reading.host_mask] ** 2, axis=-1)
@@ -149,7 +149,7 @@ def _with_shared(model: Model, of_others: Fit) -> Model:
         if slot.shared is not None and fitted.shared is not None:
             x = x.at[slot.shared].set(of_others.x[fitted.shared])
     record = stacking.pick_records(model.records, 0)
-    scene = with_steps(template(model, record), model.slots, model.index.rows(x)[0])
+    scene = with_steps(scene_template(model, record), model.slots, model.index.rows(x)[0])
     sensors = jax.tree.map(lambda leaf: leaf[None] if eqx.is_array(leaf) else leaf, scene.sensors)
     own = [
         slot if slot.each else dataclasses.replace(slot, each=True, prior=slot.spread, spread=None)

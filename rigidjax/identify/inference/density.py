@@ -28,7 +28,7 @@ from rigidjax.identify.model.model import (
     with_parts,
 )
 from rigidjax.identify.model.scene import Process, Scene, require_process
-from rigidjax.identify.model.terms import Noise, template
+from rigidjax.identify.model.terms import Noise, scene_template
 from rigidjax.identify.uncertainty.covariance import white_covariance
 from rigidjax.motion.torques.composite import parts_of
 
@@ -212,7 +212,7 @@ def _factor(
 
 def _path_of(model: Model, where: Callable[[Scene], Any]) -> tuple[Any, ...]:
     """Return the path of the leaf of a scene that `where` picks, even if the leaf is `None`."""
-    scene = template(model, model.records)
+    scene = scene_template(model, model.records)
     marked = eqx.tree_at(where, scene, 0.0, is_leaf=lambda node: node is None)
     pairs = jax.tree.leaves_with_path(eqx.tree_at(where, marked, _MARK))
     return next(path for path, leaf in pairs if leaf is _MARK)

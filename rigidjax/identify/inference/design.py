@@ -14,7 +14,7 @@ from rigidjax._types import Scalar, Vec3, Vector
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.model.model import Model, require_numbers, require_one
 from rigidjax.identify.model.normal import normal_of
-from rigidjax.identify.model.terms import blocks, changes, in_deviations
+from rigidjax.identify.model.terms import delay_derivatives, errors_and_jacobians, in_deviations
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.covariance import covariance_root
 from rigidjax.identify.uncertainty.quantities import Quantity, quantities, values_and_slopes
@@ -74,12 +74,12 @@ def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
     """Return the result of `fisher` without its checks, as one program."""
     sensors = model.records.sensors
     noises: list[Any] = [sensor.noise for sensor in sensors]
-    _, slopes = blocks(model, x)
+    _, slopes = errors_and_jacobians(model, x)
     rows = []
     for index, (sensor, noise, block) in enumerate(zip(sensors, noises, slopes, strict=True)):
         jitter, late = getattr(sensor, "jitter", None), None
         if jitter is not None:
-            late = jitter.deviation[:, None, None] * changes(model, x)[index]
+            late = jitter.deviation[:, None, None] * delay_derivatives(model, x)[index]
         rows.append(in_deviations(block, noise, late))
     return normal_of(rows, model.index.places, model.size).core
 

@@ -21,7 +21,7 @@ from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.filtering.terms import curvature
 from rigidjax.identify.inference.density import LogDensity, map_draws
 from rigidjax.identify.model.model import Unpacked
-from rigidjax.identify.model.normal import Normal
+from rigidjax.identify.model.normal import NormalMatrix
 from rigidjax.identify.search.least_squares import Settings, minimise
 from rigidjax.identify.search.stages import is_order_one
 from rigidjax.identify.uncertainty.quantities import interval_about
@@ -385,9 +385,9 @@ def refit(
 def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: int) -> Refit:
     """Return the result of `refit` with `count` draws, as one program."""
 
-    def evaluate(x: Array) -> tuple[None, Array, Normal, Array]:
+    def evaluate(x: Array) -> tuple[None, Array, NormalMatrix, Array]:
         cost, gram, slope = curvature(density.model, x)
-        return None, cost, Normal(gram), slope
+        return None, cost, NormalMatrix(gram), slope
 
     order_one = is_order_one(density.model, density.x0.dtype)
     end = minimise(evaluate, density.x0, order_one, settings, None)

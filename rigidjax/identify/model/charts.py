@@ -332,9 +332,9 @@ class Known(AbstractBodyChart):
         return jnp.zeros(0)
 
 
-def _pad(x: Float[Array, "*rows n"], before: int, after: int) -> Float[Array, "*rows m"]:
-    """Return x with zeros `before` and `after` it along the last axis."""
-    return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(before, after)])
+def _pad(x: Float[Array, "*rows n"], leading: int, trailing: int) -> Float[Array, "*rows m"]:
+    """Return x with zeros `leading` and `trailing` it along the last axis."""
+    return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(leading, trailing)])
 
 
 class Bodies(eqx.Module):
@@ -438,14 +438,14 @@ def body_of_recording(
     return body.body(vector, body_index)
 
 
-def charts_of(body: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...]:
+def chart_list(body: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...]:
     """Return the charts of one body or of several."""
     return body.charts if isinstance(body, Bodies) else (body,)
 
 
 def numbers_of(body: AbstractBodyChart | Bodies, vector: Array | np.ndarray) -> list[Any]:
     """Split the numbers `vector` of one body or of several into those of each chart."""
-    sizes = [chart.size for chart in charts_of(body)]
+    sizes = [chart.size for chart in chart_list(body)]
     return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
 
 

@@ -196,7 +196,7 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
         groups, labels = None, ()
         if not isinstance(item.each, bool):
             groups, labels = group_of_each(item.each, bodies, here)
-        unit = _unit_of(scene, path) if item.unit is None else item.unit
+        unit = _implied_unit(scene, path) if item.unit is None else item.unit
         slots.append(
             Slot(
                 path,
@@ -217,11 +217,11 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
 
 
 def leaf_at(
-    where: Callable[[Any], Any], tree: PyTree, name: str, what: str
+    where: Callable[[Any], Any], tree: PyTree, name: str, role: str
 ) -> tuple[tuple[Any, ...], Any]:
     """Return the path of the leaf of a tree that `where` picks, and the leaf, an array of numbers.
 
-    `name` and `what` are words for errors: the object that has `where`, and the one that needs a
+    `name` and `role` are words for errors: the object that has `where`, and the one that needs a
     starting value.
     """
     pairs, structure = jax.tree.flatten_with_path(tree)
@@ -232,7 +232,7 @@ def leaf_at(
         raise ValueError(f"{name}: nothing is there ({error})") from None
     if index is None:
         raise ValueError(
-            f"{name}: None is there; give {what} a starting value, such as "
+            f"{name}: None is there; give {role} a starting value, such as "
             "Gyro(bias=[0.0, 0.0, 0.0])"
         )
     if not isinstance(index, int):
@@ -247,7 +247,7 @@ def leaf_at(
 _UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place": "m"}
 
 
-def _unit_of(scene: Scene, path: tuple[Any, ...]) -> str:
+def _implied_unit(scene: Scene, path: tuple[Any, ...]) -> str:
     """Return the unit of a leaf of a scene, if its name implies one."""
     *way, last = path
     name = getattr(last, "name", "")

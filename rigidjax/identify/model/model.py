@@ -29,7 +29,7 @@ from rigidjax.identify.data.windows import (
 from rigidjax.identify.model.charts import (
     AbstractBodyChart,
     Bodies,
-    charts_of,
+    chart_list,
     has_mass,
     places_of,
     scaled_body,
@@ -44,7 +44,7 @@ from rigidjax.identify.model.terms import (
     motion_of_scene,
     over_records,
     scene_of,
-    template,
+    scene_template,
     with_jacobian,
 )
 from rigidjax.identify.model.walks import Drift, Walk, find_drifts
@@ -185,7 +185,7 @@ class Model(eqx.Module):
     ):
         windows = recording if isinstance(recording, Windows) else None
         if windows is None:
-            recordings, charts, names = _by_body(recording, chart)
+            recordings, charts, names = _charts_and_names(recording, chart)
         else:
             require_windows(windows)
             recordings, names = [], ("",) * windows.count
@@ -289,10 +289,13 @@ class Model(eqx.Module):
             if not isinstance(body, Mapping | None) or set(by_name) - set(names):
                 raise ValueError(f"body: wanted bodies by name, of {', '.join(names)}, or None")
             vector = jnp.concatenate(
-                [_numbers(chart, by_name.get(n)) for n, chart in zip(names, charts, strict=True)]
+                [
+                    _numbers_in_chart(chart, by_name.get(n))
+                    for n, chart in zip(names, charts, strict=True)
+                ]
             )
         else:
-            vector = _numbers(self.chart, body)
+            vector = _numbers_in_chart(self.chart, body)
         kind = jnp.result_type(float)
         if omega is None and not self.index.start.size:
             rates = np.zeros((1, 3))
@@ -346,11 +349,11 @@ class Model(eqx.Module):
         """
         x = require_numbers(self, x)
 
-        def of_one(row: Array, record: Recording, *rest: PyTree) -> Any:
-            scene = scene_of(self, row, record, *rest)
+        def motion_of_recording(row: Array, record: Recording, *others: PyTree) -> Any:
+            scene = scene_of(self, row, record, *others)
             return motion_of(motion_of_scene(self, scene, record)[0])
 
-        states = over_records(of_one, self, self.index.rows(x))
+        states = over_records(motion_of_recording, self, self.index.rows(x))
         return stacking.pick_records(states, 0) if self.count == 1 else states
 
     def errors(self, x: Float[Array, " n"]) -> tuple[Float[Array, "*records times _"], ...]:
@@ -427,7 +430,7 @@ def _require_parts(
     integrator: object,
 ) -> None:
     """Raise `TypeError` unless the parts of a model are of their types."""
-    for one in charts_of(charts):
+    for one in chart_list(charts):
         known = isinstance(one, Inertia | MassProperties)
         hint = "give a known body as Known(body)" if known else ""
         hint = "was () forgotten?" if isinstance(one, type) else hint
@@ -445,7 +448,7 @@ def _require_parts(
 
 def _require_own_names(slots: Sequence[Slot], charts: AbstractBodyChart | Bodies) -> None:
     """Raise `ValueError` for a `Free` with the name of a quantity of the body."""
-    taken = {name for one in charts_of(charts) for name in (*one.log_names, *one.plain_names)}
+    taken = {name for one in chart_list(charts) for name in (*one.log_names, *one.plain_names)}
     for slot in slots:
         if slot.name in taken | {"Ωx", "Ωy", "Ωz"}:
             words = "a quantity of the body has this name; give another"
@@ -484,11 +487,13 @@ def without_samples(model: Model) -> Model:
 def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
     """Return the result of `Model.scenes`, without a check of x."""
 
-    def of_one(row: Array, *rest: PyTree) -> Scene:
+    def scene_of_recording(row: Array, *rest: PyTree) -> Scene:
         return scene_of(model, row, *rest)
 
     rows = model.index.rows(x)
-    return eqx.filter_vmap(of_one)(rows, model.records, model.reference, model.body_indices)
+    return eqx.filter_vmap(scene_of_recording)(
+        rows, model.records, model.reference, model.body_indices
+    )
 
 
 def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
@@ -514,7 +519,7 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
 
 def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
     """Return the starting value of each slot in each recording."""
-    leaves, out = dict(jax.tree.leaves_with_path(template(model, model.records))), []
+    leaves, out = dict(jax.tree.leaves_with_path(scene_template(model, model.records))), []
     for slot in model.slots:
         leaf = jnp.asarray(leaves[slot.path])
         of_each = slot.path[0].name == "sensors"
@@ -613,18 +618,18 @@ def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
         raise ValueError("; ".join(wrong))
 
 
-def words_on_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
+def describe_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
     """Describe the delays that at the free numbers x read beyond their windows; none otherwise."""
     if model.clusters is None or not delays_of(model.torque):
         return []
     t, rows = np.asarray(model.records.t)[0], max(len(a[0]) for a in model.records.inputs.values())
     step = float(t[1] - t[0])
     known, length = (rows - t.size) * step, (t.size - 1) * step
-    return mistakes_of_delays(_scenes(model, x).torque, known, length)
+    return mistakes_of_delays(_scenes_program(model, x).torque, known, length)
 
 
 @eqx.filter_jit
-def _scenes(model: Model, x: Float[Array, " n"]) -> Scene:
+def _scenes_program(model: Model, x: Float[Array, " n"]) -> Scene:
     """Return the result of `scenes_of` by one program.
 
     Outside of a trace each operation of JAX takes as long as a run of 100 steps.
@@ -658,7 +663,7 @@ def _require_held_steps(integrator: object) -> None:
         )
 
 
-def _by_body(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
+def _charts_and_names(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
     """Return all recordings, the chart or charts, and the name of the body of each recording."""
     if isinstance(recording, Mapping) or isinstance(body, Mapping):
         if not (isinstance(recording, Mapping) and isinstance(body, Mapping)):
@@ -710,10 +715,10 @@ def _require_recordings(recordings: Sequence[Any]) -> None:
         _checks.numeric_array(item.t, "recording")
 
 
-def _numbers(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " chart"]:
+def _numbers_in_chart(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " chart"]:
     """Return the numbers of a body in a chart; zeros, the start of the chart, for `None`."""
     if body is None:
-        return _zeros(chart.size)
+        return _host_zeros(chart.size)
     one = validation.single(body, (Inertia, MassProperties), "body")
     if _checks.is_known(one):
         jax.tree.map(lambda leaf: _checks.require_finite(leaf, "body"), one)
@@ -728,7 +733,7 @@ def _numbers(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " char
     return vector
 
 
-def _zeros(*shape: int) -> Array:
+def _host_zeros(*shape: int) -> Array:
     """Return zeros, made by NumPy: JAX would compile a program for each shape."""
     return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
 
@@ -745,7 +750,7 @@ def _state_kind(
         needed.append(getattr(torque, "feels", HasAttitude))
     forced = any(isinstance(part, AbstractForce) for part in parts_of(torque))
     if HasPose in needed or forced:
-        for chart in charts_of(body):
+        for chart in chart_list(body):
             if not has_mass(chart):
                 raise ValueError(
                     "Model: a sensor or force needs a body that moves, whose mass is known or "

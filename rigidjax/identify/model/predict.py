@@ -108,7 +108,7 @@ class FixedSteps(AbstractIntegrator):
         return FixedSteps(2 * self.substeps, self.solver, self.last)
 
 
-def _tolerance(name: str) -> Callable[[ScalarLike], Array]:
+def _tolerance_field(name: str) -> Callable[[ScalarLike], Array]:
     """Return a converter of a field to an array, so that another value compiles no new program."""
     return lambda value: jnp.asarray(_checks.known_float(value, name), jnp.result_type(float))
 
@@ -123,8 +123,8 @@ class Adaptive(AbstractIntegrator):
     1e-09
     """
 
-    rtol: Float[Array, ""] = eqx.field(converter=_tolerance("rtol"), default=1e-9)
-    atol: Float[Array, ""] = eqx.field(converter=_tolerance("atol"), default=1e-12)
+    rtol: Float[Array, ""] = eqx.field(converter=_tolerance_field("rtol"), default=1e-9)
+    atol: Float[Array, ""] = eqx.field(converter=_tolerance_field("atol"), default=1e-12)
 
     def __check_init__(self):
         _checks.positive_float(self.rtol, "rtol")
@@ -216,20 +216,20 @@ class HeldSteps(AbstractIntegrator):
         field = equations_of_motion(body, start, torque)
         stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
 
-        def one(y: PyTree, i: Array) -> tuple[PyTree, PyTree]:
+        def take_step(y: PyTree, i: Array) -> tuple[PyTree, PyTree]:
             y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
             return y, stepper.state(y)
 
         def warm_up(y: PyTree, i: Array) -> tuple[PyTree, None]:
             # The torque's own states follow the inputs; the body keeps its initial state.
-            y, _ = one(y, i)
+            y, _ = take_step(y, i)
             return split(Coupled(start.motion, stepper.state(y).own)), None
 
         y0 = stepper.start
         if before and isinstance(start, Coupled):
             y0, _ = lax.scan(warm_up, y0, jnp.arange(-before, 0, dtype=jnp.int32))
         still = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *jnp.shape(a))), start)
-        later = first_rows(count if self.last is None else self.last, one, y0, still)
+        later = first_rows(count if self.last is None else self.last, take_step, y0, still)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, later)
 
 
@@ -310,13 +310,13 @@ def errors_along(
     return values + lowpass(times, jax.vmap(error)(times, states, jnp.zeros_like(values)))
 
 
-def _error_of(sensor: AbstractSensor, now: SensorInput, value: Array) -> Array:
+def _error_of(sensor: AbstractSensor, motion: SensorInput, value: Array) -> Array:
     """Return the error of a reading, checked: a user may have written the method `error`."""
     name = type(sensor).__name__
     try:
-        error = sensor.error(now, value)
+        error = sensor.error(motion, value)
     except AttributeError as wrong:
-        if type(now.state).__name__ not in str(wrong):
+        if type(motion.state).__name__ not in str(wrong):
             raise
         raise TypeError(
             f"{name}.error: {wrong}; it has feels = {sensor.feels.__name__}, but it reads more "
@@ -443,6 +443,6 @@ def _require_sensor(sensor: PyTree, state0: State, key: object) -> None:
     if not hasattr(sensor, "reading_of") and math.prod(sensor.reading_shape) != sensor.components:
         raise ValueError(
             f"{name}: its readings of shape {sensor.reading_shape} are not its error of "
-            f"{sensor.components} numbers plus a prediction; write a method reading_of(now, "
+            f"{sensor.components} numbers plus a prediction; write a method reading_of(motion, "
             "error), the reading whose error is this one"
         )

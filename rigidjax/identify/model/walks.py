@@ -40,8 +40,8 @@ class Walk(eqx.Module):
     ):
         words = "of a scene, such as lambda s: s.sensors[0].bias"
         self.where = _checks.require_function(where, "where", words)
-        self.deviation = not_negative(deviation, "deviation")
-        self.density = not_negative(density, "density")
+        self.deviation = require_nonnegative(deviation, "deviation")
+        self.density = require_nonnegative(density, "density")
 
 
 class Drift(eqx.Module):
@@ -75,7 +75,7 @@ def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]
             raise ValueError("Walk: another Walk moves the same numbers")
         value = jnp.asarray(value)
         parts = (
-            in_shape(number, value.shape, name).astype(value.dtype)
+            broadcast_to_shape(number, value.shape, name).astype(value.dtype)
             for number, name in ((walk.deviation, "deviation"), (walk.density, "density"))
         )
         drifts.append(Drift(path, *parts))
@@ -87,7 +87,7 @@ def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
     return leaves_at(scene, [drift.path for drift in drifts])
 
 
-def not_negative(value: NumbersLike, name: str) -> Array:
+def require_nonnegative(value: NumbersLike, name: str) -> Array:
     """Return finite numbers, if none is below zero; else raise `ValueError`."""
     array, wanted = _checks.numeric_array(value, name), "a finite number that is not below zero"
     if not array.size:
@@ -95,12 +95,12 @@ def not_negative(value: NumbersLike, name: str) -> Array:
     return _checks.require_sign(array, name, wanted, zero=True)
 
 
-def in_shape(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
+def broadcast_to_shape(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
     """Return one number, or numbers of this `shape`, as an array of this shape.
 
     Raise `ValueError` for another shape, or for a number below zero.
     """
-    numbers = not_negative(value, name)
+    numbers = require_nonnegative(value, name)
     if numbers.shape not in ((), shape):
         raise ValueError(f"{name}: wanted one number or shape {shape}, got {numbers.shape}")
     return jnp.broadcast_to(numbers, shape)

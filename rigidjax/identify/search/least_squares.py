@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from rigidjax.identify.model.normal import Normal
+from rigidjax.identify.model.normal import NormalMatrix
 
 # The damping of the first step, in units of the diagonal of the normal equations (Marquardt's): a
 # damping of one makes a step half as long as a Gauss–Newton step.
@@ -96,7 +96,7 @@ class LMState(eqx.Module):
     first: Float[Array, ""]
     point: Float[Array, " n"]
     cost: Float[Array, ""]
-    normal: Normal
+    normal: NormalMatrix
     slope: Float[Array, " n"]
     trial: Float[Array, " n"]
     hoped: Float[Array, ""]
@@ -111,13 +111,13 @@ class LMState(eqx.Module):
 
 
 def minimise(
-    evaluate: Callable[[Array], tuple[PyTree, Array, Normal, Array]],
+    evaluate: Callable[[Array], tuple[PyTree, Array, NormalMatrix, Array]],
     start: Float[Array, " n"],
     order_one: Float[Array, " n"],
     settings: Settings,
     zeros: PyTree,
-    zero_normal: Normal | None = None,
-    gain_of_noise: Callable[[Any, Normal], Array] | None = None,
+    zero_normal: NormalMatrix | None = None,
+    gain_of_noise: Callable[[Any, NormalMatrix], Array] | None = None,
 ) -> LMState:
     """Minimise a cost from `start`, and return the last state of the search.
 
@@ -143,7 +143,7 @@ def minimise(
         jnp.asarray(jnp.inf, kind),
         start,
         jnp.asarray(jnp.inf, kind),
-        Normal(jnp.zeros((number, number), kind)) if zero_normal is None else zero_normal,
+        NormalMatrix(jnp.zeros((number, number), kind)) if zero_normal is None else zero_normal,
         jnp.zeros(number, kind),
         start,
         jnp.zeros((), kind),
@@ -165,10 +165,10 @@ def minimise(
 
 def _next_state(
     state: LMState,
-    evaluation: tuple[Any, Array, Normal, Array],
+    evaluation: tuple[Any, Array, NormalMatrix, Array],
     order_one: Array,
     settings: Settings,
-    gain_of_noise: Callable[[Any, Normal], Array] | None,
+    gain_of_noise: Callable[[Any, NormalMatrix], Array] | None,
 ) -> LMState:
     """Return the state after an evaluation of the trial point, with the next trial."""
     values, cost, normal, slope = evaluation
@@ -235,7 +235,7 @@ def _next_state(
 
 
 def _damped_step(
-    normal: Normal, slope: Array, order_one: Array, damping: Array
+    normal: NormalMatrix, slope: Array, order_one: Array, damping: Array
 ) -> tuple[Array, Array]:
     """Return the damped step (n,), and the root (n,) of the diagonal of the normal matrix."""
     diagonal = normal.diagonal
@@ -243,6 +243,6 @@ def _damped_step(
     # Scale columns to length one, so that Cholesky's factor loses no digits to units.
     root = jnp.sqrt(diagonal)
     damped = damping * jnp.maximum(diagonal, order_one) / root**2
-    move = -normal.in_units(1.0 / root).plus(damped).solve(slope / root) / root
+    move = -normal.in_units(1.0 / root).add_diagonal(damped).solve(slope / root) / root
     far = jnp.max(jnp.abs(move) * order_one)
     return move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300)), root

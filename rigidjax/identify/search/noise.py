@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.terms import Blocks, Noise, changes, weights_of
+from rigidjax.identify.model.terms import Blocks, Noise, delay_derivatives, weights_of
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
 
@@ -28,7 +28,7 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
     **Arguments:**
 
     - `x`: (n,) the free numbers of the `model`.
-    - `blocks`: the errors and derivatives at x, as `terms.blocks` returns them.
+    - `blocks`: the errors and derivatives at x, as `terms.errors_and_jacobians` returns them.
     - `noise`: the present estimate.
     """
     errors = blocks[0]
@@ -57,7 +57,7 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
             each = np.broadcast_to(each[:, None], sigma.shape)
             sigma = jnp.asarray(each.astype(sigma.dtype))
         if reading.jitter_error is not None:
-            change = changes(model, x)[index]
+            change = delay_derivatives(model, x)[index]
             root = np.sqrt(np.asarray(weight, float) / share[groups][:, None])
             size = np.asarray(sigma, float)
             e, u = (np.where(mask, np.asarray(x) / size[:, None], 0.0) for x in (error, change))

@@ -14,9 +14,9 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.data.recording import Reading, count_of
 from rigidjax.identify.model import terms
-from rigidjax.identify.model.charts import charts_of, numbers_of
+from rigidjax.identify.model.charts import chart_list, numbers_of
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.normal import Normal, normal_of
+from rigidjax.identify.model.normal import NormalMatrix, normal_of
 from rigidjax.identify.model.predict import FixedSteps, HeldSteps
 from rigidjax.identify.model.terms import Blocks, Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
@@ -47,8 +47,8 @@ _BEYOND = 2
 class Evaluation(NamedTuple):
     """The values that a search keeps of the last evaluation.
 
-    **Fields:** `blocks` the errors of all readings and their derivatives (`terms.blocks`); `pulls`
-    (R, m) the part of each of R recordings in the gradient.
+    **Fields:** `blocks` the errors of all readings and their derivatives
+    (`terms.errors_and_jacobians`); `pulls` (R, m) the part of each of R recordings in the gradient.
     """
 
     blocks: Blocks
@@ -63,7 +63,8 @@ class Attempt(eqx.Module):
     - `x`: (n,) the free numbers.
     - `cost`: half the sum of squares at x.
     - `converged`: whether the search converged.
-    - `blocks`: the errors and their derivatives at x (`terms.blocks`), `None` if not known.
+    - `blocks`: the errors and their derivatives at x (`terms.errors_and_jacobians`), `None` if not
+      known.
     """
 
     x: Float[Array, " n"]
@@ -110,9 +111,9 @@ def least_squares_from(
     prior = terms.prior_weights(model)
     alone = np.asarray(model.index.alone, int) if model.count >= MANY else None
 
-    def evaluate(x: Array) -> tuple[Evaluation, Array, Normal, Array]:
-        errors, slopes = terms.blocks(model, x)
-        residuals, rows = terms.with_rows(
+    def evaluate(x: Array) -> tuple[Evaluation, Array, NormalMatrix, Array]:
+        errors, slopes = terms.errors_and_jacobians(model, x)
+        residuals, rows = terms.residuals_and_jacobians(
             lambda e: terms.reading_residuals(model, e, noise, weights), errors, slopes
         )
         total, pulls = jnp.zeros((), kind), jnp.zeros(places.shape, kind)
@@ -122,7 +123,7 @@ def least_squares_from(
             flat = row.reshape(model.count, -1, places.shape[1])
             pulls = pulls + (e.reshape(model.count, 1, -1) @ flat)[:, 0]
         slope = jnp.zeros(number + 1, kind).at[places].add(pulls)
-        normal = normal_of(rows, places, number, alone).plus(prior**2)
+        normal = normal_of(rows, places, number, alone).add_diagonal(prior**2)
         total, slope = total + jnp.sum((prior * x) ** 2), slope[:-1] + prior**2 * x
         row, e = terms.with_jacobian(lambda x: terms.extra_residuals(model, x), x)
         if e.size:
@@ -149,7 +150,7 @@ def least_squares_from(
     )
 
 
-def _gain_of_noise(model: Model, evaluation: Evaluation, normal: Normal) -> Float[Array, ""]:
+def _gain_of_noise(model: Model, evaluation: Evaluation, normal: NormalMatrix) -> Float[Array, ""]:
     """Return ½ tr(K G⁻¹), the mean excess of the cost at the true numbers, of windows.
 
     G is the normal matrix of the shared numbers, without the starts of the windows; K adds up
@@ -167,7 +168,7 @@ def _gain_of_noise(model: Model, evaluation: Evaluation, normal: Normal) -> Floa
     slopes = slopes.at[:, starts].set(0.0)
     diagonal = normal.diagonal
     root = jnp.sqrt(jnp.maximum(diagonal, 1e-12 * jnp.max(diagonal)))
-    definite = normal.in_units(1.0 / root).plus(jnp.full_like(root, 1e-12))
+    definite = normal.in_units(1.0 / root).add_diagonal(jnp.full_like(root, 1e-12))
     scaled = slopes / root[None, :]
     return 0.5 * jnp.sum(scaled * definite.solve(scaled.T).T)
 
@@ -187,7 +188,7 @@ def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
     `slope` (n,) is the gradient of the cost (`AbstractBodyChart.bend`).
     """
     count = model.index.bodies
-    parts = (charts_of(model.chart), *(numbers_of(model.chart, y[:count]) for y in (x, slope)))
+    parts = (chart_list(model.chart), *(numbers_of(model.chart, y[:count]) for y in (x, slope)))
     rows = block_diag(*(chart.bend(*mine) for chart, *mine in zip(*parts, strict=True)))
     return jnp.pad(rows, ((0, 0), (0, slope.size - rows.shape[1])))
 
@@ -205,7 +206,10 @@ def _until_last_weight(model: Model, weights: Float[Array, "records times"]) -> 
 
 
 def _zeros_of_evaluation(model: Model, kind: DTypeLike) -> Evaluation:
-    """Return zeros of the shapes that are kept: to trace `terms.blocks` once more takes seconds."""
+    """Return zeros of the shapes of an `Evaluation`.
+
+    They are made from the shapes alone: to trace `terms.errors_and_jacobians` takes seconds.
+    """
     count, times = model.records.t.shape
     columns = model.index.places.shape[1]
     shapes = [(count, times, sensor.components) for sensor in model.records.sensors]
@@ -255,7 +259,7 @@ def _evaluate_at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
 
 
 def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Blocks:
-    """Return errors and derivatives at x (`terms.blocks`), by the program of the search."""
+    """Return `terms.errors_and_jacobians` at x, by the program of the search."""
     kind, sensors = model.records.t.dtype, model.records.sensors
     ones = (np.ones((model.count, sensor.components), kind) for sensor in sensors)
     return _evaluate_at(model, x, tuple(map(jnp.asarray, ones))).evaluation.blocks

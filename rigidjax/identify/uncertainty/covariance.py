@@ -15,10 +15,10 @@ from rigidjax.identify.model.terms import (
     Noise,
     extra_residuals,
     prior_weights,
+    residuals_and_jacobians,
     weights_of,
     whiten,
     with_jacobian,
-    with_rows,
 )
 
 # A direction is undetermined if its singular value is below this share of the largest one.
@@ -135,7 +135,7 @@ def _flatten_rows(slopes: np.ndarray) -> np.ndarray:
 def _linearise_parts(model: Model, x: Array, noise: Noise, blocks: Blocks) -> PyTree[Array]:
     """Return the parts of `linearise` as one program: of readings, places, of other residuals."""
     errors, slopes = blocks
-    out, slopes = with_rows(lambda e: whiten(model, e, noise), errors, slopes)
+    out, slopes = residuals_and_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
     extra_slopes, extra = with_jacobian(lambda x: extra_residuals(model, x), x)
     weights, prior = weights_of(model, errors, noise), prior_weights(model)
     return (out, slopes, weights), model.index.places, (prior * x, prior, extra, extra_slopes)
@@ -154,7 +154,7 @@ def linearise(
 
     - `model`, `noise`: the model, and the noise of its sensors.
     - `x`: (n,) the free numbers.
-    - `blocks`: the errors and derivatives at x, as `terms.blocks` returns them.
+    - `blocks`: the errors and derivatives at x, as `terms.errors_and_jacobians` returns them.
     - `thickened`: if a body is flat at x, the point with a thicker body at which derivatives are
       taken, and the `blocks` there.
     """

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PyTree
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import swap_trace
-from rigidjax.identify.model.charts import AbstractBodyChart, as_list, charts_of, numbers_of
+from rigidjax.identify.model.charts import AbstractBodyChart, as_list, chart_list, numbers_of
 from rigidjax.identify.model.model import Model, without_samples
 
 # Derivatives are taken at a body whose least second moment is at least this share of the trace.
@@ -82,7 +82,7 @@ def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     The derivative of a chart is zero at a flat body. The information on the tensor itself is
     regular there, and hardly differs between a flat body and one of so small a thickness.
     """
-    thick = list(map(_thicken_chart, charts_of(model.chart), bodies_of(model, x)))
+    thick = list(map(_thicken_chart, chart_list(model.chart), bodies_of(model, x)))
     if all(one is None for one in thick):
         return None
     pairs = zip(numbers_of(model.chart, x[: model.index.bodies]), thick, strict=True)
@@ -136,7 +136,7 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
     """Return (I1 + I2 − I3) / I3 of each body; 1 for a body whose moments are not free."""
     out = []
     bodies = as_list(model.bodies(x))
-    for chart, body in zip(charts_of(model.chart), bodies, strict=True):
+    for chart, body in zip(chart_list(model.chart), bodies, strict=True):
         if not _has_limit(chart):
             out.append(jnp.ones((), x.dtype))
             continue
@@ -163,7 +163,7 @@ def flat_limits(
     - `names`: the suffix of the names of each body's quantities.
     """
     rows = zip(names, *(part[-len(names) :] for part in numbers), strict=True)
-    have_limits = [_has_limit(chart) for chart in charts_of(model.chart)]
+    have_limits = [_has_limit(chart) for chart in chart_list(model.chart)]
     return tuple(
         Limit(name, float(value), float(value + min(slope @ step, 0.0)), slope)
         for (name, value, slope), has_limit in zip(rows, have_limits, strict=True)

@@ -39,7 +39,7 @@ def drawn_body(key):
     line = cell * jnp.arange(-150.0, 150.0)
     centre = identify.Model(record(np.ones((TS.size, 3))), CHART).start(PRIOR.guess)
     points = centre[:2][None] + jnp.stack(jnp.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    log = jax.vmap(lambda x: -0.5 * jnp.sum(PRIOR.residuals(CHART.body(x), scaled=False) ** 2))
+    log = jax.vmap(lambda x: -0.5 * jnp.sum(PRIOR.residuals(CHART.body(x), to_scale=False) ** 2))
     # Of the numbers of a body those whose root has no negative eigenvalue: a flat body, which the
     # prior forbids, is between these and the others.
     inside = (points > -1.0).all(axis=1) & (points.sum(axis=1) < 1.0)
