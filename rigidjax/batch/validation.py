@@ -13,9 +13,9 @@ from jaxtyping import Array, ArrayLike, PyTree
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
-from rigidjax.body.validation import first_impossible
+from rigidjax.body.validation import first_impossible_row
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.rotation.validation import tolerance
@@ -55,7 +55,7 @@ def one_body(shared: PyTree, row: PyTree, constants: PyTree) -> tuple[Any, Any, 
     A state that is invalid becomes NaN.
     """
     body, state0, torque = eqx.combine(shared, row, constants)
-    return body, on_the_group(validation.start(state0, False)), torque
+    return body, project_to_group(validation.start(state0, False)), torque
 
 
 def check_batch(
@@ -219,7 +219,7 @@ def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
         except ValueError as error:
             raise ValueError(f"bodies: {error}; this is body {i}") from None
 
-    return bodies, [(first_impossible(tensors), refuse)]
+    return bodies, [(first_impossible_row(tensors), refuse)]
 
 
 def _check_unit(q: Array) -> list[Check]:

@@ -65,11 +65,11 @@ def kinetic_energy_about(
     >>> kinetic_energy_about(ball, [1.0, 0, 0, 0], [0.0, 1, 0], [0.0, 0, 1])
     Array(2., dtype=float64)
     """
-    body = validation.single(body, MassProperties, "body")
+    body = validation.require_single_body(body, MassProperties, "body")
     velocity = _checks.array_of_shape(velocity, (3,), "velocity")
     omega = _checks.array_of_shape(omega, (3,), "omega")
     about_origin = body.inertia_about(jnp.zeros_like(body.com)).tensor
-    swing = quaternion.rotate(validation.unit_quaternion(q), cross(omega, body.com))
+    swing = quaternion.rotate(validation.attitude_quaternion(q), cross(omega, body.com))
     return (
         0.5 * body.mass * dot(velocity, velocity)
         + body.mass * dot(velocity, swing)
@@ -157,7 +157,7 @@ def ellipsoid(
         words = {"mass": "no size", "energy": "the energy, J", "momentum": "the momentum, kg m²/s"}
         raise TypeError(f"size: wanted {words[kind]} for the ellipsoid of {kind}, got {size!r}")
     if kind == "mass":
-        solid = validation.single(body, MassProperties, "body")
+        solid = validation.require_single_body(body, MassProperties, "body")
         second_moments, q = principal(solid.second_moment)
         return jnp.sqrt(5.0 * second_moments / solid.mass), q
     one = _checks.require_single(body, (Inertia, MassProperties), "body", hint=_HINT)
@@ -174,4 +174,6 @@ def _omega(state):
 
 
 def _tensor(body: Inertia | MassProperties) -> Mat3:
-    return tensor_of(validation.single(body, (Inertia, MassProperties), "body", hint=_HINT))
+    return tensor_of(
+        validation.require_single_body(body, (Inertia, MassProperties), "body", hint=_HINT)
+    )

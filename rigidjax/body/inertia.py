@@ -80,7 +80,7 @@ class Inertia(eqx.Module):
         (3, 3)
         """
         a = _checks.array_of_shape(tensor, (3, 3), "inertia tensor")
-        return Inertia(validation.real_inertia(a))
+        return Inertia(validation.require_real_inertia(a))
 
     @staticmethod
     def from_principal(i1: ScalarLike, i2: ScalarLike, i3: ScalarLike) -> "Inertia":
@@ -90,7 +90,7 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 3.0).tensor[2, 2]
         Array(3., dtype=float64)
         """
-        moments = validation.real_moments(jnp.stack(_checks.scalars(i1=i1, i2=i2, i3=i3)))
+        moments = validation.require_real_moments(jnp.stack(_checks.scalars(i1=i1, i2=i2, i3=i3)))
         return Inertia(jnp.diag(moments))
 
     @staticmethod
@@ -105,7 +105,7 @@ class Inertia(eqx.Module):
         Array([1., 2., 3.], dtype=float64)
         """
         s = _checks.array_of_shape(second_moment, (3, 3), "second moment", unit="kg m²")
-        return Inertia(swap_trace(validation.real_second_moment(s)))
+        return Inertia(swap_trace(validation.require_real_second_moment(s)))
 
     @property
     def second_moment(self) -> Float[Array, "*batch 3 3"]:
@@ -157,7 +157,7 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 2.5).rotated([half, 0, 0, half]).tensor[0, 0]
         Array(2., dtype=float64)
         """
-        m = quaternion.to_matrix(validation.unit_quaternion(q))
+        m = quaternion.to_matrix(validation.attitude_quaternion(q))
         return Inertia(product(m, product(self.tensor, m.T)), self.scale)
 
     def invertible(self) -> "Inertia":
@@ -206,11 +206,13 @@ class MassProperties(eqx.Module):
         )
         _checks.require_same_batch(mass=(mass, 0), com=(com, 1), second_moment=(s, 2))
         dtype = jnp.result_type(mass, com, s)
-        mass = _checks.check_if_known(validation.real_mass, mass.astype(dtype))
+        mass = _checks.check_if_known(validation.require_real_mass, mass.astype(dtype))
         # A traced mass that is not positive makes the body NaN: an error needs `checked`.
         self.mass = mass if _checks.is_known(mass) else jnp.where(mass > 0, mass, jnp.nan)
         self.com = _checks.check_if_known(_checks.require_finite, com.astype(dtype), "com")
-        self.second_moment = _checks.check_if_known(validation.real_second_moment, s.astype(dtype))
+        self.second_moment = _checks.check_if_known(
+            validation.require_real_second_moment, s.astype(dtype)
+        )
 
     @property
     def inertia(self) -> Inertia:
@@ -222,9 +224,9 @@ class MassProperties(eqx.Module):
         constructor.
         """
         return MassProperties(
-            validation.real_mass(self.mass),
+            validation.require_real_mass(self.mass),
             _checks.require_finite(self.com, "com"),
-            validation.real_second_moment(self.second_moment),
+            validation.require_real_second_moment(self.second_moment),
         )
 
     def invertible(self) -> "MassProperties":
@@ -272,7 +274,7 @@ class MassProperties(eqx.Module):
         >>> body.rotated([0.0, 0, 0, 1]).com
         Array([-1.,  0.,  0.], dtype=float64)
         """
-        m = quaternion.to_matrix(validation.unit_quaternion(q))
+        m = quaternion.to_matrix(validation.attitude_quaternion(q))
         second_moment = product(m, product(self.second_moment, m.T))
         return MassProperties(self.mass, apply(m, self.com), second_moment)
 

@@ -95,12 +95,12 @@ def quadrature(
     dtype = jnp.result_type(float)
     cube, weight = jnp.asarray(cube, dtype), jnp.asarray(weight, dtype)
 
-    def at(u):
+    def mass_and_place_at(u):
         r = _checks.array_of_shape(place(u), (3,), "place(u)")
         volume = determinant(jax.jacfwd(place)(u))
         return _checks.array_of_shape(density(r), (), "density(r)") * jnp.abs(volume), r
 
-    per_volume, positions = jax.vmap(at)(cube)
+    per_volume, positions = jax.vmap(mass_and_place_at)(cube)
     _checks.check_if_known(_checks.require_finite, positions, "place(u)")
     _checks.check_if_known(_checks.require_finite, per_volume, "density(r) |∂r/∂u|")
     return sum_masses(per_volume * weight, positions)

@@ -15,7 +15,7 @@ Real = Float[ArrayLike, "..."]
 Result = Float[Array, "..."]
 
 
-def common(**named: Real) -> tuple[Result, ...]:
+def to_common_dtype(**named: Real) -> tuple[Result, ...]:
     """Convert the arguments to arrays of one dtype and shape; Python numbers take the dtype."""
     arrays = {
         name: _checks.array_of_shape(value, (), name, batched=True) for name, value in named.items()
@@ -29,7 +29,7 @@ def common(**named: Real) -> tuple[Result, ...]:
     return tuple(jnp.broadcast_to(array.astype(dtype), shape) for array in arrays.values())
 
 
-def complementary(name: str, value: Real, complement: Real | None) -> dict[str, Any]:
+def complement_pair(name: str, value: Real, complement: Real | None) -> dict[str, Any]:
     """Return `value` and 1 − `value` by name; a `complement` that is given must fit `value`."""
     value = _checks.array_of_shape(value, (), name, batched=True)
     if complement is None:

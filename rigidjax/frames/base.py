@@ -77,18 +77,18 @@ class Force(AbstractScene):
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """Return the times, s, at which the force jumps or has a kink, by its own `jump_times`."""
-        return jumps_within(self.force)
+        return jump_times_within(self.force)
 
     def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
         if self.force is None:
             return jnp.zeros_like(state.x)
-        return per_mass(self.force(t, state, None), self.force)
+        return checked_force_per_mass(self.force(t, state, None), self.force)
 
     def conserved(self, t: ScalarLike, state: PyTree) -> dict[str, Scalar]:
         return {}
 
 
-def per_mass(value: NumbersLike, force: object) -> Vec3:
+def checked_force_per_mass(value: NumbersLike, force: object) -> Vec3:
     """Return the value of a force after a check of its shape: a user's force may return
     anything.
     """
@@ -96,7 +96,7 @@ def per_mass(value: NumbersLike, force: object) -> Vec3:
     return _checks.array_of_shape(value, (3,), f"force {name}", hint="force per mass, m/s²")
 
 
-def jumps_within(*laws: object) -> Float[Array, " n"]:
+def jump_times_within(*laws: object) -> Float[Array, " n"]:
     """Return the `jump_times` of the laws that have them, s.
 
     A scene or torque that contains laws must pass their times on: a solver does not see them.

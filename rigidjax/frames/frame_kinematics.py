@@ -36,9 +36,9 @@ class Instant(eqx.Module):
         turned = {}
         if hasattr(state, "x"):
             x, rate = state.x, self.rate.astype(state.x.dtype)
-            turned["x"] = self.origin.astype(x.dtype) + self.outward(x)
+            turned["x"] = self.origin.astype(x.dtype) + self.to_inertial_axes(x)
             velocity = state.v + linalg3.cross(rate, x)
-            turned["v"] = self.origin_velocity.astype(x.dtype) + self.outward(velocity)
+            turned["v"] = self.origin_velocity.astype(x.dtype) + self.to_inertial_axes(velocity)
         if hasattr(state, "q"):
             q = quaternion.from_matrix(self.rotation).astype(state.q.dtype)
             rate = quaternion.rotate_inverse(state.q, self.rate.astype(state.q.dtype))
@@ -52,8 +52,8 @@ class Instant(eqx.Module):
         turned = {}
         if hasattr(state, "x"):
             dtype = state.x.dtype
-            x = self.inward(state.x - self.origin.astype(dtype))
-            v = self.inward(state.v - self.origin_velocity.astype(dtype))
+            x = self.from_inertial_axes(state.x - self.origin.astype(dtype))
+            v = self.from_inertial_axes(state.v - self.origin_velocity.astype(dtype))
             turned["x"], turned["v"] = x, v - linalg3.cross(self.rate.astype(dtype), x)
         if hasattr(state, "q"):
             back = quaternion.from_matrix(self.rotation.T).astype(state.q.dtype)
@@ -62,14 +62,14 @@ class Instant(eqx.Module):
             turned["omega"] = state.omega - quaternion.rotate_inverse(turned["q"], rate)
         return _replace_fields(state, turned)
 
-    def outward(self, y: Vector) -> Vec3:
+    def to_inertial_axes(self, y: Vector) -> Vec3:
         """Return the components in S, M y', of a vector given in S' (notes, eq 85): a force, a
         direction.
         """
         y = _checks.array_of_shape(y, (3,), "y")
         return linalg3.apply(self.rotation.astype(y.dtype), y)
 
-    def inward(self, y: Vector) -> Vec3:
+    def from_inertial_axes(self, y: Vector) -> Vec3:
         """Return the components in S', Mᵀ y, of a vector given in S (notes, eq 86; f = MᵀF of eq
         91).
         """
@@ -94,7 +94,7 @@ class Instant(eqx.Module):
 
     def translation(self) -> Vec3:
         """Return the acceleration −Mᵀ d²X/dt² of an accelerated origin."""
-        return -self.inward(self.origin_acceleration)
+        return -self.from_inertial_axes(self.origin_acceleration)
 
     def fictitious(self, x: Vector, v: Vector) -> Vec3:
         """Return the sum of the four inertial accelerations (notes, eq 91)."""
@@ -119,6 +119,6 @@ def _can_travel(state: PyTree) -> None:
             _checks.array_of_shape(getattr(state, name), (size,), name, hint=hint)
 
 
-def _replace_fields(state: PyTree, turned: dict[str, Any]) -> Any:
-    names = list(turned)
-    return eqx.tree_at(lambda s: [getattr(s, n) for n in names], state, [turned[n] for n in names])
+def _replace_fields(state: PyTree, fields: dict[str, Any]) -> Any:
+    names = list(fields)
+    return eqx.tree_at(lambda s: [getattr(s, n) for n in names], state, [fields[n] for n in names])

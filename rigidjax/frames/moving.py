@@ -59,7 +59,7 @@ class MovingFrame(eqx.Module):
             _checks.require_function(origin, "origin", "of time to (3,)", hint=hint)
         if rate is not None:
             _checks.require_function(rate, "rate", "of time to (3,)")
-        self.rotation, self.origin = rotation_models.differentiable(rotation), origin
+        self.rotation, self.origin = rotation_models.with_forward_solves(rotation), origin
         self.rate = getattr(rotation, "rate", None) if rate is None else rate
 
     def matrix(self, t: ScalarLike) -> Mat3:
@@ -165,7 +165,7 @@ class MovingFrame(eqx.Module):
         `t` (eqs 89, 90).
         """
         now, a = self.at(t), _checks.array_of_shape(a, (3,), "a")
-        return now.outward(a - now.fictitious(x, v))
+        return now.to_inertial_axes(a - now.fictitious(x, v))
 
     def force_from_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
         """Return f = MᵀF (3,): a force F, or any direction, in the axes of S' (notes, eq 91)."""

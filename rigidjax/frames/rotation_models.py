@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from rigidjax import _checks
 from rigidjax._types import Mat3, ScalarLike, Vec3
 from rigidjax.rotation import linalg3, quaternion, so3
-from rigidjax.rotation.validation import near_unit, rotation_matrix
+from rigidjax.rotation.validation import require_near_unit, require_rotation_matrix
 
 
 class Uniform(eqx.Module):
@@ -69,7 +69,7 @@ class AboutAxis(eqx.Module):
         return speed * self.axis.astype(t.dtype)
 
 
-def differentiable(rotation: PyTree) -> Any:
+def with_forward_solves(rotation: PyTree) -> Any:
     """Return `rotation` with its own solves in forward mode, which dΩ/dt needs."""
 
     def reverse(part: PyTree) -> bool:
@@ -92,8 +92,8 @@ def matrix(rotation: PyTree, t: Array) -> Mat3:
     shape = jnp.shape(value)
     if shape == (4,):
         q = _checks.array_of_shape(value, (4,), "rotation").astype(t.dtype)
-        return quaternion.to_matrix(quaternion.normalise(near_unit(q, "rotation", 1e-3)))
+        return quaternion.to_matrix(quaternion.normalise(require_near_unit(q, "rotation", 1e-3)))
     m = _checks.array_of_shape(
         value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)"
     )
-    return _checks.check_if_known(rotation_matrix, m, "rotation").astype(t.dtype)
+    return _checks.check_if_known(require_rotation_matrix, m, "rotation").astype(t.dtype)

@@ -63,7 +63,9 @@ class LagrangeEquations(eqx.Module):
         push = jax.grad(self._value)(q, rate) - carried
         if self.force is not None:
             push = push + _checks.array_of_shape(self.force(t, q, rate), q.shape, "force")
-        return Coordinates(rate, _solve(jax.jacfwd(lambda v: momentum(q, v))(rate), push))
+        return Coordinates(
+            rate, _solve_for_acceleration(jax.jacfwd(lambda v: momentum(q, v))(rate), push)
+        )
 
     def energy(self, y: Coordinates) -> Scalar:
         """Return Jacobi's integral `q̇·∂L/∂q̇ − L`, J: conserved without a `force`."""
@@ -120,7 +122,7 @@ class EulerAngleTop(eqx.Module):
     torque: Torque | None
 
     def __init__(self, inertia: Inertia, torque: Torque | None = None):
-        inertia = validation.single(inertia, Inertia, "inertia")
+        inertia = validation.require_single_body(inertia, Inertia, "inertia")
         if torque is not None:
             require_law(torque)
         if torque is not None and not hasattr(torque, "energy"):
@@ -170,7 +172,9 @@ def from_attitude(state: HasAttitude) -> Coordinates:
     return Coordinates(angles, euler.omega_to_rates(angles, state.omega))
 
 
-def _solve(matrix: Float[Array, "n n"], push: Float[Array, " n"]) -> Float[Array, " n"]:
+def _solve_for_acceleration(
+    matrix: Float[Array, "n n"], push: Float[Array, " n"]
+) -> Float[Array, " n"]:
     n = push.shape[0]
     if n == 1:
         return push / matrix[0]

@@ -59,7 +59,7 @@ class LiePoisson(eqx.Module):
     hamiltonian: Callable[[Any], Any]
 
     def __call__(self, t: ScalarLike, y: Momentum, args: object = None) -> Momentum:
-        return Momentum(cross(y.pi, jax.grad(lambda p: _number(self.hamiltonian(p)))(y.pi)))
+        return Momentum(cross(y.pi, jax.grad(lambda p: _checked_scalar(self.hamiltonian(p)))(y.pi)))
 
 
 class LiePoissonWithDirection(eqx.Module):
@@ -72,7 +72,7 @@ class LiePoissonWithDirection(eqx.Module):
     def __call__(
         self, t: ScalarLike, y: MomentumAndDirection, args: object = None
     ) -> MomentumAndDirection:
-        value = lambda p, g: _number(self.hamiltonian(p, g))  # noqa: E731
+        value = lambda p, g: _checked_scalar(self.hamiltonian(p, g))  # noqa: E731
         turn, pull = jax.grad(value, argnums=(0, 1))(y.pi, y.gamma)
         return MomentumAndDirection(cross(y.pi, turn) + cross(y.gamma, pull), cross(y.gamma, turn))
 
@@ -108,7 +108,7 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
     return LiePoissonWithDirection(_checks.require_function(hamiltonian, "hamiltonian", _WANTED))
 
 
-def _invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
+def _require_invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
     _checks.require_single(inertia, _inertia.Inertia, "inertia")
     return validation.check_body(inertia, inertia.tensor, None, throw=False)
 
@@ -126,7 +126,7 @@ class RotationalHamiltonian(eqx.Module):
     inverse: Mat3
 
     def __init__(self, inertia: _inertia.Inertia):
-        self.inverse = _inertia.inverse(_invertible(inertia).tensor)
+        self.inverse = _inertia.inverse(_require_invertible(inertia).tensor)
 
     def __call__(self, pi: Float[ArrayLike, "3"] | list[float]) -> Scalar:
         pi = _checks.array_of_shape(pi, (3,), "pi")
@@ -151,7 +151,7 @@ class HeavyTopHamiltonian(eqx.Module):
     top: HeavyTop
 
     def __init__(self, inertia: _inertia.Inertia, top: HeavyTop):
-        self.inertia = _invertible(inertia)
+        self.inertia = _require_invertible(inertia)
         hint = "this Hamiltonian is for gravity alone"
         self.top = _checks.require_instance(top, HeavyTop, "top", hint=hint)
         self.inverse = _inertia.inverse(self.inertia.tensor)
@@ -171,5 +171,5 @@ class HeavyTopHamiltonian(eqx.Module):
         return MomentumAndDirection(pi, quaternion.rotate_inverse(state.q, self.top.gravity))
 
 
-def _number(value):
+def _checked_scalar(value):
     return _checks.array_of_shape(value, (), "hamiltonian", hint="one number, J")

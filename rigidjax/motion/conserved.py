@@ -14,7 +14,7 @@ from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.torques import AbstractTorque, CentralGravity
 from rigidjax.motion.torques.base import Torque, in_precision, length_or_zero, require_scene
 from rigidjax.motion.torques.composite import parts_of
-from rigidjax.motion.torques.states import Frozen, freeze
+from rigidjax.motion.torques.states import FrozenLaw, freeze
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
 
@@ -38,7 +38,7 @@ def energy(
     >>> energy(rj.Inertia.from_principal(1.0, 1.0, 1.0), start, top)
     Array(10.31, dtype=float64)
     """
-    turning, parts, t = _scene(body, state, torque, t)
+    turning, parts, t = _state_and_torques(body, state, torque, t)
     for part in parts:
         if not hasattr(part, "energy"):
             words = f"energy: wanted torques with a potential, got {type(part).__name__}, which has"
@@ -74,7 +74,7 @@ def conserved(
     >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))
     ['energy', 'momentum_squared']
     """
-    turning, parts, t = _scene(body, state, torque, t)
+    turning, parts, t = _state_and_torques(body, state, torque, t)
     dtype = turning.omega.dtype
     body = in_precision(body, dtype)
     found: dict[str, Float[Array, "..."]] = {}
@@ -94,7 +94,7 @@ def conserved(
             length = length_or_zero(axis)
             found["momentum_along_axis"] = dot(momentum, axis) / jnp.where(length > 0, length, 1)
     if isinstance(turning, HasPose) and isinstance(body, MassProperties):
-        plain = [(part, part.law if isinstance(part, Frozen) else part) for part in parts]
+        plain = [(part, part.law if isinstance(part, FrozenLaw) else part) for part in parts]
         # A torque whose `feels` is `HasPose` may return a force as well.
         turns = lambda law: isinstance(law, AbstractTorque) and law.feels is not HasPose  # noqa: E731
         pushed = [part for part, law in plain if not turns(law)]
@@ -139,11 +139,11 @@ def drift(
     spin = jax.vmap(lambda t, y: _spin_size(body, y, torque, t))(ts, ys)
     found = {}
     for name, values in at_all.items():
-        away = _size(values - jax.lax.slice_in_dim(values, 0, 1))
+        away = _row_lengths(values - jax.lax.slice_in_dim(values, 0, 1))
         if name == "energy":
             scale = kinetic
         elif name in ("linear_momentum", "momentum_about_origin"):
-            scale = _size(values)
+            scale = _row_lengths(values)
         else:
             scale = spin**2 if name == "momentum_squared" else spin
         scale = jnp.max(scale)
@@ -151,7 +151,7 @@ def drift(
     return found
 
 
-def _scene(
+def _state_and_torques(
     body: Body, state: PyTree, torque: Torque | None, t: ScalarLike
 ) -> tuple[Any, tuple[Any, ...], Scalar]:
     """Return the body's state, its torques with their own states inserted, and the time."""
@@ -183,10 +183,10 @@ def _momentum(body: Body, state: HasSpin, parts: tuple[Any, ...], t: ScalarLike)
 
 
 def _spin_size(body: Body, state: PyTree, torque: Torque | None, t: ScalarLike) -> Scalar:
-    state, parts, t = _scene(body, state, torque, t)
+    state, parts, t = _state_and_torques(body, state, torque, t)
     return length_or_zero(_momentum(in_precision(body, state.omega.dtype), state, parts, t))
 
 
-def _size(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:
+def _row_lengths(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:
     """Return the length of each row, or the absolute values of plain numbers."""
     return jnp.abs(values) if values.ndim == 1 else jnp.sqrt(jnp.sum(values**2, axis=-1))

@@ -175,12 +175,12 @@ class NewtonEuler(eqx.Module):
         return Rigid(y.v, acceleration, quaternion.rate(y.q, y.omega), spin)
 
 
-def on_the_group(state: State) -> State:
+def project_to_group(state: State) -> State:
     """Return the state with its quaternion, if it has one, scaled to length 1; refuse a quaternion
     of zero.
     """
     if isinstance(state, Coupled):
-        return eqx.tree_at(lambda s: s.motion, state, on_the_group(state.motion))
+        return eqx.tree_at(lambda s: s.motion, state, project_to_group(state.motion))
     if isinstance(state, HasAttitude):
         q = _checks.array_of_shape(state.q, (4,), "state.q")
         if _checks.is_known(q):
@@ -188,11 +188,11 @@ def on_the_group(state: State) -> State:
             _checks.error_if(
                 q, length**2 == 0, f"state.q: wanted a length near 1, got {length:.3g}"
             )
-        return eqx.tree_at(lambda s: s.q, state, _unit(state.q))
+        return eqx.tree_at(lambda s: s.q, state, _normalise(state.q))
     return state
 
 
-def _unit(q: Quat) -> Quat:
+def _normalise(q: Quat) -> Quat:
     """Return q/|q|, with equal rounding in every program.
 
     XLA replaces q/√n by a product with 1/√n in some programs. Reverse mode runs steps again in

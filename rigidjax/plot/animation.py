@@ -112,7 +112,7 @@ def tumble(
     b'GIF89a'
     """
     seconds, pictures = _length(ts, seconds, fps)
-    body = validation.single(body, (Inertia, MassProperties), "body")
+    body = validation.require_single_body(body, (Inertia, MassProperties), "body")
     moments, q = evenly(ts, states, pictures)
     size = _checks.integer(size, "size", 64)
     corners, tip, reach = _box(body)

@@ -65,7 +65,7 @@ def _body_and_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties
     it is no fit.
     """
     if isinstance(body, Inertia | MassProperties):
-        return validation.single(body, (Inertia, MassProperties), "body"), None
+        return validation.require_single_body(body, (Inertia, MassProperties), "body"), None
     if not hasattr(body, "x") or not hasattr(body, "model"):
         words = "inertia_ellipsoid: wanted an Inertia, a MassProperties or a Fit, got "
         raise TypeError(words + _checks.type_name(body))

@@ -43,7 +43,7 @@ def phase_portrait(
     >>> phase_portrait(body, top, rj.simulate(body, start, [0.0, 0.1, 0.2], top).ys).get_xlabel()
     'tilt θ, deg'
     """
-    inertia = validation.single(inertia, Inertia, "inertia")
+    inertia = validation.require_single_body(inertia, Inertia, "inertia")
     for name, size in (("mass", ()), ("com", (3,)), ("gravity", (3,))):
         _checks.array_of_shape(
             getattr(_checks.require_instance(top, HeavyTop, "top"), name), size, f"top.{name}"

@@ -25,12 +25,16 @@ from rigidjax.rotation.linalg3 import (
     determinant,
     dot,
     hat,
-    near_one,
+    power_of_two_scale,
     product,
     solve,
     vee,
 )
-from rigidjax.rotation.validation import direction, rotation_matrix, unit_quaternion
+from rigidjax.rotation.validation import (
+    require_direction,
+    require_rotation_matrix,
+    require_unit_quaternion,
+)
 
 # The least weight, relative to the largest, of the first estimate in Wahba's problem.
 _LIGHT = 1e-3
@@ -50,7 +54,7 @@ def project(matrix: Mat3Like) -> Mat3:
     matrix = _checks.array_of_shape(matrix, (3, 3), "matrix")
     if _checks.is_known(matrix):
         _checks.require_finite(matrix, "matrix")
-        direction(matrix.reshape(9), "matrix")
+        require_direction(matrix.reshape(9), "matrix")
         size = np.max(np.abs(np.asarray(matrix)))
         # For the matrix over its largest entry: its own determinant may overflow.
         found = np.linalg.det(np.asarray(matrix) / size)
@@ -83,8 +87,8 @@ def wahba(
     world = _checks.array_of_shape(world, body.shape, "world")
     w = weights_of(weights, body[:, 0], "body")
     for name, rows in (("body", body), ("world", world)):
-        direction(rows.reshape(-1), name)
-    w, world, body = (of_order_one(x) for x in (w, world, body))
+        require_direction(rows.reshape(-1), name)
+    w, world, body = (scale_to_order_one(x) for x in (w, world, body))
     words = "wahba: these directions do not fix the attitude; two that are not parallel are needed"
     heavy, those, these = lax.stop_gradient((w, world, body))
     # In one sum a light direction would lose its digits beside a heavy one.
@@ -149,7 +153,7 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     [0.0, 1.0, 0.0]
     """
     a, b = _checks.array_of_shape(a, (3,), "a"), _checks.array_of_shape(b, (3,), "b")
-    a, b = (of_order_one(direction(x, name)) for x, name in ((a, "a"), (b, "b")))
+    a, b = (scale_to_order_one(require_direction(x, name)) for x, name in ((a, "a"), (b, "b")))
     a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
     middle = a + b
     n2, normal = dot(middle, middle), cross(a, middle)
@@ -176,7 +180,7 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     matrices = _checks.array_of_rows(matrices, (3, 3), "matrices")
-    _checks.check_if_known(rotation_matrix, matrices, "matrices")
+    _checks.check_if_known(require_rotation_matrix, matrices, "matrices")
     weights_of(weights, matrices[:, 0, 0], "matrices")
     return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
 
@@ -193,8 +197,8 @@ def mean_quaternion(
     [1.0, 0.0, 0.0, 0.0]
     """
     q = _checks.array_of_rows(quaternions, (4,), "quaternions")
-    _checks.check_if_known(unit_quaternion, q, "quaternions")
-    return _karcher(q, of_order_one(weights_of(weights, q[:, 0], "quaternions")))
+    _checks.check_if_known(require_unit_quaternion, q, "quaternions")
+    return _karcher(q, scale_to_order_one(weights_of(weights, q[:, 0], "quaternions")))
 
 
 # Compiled once: outside of `jit` the loop would be compiled again at each call.
@@ -218,23 +222,23 @@ def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
     return quaternion.canonical(quaternion.normalise(start))
 
 
-def of_order_one(x: Array) -> Array:
+def scale_to_order_one(x: Array) -> Array:
     """Return the array multiplied by a power of two that brings its largest entry near 1.
 
     It serves formulas of ratios, in which the scale cancels: no product overflows.
     """
-    return near_one(jnp.max(jnp.abs(x))) * x
+    return power_of_two_scale(jnp.max(jnp.abs(x))) * x
 
 
-def weights_of(weights: ArrayLike | None, like: Array, of: str) -> Array:
-    """Return one weight for each row of `like`, 1 where `weights` is `None`; known weights must
+def weights_of(weights: ArrayLike | None, rows: Array, description: str) -> Array:
+    """Return one weight for each row of `rows`, 1 where `weights` is `None`; known weights must
     have a positive sum.
     """
-    if like.shape[0] == 0:
-        raise ValueError(f"{of}: wanted at least one row, got none")
+    if rows.shape[0] == 0:
+        raise ValueError(f"{description}: wanted at least one row, got none")
     if weights is None:
-        return jnp.ones_like(like)
-    w = _checks.array_of_shape(weights, like.shape, "weights")
+        return jnp.ones_like(rows)
+    w = _checks.array_of_shape(weights, rows.shape, "weights")
     if _checks.is_known(w):
         words = "numbers ≥ 0, at least one of them positive"
         _checks.require_sign(_checks.require_finite(w, "weights"), "weights", words, zero=True)
@@ -269,7 +273,7 @@ def _curvature(r: Mat3, b: Mat3) -> Mat3:
 @jax.custom_jvp
 def nearest_rotation(b: Mat3) -> Mat3:
     """Return the rotation R with the largest Tr(Rᵀb), for a matrix of any size."""
-    b = of_order_one(b)
+    b = scale_to_order_one(b)
     b = b / jnp.sqrt((b * b).sum())
     root, zeta = _quartic(b)
     kappa = 0.5 * (root * root - 1)
@@ -288,6 +292,6 @@ def _best_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tupl
     (b,), (db,) = primals, tangents
     r = nearest_rotation(b)
     # `b` may have any size: a common factor for `b` and `db` leaves the derivative unchanged.
-    scale = near_one(jnp.max(jnp.abs(b)))
+    scale = power_of_two_scale(jnp.max(jnp.abs(b)))
     b, db = scale * b, scale * db
     return r, product(r, hat(solve(_curvature(r, b), 2 * vee(product(r.T, db)))))

@@ -59,7 +59,7 @@ def square(v: Sequence[Scalar]) -> Scalar:
     return compute_once(dot_components(v, v))
 
 
-def near_one(*parts: Scalar) -> Scalar:
+def power_of_two_scale(*parts: Scalar) -> Scalar:
     """Return a power of two that brings the largest of some scalars near 1, with derivative zero.
 
     It serves formulas that do not depend on the length of their argument. The argument multiplied

@@ -12,8 +12,8 @@ from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.linalg3 import components, cross, dot, near_one
-from rigidjax.rotation.validation import direction
+from rigidjax.rotation.linalg3 import components, cross, dot, power_of_two_scale
+from rigidjax.rotation.validation import require_direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
@@ -37,7 +37,7 @@ def to_quaternion(sigma: Vec3Like) -> Quat:
     sigma = _checks.finite_array(sigma, (3,), "sigma")
     # Numerator and denominator are multiplied by the square of a power of two, `one`, so that
     # |σ|² does not overflow; the number 1 of the formula becomes `one`².
-    one = jnp.minimum(near_one(*components(sigma)), 1)
+    one = jnp.minimum(power_of_two_scale(*components(sigma)), 1)
     sigma = one * sigma
     s, one2 = dot(sigma, sigma), one * one
     return jnp.concatenate([(one2 - s)[None], 2 * one * sigma]) / (one2 + s)
@@ -68,7 +68,7 @@ def shadow(sigma: Vec3Like) -> Vec3:
     >>> shadow(jnp.array([0.0, 0.5, 0.0])).tolist()
     [-0.0, -2.0, -0.0]
     """
-    return _shadow(direction(_checks.array_of_shape(sigma, (3,), "sigma"), "sigma"))
+    return _shadow(require_direction(_checks.array_of_shape(sigma, (3,), "sigma"), "sigma"))
 
 
 def switch(sigma: Vec3Like) -> Vec3:
@@ -83,7 +83,7 @@ def switch(sigma: Vec3Like) -> Vec3:
 
 
 def _shadow(sigma: Vec3) -> Vec3:
-    scale = near_one(*components(sigma))
+    scale = power_of_two_scale(*components(sigma))
     near = scale * sigma
     return -scale * (near / dot(near, near))
 

@@ -13,8 +13,8 @@ from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.linalg3 import components, cross, dot, near_one
-from rigidjax.rotation.validation import direction
+from rigidjax.rotation.linalg3 import components, cross, dot, power_of_two_scale
+from rigidjax.rotation.validation import require_direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
@@ -26,10 +26,10 @@ def from_quaternion(q: QuatLike) -> Vec3:
     >>> from_quaternion(jnp.array([2.0, 0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 1.0]
     """
-    q = direction(quaternion.canonical(q), "q")
+    q = require_direction(quaternion.canonical(q), "q")
     # The derivative squares the denominator: a q of any length is scaled first, so that nothing
     # overflows.
-    q = near_one(*components(q)) * q
+    q = power_of_two_scale(*components(q)) * q
     return q[1:] / q[0]
 
 

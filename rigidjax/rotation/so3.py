@@ -35,7 +35,7 @@ from rigidjax.rotation.linalg3 import (
     vee as vee,
 )
 from rigidjax.rotation.stumpff import stumpff
-from rigidjax.rotation.validation import rotation_matrix, turn
+from rigidjax.rotation.validation import require_rotation_matrix, require_turn
 
 
 def exp(v: Vec3Like) -> Mat3:
@@ -47,7 +47,7 @@ def exp(v: Vec3Like) -> Mat3:
     >>> exp(jnp.array([0.0, 0.0, jnp.pi / 2])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
     """
-    return vector_to_matrix(turn(_checks.array_of_shape(v, (3,), "v"), "v"))
+    return vector_to_matrix(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
 
 
 def log(matrix: Mat3Like) -> Vec3:
@@ -73,7 +73,7 @@ def left_jacobian(v: Vec3Like) -> Mat3:
     >>> left_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    parts = components(turn(_checks.array_of_shape(v, (3,), "v"), "v"))
+    parts = components(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
     t = square(parts)
     return hat_polynomial(parts, stumpff(2, t), stumpff(3, t))
 
@@ -97,7 +97,7 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
     >>> left_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    return kernels.left_jacobian_inverse(turn(_checks.array_of_shape(v, (3,), "v"), "v"))
+    return kernels.left_jacobian_inverse(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
 
 
 def right_jacobian_inverse(v: Vec3Like) -> Mat3:
@@ -237,7 +237,7 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     """
     a, b = _checks.array_of_shape(a, (3, 3), "a"), _checks.array_of_shape(b, (3, 3), "b")
     v = quaternion.log(matrix_to_quaternion(_relative_rotation(a, b)))
-    part = turn(_checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn")
+    part = require_turn(_checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn")
     return product(a, vector_to_matrix(part))
 
 
@@ -264,7 +264,7 @@ def check(
     >>> check(jnp.eye(3)).shape
     (3, 3)
     """
-    return rotation_matrix(_checks.array_of_shape(matrix, (3, 3), name, batched=True), name)
+    return require_rotation_matrix(_checks.array_of_shape(matrix, (3, 3), name, batched=True), name)
 
 
 __all__ = [

@@ -16,39 +16,46 @@ def tolerance(dtype: object) -> float:
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
-def direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
+def require_direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
     """Refuse a known vector without a direction: zero, NaN, infinity.
 
     XLA takes a number below the least normal number, 2e-308, for zero on some machines.
     """
     if (
         _checks.is_known(v)
-        and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest(v) < np.inf
+        and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest_component(v) < np.inf
     ):
         _checks.require_finite(v, name)
-        found = "zero" if _largest(v) == 0 else f"less than the least normal number, {least:.2g}"
+        found = (
+            "zero"
+            if _largest_component(v) == 0
+            else f"less than the least normal number, {least:.2g}"
+        )
         raise ValueError(f"{name}: wanted a direction, got {found}")
     return v
 
 
-def turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
+def require_turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
     """Refuse a known rotation vector or angle that is so large that no digit is correct."""
-    if _checks.is_known(v) and not _largest(v) <= (limit := 1 / float(jnp.finfo(v.dtype).eps)):
+    if _checks.is_known(v) and not _largest_component(v) <= (
+        limit := 1 / float(jnp.finfo(v.dtype).eps)
+    ):
         _checks.require_finite(v, name)
         raise ValueError(
-            f"{name}: a turn by {_largest(v):.3g} rad; beyond {limit:.2g} rad neighbouring "
-            f"{v.dtype} numbers are more than half a radian apart: the attitude is unknown"
+            f"{name}: a turn by {_largest_component(v):.3g} rad; beyond {limit:.2g} rad "
+            f"neighbouring {v.dtype} numbers are more than half a radian apart: the attitude is "
+            "unknown"
         )
     return v
 
 
-def _largest(v: Float[Array, "*n"]) -> float:
+def _largest_component(v: Float[Array, "*n"]) -> float:
     # The result is NaN if an entry is. It is one call of NumPy only, because it runs before every
     # map that is called outside of `jit`.
     return float(np.abs(np.asarray(v)).max())
 
 
-def rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
+def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
     """Refuse any matrix but a rotation, with the determinant or the error in the message."""
     m = _checks.require_finite(m, name)
     known = _checks.is_known(m)
@@ -69,7 +76,7 @@ def rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*
     return _checks.error_if(m, ~(error.max() <= limit), words)
 
 
-def near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"]:
+def require_near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"]:
     """Refuse a known quaternion whose length is not 1 to `limit`."""
     if _checks.is_known(q):
         length = float(np.linalg.norm(np.asarray(q, float)))
@@ -79,7 +86,7 @@ def near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"
     return q
 
 
-def unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
+def require_unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
     """Return a quaternion scaled to length 1 if its length is nearly 1; refuse any other."""
     q = _checks.require_finite(q, name)
     # Under `jit` JAX traces what is computed from known numbers, too; NumPy does not.

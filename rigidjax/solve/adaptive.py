@@ -14,7 +14,7 @@ from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 from rigidjax.solve import adaptive_loop, adjoint, validation
 from rigidjax.solve.adaptive_loop import HALTED, LoopState, Method, Record, Run, outcome
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
@@ -90,7 +90,7 @@ def adaptive(
         ends = lambda given, t, y: condition.call(given[count:], t, y)  # noqa: E731
     # Neither the condition that ends a run nor the side of a switch has a derivative.
     smooth = [i < ready.smooth and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
-    project = lambda y: ravel_pytree(on_the_group(tree(y)))[0]  # noqa: E731
+    project = lambda y: ravel_pytree(project_to_group(tree(y)))[0]  # noqa: E731
     sizes = [leaf.size for leaf in jax.tree.leaves(y0)]
     of_field = lambda given, t, y: ready.field(given[:count], t, y)  # noqa: E731
     method = Method(solver.tableau, of_field, project, ends, sizes, max_steps)

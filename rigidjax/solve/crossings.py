@@ -34,7 +34,7 @@ from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, with_own_states
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import missing_state_message
 from rigidjax.solve import crossing_loop, validation
 from rigidjax.solve.adaptive import taken_out
@@ -236,7 +236,7 @@ def solve_until(
     setup: Free | Loop, event: Event, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
     """As `solve`, up to the event; and the event's time and state, NaN if there is none."""
-    state0 = on_the_group(state0)
+    state0 = project_to_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
     steps = setup.max_steps if isinstance(setup, Loop) else 1_000_000
     found = located(crossed, Search(event.direction, 1, steps), numbers)
@@ -277,7 +277,7 @@ def _with_derivatives(crossing: Any, jumps: Array, inputs: Any) -> Any:
 def _solved(
     setup: Free | Loop, event: Event, many: int, max_steps: int, state0: Any, ts: Array
 ) -> Crossings:
-    state0 = on_the_group(state0)
+    state0 = project_to_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
     found = located(crossed, Search(event.direction, many, max_steps), numbers)
     times, states = _as_found(found.times, found.states, found.jumps, setup, event, state0, ts)
@@ -342,7 +342,7 @@ class Section(NamedTuple):
         return self.tree(y) if self.form is None else self.form.leave(t, self.tree(y))
 
     def project(self, y: Array) -> Array:
-        return ravel_pytree(on_the_group(self.tree(y)))[0]
+        return ravel_pytree(project_to_group(self.tree(y)))[0]
 
     def time(self, s: Array) -> Array:
         """Time t at s, and the other way."""

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from rigidjax import _checks, _show
 from rigidjax._types import ScalarLike
-from rigidjax.motion.manifold import minus, names, parts
+from rigidjax.motion.manifold import minus, names, parts_by_name
 from rigidjax.solve import difference, validation
 from rigidjax.solve.linear_map import as_known
 from rigidjax.solve.run import Free, Loop, equations_of_motion, solve
@@ -187,7 +187,7 @@ def _apart(others: Any, ys: Any) -> dict[str, Array]:
 
 
 def _lengths(state: Any, changes: Array) -> dict[str, Array]:
-    named = parts(state, changes).items()
+    named = parts_by_name(state, changes).items()
     return {name.removeprefix("motion."): jnp.linalg.norm(part, axis=-1) for name, part in named}
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.motion.coupled import Coupled
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.manifold import dimension, minus_small, plus
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
@@ -135,7 +135,7 @@ def _solved(
 ) -> Exponents:
     # Whole numbers of Python are no arrays: `filter_jit` compiles for each.
     solver, many, intervals, transient, max_steps = how
-    state0 = on_the_group(state0)
+    state0 = project_to_group(state0)
     step = length / intervals
 
     def along(t: Array, y: Coupled, args: None) -> Coupled:

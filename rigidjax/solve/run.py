@@ -25,7 +25,7 @@ from rigidjax.motion.equations import (
     AttitudeEquations,
     EulerEquations,
     NewtonEuler,
-    on_the_group,
+    project_to_group,
 )  # fmt: skip
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import validation
@@ -152,7 +152,7 @@ def solve(
     setup: Free | Loop | Setup, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
-    state0 = given = on_the_group(state0)
+    state0 = given = project_to_group(state0)
     if isinstance(setup, Free):
         ys, stats, result = _free(setup, state0, ts)
     else:
@@ -318,7 +318,7 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
 @eqx.filter_jit
 def _end_of(loop: Loop, state0: Any, ts: Array) -> Any:
     """Where a run ends: time, next step, number of steps, and state."""
-    state0 = with_own_states(loop.body, on_the_group(state0), loop.torque, ts[0])
+    state0 = with_own_states(loop.body, project_to_group(state0), loop.torque, ts[0])
     *_, stats, _, end = _loop(loop, None, state0, ts)
     return *end, stats["num_steps"]
 

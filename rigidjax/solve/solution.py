@@ -17,7 +17,7 @@ from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.conserved import drift
 from rigidjax.motion.coupled import Coupled, motion_of
-from rigidjax.motion.manifold import dimension, minus_small, parts, plus, turns
+from rigidjax.motion.manifold import dimension, minus_small, parts_by_name, plus, rotation_slices
 from rigidjax.motion.torques.states import require_stateless
 from rigidjax.solve.error import Error, error_of_run, largest_in_run
 from rigidjax.solve.run import Free, Loop, Setup, solve
@@ -225,12 +225,12 @@ def _transition(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, 
 def _growth(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, " times"]:
     """The largest singular value of dy(t)/dy(t0), each part relative to its largest size."""
     start = jax.tree.map(lambda leaf: leaf[0], ys)
-    each = parts(start, jnp.ones(dimension(start), ts.dtype)).values()
+    each = parts_by_name(start, jnp.ones(dimension(start), ts.dtype)).values()
     both = zip(each, jax.tree.leaves(ys), strict=True)
     sizes = jnp.concatenate([a.reshape(-1) * largest_in_run(b) for a, b in both])
     sizes = jnp.where(sizes > 0, sizes, 1)
     # A turn by δθ changes q by half of it.
-    for turned in turns(start):
+    for turned in rotation_slices(start):
         sizes = sizes.at[turned].multiply(2)
     change = _transition(setup, ts, ys) * (sizes[None] / sizes[:, None])[None]
     return jnp.linalg.norm(change, ord=2, axis=(1, 2))

@@ -17,7 +17,7 @@ from rigidjax.frames import AbstractScene, BodyInFrame, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.torques import ChangingInertia, GravityGradient
-from rigidjax.motion.torques.base import require_rung
+from rigidjax.motion.torques.base import require_state_type
 from rigidjax.motion.torques.composite import parts_of
 from rigidjax.rotation.validation import tolerance
 
@@ -52,7 +52,7 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
     if isinstance(state0, Point):
         scene_of(torque)
     if torque is not None and not isinstance(torque, AbstractScene | MovingFrame):
-        require_rung(torque, state0)
+        require_state_type(torque, state0)
         _require_one_frame(torque)
     if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
         raise TypeError(

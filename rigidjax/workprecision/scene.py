@@ -97,7 +97,7 @@ class BenchmarkScene(eqx.Module):
         wanted = "an Attitude or a Point"
         _checks.require_instance(self.state0, (Attitude, Point), "state0", wanted=wanted, hint=hint)
         if self.body is not None:
-            validation.single(self.body, Inertia, "body", hint="or None with a Point")
+            validation.require_single_body(self.body, Inertia, "body", hint="or None with a Point")
         _checks.positive_float(self.end, "end", "an end > 0, s")
 
     @property

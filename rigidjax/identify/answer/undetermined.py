@@ -30,7 +30,7 @@ from rigidjax.identify.uncertainty.quantities import (
     reports_starts,
     value_and_slope,
 )
-from rigidjax.motion.manifold import minus, parts
+from rigidjax.motion.manifold import minus, parts_by_name
 from rigidjax.rotation import quaternion
 
 if TYPE_CHECKING:
@@ -224,8 +224,8 @@ def _values_and_slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, 
     def initial_states(x: Array) -> list[Array]:
         states = jax.vmap(ReferenceStates.start_at)(reference, x[model.index.start])
         one, numbers = jax.tree.map(lambda leaf: leaf[0], states), []
-        change = parts(one, jax.vmap(minus)(states, start))
-        offset = parts(one, jax.vmap(minus)(states, reference.state))
+        change = parts_by_name(one, jax.vmap(minus)(states, start))
+        offset = parts_by_name(one, jax.vmap(minus)(states, reference.state))
         if "q" in change:
             numbers += [jax.vmap(quaternion.rotate)(start.q, change["q"]), change["q"]]
         return [*numbers, *(offset[name] for name in ("x", "v") if name in offset)]

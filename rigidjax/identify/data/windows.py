@@ -19,7 +19,7 @@ from rigidjax.identify.data.recording import Reading, Recording, recording_of
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.sensors.states import StateSensor
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.manifold import minus_small, names, parts
+from rigidjax.motion.manifold import minus_small, names, parts_by_name
 from rigidjax.motion.torques.inputs import delays_of
 
 
@@ -49,7 +49,7 @@ class Horizons(NamedTuple):
 
 def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"]) -> Horizons:
     """Average the `errors` of states over windows; `starts` has the type of the states."""
-    by_kind = parts(jax.tree.map(lambda leaf: leaf[0], starts), errors)
+    by_kind = parts_by_name(jax.tree.map(lambda leaf: leaf[0], starts), errors)
     absolute = {k: np.asarray(jnp.mean(jnp.abs(v), (0, 2))) for k, v in by_kind.items()}
     squares = {k: jnp.sum(v * v, 2) for k, v in by_kind.items()}
     norm = {k: np.asarray(jnp.mean(jnp.sqrt(v), 0)) for k, v in squares.items()}

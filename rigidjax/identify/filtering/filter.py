@@ -30,7 +30,7 @@ from rigidjax.identify.model.scene import Process, Scene
 from rigidjax.identify.model.terms import scene_of, torque_of_scene
 from rigidjax.identify.model.walks import Drift, broadcast_to_shape, drifting_values
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.manifold import names, plus
 
 
@@ -118,7 +118,7 @@ def first_belief(
     if state is None and x is None:
         _require_shown_attitude(record, start)
     _checks.require_single(start, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
-    start = on_the_group(start)
+    start = project_to_group(start)
     deviations = {"attitude": attitude, "rate": rate, "position": position, "velocity": velocity}
     words = {"x": "position", "v": "velocity", "q": "attitude", "omega": "rate"}
     kind, wanted = type(start).__name__, [words[part] for part in names(start)]

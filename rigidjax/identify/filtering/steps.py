@@ -30,8 +30,8 @@ from rigidjax.identify.model.scene import (
 from rigidjax.identify.model.walks import Drift
 from rigidjax.identify.sensors import AbstractSensor, Gyro, SensorInput
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.equations import on_the_group
-from rigidjax.motion.manifold import coordinates, dimension, tangent, turns
+from rigidjax.motion.equations import project_to_group
+from rigidjax.motion.manifold import dimension, rotation_slices, tangent, tangent_to_vector
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
 from rigidjax.motion.torques.base import Torque, in_precision, require_law, tensor_of
 from rigidjax.motion.torques.composite import parts_of
@@ -162,7 +162,7 @@ class Dynamics(eqx.Module):
         def column(unit: Array) -> Array:
             along = tangent(moving, unit[:size])
             moved = push(ExtendedState(along.motion, along.torques, still), unit[size:])
-            return coordinates(after, moved)[:size]
+            return tangent_to_vector(after, moved)[:size]
 
         both = jax.vmap(column, out_axes=1)(jnp.eye(size + self.kicks, dtype=kicks.dtype))
         grown, noise = both[:, :size], both[:, size:]
@@ -215,7 +215,7 @@ def moved_root(
     """
     first, second = (0.5, 1 / 12) if inverse else (-0.5, 1 / 6)
     across = jax.vmap(cross, (None, 1), 1)
-    for rows in turns(x):
+    for rows in rotation_slices(x):
         turn, mine = e[rows], root[rows]
         once = across(turn, mine)
         mine = mine + first * once + second * across(turn, once)
@@ -377,7 +377,7 @@ def sample(
     ((3, 3), ())
     """
     _checks.random_key(key)
-    body = validation.single(body, (Inertia, MassProperties), "body")
+    body = validation.require_single_body(body, (Inertia, MassProperties), "body")
     _checks.require_single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
     require_process(process)
     if torque is not None:
@@ -390,7 +390,7 @@ def sample(
         words = "ts: wanted increasing times"
         _checks.error_if(times, not (np.diff(np.asarray(times)) > 0).all(), words)
     pieces = int(steps_of(process, times, state0, substeps).max())
-    scene = Scene(body, torque, process, (), on_the_group(state0))
+    scene = Scene(body, torque, process, (), project_to_group(state0))
     return _sample(key, scene, times, pieces)
 
 

@@ -320,7 +320,7 @@ class Known(AbstractBodyChart):
     log_names: ClassVar[tuple[str, ...]] = ()
 
     def __check_init__(self) -> None:
-        validation.single(self.known, (Inertia, MassProperties), "known")
+        validation.require_single_body(self.known, (Inertia, MassProperties), "known")
 
     def body(self, vector: Numbers) -> Inertia | MassProperties:
         return self.known

@@ -719,7 +719,7 @@ def _numbers_in_chart(chart: AbstractBodyChart, body: Body | None) -> Float[Arra
     """Return the numbers of a body in a chart; zeros, the start of the chart, for `None`."""
     if body is None:
         return _host_zeros(chart.size)
-    one = validation.single(body, (Inertia, MassProperties), "body")
+    one = validation.require_single_body(body, (Inertia, MassProperties), "body")
     if _checks.is_known(one):
         jax.tree.map(lambda leaf: _checks.require_finite(leaf, "body"), one)
     vector = eqx.filter_jit(chart.vector)(one)

@@ -113,7 +113,7 @@ class Entropic(eqx.Module):
     weight: Scalar = eqx.field(converter=_checked_weight)
 
     def __check_init__(self) -> None:
-        validation.single(self.guess, (Inertia, MassProperties), "guess")
+        validation.require_single_body(self.guess, (Inertia, MassProperties), "guess")
 
     def residuals(
         self, body: Inertia | MassProperties, to_scale: bool = True

@@ -24,7 +24,7 @@ from rigidjax._types import (
     Vector,
 )
 from rigidjax.body.inertia import Body, Inertia, MassProperties, tensor_of as tensor_of
-from rigidjax.motion.torques.states import Frozen, require_frozen
+from rigidjax.motion.torques.states import FrozenLaw, require_frozen
 
 
 class Wrench(eqx.Module):
@@ -102,7 +102,7 @@ class AbstractForce(eqx.Module):
         """
 
 
-class OfTime(AbstractTorque):
+class AbstractTimeTorque(AbstractTorque):
     """Define a torque with vectors as fields, each of which may be a function of time."""
 
     @property
@@ -160,7 +160,7 @@ def sees_rate(torque: Torque | None) -> bool:
     return torque is not None and not getattr(torque, "rate_free", False)
 
 
-def require_rung(torque: Torque, state: object) -> None:
+def require_state_type(torque: Torque, state: object) -> None:
     """Raise `TypeError` unless `torque` can be called and `state` has the parts that the torque
     reads.
     """
@@ -179,9 +179,9 @@ def require_scene(law: Torque | None, state: object, body: object) -> None:
     """
     _checks.require_single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
     if law is not None:
-        require_rung(law, state)
+        require_state_type(law, state)
         require_frozen(law)
-        one_law(law.law if isinstance(law, Frozen) else law)
+        require_one_law(law.law if isinstance(law, FrozenLaw) else law)
     _checks.require_single(body, (Inertia, MassProperties), "body")
 
 
@@ -233,18 +233,18 @@ _HIGHER = {
 }
 
 
-def missing_state_message(who: str, wrong: AttributeError) -> str | None:
+def missing_state_message(caller: str, error: AttributeError) -> str | None:
     """Return the message for a user's function that read a part which its state lacks; `None` for
     any other error.
     """
-    if wrong.name not in _HIGHER or not isinstance(wrong.obj, HasSpin):
+    if error.name not in _HIGHER or not isinstance(error.obj, HasSpin):
         return None
-    what, higher = _HIGHER[wrong.name]
-    has_none = f"the {what}, and {type(wrong.obj).__name__} has none"
-    return f"{who} looks at state.{wrong.name}, {has_none}: start from {higher}"
+    what, higher = _HIGHER[error.name]
+    has_none = f"the {what}, and {type(error.obj).__name__} has none"
+    return f"{caller} looks at state.{error.name}, {has_none}: start from {higher}"
 
 
-def one_law(law: Torque) -> None:
+def require_one_law(law: Torque) -> None:
     """Raise `ValueError` for a field whose shape is not that of one torque, such as a batch made by
     `jax.vmap`.
     """
@@ -276,17 +276,17 @@ def vector_at(source: PyTree, t: ScalarLike, name: str, size: int = 3) -> Float[
     return _checks.array_of_shape(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
-def vector(name: str, *, hint: str = "") -> Callable[[Any], Array]:
+def vector_converter(name: str, *, hint: str = "") -> Callable[[Any], Array]:
     """Return a converter to a field of three numbers, for `equinox.field(converter=…)`."""
     return lambda value: _checks.finite_array(value, (3,), name, hint=hint)
 
 
-def number(name: str) -> Callable[[Any], Array]:
+def number_converter(name: str) -> Callable[[Any], Array]:
     """Return a converter to a field of one number."""
     return lambda value: _checks.finite_array(value, (), name)
 
 
-def source(name: str) -> Callable[[Any], Any]:
+def source_converter(name: str) -> Callable[[Any], Any]:
     """Return a converter to a field that is a vector, or a function of time to a vector."""
     return lambda value: constant_or_callable(value, name)
 
@@ -330,7 +330,7 @@ def unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array, "n 3"]:
     return rows
 
 
-def count_of(value: NumbersLike, name: str, one: str) -> int:
+def row_count(value: NumbersLike, name: str, one: str) -> int:
     """Return the number of rows (x, y, z) in `value`, one row for each `one`; at least one row is
     wanted.
     """
@@ -340,7 +340,7 @@ def count_of(value: NumbersLike, name: str, one: str) -> int:
     return shape[0]
 
 
-def one_or_each(value: NumbersLike, count: int, name: str) -> Array:
+def broadcast_to_each(value: NumbersLike, count: int, name: str) -> Array:
     """Return one number for all, or one number for each of `count`, by the shape of `value`."""
     return _checks.finite_array(
         value, (count,) if _checks.numeric_array(value, name).ndim else (), name

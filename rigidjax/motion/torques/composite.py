@@ -196,11 +196,11 @@ class Tide(eqx.Module):
     """
 
     feels: ClassVar[type] = HasAttitude
-    response: Scalar = eqx.field(converter=base.number("response"))
-    delay: Scalar = eqx.field(converter=base.number("delay"))
-    mu: Scalar = eqx.field(converter=base.number("mu"))
-    position: Any = eqx.field(converter=base.source("position"))
-    mean_rate: Scalar = eqx.field(converter=base.number("mean_rate"), default=0.0)
+    response: Scalar = eqx.field(converter=base.number_converter("response"))
+    delay: Scalar = eqx.field(converter=base.number_converter("delay"))
+    mu: Scalar = eqx.field(converter=base.number_converter("mu"))
+    position: Any = eqx.field(converter=base.source_converter("position"))
+    mean_rate: Scalar = eqx.field(converter=base.number_converter("mean_rate"), default=0.0)
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: Body) -> Mat3:
         before = quaternion.multiply(state.q, quaternion.exp(-self.delay * state.omega))

@@ -40,7 +40,7 @@ class Input(eqx.Module):
         )
 
 
-class _Now(eqx.Module):
+class _ConstantFunction(eqx.Module):
     """Hold a value that does not depend on time."""
 
     value: Array
@@ -126,10 +126,10 @@ class Lagged(eqx.Module):
         self.source = _checks.require_function(source, "source", "of time")
         kind = jnp.result_type(float)
         time = _checks.check_if_known(
-            _checks.require_sign, _channels(time, "time"), "time", "a positive time, s"
+            _checks.require_sign, _checked_channels(time, "time"), "time", "a positive time, s"
         )
         self.time = time.astype(kind)
-        self.start = None if start is None else _channels(start, "start").astype(kind)
+        self.start = None if start is None else _checked_channels(start, "start").astype(kind)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -157,25 +157,29 @@ def require_no_jumps(source: PyTree, name: str) -> None:
 
     An `Input` is checked when it has a value: `bind` may give it a smooth function of time.
     """
-    jumping = (Held, _Now)
+    jumping = (Held, _ConstantFunction)
     nodes = jax.tree.leaves(source, is_leaf=lambda node: isinstance(node, jumping))
     for node in nodes:
         if isinstance(node, jumping):
-            what = "an Input with held samples" if isinstance(node, _Now) else type(node).__name__
+            what = (
+                "an Input with held samples"
+                if isinstance(node, _ConstantFunction)
+                else type(node).__name__
+            )
             raise TypeError(
                 f"{name}: wanted a function of time without jumps, since its derivative acts on "
                 f"the body, got {what}; take Linear(times, values) or Series(times, values)"
             )
 
 
-def _channels(value: NumbersLike, name: str) -> Array:
+def _checked_channels(value: NumbersLike, name: str) -> Array:
     array = _checks.numeric_array(value, name)
     if not array.size:
         raise ValueError(f"{name}: wanted one number, or one a channel, got none")
     return _checks.check_if_known(_checks.require_finite, array, name)
 
 
-class Row(NamedTuple):
+class InputRow(NamedTuple):
     """Hold the inputs in (a part of) a step: `values` by name, and `delayed` of each `Delayed`
     input.
     """
@@ -184,7 +188,7 @@ class Row(NamedTuple):
     delayed: tuple[Any, ...]
 
 
-def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
+def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
     """Return the torque with values instead of its `Input`s.
 
     **Arguments:** `law` a torque, a force, or a tree of them; `inputs` by name an array, which is
@@ -197,22 +201,22 @@ def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
     if inputs is None:
         return law
 
-    values, later = inputs if isinstance(inputs, Row) else (inputs, None)
+    values, later = inputs if isinstance(inputs, InputRow) else (inputs, None)
     queue = list(later or ())
 
     def value(node: PyTree) -> Any:
         if _is_delayed(node):
             if later is not None:
-                return _Now(jnp.asarray(queue.pop(0)))
+                return _ConstantFunction(jnp.asarray(queue.pop(0)))
             found = value(node.source)
-            return found if isinstance(found, _Now) else Delayed(found, node.delay)
+            return found if isinstance(found, _ConstantFunction) else Delayed(found, node.delay)
         if not isinstance(node, Input):
             return node
         if node.name not in values:
             found = ", ".join(map(repr, values)) or "none"
             raise ValueError(f"inputs: the torque reads {node.name!r}, got {found}")
         found = values[node.name]
-        return found if callable(found) else _Now(jnp.asarray(found))
+        return found if callable(found) else _ConstantFunction(jnp.asarray(found))
 
     return jax.tree.map(value, law, is_leaf=lambda n: isinstance(n, Input) or _is_delayed(n))
 

@@ -43,7 +43,7 @@ class Series(eqx.Module):
     slopes: Float[Array, "n *channels"]
 
     def __init__(self, times: Float[ArrayLike, " n"] | Sequence[Any], values: Samples):
-        t, rows = _numbers(times, "times"), _numbers(values, "values")
+        t, rows = _known_numbers(times, "times"), _known_numbers(values, "values")
         if t.ndim != 1 or t.size < 4 or rows.shape[:1] != t.shape:
             words = f"got shapes {t.shape} and {rows.shape}"
             raise ValueError(f"Series: wanted at least four times and as many rows, {words}")
@@ -61,7 +61,9 @@ class Series(eqx.Module):
         dtype = jnp.result_type(float)
         self.start, self.step = jnp.asarray(t[0], dtype), jnp.asarray(step, dtype)
         self.values = jnp.asarray(rows, dtype)
-        self.slopes = _checks.require_finite(_slopes(self.values), "Series: slopes of the values")
+        self.slopes = _checks.require_finite(
+            _slopes_at_samples(self.values), "Series: slopes of the values"
+        )
 
     def __call__(self, t: ScalarLike) -> Any:
         """Return the value at `t` (s), () or (k,)."""
@@ -80,7 +82,7 @@ class Series(eqx.Module):
         return left + s * (out + s * (bend + s * twist))
 
 
-def _numbers(value: NumbersLike, name: str) -> Any:
+def _known_numbers(value: NumbersLike, name: str) -> Any:
     """Return the numbers, as NumPy's float64 if they are known: times of a log have more than seven
     digits.
     """
@@ -89,7 +91,7 @@ def _numbers(value: NumbersLike, name: str) -> Any:
     return _checks.numeric_array(value, f"Series: {name}").astype(jnp.result_type(float))
 
 
-def _slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
+def _slopes_at_samples(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
     """Return the change per step at each sample, s_i.
 
     It solves s₋ + 4 s + s₊ = 3 (v₊ − v₋) for the neighbours − and + of each sample; at the ends the
