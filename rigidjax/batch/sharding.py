@@ -39,7 +39,7 @@ def compiler_options() -> dict[str, Any]:
     return dict(_WIDE) if platform() == "cpu" else {}
 
 
-class Compiled:
+class CompiledFunction:
     """Call a compiled function; it has the `compiler_options` if its last argument is known.
 
     Where that argument is traced, the call stands within another `jit`, where JAX takes no options.

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.batch.rollout import Inputs, rollout
-from rigidjax.batch.sharding import Compiled, Devices, chunk_of, map_bodies, mesh_of
+from rigidjax.batch.sharding import CompiledFunction, Devices, chunk_of, map_bodies, mesh_of
 from rigidjax.batch.validation import BodyBatch, TorqueAxes, check_batch, one_body, step_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -162,8 +162,8 @@ def _simulate_bodies(
     """
     (shared, per_body, ts), (chunk, mesh) = numbers, division
 
-    def simulate_body(of_all: PyTree, row: PyTree) -> tuple[Any, ...]:
-        shared, ts = of_all
+    def simulate_body(shared_numbers: PyTree, row: PyTree) -> tuple[Any, ...]:
+        shared, ts = shared_numbers
         body, state0, torque = one_body(shared, row, constants)
         sol = simulate_one(body, state0, ts, torque, throw=False, **options)
         return sol.ys, sol.result, jnp.asarray(sol.stats["num_steps"], jnp.int32), sol.own
@@ -186,7 +186,7 @@ def _simulate_bodies(
     return jax.tree.map(lambda a: a[inverse], out)
 
 
-_compiled = Compiled(_simulate_bodies)
+_compiled = CompiledFunction(_simulate_bodies)
 
 
 @eqx.filter_jit

@@ -234,10 +234,10 @@ def _check_unit(q: Array) -> list[Check]:
             "normalise with rigidjax.quaternion.normalise, and mind that the scalar is first"
         )
 
-    return [(_checks.first_bad_row(_not_unit, q), refuse)]
+    return [(_checks.first_bad_row(_is_not_unit, q), refuse)]
 
 
-def _not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
+def _is_not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
     return xp.abs(xp.sqrt(xp.sum(xp.square(q), axis=-1)) - 1) > tolerance(q.dtype)
 
 

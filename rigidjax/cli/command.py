@@ -56,9 +56,9 @@ def main(arguments: list[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")  # pyright: ignore
         sys.unraisablehook = _raise_interrupt_again
     try:
-        return _run(options, parser, own=arguments is None)
+        return _run(options, parser, owns_process=arguments is None)
     except KeyboardInterrupt:
-        _error("interrupted (Ctrl-C); nothing more is written")
+        _print_error("interrupted (Ctrl-C); nothing more is written")
         return 130
 
 
@@ -74,10 +74,13 @@ def _raise_interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(dropped)
 
 
-def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, own: bool) -> int:
-    """Run the command of the options and return its exit code; `own` if the process is its own."""
+def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, owns_process: bool) -> int:
+    """Run the command of the options and return its exit code.
+
+    `owns_process` says whether the process is its own.
+    """
     if options.command == "workprecision":
-        return workprecision.run(options)
+        return workprecision.run_subcommand(options)
     if options.demo:
         plain = vars(parser.parse_args(["identify", "--demo"]))
         changed = [name for name, value in vars(options).items() if value != plain[name]]
@@ -85,11 +88,11 @@ def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, own: bool
         if unused:
             names = ", ".join("--" + name.replace("_", "-") for name in unused)
             parser.error(f"identify --demo: {names} is for log FILES only")
-    if own and options.no_cache:
+    if owns_process and options.no_cache:
         jax.config.update("jax_enable_compilation_cache", False)
-    elif own:
+    elif owns_process:
         _keep_compiled_programs()
-    return _demo(options) if options.demo else _logs(options)
+    return _run_demo(options) if options.demo else _run_logs(options)
 
 
 def _check_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
@@ -250,11 +253,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     for name, how in OPTIONS.items():
         identify.add_argument(name, **how)
-    workprecision.add(commands)
+    workprecision.add_subcommand(commands)
     return parser
 
 
-def _demo(options: argparse.Namespace) -> int:
+def _run_demo(options: argparse.Namespace) -> int:
     """Run the demo, the fit of asteroid Toutatis; return the exit code."""
     from rigidjax.datasets import toutatis
 
@@ -274,7 +277,7 @@ def _demo(options: argparse.Namespace) -> int:
     return _write(fit, options, title, [toutatis.CITATION], [title], units, more)
 
 
-def _channels(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Channel]:
+def _channels_of_options(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Channel]:
     """Return the sensors that the options describe; `rates` are the names of the rate columns."""
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
@@ -283,8 +286,8 @@ def _channels(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Ch
                 f"--{alone[0]}: not together with --sensor, which holds it itself, as in "
                 "--sensor gyro=wx,wy,wz:deg/s:0.1"
             )
-        return [spec.channel(text) for text in options.sensor]
-    noise = None if options.noise is None else spec.noises(options.noise, "--noise")
+        return [spec.parse_channel(text) for text in options.sensor]
+    noise = None if options.noise is None else spec.broadcast_noise(options.noise, "--noise")
     if options.limit is not None and not options.limit > 0:
         raise LogError(f"--limit: wanted a positive number, got {options.limit}")
     return [spec.Channel("gyro", tuple(rates), options.unit, noise, options.limit)]
@@ -296,7 +299,7 @@ def _read_logs(
     """Return the sensors, the recordings, and the model that the options describe."""
     if options.columns and options.time:
         raise LogError("--time: not together with --columns, whose first name is the time column")
-    wheels = [spec.wheel(text) for text in options.wheel]
+    wheels = [spec.parse_wheel(text) for text in options.wheel]
     if options.model in ("tensor", "principal") and not wheels:
         words = "free motion shows ratios only; a scale needs a --wheel"
         raise LogError(f"--model {options.model}: {words}")
@@ -310,7 +313,7 @@ def _read_logs(
         time_unit = spec.unit_of_time(path, time, options.time_unit)
         channels = [
             dataclasses.replace(one, unit=spec.unit_of_channel(path, one))
-            for one in _channels(options, rates)
+            for one in _channels_of_options(options, rates)
         ]
         _say_units(path, time, time_unit, channels)
         how |= dict(time=time, time_unit=time_unit, flight=options.flight)
@@ -345,15 +348,15 @@ def _log_warnings(strict: bool) -> Iterator[None]:
         yield
 
 
-def _logs(options: argparse.Namespace) -> int:
+def _run_logs(options: argparse.Namespace) -> int:
     """Fit the logs that the options name, and print the report; return the exit code."""
     try:
         with _log_warnings(options.strict):
             channels, records, model = _read_logs(options)
     except ValueError as error:
-        return _error(error)
+        return _print_error(error)
     except LogWarning as warning:
-        return _error(f"{warning} (--strict)")
+        return _print_error(f"{warning} (--strict)")
     for path, record in zip(options.logs, records, strict=True):
         gaps = sum(int((~reading.host_mask).sum()) for reading in record.readings) + record.dropped
         words = f", {gaps} gap{'s' if gaps > 1 else ''}" if gaps else ""
@@ -393,7 +396,7 @@ def _fit(
             checkpoint=options.checkpoint,
         )
     except (OSError, ValueError) as error:
-        _error(error)
+        _print_error(error)
         return None
 
 
@@ -401,17 +404,17 @@ def _write(
     fit: rj.identify.Fit,
     options: argparse.Namespace,
     title: str,
-    read: list[str],
+    files_read: list[str],
     names: list[str],
     units: dict[str, str],
-    more: Sequence[tuple[str, float, float, float, str]] = (),
+    more_rows: Sequence[tuple[str, float, float, float, str]] = (),
 ) -> int:
     """Write the outputs that the options ask for, and return the exit code.
 
     An output that fails is reported, and the others are still written.
 
-    **Arguments:** `fit`; `options`; `title` of the report; `read` the files that were read; `names`
-    of the recordings; `units` of rates and times; `more` rows of further quantities.
+    **Arguments:** `fit`; `options`; `title` of the report; `files_read` the files that were read;
+    `names` of the recordings; `units` of rates and times; `more_rows` rows of further quantities.
     """
     report, figure = rj.identify.report, options.figure
     if options.demo and figure is None and _matplotlib():
@@ -419,13 +422,18 @@ def _write(
 
     def page() -> None:
         figures = _figures(fit, names, units) if figure is not None or _matplotlib() else []
-        page: dict[str, Any] = {"title": title, "figures": figures, "files": read, "more": more}
+        page: dict[str, Any] = {
+            "title": title,
+            "figures": figures,
+            "files": files_read,
+            "more": more_rows,
+        }
         report.write_html(fit, options.report, rate_unit=units["rate_unit"], **page)
 
     def picture() -> None:
         rj.plot.fit(fit, index=0, title=names[0], **units).savefig(figure, dpi=130)
 
-    numbers = functools.partial(report.write_json, fit, options.json, read, more)
+    numbers = functools.partial(report.write_json, fit, options.json, files_read, more_rows)
     wanted = (
         ("figure", figure, picture), ("numbers", options.json, numbers),
         ("report", options.report, page),
@@ -438,10 +446,10 @@ def _write(
                 _print_line(f"{what}: {path}")
         except Exception as error:
             # A fit of an hour must not be lost to one output.
-            _error(f"no {what}: {path}: {type(error).__name__}: {error}")
+            _print_error(f"no {what}: {path}: {type(error).__name__}: {error}")
             all_written = False
     if "interrupted" in fit.status:
-        _error("interrupted (Ctrl-C): not all starts were made, see the status")
+        _print_error("interrupted (Ctrl-C): not all starts were made, see the status")
         return 130
     return 2 if not all_written else 0 if fit.ok else 1
 
@@ -457,7 +465,7 @@ def _figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str]) -> l
             drawn = make()
             figures.append(drawn.flat[0].figure if isinstance(drawn, np.ndarray) else drawn)
         except Exception as error:
-            _error(f"a figure is left out: {type(error).__name__}: {error}")
+            _print_error(f"a figure is left out: {type(error).__name__}: {error}")
     return figures
 
 
@@ -482,7 +490,7 @@ def _print_line(line: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _error(what: object) -> int:
-    """Print the error `what` in one line, and return the exit code 2."""
-    print(f"error: {_checks.escape_controls(what)}", file=sys.stderr)
+def _print_error(message: object) -> int:
+    """Print the error `message` in one line, and return the exit code 2."""
+    print(f"error: {_checks.escape_controls(message)}", file=sys.stderr)
     return 2

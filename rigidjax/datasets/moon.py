@@ -77,7 +77,9 @@ class Moon(eqx.Module):
             """Return coefficients on intervals of `step` days."""
             rows = np.load(Path(found.origin or "").parent / f"jpl-{name}.npy", mmap_mode="r")
             a_block = len(rows) // _BLOCKS
-            return _subdivide(rows[low * a_block : high * a_block], _BLOCK // a_block // step)
+            return _subdivide_polynomials(
+                rows[low * a_block : high * a_block], _BLOCK // a_block // step
+            )
 
         numbers = np.load(Path(found.origin).parent / "constants.npy")
         self.constants = {name.decode(): float(value) for name, value in numbers}
@@ -280,7 +282,7 @@ def _add_to_z(table: Chebyshev, z: float) -> Chebyshev:
     return eqx.tree_at(lambda t: t.coefficients, table, moved)
 
 
-def _subdivide(rows: np.ndarray, parts: int) -> np.ndarray:
+def _subdivide_polynomials(rows: np.ndarray, parts: int) -> np.ndarray:
     """Return polynomials (intervals, k, terms) on intervals shortened by `parts`, equal to those
     given.
     """

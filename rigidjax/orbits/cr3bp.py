@@ -150,9 +150,9 @@ class ThreeBody(AbstractReversible):
     def lyapunov_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
         """Return a start near a planar Lyapunov orbit about L1, L2 or L3, for `periodic_orbit`.
 
-        **Arguments:** `point` 1, 2 or 3; `amplitude` along x. Source: `richardson.guess`.
+        **Arguments:** `point` 1, 2 or 3; `amplitude` along x. Source: `richardson.orbit_guess`.
         """
-        return richardson.guess(self.mu, point, amplitude, None)
+        return richardson.orbit_guess(self.mu, point, amplitude, None)
 
     def halo_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
         """Return a start near a halo orbit about L1, L2 or L3, for `periodic_orbit(…, hold="z")`.
@@ -160,7 +160,7 @@ class ThreeBody(AbstractReversible):
         **Arguments:** `point` 1, 2 or 3; `amplitude` along z, whose sign is that of the branch.
         Source: Richardson 1980, doi:10.1007/BF01229511 (third order).
         """
-        return richardson.guess(self.mu, point, None, amplitude)
+        return richardson.orbit_guess(self.mu, point, None, amplitude)
 
 
 def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> ThreeBody:

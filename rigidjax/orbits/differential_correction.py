@@ -70,7 +70,7 @@ def periodic_orbit(
     free = np.delete(np.arange(4), index)
     if tolerance is None:
         tolerance = usual_tolerance(numbers)
-    unknown, left = _solve(scene, numbers[free], numbers[index], index, tolerance)
+    unknown, left = _corrected_numbers(scene, numbers[free], numbers[index], index, tolerance)
     bad = ~(left <= tolerance)
     said = f" ({float(left):.1e} left at half period)" if _checks.is_known(left) else ""
     words = f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
@@ -112,12 +112,12 @@ def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
     return PeriodicOrbit(Point(jnp.stack([x, zero, z]), jnp.stack([zero, vy, zero])), 2 * half)
 
 
-def insert_held(unknown: Float[Array, "3"], held: Scalar, index: int) -> Float[Array, "4"]:
+def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> Float[Array, "4"]:
     """Return the four numbers of a crossing: the three unknown ones with the held one inserted at
     `index`.
     """
     parts = list(unknown)
-    parts.insert(index, held)
+    parts.insert(index, held_value)
     return jnp.stack(parts)
 
 
@@ -149,7 +149,7 @@ def state_after(
     return jnp.concatenate([end.x[0], end.v[0]])
 
 
-def transition(
+def transition_matrix(
     scene: AbstractScene, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
 ) -> Float[Array, "6 6"]:
     """Return the state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) from `state`, by forward
@@ -157,11 +157,13 @@ def transition(
     """
     _checks.require_instance(state, Point, "state", wanted="a Point(x, v)")
     t = _checks.require_finite(_checks.array_of_shape(t, (), "t"), "t")
-    return _transition(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
+    return _transition_matrix(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
 
 
 @eqx.filter_jit
-def _transition(scene: AbstractScene, numbers: Array, t: Array, rtol: float, atol: float) -> Array:
+def _transition_matrix(
+    scene: AbstractScene, numbers: Array, t: Array, rtol: float, atol: float
+) -> Array:
     # The tangents are solved along with the motion.
     return jax.jacfwd(lambda n: state_after(scene, n, t, rtol=rtol, atol=atol))(numbers)
 
@@ -187,7 +189,7 @@ def newton(f: Callable[[Array], Array], x: Array, tolerance: float) -> Array:
     tolerance.
     """
 
-    def keep_on(carry: tuple[Array, Array, Array]) -> Any:
+    def is_unfinished(carry: tuple[Array, Array, Array]) -> Any:
         _, left, count = carry
         return (left > 0.1 * tolerance) & (count < MAX_STEPS)
 
@@ -199,25 +201,27 @@ def newton(f: Callable[[Array], Array], x: Array, tolerance: float) -> Array:
         # converges quadratically, so that the result is better still.
         return jnp.where(jnp.isfinite(moved), moved, x), jnp.max(jnp.abs(missed)), count + 1
 
-    return lax.while_loop(keep_on, step, (x, jnp.full_like(x[0], jnp.inf), 0))[0]
+    return lax.while_loop(is_unfinished, step, (x, jnp.full_like(x[0], jnp.inf), 0))[0]
 
 
 # Newton's method itself is not differentiated. The rule below is linear in the tangents, so that
 # one rule serves jacfwd and grad, although the solves inside run in forward mode.
 @eqx.filter_jit
-def _solve(scene: AbstractScene, unknown: Array, held: Array, index: int, tolerance: float) -> Any:
-    return correct_orbit(index, float(tolerance), scene, unknown, held)
+def _corrected_numbers(
+    scene: AbstractScene, unknown: Array, held_value: Array, index: int, tolerance: float
+) -> Any:
+    return correct_orbit(index, float(tolerance), scene, unknown, held_value)
 
 
 @eqx.filter_custom_jvp
 def correct_orbit(
-    index: int, tolerance: float, scene: AbstractScene, unknown: Array, held: Array
+    index: int, tolerance: float, scene: AbstractScene, unknown: Array, held_value: Array
 ) -> Any:
-    def missed(unknown: Array) -> Array:
-        return periodicity_residual(scene, insert_held(unknown, held, index))
+    def residual(unknown: Array) -> Array:
+        return periodicity_residual(scene, insert_held(unknown, held_value, index))
 
-    unknown = newton(missed, unknown, tolerance)
-    return unknown, jnp.max(jnp.abs(missed(unknown)))
+    unknown = newton(residual, unknown, tolerance)
+    return unknown, jnp.max(jnp.abs(residual(unknown)))
 
 
 @correct_orbit.def_jvp
@@ -231,12 +235,12 @@ def _correct_orbit_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
     leaves, tree = jax.tree.flatten(numbers)
     flat, unflatten = ravel_pytree((leaves, held, found))
 
-    def missed(flat: Array) -> Array:
+    def residual(flat: Array) -> Array:
         leaves, held, unknown = unflatten(flat)
         whole = eqx.combine(jax.tree.unflatten(tree, leaves), rest)
         return periodicity_residual(whole, insert_held(unknown, held, index))
 
-    matrix = jax.jacfwd(missed)(flat)
+    matrix = jax.jacfwd(residual)(flat)
     paths = {path: dot for path, dot in jax.tree.leaves_with_path(scene_dot) if dot is not None}
     # A leaf without a tangent does not change.
     named = jax.tree.leaves_with_path(numbers)

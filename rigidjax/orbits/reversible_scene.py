@@ -67,7 +67,7 @@ class AbstractReversible(AbstractScene):
         return continuation.stability_indices(self.monodromy(orbit))
 
     # Functions whose first argument is the scene.
-    transition = differential_correction.transition
+    transition = differential_correction.transition_matrix
     periodic_orbit = differential_correction.periodic_orbit
     family = continuation.family
     family_slope = continuation.family_slope

@@ -9,7 +9,7 @@ import numpy as np
 from rigidjax import _checks
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.plot.style import AXES, COLOURS, escape_formulas, several_axes
+from rigidjax.plot.style import AXES, COLOURS, axes_of_shape, escape_formulas
 
 _PLANES = ((0, 1), (0, 2), (1, 2))
 
@@ -43,15 +43,15 @@ def inertia_ellipsoid(
     size = 1.0 if solid else float(np.trace(np.asarray(best.second_moment)))
     if not size > 0:
         raise ValueError("body: wanted a body with an extension, got 𝔖 = 0; there is no ellipsoid")
-    shapes = {"body": np.asarray(_shape(best))[None] / size}
+    shapes = {"body": np.asarray(_drawn_matrix(best))[None] / size}
     if drawn is not None:
-        shapes["cloud"] = np.asarray(jax.vmap(_shape)(drawn)) / size
+        shapes["cloud"] = np.asarray(jax.vmap(_drawn_matrix)(drawn)) / size
     if truth is not None:
-        other = np.asarray(_shape(truth))
+        other = np.asarray(_drawn_matrix(truth))
         # Only the shape is compared if the scale is unknown.
         own = solid and isinstance(truth, MassProperties)
         shapes["truth"] = other[None] / (1.0 if own else float(np.trace(other)))
-    ax = several_axes(ax, (3,), ncols=3, figsize=(10.5, 3.9))
+    ax = axes_of_shape(ax, (3,), ncols=3, figsize=(10.5, 3.9))
     _outlines(ax, shapes, "m" if solid else "relative size")
     if len(shapes) > 1:
         how = dict(loc="outside lower center", ncols=3, frameon=False)
@@ -103,7 +103,7 @@ def _outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
         one.grid(alpha=0.3)
 
 
-def _shape(body: Inertia | MassProperties) -> Any:
+def _drawn_matrix(body: Inertia | MassProperties) -> Any:
     """Return the matrix whose ellipsoid r·A⁻¹r = 1 is drawn."""
     if isinstance(body, MassProperties):
         return body.second_moment * (5.0 / body.mass)

@@ -10,7 +10,14 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax.frames import AbstractScene, MovingFrame, Point
-from rigidjax.plot.style import AXES, COLOURS, escape_formulas, rows, several_axes, times
+from rigidjax.plot.style import (
+    AXES,
+    COLOURS,
+    axes_of_shape,
+    escape_formulas,
+    rows_on_host,
+    times_on_host,
+)
 
 
 def frames(
@@ -46,11 +53,11 @@ def frames(
     if not known or len(plane) != 2 or plane[0] == plane[1]:
         raise ValueError(f"plane: wanted two of x, y, z such as 'xz', got {plane!r}")
     i, j = (AXES.index(name) for name in plane)
-    path = rows(inside.x, 3, "inside.x")
+    path = rows_on_host(inside.x, 3, "inside.x")
     kind = _checks.numeric_array(inside.x, "inside.x").dtype
-    t = jnp.asarray(times(ts, path.shape[0], "the path has"), kind)
+    t = jnp.asarray(times_on_host(ts, path.shape[0], "the path has"), kind)
     outside = np.asarray(jax.vmap(moving.to_inertial)(inside, t).x)
-    ax = several_axes(ax, (2,), ncols=2, figsize=(9.6, 4.6))
+    ax = axes_of_shape(ax, (2,), ncols=2, figsize=(9.6, 4.6))
     names = (("moving", path), ("inertial", outside))
     for one, (name, line) in zip(ax, names, strict=True):
         one.plot(line[:, i], line[:, j], color=COLOURS[0], lw=1.2)

@@ -13,7 +13,7 @@ from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion.torques import HeavyTop
 from rigidjax.plot import style
-from rigidjax.plot.style import COLOURS, escape_formulas, rows
+from rigidjax.plot.style import COLOURS, escape_formulas, rows_on_host
 
 
 def phase_portrait(
@@ -50,8 +50,8 @@ def phase_portrait(
         )
     levels = _checks.integer(levels, "levels", 1)
     across, along, axis, weight, up = _symmetric_top(inertia, top)
-    m = style.matrices(style.attitudes(states))
-    omega = np.einsum("tij,tj->ti", m, rows(states.omega, 3, "states.omega"))
+    m = style.rotation_matrices(style.attitudes_on_host(states))
+    omega = np.einsum("tij,tj->ti", m, rows_on_host(states.omega, 3, "states.omega"))
     first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], states)
     about_up = float(np.asarray(spatial_angular_momentum(inertia, first)) @ up)
     about_axis = along * float(np.asarray(first.omega) @ axis)

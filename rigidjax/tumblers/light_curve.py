@@ -222,7 +222,7 @@ def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Arr
 
 
 @eqx.filter_jit
-def _slopes(x: Float[Array, " n"], model: Model) -> Float[Array, "4 n"]:
+def _period_derivatives(x: Float[Array, " n"], model: Model) -> Float[Array, "4 n"]:
     """Return the derivatives of the logarithms of both periods and both ratios."""
     return jax.jacfwd(lambda x: _periods_and_ratios(x, model)[0])(x)
 
@@ -253,10 +253,10 @@ def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
     return out
 
 
-def _is_same_motion(a: Alias, b: Alias, near: np.ndarray) -> bool:
-    """Return whether two motions are the same: of one mode, and `near` in the four logarithms."""
+def _is_same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
+    """Return whether two motions have one mode, and logarithms within `tolerance`."""
     one, other = (np.log([m.rotation, m.precession, *m.ratios]) for m in (a, b))
-    return a.mode == b.mode and bool((np.abs(one - other) < near).all())
+    return a.mode == b.mode and bool((np.abs(one - other) < tolerance).all())
 
 
 @eqx.filter_jit
@@ -267,14 +267,14 @@ def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
     motion, t = exact.FreeBody(Inertia(tensor_of(body)), state0), model.records.t[0]
     sensor = stacking.pick_records(model.records.readings[0], 0).sensor
 
-    def at(now: Array) -> Array:
+    def bisector_at(now: Array) -> Array:
         state: Any = motion(now - t[0])
         return quaternion.rotate_inverse(state.q, bisector(sensor, now))
 
-    return jax.vmap(at)(t)
+    return jax.vmap(bisector_at)(t)
 
 
-def _with_shape(best: Fit) -> Fit:
+def _allow_for_shape(best: Fit) -> Fit:
     """Return the fit with a covariance that allows for a body that is no ellipsoid."""
     linear: Any = best.linear
     reading, weight = stacking.pick_records(best.model.records.readings[0], 0), linear.weights[0][0]
@@ -301,9 +301,17 @@ def _with_shape(best: Fit) -> Fit:
     )
 
 
-def _result(best: Fit, aliases: list[Alias], pairs: TwoFrequencies, cut: bool) -> LightCurve:
-    """Return the result from the `best` fit and all motions; `cut` if not all pairs were tried."""
-    slopes, wider = np.asarray(_slopes(best.derivative_point, best.model)), _with_shape(best)
+def _result(
+    best: Fit, aliases: list[Alias], pairs: TwoFrequencies, is_incomplete: bool
+) -> LightCurve:
+    """Return the result from the `best` fit and all motions.
+
+    It `is_incomplete` if not all pairs were tried.
+    """
+    slopes, wider = (
+        np.asarray(_period_derivatives(best.derivative_point, best.model)),
+        _allow_for_shape(best),
+    )
     own, deviations = (
         standard_deviations(
             slopes, np.asarray(one.determined_covariance), np.asarray(one.null_directions)
@@ -327,7 +335,7 @@ def _result(best: Fit, aliases: list[Alias], pairs: TwoFrequencies, cut: bool) -
     if rivals and search.word != NOT_ENDED and explanation.word != FAILS:
         who = "another motion explains" if rivals == 1 else f"{rivals} other motions explain"
         search = Answer(NOT_ALONE, (f"{who} the light curve nearly as well",))
-    elif cut and best.ok:
+    elif is_incomplete and best.ok:
         search = Answer(NOT_ENDED, ("more pairs of frequencies fit than were tried",))
     # Outliers dominate χ² under a robust loss.
     above = best.chi2 - best.dof if best.model.loss is None else 0.0

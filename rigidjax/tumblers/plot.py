@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._names import show
-from rigidjax.plot.style import COLOURS, TIMES, escape_formulas, several_axes, unit
+from rigidjax.plot.style import COLOURS, TIMES, axes_of_shape, escape_formulas, unit_factor
 
 # The colour map of the cycles, from the first to the last.
 _MAP = "viridis"
@@ -49,7 +49,7 @@ def light_curve(
     >>> light_curve(t, 15 + 0.1 * np.cos(2 * np.pi * t / 3600), 3600.0)[1].get_xlabel()
     'phase, in periods of 1 h'
     """
-    seconds = unit(time_unit, TIMES, "time_unit")
+    seconds = unit_factor(time_unit, TIMES, "time_unit")
     _checks.require_option(quantity, ("mag", "flux"), "quantity")
     t, read = _checks.host_array(ts, "ts"), _checks.host_array(values, "values")
     if t.ndim != 1 or read.shape != t.shape:
@@ -64,7 +64,7 @@ def light_curve(
         raise ValueError(f"periods: wanted one or a row of them, s, got shape {several.shape}")
     folds = [_checks.positive_float(period, "periods", "positive periods, s") for period in several]
     count = 1 + len(folds)
-    ax = several_axes(ax, (count,), nrows=count, figsize=(7.2, 2.5 * count))
+    ax = axes_of_shape(ax, (count,), nrows=count, figsize=(7.2, 2.5 * count))
     label = "magnitude" if quantity == "mag" else "flux"
     ax[0].plot(t / seconds, read, ".", color=COLOURS[6], ms=3, label="read")
     if predicted is not None:

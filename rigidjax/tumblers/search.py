@@ -90,13 +90,13 @@ def starts_of(
     return [_free_numbers(model, one, turn) for one in chosen]
 
 
-def _free_numbers(model: Model, one: starts.Candidate, turn: np.ndarray) -> Array:
+def _free_numbers(model: Model, candidate: starts.Candidate, turn: np.ndarray) -> Array:
     """Return the free numbers (n,) of a candidate; `turn` leads from principal to body axes."""
-    moments = turn @ np.diag(one.moments) @ turn.T
+    moments = turn @ np.diag(candidate.moments) @ turn.T
     start = model.start(Inertia(jnp.asarray(moments)))
     reference = model.reference
-    step = _rotation_vector(jnp.asarray(one.q), jnp.asarray(turn), reference.state.q[0])
-    spin = jnp.asarray(turn @ one.omega) / reference.rate[0]
+    step = _rotation_vector(jnp.asarray(candidate.q), jnp.asarray(turn), reference.state.q[0])
+    spin = jnp.asarray(turn @ candidate.omega) / reference.rate[0]
     # The free numbers of an initial `Attitude`: the turn from the reference, and the rate.
     return start.at[model.index.start[0]].set(jnp.concatenate([step, spin]))
 

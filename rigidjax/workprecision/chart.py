@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from rigidjax._checks import escape_formulas
-from rigidjax.workprecision.pareto import first_answers, front
+from rigidjax.workprecision.pareto import first_answers, pareto_front
 from rigidjax.workprecision.record import Measurement, list_records
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
     return figure
 
 
-def _places(records: list[Measurement]) -> tuple[list[float], list[float]]:
+def _errors_and_times(records: list[Measurement]) -> tuple[list[float], list[float]]:
     """Return the errors and the times, ms."""
     return [max(r.error, 1e-16) for r in records], [1e3 * r.time for r in records]
 
@@ -106,7 +106,7 @@ def _draw_reached_errors(
     wanted = sorted(r.setting for r in records)
     axis.plot(wanted, wanted, color="0.6", linewidth=6, alpha=0.3, zorder=0, label="as asked")
     axis.set(xlabel="tolerance or accuracy asked for", ylabel="error reached")
-    _dressed(axis)
+    _style_axis(axis)
 
 
 def _draw_times(axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]) -> None:
@@ -115,18 +115,26 @@ def _draw_times(axis: "Axes", records: list[Measurement], labels: list[tuple[str
             [max(1e3 * (r.time - r.time_low), 0.0) for r in of],
             [max(1e3 * (r.time_high - r.time), 0.0) for r in of],
         ]
-        axis.errorbar(*_places(of), bars, elinewidth=0.6, **how)
+        axis.errorbar(*_errors_and_times(of), bars, elinewidth=0.6, **how)
     for best, colour, what in (
-        (front(records), "0.6", "front"),
-        (front(r for r in records if r.group != "peer"), "tab:cyan", "front in JAX"),
+        (pareto_front(records), "0.6", "front"),
+        (pareto_front(r for r in records if r.group != "peer"), "tab:cyan", "front in JAX"),
     ):
-        axis.plot(*_places(best), "-", color=colour, linewidth=6, alpha=0.3, zorder=0, label=what)
+        axis.plot(
+            *_errors_and_times(best),
+            "-",
+            color=colour,
+            linewidth=6,
+            alpha=0.3,
+            zorder=0,
+            label=what,
+        )
     ringed: dict[str, Any] = dict(color="k", markerfacecolor="none", markersize=9, zorder=5)
-    axis.plot(*_places(front(records)), "o", **ringed)
-    _dressed(axis)
+    axis.plot(*_errors_and_times(pareto_front(records)), "o", **ringed)
+    _style_axis(axis)
 
 
-def _dressed(axis: "Axes") -> None:
+def _style_axis(axis: "Axes") -> None:
     axis.set(xscale="log", yscale="log")
     # Better is to the right and down.
     axis.invert_xaxis()

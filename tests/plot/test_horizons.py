@@ -52,12 +52,12 @@ SPIN = identify.windows(T, rj.Spin(FALL.omega), length=10).held_horizons()
 @pytest.mark.parametrize(
     ("given", "kind", "words"),
     [
-        (dict(found={}), ValueError, "at least one Horizons"),
-        (dict(found=CUT), TypeError, "wanted a Horizons of rigidjax.identify.*got Windows"),
-        (dict(found={"a": CUT.held_horizons(), "b": SPIN}), ValueError, "the same kinds of errors"),
-        (dict(found=SPIN, measure="worst"), ValueError, "measure: wanted one of mean_absolute, mean_norm"),
-        (dict(found=SPIN, step=0.0), ValueError, "step: wanted a positive time"),
-        (dict(found=SPIN, ax=[None, None]), ValueError, "wanted 1 axes in a row"),
+        (dict(results={}), ValueError, "at least one Horizons"),
+        (dict(results=CUT), TypeError, "wanted a Horizons of rigidjax.identify.*got Windows"),
+        (dict(results={"a": CUT.held_horizons(), "b": SPIN}), ValueError, "the same kinds of errors"),
+        (dict(results=SPIN, measure="worst"), ValueError, "measure: wanted one of mean_absolute, mean_norm"),
+        (dict(results=SPIN, step=0.0), ValueError, "step: wanted a positive time"),
+        (dict(results=SPIN, ax=[None, None]), ValueError, "wanted 1 axes in a row"),
     ],
 )  # fmt: skip
 def test_mistakes_are_named(given, kind, words):

@@ -77,7 +77,7 @@ row(
 )
 row(
     "plot.horizons",
-    lambda: dict(found=held(), step=0.1, measure="rms"),
+    lambda: dict(results=held(), step=0.1, measure="rms"),
     groups=KINDS,
     transforms=(),
 )

@@ -317,10 +317,15 @@ row(
     ),
     transforms=(),
 )  # fmt: skip
-row("plot.fit", lambda: dict(found=s.found(), index=0, time_unit="s"), groups=KINDS, transforms=())
+row(
+    "plot.fit",
+    lambda: dict(fit_result=s.found(), index=0, time_unit="s"),
+    groups=KINDS,
+    transforms=(),
+)
 row(
     "plot.residuals",
-    lambda: dict(found=s.found(), index=0, time_unit="s"),
+    lambda: dict(fit_result=s.found(), index=0, time_unit="s"),
     groups=KINDS,
     transforms=(),
 )
@@ -370,5 +375,8 @@ row(
 leave_out("minutes of measuring: tests/workprecision", "workprecision.measure")
 leave_out(
     "a record that is filled as it comes",
-    *(f"workprecision.{n}" for n in ("Choice", "Measurement", "Ready", "Reference", "TimedMethod")),
+    *(
+        f"workprecision.{n}"
+        for n in ("Choice", "Measurement", "PreparedMethod", "Reference", "TimedMethod")
+    ),
 )

@@ -256,11 +256,11 @@ def our_light(sun, observer, q, axes, level):
     now = _still(q)
     flux = tumblers.Brightness(sun, observer, noise=0.1, level=level, semi_axes=axes)
     mag = tumblers.Brightness(sun, observer, noise=0.1, level=level, semi_axes=axes, unit="mag")
-    return flux.predicted(now), mag.predicted(now), flux.error(now, jnp.asarray(1.0))
+    return flux.predict(now), mag.predict(now), flux.error(now, jnp.asarray(1.0))
 
 
 way(
-    "tumblers.Brightness tumblers.Brightness.predicted tumblers.Brightness.error",
+    "tumblers.Brightness tumblers.Brightness.predict tumblers.Brightness.error",
     our_light, (v.ordinary, v.ordinary, v.quaternion, between(0.5, 2.0, 3), between(1, 3)), light,
     norm=True, ulps=32, cost=2,
 )  # fmt: skip

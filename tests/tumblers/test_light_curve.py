@@ -73,7 +73,7 @@ def test_from_any_alias_alone_the_right_pair_is_found(shift):
     t, y, pair, day = daily(1)
     span = t[-1]
     x, sigma = jnp.asarray(t / span), jnp.full(t.size, 0.1)
-    table = lattice_series.sums((x, jnp.asarray(y) / sigma, 1 / sigma), 610.0)
+    table = lattice_series.sum_table((x, jnp.asarray(y) / sigma, 1 / sigma), 610.0)
     wrong = (pair + np.array(shift) / day)[None] * span
     misfits = lattice_series.lattice_chi2(table, wrong, 1)
     pairs, misfits = with_aliases(table, wrong, misfits, 100.0, 1)

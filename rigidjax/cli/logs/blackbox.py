@@ -29,7 +29,7 @@ _END_MARK = b"End of log\0"
 _ERASED = re.compile(rb"[\xff\0]*\Z")
 
 
-def blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
+def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
     """Return the names of all fields, and the wanted ones, of one flight in a Blackbox log.
 
     Rates are in deg/s and accelerations in g, by the scales in the header, as in the flight

@@ -12,7 +12,7 @@ from rigidjax import _checks
 from rigidjax.cli.logs.columns import Columns
 
 
-def mcap(path: Path, columns: Sequence[str]) -> Columns:
+def read_mcap(path: Path, columns: Sequence[str]) -> Columns:
     """Return the fields of JSON and ROS 2 messages, such as `/imu.angular_velocity.x`.
 
     The times `topic.log_time` and `topic.stamp` (the latter of the header of a message) are in s

@@ -7,7 +7,7 @@ from rigidjax import _checks
 from rigidjax.cli.logs.columns import Columns
 
 
-def ulog(path: Path, columns: Sequence[str]) -> Columns:
+def read_ulog(path: Path, columns: Sequence[str]) -> Columns:
     """Return the fields of a ULog of PX4 as `topic.field`, such as `sensor_combined.gyro_rad[0]`.
 
     The fields of a second instance of a topic are `topic#1.field`; times are in µs.
