@@ -55,8 +55,8 @@ def array_of_shape(
     digits cannot hold a rotation), and for another unit; `ValueError` for a wrong shape.
     """
     array = numeric_array(value, name, unit)
-    found = array.shape[array.ndim - len(shape) :] if batched else array.shape
-    if found != shape:
+    got_shape = array.shape[array.ndim - len(shape) :] if batched else array.shape
+    if got_shape != shape:
         many = array.ndim > len(shape) and array.shape[array.ndim - len(shape) :] == shape
         advice = hint or ("functions take one body; batch with jax.vmap" if many else "")
         raise ValueError(f"{name}: wanted shape {shape}, got {array.shape}{_with_hint(advice)}")
@@ -89,9 +89,9 @@ def numeric_array(value: object, name: str, unit: str = "") -> Array:
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
-        found = type(value).__name__
-        found += f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
-        raise TypeError(f"{name}: wanted an array of numbers, got {found}") from error
+        got = type(value).__name__
+        got += f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name}: wanted an array of numbers, got {got}") from error
     if isinstance(value, np.ndarray) and value.dtype == np.float64 and array.dtype != np.float64:
         _warn_of_lost_digits()
     if jnp.issubdtype(array.dtype, jnp.integer):
@@ -132,7 +132,7 @@ def without_mask(value: object, name: str) -> Any:
     return value
 
 
-def _convert_to_si(value: Any, name: str, wanted: str = "") -> Any:
+def _convert_to_si(value: Any, name: str, si_unit: str = "") -> Any:
     """Return the numbers of quantities of astropy or pint in SI, and those of SciPy's `Rotation`.
 
     A `Rotation` becomes its quaternion (w, x, y, z). Other values are returned as they are.
@@ -142,16 +142,16 @@ def _convert_to_si(value: Any, name: str, wanted: str = "") -> Any:
         return value.as_quat()[..., [3, 0, 1, 2]]
     value = without_mask(value, name)
     if isinstance(value, (list, tuple)):
-        items = [_convert_to_si(item, name, wanted) for item in value]
+        items = [_convert_to_si(item, name, si_unit) for item in value]
         same = all(a is b for a, b in zip(items, value, strict=True))
         return value if same else type(value)(items)
     unit = getattr(value, "unit", getattr(value, "units", None))
     if unit is None or isinstance(value, jax.Array):
         return value
-    wanted = wanted or _UNITS.get(name, "")
+    si_unit = si_unit or _UNITS.get(name, "")
     kind = _dimension(value, unit)
-    if wanted and kind is not None and kind != _DIMENSIONS[wanted]:
-        raise TypeError(f"{name}: wanted a unit such as {wanted}, got {unit or 'no unit'}")
+    if si_unit and kind is not None and kind != _DIMENSIONS[si_unit]:
+        raise TypeError(f"{name}: wanted a unit such as {si_unit}, got {unit or 'no unit'}")
     if hasattr(value, "si"):
         return np.asarray(value.si.value)
     if hasattr(value, "to_base_units"):
@@ -190,11 +190,11 @@ def require_same_batch(**arrays: tuple[Array, int]) -> None:
     """
     leading = {name: a.shape[: a.ndim - n] for name, (a, n) in arrays.items()}
     if len(set(leading.values())) > 1:
-        found = ", ".join(f"{name} {a.shape}" for name, (a, _) in arrays.items())
+        shapes = ", ".join(f"{name} {a.shape}" for name, (a, _) in arrays.items())
         wanted = ", ".join(f"{name} {a.shape[a.ndim - n :]}" for name, (a, n) in arrays.items())
         raise ValueError(
             f"{', '.join(arrays)}: wanted one of each, {wanted}, or the same leading axes before "
-            f"all of them, got shapes {found}"
+            f"all of them, got shapes {shapes}"
         )
 
 
@@ -239,8 +239,8 @@ def own_sentence(error: RuntimeError) -> RuntimeError:
     r"""Return an equal error with its own sentence alone, without the long text that Equinox
     adds.
     """
-    found = re.search(r"^\S*EquinoxRuntimeError: (.+?)\n\n-+$", str(error), re.M | re.S)
-    return type(error)(found[1]) if found else error
+    match = re.search(r"^\S*EquinoxRuntimeError: (.+?)\n\n-+$", str(error), re.M | re.S)
+    return type(error)(match[1]) if match else error
 
 
 # From so many rows on one compiled pass is quicker than NumPy, and they stay on their device.
@@ -291,16 +291,16 @@ def require_finite(value: Numbers, name: str) -> Numbers:
     return error_if(value, bad.any(), f"{name}: contains NaN or infinity{where}")
 
 
-def finite_array(value: object, shape: tuple[int, ...], name: str, **how: Any) -> Array:
+def finite_array(value: object, shape: tuple[int, ...], name: str, **options: Any) -> Array:
     """Return `value` as `array_of_shape` does; its numbers must be finite if they are known."""
-    array = array_of_shape(value, shape, name, **how)
+    array = array_of_shape(value, shape, name, **options)
     return require_finite(array, name) if is_known(array) else array
 
 
 def scalars(**named: object) -> list[Array]:
     """Return named numbers, each converted as by `array_of_shape`, in one common precision."""
-    found = [array_of_shape(value, (), name) for name, value in named.items()]
-    return [value.astype(jnp.result_type(*found)) for value in found]
+    numbers = [array_of_shape(value, (), name) for name, value in named.items()]
+    return [value.astype(jnp.result_type(*numbers)) for value in numbers]
 
 
 def checked_time(value: object, name: str = "t") -> Array:
@@ -308,13 +308,13 @@ def checked_time(value: object, name: str = "t") -> Array:
     return finite_array(value, (), name)
 
 
-def require_sign(value: Array, name: str, wanted: str, *, zero: bool = False) -> Array:
+def require_sign(value: Array, name: str, requirement: str, *, zero: bool = False) -> Array:
     """Return `value` if all numbers are finite and positive (with `zero`: ≥ 0), or refuse it."""
     xp = namespace(value)
     numbers = xp.asarray(value)
     bad = ~(((numbers >= 0) if zero else (numbers > 0)) & xp.isfinite(numbers))
-    found = f", got {numbers[bad][0]}" if xp is np and bad.any() else ""
-    return error_if(value, bad.any(), f"{name}: wanted {wanted}{found}")
+    example = f", got {numbers[bad][0]}" if xp is np and bad.any() else ""
+    return error_if(value, bad.any(), f"{name}: wanted {requirement}{example}")
 
 
 def check_if_known(check: Callable[..., Array], value: Array, *args: Any, **options: Any) -> Array:
@@ -323,19 +323,24 @@ def check_if_known(check: Callable[..., Array], value: Array, *args: Any, **opti
 
 
 def require_instance(
-    value: object, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
+    value: object,
+    kinds: type | tuple[type, ...],
+    name: str,
+    *,
+    requirement: str = "",
+    hint: str = "",
 ) -> Any:
     """Return `value` if it is an instance of `kinds`, or raise `TypeError` with what was wanted."""
     if isinstance(value, kinds):
         return value
-    if not wanted:
+    if not requirement:
         several = kinds if isinstance(kinds, tuple) else (kinds,)
-        wanted = " or ".join(kind.__name__ for kind in several)
+        requirement = " or ".join(kind.__name__ for kind in several)
     # Common mistakes are a whole solution instead of its states, or a body with mass instead of its
     # inertia.
     own = [name for name in ("ys", "inertia") if isinstance(getattr(value, name, None), kinds)]
     hint = hint or (f"give its .{own[0]}" if own else "")
-    raise TypeError(f"{name}: wanted {wanted}, got {type_name(value)}{_with_hint(hint)}")
+    raise TypeError(f"{name}: wanted {requirement}, got {type_name(value)}{_with_hint(hint)}")
 
 
 # The shape of each field of one body or one state, by the name of the field.
@@ -346,14 +351,19 @@ _ONE = {
 
 
 def require_single(
-    value: object, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
+    value: object,
+    kinds: type | tuple[type, ...],
+    name: str,
+    *,
+    requirement: str = "",
+    hint: str = "",
 ) -> Any:
     """Return `value` if it is an instance of `kinds`, and one body or state, without leading axes.
 
     A container of many bodies has the type of one body; without this check its shape would raise an
     error in the middle of the arithmetic.
     """
-    require_instance(value, kinds, name, wanted=wanted, hint=hint)
+    require_instance(value, kinds, name, requirement=requirement, hint=hint)
     for field in (field for field in _ONE if field in vars(value)):
         part, shape = getattr(value, field), _ONE[field]
         if getattr(part, "shape", None) != shape or part.dtype not in (jnp.float32, jnp.float64):
@@ -367,13 +377,13 @@ def require_function(value: object, name: str, description: str, *, hint: str = 
     `description` is that of arguments and result for messages, such as "t → (3,)". The number of
     arguments is checked if it begins with their list: "(t, state, body) → scalar".
     """
-    found = type_name(value)
+    got = type_name(value)
     if callable(value) and not isinstance(value, type):
         listed = re.match(r"\w*\(([^()]*)\)", description)
         if listed is None or _accepts(value, len(listed[1].split(","))):
             return value
-        found = f"one with other arguments: {inspect.signature(value)}"
-    raise TypeError(f"{name}: wanted a function {description}, got {found}{_with_hint(hint)}")
+        got = f"one with other arguments: {inspect.signature(value)}"
+    raise TypeError(f"{name}: wanted a function {description}, got {got}{_with_hint(hint)}")
 
 
 def _accepts(value: Callable[..., Any], count: int) -> bool:
@@ -403,26 +413,26 @@ def known_float(value: object, name: str) -> float:
     return float(array)
 
 
-def positive_float(value: object, name: str, what: str = "a positive number") -> float:
+def positive_float(value: object, name: str, requirement: str = "a positive number") -> float:
     """Return `value` as a positive, finite Python float, known before anything is compiled."""
-    found = known_float(value, name)
-    if not 0 < found < np.inf:
-        raise ValueError(f"{name}: wanted {what}, got {found}")
-    return found
+    number = known_float(value, name)
+    if not 0 < number < np.inf:
+        raise ValueError(f"{name}: wanted {requirement}, got {number}")
+    return number
 
 
-def fraction(value: object, name: str, what: str = "a number between 0 and 1") -> float:
+def fraction(value: object, name: str, requirement: str = "a number between 0 and 1") -> float:
     """Return `value` as a Python float above 0 and below 1."""
-    found = positive_float(value, name, what)
-    if not found < 1:
-        raise ValueError(f"{name}: wanted {what}, got {found}")
-    return found
+    number = positive_float(value, name, requirement)
+    if not number < 1:
+        raise ValueError(f"{name}: wanted {requirement}, got {number}")
+    return number
 
 
 def nonnegative_float(value: object, name: str) -> float:
     """Return `value` as a finite Python float ≥ 0, known before anything is compiled."""
-    found = known_float(value, name)
-    return 0.0 if found == 0 else positive_float(found, name, "a number ≥ 0")
+    number = known_float(value, name)
+    return 0.0 if number == 0 else positive_float(number, name, "a number ≥ 0")
 
 
 def host_array(value: object, name: str) -> np.ndarray:
@@ -438,10 +448,8 @@ def host_array(value: object, name: str) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name}: wanted numbers, got {type(value).__name__}") from error
     if array.dtype.kind not in "iuf" and array.dtype != jnp.bfloat16:
-        found = (
-            type_name(value) if array.dtype == object else f"{type_name(value)} of {array.dtype}"
-        )
-        raise TypeError(f"{name}: wanted numbers, got {found}")
+        got = type_name(value) if array.dtype == object else f"{type_name(value)} of {array.dtype}"
+        raise TypeError(f"{name}: wanted numbers, got {got}")
     return array.astype(float)
 
 
@@ -482,19 +490,19 @@ def random_key(value: object, name: str = "key") -> Any:
         return value
     if array and value.dtype == jnp.uint32 and value.ndim == 1:
         return value
-    found = f"{value.dtype} of shape {value.shape}" if array else type(value).__name__
+    got = f"{value.dtype} of shape {value.shape}" if array else type(value).__name__
     raise TypeError(
-        f"{name}: wanted one random key, such as jax.random.key(0), got {found}; for many use "
+        f"{name}: wanted one random key, such as jax.random.key(0), got {got}; for many use "
         "jax.vmap over jax.random.split(key, n)"
     )
 
 
-def import_library(module: str, extra: str, who: str) -> Any:
+def import_library(module: str, extra: str, caller: str) -> Any:
     """Import the module and return it, or raise an error that names the extra to install."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        words = f"{who}: {module} is missing; pip install 'rigidjax[{extra}]'"
+        words = f"{caller}: {module} is missing; pip install 'rigidjax[{extra}]'"
         raise ModuleNotFoundError(words, name=module) from error
 
 

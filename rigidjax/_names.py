@@ -32,8 +32,8 @@ def raise_attribute_error(module: str, name: str) -> ModuleType:
         # `fit` and `Fit` are two names: the spelling with these capitals goes first.
         same = next((one for one in (name, name.lower()) if one in paths), None)
         near = [same] if same else difflib.get_close_matches(name.lower(), paths, n=4, cutoff=0.75)
-        found = list(dict.fromkeys(paths[one] for one in near))[:2]
-        hint = f"; did you mean {' or '.join(found)}?" if found else ""
+        nearest = list(dict.fromkeys(paths[one] for one in near))[:2]
+        hint = f"; did you mean {' or '.join(nearest)}?" if nearest else ""
     raise AttributeError(f"module {module!r} has no attribute {name!r}{hint}", name=name)
 
 

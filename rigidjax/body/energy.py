@@ -120,7 +120,7 @@ def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude)
     """
     hint = "in the body frame use angular_momentum"
     wanted = "a state with an attitude (.q)"
-    _checks.require_single(state, HasAttitude, "state", wanted=wanted, hint=hint)
+    _checks.require_single(state, HasAttitude, "state", requirement=wanted, hint=hint)
     momentum = quaternion.rotate(state.q, angular_momentum(body, state))
     if isinstance(body, MassProperties) and isinstance(state, HasPose):
         momentum = momentum + body.mass * cross(state.x, state.v)

@@ -111,7 +111,9 @@ def write_inertials(
     ValueError: bodies: wanted at least one name → MassProperties, got none
     """
     path, source = _checks.file_path(path), _checks.file_path(source, "source")
-    _checks.require_instance(bodies, Mapping, "bodies", wanted="a dict of name → MassProperties")
+    _checks.require_instance(
+        bodies, Mapping, "bodies", requirement="a dict of name → MassProperties"
+    )
     if not bodies:
         raise ValueError("bodies: wanted at least one name → MassProperties, got none")
     root, nodes = _open_file(source)

@@ -112,10 +112,10 @@ def _require_outward(volume, corners, faces):
     longest = jnp.ptp(corners, axis=0).max()
     area = 0.5 * jnp.sqrt((jnp.cross(b - a, c - a) ** 2).sum(axis=1)).sum()
     slack = 4.0 * jnp.finfo(corners.dtype).eps * jax.lax.stop_gradient(longest) * area
-    found = f" (volume {float(volume):.6g} m³)" if _checks.is_known(volume) else ""
-    words = f"mesh: it is inside out{found}: its faces are clockwise; give faces[:, ::-1]"
+    volume_text = f" (volume {float(volume):.6g} m³)" if _checks.is_known(volume) else ""
+    words = f"mesh: it is inside out{volume_text}: its faces are clockwise; give faces[:, ::-1]"
     volume = _checks.error_if(volume, volume < -slack, words)
-    words = f"mesh: it encloses no volume{found}; for a flat body use plate"
+    words = f"mesh: it encloses no volume{volume_text}; for a flat body use plate"
     return _checks.error_if(volume, ~(volume > slack), words)
 
 
@@ -133,8 +133,8 @@ def faces_of(faces: Any, n: int) -> Array:
     if table.ndim != 2 or table.shape[1] != 3 or len(table) == 0:
         raise ValueError(f"faces: wanted shape (m, 3), triangles, got {table.shape}")
     if table.min() < 0 or table.max() >= n:
-        found = f"{table.min()} to {table.max()}; OBJ files count from 1"
-        raise ValueError(f"faces: wanted vertex numbers from 0 to {n - 1}, got {found}")
+        got = f"{table.min()} to {table.max()}; OBJ files count from 1"
+        raise ValueError(f"faces: wanted vertex numbers from 0 to {n - 1}, got {got}")
     repeated = (table == np.roll(table, 1, axis=1)).any(axis=1)
     if repeated.any():
         which = int(np.argmax(repeated))

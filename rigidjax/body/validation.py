@@ -51,26 +51,31 @@ def require_real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*
     """Refuse a second moment that is not symmetric and positive semi-definite."""
     s = _require_symmetric(_checks.require_finite(s, "second moment"), "second moment")
     least, largest = (e := _eigenvalues(s))[..., 0], e[..., 2]
-    found = (
+    got = (
         f", got principal second moments {_moments_as_text(e)} kg m²" if _checks.is_known(s) else ""
     )
     return _checks.error_if(
         s,
         (least < -_round_off_bound(s) * largest).any() | (largest < 0).any(),
         "second moment 𝔖 = ∫ r rᵀ dm: wanted a positive semi-definite matrix (mass is not "
-        f"negative){found}; is this an inertia tensor I? then use from_tensor (I = Tr(𝔖) 1 − 𝔖)",
+        f"negative){got}; is this an inertia tensor I? then use from_tensor (I = Tr(𝔖) 1 − 𝔖)",
     )
 
 
 def require_single_body(
-    value: object, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
+    value: object,
+    kinds: type | tuple[type, ...],
+    name: str,
+    *,
+    requirement: str = "",
+    hint: str = "",
 ) -> Any:
     """Return `value` if it is one body of one of `kinds` and some mass has its numbers.
 
     Known numbers that no real body has are refused; a traced body with such numbers becomes NaN. A
     moment may be zero: a function that divides by the moments calls `check_body`.
     """
-    body = _checks.require_single(value, kinds, name, wanted=wanted, hint=hint)
+    body = _checks.require_single(value, kinds, name, requirement=requirement, hint=hint)
     has_mass = hasattr(body, "mass")
     tensor = body.inertia.tensor if has_mass else body.tensor
     return check_body(body, tensor, body.mass if has_mass else None, throw=False, allow_thin=True)
@@ -206,19 +211,20 @@ def attitude_quaternion(q: Quaternion) -> Quat:
 
 def _moments_of_a_body(value, moments):
     m1, m2, m3 = moments[..., 0], moments[..., 1], moments[..., 2]
-    found = f" {_moments_as_text(moments)} kg m²" if _checks.is_known(value) else ""
+    moments_text = f" {_moments_as_text(moments)} kg m²" if _checks.is_known(value) else ""
     slack = _round_off_bound(value) * abs(m3)
     value = _checks.error_if(
         value,
         (m1 < -slack).any() | (m3 < 0).any(),
-        f"inertia: wanted moments that are not negative, got{found or ' a negative one'}; "
+        f"inertia: wanted moments that are not negative, got{moments_text or ' a negative one'}; "
         "possible causes: an inside-out mesh, or a product of inertia with the wrong sign",
     )
     short = f" ({float(np.max(m3 - m1 - m2)):.3g} too large)" if _checks.is_known(value) else ""
     return _checks.error_if(
         value,
         (m3 - m1 - m2 > slack).any(),
-        f"inertia: the moments{found} break the triangle inequality I1 + I2 ≥ I3: the largest may "
+        f"inertia: the moments{moments_text} break the triangle inequality I1 + I2 ≥ I3: the "
+        "largest may "
         f"not exceed the sum of the other two{short}; no distribution of mass has such moments. "
         "Is this a second moment 𝔖? then use from_second_moment",
     )
@@ -236,11 +242,13 @@ def _asymmetry(a):
 
 def _require_symmetric(a, name):
     difference, bad = _asymmetry(a)
-    found = f" (largest difference {float(difference.max()):.3g})" if _checks.is_known(a) else ""
+    difference_text = (
+        f" (largest difference {float(difference.max()):.3g})" if _checks.is_known(a) else ""
+    )
     return _checks.error_if(
         a,
         bad,
-        f"{name}{_SKEW}{found}{_CAUSE}",
+        f"{name}{_SKEW}{difference_text}{_CAUSE}",
     )
 
 

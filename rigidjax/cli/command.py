@@ -338,11 +338,13 @@ def _log_warnings(strict: bool) -> Iterator[None]:
         warnings.simplefilter("error" if strict else "always", LogWarning)
         usual = warnings.showwarning
 
-        def show(message: Warning | str, category: type[Warning], *where: Any, **how: Any) -> None:
+        def show(
+            message: Warning | str, category: type[Warning], *_place: Any, **_options: Any
+        ) -> None:
             if issubclass(category, LogWarning):
                 _print_line(str(message))
             else:
-                usual(message, category, *where, **how)
+                usual(message, category, *_place, **_options)
 
         warnings.showwarning = show
         yield

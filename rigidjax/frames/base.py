@@ -102,8 +102,8 @@ def jump_times_within(*laws: object) -> Float[Array, " n"]:
     A scene or torque that contains laws must pass their times on: a solver does not see them.
     """
     jumps = (getattr(law, "jump_times", None) for law in laws)
-    found = [jnp.asarray(times, float) for times in jumps if times is not None]
-    return jnp.concatenate([jnp.zeros(0), *found])
+    times = [jnp.asarray(times, float) for times in jumps if times is not None]
+    return jnp.concatenate([jnp.zeros(0), *times])
 
 
 def cast_like(x: Array, *values: Array) -> tuple[Array, ...]:

@@ -64,7 +64,9 @@ def libration_integral(state: PyTree, body: _inertia.Inertia, rate: ScalarLike) 
     >>> float(libration_integral(at_rest, body, 2.0))
     1.0
     """
-    _checks.require_single(state, HasAttitude, "state", wanted="an Attitude in the orbital frame")
+    _checks.require_single(
+        state, HasAttitude, "state", requirement="an Attitude in the orbital frame"
+    )
     body = validation.require_single_body(body, _inertia.Inertia, "body")
     axes = jnp.eye(3, dtype=state.q.dtype)
     n = _checks.array_of_shape(rate, (), "rate").astype(state.q.dtype)

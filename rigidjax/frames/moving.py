@@ -216,7 +216,9 @@ class MovingFrame(eqx.Module):
 def require_frame(frame: object, name: str) -> Any:
     """Return `frame` if it is a `MovingFrame`; raise `TypeError` for anything else."""
     hint = "make one from a rotation with MovingFrame(rotation)"
-    return _checks.require_instance(frame, MovingFrame, name, wanted="a MovingFrame", hint=hint)
+    return _checks.require_instance(
+        frame, MovingFrame, name, requirement="a MovingFrame", hint=hint
+    )
 
 
 class _Composed(eqx.Module):

@@ -56,7 +56,9 @@ def table(lines: list[Row]) -> str:
                  value  95 % interval
     I1          1.2346  1.2000 … 1.2700 kg m²
     """
-    for line in _checks.require_instance(lines, (list, tuple), "lines", wanted="a list of rows"):
+    for line in _checks.require_instance(
+        lines, (list, tuple), "lines", requirement="a list of rows"
+    ):
         if not isinstance(line, tuple) or len(line) != 5:
             raise TypeError(f"lines: wanted rows (name, value, low, high, unit), got {line!r}")
     if not lines:

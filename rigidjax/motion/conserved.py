@@ -77,32 +77,34 @@ def conserved(
     turning, parts, t = _state_and_torques(body, state, torque, t)
     dtype = turning.omega.dtype
     body = in_precision(body, dtype)
-    found: dict[str, Float[Array, "..."]] = {}
+    quantities: dict[str, Float[Array, "..."]] = {}
     if all(hasattr(part, "energy") and getattr(part, "steady", False) for part in parts):
-        found["energy"] = _energy(body, turning, parts, t)
+        quantities["energy"] = _energy(body, turning, parts, t)
     outside = [part for part in parts if not hasattr(part, "internal_momentum")]
     momentum = _momentum(body, turning, parts, t)
     if not outside:
-        found["momentum_squared"] = dot(momentum, momentum)
+        quantities["momentum_squared"] = dot(momentum, momentum)
     if isinstance(turning, HasAttitude):
         momentum = quaternion.rotate(turning.q, momentum)
         axis = getattr(outside[0], "axis", None) if len(outside) == 1 else None
         if not outside:
-            found["momentum"] = momentum
+            quantities["momentum"] = momentum
         elif axis is not None:
             axis = axis.astype(dtype)
             length = length_or_zero(axis)
-            found["momentum_along_axis"] = dot(momentum, axis) / jnp.where(length > 0, length, 1)
+            quantities["momentum_along_axis"] = dot(momentum, axis) / jnp.where(
+                length > 0, length, 1
+            )
     if isinstance(turning, HasPose) and isinstance(body, MassProperties):
         plain = [(part, part.law if isinstance(part, FrozenLaw) else part) for part in parts]
         # A torque whose `feels` is `HasPose` may return a force as well.
         turns = lambda law: isinstance(law, AbstractTorque) and law.feels is not HasPose  # noqa: E731
         pushed = [part for part, law in plain if not turns(law)]
         if not pushed:
-            found["linear_momentum"] = body.mass * turning.v
+            quantities["linear_momentum"] = body.mass * turning.v
         if all(isinstance(part, CentralGravity) for part in [*outside, *pushed]):
-            found["momentum_about_origin"] = body.mass * cross(turning.x, turning.v) + momentum
-    return found
+            quantities["momentum_about_origin"] = body.mass * cross(turning.x, turning.v) + momentum
+    return quantities
 
 
 def drift(
@@ -129,7 +131,7 @@ def drift(
     if not ts.size:
         raise ValueError("ts: wanted at least one time, got none")
     turning = motion_of(ys)
-    _checks.require_instance(turning, HasSpin, "ys", wanted="states with a leading time axis")
+    _checks.require_instance(turning, HasSpin, "ys", requirement="states with a leading time axis")
     for leaf in jax.tree.leaves(ys):
         if leaf.shape[:1] != ts.shape:
             words = f"ys: wanted one row for each of {ts.shape[0]} times"
@@ -137,7 +139,7 @@ def drift(
     at_all = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
     kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(turning)
     spin = jax.vmap(lambda t, y: _spin_size(body, y, torque, t))(ts, ys)
-    found = {}
+    drifts = {}
     for name, values in at_all.items():
         away = _row_lengths(values - jax.lax.slice_in_dim(values, 0, 1))
         if name == "energy":
@@ -147,8 +149,8 @@ def drift(
         else:
             scale = spin**2 if name == "momentum_squared" else spin
         scale = jnp.max(scale)
-        found[name] = jnp.max(away) / jnp.where(scale > 0, scale, 1)
-    return found
+        drifts[name] = jnp.max(away) / jnp.where(scale > 0, scale, 1)
+    return drifts
 
 
 def _state_and_torques(

@@ -35,7 +35,9 @@ class Coupled(eqx.Module):
         `rigidjax.simulate`) at `t`, s.
         """
         _checks.require_single(body, (Inertia, MassProperties), "body")
-        _checks.require_single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
+        _checks.require_single(
+            state0, HasSpin, "state0", requirement="a Spin, an Attitude or a Rigid"
+        )
         dtype = state0.omega.dtype
         t = _checks.array_of_shape(t, (), "t").astype(dtype)
         own = initial_states(in_precision(torque, dtype), t, state0, in_precision(body, dtype))

@@ -94,14 +94,14 @@ def _members_at_values(
         guess = previous[free] + _slope_along_family(still, previous, index) * (
             aim - previous[index]
         )
-        found, left = correction.correct_orbit(index, tolerance, scene, guess, value)
-        numbers = correction.insert_held(found, value, index)
+        root, left = correction.correct_orbit(index, tolerance, scene, guess, value)
+        numbers = correction.insert_held(root, value, index)
         return numbers, (numbers, left)
 
     # The guess is corrected first: the tangent is needed at an orbit.
     held_now = lax.stop_gradient(start[index])
-    found, _ = correction.correct_orbit(index, tolerance, still, start[free], held_now)
-    _, out = lax.scan(step, correction.insert_held(found, start[index], index), held_value)
+    root, _ = correction.correct_orbit(index, tolerance, still, start[free], held_now)
+    _, out = lax.scan(step, correction.insert_held(root, start[index], index), held_value)
     return out
 
 
@@ -200,8 +200,8 @@ def _follow_family(
         def across(numbers: Array) -> Array:
             return jnp.append(residual(numbers), jnp.sum(along * (numbers - last)) - step)
 
-        found = correction.newton(across, last + step * along, tolerance)
-        return (found, along), (found, jnp.max(jnp.abs(residual(found))))
+        root = correction.newton(across, last + step * along, tolerance)
+        return (root, along), (root, jnp.max(jnp.abs(residual(root))))
 
     first = jnp.zeros(4, start.dtype).at[index].set(1)
     carry: Any = start, first
@@ -253,14 +253,14 @@ def bifurcation(
         raise ValueError(f"value: wanted a finite number, got {value}")
     a, b = (float(crossing(one)[place]) for one in (orbit, other))
     left, right = (scene.periodic_orbit(one, hold=hold) for one in (orbit, other))
-    found = {a: left, b: right}
+    orbits = {a: left, b: right}
 
     def excess(held_value: float) -> float:
-        if held_value not in found:
+        if held_value not in orbits:
             share = (held_value - a) / (b - a)
             guess = jax.tree.map(lambda x, y: (1 - share) * x + share * y, left, right)
-            found[held_value] = scene.periodic_orbit(guess, hold=hold)
-        away = _index_of_held(scene, found[held_value], index) - value
+            orbits[held_value] = scene.periodic_orbit(guess, hold=hold)
+        away = _stability_index(scene, orbits[held_value], index) - value
         return away if abs(away) > 1e-12 * max(1.0, abs(value)) else 0.0
 
     low, high = excess(a), excess(b)
@@ -268,15 +268,15 @@ def bifurcation(
         ends = f"{low + value:.6g} at one orbit, {high + value:.6g} at the other"
         raise ValueError(f"bifurcation: the index is {ends}: {value:g} does not lie between")
     root: Any = brentq(excess, a, b, xtol=1e-13 * max(1.0, abs(b - a)), maxiter=_MOST)
-    return found[root]
+    return orbits[root]
 
 
-def _index_of_held(scene: "AbstractReversible", orbit: PeriodicOrbit, index: int) -> float:
-    found = np.asarray(_stability_of_orbit(scene, orbit))[index]
-    if abs(found.imag) > 1e-9 * max(1.0, abs(found)):
+def _stability_index(scene: "AbstractReversible", orbit: PeriodicOrbit, index: int) -> float:
+    stability = np.asarray(_stability_of_orbit(scene, orbit))[index]
+    if abs(stability.imag) > 1e-9 * max(1.0, abs(stability)):
         words = "the stability indices are complex at a member between the orbits"
         raise ValueError(f"bifurcation: {words}; give orbits nearer to each other")
-    return float(found.real)
+    return float(stability.real)
 
 
 @eqx.filter_jit

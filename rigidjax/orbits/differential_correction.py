@@ -35,7 +35,7 @@ class PeriodicOrbit(eqx.Module):
     period: Float[Array, "*batch"]
 
     def __init__(self, state: Point, period: ScalarLike):
-        self.state = _checks.require_instance(state, Point, "state", wanted="a Point(x, v)")
+        self.state = _checks.require_instance(state, Point, "state", requirement="a Point(x, v)")
         _checks.array_of_shape(state.x, (3,), "state.x", batched=True)
         period = _checks.array_of_shape(period, (), "period", batched=True)
         _checks.require_same_batch(state=(state.x, 1), period=(period, 0))
@@ -76,13 +76,13 @@ def periodic_orbit(
     words = f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
     words += "hold another of x, z, vy, period, or loosen the tolerance"
     unknown = _checks.error_if(unknown, bad, words)
-    found = insert_held(unknown, numbers[index], index)
+    corrected = insert_held(unknown, numbers[index], index)
     # A half period of zero solves the equations of every start.
-    ratio = found[3] / numbers[3]
+    ratio = corrected[3] / numbers[3]
     words = "periodic_orbit: Newton's method went from the guess to an orbit of less than half or "
     words += "more than twice its period; start nearer"
-    found = _checks.error_if(found, ~((ratio > 0.5) & (ratio < 2)), words)
-    return orbit_of(found)
+    corrected = _checks.error_if(corrected, ~((ratio > 0.5) & (ratio < 2)), words)
+    return orbit_of(corrected)
 
 
 def index_of_held(hold: str) -> int:
@@ -94,7 +94,7 @@ def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
     """Return the four numbers of an orbit that crosses y = 0 at a right angle: x, z, v_y, T/2."""
     made = "lyapunov_guess and halo_guess make one"
     wanted = "a PeriodicOrbit(state, period)"
-    _checks.require_instance(guess, PeriodicOrbit, "guess", wanted=wanted, hint=made)
+    _checks.require_instance(guess, PeriodicOrbit, "guess", requirement=wanted, hint=made)
     x, v = guess.state.x, guess.state.v
     if x.ndim != 1:
         raise ValueError(f"guess: wanted one orbit, x of shape (3,), got {x.shape}; use jax.vmap")
@@ -127,16 +127,16 @@ def usual_tolerance(numbers: Array) -> float:
 
 
 def integrate(
-    scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **how: Any
+    scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **options: Any
 ) -> dfx.Solution:
     """Return the motion from 0 to `t`, with derivatives in forward mode.
 
-    Further arguments `how` are those of `diffrax.diffeqsolve`.
+    Further arguments `options` are those of `diffrax.diffeqsolve`.
     """
     motion = dfx.ODETerm(scene.field), dfx.Dopri8(), jnp.zeros_like(t), t, None, state
-    how |= dict(adjoint=dfx.ForwardMode(), max_steps=100_000, throw=False)
-    how["stepsize_controller"] = dfx.PIDController(rtol=rtol, atol=atol)
-    return dfx.diffeqsolve(*motion, **how)
+    options |= dict(adjoint=dfx.ForwardMode(), max_steps=100_000, throw=False)
+    options["stepsize_controller"] = dfx.PIDController(rtol=rtol, atol=atol)
+    return dfx.diffeqsolve(*motion, **options)
 
 
 @eqx.filter_jit
@@ -155,7 +155,7 @@ def transition_matrix(
     """Return the state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) from `state`, by forward
     mode.
     """
-    _checks.require_instance(state, Point, "state", wanted="a Point(x, v)")
+    _checks.require_instance(state, Point, "state", requirement="a Point(x, v)")
     t = _checks.require_finite(_checks.array_of_shape(t, (), "t"), "t")
     return _transition_matrix(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
 
@@ -228,12 +228,12 @@ def correct_orbit(
 def _correct_orbit_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents
-    found, left = correct_orbit(index, tolerance, scene, unknown, held)
+    root, left = correct_orbit(index, tolerance, scene, unknown, held)
     # All derivatives of the residual are one matrix, so that the rule stays linear in the tangents
     # and can be transposed.
     numbers, rest = eqx.partition(scene, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(numbers)
-    flat, unflatten = ravel_pytree((leaves, held, found))
+    flat, unflatten = ravel_pytree((leaves, held, root))
 
     def residual(flat: Array) -> Array:
         leaves, held, unknown = unflatten(flat)
@@ -249,4 +249,4 @@ def _correct_orbit_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
     pushed, _ = ravel_pytree((dots, held_dot))
     moved = jnp.sum(matrix[:, :-3] * pushed[None], axis=1)
     total = -jnp.linalg.solve(matrix[:, -3:], moved)
-    return (found, left), (total, jnp.zeros_like(left))
+    return (root, left), (total, jnp.zeros_like(left))

@@ -200,9 +200,9 @@ def manifold_start(
 
 
 def _positive_distance(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
-    found = _checks.array_of_shape(value, (), name)
+    distance = _checks.array_of_shape(value, (), name)
     return _checks.require_sign(
-        found if dtype is None else found.astype(dtype), name, "a positive number"
+        distance if dtype is None else distance.astype(dtype), name, "a positive number"
     )
 
 

@@ -47,7 +47,7 @@ def frames(
     """
     moving: Any = getattr(frame, "frame", frame)
     wanted = "a MovingFrame, or a scene with one such as scenes.turntable"
-    _checks.require_instance(moving, MovingFrame, "frame", wanted=wanted)
+    _checks.require_instance(moving, MovingFrame, "frame", requirement=wanted)
     _checks.require_instance(inside, Point, "inside")
     known = isinstance(plane, str) and set(plane) <= set(AXES)
     if not known or len(plane) != 2 or plane[0] == plane[1]:

@@ -71,7 +71,9 @@ def polhode(
     'Π₃ / h'
     """
     _checks.require_single(inertia, Inertia, "inertia")
-    _checks.require_instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
+    _checks.require_instance(
+        states, HasSpin, "states", requirement="a Spin, an Attitude or a Rigid"
+    )
     energies = _checks.integer(energies, "energies", 0)
     moments, q = inertia.invertible().principal()
     i = np.asarray(moments, dtype=float)

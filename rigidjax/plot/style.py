@@ -29,11 +29,12 @@ def pyplot() -> Any:
     return plt
 
 
-def unit_factor(name: str, units: dict[str, float], what: str) -> float:
-    """Return the factor of a unit to or from SI, by its name; the error for other names lists the
-    known names.
+def unit_factor(unit: str, units: dict[str, float], name: str) -> float:
+    """Return the factor of a unit to or from SI; the error for another unit lists the known ones.
+
+    `name` is that of the argument.
     """
-    return units[_checks.require_option(name, tuple(units), what)]
+    return units[_checks.require_option(unit, tuple(units), name)]
 
 
 def readings_of_fit(
@@ -63,11 +64,11 @@ def readings_of_fit(
     return record, errors, [np.hypot(noise[which], late) for noise, late in noises]
 
 
-def flat_axes(ax: Any, **how: Any) -> Any:
+def flat_axes(ax: Any, **options: Any) -> Any:
     """Return `ax`, or the axes of a new figure for `None`."""
     if ax is not None:
         return ax
-    return pyplot().subplots(layout="constrained", **{"figsize": (6.4, 4.4), **how})[1]
+    return pyplot().subplots(layout="constrained", **{"figsize": (6.4, 4.4), **options})[1]
 
 
 def solid_axes(ax: Any) -> Any:
@@ -82,15 +83,16 @@ def solid_axes(ax: Any) -> Any:
     return ax
 
 
-def axes_of_shape(ax: Any, shape: tuple[int, ...], **how: Any) -> Any:
-    """Return `ax` if it has this shape, or new axes (`how` of `subplots`) for `None`. **Raises:**
-    `ValueError` for another shape.
+def axes_of_shape(ax: Any, shape: tuple[int, ...], **options: Any) -> Any:
+    """Return `ax` if it has this shape, or new axes (`options` of `subplots`) for `None`.
+
+    **Raises:** `ValueError` for another shape.
     """
     if ax is None:
-        ax = np.reshape(pyplot().subplots(layout="constrained", **how)[1], shape)
+        ax = np.reshape(pyplot().subplots(layout="constrained", **options)[1], shape)
     ax = np.atleast_1d(np.asarray(ax, dtype=object))
     if ax.shape != shape:
-        words = f"{shape[0]} axes" + (" in a row" if "ncols" in how else "")
+        words = f"{shape[0]} axes" + (" in a row" if "ncols" in options else "")
         words = words if len(shape) == 1 else f"{shape} axes, one row for each sensor"
         raise ValueError(f"ax: wanted {words}, got shape {ax.shape}")
     return ax
@@ -104,13 +106,13 @@ def legend_below(ax: Any, *entries: Any, down: float = 0.16) -> None:
     ax.legend(*entries, **place, ncols=3, fontsize=8, frameon=False)
 
 
-def times_on_host(ts: object, count: int, what: str = "the states have") -> np.ndarray:
+def times_on_host(ts: object, count: int, name: str = "the states have") -> np.ndarray:
     """Return the times (T,) as NumPy float64. **Raises:** `ValueError` unless there are as many
     times as states.
     """
     t = _checks.host_array(ts, "ts")
     if t.shape != (count,):
-        raise ValueError(f"ts: wanted ({count},) as {what}, got {t.shape}")
+        raise ValueError(f"ts: wanted ({count},) as {name}, got {t.shape}")
     return t
 
 
@@ -132,8 +134,8 @@ def attitudes_on_host(states: Any) -> np.ndarray:
     attitude.
     """
     if not hasattr(states, "q"):
-        found = type(states).__name__
-        raise TypeError(f"states: wanted states with an attitude (Attitude, Rigid), got {found}")
+        got = type(states).__name__
+        raise TypeError(f"states: wanted states with an attitude (Attitude, Rigid), got {got}")
     return rows_on_host(states.q, 4, "states.q")
 
 
@@ -150,18 +152,18 @@ def sphere_points(longitude: np.ndarray, colatitude: np.ndarray) -> np.ndarray:
 
 
 def draw_around_ball(
-    ax: Any, path: np.ndarray, *, hidden_style: dict[str, Any] | None = None, **how: Any
+    ax: Any, path: np.ndarray, *, hidden_style: dict[str, Any] | None = None, **style: Any
 ) -> None:
     """Draw a line `path` (T, 3) on the unit sphere, in `hidden_style` where the sphere hides it."""
     up, around = np.radians(ax.elev), np.radians(ax.azim)
     eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
-    front, label = path @ eye > 0, how.pop("label", None)
+    front, label = path @ eye > 0, style.pop("label", None)
     for seen, more in ((front, {"label": label}), (~front, hidden_style or {"alpha": 0.25})):
         # Each part has one point more on both sides of the edge, so that no gap opens between them.
         wide = seen | np.roll(seen, 1) | np.roll(seen, -1)
         wide[0], wide[-1] = seen[0], seen[-1]
         line = np.where(wide[:, None], path, np.nan)
-        ax.plot(*line.T, **{**how, **more})
+        ax.plot(*line.T, **{**style, **more})
 
 
 def sphere_grid() -> np.ndarray:

@@ -39,7 +39,9 @@ def motion(
     """
     turned = style.unit_factor(rate_unit, RATES, "rate_unit")
     seconds = style.unit_factor(time_unit, TIMES, "time_unit")
-    _checks.require_instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
+    _checks.require_instance(
+        states, HasSpin, "states", requirement="a Spin, an Attitude or a Rigid"
+    )
     omega = rows_on_host(states.omega, 3, "states.omega") * turned
     t = style.times_on_host(ts, omega.shape[0]) / seconds
     both = hasattr(states, "q")
@@ -60,11 +62,11 @@ def motion(
     return ax
 
 
-def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, how: str) -> None:
-    _checks.require_option(how, ("quaternion", "axes", "angles"), "attitude")
-    if how == "quaternion":
+def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, style: str) -> None:
+    _checks.require_option(style, ("quaternion", "axes", "angles"), "attitude")
+    if style == "quaternion":
         names, lines, label = [f"q{n}" for n in "wxyz"], q.T, "attitude q"
-    elif how == "axes":
+    elif style == "axes":
         names = [f"{n}' · z" for n in "xyz"]
         lines, label = style.rotation_matrices(q)[:, 2, :].T, "body axes along world z"
     else:

@@ -57,9 +57,9 @@ def project(matrix: Mat3Like) -> Mat3:
         require_direction(matrix.reshape(9), "matrix")
         size = np.max(np.abs(np.asarray(matrix)))
         # For the matrix over its largest entry: its own determinant may overflow.
-        found = np.linalg.det(np.asarray(matrix) / size)
-        if found <= 0:
-            words = f"left-handed frame or singular, det = {found:.3g}; no rotation is nearest"
+        det = np.linalg.det(np.asarray(matrix) / size)
+        if det <= 0:
+            words = f"left-handed frame or singular, det = {det:.3g}; no rotation is nearest"
             raise ValueError(f"matrix: {words}")
     return nearest_rotation(matrix)
 

@@ -26,12 +26,12 @@ def require_direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
         and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest_component(v) < np.inf
     ):
         _checks.require_finite(v, name)
-        found = (
+        got = (
             "zero"
             if _largest_component(v) == 0
             else f"less than the least normal number, {least:.2g}"
         )
-        raise ValueError(f"{name}: wanted a direction, got {found}")
+        raise ValueError(f"{name}: wanted a direction, got {got}")
     return v
 
 
@@ -65,13 +65,13 @@ def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[A
     with np.errstate(over="ignore", invalid="ignore"):
         det = (rows[0] * xp.cross(rows[1], rows[2])).sum(-1)
         gram = (values[..., :, :, None] * values[..., :, None, :]).sum(-3)
-    found = f", det = {det.min():.4g}" if known else ""
-    words = f"left-handed frame{found}; a rotation has det = +1 (an axis flipped or swapped?)"
+    got = f", det = {det.min():.4g}" if known else ""
+    words = f"left-handed frame{got}; a rotation has det = +1 (an axis flipped or swapped?)"
     m = _checks.error_if(m, (det < 0).any(), f"{name}: {words}")
     error = abs(gram - xp.eye(3, dtype=values.dtype).reshape((1,) * (values.ndim - 2) + (3, 3)))
     limit = tolerance(values.dtype)
-    found = f" is {error.max():.3g}" if known else " is too large"
-    words = f"{name}: not orthogonal, the largest entry of |MᵀM − 1|{found} (limit {limit:g}); "
+    got = f" is {error.max():.3g}" if known else " is too large"
+    words = f"{name}: not orthogonal, the largest entry of |MᵀM − 1|{got} (limit {limit:g}); "
     words += "so3.project gives the nearest rotation"
     return _checks.error_if(m, ~(error.max() <= limit), words)
 
@@ -97,7 +97,7 @@ def require_unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Arr
     q = _checks.error_if(q, (length == 0).any(), words)
     off = xp.abs(length - 1)
     limit = tolerance(q.dtype)
-    found = f", its length is {length.ravel()[off.argmax()]:.6g}" if xp is np else ""
-    words = f"{name}: not a unit quaternion{found} (limit 1 ± {limit:g}); use quaternion.normalise"
+    got = f", its length is {length.ravel()[off.argmax()]:.6g}" if xp is np else ""
+    words = f"{name}: not a unit quaternion{got} (limit 1 ± {limit:g}); use quaternion.normalise"
     q = _checks.error_if(q, ~(off.max() <= limit), words)
     return q / length

@@ -157,4 +157,4 @@ def explicit(solver: AbstractExplicit | None) -> AbstractExplicit:
     """The solver, `DormandPrince8` for `None`; `TypeError` for one that is not explicit."""
     solver = DormandPrince8() if solver is None else solver
     wanted = "an explicit method of rigidjax.solvers"
-    return _checks.require_instance(solver, AbstractExplicit, "solver", wanted=wanted)
+    return _checks.require_instance(solver, AbstractExplicit, "solver", requirement=wanted)

@@ -208,7 +208,7 @@ def first_step(dt0: Any, times: Array) -> Array:
 def start(state0: Any, throw: bool) -> Any:
     """`state0` of one body, finite, with a unit quaternion; or NaN, as for `times`."""
     wanted = "Spin, Attitude or Rigid, or Point without a body"
-    _checks.require_single(state0, (Spin, Attitude, Rigid, Point), "state0", wanted=wanted)
+    _checks.require_single(state0, (Spin, Attitude, Rigid, Point), "state0", requirement=wanted)
     named, tree = jax.tree.flatten_with_path(state0)
     leaves = [
         _checks.require_finite(leaf, str(path[-1]).lstrip("."))

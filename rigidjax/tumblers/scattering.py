@@ -119,7 +119,9 @@ def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
     if scattering is None:
         return LommelSeeliger()
     wanted = "LommelSeeliger(), Geometric() or Lambert()"
-    return _checks.require_instance(scattering, AbstractScattering, "scattering", wanted=wanted)
+    return _checks.require_instance(
+        scattering, AbstractScattering, "scattering", requirement=wanted
+    )
 
 
 def unit_direction(value: Vec3Like | Numbers, name: str) -> Vec3:

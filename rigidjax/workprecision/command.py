@@ -114,7 +114,7 @@ def run_subcommand(options: argparse.Namespace) -> int:
 def _measure(options: argparse.Namespace) -> list[Measurement]:
     quick = options.quick or options.check is not None or options.keep is not None
     names = options.scene or (QUICK if quick else [n for n, m in scenes().items() if not m().slow])
-    found: list[Measurement] = []
+    records: list[Measurement] = []
     begin = time.perf_counter()
 
     def say(line: str) -> None:
@@ -122,7 +122,7 @@ def _measure(options: argparse.Namespace) -> list[Measurement]:
 
     for name in names:
         if name == DRIFT:
-            found += long_drift(progress=say)
+            records += long_drift(progress=say)
             continue
         alone = options.no_peers or options.float32
         chosen = [m for m in methods() if not (alone and m.group == "peer")]
@@ -133,8 +133,8 @@ def _measure(options: argparse.Namespace) -> list[Measurement]:
         graded = not options.no_gradients and (name in GRADED or bool(options.scene))
         scene, thin = scenes()[name](), 4 if quick else options.thin
         scene = to_float32(scene, graded) if options.float32 else scene
-        found += measure(scene, chosen, gradients=graded, progress=say, thin=thin)
-    return found
+        records += measure(scene, chosen, gradients=graded, progress=say, thin=thin)
+    return records
 
 
 def summary(records: Iterable[Measurement]) -> str:

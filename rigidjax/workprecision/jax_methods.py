@@ -202,7 +202,9 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Ti
     >>> diffrax_method(dfx.Heun()).name
     'diffrax Heun'
     """
-    _checks.require_instance(solver, dfx.AbstractSolver, "solver", wanted="a solver of diffrax")
+    _checks.require_instance(
+        solver, dfx.AbstractSolver, "solver", requirement="a solver of diffrax"
+    )
     ways = {
         "forward": (dfx.ForwardMode(), jax.jacfwd),
         "checkpointed": (dfx.RecursiveCheckpointAdjoint(), jax.grad),

@@ -82,11 +82,13 @@ def measure(
     **Raises:** `TypeError` for something that is no `BenchmarkScene` or `TimedMethod`.
     """
     made = 'standard ones are made by rj.workprecision.scenes()["heavy-top"]()'
-    _checks.require_instance(scene, BenchmarkScene, "scene", wanted="a BenchmarkScene", hint=made)
+    _checks.require_instance(
+        scene, BenchmarkScene, "scene", requirement="a BenchmarkScene", hint=made
+    )
     chosen = [*(known.methods() if methods is None else methods), *peers]
     for method in chosen:
         _checks.require_instance(
-            method, TimedMethod, "methods", wanted="methods of workprecision.methods()"
+            method, TimedMethod, "methods", requirement="methods of workprecision.methods()"
         )
     right = scene.reference if scene.reference is not None else compute_reference(scene, gradients)
     jobs: list[_Job] = []
@@ -102,12 +104,12 @@ def measure(
             for setting in _settings(scene, method, thin * (2 if adjoint else 1)):
                 jobs += _inspect_run(scene, method, adjoint, setting, ready, right)
     _time_jobs(jobs, rounds)
-    found = []
+    records = []
     for job in jobs:
         low, middle, high = (float(p) for p in np.percentile(job.times[1:], [25, 50, 75]))
         times = dict(time=middle, time_low=low, time_high=high)
-        found.append(dataclasses.replace(job.record, **times))
-    return found
+        records.append(dataclasses.replace(job.record, **times))
+    return records
 
 
 def compute_reference(scene: BenchmarkScene, gradients: bool = True) -> Reference:
@@ -161,12 +163,12 @@ def _turn(scene: BenchmarkScene) -> float:
 
 
 def _settings(scene: BenchmarkScene, method: TimedMethod, thin: int) -> list[float]:
-    found = list(method.settings)[::-1][::thin][::-1]
+    settings = list(method.settings)[::-1][::thin][::-1]
     if method.equal:
-        return [float(round(s * _turn(scene) / 50)) for s in found]
+        return [float(round(s * _turn(scene) / 50)) for s in settings]
     # A tolerance below ten units of round-off rejects every step.
     least = 10 * float(jnp.finfo(scene.numbers.dtype).eps)
-    return [float(s) for s in found if s == 0 or s > least]
+    return [float(s) for s in settings if s == 0 or s > least]
 
 
 def _inspect_run(
@@ -202,10 +204,10 @@ def _relative_errors(
 def _gradient_errors(
     scene: BenchmarkScene, slope: np.ndarray | Array, reference: Reference
 ) -> dict[str, float]:
-    found, wanted = np.asarray(slope, float), np.asarray(reference.gradient)
+    gradient, wanted = np.asarray(slope, float), np.asarray(reference.gradient)
 
     def relative_error(part: slice) -> float:
-        miss, size = np.linalg.norm(found[part] - wanted[part]), np.linalg.norm(wanted[part])
+        miss, size = np.linalg.norm(gradient[part] - wanted[part]), np.linalg.norm(wanted[part])
         return float(miss / max(size, 1e-300))
 
     parts = {key: relative_error(part) for key, part in scene.blocks.items()}
@@ -273,7 +275,7 @@ def long_drift(
         raise ValueError(f"long_drift: no method {unknown[0]!r}; there are {', '.join(RUNS)}")
     if steps < 100 * (LOOKS - 1):
         raise ValueError(f"long_drift: wanted {100 * (LOOKS - 1)} steps or more, got {steps}")
-    found = []
+    drifts_by_method = []
     for name in RUNS if names is None else [name for name in RUNS if name in names]:
         h, solver = RUNS[name]
         if progress is not None:
@@ -291,7 +293,7 @@ def long_drift(
             away = {k: float(v) for k, v in drift(ts / part, ys, body, law).items()}
             if not np.isfinite(list(away.values())).all():
                 raise FloatingPointError(f"long_drift: {name} gave no numbers: {away}")
-            found.append(
+            drifts_by_method.append(
                 Measurement(
                     scene, f"{name}, equal steps", "ours", "value", "", h, error=away["energy"],
                     energy=away["energy"], momentum=away["momentum_along_axis"],
@@ -299,4 +301,4 @@ def long_drift(
                     compile=compiling,
                 )
             )  # fmt: skip
-    return found
+    return drifts_by_method

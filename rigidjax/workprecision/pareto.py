@@ -150,7 +150,7 @@ def table(lines: Iterable[Choice]) -> str:
     if isinstance(lines, str) or not isinstance(lines, Iterable):
         raise TypeError(f"lines: wanted what choose returns, got {type(lines).__name__}")
     for c in lines:
-        _checks.require_instance(c, Choice, "lines", wanted="lines of choose")
+        _checks.require_instance(c, Choice, "lines", requirement="lines of choose")
         peer = f"{c.peer}, {_in_microseconds(c.peer_time)}" if c.peer else ""
         rows.append(
             f"| {c.scene} | {c.wanted:.0e} | {c.method or 'none'} | {_in_microseconds(c.time)} | "

@@ -26,10 +26,10 @@ TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
 
 
-def _rates(scene: BenchmarkScene, numbers: np.ndarray, **how: Any) -> Any:
+def _rates(scene: BenchmarkScene, numbers: np.ndarray, **options: Any) -> Any:
     """Return the plain equations of a scene on Python's floats."""
     plain: Any = scene.plain
-    return plain(tuple(map(float, numbers)), math.sin, math.cos, math.sqrt, **how)
+    return plain(tuple(map(float, numbers)), math.sin, math.cos, math.sqrt, **options)
 
 
 def _is_written_out(scene: BenchmarkScene) -> bool:
@@ -148,7 +148,7 @@ def _system(scene: BenchmarkScene, hy: ModuleType, numbers: Sequence[Any]) -> An
 
 
 def _run_of_propagator(
-    hy: ModuleType, end: float, start: np.ndarray, system: Any, **how: Any
+    hy: ModuleType, end: float, start: np.ndarray, system: Any, **options: Any
 ) -> Any:
     """Return the run tolerance → (state at the end, steps). Order and code depend on the tolerance:
     each is compiled.
@@ -157,7 +157,7 @@ def _run_of_propagator(
 
     def run(setting: float) -> tuple[Any, Any]:
         if setting not in made:
-            stepper = hy.taylor_adaptive(system, start, tol=setting, **how)
+            stepper = hy.taylor_adaptive(system, start, tol=setting, **options)
             made[setting] = stepper, stepper.state.copy()
         stepper, first = made[setting]
         stepper.state[:], stepper.time = first, 0.0
@@ -198,9 +198,9 @@ def _variational(
         slope = np.asarray(pull(state[:n])) @ state[n:].reshape(n, -1)
         # The derivative by the initial state is carried on to the numbers of the scene; then the
         # derivative by the parameters is added.
-        found = slope[:n] @ chain
-        found[:size] += slope[n : n + size]
-        return found, steps
+        gradient = slope[:n] @ chain
+        gradient[:size] += slope[n : n + size]
+        return gradient, steps
 
     return run
 
@@ -226,9 +226,9 @@ class _Ensemble:
         assert self.plain is not None
         return jnp.stack(self.plain(tuple(p), jnp.sin, jnp.cos, jnp.sqrt)(t, y))
 
-    def call(self, name: str, setting: float, **how: Any) -> Any:
-        how |= dict(engine="vern7_replay", fused=False, rtol=setting, atol=1e-3 * setting)
-        return getattr(self.module, name)(self, self.start, self.numbers, **how)
+    def call(self, name: str, setting: float, **options: Any) -> Any:
+        options |= dict(engine="vern7_replay", fused=False, rtol=setting, atol=1e-3 * setting)
+        return getattr(self.module, name)(self, self.start, self.numbers, **options)
 
 
 @_peer_decorator("gradsolve", _is_in_double)
@@ -238,8 +238,8 @@ def _solve_and_record(
     ensemble = _Ensemble(scene, numbers, start, module)
 
     def run(setting: float) -> tuple[Any, Any]:
-        found = ensemble.call("solve", setting)
-        return found.y_final[0], int(found.accepted_steps[0])
+        solution = ensemble.call("solve", setting)
+        return solution.y_final[0], int(solution.accepted_steps[0])
 
     run(TOLERANCES[0])
     return run
@@ -306,5 +306,5 @@ def methods(group: str | None = None) -> list[TimedMethod]:
     """
     if group is not None:
         _checks.require_option(group, ("ours", "jax", "peer"), "group")
-    found = [*methods_in_jax(), *methods_outside()]
-    return [method for method in found if group in (None, method.group)]
+    available = [*methods_in_jax(), *methods_outside()]
+    return [method for method in available if group in (None, method.group)]

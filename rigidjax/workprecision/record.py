@@ -66,11 +66,11 @@ _WORDS = ("scene", "method", "group", "kind", "adjoint")
 
 def list_records(records: Iterable[Measurement], name: str = "records") -> list[Measurement]:
     """Return the records as a list. **Raises:** `TypeError` if something else is among them."""
-    _checks.require_instance(records, Iterable, name, wanted="records")
-    found = list(records)
-    for record in found:
+    _checks.require_instance(records, Iterable, name, requirement="records")
+    items = list(records)
+    for record in items:
         _checks.require_instance(record, Measurement, name)
-    return found
+    return items
 
 
 def write_csv(records: Iterable[Measurement], path: str | Path) -> None:

@@ -95,7 +95,9 @@ class BenchmarkScene(eqx.Module):
             )
         hint = "errors are angles between attitudes, or distances"
         wanted = "an Attitude or a Point"
-        _checks.require_instance(self.state0, (Attitude, Point), "state0", wanted=wanted, hint=hint)
+        _checks.require_instance(
+            self.state0, (Attitude, Point), "state0", requirement=wanted, hint=hint
+        )
         if self.body is not None:
             validation.require_single_body(self.body, Inertia, "body", hint="or None with a Point")
         _checks.positive_float(self.end, "end", "an end > 0, s")

@@ -64,7 +64,7 @@ def read_table(
     rigidjax.cli.logs.errors.LogError: missing.csv: no such file
     """
     path = _checks.file_path(path)
-    _checks.require_instance(columns, Sequence, "columns", wanted="a sequence of names")
+    _checks.require_instance(columns, Sequence, "columns", requirement="a sequence of names")
     if isinstance(columns, str) or not columns or not all(isinstance(c, str) for c in columns):
         raise TypeError(f"columns: wanted a sequence of names, got {columns!r}")
     twice = [name for name in columns if columns.count(name) > 1]

@@ -112,7 +112,7 @@ def fit(
     ...                                  jnp.diag(jnp.array([1.0, 2.0, 2.5])), atol=1e-6))
     ('ok', True)
     """
-    _checks.require_instance(model, Model, "fit", wanted="a Model")
+    _checks.require_instance(model, Model, "fit", requirement="a Model")
     starts = _checks.integer(starts, "starts", 1)
     max_steps = _checks.integer(max_steps, "max_steps", 1)
     tolerance = _checks.positive_float(tolerance, "tolerance")
@@ -124,7 +124,7 @@ def fit(
     if checkpoint is not None:
         require_folder(checkpoint)
     wanted = "a Descent(optimiser, …) or None"
-    _checks.require_instance(descent, (Descent, NoneType), "fit", wanted=wanted)
+    _checks.require_instance(descent, (Descent, NoneType), "fit", requirement=wanted)
     shared = model.size - len(model.index.alone) * model.count
     if shared > MOST_SHARED:
         raise ValueError(

@@ -214,7 +214,7 @@ def count_of(reading: Reading) -> int:
 def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
     """Return the inputs by name: functions of time unchanged, checked samples (T, …) as arrays."""
     _checks.require_instance(
-        inputs, Mapping, "inputs", wanted="samples or functions of time by name"
+        inputs, Mapping, "inputs", requirement="samples or functions of time by name"
     )
     out = {}
     for name, source in inputs.items():

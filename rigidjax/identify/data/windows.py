@@ -265,7 +265,7 @@ def _checked_by_kind(
     numbers: object, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
 ) -> dict[str, float]:
     """Return the numbers of a mapping whose keys are `kinds`, each one checked by `check`."""
-    by_kind = _checks.require_instance(numbers, Mapping, name, wanted="numbers by kind")
+    by_kind = _checks.require_instance(numbers, Mapping, name, requirement="numbers by kind")
     if set(by_kind) != set(kinds):
         raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(by_kind)}")
     return {kind: float(check(by_kind[kind], f"{name}[{kind!r}]")) for kind in kinds}
@@ -324,7 +324,9 @@ def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
 
 def require_windows(windows: PyTree) -> None:
     """Raise `TypeError` or `ValueError` unless these are several windows of finite numbers."""
-    _checks.require_instance(windows, Windows, "windows", wanted="what identify.windows returns")
+    _checks.require_instance(
+        windows, Windows, "windows", requirement="what identify.windows returns"
+    )
     for name, wanted in (("starts", 2), ("wanted", 3)):
         for leaf in jax.tree.leaves(getattr(windows, name)):
             if leaf.ndim != wanted or not leaf.shape[0]:

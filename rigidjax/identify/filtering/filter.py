@@ -117,7 +117,7 @@ def first_belief(
     start: Any = scene.start if state is None else state
     if state is None and x is None:
         _require_shown_attitude(record, start)
-    _checks.require_single(start, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
+    _checks.require_single(start, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid")
     start = project_to_group(start)
     deviations = {"attitude": attitude, "rate": rate, "position": position, "velocity": velocity}
     words = {"x": "position", "v": "velocity", "q": "attitude", "omega": "rate"}

@@ -205,7 +205,7 @@ def _checked_parts(
     if mask.dtype != bool or mask.shape != readings.shape:
         raise ValueError(f"mask: wanted truth values {readings.shape}, got {mask.shape}")
     bad = mask & ~jnp.isfinite(readings)
-    words = "readings: contains NaN or infinity; give a `mask` if it is a gap"
+    words = "readings: contains NaN or infinity; mask it if it is a gap"
     readings = jnp.where(mask, _checks.error_if(readings, bad.any(), words), 0)
     parts = {name: getattr(model, name) for name in _AXES}
     for name, part in _time_varying(parts).items():

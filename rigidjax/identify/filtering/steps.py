@@ -378,7 +378,7 @@ def sample(
     """
     _checks.random_key(key)
     body = validation.require_single_body(body, (Inertia, MassProperties), "body")
-    _checks.require_single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
+    _checks.require_single(state0, HasSpin, "state0", requirement="a Spin, an Attitude or a Rigid")
     require_process(process)
     if torque is not None:
         require_law(torque)

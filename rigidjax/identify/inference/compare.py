@@ -58,7 +58,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     >>> best.name, best.free, best.information  # free: two ratios, initial attitude and rate
     ('one', 8, 0.0)
     """
-    _checks.require_instance(fits, Mapping, "fits", wanted="a dict of name → Fit")
+    _checks.require_instance(fits, Mapping, "fits", requirement="a dict of name → Fit")
     for name, one in fits.items():
         _checks.require_instance(one, Fit, f"fits[{name!r}]")
     if not fits:
@@ -128,7 +128,9 @@ def cross_validate(
     ValueError: cross_validate: wanted at least two recordings, got 0
     """
     _checks.require_function(build, "build", "of a sequence of recordings → Model")
-    _checks.require_instance(recordings, Sequence, "recordings", wanted="a sequence of Recording")
+    _checks.require_instance(
+        recordings, Sequence, "recordings", requirement="a sequence of Recording"
+    )
     for item in recordings:
         _checks.require_instance(item, Recording, "recordings")
     if len(recordings) < 2:

@@ -97,7 +97,9 @@ class LogDensity(eqx.Module):
         *,
         deviation: float | None = 2.0,
     ):
-        _checks.require_instance(fit, Fit, "LogDensity: fit", wanted="what identify.fit returns")
+        _checks.require_instance(
+            fit, Fit, "LogDensity: fit", requirement="what identify.fit returns"
+        )
         model = fit.model
         process = model.process if process is None else process
         if process is not None:

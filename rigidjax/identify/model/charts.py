@@ -252,7 +252,7 @@ class Mass(AbstractBodyChart):
     def __init__(self, guess: MassProperties, free: Sequence[str] = tuple(_PARTS)):
         self.guess = _checks.require_single(guess, MassProperties, "guess")
         wanted = "some of mass, inertia, com"
-        _checks.require_instance(free, Sequence, "free", wanted=wanted)
+        _checks.require_instance(free, Sequence, "free", requirement=wanted)
         chosen = [free] if isinstance(free, str) else list(free)
         for name in chosen:
             _checks.require_option(name, tuple(_PARTS), "free")

@@ -93,7 +93,7 @@ def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
     if isinstance(each, str):
         return _checks.require_option(each, ("body",), name)
     wanted = 'True, False, "body", or a sequence of labels, one for each recording'
-    return tuple(_checks.require_instance(each, Sequence, name, wanted=wanted))
+    return tuple(_checks.require_instance(each, Sequence, name, requirement=wanted))
 
 
 class Slot(eqx.Module):
@@ -173,7 +173,7 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
     """Return the slot of each `Free` in a scene; `bodies` (R,) names each recording's body."""
     slots: list[Slot] = []
     for item in free:
-        _checks.require_instance(item, Free, "free", wanted="Free(where, name)")
+        _checks.require_instance(item, Free, "free", requirement="Free(where, name)")
         here = f"Free {item.name!r}"
         path, value = leaf_at(item.where, scene, here, "it")
         if any(slot.path == path for slot in slots):

@@ -435,8 +435,8 @@ def _require_parts(
         hint = "give a known body as Known(body)" if known else ""
         hint = "was () forgotten?" if isinstance(one, type) else hint
         wanted = "what of the body is free, such as Ratios() or PrincipalRatios()"
-        _checks.require_instance(one, AbstractBodyChart, "Model", wanted=wanted, hint=hint)
-    _checks.require_instance(free, Sequence, "free", wanted="a sequence of Free(where, name)")
+        _checks.require_instance(one, AbstractBodyChart, "Model", requirement=wanted, hint=hint)
+    _checks.require_instance(free, Sequence, "free", requirement="a sequence of Free(where, name)")
     for name, value, kind in (
         ("loss", loss, AbstractLoss),
         ("prior", prior, Entropic),
@@ -678,7 +678,7 @@ def _charts_and_names(recording: Any, body: Any) -> tuple[list[Recording], Any, 
             )
         for chart in body.values():
             _checks.require_instance(
-                chart, AbstractBodyChart, "body", wanted="a chart such as Tensor()"
+                chart, AbstractBodyChart, "body", requirement="a chart such as Tensor()"
             )
         rows, of = [], []
         for name in body:
@@ -700,7 +700,7 @@ def _require_recordings(recordings: Sequence[Any]) -> None:
     if not recordings:
         raise ValueError("Model: wanted at least one Recording, got an empty sequence")
     for item in recordings:
-        _checks.require_instance(item, Recording, "Model", wanted="a Recording")
+        _checks.require_instance(item, Recording, "Model", requirement="a Recording")
         if not _checks.is_known((item.t, [reading.values for reading in item.readings])):
             raise TypeError(
                 "recording: wanted known readings, got traced ones; make the Model outside "

@@ -92,7 +92,7 @@ class FixedSteps(AbstractIntegrator):
     def __check_init__(self):
         _checks.integer(self.substeps, "substeps", 1)
         _checks.require_instance(
-            self.solver, AbstractExplicit, "solver", wanted="one of rigidjax.solvers"
+            self.solver, AbstractExplicit, "solver", requirement="one of rigidjax.solvers"
         )
 
     def states(
@@ -420,7 +420,7 @@ def _readings(
 def _require_sensor(sensor: PyTree, state0: State, key: object) -> None:
     """Raise an error for anything but a sensor that can read this state, with noise for a key."""
     name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
-    _checks.require_instance(sensor, AbstractSensor, "sensor", wanted=wanted)
+    _checks.require_instance(sensor, AbstractSensor, "sensor", requirement=wanted)
     if not isinstance(state0, sensor.feels):
         raise TypeError(
             f"{name} needs a state with {sensor.feels.__name__}, got {type(state0).__name__}; take "

@@ -61,10 +61,10 @@ class Drift(eqx.Module):
 def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]:
     """Return the drift of each `Walk` in a scene."""
     wanted = "a sequence of Walk(where, deviation)"
-    _checks.require_instance(walks, (Walk, Sequence), "walks", wanted=wanted)
+    _checks.require_instance(walks, (Walk, Sequence), "walks", requirement=wanted)
     drifts: list[Drift] = []
     for walk in (walks,) if isinstance(walks, Walk) else tuple(walks):
-        _checks.require_instance(walk, Walk, "walks", wanted=wanted)
+        _checks.require_instance(walk, Walk, "walks", requirement=wanted)
         path, value = leaf_at(walk.where, scene, "Walk", "the sensor")
         if path[0].name != "sensors":
             raise ValueError(

@@ -59,7 +59,9 @@ class Descent(eqx.Module):
         import optax
 
         wanted = "an optimiser of optax such as optax.adam(1e-2)"
-        _checks.require_instance(optimiser, optax.GradientTransformation, "Descent", wanted=wanted)
+        _checks.require_instance(
+            optimiser, optax.GradientTransformation, "Descent", requirement=wanted
+        )
         self.optimiser = optimiser
         self.steps, self.batch = (
             _checks.integer(steps, "steps", 1),
@@ -107,9 +109,9 @@ def descend(
     >>> bool(jnp.abs(model.values(x)["drag"] - 0.3).max() < 0.02)
     True
     """
-    _checks.require_instance(model, Model, "descend", wanted="a Model")
+    _checks.require_instance(model, Model, "descend", requirement="a Model")
     _checks.require_instance(
-        descent, Descent, "descend", wanted="a Descent(optimiser, steps=…, batch=…)"
+        descent, Descent, "descend", requirement="a Descent(optimiser, steps=…, batch=…)"
     )
     x = model.start() if initial is None else require_numbers(model, initial)
     random: Any = jax.random.key(0) if key is None else _checks.random_key(key)

@@ -97,7 +97,7 @@ class LowPass(eqx.Module):
 def lowpass_of(lowpass: object) -> LowPass | None:
     """Return `lowpass` if it is a `LowPass` or `None`; raise `TypeError` for others."""
     wanted = "LowPass(cutoff in Hz) or None"
-    return _checks.require_instance(lowpass, (LowPass, NoneType), "lowpass", wanted=wanted)
+    return _checks.require_instance(lowpass, (LowPass, NoneType), "lowpass", requirement=wanted)
 
 
 def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:

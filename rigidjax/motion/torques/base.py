@@ -177,7 +177,7 @@ def require_scene(law: Torque | None, state: object, body: object) -> None:
     """Raise an error unless the arguments are a torque or `None`, a state that it can act on, and a
     body.
     """
-    _checks.require_single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
+    _checks.require_single(state, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid")
     if law is not None:
         require_state_type(law, state)
         require_frozen(law)
@@ -210,7 +210,7 @@ def force_and_torque(
     name = f"torque {getattr(law, 'law_name', type(law).__name__)}"
     # A table in float64 must not lift a float32 solve, nor stop it under strict promotion.
     try:
-        found = in_precision(law, dtype)(t, state, in_precision(body, dtype))
+        result = in_precision(law, dtype)(t, state, in_precision(body, dtype))
     except AttributeError as wrong:
         told = missing_state_message(name, wrong)
         if told is None:
@@ -219,9 +219,9 @@ def force_and_torque(
         raise TypeError(told + hint) from wrong
     # The test is not by class: torques of moving frames return forces of a class of their own,
     # since they do not import this module.
-    if hasattr(found, "force"):
-        return found.force.astype(dtype), found.torque.astype(dtype)
-    value = _checks.array_of_shape(found, (3,), name, hint="body-frame N m")
+    if hasattr(result, "force"):
+        return result.force.astype(dtype), result.torque.astype(dtype)
+    value = _checks.array_of_shape(result, (3,), name, hint="body-frame N m")
     return None, value.astype(dtype)
 
 
@@ -302,8 +302,8 @@ def jumps_of(source: object) -> Float[Array, " n"]:
     """Return the times at which a torque or a function of time jumps, s; empty if there are
     none.
     """
-    found = getattr(source, "jump_times", None)
-    return jnp.zeros(0) if found is None else found
+    times = getattr(source, "jump_times", None)
+    return jnp.zeros(0) if times is None else times
 
 
 def jumps_in(*sources: object) -> Float[Array, " n"]:

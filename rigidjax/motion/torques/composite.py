@@ -132,9 +132,9 @@ class ChangingInertia(eqx.Module):
     def tensor(self, t: ScalarLike, state: PyTree = None, body: Body | None = None) -> Mat3:
         """Return I, (3, 3), kg m²; a function of time needs no `state` and `body`."""
         seen = (t, state, body) if hasattr(self.inertia, "feels") else (t,)
-        found = self.inertia(*seen)
-        found = found.tensor if isinstance(found, Inertia) else found
-        return _checks.array_of_shape(found, (3, 3), "inertia(t)")
+        inertia = self.inertia(*seen)
+        inertia = inertia.tensor if isinstance(inertia, Inertia) else inertia
+        return _checks.array_of_shape(inertia, (3, 3), "inertia(t)")
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: Body) -> Vec3 | base.Wrench:
         omega = state.omega

@@ -208,15 +208,15 @@ def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
         if _is_delayed(node):
             if later is not None:
                 return _ConstantFunction(jnp.asarray(queue.pop(0)))
-            found = value(node.source)
-            return found if isinstance(found, _ConstantFunction) else Delayed(found, node.delay)
+            bound = value(node.source)
+            return bound if isinstance(bound, _ConstantFunction) else Delayed(bound, node.delay)
         if not isinstance(node, Input):
             return node
         if node.name not in values:
-            found = ", ".join(map(repr, values)) or "none"
-            raise ValueError(f"inputs: the torque reads {node.name!r}, got {found}")
-        found = values[node.name]
-        return found if callable(found) else _ConstantFunction(jnp.asarray(found))
+            names = ", ".join(map(repr, values)) or "none"
+            raise ValueError(f"inputs: the torque reads {node.name!r}, got {names}")
+        bound = values[node.name]
+        return bound if callable(bound) else _ConstantFunction(jnp.asarray(bound))
 
     return jax.tree.map(value, law, is_leaf=lambda n: isinstance(n, Input) or _is_delayed(n))
 
@@ -241,12 +241,12 @@ def require_inputs(law: PyTree, inputs: object) -> Mapping[str, Any]:
     """Return `inputs` as a mapping, empty for `None`. **Raises:** `ValueError` unless they are
     exactly those that the torque reads.
     """
-    read, found = inputs_of(law), {} if inputs is None else inputs
-    if not isinstance(found, Mapping):
-        raise TypeError(f"inputs: wanted arrays by name, got {type(found).__name__}")
-    if set(read) != set(found):
+    read, mapping = inputs_of(law), {} if inputs is None else inputs
+    if not isinstance(mapping, Mapping):
+        raise TypeError(f"inputs: wanted arrays by name, got {type(mapping).__name__}")
+    if set(read) != set(mapping):
         raise ValueError(
             f"inputs: the torque reads {', '.join(map(repr, read)) or 'none'}, got "
-            f"{', '.join(map(repr, found)) or 'none'}"
+            f"{', '.join(map(repr, mapping)) or 'none'}"
         )
-    return found
+    return mapping

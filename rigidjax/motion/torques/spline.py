@@ -144,9 +144,9 @@ class Wheel(eqx.Module):
     ):
         direction = _checks.array_of_shape(axis, (3,), "axis")
         x, y, z = _checks.namespace(direction).asarray(direction)
-        found = f", got {np.asarray(direction)}" if _checks.is_known(direction) else ""
+        got = f", got {np.asarray(direction)}" if _checks.is_known(direction) else ""
         off = ~(abs(x * x + y * y + z * z - 1) < 2e-6)
-        direction = _checks.error_if(direction, off, f"axis: wanted a unit vector (3,){found}")
+        direction = _checks.error_if(direction, off, f"axis: wanted a unit vector (3,){got}")
         _checks.require_function(speed, "speed", "of time to rad/s")
         kind = jnp.result_type(float)
         self.inertia = _checks.finite_array(inertia, (), "inertia").astype(kind)

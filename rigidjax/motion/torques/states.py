@@ -36,8 +36,8 @@ class FrozenLaw(eqx.Module):
         # The torque's members (`feels`, `jump_times`, …), except those of its states.
         if name.startswith("_") or name in ("law", "own", "state0", "rate"):
             raise AttributeError(name)
-        found = getattr(self.law, name)
-        return FrozenLaw(found, self.own) if name in _OF_STATES else found
+        attribute = getattr(self.law, name)
+        return FrozenLaw(attribute, self.own) if name in _OF_STATES else attribute
 
 
 def has_own_states(node: object) -> bool:
@@ -82,18 +82,18 @@ def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
 
 def initial_states(law: PyTree, t: ScalarLike, state: PyTree, body: Body) -> tuple[Any, ...]:
     """Return the initial states of a torque, in the precision of the body's state: see `freeze`."""
-    found: list[Any] = []
+    states: list[Any] = []
 
     def begin(node: PyTree) -> Any:
         here = node.state0(t, state, body) if callable(node.state0) else node.state0
         own = _checked_numbers(here, f"state0 of {type(node).__name__}", state.omega.dtype)
         if not jax.tree.leaves(own):
             raise ValueError(f"state0 of {type(node).__name__}: wanted a tree of arrays, got none")
-        found.append(own)
+        states.append(own)
         return own
 
     _insert_states(law, begin)
-    return tuple(found)
+    return tuple(states)
 
 
 def rates_of_own_states(
@@ -102,7 +102,7 @@ def rates_of_own_states(
     """Return the derivative of each state in `own`. **Raises:** `ValueError` for a shape other than
     that of `state0`.
     """
-    queue, found = list(own), []
+    queue, rates = list(own), []
 
     def one(node: PyTree) -> Any:
         here = queue.pop(0)
@@ -111,11 +111,11 @@ def rates_of_own_states(
         wanted, shapes = (jax.tree.map(jnp.shape, tree) for tree in (here, rate))
         if wanted != shapes:
             raise ValueError(f"{name}: wanted arrays as in state0, {wanted}, got {shapes}")
-        found.append(rate)
+        rates.append(rate)
         return here
 
     _insert_states(law, one)
-    return tuple(found)
+    return tuple(rates)
 
 
 def require_frozen(law: PyTree) -> None:

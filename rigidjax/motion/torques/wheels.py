@@ -177,7 +177,7 @@ class ReactionWheels(base.AbstractTorque):
         """
         own = _checks.array_of_shape(own, self.inertia.shape, "own")
         omega = _checks.require_single(
-            state, HasSpin, "state", wanted="a Spin, Attitude or Rigid"
+            state, HasSpin, "state", requirement="a Spin, Attitude or Rigid"
         ).omega
         along = jnp.stack([a[0] * omega[0] + a[1] * omega[1] + a[2] * omega[2] for a in self.axes])
         return own / self.inertia - along
@@ -189,8 +189,8 @@ class ReactionWheels(base.AbstractTorque):
         if self.motor is not None:
             total = total + base.vector_at(self.motor, t, "motor", count).astype(total.dtype)
         if self.feedback is not None:
-            found = self.feedback(t, state, speeds)
-            total = total + _checks.array_of_shape(found, (count,), "feedback(t, state, speeds)")
+            feedback = self.feedback(t, state, speeds)
+            total = total + _checks.array_of_shape(feedback, (count,), "feedback(t, state, speeds)")
         if self.max_torque is not None:
             total = jnp.clip(total, -self.max_torque, self.max_torque)
         if self.max_speed is not None:
@@ -246,7 +246,7 @@ def _checked_one_or_each(
     """
     if value is None:
         return None
-    found = base.broadcast_to_each(value, count, name)
+    numbers = base.broadcast_to_each(value, count, name)
     return _checks.check_if_known(
-        _checks.require_sign, found, name, requirement, zero=requirement == "≥ 0"
+        _checks.require_sign, numbers, name, requirement, zero=requirement == "≥ 0"
     )
