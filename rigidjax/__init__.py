@@ -25,7 +25,7 @@ from rigidjax import (
     motion as motion,
     solve as solve,
 )
-from rigidjax._names import refuse, show
+from rigidjax._names import raise_attribute_error, show
 from rigidjax.body import (
     Inertia as Inertia,
     MassProperties as MassProperties,
@@ -87,4 +87,8 @@ show(__name__)
 
 def __getattr__(name: str) -> ModuleType:
     later = name in _LATER
-    return importlib.import_module(f"rigidjax.{name}") if later else refuse(__name__, name)
+    return (
+        importlib.import_module(f"rigidjax.{name}")
+        if later
+        else raise_attribute_error(__name__, name)
+    )

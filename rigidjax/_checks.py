@@ -35,7 +35,7 @@ _DIMENSIONS: dict[str, dict[str, int]] = {
 _PINT = {"[length]": "m", "[mass]": "kg", "[time]": "s"}
 
 
-def floating(
+def array_of_shape(
     value: object,
     shape: tuple[int, ...],
     name: str,
@@ -54,18 +54,18 @@ def floating(
     **Raises:** `TypeError` for anything but an array of real numbers, for half precision (its 3
     digits cannot hold a rotation), and for another unit; `ValueError` for a wrong shape.
     """
-    array = numbers(value, name, unit)
-    found = array.shape[array.ndim - len(shape) :] if batched else array.shape
-    if found != shape:
+    array = numeric_array(value, name, unit)
+    got_shape = array.shape[array.ndim - len(shape) :] if batched else array.shape
+    if got_shape != shape:
         many = array.ndim > len(shape) and array.shape[array.ndim - len(shape) :] == shape
         advice = hint or ("functions take one body; batch with jax.vmap" if many else "")
         raise ValueError(f"{name}: wanted shape {shape}, got {array.shape}{_with_hint(advice)}")
     return array
 
 
-def rows(value: object, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
-    """Return `value` as an array (n, *shape) with n rows, converted as by `floating`."""
-    array = numbers(value, name)
+def array_of_rows(value: object, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
+    """Return `value` as an array (n, *shape) with n rows, converted as by `array_of_shape`."""
+    array = numeric_array(value, name)
     if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
         wanted = ", ".join(map(str, ("n", *shape))) + ("," if not shape else "")
         raise ValueError(f"{name}: wanted shape ({wanted}), got {array.shape}{_with_hint(hint)}")
@@ -76,22 +76,22 @@ def _with_hint(hint: str) -> str:
     return f"; {hint}" if hint else ""
 
 
-def kind(value: object) -> str:
+def type_name(value: object) -> str:
     """Return the name of a value's type for a message, or of the value if it is a class."""
     if isinstance(value, jax.Array):
         return f"an array of shape {value.shape}"
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
 
-def numbers(value: object, name: str, unit: str = "") -> Array:
-    """Return `value` as a float32 or float64 array of any shape, converted as by `floating`."""
-    value = _in_si(value, name, unit)
+def numeric_array(value: object, name: str, unit: str = "") -> Array:
+    """Return `value` as an array of any shape, converted as by `array_of_shape`."""
+    value = _convert_to_si(value, name, unit)
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
-        found = type(value).__name__
-        found += f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
-        raise TypeError(f"{name}: wanted an array of numbers, got {found}") from error
+        got = type(value).__name__
+        got += f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name}: wanted an array of numbers, got {got}") from error
     if isinstance(value, np.ndarray) and value.dtype == np.float64 and array.dtype != np.float64:
         _warn_of_lost_digits()
     if jnp.issubdtype(array.dtype, jnp.integer):
@@ -132,7 +132,7 @@ def without_mask(value: object, name: str) -> Any:
     return value
 
 
-def _in_si(value: Any, name: str, wanted: str = "") -> Any:
+def _convert_to_si(value: Any, name: str, si_unit: str = "") -> Any:
     """Return the numbers of quantities of astropy or pint in SI, and those of SciPy's `Rotation`.
 
     A `Rotation` becomes its quaternion (w, x, y, z). Other values are returned as they are.
@@ -142,16 +142,16 @@ def _in_si(value: Any, name: str, wanted: str = "") -> Any:
         return value.as_quat()[..., [3, 0, 1, 2]]
     value = without_mask(value, name)
     if isinstance(value, (list, tuple)):
-        items = [_in_si(item, name, wanted) for item in value]
+        items = [_convert_to_si(item, name, si_unit) for item in value]
         same = all(a is b for a, b in zip(items, value, strict=True))
         return value if same else type(value)(items)
     unit = getattr(value, "unit", getattr(value, "units", None))
     if unit is None or isinstance(value, jax.Array):
         return value
-    wanted = wanted or _UNITS.get(name, "")
+    si_unit = si_unit or _UNITS.get(name, "")
     kind = _dimension(value, unit)
-    if wanted and kind is not None and kind != _DIMENSIONS[wanted]:
-        raise TypeError(f"{name}: wanted a unit such as {wanted}, got {unit or 'no unit'}")
+    if si_unit and kind is not None and kind != _DIMENSIONS[si_unit]:
+        raise TypeError(f"{name}: wanted a unit such as {si_unit}, got {unit or 'no unit'}")
     if hasattr(value, "si"):
         return np.asarray(value.si.value)
     if hasattr(value, "to_base_units"):
@@ -180,7 +180,7 @@ def _dimension(value: Any, unit: Any) -> dict[str, Any] | None:
     return {str(part.name): power for part, power in parts if part.name != "rad"}
 
 
-def same_batch(**arrays: tuple[Array, int]) -> None:
+def require_same_batch(**arrays: tuple[Array, int]) -> None:
     """Refuse arrays whose leading axes, those before the last `n` of each, differ.
 
     **Arguments:** `name=(array, n)`, for each part of one container. A container of many bodies has
@@ -190,11 +190,11 @@ def same_batch(**arrays: tuple[Array, int]) -> None:
     """
     leading = {name: a.shape[: a.ndim - n] for name, (a, n) in arrays.items()}
     if len(set(leading.values())) > 1:
-        found = ", ".join(f"{name} {a.shape}" for name, (a, _) in arrays.items())
+        shapes = ", ".join(f"{name} {a.shape}" for name, (a, _) in arrays.items())
         wanted = ", ".join(f"{name} {a.shape[a.ndim - n :]}" for name, (a, n) in arrays.items())
         raise ValueError(
             f"{', '.join(arrays)}: wanted one of each, {wanted}, or the same leading axes before "
-            f"all of them, got shapes {found}"
+            f"all of them, got shapes {shapes}"
         )
 
 
@@ -208,7 +208,7 @@ def _warn_of_lost_digits() -> None:
     )
 
 
-def known(value: object) -> bool:
+def is_known(value: object) -> bool:
     """Return whether `value` is an array of known numbers, and not traced."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
 
@@ -219,16 +219,16 @@ def namespace(value: object) -> Any:
     A check of known numbers is done by NumPy on the host: a JAX operation outside `jit` costs some
     30 µs, and ten of them cost more than a whole short simulation.
     """
-    return np if known(value) else jnp
+    return np if is_known(value) else jnp
 
 
-def refuse(value: PyTree, bad: Bool[ArrayLike, "..."], message: str) -> Any:
+def error_if(value: PyTree, bad: Bool[ArrayLike, "..."], message: str) -> Any:
     """Return `value` unless `bad`; then raise an error with `message`, also under `jit`.
 
     Outside a trace this is a `ValueError` with the text alone. Inside a trace it is
     `equinox.error_if`; the result must be used, or the check is dropped.
     """
-    if known(bad):
+    if is_known(bad):
         if bool(np.any(np.asarray(bad))):
             raise ValueError(message)
         return value
@@ -239,15 +239,15 @@ def own_sentence(error: RuntimeError) -> RuntimeError:
     r"""Return an equal error with its own sentence alone, without the long text that Equinox
     adds.
     """
-    found = re.search(r"^\S*EquinoxRuntimeError: (.+?)\n\n-+$", str(error), re.M | re.S)
-    return type(error)(found[1]) if found else error
+    match = re.search(r"^\S*EquinoxRuntimeError: (.+?)\n\n-+$", str(error), re.M | re.S)
+    return type(error)(match[1]) if match else error
 
 
 # From so many rows on one compiled pass is quicker than NumPy, and they stay on their device.
 _MANY = 4096
 
 
-def first_bad(faults: Callable[[Any, Any], Any], rows: Array | np.ndarray) -> Any:
+def first_bad_row(faults: Callable[[Any, Any], Any], rows: Array | np.ndarray) -> Any:
     """Return the index of the first of these known rows (n, …) that has a fault, −1 if none has.
 
     `faults(xp, rows)` is (n,), true where there is one, by the functions of `xp`, which is NumPy or
@@ -257,28 +257,28 @@ def first_bad(faults: Callable[[Any, Any], Any], rows: Array | np.ndarray) -> An
         if rows.shape[0] > _MANY:
             # Also within a trace, in which the index would not be known.
             with jax.ensure_compile_time_eval():
-                return _compiled_first(faults, rows)
-        return _first_true(np, faults(np, np.asarray(rows)))
+                return _compiled_index_of_first(faults, rows)
+        return _index_of_first_true(np, faults(np, np.asarray(rows)))
 
 
-def _first_true(xp: ModuleType, bad: Array | np.ndarray) -> Any:
+def _index_of_first_true(xp: ModuleType, bad: Array | np.ndarray) -> Any:
     return xp.where(bad.any(), xp.argmax(bad), -1)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _compiled_first(faults: Callable[[Any, Any], Any], rows: Array) -> Array:
-    return _first_true(jnp, faults(jnp, rows))
+def _compiled_index_of_first(faults: Callable[[Any, Any], Any], rows: Array) -> Array:
+    return _index_of_first_true(jnp, faults(jnp, rows))
 
 
-def _not_finite(xp: ModuleType, rows: Array | np.ndarray) -> Any:
+def _is_not_finite(xp: ModuleType, rows: Array | np.ndarray) -> Any:
     return ~xp.isfinite(rows).reshape(rows.shape[0], -1).all(axis=1)
 
 
-def finite(value: Numbers, name: str) -> Numbers:
+def require_finite(value: Numbers, name: str) -> Numbers:
     """Return `value`, or refuse it if it contains a NaN or an infinity."""
     rows: Any = value
-    if isinstance(rows, jax.Array) and known(rows) and rows.ndim and rows.shape[0] > _MANY:
-        row = int(first_bad(_not_finite, rows))
+    if isinstance(rows, jax.Array) and is_known(rows) and rows.ndim and rows.shape[0] > _MANY:
+        row = int(first_bad_row(_is_not_finite, rows))
         if row < 0:
             return value
         place = row, *(int(i) for i in np.argwhere(~np.isfinite(np.asarray(value)[row]))[0])
@@ -288,54 +288,59 @@ def finite(value: Numbers, name: str) -> Numbers:
     where = ""
     if xp is np and bad.ndim and bad.any():
         where = f" at index {tuple(int(i) for i in np.argwhere(bad)[0])}"
-    return refuse(value, bad.any(), f"{name}: contains NaN or infinity{where}")
+    return error_if(value, bad.any(), f"{name}: contains NaN or infinity{where}")
 
 
-def finite_floating(value: object, shape: tuple[int, ...], name: str, **how: Any) -> Array:
-    """Return `value` as `floating` does; its numbers must be finite if they are known."""
-    array = floating(value, shape, name, **how)
-    return finite(array, name) if known(array) else array
+def finite_array(value: object, shape: tuple[int, ...], name: str, **options: Any) -> Array:
+    """Return `value` as `array_of_shape` does; its numbers must be finite if they are known."""
+    array = array_of_shape(value, shape, name, **options)
+    return require_finite(array, name) if is_known(array) else array
 
 
 def scalars(**named: object) -> list[Array]:
-    """Return named numbers, each converted as by `floating`, in one common precision."""
-    found = [floating(value, (), name) for name, value in named.items()]
-    return [value.astype(jnp.result_type(*found)) for value in found]
+    """Return named numbers, each converted as by `array_of_shape`, in one common precision."""
+    numbers = [array_of_shape(value, (), name) for name, value in named.items()]
+    return [value.astype(jnp.result_type(*numbers)) for value in numbers]
 
 
-def time(value: object, name: str = "t") -> Array:
+def checked_time(value: object, name: str = "t") -> Array:
     """Return a time, which is one number; it must be finite if it is known."""
-    return finite_floating(value, (), name)
+    return finite_array(value, (), name)
 
 
-def sign(value: Array, name: str, wanted: str, *, zero: bool = False) -> Array:
+def require_sign(value: Array, name: str, requirement: str, *, zero: bool = False) -> Array:
     """Return `value` if all numbers are finite and positive (with `zero`: ≥ 0), or refuse it."""
     xp = namespace(value)
     numbers = xp.asarray(value)
     bad = ~(((numbers >= 0) if zero else (numbers > 0)) & xp.isfinite(numbers))
-    found = f", got {numbers[bad][0]}" if xp is np and bad.any() else ""
-    return refuse(value, bad.any(), f"{name}: wanted {wanted}{found}")
+    example = f", got {numbers[bad][0]}" if xp is np and bad.any() else ""
+    return error_if(value, bad.any(), f"{name}: wanted {requirement}{example}")
 
 
-def if_known(check: Callable[..., Array], value: Array, *args: Any, **options: Any) -> Array:
+def check_if_known(check: Callable[..., Array], value: Array, *args: Any, **options: Any) -> Array:
     """Return `check(value, …)` for known numbers, at least one; return other values unchanged."""
-    return check(value, *args, **options) if known(value) and value.size else value
+    return check(value, *args, **options) if is_known(value) and value.size else value
 
 
-def instance(
-    value: object, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
+def require_instance(
+    value: object,
+    kinds: type | tuple[type, ...],
+    name: str,
+    *,
+    requirement: str = "",
+    hint: str = "",
 ) -> Any:
     """Return `value` if it is an instance of `kinds`, or raise `TypeError` with what was wanted."""
     if isinstance(value, kinds):
         return value
-    if not wanted:
+    if not requirement:
         several = kinds if isinstance(kinds, tuple) else (kinds,)
-        wanted = " or ".join(kind.__name__ for kind in several)
+        requirement = " or ".join(kind.__name__ for kind in several)
     # Common mistakes are a whole solution instead of its states, or a body with mass instead of its
     # inertia.
     own = [name for name in ("ys", "inertia") if isinstance(getattr(value, name, None), kinds)]
     hint = hint or (f"give its .{own[0]}" if own else "")
-    raise TypeError(f"{name}: wanted {wanted}, got {kind(value)}{_with_hint(hint)}")
+    raise TypeError(f"{name}: wanted {requirement}, got {type_name(value)}{_with_hint(hint)}")
 
 
 # The shape of each field of one body or one state, by the name of the field.
@@ -345,35 +350,40 @@ _ONE = {
 }  # fmt: skip
 
 
-def single(
-    value: object, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
+def require_single(
+    value: object,
+    kinds: type | tuple[type, ...],
+    name: str,
+    *,
+    requirement: str = "",
+    hint: str = "",
 ) -> Any:
     """Return `value` if it is an instance of `kinds`, and one body or state, without leading axes.
 
     A container of many bodies has the type of one body; without this check its shape would raise an
     error in the middle of the arithmetic.
     """
-    instance(value, kinds, name, wanted=wanted, hint=hint)
+    require_instance(value, kinds, name, requirement=requirement, hint=hint)
     for field in (field for field in _ONE if field in vars(value)):
         part, shape = getattr(value, field), _ONE[field]
         if getattr(part, "shape", None) != shape or part.dtype not in (jnp.float32, jnp.float64):
-            floating(part, shape, f"{name}.{field}")
+            array_of_shape(part, shape, f"{name}.{field}")
     return value
 
 
-def function(value: object, name: str, of: str, *, hint: str = "") -> Any:
-    """Return `value` if it is a function and no class; `of` describes arguments and result, as in
-    "t → (3,)".
+def require_function(value: object, name: str, description: str, *, hint: str = "") -> Any:
+    """Return `value` if it is a function and no class.
 
-    The number of arguments is checked if `of` begins with a list: "(t, state, body) → scalar".
+    `description` is that of arguments and result for messages, such as "t → (3,)". The number of
+    arguments is checked if it begins with their list: "(t, state, body) → scalar".
     """
-    found = kind(value)
+    got = type_name(value)
     if callable(value) and not isinstance(value, type):
-        listed = re.match(r"\w*\(([^()]*)\)", of)
+        listed = re.match(r"\w*\(([^()]*)\)", description)
         if listed is None or _accepts(value, len(listed[1].split(","))):
             return value
-        found = f"one with other arguments: {inspect.signature(value)}"
-    raise TypeError(f"{name}: wanted a function {of}, got {found}{_with_hint(hint)}")
+        got = f"one with other arguments: {inspect.signature(value)}"
+    raise TypeError(f"{name}: wanted a function {description}, got {got}{_with_hint(hint)}")
 
 
 def _accepts(value: Callable[..., Any], count: int) -> bool:
@@ -386,7 +396,7 @@ def _accepts(value: Callable[..., Any], count: int) -> bool:
     return True
 
 
-def whole(value: object, name: str, least: int) -> int:
+def integer(value: object, name: str, least: int) -> int:
     """Return `value` as a Python integer of at least `least`, known before anything is compiled."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name}: wanted a whole number of Python, got {_describe(value)}")
@@ -395,55 +405,55 @@ def whole(value: object, name: str, least: int) -> int:
     return int(value)
 
 
-def number(value: object, name: str) -> float:
+def known_float(value: object, name: str) -> float:
     """Return `value` as one Python float, known before anything is compiled."""
-    array = on_host(value, name)
+    array = host_array(value, name)
     if array.shape != ():
         raise ValueError(f"{name}: wanted one number, got shape {array.shape}")
     return float(array)
 
 
-def positive(value: object, name: str, what: str = "a positive number") -> float:
+def positive_float(value: object, name: str, requirement: str = "a positive number") -> float:
     """Return `value` as a positive, finite Python float, known before anything is compiled."""
-    found = number(value, name)
-    if not 0 < found < np.inf:
-        raise ValueError(f"{name}: wanted {what}, got {found}")
-    return found
+    number = known_float(value, name)
+    if not 0 < number < np.inf:
+        raise ValueError(f"{name}: wanted {requirement}, got {number}")
+    return number
 
 
-def fraction(value: object, name: str, what: str = "a number between 0 and 1") -> float:
+def fraction(value: object, name: str, requirement: str = "a number between 0 and 1") -> float:
     """Return `value` as a Python float above 0 and below 1."""
-    found = positive(value, name, what)
-    if not found < 1:
-        raise ValueError(f"{name}: wanted {what}, got {found}")
-    return found
+    number = positive_float(value, name, requirement)
+    if not number < 1:
+        raise ValueError(f"{name}: wanted {requirement}, got {number}")
+    return number
 
 
-def not_negative(value: object, name: str) -> float:
+def nonnegative_float(value: object, name: str) -> float:
     """Return `value` as a finite Python float ≥ 0, known before anything is compiled."""
-    found = number(value, name)
-    return 0.0 if found == 0 else positive(found, name, "a number ≥ 0")
+    number = known_float(value, name)
+    return 0.0 if number == 0 else positive_float(number, name, "a number ≥ 0")
 
 
-def on_host(value: object, name: str) -> np.ndarray:
+def host_array(value: object, name: str) -> np.ndarray:
     """Return known numbers as a NumPy array of floats; refuse traced arrays and other values."""
     if isinstance(value, Tracer):
         raise TypeError(
             f"{name}: wanted numbers that are known, got a traced array; this works on the host: "
             "call it outside of jax.jit, jax.grad and jax.vmap"
         )
-    value = _in_si(value, name)
+    value = _convert_to_si(value, name)
     try:
         array = np.asarray(value)
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name}: wanted numbers, got {type(value).__name__}") from error
     if array.dtype.kind not in "iuf" and array.dtype != jnp.bfloat16:
-        found = kind(value) if array.dtype == object else f"{kind(value)} of {array.dtype}"
-        raise TypeError(f"{name}: wanted numbers, got {found}")
+        got = type_name(value) if array.dtype == object else f"{type_name(value)} of {array.dtype}"
+        raise TypeError(f"{name}: wanted numbers, got {got}")
     return array.astype(float)
 
 
-def path(value: Any, name: str = "path") -> Path:
+def file_path(value: Any, name: str = "path") -> Path:
     """Return the path of a file from its name, `value`."""
     named = isinstance(value, str | os.PathLike) and isinstance(os.fspath(value), str)
     if not named or value == "":
@@ -451,18 +461,18 @@ def path(value: Any, name: str = "path") -> Path:
     return Path(value)
 
 
-def printable(text: object) -> str:
+def escape_controls(text: object) -> str:
     """Return the text with control characters (escapes, ends of line) as Python writes them."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
 
 
-def plain(text: object) -> str:
+def escape_formulas(text: object) -> str:
     """Return the text as matplotlib shows it unchanged: no formula between `$`, no hidden label."""
     text = str(text).replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
 
-def word(value: object, options: Sequence[str], name: str) -> str:
+def require_option(value: object, options: Sequence[str], name: str) -> str:
     """Return `value` if it is one of `options`."""
     if isinstance(value, str) and value in options:
         return value
@@ -473,26 +483,26 @@ def _describe(value: object) -> str:
     return repr(value) if isinstance(value, int | float | str) else type(value).__name__
 
 
-def key(value: object, name: str = "key") -> Any:
+def random_key(value: object, name: str = "key") -> Any:
     """Return `value` if it is one random key of JAX, new or old."""
     array = isinstance(value, jax.Array)
     if array and jnp.issubdtype(value.dtype, jax.dtypes.prng_key) and value.shape == ():
         return value
     if array and value.dtype == jnp.uint32 and value.ndim == 1:
         return value
-    found = f"{value.dtype} of shape {value.shape}" if array else type(value).__name__
+    got = f"{value.dtype} of shape {value.shape}" if array else type(value).__name__
     raise TypeError(
-        f"{name}: wanted one random key, such as jax.random.key(0), got {found}; for many use "
+        f"{name}: wanted one random key, such as jax.random.key(0), got {got}; for many use "
         "jax.vmap over jax.random.split(key, n)"
     )
 
 
-def library(module: str, extra: str, who: str) -> Any:
+def import_library(module: str, extra: str, caller: str) -> Any:
     """Import the module and return it, or raise an error that names the extra to install."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        words = f"{who}: {module} is missing; pip install 'rigidjax[{extra}]'"
+        words = f"{caller}: {module} is missing; pip install 'rigidjax[{extra}]'"
         raise ModuleNotFoundError(words, name=module) from error
 
 
@@ -509,7 +519,7 @@ def float_type(value: Any, name: str = "dtype") -> Any:
     return kind
 
 
-def later_origin(dtype: DTypeLike) -> str:
+def advice_for_large_times(dtype: DTypeLike) -> str:
     """Return the advice for times that are so large that `dtype` cannot resolve their steps."""
     if np.dtype(dtype) == np.float64:
         return "count time from a later origin, such as the first time of the run"

@@ -10,14 +10,15 @@ _NOT_MODELLED = ("joint", "contact", "hinge", "constraint", "collide", "render",
 
 
 def show(module: str) -> None:
-    """Make `dir` of a module list its `__all__`, and a wrong name raise the error of `refuse`."""
+    """Make `dir` of a module list its `__all__`; a wrong name calls `raise_attribute_error`."""
     here = sys.modules[module]
     vars(here).update(
-        __dir__=lambda: sorted(here.__all__), __getattr__=functools.partial(refuse, module)
+        __dir__=lambda: sorted(here.__all__),
+        __getattr__=functools.partial(raise_attribute_error, module),
     )
 
 
-def refuse(module: str, name: str) -> ModuleType:
+def raise_attribute_error(module: str, name: str) -> ModuleType:
     """Raise `AttributeError` for a name that the module lacks, with the nearest public names."""
     here, hint = sys.modules[module], ""
     if module == "rigidjax" and any(word in name.lower() for word in _NOT_MODELLED):
@@ -31,8 +32,8 @@ def refuse(module: str, name: str) -> ModuleType:
         # `fit` and `Fit` are two names: the spelling with these capitals goes first.
         same = next((one for one in (name, name.lower()) if one in paths), None)
         near = [same] if same else difflib.get_close_matches(name.lower(), paths, n=4, cutoff=0.75)
-        found = list(dict.fromkeys(paths[one] for one in near))[:2]
-        hint = f"; did you mean {' or '.join(found)}?" if found else ""
+        nearest = list(dict.fromkeys(paths[one] for one in near))[:2]
+        hint = f"; did you mean {' or '.join(nearest)}?" if nearest else ""
     raise AttributeError(f"module {module!r} has no attribute {name!r}{hint}", name=name)
 
 

@@ -12,7 +12,7 @@ from jax.core import Tracer
 MOST = 16
 
 
-def numbers(self: Any) -> str:
+def fields_as_text(self: Any) -> str:
     """Return `Name(field=numbers, …)`; a traced or large array is shown by its shape."""
     fields = [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.repr]
     fields = [(name, value) for name, value in fields if value is not None]
@@ -28,7 +28,7 @@ def as_text(value: object) -> str:
     return _nested_as_text(np.asarray(value).tolist())
 
 
-def time(t: Any, span: Any, digits: int = 6) -> str:
+def time_as_text(t: Any, span: Any, digits: int = 6) -> str:
     """Return a time with `digits` digits of the `span` of its record: seconds since 1970 need more
     of them.
     """

@@ -29,7 +29,7 @@ def three(t, state, body):
     ],
 )
 def test_functions_of_three_arguments_pass(function):
-    assert _checks.function(function, "condition", OF) is function
+    assert _checks.require_function(function, "condition", OF) is function
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> Py
         sent = np.asarray(multihost_utils.process_allgather(jnp.asarray(filled)))
         return np.concatenate([part[:n] for part, n in zip(sent, counts, strict=True)])
 
-    return _send_arrays(rows_of_all, _on_host(tree, "gather"), checkpoint)
+    return _send_arrays(rows_of_all, _copy_to_host(tree, "gather"), checkpoint)
 
 
 def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyTree:
@@ -111,7 +111,7 @@ def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyT
     [1.0, 1.0]
     """
     add = lambda leaf: multihost_utils.process_allgather(jnp.asarray(leaf)).sum(axis=0)  # noqa: E731
-    return _send_arrays(add, _on_host(tree, "total"), checkpoint)
+    return _send_arrays(add, _copy_to_host(tree, "total"), checkpoint)
 
 
 def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
@@ -124,8 +124,10 @@ def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
     ...     save(jnp.arange(2), folder).name
     'share-0.npz'
     """
-    folder = _checks.path(folder, "folder")
-    leaves = {f"leaf{i}": leaf for i, leaf in enumerate(jax.tree.leaves(_on_host(tree, "save")))}
+    folder = _checks.file_path(folder, "folder")
+    leaves = {
+        f"leaf{i}": leaf for i, leaf in enumerate(jax.tree.leaves(_copy_to_host(tree, "save")))
+    }
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"share-{jax.process_index()}.npz"
     handle, name = tempfile.mkstemp(dir=folder, suffix=".part")
@@ -154,7 +156,7 @@ def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
     ...     recover(jnp.zeros(2), folder)[0].tolist()
     [0, 1]
     """
-    folder = _checks.path(folder, "folder")
+    folder = _checks.file_path(folder, "folder")
     paths = sorted(folder.glob("share-*.npz"), key=lambda p: int(p.stem.split("-")[1]))
     if not paths:
         raise FileNotFoundError(f"recover: no share-*.npz in {folder}")
@@ -175,9 +177,9 @@ def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
     return trees
 
 
-def _on_host(tree: PyTree, name: str) -> PyTree:
+def _copy_to_host(tree: PyTree, name: str) -> PyTree:
     """Return the tree in host memory; refuse a traced tree, with the `name` of the function."""
-    if not _checks.known(tree):
+    if not _checks.is_known(tree):
         raise TypeError(
             f"{name}: wanted a tree of known arrays, got one that is traced; {name} sends arrays "
             "between processes: call it outside of jax.jit, jax.grad and jax.vmap"

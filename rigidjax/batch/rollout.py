@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.batch.sharding import Compiled, Devices, chunk_of, map_bodies, mesh_of
+from rigidjax.batch.sharding import CompiledFunction, Devices, chunk_of, map_bodies, mesh_of
 from rigidjax.batch.validation import TorqueAxes, check_batch, inputs_of_bodies, one_body, step_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -161,7 +161,7 @@ def rollout(
     if not isinstance(every, int) or every < 1 or count % every:
         raise ValueError(f"save_every: wanted a divisor of num_steps = {count}, got {save_every!r}")
     start = jax.tree.map(jnp.asarray, initial)
-    begin = _checks.time(t0, "t0").astype(batch.dtype)
+    begin = _checks.checked_time(t0, "t0").astype(batch.dtype)
     numbers = (batch.shared, (batch.per_body, samples), start, h, begin)
     steps = solver, count, every, save_every is not None and reduce is None
     division = chunk_of(chunk, batch.dtype, batch.num_bodies), mesh_of(devices)
@@ -186,8 +186,8 @@ def _take_steps(
     """
     (solver, count, every, keep), (shared, per_body, initial, h, t0) = steps, numbers
 
-    def step_body(of_all: PyTree, row: PyTree) -> PyTree:
-        shared, initial, h, t0 = of_all
+    def step_body(numbers: PyTree, row: PyTree) -> PyTree:
+        shared, initial, h, t0 = numbers
         own, inputs = row
         body, state0, torque = one_body(shared, own, constants)
         state0 = with_own_states(body, state0, bind(torque, first_row(torque, h, inputs)), t0)
@@ -221,4 +221,4 @@ def _take_steps(
     return map_bodies(step_body, (shared, initial, h, t0), per_body, *division)
 
 
-_compiled = Compiled(_take_steps)
+_compiled = CompiledFunction(_take_steps)

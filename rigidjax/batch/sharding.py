@@ -39,7 +39,7 @@ def compiler_options() -> dict[str, Any]:
     return dict(_WIDE) if platform() == "cpu" else {}
 
 
-class Compiled:
+class CompiledFunction:
     """Call a compiled function; it has the `compiler_options` if its last argument is known.
 
     Where that argument is traced, the call stands within another `jit`, where JAX takes no options.
@@ -56,7 +56,7 @@ class Compiled:
         return jit(self.function, compiler_options=options) if options else self._without_options
 
     def __call__(self, *args: Any) -> Any:
-        known = _checks.known(args[-1])
+        known = _checks.is_known(args[-1])
         return (self._with_options if known else self._without_options)(*args)
 
 

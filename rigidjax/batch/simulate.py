@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.batch.rollout import Inputs, rollout
-from rigidjax.batch.sharding import Compiled, Devices, chunk_of, map_bodies, mesh_of
+from rigidjax.batch.sharding import CompiledFunction, Devices, chunk_of, map_bodies, mesh_of
 from rigidjax.batch.validation import BodyBatch, TorqueAxes, check_batch, one_body, step_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -123,7 +123,7 @@ def simulate(
         batch = check_batch(bodies, states0, torque, torque_axes)
         h, count = step_of(size, number, batch.dtype)
         ts = h * jnp.arange(every, count + 1, every).astype(h.dtype)
-        ts = _checks.time(t0, "t0").astype(h.dtype) + ts
+        ts = _checks.checked_time(t0, "t0").astype(h.dtype) + ts
         num_steps = jnp.full(batch.num_bodies, count, jnp.int32)
         own = ys.own if isinstance(ys, Coupled) else None
         return Batch(ts, motion_of(ys), _statuses(batch._replace(checks=()), ys), num_steps, own)
@@ -137,7 +137,7 @@ def simulate(
     batch = check_batch(bodies, states0, torque, torque_axes)
     ts = validation.times(ts_or_steps, True).astype(batch.dtype)
     if torque is not None or solver is not None:
-        max_steps = _checks.whole(max_steps, "max_steps", 1)
+        max_steps = _checks.integer(max_steps, "max_steps", 1)
         rtol, atol = validation.tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if solver is None else solver
     options = dict(solver=solver, rtol=rtol, atol=atol, max_steps=max_steps, adjoint=adjoint)
@@ -162,8 +162,8 @@ def _simulate_bodies(
     """
     (shared, per_body, ts), (chunk, mesh) = numbers, division
 
-    def simulate_body(of_all: PyTree, row: PyTree) -> tuple[Any, ...]:
-        shared, ts = of_all
+    def simulate_body(shared_numbers: PyTree, row: PyTree) -> tuple[Any, ...]:
+        shared, ts = shared_numbers
         body, state0, torque = one_body(shared, row, constants)
         sol = simulate_one(body, state0, ts, torque, throw=False, **options)
         return sol.ys, sol.result, jnp.asarray(sol.stats["num_steps"], jnp.int32), sol.own
@@ -186,7 +186,7 @@ def _simulate_bodies(
     return jax.tree.map(lambda a: a[inverse], out)
 
 
-_compiled = Compiled(_simulate_bodies)
+_compiled = CompiledFunction(_simulate_bodies)
 
 
 @eqx.filter_jit

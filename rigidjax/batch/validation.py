@@ -13,9 +13,9 @@ from jaxtyping import Array, ArrayLike, PyTree
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
-from rigidjax.body.validation import first_impossible
+from rigidjax.body.validation import first_impossible_row
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.rotation.validation import tolerance
@@ -55,7 +55,7 @@ def one_body(shared: PyTree, row: PyTree, constants: PyTree) -> tuple[Any, Any, 
     A state that is invalid becomes NaN.
     """
     body, state0, torque = eqx.combine(shared, row, constants)
-    return body, on_the_group(validation.start(state0, False)), torque
+    return body, project_to_group(validation.start(state0, False)), torque
 
 
 def check_batch(
@@ -87,7 +87,7 @@ def check_batch(
                 f"shape {leaf.shape}"
             )
     dtype = validation.one_dtype(states0, "states0")
-    _checks.numbers(states0.omega, "states0")
+    _checks.numeric_array(states0.omega, "states0")
     if not isinstance(bodies, Inertia | MassProperties):
         raise TypeError(
             f"bodies: wanted Inertia, or MassProperties for Rigid, got {type(bodies).__name__}"
@@ -138,7 +138,7 @@ def inputs_of_bodies(
     Refuse inputs that do not fit the torque, the bodies or the `count` steps of `h` seconds.
     """
     for name, delay in delays_of(torque):
-        if _checks.known((delay, h)):
+        if _checks.is_known((delay, h)):
             longest, whole = np.abs(np.asarray(delay)).max(), count * float(h)
             if longest >= whole:
                 raise ValueError(
@@ -148,13 +148,13 @@ def inputs_of_bodies(
     wanted = (*states0.omega.shape[:1], count)
     samples = {}
     for name, value in require_inputs(torque, inputs).items():
-        rows = _checks.numbers(value, f"inputs[{name!r}]")
+        rows = _checks.numeric_array(value, f"inputs[{name!r}]")
         if rows.shape[:2] != wanted:
             raise ValueError(
                 f"inputs[{name!r}]: wanted shape (N, num_steps, *k) that begins with {wanted}, got "
                 f"{rows.shape}"
             )
-        rows = _checks.finite(rows.astype(states0.omega.dtype), f"inputs[{name!r}]")
+        rows = _checks.require_finite(rows.astype(states0.omega.dtype), f"inputs[{name!r}]")
         samples[name] = jnp.asarray(rows)
     return samples or None
 
@@ -207,7 +207,7 @@ def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
     Only known bodies can be refused. Traced ones with such an inertia become NaN.
     """
     tensor = tensor_of(bodies)
-    if not _checks.known(tensor):
+    if not _checks.is_known(tensor):
         return validation.real_or_nan(bodies), []
     # Within a trace, a known tensor would be traced once JAX has reshaped it.
     with jax.ensure_compile_time_eval():
@@ -219,12 +219,12 @@ def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
         except ValueError as error:
             raise ValueError(f"bodies: {error}; this is body {i}") from None
 
-    return bodies, [(first_impossible(tensors), refuse)]
+    return bodies, [(first_impossible_row(tensors), refuse)]
 
 
 def _check_unit(q: Array) -> list[Check]:
     """Return the check that finds the first known quaternion which is not unit."""
-    if not _checks.known(q):
+    if not _checks.is_known(q):
         return []
 
     def refuse(i: int) -> None:
@@ -234,19 +234,19 @@ def _check_unit(q: Array) -> list[Check]:
             "normalise with rigidjax.quaternion.normalise, and mind that the scalar is first"
         )
 
-    return [(_checks.first_bad(_not_unit, q), refuse)]
+    return [(_checks.first_bad_row(_is_not_unit, q), refuse)]
 
 
-def _not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
+def _is_not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
     return xp.abs(xp.sqrt(xp.sum(xp.square(q), axis=-1)) - 1) > tolerance(q.dtype)
 
 
 def step_of(step_size: ScalarLike, num_steps: int, dtype: np.dtype) -> tuple[Array, int]:
     """Return the step, s, and the number of steps, both checked."""
-    h = _checks.floating(step_size, (), "step_size").astype(dtype)
-    if _checks.known(h) and not 0 < float(h) < np.inf:
+    h = _checks.array_of_shape(step_size, (), "step_size").astype(dtype)
+    if _checks.is_known(h) and not 0 < float(h) < np.inf:
         raise ValueError(
             f"step_size: wanted a positive step, s, got {step_size}; to go back in time negate Ω "
             "and the time of the torque"
         )
-    return h, _checks.whole(num_steps, "num_steps", 1)
+    return h, _checks.integer(num_steps, "num_steps", 1)

@@ -29,8 +29,8 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     >>> abs(float(divergence(body, body))) < 1e-14
     True
     """
-    _checks.single(body, MassProperties, "body")
-    _checks.single(reference, MassProperties, "reference")
+    _checks.require_single(body, MassProperties, "body")
+    _checks.require_single(reference, MassProperties, "reference")
     ratio = body.mass / reference.mass
     # By Cholesky factors: cofactors lose twice as many digits for a long, thin body.
     root = jnp.linalg.cholesky(reference.second_moment / reference.mass)

@@ -65,11 +65,11 @@ def kinetic_energy_about(
     >>> kinetic_energy_about(ball, [1.0, 0, 0, 0], [0.0, 1, 0], [0.0, 0, 1])
     Array(2., dtype=float64)
     """
-    body = validation.single(body, MassProperties, "body")
-    velocity = _checks.floating(velocity, (3,), "velocity")
-    omega = _checks.floating(omega, (3,), "omega")
+    body = validation.require_single_body(body, MassProperties, "body")
+    velocity = _checks.array_of_shape(velocity, (3,), "velocity")
+    omega = _checks.array_of_shape(omega, (3,), "omega")
     about_origin = body.inertia_about(jnp.zeros_like(body.com)).tensor
-    swing = quaternion.rotate(validation.unit_quaternion(q), cross(omega, body.com))
+    swing = quaternion.rotate(validation.attitude_quaternion(q), cross(omega, body.com))
     return (
         0.5 * body.mass * dot(velocity, velocity)
         + body.mass * dot(velocity, swing)
@@ -87,9 +87,9 @@ def kinetic_energy_of_matrix_rate(second_moment: Matrix, matrix_rate: Matrix) ->
     >>> kinetic_energy_of_matrix_rate(jnp.eye(3), jnp.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]))
     Array(1., dtype=float64)
     """
-    s = _checks.floating(second_moment, (3, 3), "second_moment")
+    s = _checks.array_of_shape(second_moment, (3, 3), "second_moment")
     s = validation.check_symmetric(s, "second_moment")
-    rate = _checks.floating(matrix_rate, (3, 3), "matrix_rate")
+    rate = _checks.array_of_shape(matrix_rate, (3, 3), "matrix_rate")
     return 0.5 * jnp.sum(product(rate, s) * rate)
 
 
@@ -120,7 +120,7 @@ def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude)
     """
     hint = "in the body frame use angular_momentum"
     wanted = "a state with an attitude (.q)"
-    _checks.single(state, HasAttitude, "state", wanted=wanted, hint=hint)
+    _checks.require_single(state, HasAttitude, "state", requirement=wanted, hint=hint)
     momentum = quaternion.rotate(state.q, angular_momentum(body, state))
     if isinstance(body, MassProperties) and isinstance(state, HasPose):
         momentum = momentum + body.mass * cross(state.x, state.v)
@@ -152,24 +152,28 @@ def ellipsoid(
     >>> ellipsoid(rj.shapes.ellipsoid(3.0, [1.0, 2.0, 3.0]), "mass")[0]
     Array([1., 2., 3.], dtype=float64)
     """
-    _checks.word(kind, ("energy", "momentum", "mass"), "kind")
+    _checks.require_option(kind, ("energy", "momentum", "mass"), "kind")
     if (size is None) != (kind == "mass"):
         words = {"mass": "no size", "energy": "the energy, J", "momentum": "the momentum, kg m²/s"}
         raise TypeError(f"size: wanted {words[kind]} for the ellipsoid of {kind}, got {size!r}")
     if kind == "mass":
-        solid = validation.single(body, MassProperties, "body")
+        solid = validation.require_single_body(body, MassProperties, "body")
         second_moments, q = principal(solid.second_moment)
         return jnp.sqrt(5.0 * second_moments / solid.mass), q
-    one = _checks.single(body, (Inertia, MassProperties), "body", hint=_HINT)
+    one = _checks.require_single(body, (Inertia, MassProperties), "body", hint=_HINT)
     moments, q = Inertia(tensor_of(one)).invertible().principal()
     wanted = "a number ≥ 0, J" if kind == "energy" else "a number ≥ 0, kg m²/s"
-    size = _checks.sign(_checks.floating(size, (), "size"), "size", wanted, zero=True)
+    size = _checks.require_sign(_checks.array_of_shape(size, (), "size"), "size", wanted, zero=True)
     return (jnp.sqrt(2.0 * size / moments) if kind == "energy" else size / moments), q
 
 
 def _omega(state):
-    return _checks.floating(state.omega if isinstance(state, HasSpin) else state, (3,), "omega")
+    return _checks.array_of_shape(
+        state.omega if isinstance(state, HasSpin) else state, (3,), "omega"
+    )
 
 
 def _tensor(body: Inertia | MassProperties) -> Mat3:
-    return tensor_of(validation.single(body, (Inertia, MassProperties), "body", hint=_HINT))
+    return tensor_of(
+        validation.require_single_body(body, (Inertia, MassProperties), "body", hint=_HINT)
+    )

@@ -56,14 +56,16 @@ class Inertia(eqx.Module):
     tensor: Float[Array, "*batch 3 3"]
     scale: str | None = eqx.field(static=True)
 
-    __repr__ = _show.numbers
+    __repr__ = _show.fields_as_text
 
     def __init__(self, tensor: Matrices, scale: str | None = None):
         hint = "Inertia.from_principal takes principal moments"
-        self.tensor = _checks.floating(
+        self.tensor = _checks.array_of_shape(
             tensor, (3, 3), "tensor", batched=True, hint=hint, unit="kg m²"
         )
-        self.scale = None if scale is None else _checks.word(scale, ("arbitrary",), "scale")
+        self.scale = (
+            None if scale is None else _checks.require_option(scale, ("arbitrary",), "scale")
+        )
 
     @staticmethod
     def from_tensor(tensor: Matrix) -> "Inertia":
@@ -77,8 +79,8 @@ class Inertia(eqx.Module):
         >>> Inertia.from_tensor([[2.0, 0.1, 0], [0.1, 2, 0], [0, 0, 3]]).tensor.shape
         (3, 3)
         """
-        a = _checks.floating(tensor, (3, 3), "inertia tensor")
-        return Inertia(validation.real_inertia(a))
+        a = _checks.array_of_shape(tensor, (3, 3), "inertia tensor")
+        return Inertia(validation.require_real_inertia(a))
 
     @staticmethod
     def from_principal(i1: ScalarLike, i2: ScalarLike, i3: ScalarLike) -> "Inertia":
@@ -88,7 +90,7 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 3.0).tensor[2, 2]
         Array(3., dtype=float64)
         """
-        moments = validation.real_moments(jnp.stack(_checks.scalars(i1=i1, i2=i2, i3=i3)))
+        moments = validation.require_real_moments(jnp.stack(_checks.scalars(i1=i1, i2=i2, i3=i3)))
         return Inertia(jnp.diag(moments))
 
     @staticmethod
@@ -102,8 +104,8 @@ class Inertia(eqx.Module):
         >>> Inertia.from_second_moment(jnp.diag(jnp.array([2.0, 1.0, 0.0]))).moments
         Array([1., 2., 3.], dtype=float64)
         """
-        s = _checks.floating(second_moment, (3, 3), "second moment", unit="kg m²")
-        return Inertia(swap_trace(validation.real_second_moment(s)))
+        s = _checks.array_of_shape(second_moment, (3, 3), "second moment", unit="kg m²")
+        return Inertia(swap_trace(validation.require_real_second_moment(s)))
 
     @property
     def second_moment(self) -> Float[Array, "*batch 3 3"]:
@@ -137,7 +139,10 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 1.0, 1.0).shifted([0.0, 0.0, 2.0], 3.0).moments
         Array([ 1., 13., 13.], dtype=float64)
         """
-        r, m = _checks.floating(r, (3,), "r", unit="m"), _checks.floating(mass, (), "mass")
+        r, m = (
+            _checks.array_of_shape(r, (3,), "r", unit="m"),
+            _checks.array_of_shape(mass, (), "mass"),
+        )
         if self.scale is not None:
             raise ValueError("shifted: wanted an inertia in kg m², got one of arbitrary scale")
         return Inertia(self.tensor + swap_trace(m * outer(r, r)))
@@ -152,7 +157,7 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 2.5).rotated([half, 0, 0, half]).tensor[0, 0]
         Array(2., dtype=float64)
         """
-        m = quaternion.to_matrix(validation.unit_quaternion(q))
+        m = quaternion.to_matrix(validation.attitude_quaternion(q))
         return Inertia(product(m, product(self.tensor, m.T)), self.scale)
 
     def invertible(self) -> "Inertia":
@@ -188,22 +193,26 @@ class MassProperties(eqx.Module):
     com: Float[Array, "*batch 3"]
     second_moment: Float[Array, "*batch 3 3"]
 
-    __repr__ = _show.numbers
+    __repr__ = _show.fields_as_text
 
     def __init__(self, mass: Scalars, com: Vectors, second_moment: Matrices):
-        mass = _checks.floating(mass, (), "mass", batched=True)
-        com = _checks.floating(com, (3,), "com", batched=True)
+        mass = _checks.array_of_shape(mass, (), "mass", batched=True)
+        com = _checks.array_of_shape(com, (3,), "com", batched=True)
         if isinstance(second_moment, Inertia):
             words = "second_moment: wanted 𝔖 about the centre of mass, got an Inertia"
             raise TypeError(f"{words}; give its .second_moment")
-        s = _checks.floating(second_moment, (3, 3), "second_moment", batched=True, unit="kg m²")
-        _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(s, 2))
+        s = _checks.array_of_shape(
+            second_moment, (3, 3), "second_moment", batched=True, unit="kg m²"
+        )
+        _checks.require_same_batch(mass=(mass, 0), com=(com, 1), second_moment=(s, 2))
         dtype = jnp.result_type(mass, com, s)
-        mass = _checks.if_known(validation.real_mass, mass.astype(dtype))
+        mass = _checks.check_if_known(validation.require_real_mass, mass.astype(dtype))
         # A traced mass that is not positive makes the body NaN: an error needs `checked`.
-        self.mass = mass if _checks.known(mass) else jnp.where(mass > 0, mass, jnp.nan)
-        self.com = _checks.if_known(_checks.finite, com.astype(dtype), "com")
-        self.second_moment = _checks.if_known(validation.real_second_moment, s.astype(dtype))
+        self.mass = mass if _checks.is_known(mass) else jnp.where(mass > 0, mass, jnp.nan)
+        self.com = _checks.check_if_known(_checks.require_finite, com.astype(dtype), "com")
+        self.second_moment = _checks.check_if_known(
+            validation.require_real_second_moment, s.astype(dtype)
+        )
 
     @property
     def inertia(self) -> Inertia:
@@ -215,9 +224,9 @@ class MassProperties(eqx.Module):
         constructor.
         """
         return MassProperties(
-            validation.real_mass(self.mass),
-            _checks.finite(self.com, "com"),
-            validation.real_second_moment(self.second_moment),
+            validation.require_real_mass(self.mass),
+            _checks.require_finite(self.com, "com"),
+            validation.require_real_second_moment(self.second_moment),
         )
 
     def invertible(self) -> "MassProperties":
@@ -234,7 +243,7 @@ class MassProperties(eqx.Module):
         >>> body.second_moment_about([0.0, 0, 0])[0, 0]
         Array(3., dtype=float64)
         """
-        d = self.com - _checks.floating(point, (3,), "point")
+        d = self.com - _checks.array_of_shape(point, (3,), "point")
         return self.second_moment + self.mass * outer(d, d)
 
     def inertia_about(self, point: Vector) -> Inertia:
@@ -254,7 +263,7 @@ class MassProperties(eqx.Module):
         >>> body.shifted([0.0, 1.0, 0.0]).com
         Array([1., 1., 0.], dtype=float64)
         """
-        com = self.com + _checks.floating(r, (3,), "r")
+        com = self.com + _checks.array_of_shape(r, (3,), "r")
         return MassProperties(self.mass, com, self.second_moment)
 
     def rotated(self, q: Quaternion) -> "MassProperties":
@@ -265,7 +274,7 @@ class MassProperties(eqx.Module):
         >>> body.rotated([0.0, 0, 0, 1]).com
         Array([-1.,  0.,  0.], dtype=float64)
         """
-        m = quaternion.to_matrix(validation.unit_quaternion(q))
+        m = quaternion.to_matrix(validation.attitude_quaternion(q))
         second_moment = product(m, product(self.second_moment, m.T))
         return MassProperties(self.mass, apply(m, self.com), second_moment)
 

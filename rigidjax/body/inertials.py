@@ -37,9 +37,9 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     Traceback (most recent call last):
     ValueError: missing.urdf: no such file
     """
-    path = _checks.path(path)
+    path = _checks.file_path(path)
     root, nodes = _open_file(path)
-    read = _from_urdf if root.tag == "robot" else _from_mujoco
+    read = _body_from_urdf if root.tag == "robot" else _body_from_mujoco
     bodies: dict[str, MassProperties] = {}
     faults = []
     for name, node in nodes.items():
@@ -53,7 +53,7 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
         raise ValueError(faults[0])
     for words in [f"{fault}; this body is left out" for fault in faults]:
         warnings.warn(words, stacklevel=2)
-    for words in _settings(root):
+    for words in _settings_warnings(root):
         warnings.warn(f"{path}: {words}", stacklevel=2)
     return bodies
 
@@ -74,7 +74,7 @@ _CHANGES = {
 }
 
 
-def _settings(root: Tree.Element) -> list[str]:
+def _settings_warnings(root: Tree.Element) -> list[str]:
     """Return warnings of settings that make MuJoCo use other masses than the inertials in the
     file.
     """
@@ -110,14 +110,16 @@ def write_inertials(
     Traceback (most recent call last):
     ValueError: bodies: wanted at least one name → MassProperties, got none
     """
-    path, source = _checks.path(path), _checks.path(source, "source")
-    _checks.instance(bodies, Mapping, "bodies", wanted="a dict of name → MassProperties")
+    path, source = _checks.file_path(path), _checks.file_path(source, "source")
+    _checks.require_instance(
+        bodies, Mapping, "bodies", requirement="a dict of name → MassProperties"
+    )
     if not bodies:
         raise ValueError("bodies: wanted at least one name → MassProperties, got none")
     root, nodes = _open_file(source)
-    write = _to_urdf if root.tag == "robot" else _to_mujoco
+    write = _write_to_urdf if root.tag == "robot" else _write_to_mujoco
     for name, body in bodies.items():
-        _checks.single(body, MassProperties, f"bodies[{name!r}]")
+        _checks.require_single(body, MassProperties, f"bodies[{name!r}]")
         if name not in nodes:
             raise ValueError(f"{source}: no body {name!r}; there are {', '.join(nodes)}")
         inertial = nodes[name].find("inertial")
@@ -147,35 +149,37 @@ def _open_file(path: Path) -> tuple[Tree.Element, dict[str, Tree.Element]]:
     return root, dict(zip(names, nodes, strict=True))
 
 
-def _from_urdf(inertial: Tree.Element) -> MassProperties:
+def _body_from_urdf(inertial: Tree.Element) -> MassProperties:
     origin, mass, inertia = (inertial.find(tag) for tag in ("origin", "mass", "inertia"))
     if mass is None or inertia is None:
         raise ValueError("wanted a <mass> and an <inertia>")
-    place = _numbers(origin, "xyz", 3, [0.0] * 3)
+    place = _read_numbers(origin, "xyz", 3, [0.0] * 3)
     # Fixed axes: roll about x, then pitch about y, then yaw about z.
-    turn = euler.to_matrix(_numbers(origin, "rpy", 3, [0.0] * 3), "xyz")
-    diagonal = [_numbers(inertia, key, 1)[0] for key in _KEYS[:3]]
-    others = [_numbers(inertia, key, 1, [0.0])[0] for key in _KEYS[3:]]
-    return _body(_numbers(mass, "value", 1)[0], place, turn, [*diagonal, *others])
+    turn = euler.to_matrix(_read_numbers(origin, "rpy", 3, [0.0] * 3), "xyz")
+    diagonal = [_read_numbers(inertia, key, 1)[0] for key in _KEYS[:3]]
+    others = [_read_numbers(inertia, key, 1, [0.0])[0] for key in _KEYS[3:]]
+    return _body_from_parts(_read_numbers(mass, "value", 1)[0], place, turn, [*diagonal, *others])
 
 
-def _from_mujoco(inertial: Tree.Element) -> MassProperties:
+def _body_from_mujoco(inertial: Tree.Element) -> MassProperties:
     other = [key for key in ("axisangle", "xyaxes", "zaxis", "euler") if key in inertial.attrib]
     if other:
         raise ValueError(f"its inertial is turned by {other[0]}; wanted quat")
-    q = quaternion.normalise(_numbers(inertial, "quat", 4, [1.0, 0.0, 0.0, 0.0]))
+    q = quaternion.normalise(_read_numbers(inertial, "quat", 4, [1.0, 0.0, 0.0, 0.0]))
     if "fullinertia" in inertial.attrib:
-        six = _numbers(inertial, "fullinertia", 6)
+        six = _read_numbers(inertial, "fullinertia", 6)
     else:
-        six = [*_numbers(inertial, "diaginertia", 3), 0.0, 0.0, 0.0]
-    place = _numbers(inertial, "pos", 3, [0.0] * 3)
-    return _body(_numbers(inertial, "mass", 1)[0], place, quaternion.to_matrix(q), six)
+        six = [*_read_numbers(inertial, "diaginertia", 3), 0.0, 0.0, 0.0]
+    place = _read_numbers(inertial, "pos", 3, [0.0] * 3)
+    return _body_from_parts(
+        _read_numbers(inertial, "mass", 1)[0], place, quaternion.to_matrix(q), six
+    )
 
 
-def _body(
-    mass: float, place: np.ndarray, turn: ArrayLike, six: Sequence[float] | np.ndarray
+def _body_from_parts(
+    mass: float, place: np.ndarray, turn: ArrayLike, entries: Sequence[float] | np.ndarray
 ) -> MassProperties:
-    xx, yy, zz, xy, xz, yz = six
+    xx, yy, zz, xy, xz, yz = entries
     turn = np.asarray(turn, float)
     tensor = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
     if not mass > 0:
@@ -191,14 +195,14 @@ def _body(
     return MassProperties(mass, place, second)
 
 
-def _numbers(
-    node: Tree.Element | None, key: str, count: int, otherwise: list[float] | None = None
+def _read_numbers(
+    node: Tree.Element | None, key: str, count: int, default: list[float] | None = None
 ) -> np.ndarray:
     text = None if node is None else node.get(key)
     if text is None:
-        if otherwise is None:
+        if default is None:
             raise ValueError(f"wanted an attribute {key}, got none")
-        return np.array(otherwise)
+        return np.array(default)
     try:
         numbers = np.array([float(part) for part in text.split()])
     except ValueError:
@@ -208,20 +212,20 @@ def _numbers(
     return numbers
 
 
-def _text(numbers: ArrayLike | Numbers) -> str:
+def _numbers_as_text(numbers: ArrayLike | Numbers) -> str:
     return " ".join(repr(float(number)) for number in np.ravel(numbers))
 
 
-def _to_urdf(inertial: Tree.Element, body: MassProperties) -> None:
+def _write_to_urdf(inertial: Tree.Element, body: MassProperties) -> None:
     tensor = np.asarray(body.inertia.tensor)
-    Tree.SubElement(inertial, "origin", xyz=_text(body.com), rpy="0 0 0")
-    Tree.SubElement(inertial, "mass", value=_text(body.mass))
-    entries = {key: _text(tensor[at]) for key, at in zip(_KEYS, PAIRS, strict=True)}
+    Tree.SubElement(inertial, "origin", xyz=_numbers_as_text(body.com), rpy="0 0 0")
+    Tree.SubElement(inertial, "mass", value=_numbers_as_text(body.mass))
+    entries = {key: _numbers_as_text(tensor[at]) for key, at in zip(_KEYS, PAIRS, strict=True)}
     Tree.SubElement(inertial, "inertia", entries)
 
 
-def _to_mujoco(inertial: Tree.Element, body: MassProperties) -> None:
+def _write_to_mujoco(inertial: Tree.Element, body: MassProperties) -> None:
     tensor = np.asarray(body.inertia.tensor)
-    inertial.set("mass", _text(body.mass))
-    inertial.set("pos", _text(body.com))
-    inertial.set("fullinertia", _text([tensor[at] for at in PAIRS]))
+    inertial.set("mass", _numbers_as_text(body.mass))
+    inertial.set("pos", _numbers_as_text(body.com))
+    inertial.set("fullinertia", _numbers_as_text([tensor[at] for at in PAIRS]))

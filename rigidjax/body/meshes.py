@@ -42,13 +42,13 @@ def mesh(
     >>> round(float(body.mass), 12), round(float(body.com[0]), 12)
     (1.0, 0.25)
     """
-    corners = _checks.rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
+    corners = _checks.array_of_rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
     if not corners.size:
         raise ValueError("vertices: wanted some, got none")
-    _checks.if_known(_checks.finite, corners, "vertices")
+    _checks.check_if_known(_checks.require_finite, corners, "vertices")
     faces = faces_of(faces, corners.shape[0])
-    density = _checks.floating(density, (), "density")
-    _checks.if_known(_checks.sign, density, "density", "a positive number, kg/m³")
+    density = _checks.array_of_shape(density, (), "density")
+    _checks.check_if_known(_checks.require_sign, density, "density", "a positive number, kg/m³")
 
     centre = jax.lax.stop_gradient(corners.mean(axis=0))
     six, (a, b, c) = _tetrahedra(corners - centre[None, :], faces)
@@ -112,16 +112,16 @@ def _require_outward(volume, corners, faces):
     longest = jnp.ptp(corners, axis=0).max()
     area = 0.5 * jnp.sqrt((jnp.cross(b - a, c - a) ** 2).sum(axis=1)).sum()
     slack = 4.0 * jnp.finfo(corners.dtype).eps * jax.lax.stop_gradient(longest) * area
-    found = f" (volume {float(volume):.6g} m³)" if _checks.known(volume) else ""
-    words = f"mesh: it is inside out{found}: its faces are clockwise; give faces[:, ::-1]"
-    volume = _checks.refuse(volume, volume < -slack, words)
-    words = f"mesh: it encloses no volume{found}; for a flat body use plate"
-    return _checks.refuse(volume, ~(volume > slack), words)
+    volume_text = f" (volume {float(volume):.6g} m³)" if _checks.is_known(volume) else ""
+    words = f"mesh: it is inside out{volume_text}: its faces are clockwise; give faces[:, ::-1]"
+    volume = _checks.error_if(volume, volume < -slack, words)
+    words = f"mesh: it encloses no volume{volume_text}; for a flat body use plate"
+    return _checks.error_if(volume, ~(volume > slack), words)
 
 
 def faces_of(faces: Any, n: int) -> Array:
     """Return the faces as an array (m, 3) of vertex numbers below n; known faces are checked."""
-    if not _checks.known(faces):
+    if not _checks.is_known(faces):
         return faces
     faces = _checks.without_mask(faces, "faces")
     try:
@@ -133,8 +133,8 @@ def faces_of(faces: Any, n: int) -> Array:
     if table.ndim != 2 or table.shape[1] != 3 or len(table) == 0:
         raise ValueError(f"faces: wanted shape (m, 3), triangles, got {table.shape}")
     if table.min() < 0 or table.max() >= n:
-        found = f"{table.min()} to {table.max()}; OBJ files count from 1"
-        raise ValueError(f"faces: wanted vertex numbers from 0 to {n - 1}, got {found}")
+        got = f"{table.min()} to {table.max()}; OBJ files count from 1"
+        raise ValueError(f"faces: wanted vertex numbers from 0 to {n - 1}, got {got}")
     repeated = (table == np.roll(table, 1, axis=1)).any(axis=1)
     if repeated.any():
         which = int(np.argmax(repeated))

@@ -18,7 +18,7 @@ from rigidjax._types import Mat3, Matrix, Numbers, Scalar, Vec3, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.principal_axes import eigensystem
 from rigidjax.body.symmetric3 import apply, from_components, product
-from rigidjax.body.validation import real_moments, real_second_moment
+from rigidjax.body.validation import require_real_moments, require_real_second_moment
 from rigidjax.rotation.linalg3 import cross
 
 # A body is flat if its least second moment is below this fraction of their sum.
@@ -38,8 +38,8 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     2.0
     """
     hint = "for an Inertia use pack_second_moment(body.second_moment), or pack_shape"
-    _checks.single(body, MassProperties, "body", hint=hint)
-    alpha = _hold(0.5 * jnp.log(body.mass), jnp.expm1)
+    _checks.require_single(body, MassProperties, "body", hint=hint)
+    alpha = _bend_exponent(0.5 * jnp.log(body.mass), jnp.expm1)
     shape = _factors(body.second_moment / body.mass)
     return jnp.concatenate([alpha[None], shape, body.com])
 
@@ -54,10 +54,10 @@ def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     >>> unpack(jnp.zeros(10)).inertia.moments
     Array([2., 2., 2.], dtype=float64)
     """
-    v = _checks.floating(vector, (10,), "vector")
-    alpha = _hold(v[0])
-    size = 3.0 * jnp.exp(2.0 * _hold(alpha + v[1]))
-    return MassProperties(jnp.exp(2.0 * alpha), v[7:10], size * _shape(v[2:7]))
+    v = _checks.array_of_shape(vector, (10,), "vector")
+    alpha = _bend_exponent(v[0])
+    size = 3.0 * jnp.exp(2.0 * _bend_exponent(alpha + v[1]))
+    return MassProperties(jnp.exp(2.0 * alpha), v[7:10], size * _square_over_trace(v[2:7]))
 
 
 def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
@@ -70,7 +70,7 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
     >>> pack_second_moment(jnp.eye(3))
     Array([0., 0., 0., 0., 0., 0.], dtype=float64)
     """
-    return _factors(_checks.floating(second_moment, (3, 3), "second_moment"))
+    return _factors(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))
 
 
 def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
@@ -80,8 +80,8 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
     >>> unpack_second_moment(jnp.zeros(6))[0]
     Array([1., 0., 0.], dtype=float64)
     """
-    v = _checks.floating(vector, (6,), "vector")
-    return 3.0 * jnp.exp(2.0 * _hold(v[0])) * _shape(v[1:])
+    v = _checks.array_of_shape(vector, (6,), "vector")
+    return 3.0 * jnp.exp(2.0 * _bend_exponent(v[0])) * _square_over_trace(v[1:])
 
 
 def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
@@ -96,7 +96,7 @@ def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
     >>> pack_shape(jnp.diag(jnp.array([4.0, 4.0, 0.0])))  # a plate
     Array([0.5, 0.5, 0. , 0. , 0. ], dtype=float64)
     """
-    return _factors(_checks.floating(second_moment, (3, 3), "second_moment"))[1:]
+    return _factors(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))[1:]
 
 
 def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
@@ -106,7 +106,7 @@ def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
     >>> float(jnp.trace(unpack_shape(jnp.ones(5))))
     1.0
     """
-    return _shape(_checks.floating(vector, (5,), "vector"))
+    return _square_over_trace(_checks.array_of_shape(vector, (5,), "vector"))
 
 
 def pack_moments(moments: Vector) -> Float[Array, "3"]:
@@ -119,11 +119,11 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
     >>> pack_moments([2.0, 2.0, 2.0])
     Array([0., 0., 0.], dtype=float64)
     """
-    i = real_moments(_checks.floating(moments, (3,), "moments"))
+    i = require_real_moments(_checks.array_of_shape(moments, (3,), "moments"))
     s = 0.5 * jnp.stack([(i[1] - i[0]) + i[2], (i[2] - i[1]) + i[0], (i[0] - i[2]) + i[1]])
-    total = _not_a_point(s[0] + s[1] + s[2])
+    total = _refuse_point(s[0] + s[1] + s[2])
     root = jnp.sqrt(jnp.maximum(_quotient(s, total), 0.0))
-    size = _hold(0.5 * jnp.log(total / 3.0), jnp.expm1)
+    size = _bend_exponent(0.5 * jnp.log(total / 3.0), jnp.expm1)
     return jnp.stack([size, *(3.0 * root[:2] / (root[0] + root[1] + root[2]) - 1.0)])
 
 
@@ -134,11 +134,11 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
     >>> unpack_moments([0.0, 0.0, 0.0])
     Array([2., 2., 2.], dtype=float64)
     """
-    v = _checks.floating(vector, (3,), "vector")
+    v = _checks.array_of_shape(vector, (3,), "vector")
     root = jnp.stack([1.0 + v[1], 1.0 + v[2], 1.0 - v[1] - v[2]])
     root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
     a, b, c = root * root / jnp.sum(root * root)
-    s = 3.0 * jnp.exp(2.0 * _hold(v[0]))
+    s = 3.0 * jnp.exp(2.0 * _bend_exponent(v[0]))
     return s * jnp.stack([b + c, c + a, a + b])
 
 
@@ -160,9 +160,9 @@ def flat_bend(
     >>> flat_bend(plate, -1e-6 * jnp.ones(5)).shape
     (3, 5)
     """
-    shape = _checks.floating(shape, (5,), "shape")
-    slope = _checks.floating(slope, (5,), "slope")
-    root = _root_of(shape)
+    shape = _checks.array_of_shape(shape, (5,), "shape")
+    slope = _checks.array_of_shape(slope, (5,), "slope")
+    root = _root_of_trace_three(shape)
     # The columns of a flat body's adjugate are along n: this is cheaper than eigenvectors, in every
     # step of a fit.
     rows = root[0], root[1], root[2]
@@ -187,16 +187,16 @@ def flat_bend(
     return size * jnp.stack([jnp.stack(row) for row in rows])
 
 
-def _shape(v: Float[Array, "5"]) -> Mat3:
+def _square_over_trace(v: Float[Array, "5"]) -> Mat3:
     """Return (1 + V)² over its trace."""
-    root = _root_of(v)
+    root = _root_of_trace_three(v)
     # The root is scaled first: after a far too long step of an optimiser its squares overflow.
     root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
     square = product(root, root)
     return square / (square[0, 0] + square[1, 1] + square[2, 2])
 
 
-def _root_of(shape: Float[Array, "5"]) -> Mat3:
+def _root_of_trace_three(shape: Float[Array, "5"]) -> Mat3:
     """Return the root 1 + V of a second moment; its trace is 3."""
     d1, d2, s12, s23, s13 = shape
     return from_components(1.0 + d1, 1.0 + d2, 1.0 - d1 - d2, s12, s13, s23)
@@ -204,33 +204,33 @@ def _root_of(shape: Float[Array, "5"]) -> Mat3:
 
 def _factors(s: Mat3) -> Float[Array, "6"]:
     """Return (ρ, d1, d2, s12, s23, s13) of 𝔖 = 3 e^{2ρ} (1 + V)² / Tr (1 + V)²."""
-    total = _not_a_point(s[0, 0] + s[1, 1] + s[2, 2])
-    root = _root(_quotient(real_second_moment(s), total))
+    total = _refuse_point(s[0, 0] + s[1, 1] + s[2, 2])
+    root = _square_root(_quotient(require_real_second_moment(s), total))
     v = 3.0 * root / (root[0, 0] + root[1, 1] + root[2, 2]) - jnp.eye(3, dtype=s.dtype)
-    size = _hold(0.5 * jnp.log(total / 3.0), jnp.expm1)
+    size = _bend_exponent(0.5 * jnp.log(total / 3.0), jnp.expm1)
     return jnp.stack([size, v[0, 0], v[1, 1], v[0, 1], v[1, 2], v[0, 2]])
 
 
 @jax.custom_jvp
-def _root(s: Mat3) -> Mat3:
+def _square_root(s: Mat3) -> Mat3:
     """Return the symmetric, positive semi-definite root A of a second moment, A A = 𝔖."""
     values, axes = eigensystem(s)
     return product(axes * jnp.sqrt(jnp.maximum(values, 0.0))[None], axes.T)
 
 
-@_root.defjvp
-def _root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
+@_square_root.defjvp
+def _square_root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
     # A dA + dA A = d𝔖 is solved for dA as nine equations. This is right also at equal moments,
     # where the axes have no derivative.
-    root, one = _root(*primals), jnp.eye(3, dtype=primals[0].dtype)
+    root, one = _square_root(*primals), jnp.eye(3, dtype=primals[0].dtype)
     sums = jnp.kron(root, one) + jnp.kron(one, root)
     change = 0.5 * (tangents[0] + tangents[0].T)
     return root, jnp.linalg.solve(sums, change.reshape(9)).reshape(3, 3)
 
 
-def _not_a_point(total: Scalar) -> Scalar:
+def _refuse_point(total: Scalar) -> Scalar:
     words = "pack: the second moment is zero (a point has no shape) or beyond the dtype"
-    return _checks.refuse(total, ~((total > 0) & (total < jnp.inf)), words)
+    return _checks.error_if(total, ~((total > 0) & (total < jnp.inf)), words)
 
 
 def _quotient(part: Array, total: Scalar) -> Array:
@@ -241,7 +241,7 @@ def _quotient(part: Array, total: Scalar) -> Array:
     return (0.25 * part) / (0.25 * total)
 
 
-def _hold(exponent: Array, bend: Callable[[Array], Array] = jnp.log1p) -> Array:
+def _bend_exponent(exponent: Array, bend: Callable[[Array], Array] = jnp.log1p) -> Array:
     """Return the exponent, bent beyond the range of the dtype: `log1p` to a logarithm, `expm1`
     back.
     """

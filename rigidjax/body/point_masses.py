@@ -26,14 +26,14 @@ def points(
     >>> points([1.0, 1.0], [[1.0, 0, 0], [-1.0, 0, 0]]).inertia.moments
     Array([0., 2., 2.], dtype=float64)
     """
-    masses = _checks.rows(masses, (), "masses")
+    masses = _checks.array_of_rows(masses, (), "masses")
     n = masses.shape[0]
     hint = f"one row for each of {n} masses"
-    positions = _checks.floating(positions, (n, 3), "positions", hint=hint)
+    positions = _checks.array_of_shape(positions, (n, 3), "positions", hint=hint)
     if n == 0:
         raise ValueError("masses: wanted at least one, got none")
-    _checks.if_known(_checks.sign, masses, "masses", "masses ≥ 0", zero=True)
-    _checks.if_known(_checks.finite, positions, "positions")
+    _checks.check_if_known(_checks.require_sign, masses, "masses", "masses ≥ 0", zero=True)
+    _checks.check_if_known(_checks.require_finite, positions, "positions")
     return sum_masses(masses, positions)
 
 
@@ -50,15 +50,17 @@ def voxels(
     >>> voxels(jnp.ones((1, 2, 3)), [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]).com
     Array([0.5, 1. , 1.5], dtype=float64)
     """
-    density = _checks.numbers(density, "density")
+    density = _checks.numeric_array(density, "density")
     if density.ndim != 3 or density.size == 0:
         raise ValueError(f"density: wanted shape (nx, ny, nz), got {density.shape}")
     h, low = (
-        _checks.floating(spacing, (3,), "spacing"),
-        _checks.finite_floating(corner, (3,), "corner"),
+        _checks.array_of_shape(spacing, (3,), "spacing"),
+        _checks.finite_array(corner, (3,), "corner"),
     )
-    _checks.if_known(_checks.sign, density, "density", "values ≥ 0 (kg/m³)", zero=True)
-    _checks.if_known(_checks.sign, h, "spacing", "three positive edges of a cell, m")
+    _checks.check_if_known(
+        _checks.require_sign, density, "density", "values ≥ 0 (kg/m³)", zero=True
+    )
+    _checks.check_if_known(_checks.require_sign, h, "spacing", "three positive edges of a cell, m")
     axes = [(jnp.arange(n, dtype=density.dtype) + 0.5) * h[i] for i, n in enumerate(density.shape)]
     centres = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     masses = density.reshape(-1) * (h[0] * h[1] * h[2])
@@ -83,9 +85,9 @@ def quadrature(
     >>> round(float(body.mass), 12), round(float(body.com[2]), 12)
     (6.0, 1.5)
     """
-    _checks.function(density, "density", "r (3,) → kg/m³")
-    _checks.function(place, "place", "u (3,) → r (3,), m")
-    order = _checks.whole(order, "order", 1)
+    _checks.require_function(density, "density", "r (3,) → kg/m³")
+    _checks.require_function(place, "place", "u (3,) → r (3,), m")
+    order = _checks.integer(order, "order", 1)
     nodes, weights = np.polynomial.legendre.leggauss(order)
     nodes, weights = 0.5 * (nodes + 1.0), 0.5 * weights
     cube = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -93,14 +95,14 @@ def quadrature(
     dtype = jnp.result_type(float)
     cube, weight = jnp.asarray(cube, dtype), jnp.asarray(weight, dtype)
 
-    def at(u):
-        r = _checks.floating(place(u), (3,), "place(u)")
+    def mass_and_place_at(u):
+        r = _checks.array_of_shape(place(u), (3,), "place(u)")
         volume = determinant(jax.jacfwd(place)(u))
-        return _checks.floating(density(r), (), "density(r)") * jnp.abs(volume), r
+        return _checks.array_of_shape(density(r), (), "density(r)") * jnp.abs(volume), r
 
-    per_volume, positions = jax.vmap(at)(cube)
-    _checks.if_known(_checks.finite, positions, "place(u)")
-    _checks.if_known(_checks.finite, per_volume, "density(r) |∂r/∂u|")
+    per_volume, positions = jax.vmap(mass_and_place_at)(cube)
+    _checks.check_if_known(_checks.require_finite, positions, "place(u)")
+    _checks.check_if_known(_checks.require_finite, per_volume, "density(r) |∂r/∂u|")
     return sum_masses(per_volume * weight, positions)
 
 

@@ -55,7 +55,7 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
     (Array([1., 2., 3.], dtype=float64), Array([1., 0., 0., 0.], dtype=float64))
     """
     moments, axes = eigensystem(
-        validation.check_symmetric(_checks.floating(tensor, (3, 3), "tensor"), "tensor")
+        validation.check_symmetric(_checks.array_of_shape(tensor, (3, 3), "tensor"), "tensor")
     )
     return moments, _quaternion_near_identity(axes)
 
@@ -79,8 +79,8 @@ def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
         ((one, nil, nil), (nil, one, nil), (nil, nil, one)),
     )
     values, _, axes = jax.lax.fori_loop(0, _SWEEPS, _sweep, start)
-    values, axes = _ascending(values, axes)
-    return times_power_of_two(jnp.stack(values), exponent), _nearest_signs(axes)
+    values, axes = _sort_ascending(values, axes)
+    return times_power_of_two(jnp.stack(values), exponent), _choose_nearest_signs(axes)
 
 
 @eigensystem.defjvp
@@ -113,7 +113,7 @@ def _sweep(_, state):
     return tuple(values), tuple(opposite), tuple(axes)
 
 
-def _ascending(values, axes):
+def _sort_ascending(values, axes):
     """Sort by exchanges; each exchange reverses one axis, so that they stay right-handed."""
     values, axes = list(values), list(axes)
     for i, j in ((0, 1), (1, 2), (0, 1)):
@@ -125,7 +125,7 @@ def _ascending(values, axes):
     return values, axes
 
 
-def _nearest_signs(axes) -> Mat3:
+def _choose_nearest_signs(axes) -> Mat3:
     """Reverse two axes, or none, so that the trace is largest."""
     d0, d1, d2 = axes[0][0], axes[1][1], axes[2][2]
     traces = jnp.stack([d0 + d1 + d2, d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1])
@@ -157,15 +157,15 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     >>> matrix_function(jnp.sqrt, 4.0 * jnp.eye(3))[0]
     Array([2., 0., 0.], dtype=float64)
     """
-    a = validation.check_symmetric(_checks.floating(tensor, (3, 3), "tensor"), "tensor")
-    _checks.function(function, "function", "number → number, written in jax.numpy")
+    a = validation.check_symmetric(_checks.array_of_shape(tensor, (3, 3), "tensor"), "tensor")
+    _checks.require_function(function, "function", "number → number, written in jax.numpy")
     # The unit is a power of two near the largest entry: no product leaves the dtype's range. It is
     # one power smaller, since for the largest number of the dtype the next power is infinite.
     unit = times_power_of_two(jnp.ones((), a.dtype), exponent_of(a) - 1)
     a = 0.5 * (a + a.T) / unit
 
     def scaled(value):
-        return _checks.floating(function(unit * value), (), "function(λ)", hint="one number")
+        return _checks.array_of_shape(function(unit * value), (), "function(λ)", hint="one number")
 
     values, axes = eigensystem(jax.lax.stop_gradient(a))
     change = product(axes.T, product(a - jax.lax.stop_gradient(a), axes))
@@ -173,7 +173,9 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     x, y = values[np.array(_PAIRS)].T
     first = jax.vmap(lambda x, y: _divided_difference(scaled, x, y, close))(x, y)[_PAIR]
     x, y, z = values[np.array(_TRIPLES)].T
-    second = jax.vmap(lambda x, y, z: _second(scaled, x, y, z, close))(x, y, z)[_TRIPLE]
+    second = jax.vmap(lambda x, y, z: _second_divided_difference(scaled, x, y, z, close))(x, y, z)[
+        _TRIPLE
+    ]
     bent = second * change[:, :, None] * change[None, :, :]
     inner = jnp.diag(jax.vmap(scaled)(values)) + first * change + bent.sum(axis=1)
     return product(axes, product(inner, axes.T))
@@ -190,7 +192,7 @@ def _divided_difference(f, x, y, close):
     return jnp.where(near, mean, (f(y) - f(x)) / jnp.where(near, 1.0, y - x))
 
 
-def _second(f, x, y, z, close):
+def _second_divided_difference(f, x, y, z, close):
     """Return the divided difference f[x, y, z], x ≤ y ≤ z: an integral of f'' over the triangle of
     the three.
     """

@@ -28,7 +28,7 @@ def box(mass: ScalarLike, size: Vector) -> MassProperties:
     >>> box(12.0, [1.0, 2.0, 3.0]).inertia.moments
     Array([ 5., 10., 13.], dtype=float64)
     """
-    edges = _lengths(size, (3,), "size")
+    edges = _checked_lengths(size, (3,), "size")
     return _body_at_centre(mass, edges * edges / 12.0)
 
 
@@ -39,7 +39,7 @@ def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
     >>> ellipsoid(5.0, [1.0, 2.0, 3.0]).inertia.moments
     Array([ 5., 10., 13.], dtype=float64)
     """
-    half = _lengths(semi_axes, (3,), "semi_axes")
+    half = _checked_lengths(semi_axes, (3,), "semi_axes")
     return _body_at_centre(mass, half * half / 5.0)
 
 
@@ -49,8 +49,8 @@ def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     >>> sphere(5.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
     """
-    r = _lengths(radius, (), "radius")
-    return _body_at_centre(mass, _round(r * r / 5.0, r * r / 5.0))
+    r = _checked_lengths(radius, (), "radius")
+    return _body_at_centre(mass, _axisymmetric_diagonal(r * r / 5.0, r * r / 5.0))
 
 
 def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> MassProperties:
@@ -66,7 +66,7 @@ def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> Mas
     # Homogeneous of degree 2: in u = r/R nothing overflows, and thin shells lose no digit.
     u = r / R
     ratio = (1.0 + u * (1.0 + u * (1.0 + u * (1.0 + u)))) / (1.0 + u * (1.0 + u))
-    return _body_at_centre(mass, _round(R * R * ratio / 5.0, R * R * ratio / 5.0))
+    return _body_at_centre(mass, _axisymmetric_diagonal(R * R * ratio / 5.0, R * R * ratio / 5.0))
 
 
 def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
@@ -75,8 +75,8 @@ def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     >>> shell(3.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
     """
-    r = _lengths(radius, (), "radius")
-    return _body_at_centre(mass, _round(r * r / 3.0, r * r / 3.0))
+    r = _checked_lengths(radius, (), "radius")
+    return _body_at_centre(mass, _axisymmetric_diagonal(r * r / 3.0, r * r / 3.0))
 
 
 def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
@@ -86,8 +86,8 @@ def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassPr
     >>> cylinder(12.0, 1.0, 1.0).inertia.moments
     Array([4., 4., 6.], dtype=float64)
     """
-    r, h = _lengths(radius, (), "radius"), _lengths(height, (), "height")
-    return _body_at_centre(mass, _round(r * r / 4.0, h * h / 12.0))
+    r, h = _checked_lengths(radius, (), "radius"), _checked_lengths(height, (), "height")
+    return _body_at_centre(mass, _axisymmetric_diagonal(r * r / 4.0, h * h / 12.0))
 
 
 def hollow_cylinder(
@@ -101,8 +101,8 @@ def hollow_cylinder(
     >>> hollow_cylinder(2.0, 1.0, 1.0, 0.0).inertia.moments
     Array([1., 1., 2.], dtype=float64)
     """
-    (r, R), h = _require_nested(inner, outer), _lengths(height, (), "height")
-    return _body_at_centre(mass, _round((r * r + R * R) / 4.0, h * h / 12.0))
+    (r, R), h = _require_nested(inner, outer), _checked_lengths(height, (), "height")
+    return _body_at_centre(mass, _axisymmetric_diagonal((r * r + R * R) / 4.0, h * h / 12.0))
 
 
 def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassProperties:
@@ -115,12 +115,12 @@ def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassPro
     >>> capsule(5.0, 1.0, 0.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
     """
-    r, h = _lengths(radius, (), "radius"), _lengths(length, (), "length")
+    r, h = _checked_lengths(radius, (), "radius"), _checked_lengths(length, (), "length")
     f = h / (h + 4.0 * r / 3.0)
     ends = (4.0 * r / 3.0) / (h + 4.0 * r / 3.0)
     across = f * r * r / 4.0 + ends * r * r / 5.0
     along = f * h * h / 12.0 + ends * (r * r / 5.0 + 3.0 * h * r / 8.0 + h * h / 4.0)
-    return _body_at_centre(mass, _round(across, along))
+    return _body_at_centre(mass, _axisymmetric_diagonal(across, along))
 
 
 def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
@@ -132,8 +132,8 @@ def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProper
     >>> cone(80.0, 1.0, 2.0).inertia.moments
     Array([24., 24., 24.], dtype=float64)
     """
-    r, h = _lengths(radius, (), "radius"), _lengths(height, (), "height")
-    return _body_at_centre(mass, _round(3.0 * r * r / 20.0, 3.0 * h * h / 80.0))
+    r, h = _checked_lengths(radius, (), "radius"), _checked_lengths(height, (), "height")
+    return _body_at_centre(mass, _axisymmetric_diagonal(3.0 * r * r / 20.0, 3.0 * h * h / 80.0))
 
 
 def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassProperties:
@@ -147,7 +147,9 @@ def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassPropert
     Array([1., 1., 2.], dtype=float64)
     """
     r, R = _require_nested(minor, major, names=("minor", "major"))
-    return _body_at_centre(mass, _round(R * R / 2.0 + 3.0 * r * r / 8.0, r * r / 4.0))
+    return _body_at_centre(
+        mass, _axisymmetric_diagonal(R * R / 2.0 + 3.0 * r * r / 8.0, r * r / 4.0)
+    )
 
 
 def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
@@ -157,8 +159,8 @@ def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
     >>> rod(12.0, 1.0).inertia.moments
     Array([0., 1., 1.], dtype=float64)
     """
-    h = _lengths(length, (), "length")
-    return _body_at_centre(mass, _round(jnp.zeros_like(h), h * h / 12.0))
+    h = _checked_lengths(length, (), "length")
+    return _body_at_centre(mass, _axisymmetric_diagonal(jnp.zeros_like(h), h * h / 12.0))
 
 
 def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProperties:
@@ -167,28 +169,30 @@ def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProper
     >>> plate(12.0, [1.0, 2.0]).inertia.moments
     Array([1., 4., 5.], dtype=float64)
     """
-    edges = _lengths(size, (2,), "size")
+    edges = _checked_lengths(size, (2,), "size")
     return _body_at_centre(mass, jnp.concatenate([edges * edges / 12.0, jnp.zeros_like(edges[:1])]))
 
 
-def _lengths(value, shape, name):
-    lengths = _checks.finite_floating(value, shape, name, unit="m")
-    return _checks.if_known(_checks.sign, lengths, name, "lengths ≥ 0 (m)", zero=True)
+def _checked_lengths(value, shape, name):
+    lengths = _checks.finite_array(value, shape, name, unit="m")
+    return _checks.check_if_known(_checks.require_sign, lengths, name, "lengths ≥ 0 (m)", zero=True)
 
 
 def _require_nested(inner, outer, names=("inner", "outer")):
-    r, R = _lengths(inner, (), names[0]), _lengths(outer, (), names[1])
-    if _checks.known((r, R)):
-        _checks.refuse(r, r > R, f"{names[0]}: wanted {names[0]} ≤ {names[1]}, got {r} and {R} (m)")
+    r, R = _checked_lengths(inner, (), names[0]), _checked_lengths(outer, (), names[1])
+    if _checks.is_known((r, R)):
+        _checks.error_if(
+            r, r > R, f"{names[0]}: wanted {names[0]} ≤ {names[1]}, got {r} and {R} (m)"
+        )
     return r, R
 
 
-def _round(across, along):
-    return jnp.stack([across, across, along])
+def _axisymmetric_diagonal(transverse, axial):
+    return jnp.stack([transverse, transverse, axial])
 
 
 def _body_at_centre(mass, per_mass):
-    m = _checks.floating(mass, (), "mass")
+    m = _checks.array_of_shape(mass, (), "mass")
     return MassProperties(m, jnp.zeros_like(per_mass), jnp.diag(m * per_mass))
 
 

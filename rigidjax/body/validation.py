@@ -18,67 +18,74 @@ from jaxtyping import Array, Bool, Float, PyTree
 from rigidjax import _checks
 from rigidjax._types import Quat, Quaternion
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.validation import near_unit, tolerance
+from rigidjax.rotation.validation import require_near_unit, tolerance
 
 # The tolerance in units of round-off of the largest entry. A product R I Rᵀ is off by about ten.
 _FORGIVEN = 64.0
 
 
-def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+def require_real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Refuse a mass that is not positive and finite."""
-    return _checks.sign(mass, "mass", "a positive mass (kg)")
+    return _checks.require_sign(mass, "mass", "a positive mass (kg)")
 
 
-def real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+def require_real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Refuse an inertia tensor that is not symmetric, or whose moments no real body has."""
-    tensor = _require_symmetric(_checks.finite(tensor, "inertia tensor"), "inertia tensor")
+    tensor = _require_symmetric(_checks.require_finite(tensor, "inertia tensor"), "inertia tensor")
     return _moments_of_a_body(tensor, _eigenvalues(tensor))
 
 
-def real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
+def require_real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
     """Refuse principal moments, in any order, that no real body has."""
-    if not _checks.known(moments) and _checks.known(plain := lax.stop_gradient(moments)):
+    if not _checks.is_known(moments) and _checks.is_known(plain := lax.stop_gradient(moments)):
         # The numbers are known and only differentiated: one check by NumPy instead of twenty
         # programs.
-        real_moments(plain)
+        require_real_moments(plain)
         return moments
-    moments = _checks.finite(moments, "principal moments")
-    xp = np if _checks.known(moments) else jnp
-    return _moments_of_a_body(moments, xp.sort(_values(moments)))
+    moments = _checks.require_finite(moments, "principal moments")
+    xp = np if _checks.is_known(moments) else jnp
+    return _moments_of_a_body(moments, xp.sort(_without_derivatives(moments)))
 
 
-def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+def require_real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Refuse a second moment that is not symmetric and positive semi-definite."""
-    s = _require_symmetric(_checks.finite(s, "second moment"), "second moment")
+    s = _require_symmetric(_checks.require_finite(s, "second moment"), "second moment")
     least, largest = (e := _eigenvalues(s))[..., 0], e[..., 2]
-    found = f", got principal second moments {_show(e)} kg m²" if _checks.known(s) else ""
-    return _checks.refuse(
+    got = (
+        f", got principal second moments {_moments_as_text(e)} kg m²" if _checks.is_known(s) else ""
+    )
+    return _checks.error_if(
         s,
-        (least < -_slack(s) * largest).any() | (largest < 0).any(),
+        (least < -_round_off_bound(s) * largest).any() | (largest < 0).any(),
         "second moment 𝔖 = ∫ r rᵀ dm: wanted a positive semi-definite matrix (mass is not "
-        f"negative){found}; is this an inertia tensor I? then use from_tensor (I = Tr(𝔖) 1 − 𝔖)",
+        f"negative){got}; is this an inertia tensor I? then use from_tensor (I = Tr(𝔖) 1 − 𝔖)",
     )
 
 
-def single(
-    value: object, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
+def require_single_body(
+    value: object,
+    kinds: type | tuple[type, ...],
+    name: str,
+    *,
+    requirement: str = "",
+    hint: str = "",
 ) -> Any:
     """Return `value` if it is one body of one of `kinds` and some mass has its numbers.
 
     Known numbers that no real body has are refused; a traced body with such numbers becomes NaN. A
     moment may be zero: a function that divides by the moments calls `check_body`.
     """
-    body = _checks.single(value, kinds, name, wanted=wanted, hint=hint)
+    body = _checks.require_single(value, kinds, name, requirement=requirement, hint=hint)
     has_mass = hasattr(body, "mass")
     tensor = body.inertia.tensor if has_mass else body.tensor
-    return check_body(body, tensor, body.mass if has_mass else None, throw=False, thin=True)
+    return check_body(body, tensor, body.mass if has_mass else None, throw=False, allow_thin=True)
 
 
 def check_symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
     """Return a symmetric matrix; refuse a known one that is not symmetric, and make a traced one
     NaN.
     """
-    if _checks.known(a):
+    if _checks.is_known(a):
         return _require_symmetric(a, name)
     return jnp.where(_asymmetry(a)[1], jnp.nan, a)
 
@@ -89,31 +96,33 @@ def check_body(
     mass: Array | None,
     throw: bool,
     *,
-    thin: bool = False,
+    allow_thin: bool = False,
 ) -> Any:
-    """Return `body` if some mass has these numbers and, unless `thin`, no moment is zero.
+    """Return `body` if some mass has these numbers and, unless `allow_thin`, no moment is zero.
 
     `mass` may be `None`. Other numbers are refused if they are known, or if `throw` is true; else
     the traced body becomes NaN.
     """
-    tensor = _checks.numbers(tensor, "inertia tensor")
-    is_known = _checks.known((tensor, mass))
-    if not is_known and _checks.known(plain := lax.stop_gradient((tensor, mass))):
+    tensor = _checks.numeric_array(tensor, "inertia tensor")
+    is_known = _checks.is_known((tensor, mass))
+    if not is_known and _checks.is_known(plain := lax.stop_gradient((tensor, mass))):
         # The numbers are known and only differentiated: one check by NumPy instead of thirty
         # programs.
-        faults = _faults(np, plain[0], thin)
+        faults = _faults(np, plain[0], allow_thin)
         if not any(f.any() for f in faults) and (mass is None or (np.asarray(plain[1]) > 0).all()):
             return body
     xp = np if is_known else jnp
-    light = xp.asarray(False) if mass is None else ~(_values(mass) > 0)
-    flat, broken, skew = _faults(xp, tensor if is_known else lax.stop_gradient(tensor), thin)
+    light = xp.asarray(False) if mass is None else ~(_without_derivatives(mass) > 0)
+    flat, broken, skew = _faults(xp, tensor if is_known else lax.stop_gradient(tensor), allow_thin)
     bad = light | flat | broken | skew
     if is_known:
         if bad.any():
             if mass is not None:
-                real_mass(mass)
-            real_inertia(tensor)
-            _checks.refuse(body, True, f"{_FLAT} {_show(_eigenvalues(tensor))} kg m²{_THIN}")
+                require_real_mass(mass)
+            require_real_inertia(tensor)
+            _checks.error_if(
+                body, True, f"{_FLAT} {_moments_as_text(_eigenvalues(tensor))} kg m²{_THIN}"
+            )
         return body
     if not throw:
         nan = lambda a: jnp.where(bad.reshape(bad.shape + (1,) * (a.ndim - bad.ndim)), jnp.nan, a)  # noqa: E731
@@ -123,16 +132,16 @@ def check_body(
     return eqx.branched_error_if(body, bad.any(), jnp.where(light.any(), 0, which), words)
 
 
-def first_impossible(tensors: Float[Array, "n 3 3"]) -> Any:
+def first_impossible_row(tensors: Float[Array, "n 3 3"]) -> Any:
     """Return the index of the first of these known tensors that no body has, −1 if all are real.
 
     A tensor with a NaN is skipped: in a batch of bodies it gets a status of its own.
     """
-    return _checks.first_bad(_impossible, tensors)
+    return _checks.first_bad_row(_are_impossible, tensors)
 
 
-def _impossible(xp: ModuleType, tensors: Array | np.ndarray) -> Any:
-    flat, broken, skew = _faults(xp, tensors, thin=False)
+def _are_impossible(xp: ModuleType, tensors: Array | np.ndarray) -> Any:
+    flat, broken, skew = _faults(xp, tensors, allow_thin=False)
     return (flat | broken | skew) & ~xp.isnan(xp.asarray(tensors)).any(axis=(-1, -2))
 
 
@@ -151,14 +160,13 @@ _THIN = (
 )
 
 
-def _faults(xp: ModuleType, tensor: Array | np.ndarray, thin: bool) -> tuple[Any, Any, Any]:
-    """Return three answers: is a moment zero or NaN (never if `thin`), has no mass these moments,
-    is I ≠ Iᵀ.
+def _faults(xp: ModuleType, tensor: Array | np.ndarray, allow_thin: bool) -> tuple[Any, Any, Any]:
+    """Return three answers: is a moment zero or NaN, has no mass these moments, is I ≠ Iᵀ.
 
-    Whether a mass has these moments is judged by the minors of its second moment 𝔖, in units of the
-    trace.
+    The first is never true if `allow_thin`. Whether a mass has these moments is judged by the
+    minors of its second moment 𝔖, in units of the trace.
     """
-    slack = _slack(tensor)
+    slack = _round_off_bound(tensor)
     # The nine entries are split by one operation: NumPy needs a tenth of the time of nine slices.
     nine = xp.moveaxis(xp.asarray(tensor).reshape(*tensor.shape[:-2], 9), -1, 0)
     xx, xy, xz, yx, yy, yz, zx, zy, zz = np.ascontiguousarray(nine) if xp is np else nine
@@ -180,7 +188,7 @@ def _faults(xp: ModuleType, tensor: Array | np.ndarray, thin: bool) -> tuple[Any
     for minor in (sx, sy, sz, *minors, whole):
         # If an entry is NaN the others are not scaled, so that their minors mean nothing.
         broken = broken | (some & (minor < -slack))
-    if thin:
+    if allow_thin:
         return broken & False, broken, skew
     # The product of the two larger moments is 1/9 to 1/4 of the squared trace.
     determinant = xx * (yy * zz - squares[2]) - yy * squares[1] - zz * squares[0] + product
@@ -189,33 +197,34 @@ def _faults(xp: ModuleType, tensor: Array | np.ndarray, thin: bool) -> tuple[Any
 
 def is_real(tensor: Float[Array, "*batch 3 3"]) -> Bool[Array, "*batch"]:
     """Return whether some mass has this inertia tensor, kg m², with no moment of zero."""
-    flat, broken, skew = _faults(jnp, lax.stop_gradient(tensor), thin=False)
+    flat, broken, skew = _faults(jnp, lax.stop_gradient(tensor), allow_thin=False)
     return ~(flat | broken | skew)
 
 
-def unit_quaternion(q: Quaternion) -> Quat:
+def attitude_quaternion(q: Quaternion) -> Quat:
     """Return a unit quaternion (w, x, y, z), normalised if it is off by round-off; refuse any
     other.
     """
-    q = _checks.finite_floating(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
-    return quaternion.normalise(near_unit(q, "q", tolerance(q.dtype)))
+    q = _checks.finite_array(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
+    return quaternion.normalise(require_near_unit(q, "q", tolerance(q.dtype)))
 
 
 def _moments_of_a_body(value, moments):
     m1, m2, m3 = moments[..., 0], moments[..., 1], moments[..., 2]
-    found = f" {_show(moments)} kg m²" if _checks.known(value) else ""
-    slack = _slack(value) * abs(m3)
-    value = _checks.refuse(
+    moments_text = f" {_moments_as_text(moments)} kg m²" if _checks.is_known(value) else ""
+    slack = _round_off_bound(value) * abs(m3)
+    value = _checks.error_if(
         value,
         (m1 < -slack).any() | (m3 < 0).any(),
-        f"inertia: wanted moments that are not negative, got{found or ' a negative one'}; "
+        f"inertia: wanted moments that are not negative, got{moments_text or ' a negative one'}; "
         "possible causes: an inside-out mesh, or a product of inertia with the wrong sign",
     )
-    short = f" ({float(np.max(m3 - m1 - m2)):.3g} too large)" if _checks.known(value) else ""
-    return _checks.refuse(
+    short = f" ({float(np.max(m3 - m1 - m2)):.3g} too large)" if _checks.is_known(value) else ""
+    return _checks.error_if(
         value,
         (m3 - m1 - m2 > slack).any(),
-        f"inertia: the moments{found} break the triangle inequality I1 + I2 ≥ I3: the largest may "
+        f"inertia: the moments{moments_text} break the triangle inequality I1 + I2 ≥ I3: the "
+        "largest may "
         f"not exceed the sum of the other two{short}; no distribution of mass has such moments. "
         "Is this a second moment 𝔖? then use from_second_moment",
     )
@@ -223,40 +232,46 @@ def _moments_of_a_body(value, moments):
 
 def _asymmetry(a):
     """Return the largest difference A − Aᵀ, and whether it exceeds round-off."""
-    difference = abs(_values(a) - _values(a).swapaxes(-1, -2)).max(axis=(-1, -2))
-    return difference, (difference > _slack(a) * abs(_values(a)).max(axis=(-1, -2))).any()
+    difference = abs(_without_derivatives(a) - _without_derivatives(a).swapaxes(-1, -2)).max(
+        axis=(-1, -2)
+    )
+    return difference, (
+        difference > _round_off_bound(a) * abs(_without_derivatives(a)).max(axis=(-1, -2))
+    ).any()
 
 
 def _require_symmetric(a, name):
     difference, bad = _asymmetry(a)
-    found = f" (largest difference {float(difference.max()):.3g})" if _checks.known(a) else ""
-    return _checks.refuse(
+    difference_text = (
+        f" (largest difference {float(difference.max()):.3g})" if _checks.is_known(a) else ""
+    )
+    return _checks.error_if(
         a,
         bad,
-        f"{name}{_SKEW}{found}{_CAUSE}",
+        f"{name}{_SKEW}{difference_text}{_CAUSE}",
     )
 
 
-def _values(a):
+def _without_derivatives(a):
     """Return the numbers without derivatives, by NumPy if they are known: a check then costs
     microseconds.
     """
-    return np.asarray(a) if _checks.known(a) else lax.stop_gradient(a)
+    return np.asarray(a) if _checks.is_known(a) else lax.stop_gradient(a)
 
 
 def _eigenvalues(a):
-    if _checks.known(a):
+    if _checks.is_known(a):
         return np.linalg.eigvalsh(np.asarray(a))
     scale = jnp.abs(a).max(axis=(-1, -2), keepdims=True)
     scale = lax.stop_gradient(jnp.where(scale > 0, scale, 1))
     return jnp.linalg.eigvalsh(lax.stop_gradient(a) / scale) * scale[..., 0]
 
 
-def _slack(a) -> float:
+def _round_off_bound(a) -> float:
     return float(_FORGIVEN * jnp.finfo(a.dtype).eps)
 
 
-def _show(moments) -> str:
+def _moments_as_text(moments) -> str:
     return "; ".join(
         "(" + ", ".join(f"{float(x):.6g}" for x in row) + ")"
         for row in np.asarray(moments).reshape(-1, 3)[:3]

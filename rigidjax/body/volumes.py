@@ -16,7 +16,7 @@ def box(size: Vector) -> Scalar:
     >>> box([1.0, 2.0, 3.0])
     Array(6., dtype=float64)
     """
-    a = _checks.floating(size, (3,), "size")
+    a = _checks.array_of_shape(size, (3,), "size")
     return a[0] * a[1] * a[2]
 
 
@@ -26,7 +26,7 @@ def ellipsoid(semi_axes: Vector) -> Scalar:
     >>> round(float(ellipsoid([1.0, 1.0, 0.75])), 12)
     3.14159265359
     """
-    return (4.0 * jnp.pi / 3.0) * box(_checks.floating(semi_axes, (3,), "semi_axes"))
+    return (4.0 * jnp.pi / 3.0) * box(_checks.array_of_shape(semi_axes, (3,), "semi_axes"))
 
 
 def sphere(radius: ScalarLike) -> Scalar:
@@ -35,7 +35,7 @@ def sphere(radius: ScalarLike) -> Scalar:
     >>> round(float(sphere(1.0)), 12)
     4.188790204786
     """
-    return (4.0 * jnp.pi / 3.0) * _checks.floating(radius, (), "radius") ** 3
+    return (4.0 * jnp.pi / 3.0) * _checks.array_of_shape(radius, (), "radius") ** 3
 
 
 def hollow_sphere(inner: ScalarLike, outer: ScalarLike) -> Scalar:
@@ -45,7 +45,7 @@ def hollow_sphere(inner: ScalarLike, outer: ScalarLike) -> Scalar:
     >>> round(float(hollow_sphere(0.0, 1.0)), 12)
     4.188790204786
     """
-    r, R = _checks.floating(inner, (), "inner"), _checks.floating(outer, (), "outer")
+    r, R = _checks.array_of_shape(inner, (), "inner"), _checks.array_of_shape(outer, (), "outer")
     return (4.0 * jnp.pi / 3.0) * (R - r) * (R * R + R * r + r * r)
 
 
@@ -55,7 +55,10 @@ def cylinder(radius: ScalarLike, height: ScalarLike) -> Scalar:
     >>> round(float(cylinder(1.0, 1.0)), 12)
     3.14159265359
     """
-    r, h = _checks.floating(radius, (), "radius"), _checks.floating(height, (), "height")
+    r, h = (
+        _checks.array_of_shape(radius, (), "radius"),
+        _checks.array_of_shape(height, (), "height"),
+    )
     return jnp.pi * r * r * h
 
 
@@ -66,8 +69,8 @@ def hollow_cylinder(inner: ScalarLike, outer: ScalarLike, height: ScalarLike) ->
     >>> round(float(hollow_cylinder(0.0, 1.0, 1.0)), 12)
     3.14159265359
     """
-    r, R = _checks.floating(inner, (), "inner"), _checks.floating(outer, (), "outer")
-    return jnp.pi * (R - r) * (R + r) * _checks.floating(height, (), "height")
+    r, R = _checks.array_of_shape(inner, (), "inner"), _checks.array_of_shape(outer, (), "outer")
+    return jnp.pi * (R - r) * (R + r) * _checks.array_of_shape(height, (), "height")
 
 
 def capsule(radius: ScalarLike, length: ScalarLike) -> Scalar:
@@ -77,7 +80,7 @@ def capsule(radius: ScalarLike, length: ScalarLike) -> Scalar:
     >>> round(float(capsule(1.0, 0.0)), 12)
     4.188790204786
     """
-    return sphere(radius) + cylinder(radius, _checks.floating(length, (), "length"))
+    return sphere(radius) + cylinder(radius, _checks.array_of_shape(length, (), "length"))
 
 
 def cone(radius: ScalarLike, height: ScalarLike) -> Scalar:
@@ -95,7 +98,7 @@ def torus(major: ScalarLike, minor: ScalarLike) -> Scalar:
     >>> round(float(torus(0.5, 1.0)), 12)
     9.869604401089
     """
-    R, r = _checks.floating(major, (), "major"), _checks.floating(minor, (), "minor")
+    R, r = _checks.array_of_shape(major, (), "major"), _checks.array_of_shape(minor, (), "minor")
     return 2.0 * jnp.pi**2 * R * r * r
 
 

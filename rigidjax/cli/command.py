@@ -56,9 +56,9 @@ def main(arguments: list[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")  # pyright: ignore
         sys.unraisablehook = _raise_interrupt_again
     try:
-        return _run(options, parser, own=arguments is None)
+        return _run(options, parser, owns_process=arguments is None)
     except KeyboardInterrupt:
-        _error("interrupted (Ctrl-C); nothing more is written")
+        _print_error("interrupted (Ctrl-C); nothing more is written")
         return 130
 
 
@@ -74,10 +74,13 @@ def _raise_interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(dropped)
 
 
-def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, own: bool) -> int:
-    """Run the command of the options and return its exit code; `own` if the process is its own."""
+def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, owns_process: bool) -> int:
+    """Run the command of the options and return its exit code.
+
+    `owns_process` says whether the process is its own.
+    """
     if options.command == "workprecision":
-        return workprecision.run(options)
+        return workprecision.run_subcommand(options)
     if options.demo:
         plain = vars(parser.parse_args(["identify", "--demo"]))
         changed = [name for name, value in vars(options).items() if value != plain[name]]
@@ -85,11 +88,11 @@ def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, own: bool
         if unused:
             names = ", ".join("--" + name.replace("_", "-") for name in unused)
             parser.error(f"identify --demo: {names} is for log FILES only")
-    if own and options.no_cache:
+    if owns_process and options.no_cache:
         jax.config.update("jax_enable_compilation_cache", False)
-    elif own:
+    elif owns_process:
         _keep_compiled_programs()
-    return _demo(options) if options.demo else _logs(options)
+    return _run_demo(options) if options.demo else _run_logs(options)
 
 
 def _check_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
@@ -138,7 +141,7 @@ def _keep_compiled_programs() -> None:
         if hasattr(os, "getuid"):
             if held.st_uid != os.getuid() or held.st_mode & 0o022:
                 words = "is not yours alone: it is not used, and starts are slower; delete it"
-                print(_checks.printable(f"{folder} {words}"), file=sys.stderr)
+                print(_checks.escape_controls(f"{folder} {words}"), file=sys.stderr)
                 return
             folder.chmod(0o700)
     except (OSError, RuntimeError):
@@ -164,7 +167,7 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the message, made printable, and end the program with exit code 2."""
-        super().error(_checks.printable(message))
+        super().error(_checks.escape_controls(message))
 
 
 _FLAG: dict[str, Any] = {"action": "store_true"}
@@ -250,11 +253,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     for name, how in OPTIONS.items():
         identify.add_argument(name, **how)
-    workprecision.add(commands)
+    workprecision.add_subcommand(commands)
     return parser
 
 
-def _demo(options: argparse.Namespace) -> int:
+def _run_demo(options: argparse.Namespace) -> int:
     """Run the demo, the fit of asteroid Toutatis; return the exit code."""
     from rigidjax.datasets import toutatis
 
@@ -274,7 +277,7 @@ def _demo(options: argparse.Namespace) -> int:
     return _write(fit, options, title, [toutatis.CITATION], [title], units, more)
 
 
-def _channels(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Channel]:
+def _channels_of_options(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Channel]:
     """Return the sensors that the options describe; `rates` are the names of the rate columns."""
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
@@ -283,8 +286,8 @@ def _channels(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Ch
                 f"--{alone[0]}: not together with --sensor, which holds it itself, as in "
                 "--sensor gyro=wx,wy,wz:deg/s:0.1"
             )
-        return [spec.channel(text) for text in options.sensor]
-    noise = None if options.noise is None else spec.noises(options.noise, "--noise")
+        return [spec.parse_channel(text) for text in options.sensor]
+    noise = None if options.noise is None else spec.broadcast_noise(options.noise, "--noise")
     if options.limit is not None and not options.limit > 0:
         raise LogError(f"--limit: wanted a positive number, got {options.limit}")
     return [spec.Channel("gyro", tuple(rates), options.unit, noise, options.limit)]
@@ -296,7 +299,7 @@ def _read_logs(
     """Return the sensors, the recordings, and the model that the options describe."""
     if options.columns and options.time:
         raise LogError("--time: not together with --columns, whose first name is the time column")
-    wheels = [spec.wheel(text) for text in options.wheel]
+    wheels = [spec.parse_wheel(text) for text in options.wheel]
     if options.model in ("tensor", "principal") and not wheels:
         words = "free motion shows ratios only; a scale needs a --wheel"
         raise LogError(f"--model {options.model}: {words}")
@@ -310,7 +313,7 @@ def _read_logs(
         time_unit = spec.unit_of_time(path, time, options.time_unit)
         channels = [
             dataclasses.replace(one, unit=spec.unit_of_channel(path, one))
-            for one in _channels(options, rates)
+            for one in _channels_of_options(options, rates)
         ]
         _say_units(path, time, time_unit, channels)
         how |= dict(time=time, time_unit=time_unit, flight=options.flight)
@@ -335,27 +338,29 @@ def _log_warnings(strict: bool) -> Iterator[None]:
         warnings.simplefilter("error" if strict else "always", LogWarning)
         usual = warnings.showwarning
 
-        def show(message: Warning | str, category: type[Warning], *where: Any, **how: Any) -> None:
+        def show(
+            message: Warning | str, category: type[Warning], *_place: Any, **_options: Any
+        ) -> None:
             if issubclass(category, LogWarning):
                 _print_line(str(message))
             else:
-                usual(message, category, *where, **how)
+                usual(message, category, *_place, **_options)
 
         warnings.showwarning = show
         yield
 
 
-def _logs(options: argparse.Namespace) -> int:
+def _run_logs(options: argparse.Namespace) -> int:
     """Fit the logs that the options name, and print the report; return the exit code."""
     try:
         with _log_warnings(options.strict):
             channels, records, model = _read_logs(options)
     except ValueError as error:
-        return _error(error)
+        return _print_error(error)
     except LogWarning as warning:
-        return _error(f"{warning} (--strict)")
+        return _print_error(f"{warning} (--strict)")
     for path, record in zip(options.logs, records, strict=True):
-        gaps = sum(int((~reading.seen).sum()) for reading in record.readings) + record.dropped
+        gaps = sum(int((~reading.host_mask).sum()) for reading in record.readings) + record.dropped
         words = f", {gaps} gap{'s' if gaps > 1 else ''}" if gaps else ""
         count, span = record.t.shape[0] + record.dropped, record.t[-1] - record.t[0]
         _print_line(f"{path}: {count} samples over {span:.4g} s{words}")
@@ -373,7 +378,7 @@ def _logs(options: argparse.Namespace) -> int:
         print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
     print()
     print(rj.identify.report.verdict(fit))
-    names = [_checks.printable(Path(path).name) for path in options.logs]
+    names = [_checks.escape_controls(Path(path).name) for path in options.logs]
     title = f"Identification of {', '.join(names[:3])}{' …' if names[3:] else ''}"
     return _write(fit, options, title, names, names, {"rate_unit": rate_unit})
 
@@ -393,7 +398,7 @@ def _fit(
             checkpoint=options.checkpoint,
         )
     except (OSError, ValueError) as error:
-        _error(error)
+        _print_error(error)
         return None
 
 
@@ -401,17 +406,17 @@ def _write(
     fit: rj.identify.Fit,
     options: argparse.Namespace,
     title: str,
-    read: list[str],
+    files_read: list[str],
     names: list[str],
     units: dict[str, str],
-    more: Sequence[tuple[str, float, float, float, str]] = (),
+    more_rows: Sequence[tuple[str, float, float, float, str]] = (),
 ) -> int:
     """Write the outputs that the options ask for, and return the exit code.
 
     An output that fails is reported, and the others are still written.
 
-    **Arguments:** `fit`; `options`; `title` of the report; `read` the files that were read; `names`
-    of the recordings; `units` of rates and times; `more` rows of further quantities.
+    **Arguments:** `fit`; `options`; `title` of the report; `files_read` the files that were read;
+    `names` of the recordings; `units` of rates and times; `more_rows` rows of further quantities.
     """
     report, figure = rj.identify.report, options.figure
     if options.demo and figure is None and _matplotlib():
@@ -419,13 +424,18 @@ def _write(
 
     def page() -> None:
         figures = _figures(fit, names, units) if figure is not None or _matplotlib() else []
-        page: dict[str, Any] = {"title": title, "figures": figures, "files": read, "more": more}
+        page: dict[str, Any] = {
+            "title": title,
+            "figures": figures,
+            "files": files_read,
+            "more": more_rows,
+        }
         report.write_html(fit, options.report, rate_unit=units["rate_unit"], **page)
 
     def picture() -> None:
         rj.plot.fit(fit, index=0, title=names[0], **units).savefig(figure, dpi=130)
 
-    numbers = functools.partial(report.write_json, fit, options.json, read, more)
+    numbers = functools.partial(report.write_json, fit, options.json, files_read, more_rows)
     wanted = (
         ("figure", figure, picture), ("numbers", options.json, numbers),
         ("report", options.report, page),
@@ -438,10 +448,10 @@ def _write(
                 _print_line(f"{what}: {path}")
         except Exception as error:
             # A fit of an hour must not be lost to one output.
-            _error(f"no {what}: {path}: {type(error).__name__}: {error}")
+            _print_error(f"no {what}: {path}: {type(error).__name__}: {error}")
             all_written = False
     if "interrupted" in fit.status:
-        _error("interrupted (Ctrl-C): not all starts were made, see the status")
+        _print_error("interrupted (Ctrl-C): not all starts were made, see the status")
         return 130
     return 2 if not all_written else 0 if fit.ok else 1
 
@@ -457,7 +467,7 @@ def _figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str]) -> l
             drawn = make()
             figures.append(drawn.flat[0].figure if isinstance(drawn, np.ndarray) else drawn)
         except Exception as error:
-            _error(f"a figure is left out: {type(error).__name__}: {error}")
+            _print_error(f"a figure is left out: {type(error).__name__}: {error}")
     return figures
 
 
@@ -475,14 +485,14 @@ def _matplotlib() -> bool:
 def _print_line(line: str) -> None:
     """Print a line, made printable."""
     try:
-        print(_checks.printable(line), flush=True)
+        print(_checks.escape_controls(line), flush=True)
     except OSError:
         # The reader has stopped, as `head` does, or a disk is full. Go on without output: the files
         # are still to be written.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _error(what: object) -> int:
-    """Print the error `what` in one line, and return the exit code 2."""
-    print(f"error: {_checks.printable(what)}", file=sys.stderr)
+def _print_error(message: object) -> int:
+    """Print the error `message` in one line, and return the exit code 2."""
+    print(f"error: {_checks.escape_controls(message)}", file=sys.stderr)
     return 2

@@ -14,7 +14,7 @@ import numpy as np
 from rigidjax.cli.logs.errors import LogError
 from rigidjax.cli.logs.layouts import usual_unit
 from rigidjax.cli.logs.table import read_table
-from rigidjax.cli.logs.times import kept_rows, mask_of_increasing, remark_on_step
+from rigidjax.cli.logs.times import mask_of_increasing, remark_on_step, rows_to_use
 from rigidjax.cli.logs.units import TIME_UNITS, UNITS, unit_of
 from rigidjax.identify.data.recording import Recording
 from rigidjax.identify.model import charts
@@ -73,7 +73,7 @@ class WheelColumn(eqx.Module):
     axis: tuple[float, float, float]
 
 
-def channel(text: str) -> Channel:
+def parse_channel(text: str) -> Channel:
     """Return the sensor that is written `KIND=COLUMNS[:UNIT[:NOISE]]`.
 
     An example is `gyro=wx,wy,wz:deg/s:0.1`. KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y,
@@ -101,7 +101,7 @@ def channel(text: str) -> Channel:
         noise = tuple(float(part) for part in more[1].split(","))
     except ValueError:
         raise LogError(f"sensor {text!r}: wanted a number for the noise, got {more[1]!r}") from None
-    return Channel(kind, columns, unit, noises(noise, f"sensor {text!r}"))
+    return Channel(kind, columns, unit, broadcast_noise(noise, f"sensor {text!r}"))
 
 
 def _units_of_kind(kind: str) -> tuple[str, ...]:
@@ -110,19 +110,19 @@ def _units_of_kind(kind: str) -> tuple[str, ...]:
     return () if kind == "euler" else SENSOR_UNITS.get(key, ())
 
 
-def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
+def broadcast_noise(noise: Sequence[float], place: str) -> tuple[float, ...]:
     """Return the noise of three axes, from one positive number or three.
 
-    Raise `LogError` for others; the message begins with `where`.
+    Raise `LogError` for others; the message begins with `place`.
     """
     if len(noise) not in (1, 3):
-        raise LogError(f"{where}: wanted one noise or three, got {len(noise)}")
+        raise LogError(f"{place}: wanted one noise or three, got {len(noise)}")
     if not all(0 < part < np.inf for part in noise):
-        raise LogError(f"{where}: wanted a positive noise, got {min(noise):g}")
+        raise LogError(f"{place}: wanted a positive noise, got {min(noise):g}")
     return tuple(noise) if len(noise) == 3 else 3 * tuple(noise)
 
 
-def wheel(text: str) -> WheelColumn:
+def parse_wheel(text: str) -> WheelColumn:
     """Return the wheel that is written `COLUMN:INERTIA[:AXIS[:UNIT]]`.
 
     An example is `flywheel:5.2e-7:z:rad/s`. INERTIA is in kg m² about its axis, AXIS `x`, `y` or
@@ -179,7 +179,7 @@ def read_log(
     table = read_table(path, names, flight=flight)
     # Count from the first stamp: seconds since 1970, or nanoseconds, leave few digits for a step.
     t = (table[time] - _first_time(table[time])) * UNITS[unit]
-    kept = kept_rows(path, t, time, window)
+    kept = rows_to_use(path, t, time, window)
     # A slice makes no copy of a large log.
     kept = slice(None) if kept.size == t.size else kept
     readings, rate = [], 0.0
@@ -190,10 +190,10 @@ def read_log(
         mask = np.isfinite(values).all(axis=1)
         if one.kind == "gyro":
             rate = _typical_rate(path, one, values[kept][mask[kept]])
-        sensor, values = _sensor(one, values, factor, "bias" in free)
+        sensor, values = _sensor_and_readings(one, values, factor, "bias" in free)
         readings.append((sensor, values[kept], mask[kept]))
     remark_on_step(path, t[kept], unit, rate)
-    inputs = _speeds(path, t, table, wheels)
+    inputs = _logged_speeds(path, t, table, wheels)
     # Free the memory of a large log before the recording copies its columns.
     del table
     try:
@@ -208,22 +208,22 @@ def _first_time(t: np.ndarray) -> float:
     return float(t[np.argmax(finite)]) if finite.any() else 0.0
 
 
-def unit_of_channel(path: str | Path, one: Channel) -> str:
+def unit_of_channel(path: str | Path, channel: Channel) -> str:
     """Return the unit of a channel: its own, that in the names of its columns, or the usual one."""
-    allowed = _units_of_kind(one.kind)
-    usual = usual_unit(path, one.columns[0]) or allowed[0]
-    return unit_of(one.columns, one.unit, usual, allowed, str(path))
+    allowed = _units_of_kind(channel.kind)
+    usual = usual_unit(path, channel.columns[0]) or allowed[0]
+    return unit_of(channel.columns, channel.unit, usual, allowed, str(path))
 
 
-def unit_of_time(path: str | Path, column: str, stated: str | None) -> str:
-    """Return the unit of times: the `stated` one, that in the column's name, or the usual one."""
+def unit_of_time(path: str | Path, column: str, stated_unit: str | None) -> str:
+    """Return the unit of times: the `stated_unit`, that in the column's name, or the usual one."""
     usual = usual_unit(path, column) or "s"
-    return unit_of([column], stated, usual, TIME_UNITS, str(path))
+    return unit_of([column], stated_unit, usual, TIME_UNITS, str(path))
 
 
-def _typical_rate(path: str | Path, one: Channel, rates: np.ndarray) -> float:
+def _typical_rate(path: str | Path, channel: Channel, rates: np.ndarray) -> float:
     """Return the median length of rates (n, 3), rad/s; raise `LogError` if all are zero."""
-    names = ", ".join(one.columns)
+    names = ", ".join(channel.columns)
     if not rates.size:
         raise LogError(f"{path}: no row has a rate in each of the columns {names}")
     if not rates.any():
@@ -235,8 +235,8 @@ def _typical_rate(path: str | Path, one: Channel, rates: np.ndarray) -> float:
     return float(np.median(np.linalg.norm(rates, axis=1)))
 
 
-def _sensor(
-    one: Channel, values: np.ndarray, factor: float, bias: bool
+def _sensor_and_readings(
+    channel: Channel, values: np.ndarray, factor: float, bias: bool
 ) -> tuple[AbstractSensor, np.ndarray]:
     """Return the sensor of a channel, and its readings.
 
@@ -244,19 +244,21 @@ def _sensor(
     sensor gets one.
     """
     zero = [0.0, 0.0, 0.0] if bias else None
-    noise = None if one.noise is None else factor * np.array(one.noise)
-    limit = None if one.limit is None else one.limit * factor
-    if one.kind == "gyro":
+    noise = None if channel.noise is None else factor * np.array(channel.noise)
+    limit = None if channel.limit is None else channel.limit * factor
+    if channel.kind == "gyro":
         return Gyro(noise, bias=zero, limit=limit), values
-    if one.kind == "accelerometer":
+    if channel.kind == "accelerometer":
         return Accelerometer(noise, place=[0.0, 0.0, 0.0], bias=zero, limit=limit), values
-    if one.kind == "quaternion":
+    if channel.kind == "quaternion":
         return AttitudeSensor(noise), values
     try:
-        turned = functools.partial(euler.to_quaternion, sequence=one.kind.removeprefix("euler-"))
+        turned = functools.partial(
+            euler.to_quaternion, sequence=channel.kind.removeprefix("euler-")
+        )
         return AttitudeSensor(noise), np.asarray(jax.vmap(turned)(jnp.asarray(values)))
     except ValueError as error:
-        raise LogError(f"sensor {one.kind}: {error}") from None
+        raise LogError(f"sensor {channel.kind}: {error}") from None
 
 
 def input_names(wheels: Sequence[WheelColumn]) -> list[str]:
@@ -282,7 +284,7 @@ def _evenly_spaced(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
     return t[0] + step * places, np.interp(places, np.round(place), values)
 
 
-def _speeds(
+def _logged_speeds(
     path: str | Path, t: np.ndarray, table: dict[str, np.ndarray], wheels: Sequence[WheelColumn]
 ) -> dict[str, Series]:
     """Return the logged speed of each wheel by the name of its input, rad/s."""
@@ -299,7 +301,7 @@ def _speeds(
     return speeds
 
 
-def _torque(wheels: Sequence[WheelColumn], free: Sequence[str]) -> Torque | None:
+def _torque_of_wheels(wheels: Sequence[WheelColumn], free: Sequence[str]) -> Torque | None:
     """Return the torque of the wheels and, if `free` holds "drag", of a linear drag.
 
     Return `None` without either.
@@ -341,20 +343,20 @@ def model_of(
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {chart!r}")
     if loss not in LOSSES:
         raise LogError(f"loss: wanted one of {', '.join(LOSSES)}, got {loss!r}")
-    moving = _free(recordings[0].sensors, input_names(wheels), typical, free)
+    moving = _free_numbers(recordings[0].sensors, input_names(wheels), typical, free)
     return Model(
         list(recordings),
         MODELS[chart](typical),
-        torque=_torque(wheels, free),
+        torque=_torque_of_wheels(wheels, free),
         free=moving,
         loss=LOSSES[loss],
     )
 
 
-def _free(
+def _free_numbers(
     sensors: Sequence[AbstractSensor], wheels: Sequence[str], typical: float, free: Sequence[str]
 ) -> list[Free]:
-    """Return the `Free`s of the sensors and of the torque of `_torque`.
+    """Return the `Free`s of the sensors and of the torque of `_torque_of_wheels`.
 
     `wheels` are the names of the inputs of the wheels.
     """

@@ -62,12 +62,12 @@ class Moon(eqx.Module):
     first: float = eqx.field(static=True)
 
     def __init__(self, first: float, last: float):
-        found = find_spec("de421")
-        if found is None or found.origin is None:
+        spec = find_spec("de421")
+        if spec is None or spec.origin is None:
             raise ModuleNotFoundError(
                 "datasets.moon reads the package de421: pip install 'rigidjax[moon]'", name="de421"
             )
-        days = [(_checks.number(year, "year") - 2000) * 365.25 + 2451545.0 - _FIRST
+        days = [(_checks.known_float(year, "year") - 2000) * 365.25 + 2451545.0 - _FIRST
                 for year in (first, last)]  # fmt: skip
         low, high = int((days[0] - 10) // _BLOCK), int((days[1] + 10) // _BLOCK) + 1
         if not (days[0] < days[1] and 10 <= days[0] and high <= _BLOCKS):
@@ -75,11 +75,13 @@ class Moon(eqx.Module):
 
         def table(name: str, step: int) -> np.ndarray:
             """Return coefficients on intervals of `step` days."""
-            rows = np.load(Path(found.origin or "").parent / f"jpl-{name}.npy", mmap_mode="r")
+            rows = np.load(Path(spec.origin or "").parent / f"jpl-{name}.npy", mmap_mode="r")
             a_block = len(rows) // _BLOCKS
-            return _subdivide(rows[low * a_block : high * a_block], _BLOCK // a_block // step)
+            return _subdivide_polynomials(
+                rows[low * a_block : high * a_block], _BLOCK // a_block // step
+            )
 
-        numbers = np.load(Path(found.origin).parent / "constants.npy")
+        numbers = np.load(Path(spec.origin).parent / "constants.npy")
         self.constants = {name.decode(): float(value) for name, value in numbers}
         # The ephemeris has the Earth–Moon barycentre, and the Moon as seen from the Earth.
         share = self.constants["EMRAT"] / (1 + self.constants["EMRAT"])
@@ -267,11 +269,11 @@ def _integrate_core(
 ) -> Float[Array, "3"]:
     steps = dfx.PIDController(rtol=1e-12, atol=1e-12 * jnp.max(jnp.abs(own)))
     first = jnp.sign(ends[1] - ends[0]) * jnp.minimum(DAY, jnp.abs(ends[1] - ends[0]))
-    found = dfx.diffeqsolve(
+    solution = dfx.diffeqsolve(
         dfx.ODETerm(field), dfx.Dopri8(), ends[0], ends[1], first, own,
         stepsize_controller=steps, max_steps=1_000_000,
     )  # fmt: skip
-    return found.ys[0]  # pyright: ignore[reportOptionalSubscript]
+    return solution.ys[0]  # pyright: ignore[reportOptionalSubscript]
 
 
 def _add_to_z(table: Chebyshev, z: float) -> Chebyshev:
@@ -280,7 +282,7 @@ def _add_to_z(table: Chebyshev, z: float) -> Chebyshev:
     return eqx.tree_at(lambda t: t.coefficients, table, moved)
 
 
-def _subdivide(rows: np.ndarray, parts: int) -> np.ndarray:
+def _subdivide_polynomials(rows: np.ndarray, parts: int) -> np.ndarray:
     """Return polynomials (intervals, k, terms) on intervals shortened by `parts`, equal to those
     given.
     """

@@ -110,21 +110,21 @@ def rows(fit: Fit) -> list[Row]:
     degrees of ecliptic longitude and latitude (J2000), with 95 % intervals.
     """
 
-    def ranges(
-        of: Callable[[Any, Any], Array],
+    def rows_of_quantities(
+        quantities: Callable[[Any, Any], Array],
         names: tuple[str, str],
         shown: Callable[[np.ndarray], np.ndarray],
     ) -> Any:
-        bounds = fit.interval_of(lambda point: of(point.body, point.state0))
+        bounds = fit.interval_of(lambda point: quantities(point.body, point.state0))
         # A number that the data do not determine has an interval that ends at infinity.
         with np.errstate(over="ignore"):
-            numbers = [shown(np.asarray(v)) for v in (of(fit.body, fit.state0), *bounds)]
+            numbers = [shown(np.asarray(v)) for v in (quantities(fit.body, fit.state0), *bounds)]
         return zip(names, *numbers, strict=True)
 
     names = ("rotation about the long axis", "precession of the long axis")
-    out: list[Row] = [(*row, "day") for row in ranges(_periods, names, np.exp)]
+    out: list[Row] = [(*row, "day") for row in rows_of_quantities(_periods, names, np.exp)]
     names = ("angular momentum, longitude", "angular momentum, latitude")
-    for name, *numbers in ranges(_direction, names, np.degrees):
+    for name, *numbers in rows_of_quantities(_direction, names, np.degrees):
         turn = 360.0 if "longitude" in name and numbers[0] < 0 else 0.0
         out.append((name, *(number + turn for number in numbers), "deg, ecliptic J2000"))
     return out

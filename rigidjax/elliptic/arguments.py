@@ -15,10 +15,10 @@ Real = Float[ArrayLike, "..."]
 Result = Float[Array, "..."]
 
 
-def common(**named: Real) -> tuple[Result, ...]:
+def to_common_dtype(**named: Real) -> tuple[Result, ...]:
     """Convert the arguments to arrays of one dtype and shape; Python numbers take the dtype."""
     arrays = {
-        name: _checks.floating(value, (), name, batched=True) for name, value in named.items()
+        name: _checks.array_of_shape(value, (), name, batched=True) for name, value in named.items()
     }
     dtype = jnp.result_type(*arrays.values())
     try:
@@ -29,13 +29,13 @@ def common(**named: Real) -> tuple[Result, ...]:
     return tuple(jnp.broadcast_to(array.astype(dtype), shape) for array in arrays.values())
 
 
-def complementary(name: str, value: Real, complement: Real | None) -> dict[str, Any]:
+def complement_pair(name: str, value: Real, complement: Real | None) -> dict[str, Any]:
     """Return `value` and 1 − `value` by name; a `complement` that is given must fit `value`."""
-    value = _checks.floating(value, (), name, batched=True)
+    value = _checks.array_of_shape(value, (), name, batched=True)
     if complement is None:
         return {name: value, name + "1": 1 - value}
-    other = _checks.floating(complement, (), name + "1", batched=True)
-    if _checks.known((value, other)):
+    other = _checks.array_of_shape(complement, (), name + "1", batched=True)
+    if _checks.is_known((value, other)):
         a, b = np.asarray(value), np.asarray(other)
         eps = max(np.finfo(a.dtype).eps, np.finfo(b.dtype).eps)
         excess = np.abs(a + b - 1)

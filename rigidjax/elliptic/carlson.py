@@ -16,8 +16,8 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from rigidjax.elliptic.arguments import Real, Result, common
-from rigidjax.elliptic.carlson_r import change, nan_below_zero, r_integral, scale_of
+from rigidjax.elliptic.arguments import Real, Result, to_common_dtype
+from rigidjax.elliptic.carlson_r import directional_derivative, nan_below_zero, r_integral, scale_of
 
 # Steps after which the series is exact for ratios over the whole range of the dtype.
 _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}
@@ -34,7 +34,7 @@ def rf(x: Real, y: Real, z: Real) -> Result:
     >>> float(rf(4.0, 4.0, 4.0))
     0.5
     """
-    return _rf(common(x=x, y=y, z=z))
+    return _rf(to_common_dtype(x=x, y=y, z=z))
 
 
 def rd(x: Real, y: Real, z: Real) -> Result:
@@ -47,7 +47,7 @@ def rd(x: Real, y: Real, z: Real) -> Result:
     >>> float(rd(4.0, 4.0, 4.0))
     0.125
     """
-    return _rd(common(x=x, y=y, z=z))
+    return _rd(to_common_dtype(x=x, y=y, z=z))
 
 
 def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
@@ -61,7 +61,7 @@ def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
     >>> round(float(rj_(4.0, 4.0, 4.0, 4.0)), 14)
     0.125
     """
-    return 1.5 * r_integral((0.5, 0.5, 0.5, 1.0), common(x=x, y=y, z=z, p=p))
+    return 1.5 * r_integral((0.5, 0.5, 0.5, 1.0), to_common_dtype(x=x, y=y, z=z, p=p))
 
 
 def rc(x: Real, y: Real) -> Result:
@@ -73,7 +73,7 @@ def rc(x: Real, y: Real) -> Result:
     >>> float(rc(4.0, 4.0))
     0.5
     """
-    x, y = common(x=x, y=y)
+    x, y = to_common_dtype(x=x, y=y)
     below = y < 0
     length = jnp.where(below, x - y, 1)
     # √0 has no derivative: keep it out of the branch that is not taken.
@@ -96,7 +96,7 @@ def _rf(arguments: tuple[Array, ...]) -> Any:
     # DLMF 19.36.1.
     series = 1 - e2 / 10 + e3 / 14 + e2**2 / 24 - 3 * e2 * e3 / 44
     series = series - 5 * e2**3 / 208 + 3 * e3**2 / 104 + e2**2 * e3 / 16
-    return _domain(series / jnp.sqrt(mean * scale), arguments)
+    return _value_in_domain(series / jnp.sqrt(mean * scale), arguments)
 
 
 @partial(_rf.defjvp, symbolic_zeros=True)
@@ -132,13 +132,13 @@ def _rd(arguments: tuple[Array, ...]) -> Any:
     series = series + 45 * e2**2 * e3 / 272 - 9 * (e3 * e4 + e2 * e5) / 68
     value = total + weight / 3 * series / (mean * jnp.sqrt(mean))
     value = jnp.where(arguments[2] == 0, jnp.inf, value)
-    return _domain(value / scale / jnp.sqrt(scale), arguments)
+    return _value_in_domain(value / scale / jnp.sqrt(scale), arguments)
 
 
 @partial(_rd.defjvp, symbolic_zeros=True)
 def _rd_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
     (arguments,), (directions,) = primals, tangents
-    return _rd(arguments), 1.5 * change((0.5, 0.5, 1.5), arguments, directions)
+    return _rd(arguments), 1.5 * directional_derivative((0.5, 0.5, 1.5), arguments, directions)
 
 
 def _lambda(x: Array, y: Array, z: Array) -> Any:
@@ -147,7 +147,7 @@ def _lambda(x: Array, y: Array, z: Array) -> Any:
     return a * b + b * c + c * a
 
 
-def _domain(value: Array, arguments: tuple[Array, ...]) -> Any:
+def _value_in_domain(value: Array, arguments: tuple[Array, ...]) -> Any:
     """Return infinity if two arguments are 0, NaN if one is negative or NaN, else `value`."""
     x, y, z = (a == 0 for a in arguments)
     return nan_below_zero(jnp.where((x & y) | (y & z) | (z & x), jnp.inf, value), arguments)

@@ -71,10 +71,10 @@ def _r_integral_jvp(
     powers: tuple[float, ...], primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
     (arguments,), (directions,) = primals, tangents
-    return r_integral(powers, arguments), change(powers, arguments, directions)
+    return r_integral(powers, arguments), directional_derivative(powers, arguments, directions)
 
 
-def change(
+def directional_derivative(
     powers: tuple[float, ...],
     arguments: tuple[Array, ...],
     directions: tuple[Array | SymbolicZero, ...],

@@ -22,9 +22,15 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from rigidjax.elliptic.arguments import Real, Result, common, complementary, exact_complement
-from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, near_one
-from rigidjax.elliptic.legendre import complete, integral, mean_iterates
+from rigidjax.elliptic.arguments import (
+    Real,
+    Result,
+    complement_pair,
+    exact_complement,
+    to_common_dtype,
+)
+from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, sncndn_near_one
+from rigidjax.elliptic.legendre import complete_integral, integral, mean_iterates
 from rigidjax.rotation.stumpff import half_turns, parity
 
 # Below this cn and dn, integrals over sd² depend on their ratio only (to the floor squared).
@@ -45,8 +51,8 @@ def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Re
     >>> [round(float(x), 12) for x in sncndn(1.0, 0.5)]
     [0.803001824896, 0.595976567672, 0.823161001632]
     """
-    u, m, m1 = common(u=u, **complementary("m", m, m1))
-    s, c, d, _ = _functions(u, exact_complement(m, m1), m1)
+    u, m, m1 = to_common_dtype(u=u, **complement_pair("m", m, m1))
+    s, c, d, _ = _functions_and_half_turns(u, exact_complement(m, m1), m1)
     return s, c, d
 
 
@@ -59,13 +65,13 @@ def am(u: Real, m: Real, m1: Real | None = None) -> Result:
     >>> round(float(am(1.0, 0.5)), 12)
     0.932315079884
     """
-    u, m, m1 = common(u=u, **complementary("m", m, m1))
-    s, c, _, turns = _functions(u, exact_complement(m, m1), m1)
+    u, m, m1 = to_common_dtype(u=u, **complement_pair("m", m, m1))
+    s, c, _, turns = _functions_and_half_turns(u, exact_complement(m, m1), m1)
     sign = parity(turns)
     return jnp.arctan2(sign * s, sign * c) + math.pi * turns
 
 
-def _functions(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any, Any]:
+def _functions_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any, Any]:
     """Return sn, cn, dn for any real m, and the number of half turns in the amplitude."""
     # DLMF 22.17.2–4: m > 1 becomes 1/m, and cn and dn change places.
     above = m1 < 0
@@ -75,13 +81,13 @@ def _functions(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any, Any]:
     inner_m = jnp.where(above, 1, m) / divisor
     inner_m1 = jnp.where(above, -m1, m1) / divisor
 
-    s, c, d = _core(v, inner_m, inner_m1)
+    s, c, d = _sncndn(v, inner_m, inner_m1)
     turns = _reduce_argument(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
     return (s / root, jnp.where(above, d, c), jnp.where(above, c, d), jnp.where(above, 0, turns))
 
 
 @jax.custom_jvp
-def _core(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
+def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
     """Return sn, cn, dn for m ≤ 1, as functions of u and m1; m must be 1 − m1."""
     turns, angle, rows = _reduce_argument(u, m1)
     sign = parity(turns)
@@ -113,33 +119,35 @@ def _core(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
     return s, c, d
 
 
-@partial(_core.defjvp, symbolic_zeros=True)
-def _core_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
+@partial(_sncndn.defjvp, symbolic_zeros=True)
+def _sncndn_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
     (u, m, m1), (du, _, dm1) = primals, tangents
-    s, c, d = _core(u, m, m1)
+    s, c, d = _sncndn(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
         # DLMF 22.13.1–3.
         ds, dc, dd = c * d * du, -s * d * du, -m * s * c * du
     if not isinstance(dm1, SymbolicZero):
-        sm, cm, dm = _slopes(u, m, m1)
+        sm, cm, dm = _derivatives_by_m(u, m, m1)
         ds, dc, dd = ds - sm * dm1, dc - cm * dm1, dd - dm * dm1
     return (s, c, d), (ds, dc, dd)
 
 
 @jax.custom_jvp
-def _slopes(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
+def _derivatives_by_m(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
     """Return the derivatives of sn, cn, dn with respect to m at a fixed u."""
-    return _slopes_from_integral(u, m, m1)
+    return _derivatives_from_integral(u, m, m1)
 
 
-@partial(_slopes.defjvp, symbolic_zeros=True)
-def _slopes_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
+@partial(_derivatives_by_m.defjvp, symbolic_zeros=True)
+def _derivatives_by_m_jvp(
+    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[Any, Any]:
     (u, m, m1), (du, _, dm1) = primals, tangents
-    sm, cm, dm = slopes = _slopes(u, m, m1)
+    sm, cm, dm = slopes = _derivatives_by_m(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
-        s, c, d = _core(u, m, m1)
+        s, c, d = _sncndn(u, m, m1)
         ds, dc = (cm * d + c * dm) * du, -(sm * d + s * dm) * du
         dd = -(s * c + m * (sm * c + s * cm)) * du
     if not isinstance(dm1, SymbolicZero):
@@ -147,12 +155,12 @@ def _slopes_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tu
         near = (m1 < LARGEST_M1) & (jnp.abs(u) > 1)
         middle, one = jnp.full_like(m1, 0.5), jnp.ones_like(m1)
         far_m, far_m1 = jnp.where(near, middle, m), jnp.where(near, middle, m1)
-        _, far = jax.jvp(partial(_slopes_from_integral, u), (far_m, far_m1), (one, -one))
+        _, far = jax.jvp(partial(_derivatives_from_integral, u), (far_m, far_m1), (one, -one))
         near_m = jnp.where(near, m, 1 - LARGEST_M1)
         near_m1 = jnp.where(near, m1, LARGEST_M1)
 
         def first(a: Array, b: Array) -> Any:
-            return jax.jvp(partial(near_one, u), (a, b), (one, -one))[1]
+            return jax.jvp(partial(sncndn_near_one, u), (a, b), (one, -one))[1]
 
         _, close = jax.jvp(first, (near_m, near_m1), (one, -one))
         ss, cc, d2 = (jnp.where(near, a, b) for a, b in zip(close, far, strict=True))
@@ -160,12 +168,12 @@ def _slopes_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tu
     return slopes, (ds, dc, dd)
 
 
-def _slopes_from_integral(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
+def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
     """Return the derivatives of sn, cn, dn by m: those by the amplitude φ times dn X.
 
     X is the integral in the head of this file: Carlson's R_D of u reduced by half periods.
     """
-    s, c, d = _core(u, m, m1)
+    s, c, d = _sncndn(u, m, m1)
     turns = _reduce_argument(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = parity(turns)
     # X ~ 1/dn² must not overflow. If cn and dn are minute it depends, but for that factor, on
@@ -173,7 +181,7 @@ def _slopes_from_integral(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]
     up = jnp.maximum(1, _FLOOR[np.dtype(u.dtype)] / jax.lax.stop_gradient(d))
     c, d, raised = c * up, d * up, m1 * up * up
     near = turns == 0
-    whole = complete((1, 1, 0), jnp.where(near, 1, raised))
+    whole = complete_integral((1, 1, 0), jnp.where(near, 1, raised))
     x = integral((1, 1, 0), sign * s, sign * c, raised, jnp.ones_like(m1))
     x = -0.5 * (x + jnp.where(near, 0, 2 * turns * whole))
     return c * d * x, -s * d * x * up, -(0.5 * s * s / d + m * s * c * x) * up

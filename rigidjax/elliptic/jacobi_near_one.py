@@ -26,7 +26,7 @@ LARGEST_M1 = 0.1
 _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 
 
-def near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
+def sncndn_near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
     """Return sn, cn, dn for 0 ≤ m1 ≤ 0.1, to round-off of 1.
 
     Tangents of m must be minus those of m1 = 1 − m.

@@ -19,7 +19,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from rigidjax.elliptic.arguments import Real, Result, common, complementary
+from rigidjax.elliptic.arguments import Real, Result, complement_pair, to_common_dtype
 from rigidjax.elliptic.carlson import rd, rf
 from rigidjax.elliptic.carlson_r import r_integral
 from rigidjax.rotation.stumpff import half_turns
@@ -38,8 +38,8 @@ def ellipk(m: Real, m1: Real | None = None) -> Result:
     >>> round(float(ellipk(1.0, 1e-30)), 12)
     35.925070756031
     """
-    _, m1 = common(**complementary("m", m, m1))
-    return _complete_first(m1)
+    _, m1 = to_common_dtype(**complement_pair("m", m, m1))
+    return _complete_first_kind(m1)
 
 
 def ellipe(m: Real, m1: Real | None = None) -> Result:
@@ -51,8 +51,8 @@ def ellipe(m: Real, m1: Real | None = None) -> Result:
     >>> float(ellipe(1.0))
     1.0
     """
-    _, m1 = common(**complementary("m", m, m1))
-    return complete((0, -1, 0), m1)
+    _, m1 = to_common_dtype(**complement_pair("m", m, m1))
+    return complete_integral((0, -1, 0), m1)
 
 
 def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) -> Result:
@@ -66,8 +66,8 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
     >>> round(float(ellippi(0.5, 0.5)), 12)
     2.701287762095
     """
-    _, n1, _, m1 = common(**complementary("n", n, n1), **complementary("m", m, m1))
-    return complete((0, 0, 1), m1, n1)
+    _, n1, _, m1 = to_common_dtype(**complement_pair("n", n, n1), **complement_pair("m", m, m1))
+    return complete_integral((0, 0, 1), m1, n1)
 
 
 def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
@@ -80,8 +80,8 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
     >>> round(float(ellipf(1.0, 0.5)), 12)
     1.083216772845
     """
-    phi, _, m1 = common(phi=phi, **complementary("m", m, m1))
-    return _incomplete((0, 0, 0), phi, m1)
+    phi, _, m1 = to_common_dtype(phi=phi, **complement_pair("m", m, m1))
+    return _integral_at_any_amplitude((0, 0, 0), phi, m1)
 
 
 def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
@@ -94,8 +94,8 @@ def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
     >>> round(float(ellipeinc(1.0, 0.5)), 12)
     0.927329883624
     """
-    phi, _, m1 = common(phi=phi, **complementary("m", m, m1))
-    return _incomplete((0, -1, 0), phi, m1)
+    phi, _, m1 = to_common_dtype(phi=phi, **complement_pair("m", m, m1))
+    return _integral_at_any_amplitude((0, -1, 0), phi, m1)
 
 
 def ellippiinc(
@@ -111,8 +111,10 @@ def ellippiinc(
     >>> round(float(ellippiinc(0.5, 1.0, 0.5)), 12)
     1.288978174245
     """
-    _, n1, phi, _, m1 = common(**complementary("n", n, n1), phi=phi, **complementary("m", m, m1))
-    return _incomplete((0, 0, 1), phi, m1, n1)
+    _, n1, phi, _, m1 = to_common_dtype(
+        **complement_pair("n", n, n1), phi=phi, **complement_pair("m", m, m1)
+    )
+    return _integral_at_any_amplitude((0, 0, 1), phi, m1, n1)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -162,7 +164,7 @@ def _integral_jvp(
     return value, tangent
 
 
-def complete(orders: tuple[int, int, int], m1: Array, n1: Array | None = None) -> Any:
+def complete_integral(orders: tuple[int, int, int], m1: Array, n1: Array | None = None) -> Any:
     """Return I_jkl, `orders` (j, k, l), at φ = π/2."""
     one = jnp.ones_like(m1)
     return integral(orders, one, jnp.zeros_like(m1), m1, one if n1 is None else n1)
@@ -178,18 +180,18 @@ def mean_iterates(m1: Array) -> list[tuple[Any, Any]]:
 
 
 @jax.custom_jvp
-def _complete_first(m1: Array) -> Any:
+def _complete_first_kind(m1: Array) -> Any:
     """Return K = π/(2 agm(1, √m1)); infinity for m1 = 0."""
     a, b = mean_iterates(m1)[-1]
     return jnp.where(m1 == 0, jnp.inf, math.pi / (a + b))
 
 
-@_complete_first.defjvp
-def _complete_first_jvp(
+@_complete_first_kind.defjvp
+def _complete_first_kind_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
     (m1,), (dm1,) = primals, tangents
-    return _complete_first(m1), -0.5 * complete((1, 1, 0), m1) * dm1
+    return _complete_first_kind(m1), -0.5 * complete_integral((1, 1, 0), m1) * dm1
 
 
 def _second_kind(s: Array, c2: Array, delta2: Array, m1: Array) -> Any:
@@ -210,7 +212,7 @@ def _second_kind(s: Array, c2: Array, delta2: Array, m1: Array) -> Any:
     return jnp.where(m1 < 0, jnp.nan, value)
 
 
-def _incomplete(
+def _integral_at_any_amplitude(
     orders: tuple[int, int, int], phi: Array, m1: Array, n1: Array | None = None
 ) -> Any:
     """Return I_jkl, `orders` (j, k, l), at any amplitude φ.
@@ -225,5 +227,5 @@ def _incomplete(
     one = jnp.ones_like(m1)
     safe_m1, safe_n1 = jnp.where(near, one, m1), jnp.where(near, one, n1)
     first = orders == (0, 0, 0)
-    whole = _complete_first(safe_m1) if first else complete(orders, safe_m1, safe_n1)
+    whole = _complete_first_kind(safe_m1) if first else complete_integral(orders, safe_m1, safe_n1)
     return part + jnp.where(near, 0, 2 * turns * whole)

@@ -11,10 +11,10 @@ from rigidjax.exact.jacobi_duplication import (
     Elliptic,
     HalfPeriod,
     Modulus,
+    clip_at_rest,
     duplicate,
     elliptic,
     half_period,
-    until_rest,
 )
 from rigidjax.rotation.barrier import barrier, one_kernel
 
@@ -60,7 +60,7 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
     return Orbit(a, d12, d13, d23, (p1, p2, p3), h, m, mu, turn, half, swap)
 
 
-class Reduced(NamedTuple):
+class ReducedTime(NamedTuple):
     """Hold a time that was reduced by whole half periods."""
 
     halves: Scalar  # their number
@@ -68,14 +68,14 @@ class Reduced(NamedTuple):
     near: Scalar  # the rest, on the separatrix cut at the time to come to rest
 
 
-def reduce_time(u: Scalar, half: Scalar, m: Modulus) -> Reduced:
-    """Reduce the time u by whole half periods `half`."""
-    count = jnp.round(u / half)
-    rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half)
-    return Reduced(count, rest, until_rest(rest, m))
+def reduce_time(u: Scalar, half_period: Scalar, m: Modulus) -> ReducedTime:
+    """Reduce the time u by whole half periods `half_period`."""
+    count = jnp.round(u / half_period)
+    rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half_period)
+    return ReducedTime(count, rest, clip_at_rest(rest, m))
 
 
-def restore_periods(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar]:
+def restore_periods(o: Orbit, f: Elliptic, u: ReducedTime) -> tuple[Elliptic, Scalar]:
     """Return S, C, D at the whole time from `f`, those at `u.near`; and the phase left out."""
     big = jnp.maximum(o.modulus.p, o.modulus.q)
     whole = jnp.where(u.halves == 0, 0.0, u.halves)
@@ -94,7 +94,7 @@ def restore_periods(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar
     )
 
 
-def in_step(f: Elliptic, m: Modulus) -> Elliptic:
+def restore_identity(f: Elliptic, m: Modulus) -> Elliptic:
     """Compute the larger of C² and D² again from the smaller: D² − C² = (p − q)S².
 
     C and SD cancel near the middle axis, and of the doublings' errors only a common one does, too.
@@ -110,7 +110,7 @@ def in_step(f: Elliptic, m: Modulus) -> Elliptic:
 def momentum_at(o: Orbit, f: Elliptic) -> Triple:
     """Return the body momentum from S, C, D (`f`) at the same time, in the labelling of `o`."""
     p1, p2, p3 = o.P
-    f = in_step(f, o.modulus)
+    f = restore_identity(f, o.modulus)
     y1 = p1 * f.C - o.d23 * p2 * p3 * f.S * f.D
     y2 = p2 * f.C * f.D + o.d13 * p1 * p3 * f.S
     y3 = p3 * f.D - o.d12 * p1 * p2 * f.S * f.C
@@ -127,10 +127,10 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
 def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
     """Return the body momentum at t and the quaternion of the turn since 0, in principal axes."""
     u = reduce_time(0.5 * t, o.half.time, o.modulus)
-    return from_functions(o, elliptic(u.near, o.modulus, o.mu, o.turn), u, t)
+    return motion_from_functions(o, elliptic(u.near, o.modulus, o.mu, o.turn), u, t)
 
 
-def from_functions(o: Orbit, f: Elliptic, u: Reduced, t: Scalar) -> tuple[Triple, Four]:
+def motion_from_functions(o: Orbit, f: Elliptic, u: ReducedTime, t: Scalar) -> tuple[Triple, Four]:
     """Return momentum and turn at time t from `f`, the elliptic functions at `u.near`."""
     f, phase = barrier(restore_periods(o, f, u))
     full = barrier(duplicate(f, o.modulus, o.mu, o.turn))

@@ -17,12 +17,12 @@ Six = tuple[Scalar, ...]
 HALF = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
 
 
-def plus(a: Triple, b: Triple) -> Triple:
+def add(a: Triple, b: Triple) -> Triple:
     """Add two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-def times(m: Six, v: Triple) -> Triple:
+def matvec(m: Six, v: Triple) -> Triple:
     """Multiply a symmetric matrix by a vector."""
     a, b, c, x, y, z = m
     return (
@@ -32,7 +32,7 @@ def times(m: Six, v: Triple) -> Triple:
     )
 
 
-def product(m: Six, n: Six) -> Six:
+def commuting_product(m: Six, n: Six) -> Six:
     """Multiply two symmetric matrices that commute; their product is symmetric."""
     a, b, c, x, y, z = m
     d, e, f, u, v, w = n
@@ -46,7 +46,7 @@ def product(m: Six, n: Six) -> Six:
     )
 
 
-def symmetric(m: Six) -> tuple[Array, ...]:
+def symmetric_rows(m: Six) -> tuple[Array, ...]:
     """Return the rows of a symmetric matrix."""
     a, b, c, x, y, z = m
     return jnp.stack([a, x, y]), jnp.stack([x, b, z]), jnp.stack([y, z, c])
@@ -83,7 +83,7 @@ def half_product(q: Four, v: Triple) -> Four:
     )
 
 
-def turned_back(q: Four, v: Triple) -> Triple:
+def change_by_inverse_rotation(q: Four, v: Triple) -> Triple:
     """Return R(q)ᵀ v − v, without a difference of large numbers."""
     w, *axis = q
     first = cross(v, tuple(axis))

@@ -22,23 +22,34 @@ from jaxtyping import Array, Float
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
 from rigidjax.exact import sigma_form
-from rigidjax.exact.closed_form import Orbit, from_functions, momentum_and_turn, orbit, reduce_time
+from rigidjax.exact.closed_form import (
+    Orbit,
+    momentum_and_turn,
+    motion_from_functions,
+    orbit,
+    reduce_time,
+)
 from rigidjax.exact.components3 import (
     HALF,
     Four,
     Six,
     Triple,
+    add,
     adjugate,
+    change_by_inverse_rotation,
     cross,
     determinant,
     half_product,
-    plus,
-    symmetric,
-    times,
-    turned_back,
+    matvec,
+    symmetric_rows,
 )  # fmt: skip
 from rigidjax.exact.jacobian import integrals, jacobian_and_integral
-from rigidjax.exact.principal_axes import components_along, in_axes, out_of, principal_frame
+from rigidjax.exact.principal_axes import (
+    combine_columns,
+    components_along,
+    principal_frame,
+    tensor_in_axes,
+)
 from rigidjax.exact.sigma_form import Differences
 from rigidjax.rotation.barrier import one_kernel
 from rigidjax.rotation.linalg3 import components
@@ -64,7 +75,7 @@ def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
 
 @flow.defjvp
 def _flow_jvp(primals, tangents):
-    motion, rows, _ = slopes(*primals)
+    motion, rows, _ = motion_and_derivatives(*primals)
     d_out, d_turn, _ = _change_along(motion, rows, _variables(primals, tangents)[3])
     return motion[:2], (d_out, d_turn)
 
@@ -76,12 +87,12 @@ def _variables(primals, tangents):
 
 
 def _change_along(motion, rows, change):
-    """Return the change of the result `motion` of `slopes` as `inputs_of` move by `change`."""
+    """Return the change of Π, the turn and Ω (`motion`) as `inputs_of` move by `change`."""
     out, theta, rate = (tuple(jnp.sum(row * change) for row in three) for three in rows)
     return out, half_product(motion[1], theta), rate
 
 
-class Setting(NamedTuple):
+class MotionConstants(NamedTuple):
     """Hold the constants of a free motion: by value, never differentiated."""
 
     axes: Mat3
@@ -91,29 +102,31 @@ class Setting(NamedTuple):
 
 
 @one_kernel
-def set_up(tensor: Mat3, omega: Vec3) -> Setting:
+def set_up(tensor: Mat3, omega: Vec3) -> MotionConstants:
     """Find the principal axes, and the orbit of the momentum in them."""
     moments, axes = principal_frame(tensor)
-    momentum = times(moments, components_along(axes, omega))
-    return Setting(axes, moments[:3], momentum, orbit(moments[:3], momentum))
+    momentum = matvec(moments, components_along(axes, omega))
+    return MotionConstants(axes, moments[:3], momentum, orbit(moments[:3], momentum))
 
 
 @jax.custom_jvp
-def motion(
-    tensor: Mat3, omega: Vec3, setting: Setting, t: Float[Array, "*n"]
+def body_motion(
+    tensor: Mat3, omega: Vec3, setting: MotionConstants, t: Float[Array, "*n"]
 ) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 4"]]:
     """Return Ω(t) and the quaternion of the turn since 0, in body axes, at one time or many."""
     del tensor, omega
-    return _at_each_time(lambda time: _values(setting, time), t)
+    return _at_each_time(lambda time: _body_motion_at(setting, time), t)
 
 
-@motion.defjvp
-def _motion_jvp(primals, tangents):
+@body_motion.defjvp
+def _body_motion_jvp(primals, tangents):
     tensor, omega, setting, t = primals
     d_tensor, d_omega, _, d_t = tangents
     # Two matrices, so that the transposed part is short: the rest is compiled once.
-    first = _by_body(jnp.concatenate([tensor.ravel(), omega]), setting)
-    out, (rates, thetas) = _at_each_time(lambda time: _body_slopes(tensor, omega, setting, time), t)
+    first = _input_derivatives(jnp.concatenate([tensor.ravel(), omega]), setting)
+    out, (rates, thetas) = _at_each_time(
+        lambda time: _body_motion_and_derivatives(tensor, omega, setting, time), t
+    )
     # Summed, not a product of matrices: on a GPU that is rounded to ten bits in float32.
     change = jnp.sum(first * jnp.concatenate([d_tensor.ravel(), d_omega])[None], axis=-1)
     change = jnp.broadcast_to(change, (*t.shape, 9))
@@ -139,27 +152,29 @@ def _at_each_time(function, t):
 
 
 @one_kernel
-def _values(s: Setting, t: Scalar) -> tuple[Vec3, Quat]:
+def _body_motion_at(s: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
     """Return Ω(t) and the turn since 0 in body axes."""
     momentum, (w, *axis) = momentum_and_turn(s.orbit, t)
     rate = tuple(p / i for p, i in zip(momentum, s.moments, strict=True))
-    return jnp.stack(out_of(s.axes, rate)), jnp.stack([w, *out_of(s.axes, tuple(axis))])
+    return jnp.stack(combine_columns(s.axes, rate)), jnp.stack(
+        [w, *combine_columns(s.axes, tuple(axis))]
+    )
 
 
-def _in_axes(tensor: Mat3, omega: Vec3, s: Setting) -> tuple[Six, Triple]:
+def _moments_and_momentum(tensor: Mat3, omega: Vec3, s: MotionConstants) -> tuple[Six, Triple]:
     """Return moments and momentum as functions of `tensor` and Ω(0); the axes are held fixed."""
-    moments = in_axes(tensor, s.axes, s.moments)
-    return moments, times(moments, components_along(s.axes, omega))
+    moments = tensor_in_axes(tensor, s.axes, s.moments)
+    return moments, matvec(moments, components_along(s.axes, omega))
 
 
 @one_kernel
-def _by_body(body: Float[Array, "12"], s: Setting) -> Float[Array, "9 12"]:
+def _input_derivatives(body: Float[Array, "12"], s: MotionConstants) -> Float[Array, "9 12"]:
     """Return the derivatives of `inputs_of` by `body`: nine entries of the tensor, then Ω(0)."""
     tensor, omega, axes = body[:9].reshape(3, 3), body[9:], s.axes
-    moments, momentum = _in_axes(tensor, omega, s)
+    moments, momentum = _moments_and_momentum(tensor, omega, s)
     # δK = −K δI K in principal axes: −BᵀδI B with B = A K. A batch of sums, not of products of
-    # matrices: see `_motion_jvp`.
-    k = jnp.stack(symmetric(reciprocal(moments, momentum)[1]))
+    # matrices: see `_body_motion_jvp`.
+    k = jnp.stack(symmetric_rows(reciprocal(moments, momentum)[1]))
     b = jnp.sum(axes[:, :, None] * k[None], axis=1)
     d_k = lambda i, j: -(b[:, None, i] * b[None, :, j]).ravel()  # noqa: E731
     c1, c2, c3 = d_k(0, 0), d_k(1, 1), d_k(2, 2)
@@ -167,23 +182,23 @@ def _by_body(body: Float[Array, "12"], s: Setting) -> Float[Array, "9 12"]:
     by_tensor = jnp.stack([c1 - c2, c2 - c3, d_k(0, 1), d_k(0, 2), d_k(1, 2), *d_momentum, c3])
     by_tensor = by_tensor.reshape(9, 3, 3)
     by_tensor = 0.5 * (by_tensor + jnp.swapaxes(by_tensor, 1, 2)).reshape(9, 9)
-    by_omega = jnp.sum(jnp.stack(symmetric(moments))[:, None] * axes[None], axis=2)
+    by_omega = jnp.sum(jnp.stack(symmetric_rows(moments))[:, None] * axes[None], axis=2)
     return jnp.concatenate([by_tensor, jnp.pad(by_omega, ((5, 1), (0, 0)))], axis=1)
 
 
 @one_kernel
-def _body_slopes(tensor: Mat3, omega: Vec3, s: Setting, t: Scalar):
+def _body_motion_and_derivatives(tensor: Mat3, omega: Vec3, s: MotionConstants, t: Scalar):
     """Return Ω(t) and the turn in body axes, and their derivatives by `inputs_of`."""
-    moments, momentum = _in_axes(tensor, omega, s)
-    (_, (w, *axis), rate), rows, _ = slopes(moments, momentum, t)
-    rate = out_of(s.axes, rate)
-    turn = jnp.stack([w, *out_of(s.axes, tuple(axis))])
+    moments, momentum = _moments_and_momentum(tensor, omega, s)
+    (_, (w, *axis), rate), rows, _ = motion_and_derivatives(moments, momentum, t)
+    rate = combine_columns(s.axes, rate)
+    turn = jnp.stack([w, *combine_columns(s.axes, tuple(axis))])
     # Rows, not matrices: to stack them costs a batch five times what they are.
-    in_body = jax.vmap(lambda *v: out_of(s.axes, v))
+    in_body = jax.vmap(lambda *v: combine_columns(s.axes, v))
     return (jnp.stack(rate), turn), (in_body(*rows.rate), in_body(*rows.theta))
 
 
-class Slopes(NamedTuple):
+class MotionDerivatives(NamedTuple):
     """Hold the derivatives of Π(t), θ and Ω(t) by `inputs_of`, three rows of ten each."""
 
     momentum: Triple
@@ -193,30 +208,32 @@ class Slopes(NamedTuple):
 
 @jax.custom_jvp
 @one_kernel
-def slopes(moments: Six, momentum: Triple, t: Scalar):
-    """Return Π(t), the quaternion of the turn and Ω(t); `Slopes`; their parts by `_first_order`.
+def motion_and_derivatives(moments: Six, momentum: Triple, t: Scalar):
+    """Return Π(t), the quaternion of the turn and Ω(t); their derivatives; the parts of these.
 
-    The parts are the derivatives of Π(t) − Π(0), and G = ∫ Π Πᵀ dt.
+    The parts, which `_first_order` returns, are the derivatives of Π(t) − Π(0), and G = ∫ Π Πᵀ dt.
     """
     (out, turn), rows, g = _first_order(orbit(moments[:3], momentum), moments, momentum, t)
     _, k, energy2 = reciprocal(moments, momentum)
-    motion = out, turn, times(k, out)
-    return motion, _columns(k, energy2, momentum, t, motion, rows, g), (rows, g)
+    motion = out, turn, matvec(k, out)
+    return motion, _derivative_columns(k, energy2, momentum, t, motion, rows, g), (rows, g)
 
 
 # The jvp of a closed first derivative is taken from the tensor form, which is smooth to any order.
-@slopes.defjvp
-def _slopes_jvp(primals, tangents):
-    motion, rows, parts = slopes(*primals)
+@motion_and_derivatives.defjvp
+def _motion_and_derivatives_jvp(primals, tangents):
+    motion, rows, parts = motion_and_derivatives(*primals)
     (body, *k), (_, *d_k), inputs, change = _variables(primals, tangents)
     d_motion = _change_along(motion, rows, change)
     d_parts = _second_order(body, inputs, change)
     at, changes = (*k, *primals[1:], motion, *parts), (*d_k, *tangents[1:], d_motion, *d_parts)
-    return (motion, rows, parts), (d_motion, jax.jvp(_columns, at, changes)[1], d_parts)
+    return (motion, rows, parts), (d_motion, jax.jvp(_derivative_columns, at, changes)[1], d_parts)
 
 
-def _columns(k: Six, energy2: Scalar, momentum: Triple, t: Scalar, motion, rows, g: Six) -> Slopes:
-    """Return the derivatives of `motion`, the result of `slopes`.
+def _derivative_columns(
+    k: Six, energy2: Scalar, momentum: Triple, t: Scalar, motion, rows, g: Six
+) -> MotionDerivatives:
+    """Return the derivatives of `motion`, the result of `motion_and_derivatives`.
 
     `k`, `energy2`: of `reciprocal`; `rows`, `g`: of `_first_order`.
     """
@@ -226,10 +243,10 @@ def _columns(k: Six, energy2: Scalar, momentum: Triple, t: Scalar, motion, rows,
     most = h2 * (k[0] * k[0] + k[1] * k[1] + k[2] * k[2])
     still = jax.lax.stop_gradient(most * (t * t)) <= _STILL[t.dtype] ** 2
     r = 1.0 / jnp.where(still, 1.0, h2)
-    rate = times(k, momentum)
+    rate = matvec(k, momentum)
     pull = cross(momentum, rate)
-    gain = times(k, pull)
-    pulled = plus(cross(pull, rate), cross(momentum, gain))
+    gain = matvec(k, pull)
+    pulled = add(cross(pull, rate), cross(momentum, gain))
     squares = (p1 * p1, p2 * p2, p3 * p3, p1 * p2, p1 * p3, p2 * p3)
     weights = [c * (t * a + b) for c, a, b in zip(HALF, squares, g, strict=True)]
 
@@ -237,26 +254,26 @@ def _columns(k: Six, energy2: Scalar, momentum: Triple, t: Scalar, motion, rows,
         e12, e23, o12, o13, o23, e1, e2, e3, e33, et = e
         d_k, start = (e33 + e12 + e23, e33 + e23, e33, o12, o13, o23), (e1, e2, e3)
         d_out = tuple(a + b for a, b in zip(start, change, strict=True))
-        back = turned_back(turn, start)
+        back = change_by_inverse_rotation(turn, start)
         across = cross(out, tuple(a - b for a, b in zip(back, change, strict=True)))
         along = sum(a * b for a, b in zip(weights, d_k, strict=True))
         along = along + t * sum(a * b for a, b in zip(rate, start, strict=True)) + energy2 * et
         theta = tuple(r * (a + b * along) for a, b in zip(across, out, strict=True))
         # Near rest by a series: θ' = δΩ − Ω × θ, with Ω = KΠ and Π' = Π × Ω.
-        faster = plus(times(d_k, momentum), times(k, start))
-        d_pull = plus(cross(start, rate), cross(momentum, faster))
-        gained = plus(times(d_k, pull), times(k, d_pull))
-        bent = plus(gained, cross(faster, rate))
-        d_jerk = plus(plus(cross(d_pull, rate), cross(pull, faster)), cross(start, gain))
-        jerk = plus(d_jerk, cross(momentum, gained))
-        third = plus(times(d_k, pulled), times(k, jerk))
-        third = plus(plus(third, cross(plus(faster, faster), gain)), cross(bent, rate))
-        near = zip(faster, bent, third, times(k, out), strict=True)
+        faster = add(matvec(d_k, momentum), matvec(k, start))
+        d_pull = add(cross(start, rate), cross(momentum, faster))
+        gained = add(matvec(d_k, pull), matvec(k, d_pull))
+        bent = add(gained, cross(faster, rate))
+        d_jerk = add(add(cross(d_pull, rate), cross(pull, faster)), cross(start, gain))
+        jerk = add(d_jerk, cross(momentum, gained))
+        third = add(matvec(d_k, pulled), matvec(k, jerk))
+        third = add(add(third, cross(add(faster, faster), gain)), cross(bent, rate))
+        near = zip(faster, bent, third, matvec(k, out), strict=True)
         near = tuple(t * (a + t * (b / 2 + t * c / 6)) + et * d for a, b, c, d in near)
         theta = tuple(jnp.where(still, a, b) for a, b in zip(near, theta, strict=True))
-        return d_out, theta, plus(times(k, d_out), times(d_k, out))
+        return d_out, theta, add(matvec(k, d_out), matvec(d_k, out))
 
-    return Slopes(*jax.vmap(column)(jnp.eye(10, dtype=t.dtype), rows))
+    return MotionDerivatives(*jax.vmap(column)(jnp.eye(10, dtype=t.dtype), rows))
 
 
 def inputs_of(parts, momentum: Triple, t: Scalar) -> Float[Array, "10"]:
@@ -285,7 +302,7 @@ def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
     body, _, _ = reciprocal(moments, momentum)
     half = at._replace(f=f)
     rows, g = jacobian_and_integral(body, momentum, t, half, u.halves, whole, o.half.mean)
-    return from_functions(o, at.f, u, t), rows, g
+    return motion_from_functions(o, at.f, u, t), rows, g
 
 
 def _second_order(body: Differences, inputs, change):

@@ -14,11 +14,11 @@ from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, S
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.scaling import exponent_of, times_power_of_two
-from rigidjax.exact.derivatives import Setting, motion, set_up
+from rigidjax.exact.derivatives import MotionConstants, body_motion, set_up
 from rigidjax.motion import Attitude, Rigid
 from rigidjax.rotation.kernels import product4
 from rigidjax.rotation.linalg3 import components
-from rigidjax.rotation.validation import near_unit, tolerance
+from rigidjax.rotation.validation import require_near_unit, tolerance
 
 State = TypeVar("State", bound=HasSpin)
 
@@ -37,7 +37,7 @@ class FreeBody(eqx.Module):
     tensor: Mat3
     omega: Vec3
     exponent: Array
-    setting: Setting
+    setting: MotionConstants
 
     def __init__(self, inertia: Inertia, state0: HasSpin):
         inertia = _checked_inertia(inertia, state0)
@@ -49,7 +49,7 @@ class FreeBody(eqx.Module):
         self.state0 = state0
 
     def __call__(self, t: ScalarLike) -> HasSpin:
-        return self.at(_time(t, self.state0.omega))
+        return self.at(_checked_time(t, self.state0.omega))
 
     def at(self, ts: Float[Array, "*n"]) -> HasSpin:
         """Return the states at `ts` (n,), s since `state0`: as `jax.vmap` does, compiled sooner.
@@ -64,7 +64,7 @@ class FreeBody(eqx.Module):
         turned = jnp.abs(t) * jnp.max(jnp.abs(self.state0.omega))
         t = jnp.where(turned <= 1 / jnp.finfo(t.dtype).eps, t, jnp.nan)
         since = times_power_of_two(t, self.exponent)
-        omega, turn = motion(self.tensor, self.omega, self.setting, since)
+        omega, turn = body_motion(self.tensor, self.omega, self.setting, since)
         omega = times_power_of_two(omega, self.exponent)
         state = eqx.tree_at(lambda s: s.omega, self.state0, omega)
         if not isinstance(state, HasAttitude):
@@ -131,16 +131,16 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     Array([-0.42522037, -0.90508985,  0.24550111], dtype=float64)
     """
     _checked_inertia(inertia, state0)
-    return _jitted(inertia, state0, _time(t, state0.omega))
+    return _jitted(inertia, state0, _checked_time(t, state0.omega))
 
 
 _jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0).at(t))
 
 
-def _time(t: ScalarLike, omega: Array) -> Scalar:
+def _checked_time(t: ScalarLike, omega: Array) -> Scalar:
     """Check the time: a number in whose dtype the turn of the body has digits."""
-    t = _checks.time(t)
-    if not _checks.known((t, omega)):
+    t = _checks.checked_time(t)
+    if not _checks.is_known((t, omega)):
         return t
     dtype = jnp.promote_types(t.dtype, omega.dtype)
     with np.errstate(over="ignore"):
@@ -160,21 +160,23 @@ def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
             f"state0: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
             "also moves is free in both: add x + v t yourself, or use simulate"
         )
-    _checks.single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
+    _checks.require_single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     tensor = inertia.tensor
-    arrays = {"omega": _checks.floating(state0.omega, (3,), "omega")}
+    arrays = {"omega": _checks.array_of_shape(state0.omega, (3,), "omega")}
     if isinstance(state0, HasAttitude):
-        arrays["q"] = _checks.floating(state0.q, (4,), "q", hint="a quaternion is (w, x, y, z)")
+        arrays["q"] = _checks.array_of_shape(
+            state0.q, (4,), "q", hint="a quaternion is (w, x, y, z)"
+        )
     for name, array in arrays.items():
         if array.dtype != tensor.dtype:
             raise TypeError(f"{name} is {array.dtype}, but the inertia tensor is {tensor.dtype}")
     inertia = validation.check_body(inertia, tensor, None, throw=False)
-    if not _checks.known((tensor, arrays)):
+    if not _checks.is_known((tensor, arrays)):
         return inertia
     for name, array in arrays.items():
-        _checks.finite(array, name)
+        _checks.require_finite(array, name)
     if "q" in arrays:
-        near_unit(arrays["q"], "q", tolerance(tensor.dtype))
+        require_near_unit(arrays["q"], "q", tolerance(tensor.dtype))
     return inertia
 
 

@@ -50,7 +50,7 @@ class Limits(NamedTuple):
     rest: float  # √max(p, q) |u| beyond which the separatrix is at rest
 
 
-def limits(dtype) -> Limits:
+def dtype_limits(dtype) -> Limits:
     """Return the limits of a dtype.
 
     The doublings reach the longest quarter period, `ln(4/√floor)`; C⁴ must not underflow.
@@ -61,13 +61,13 @@ def limits(dtype) -> Limits:
 
 def is_endless(m: Modulus) -> Bool[Array, ""]:
     """Say whether the motion has no period: the separatrix, a sphere, rest."""
-    return jnp.abs(m.gap) <= limits(m.p.dtype).floor * jnp.maximum(m.p, m.q)
+    return jnp.abs(m.gap) <= dtype_limits(m.p.dtype).floor * jnp.maximum(m.p, m.q)
 
 
-def until_rest(u: Scalar, m: Modulus) -> Scalar:
+def clip_at_rest(u: Scalar, m: Modulus) -> Scalar:
     """Return the reduced time u; on the separatrix clip it to the time the motion takes to rest."""
     big = jnp.maximum(m.p, m.q)
-    rest = limits(u.dtype).rest / jnp.sqrt(jnp.where(big > 0, big, 1.0))
+    rest = dtype_limits(u.dtype).rest / jnp.sqrt(jnp.where(big > 0, big, 1.0))
     return jnp.where(is_endless(m) & (big > 0), jnp.clip(u, -rest, rest), u)
 
 
@@ -89,7 +89,7 @@ def duplicate(f: Elliptic, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
     return Elliptic(2.0 * S * C * D * r, C2, D2, x2 * scale, y2 * scale)
 
 
-def series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
+def taylor_series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
     """Sum the Taylor series at a time h, to round-off for `√max(p, q) |h| ≤ 0.15`.
 
     In float32 the bound is 0.31.
@@ -110,14 +110,14 @@ def series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
     ]
     S = h * (functools.reduce(operator.add, terms) + 1.0)
     s = S * S
-    xi = turn * growth(S, m, mu)
+    xi = turn * growth_integral(S, m, mu)
     z = xi * xi
     tangent = xi * (1.0 + z * (1 / 3 + z * (2 / 15 + z * (17 / 315))))
     one = jnp.ones_like(s)
     return Elliptic(S, jnp.sqrt(1.0 - m.p * s), jnp.sqrt(1.0 - m.q * s), one, tangent)
 
 
-def growth(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
+def growth_integral(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
     """Return ∫ S²/(1 + μS²) du = ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)) for a small S.
 
     It is a power series in S, by the recurrence of Legendre's polynomials for the roots and another
@@ -139,8 +139,8 @@ def elliptic(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
 
     `0 ≤ mu ≤ √(pq)`; `turn` = κμ times a rate. `u` is reduced: |u| at most a quarter period.
     """
-    n = limits(u.dtype).doublings
-    f = series(u * 2.0**-n, m, mu, turn)
+    n = dtype_limits(u.dtype).doublings
+    f = taylor_series(u * 2.0**-n, m, mu, turn)
     # A loop, not nine copies: compiles eight times sooner.
     return jax.lax.fori_loop(0, n, lambda _, g: duplicate(g, m, mu, turn), f)
 
@@ -175,14 +175,16 @@ def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
     # A loop: written out, eleven steps take as long to compile as the rest of the motion.
     point, half, one = jnp.sqrt(1.0 + mu / big), jnp.full_like(a, 0.5), jnp.ones_like(a)
     start = (a, b, c, ratio, half, point, one, one)
-    a, *_, total, _, _, sum_parts = jax.lax.fori_loop(0, limits(a.dtype).agm, _mean, start)
+    a, *_, total, _, _, sum_parts = jax.lax.fori_loop(
+        0, dtype_limits(a.dtype).agm, _mean_step, start
+    )
     time = math.pi / (a * jnp.sqrt(big))
     # turn = κμ h; over a quarter ξ = κ h (π/2a) ½ μ/(λ² + μ) Σ.
     phase = turn * time * 0.5 / (big + mu) * sum_parts
     return HalfPeriod(jnp.where(endless, jnp.inf, time), phase, total / big)
 
 
-def _mean(_: Array, state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+def _mean_step(_: Array, state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
     """Take a step of the arithmetic–geometric mean and of its sums; `ratio` carries 2^{n−1}."""
     a, b, c, ratio, total, point, part, sum_parts = state
     square, product = point * point, a * b

@@ -18,7 +18,14 @@ import jax.numpy as jnp
 
 from rigidjax._types import Scalar
 from rigidjax.exact.components3 import Six, Triple
-from rigidjax.exact.jacobi_duplication import Elliptic, Modulus, duplicate, growth, limits, series
+from rigidjax.exact.jacobi_duplication import (
+    Elliptic,
+    Modulus,
+    dtype_limits,
+    duplicate,
+    growth_integral,
+    taylor_series,
+)
 from rigidjax.exact.sigma_form import Differences, invariants
 
 
@@ -34,17 +41,17 @@ def jacobian_and_integral(
     body: Differences,
     momentum: Triple,
     t: Scalar,
-    before: Integrals,
+    half_time_integrals: Integrals,
     halves: Scalar,
-    whole: Scalar,
+    whole_periods: Scalar,
     mean: Scalar,
 ) -> tuple[tuple, Six]:
     """Return the derivatives of Π(t) − Π(0) as three rows, and G = ∫ Π Πᵀ dt.
 
     The columns are the derivatives by d12, d23, k12, k13, k23, Π(0), k33 and t.
 
-    Off-diagonal entries must be zero. `before` at half of a time that was reduced by `halves` half
-    periods, `whole` in all, its C and D as in `body`; `mean` of S².
+    Off-diagonal entries must be zero. `half_time_integrals` at half of a time that was reduced by
+    `halves` half periods, `whole_periods` in all, its C and D as in `body`; `mean` of S².
     """
     d12, d13, d23 = body[:3]
     p1, p2, p3 = momentum
@@ -52,14 +59,17 @@ def jacobian_and_integral(
     m = Modulus(p, q, gap)
     three = gap > 0
     top = jnp.where(three, p, q)
-    after = double_argument(before, m, jnp.zeros_like(t), jnp.zeros_like(t))
+    after = double_argument(half_time_integrals, m, jnp.zeros_like(t), jnp.zeros_like(t))
     S, C, D, *_ = after.f
-    grown2 = after.y2 + whole * mean
-    grown = after.y + whole * (1.0 - top * mean) / jnp.where(halves == 0, 1.0, jnp.abs(gap))
+    grown2 = after.y2 + whole_periods * mean
+    grown = after.y + whole_periods * (1.0 - top * mean) / jnp.where(halves == 0, 1.0, jnp.abs(gap))
 
     # Divided differences of T = diag(D, 1, C) by k12, k13, k23.
-    s = before.f.S * before.f.S
-    cc, dd = before.f.C * before.f.C, before.f.D * before.f.D
+    s = half_time_integrals.f.S * half_time_integrals.f.S
+    cc, dd = (
+        half_time_integrals.f.C * half_time_integrals.f.C,
+        half_time_integrals.f.D * half_time_integrals.f.D,
+    )
     g = 2.0 * s / (cc + p * s * dd)
     t12, t13, t23 = -g * cc * A3, g * A2, g * dd * A1
 
@@ -135,11 +145,11 @@ def jacobian_and_integral(
 
 def integrals(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
     """Return what `elliptic` does, and the integrals Y₂ and Y from 0 to u."""
-    n = limits(u.dtype).doublings
-    f = series(u * 2.0**-n, m, mu, turn)
+    n = dtype_limits(u.dtype).doublings
+    f = taylor_series(u * 2.0**-n, m, mu, turn)
     # S²/D² and S²/C² are S²/(1 + μS²) for μ = −q and −p.
     low = jnp.where(m.gap > 0, -m.q, -m.p)
-    first = Integrals(f, growth(f.S, m, jnp.zeros_like(u)), growth(f.S, m, low))
+    first = Integrals(f, growth_integral(f.S, m, jnp.zeros_like(u)), growth_integral(f.S, m, low))
     return jax.lax.fori_loop(0, n, lambda _, g: double_argument(g, m, mu, turn), first)
 
 

@@ -11,8 +11,8 @@ from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.exact import sigma_form
-from rigidjax.exact.components3 import HALF, Six, Triple, times
-from rigidjax.exact.derivatives import reciprocal, slopes
+from rigidjax.exact.components3 import HALF, Six, Triple, matvec
+from rigidjax.exact.derivatives import motion_and_derivatives, reciprocal
 from rigidjax.exact.jacobi_duplication import Modulus, half_period, is_endless
 from rigidjax.exact.principal_axes import components_along, principal_frame
 
@@ -36,7 +36,7 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> bool(abs(body_period(top, jnp.array([1.0, 0.5, 0.0])) - 4 * jnp.pi) < 1e-14)
     True
     """
-    return _periods(*_checked_arguments(inertia, omega0))[0]
+    return _periods(*_checked_tensor_and_rate(inertia, omega0))[0]
 
 
 def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
@@ -57,14 +57,14 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> precession_period(top, jnp.array([1.0, 0.5, 0.0]))  # 2π I₂/|L|
     Array(8.88576588, dtype=float64)
     """
-    return _periods(*_checked_arguments(inertia, omega0))[1]
+    return _periods(*_checked_tensor_and_rate(inertia, omega0))[1]
 
 
-def _checked_arguments(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
+def _checked_tensor_and_rate(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
     """Check body and rate; return the tensor and Ω in its dtype."""
-    _checks.single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
+    _checks.require_single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     tensor = validation.check_body(inertia, inertia.tensor, None, throw=False).tensor
-    return tensor, _checks.floating(omega0, (3,), "omega0").astype(tensor.dtype)
+    return tensor, _checks.array_of_shape(omega0, (3,), "omega0").astype(tensor.dtype)
 
 
 @jax.jit
@@ -72,7 +72,7 @@ def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
     """Return the body period and the precession period, from one program."""
     exponent = exponent_of(omega)
     moments, axes = principal_frame(times_power_of_two(tensor, -exponent_of(tensor)))
-    momentum = times(moments, components_along(axes, times_power_of_two(omega, -exponent)))
+    momentum = matvec(moments, components_along(axes, times_power_of_two(omega, -exponent)))
     body, _, _ = reciprocal(moments, momentum)
     v = sigma_form.invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
@@ -110,7 +110,7 @@ def _precession(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
 def _precession_jvp(primals, tangents):
     moments, momentum, period = primals
     (_, _, energy2), (_, d_k, d_energy2) = jax.jvp(reciprocal, (moments, momentum), tangents[:2])
-    _, _, (_, g) = slopes(moments, momentum, period)
+    _, _, (_, g) = motion_and_derivatives(moments, momentum, period)
     along = 0.5 * period * d_energy2 + energy2 * tangents[2]
     along = along + sum(w * a * b for w, a, b in zip(HALF, g, d_k, strict=True))
     h = jnp.sqrt(sum(p * p for p in momentum))

@@ -21,24 +21,24 @@ def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
     """
     columns, moments = _jacobi(jax.lax.stop_gradient(tensor))
     axes = jnp.stack([jnp.stack(row) for row in columns])
-    return in_axes(tensor, axes, moments), axes
+    return tensor_in_axes(tensor, axes, moments), axes
 
 
 @jax.custom_jvp
-def in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
+def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
     """Return `AᵀIA`, A the principal `axes` of I: diagonal in value, full in its derivative."""
     zero = jnp.zeros_like(tensor[0, 0])
     return batch_as((*moments, zero, zero, zero), (tensor, axes, moments))
 
 
-@in_axes.defjvp
-def _in_axes_jvp(primals, tangents):
+@tensor_in_axes.defjvp
+def _tensor_in_axes_jvp(primals, tangents):
     # The change of a symmetric matrix, so that a gradient is symmetric.
     axes, change = primals[1], 0.5 * (tangents[0] + tangents[0].T)
     # Summed, not a product of matrices: on a GPU that is rounded to ten bits in float32.
     turned = jnp.sum(axes[:, :, None] * change[:, None], axis=0)
     m = jnp.sum(turned[:, None] * axes.T[None], axis=2)
-    return in_axes(*primals), (m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2])
+    return tensor_in_axes(*primals), (m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2])
 
 
 def components_along(axes: Mat3, v: Vec3 | Triple) -> Triple:
@@ -46,7 +46,7 @@ def components_along(axes: Mat3, v: Vec3 | Triple) -> Triple:
     return tuple(axes[0, i] * v[0] + axes[1, i] * v[1] + axes[2, i] * v[2] for i in range(3))
 
 
-def out_of(axes: Mat3, v: Triple) -> Triple:
+def combine_columns(axes: Mat3, v: Triple) -> Triple:
     """Return the vector with the components `v` along the columns of `axes`.
 
     This is the inverse of `components_along`.
@@ -74,7 +74,7 @@ def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     # `axes` are columns: axes[i] is the i-th axis.
     d, _, axes = jax.lax.fori_loop(0, 3 * _SWEEPS, rotate, (d, o, axes))
     for i, j in ((0, 1), (1, 2), (0, 1)):
-        d, axes = _order(d, axes, i, j)
+        d, axes = _exchange_to_ascending(d, axes, i, j)
     columns = _orthonormalise([[axes[j][i] for j in range(3)] for i in range(3)])
     return columns, tuple(c + shift for c in d)
 
@@ -112,7 +112,7 @@ def _rotate(d, o, axes):
     return d, (jnp.zeros_like(x), s * z + c * y, c * z - s * y), (u, *turned)
 
 
-def _order(d, axes, i, j):
+def _exchange_to_ascending(d, axes, i, j):
     """Exchange axes i and j (turning one round) unless d[i] ≤ d[j]."""
     wrong = d[i] > d[j]
     d, axes = list(d), list(axes)

@@ -35,8 +35,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from rigidjax._types import Scalar
-from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, product, times
-from rigidjax.exact.jacobi_duplication import Modulus, is_endless, limits, until_rest
+from rigidjax.exact.components3 import Six, Triple, adjugate, commuting_product, determinant, matvec
+from rigidjax.exact.jacobi_duplication import Modulus, clip_at_rest, dtype_limits, is_endless
 from rigidjax.rotation.barrier import barrier
 
 
@@ -103,23 +103,23 @@ def invariants(body: Differences, momentum: Triple) -> Invariants:
     )
 
 
-# Doublings beyond `limits`, so that the series of `start` have two terms.
+# Doublings beyond `dtype_limits`, so that the series of `sigma_near_zero` have two terms.
 _MORE = 10
 
 
-def start(u: Scalar, v: Invariants) -> Sigma:
+def sigma_near_zero(u: Scalar, v: Invariants) -> Sigma:
     """Return σ, T, Y at a minute u: T = √(1 − x), x = σ²E, to second order in x."""
     uu, zero = u * u, jnp.zeros_like(u)
     c1 = (v.p + v.q) * uu
     s = barrier(u * (1.0 - c1 / 6))
     x = barrier(_scale((v.q, zero, v.p, v.e12, v.e13, v.e23), s * s))
-    t = tuple(-0.5 * (a + 0.25 * b) for a, b in zip(x, product(x, x), strict=True))
+    t = tuple(-0.5 * (a + 0.25 * b) for a, b in zip(x, commuting_product(x, x), strict=True))
     # Y = ⅓u³ (1 − c₁/5 + 3x/5).
     y = _scale(_add_scalar(_scale(x, 0.6), 1.0 - 0.2 * c1), u * uu / 3)
-    return _sigma(s, _add_scalar(t, 1.0), y)
+    return _scaled_sigma(s, _add_scalar(t, 1.0), y)
 
 
-def double(f: Sigma, v: Invariants) -> Sigma:
+def double_sigma(f: Sigma, v: Invariants) -> Sigma:
     """Return σ, T, Y at 2u from `f`, their values at u."""
     t1, t2, t3, t12, t13, t23 = f.t
     s = f.s
@@ -150,10 +150,12 @@ def double(f: Sigma, v: Invariants) -> Sigma:
     n12 = 2.0 * (m12 * m33 - m13 * m23)
     n13 = 2.0 * (m13 * m22 - m12 * m23)
     n23 = 2.0 * (m23 * m11 - m12 * m13)
-    after = _sigma(2.0 * s * f.det, (n11, n22, n33, n12, n13, n23), f.y)
+    after = _scaled_sigma(2.0 * s * f.det, (n11, n22, n33, n12, n13, n23), f.y)
     # Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u).
     before = barrier(_scale(f.adjugate, s / f.det))
-    more = product(barrier(product(before, before)), _scale(after.adjugate, after.s / after.det))
+    more = commuting_product(
+        barrier(commuting_product(before, before)), _scale(after.adjugate, after.s / after.det)
+    )
     return after._replace(y=barrier(tuple(2.0 * a + b for a, b in zip(f.y, more, strict=True))))
 
 
@@ -184,7 +186,9 @@ def divisor(body: Differences, v: Invariants, f: Sigma) -> Divisor:
     return Divisor(first, square, body.d13 * d, slant, k, v.h2 * (less * less))
 
 
-def move(body: Differences, w: Divisor, f: Sigma, momentum: Triple) -> tuple[Triple, Six]:
+def momentum_and_part(
+    body: Differences, w: Divisor, f: Sigma, momentum: Triple
+) -> tuple[Triple, Six]:
     """Return Π after the time of `f`, and 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ, W that of `w`."""
     p1, p2, p3 = momentum
     d12, d13, d23, k12, k13, k23 = body
@@ -193,7 +197,7 @@ def move(body: Differences, w: Divisor, f: Sigma, momentum: Triple) -> tuple[Tri
     u1 = -d23 * p2 * p3 + p2 * r3 - p3 * r2
     u2 = d13 * p1 * p3 + p3 * r1 - p1 * r3
     u3 = -d12 * p1 * p2 + p1 * r2 - p2 * r1
-    adj, turned = barrier((times(f.adjugate, momentum), times(f.t, barrier((u1, u2, u3)))))
+    adj, turned = barrier((matvec(f.adjugate, momentum), matvec(f.t, barrier((u1, u2, u3)))))
     end = jnp.where(w.first, p1, p3)
     z = w.d * (end * end) + 2.0 * (d13 * (w.k * (end * p2)) + w.slant * (k13 * (p1 * p3)))
     z = z + (r1 * r1 + r2 * r2 + r3 * r3 - w.less)
@@ -203,7 +207,7 @@ def move(body: Differences, w: Divisor, f: Sigma, momentum: Triple) -> tuple[Tri
     return barrier((tuple((a + f.s * b) * r for a, b in zip(adj, turned, strict=True)), part))
 
 
-def quarters(
+def momentum_and_integral_by_quarters(
     body: Differences, momentum: Triple, v: Invariants, span: Scalar
 ) -> tuple[Triple, Six]:
     """Return Π after `span`, and ∫ Π Πᵀ dt in four parts: T has no inverse at a quarter period."""
@@ -219,21 +223,21 @@ def quarters(
         hh * v.e23,
     )
 
-    def eighth(i, state):
+    def take_eighth(i, state):
         # Each part about its middle.
         point, total = state
-        point, part = move(body, w, f, point)
+        point, part = momentum_and_part(body, w, f, point)
         odd = i % 2 == 1
         return point, tuple(a + jnp.where(odd, c, 0.0) for a, c in zip(total, part, strict=True))
 
-    return jax.lax.fori_loop(0, 8, eighth, (momentum, _scale(product(b, f.y), -8.0)))
+    return jax.lax.fori_loop(0, 8, take_eighth, (momentum, _scale(commuting_product(b, f.y), -8.0)))
 
 
 def sigma_at(u: Scalar, v: Invariants) -> Sigma:
     """Return σ, T, Y at u: the Taylor series of a small part of u, then doublings."""
-    n = limits(u.dtype).doublings + _MORE
-    f = start(u * 2.0**-n, v)
-    return jax.lax.fori_loop(0, n, lambda _, g: double(g, v), f)
+    n = dtype_limits(u.dtype).doublings + _MORE
+    f = sigma_near_zero(u * 2.0**-n, v)
+    return jax.lax.fori_loop(0, n, lambda _, g: double_sigma(g, v), f)
 
 
 def period(v: Invariants) -> Scalar:
@@ -262,7 +266,7 @@ def period(v: Invariants) -> Scalar:
     root = barrier(jnp.sqrt(slope(x1, x2, x3)))
     a, b = 0.5 * jnp.sqrt(x1 + x2 + x3 + 2.0 * root), jnp.sqrt(root)
     mean = lambda _, x: (0.5 * (x[0] + x[1]), jnp.sqrt(x[0] * x[1]))  # noqa: E731
-    a, b = jax.lax.fori_loop(0, limits(a.dtype).agm, mean, (a, b))
+    a, b = jax.lax.fori_loop(0, dtype_limits(a.dtype).agm, mean, (a, b))
     return 2.0 * jnp.pi / a
 
 
@@ -279,16 +283,16 @@ def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
     several = count != 0
     usual = barrier(jax.tree.map(lambda a, b: jnp.where(several, a, b), v, tame))
     whole = barrier(period(usual))
-    r = 2.0 * until_rest(0.5 * (t - jnp.where(several, count * whole, 0.0)), m)
+    r = 2.0 * clip_at_rest(0.5 * (t - jnp.where(several, count * whole, 0.0)), m)
 
     # The rest and a whole period.
     both = jax.tree.map(lambda *a: jnp.stack(a), (v, r), (usual, whole))
-    out, g = jax.lax.map(lambda a: quarters(body, momentum, *a), both)
+    out, g = jax.lax.map(lambda a: momentum_and_integral_by_quarters(body, momentum, *a), both)
     g = tuple(c[0] + jnp.where(several, count * c[1], 0.0) for c in g)
     return tuple(p[0] for p in out), g
 
 
-def _sigma(s: Scalar, t: Six, y: Six) -> Sigma:
+def _scaled_sigma(s: Scalar, t: Six, y: Six) -> Sigma:
     """Return `Sigma`, with σ and T scaled by one factor so that T₂₂ = 1 in value."""
     r = barrier(1.0 / jax.lax.stop_gradient(t[1]))
     s, t = barrier((s * r, _scale(t, r)))

@@ -72,38 +72,38 @@ class Force(AbstractScene):
 
     def __check_init__(self) -> None:
         if self.force is not None:
-            _checks.function(self.force, "force", "(t, state, body) → (3,) per mass")
+            _checks.require_function(self.force, "force", "(t, state, body) → (3,) per mass")
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """Return the times, s, at which the force jumps or has a kink, by its own `jump_times`."""
-        return jumps_within(self.force)
+        return jump_times_within(self.force)
 
     def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
         if self.force is None:
             return jnp.zeros_like(state.x)
-        return per_mass(self.force(t, state, None), self.force)
+        return checked_force_per_mass(self.force(t, state, None), self.force)
 
     def conserved(self, t: ScalarLike, state: PyTree) -> dict[str, Scalar]:
         return {}
 
 
-def per_mass(value: NumbersLike, force: object) -> Vec3:
+def checked_force_per_mass(value: NumbersLike, force: object) -> Vec3:
     """Return the value of a force after a check of its shape: a user's force may return
     anything.
     """
     name = getattr(force, "__name__", type(force).__name__)
-    return _checks.floating(value, (3,), f"force {name}", hint="force per mass, m/s²")
+    return _checks.array_of_shape(value, (3,), f"force {name}", hint="force per mass, m/s²")
 
 
-def jumps_within(*laws: object) -> Float[Array, " n"]:
+def jump_times_within(*laws: object) -> Float[Array, " n"]:
     """Return the `jump_times` of the laws that have them, s.
 
     A scene or torque that contains laws must pass their times on: a solver does not see them.
     """
     jumps = (getattr(law, "jump_times", None) for law in laws)
-    found = [jnp.asarray(times, float) for times in jumps if times is not None]
-    return jnp.concatenate([jnp.zeros(0), *found])
+    times = [jnp.asarray(times, float) for times in jumps if times is not None]
+    return jnp.concatenate([jnp.zeros(0), *times])
 
 
 def cast_like(x: Array, *values: Array) -> tuple[Array, ...]:

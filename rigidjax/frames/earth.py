@@ -68,8 +68,8 @@ class Earth(AbstractScene):
         >>> round(float(earth(0.0).eastward_deflection(100.0)), 5)
         0.02195
         """
-        h = _checks.floating(height, (), "height")
-        h = _checks.sign(h, "height", "metres above the ground, a number ≥ 0", zero=True)
+        h = _checks.array_of_shape(height, (), "height")
+        h = _checks.require_sign(h, "height", "metres above the ground, a number ≥ 0", zero=True)
         time = jnp.sqrt(2 * h / self.gravity)
         return self.rate * self.gravity * jnp.cos(self.latitude) * time**3 / 3
 
@@ -87,9 +87,11 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
     """
     lat, g, w = _checks.scalars(latitude=latitude, gravity=gravity, rate=rate)
     words = "latitude: wanted radians between −π/2 and π/2; were these degrees?"
-    lat = _checks.refuse(lat, ~(jnp.abs(lat) <= 0.5000001 * jnp.pi), words)
-    g = _checks.sign(g, "gravity", "a positive number, m/s²; it points down")
-    return Earth(lat, g, _checks.refuse(w, ~jnp.isfinite(w), "rate: wanted a finite number, rad/s"))
+    lat = _checks.error_if(lat, ~(jnp.abs(lat) <= 0.5000001 * jnp.pi), words)
+    g = _checks.require_sign(g, "gravity", "a positive number, m/s²; it points down")
+    return Earth(
+        lat, g, _checks.error_if(w, ~jnp.isfinite(w), "rate: wanted a finite number, rad/s")
+    )
 
 
 class Foucault(AbstractScene):
@@ -141,7 +143,7 @@ class Foucault(AbstractScene):
         length, e, n, ve, vn = _checks.scalars(length=self.length, **named)
         below = length**2 - e * e - n * n
         words = "foucault: the start lies beyond the length of the string"
-        below = _checks.refuse(below, ~(below > 0), words)
+        below = _checks.error_if(below, ~(below > 0), words)
         up = -jnp.sqrt(below)
         return Point(jnp.stack([e, n, up]), jnp.stack([ve, vn, -(e * ve + n * vn) / up]))
 
@@ -159,7 +161,7 @@ class Foucault(AbstractScene):
         Array(0.1, dtype=float64)
         """
         require_point(state)
-        t = _checks.floating(t, (), "t").astype(state.x.dtype)
+        t = _checks.array_of_shape(t, (), "t").astype(state.x.dtype)
         x, y, _ = components(state.x)
         vx, vy, _ = components(state.v)
         place = self.place
@@ -200,6 +202,6 @@ def foucault(
     [0.0, 0.0, 0.0]
     """
     place = earth(latitude, gravity, rate)
-    string = _checks.floating(length, (), "length")
-    string = _checks.sign(string, "length", "a positive number, m")
+    string = _checks.array_of_shape(length, (), "length")
+    string = _checks.require_sign(string, "length", "a positive number, m")
     return Foucault(place, string.astype(jnp.promote_types(string.dtype, place.rate.dtype)))

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia
-from rigidjax.frames.base import AbstractScene, Force, jumps_within, per_mass
+from rigidjax.frames.base import AbstractScene, Force, checked_force_per_mass, jump_times_within
 from rigidjax.frames.moving import MovingFrame, require_frame
 from rigidjax.frames.rotation_models import Uniform
 from rigidjax.rotation import linalg3, quaternion
@@ -43,23 +43,27 @@ class InFrame(AbstractScene):
         require_frame(self.frame, "InFrame")
         for name in ("inside", "outside"):
             if getattr(self, name) is not None:
-                _checks.function(getattr(self, name), name, "(t, state) → (3,)")
+                _checks.require_function(getattr(self, name), name, "(t, state) → (3,)")
         if self.potential is not None:
-            _checks.function(self.potential, "potential", "of a place (3,) to a number, m²/s²")
+            _checks.require_function(
+                self.potential, "potential", "of a place (3,) to a number, m²/s²"
+            )
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """Return the times, s, at which a force jumps or has a kink."""
-        return jumps_within(self.inside, self.outside)
+        return jump_times_within(self.inside, self.outside)
 
     def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
         now = self.frame.at(t)
         total = now.fictitious(state.x, state.v)
         if self.inside is not None:
-            total = total + per_mass(self.inside(t, state), self.inside).astype(total.dtype)
+            total = total + checked_force_per_mass(self.inside(t, state), self.inside).astype(
+                total.dtype
+            )
         if self.outside is not None:
-            outer = per_mass(self.outside(t, now.to_inertial(state)), self.outside)
-            total = total + now.inward(outer).astype(total.dtype)
+            outer = checked_force_per_mass(self.outside(t, now.to_inertial(state)), self.outside)
+            total = total + now.from_inertial_axes(outer).astype(total.dtype)
         if self.potential is not None:
             total = total - jax.grad(self.potential)(state.x)
         return total
@@ -129,12 +133,14 @@ class BodyInFrame(eqx.Module):
     def __check_init__(self) -> None:
         require_frame(self.frame, "BodyInFrame")
         if self.torque is not None:
-            _checks.function(self.torque, "torque", "(t, state, body) → (3,), N m, or a law")
+            _checks.require_function(
+                self.torque, "torque", "(t, state, body) → (3,), N m, or a law"
+            )
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """Return the times, s, at which the torque jumps or has a kink."""
-        return jumps_within(self.torque)
+        return jump_times_within(self.torque)
 
     def __call__(self, t: ScalarLike, state: PyTree, body: _inertia.Body) -> Vec3 | FrameWrench:
         now = self.frame.at(t)
@@ -159,6 +165,6 @@ class BodyInFrame(eqx.Module):
                         f"Rigid state, got {type(state).__name__}, which has no position"
                     )
                 force, real = force + real.force.astype(omega.dtype), real.torque
-            real = _checks.floating(real, (3,), "torque", hint="body-frame N m")
+            real = _checks.array_of_shape(real, (3,), "torque", hint="body-frame N m")
             torque = torque + real.astype(omega.dtype)
         return torque if force is None else FrameWrench(force, torque)

@@ -36,9 +36,9 @@ class Instant(eqx.Module):
         turned = {}
         if hasattr(state, "x"):
             x, rate = state.x, self.rate.astype(state.x.dtype)
-            turned["x"] = self.origin.astype(x.dtype) + self.outward(x)
+            turned["x"] = self.origin.astype(x.dtype) + self.to_inertial_axes(x)
             velocity = state.v + linalg3.cross(rate, x)
-            turned["v"] = self.origin_velocity.astype(x.dtype) + self.outward(velocity)
+            turned["v"] = self.origin_velocity.astype(x.dtype) + self.to_inertial_axes(velocity)
         if hasattr(state, "q"):
             q = quaternion.from_matrix(self.rotation).astype(state.q.dtype)
             rate = quaternion.rotate_inverse(state.q, self.rate.astype(state.q.dtype))
@@ -52,8 +52,8 @@ class Instant(eqx.Module):
         turned = {}
         if hasattr(state, "x"):
             dtype = state.x.dtype
-            x = self.inward(state.x - self.origin.astype(dtype))
-            v = self.inward(state.v - self.origin_velocity.astype(dtype))
+            x = self.from_inertial_axes(state.x - self.origin.astype(dtype))
+            v = self.from_inertial_axes(state.v - self.origin_velocity.astype(dtype))
             turned["x"], turned["v"] = x, v - linalg3.cross(self.rate.astype(dtype), x)
         if hasattr(state, "q"):
             back = quaternion.from_matrix(self.rotation.T).astype(state.q.dtype)
@@ -62,43 +62,43 @@ class Instant(eqx.Module):
             turned["omega"] = state.omega - quaternion.rotate_inverse(turned["q"], rate)
         return _replace_fields(state, turned)
 
-    def outward(self, y: Vector) -> Vec3:
+    def to_inertial_axes(self, y: Vector) -> Vec3:
         """Return the components in S, M y', of a vector given in S' (notes, eq 85): a force, a
         direction.
         """
-        y = _checks.floating(y, (3,), "y")
+        y = _checks.array_of_shape(y, (3,), "y")
         return linalg3.apply(self.rotation.astype(y.dtype), y)
 
-    def inward(self, y: Vector) -> Vec3:
+    def from_inertial_axes(self, y: Vector) -> Vec3:
         """Return the components in S', Mᵀ y, of a vector given in S (notes, eq 86; f = MᵀF of eq
         91).
         """
-        y = _checks.floating(y, (3,), "y")
+        y = _checks.array_of_shape(y, (3,), "y")
         return linalg3.apply(self.rotation.T.astype(y.dtype), y)
 
     def centrifugal(self, x: Vector) -> Vec3:
         """Return the centrifugal acceleration −Ω × (Ω × x')."""
-        x = _checks.floating(x, (3,), "x")
+        x = _checks.array_of_shape(x, (3,), "x")
         rate = self.rate.astype(x.dtype)
         return linalg3.cross(linalg3.cross(rate, x), rate)
 
     def coriolis(self, v: Vector) -> Vec3:
         """Return the Coriolis acceleration −2 Ω × v'."""
-        v = _checks.floating(v, (3,), "v")
+        v = _checks.array_of_shape(v, (3,), "v")
         return 2 * linalg3.cross(v, self.rate.astype(v.dtype))
 
     def euler_acceleration(self, x: Vector) -> Vec3:
         """Return the Euler acceleration −dΩ/dt × x'."""
-        x = _checks.floating(x, (3,), "x")
+        x = _checks.array_of_shape(x, (3,), "x")
         return linalg3.cross(x, self.rate_change.astype(x.dtype))
 
     def translation(self) -> Vec3:
         """Return the acceleration −Mᵀ d²X/dt² of an accelerated origin."""
-        return -self.inward(self.origin_acceleration)
+        return -self.from_inertial_axes(self.origin_acceleration)
 
     def fictitious(self, x: Vector, v: Vector) -> Vec3:
         """Return the sum of the four inertial accelerations (notes, eq 91)."""
-        x, v = _checks.floating(x, (3,), "x"), _checks.floating(v, (3,), "v")
+        x, v = _checks.array_of_shape(x, (3,), "x"), _checks.array_of_shape(v, (3,), "v")
         turning = self.centrifugal(x) + self.coriolis(v) + self.euler_acceleration(x)
         return turning + self.translation().astype(x.dtype)
 
@@ -116,9 +116,9 @@ def _can_travel(state: PyTree) -> None:
     hint = "one state at one time; batch with jax.vmap(frame.to_inertial)(states, times)"
     for name, size in (("x", 3), ("v", 3), ("q", 4), ("omega", 3)):
         if hasattr(state, name):
-            _checks.floating(getattr(state, name), (size,), name, hint=hint)
+            _checks.array_of_shape(getattr(state, name), (size,), name, hint=hint)
 
 
-def _replace_fields(state: PyTree, turned: dict[str, Any]) -> Any:
-    names = list(turned)
-    return eqx.tree_at(lambda s: [getattr(s, n) for n in names], state, [turned[n] for n in names])
+def _replace_fields(state: PyTree, fields: dict[str, Any]) -> Any:
+    names = list(fields)
+    return eqx.tree_at(lambda s: [getattr(s, n) for n in names], state, [fields[n] for n in names])

@@ -63,7 +63,10 @@ class Hoop(AbstractScene):
         >>> hoop(2.0, 3.0).state(0.0, 1.0).v.tolist()
         [2.0, 0.0, 0.0]
         """
-        angle, speed = _checks.floating(angle, (), "angle"), _checks.floating(speed, (), "speed")
+        angle, speed = (
+            _checks.array_of_shape(angle, (), "angle"),
+            _checks.array_of_shape(speed, (), "speed"),
+        )
         c, s, zero = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)
         place, along = jnp.stack([s, zero, -c]), jnp.stack([c, zero, s])
         radius = cast_like(place, self.radius)[0]
@@ -91,8 +94,8 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
     [0.0, 0.0, 0.0]
     """
     r, w, g = _checks.scalars(radius=radius, rate=rate, gravity=gravity)
-    r = _checks.sign(r, "radius", "a positive number, m")
-    return Hoop(r, _checks.finite(w, "rate"), _checks.finite(g, "gravity"))
+    r = _checks.require_sign(r, "radius", "a positive number, m")
+    return Hoop(r, _checks.require_finite(w, "rate"), _checks.require_finite(g, "gravity"))
 
 
 class _Angle(eqx.Module):
@@ -115,7 +118,7 @@ def turntable(rate: ScalarLike, growth: ScalarLike = 0.0) -> InFrame:
     >>> turntable(2.0).acceleration(0.0, Point([1.0, 0, 0], [0.0, 0, 0])).tolist()
     [4.0, 0.0, 0.0]
     """
-    rate = _checks.finite(_checks.floating(rate, (), "rate"), "rate")
-    growth = _checks.finite(_checks.floating(growth, (), "growth"), "growth")
+    rate = _checks.require_finite(_checks.array_of_shape(rate, (), "rate"), "rate")
+    growth = _checks.require_finite(_checks.array_of_shape(growth, (), "growth"), "growth")
     up = jnp.eye(3, dtype=rate.dtype)[2]
     return InFrame(MovingFrame(AboutAxis(up, _Angle(rate, growth))))

@@ -46,7 +46,7 @@ def libration(rate: ScalarLike) -> BodyInFrame:
     >>> libration(0.001)(0.0, at_rest, body).tolist()
     [0.0, 0.0, 0.0]
     """
-    n = _checks.finite(_checks.floating(rate, (), "rate"), "rate")
+    n = _checks.require_finite(_checks.array_of_shape(rate, (), "rate"), "rate")
     return BodyInFrame(
         MovingFrame(Uniform(n * jnp.eye(3, dtype=n.dtype)[2])), OrbitalGravityGradient(n)
     )
@@ -64,13 +64,18 @@ def libration_integral(state: PyTree, body: _inertia.Inertia, rate: ScalarLike) 
     >>> float(libration_integral(at_rest, body, 2.0))
     1.0
     """
-    _checks.single(state, HasAttitude, "state", wanted="an Attitude in the orbital frame")
-    body = validation.single(body, _inertia.Inertia, "body")
+    _checks.require_single(
+        state, HasAttitude, "state", requirement="an Attitude in the orbital frame"
+    )
+    body = validation.require_single_body(body, _inertia.Inertia, "body")
     axes = jnp.eye(3, dtype=state.q.dtype)
-    n = _checks.floating(rate, (), "rate").astype(state.q.dtype)
+    n = _checks.array_of_shape(rate, (), "rate").astype(state.q.dtype)
     up, normal = (quaternion.rotate_inverse(state.q, axes[i]) for i in (0, 2))
 
-    def weighed(y: Vec3) -> Scalar:
+    def weigh_by_inertia(y: Vec3) -> Scalar:
         return linalg3.dot(y, _inertia.apply(body.tensor, y))
 
-    return 0.5 * (weighed(state.omega) + n * n * (3 * weighed(up) - weighed(normal)))
+    return 0.5 * (
+        weigh_by_inertia(state.omega)
+        + n * n * (3 * weigh_by_inertia(up) - weigh_by_inertia(normal))
+    )

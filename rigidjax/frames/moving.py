@@ -53,18 +53,18 @@ class MovingFrame(eqx.Module):
         if isinstance(rotation, type) or not hasattr(rotation, "evaluate"):
             wanted = "of time or a solution of simulate"
             hint = "for a uniform turn take frames.Uniform(omega)"
-            _checks.function(rotation, "rotation", wanted, hint=hint)
+            _checks.require_function(rotation, "rotation", wanted, hint=hint)
         if origin is not None:
             hint = "for an origin at rest pass lambda t: point"
-            _checks.function(origin, "origin", "of time to (3,)", hint=hint)
+            _checks.require_function(origin, "origin", "of time to (3,)", hint=hint)
         if rate is not None:
-            _checks.function(rate, "rate", "of time to (3,)")
-        self.rotation, self.origin = rotation_models.differentiable(rotation), origin
+            _checks.require_function(rate, "rate", "of time to (3,)")
+        self.rotation, self.origin = rotation_models.with_forward_solves(rotation), origin
         self.rate = getattr(rotation, "rate", None) if rate is None else rate
 
     def matrix(self, t: ScalarLike) -> Mat3:
         """Return M(t) (3, 3), S' → S (notes, eq 85)."""
-        return rotation_models.matrix(self.rotation, _checks.time(t))
+        return rotation_models.matrix(self.rotation, _checks.checked_time(t))
 
     def at(self, t: ScalarLike) -> Instant:
         """Return the frame at time `t`, s: M, Ω, dΩ/dt, and the origin with its two derivatives.
@@ -72,7 +72,7 @@ class MovingFrame(eqx.Module):
         >>> MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
-        t = _checks.time(t)
+        t = _checks.checked_time(t)
         one = jnp.ones_like(t)
         rate, rate_change = jax.jvp(self.angular_velocity, (t,), (one,))
         twice = jax.jvp(lambda s: jax.jvp(self.place, (s,), (one,)), (t,), (one,))
@@ -81,9 +81,9 @@ class MovingFrame(eqx.Module):
 
     def angular_velocity(self, t: ScalarLike) -> Vec3:
         """Return Ω(t) (3,), rad/s, axes of S': `rate`, or vee(Mᵀ dM/dt) (notes, eqs 45–50)."""
-        t = _checks.time(t)
+        t = _checks.checked_time(t)
         if self.rate is not None:
-            return _checks.floating(self.rate(t), (3,), "rate").astype(t.dtype)
+            return _checks.array_of_shape(self.rate(t), (3,), "rate").astype(t.dtype)
         state = rotation_models.state_of(self.rotation, t)
         if hasattr(state, "omega"):
             return state.omega.astype(t.dtype)
@@ -156,24 +156,24 @@ class MovingFrame(eqx.Module):
         >>> frame.acceleration([1.0, 0, 0], [0.0, -2, 0], 0.0).tolist()
         [-4.0, 0.0, 0.0]
         """
-        x, v = _checks.floating(x, (3,), "x"), _checks.floating(v, (3,), "v")
+        x, v = _checks.array_of_shape(x, (3,), "x"), _checks.array_of_shape(v, (3,), "v")
         free = self.at(t).fictitious(x, v)
-        return free if force is None else _checks.floating(force, (3,), "force") + free
+        return free if force is None else _checks.array_of_shape(force, (3,), "force") + free
 
     def acceleration_to_inertial(self, x: Vector, v: Vector, a: Vector, t: ScalarLike) -> Vec3:
         """Return the acceleration in S (3,), m/s², of a particle with `x`, `v`, `a` (3,) in S' at
         `t` (eqs 89, 90).
         """
-        now, a = self.at(t), _checks.floating(a, (3,), "a")
-        return now.outward(a - now.fictitious(x, v))
+        now, a = self.at(t), _checks.array_of_shape(a, (3,), "a")
+        return now.to_inertial_axes(a - now.fictitious(x, v))
 
     def force_from_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
         """Return f = MᵀF (3,): a force F, or any direction, in the axes of S' (notes, eq 91)."""
-        return linalg3.apply(self.matrix(t).T, _checks.floating(force, (3,), "force"))
+        return linalg3.apply(self.matrix(t).T, _checks.array_of_shape(force, (3,), "force"))
 
     def force_to_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
         """Return F = M f (3,): a force f, or any direction, in the axes of S (notes, eq 85)."""
-        return linalg3.apply(self.matrix(t), _checks.floating(force, (3,), "force"))
+        return linalg3.apply(self.matrix(t), _checks.array_of_shape(force, (3,), "force"))
 
     def jacobi_integral(self, state: PyTree, t: ScalarLike, potential: ScalarLike = 0.0) -> Scalar:
         """Return ½|v'|² − ½|Ω × x'|² + V, m²/s²: conserved if Ω and V(x') do not depend on time.
@@ -184,7 +184,7 @@ class MovingFrame(eqx.Module):
         require_point(state)
         speed = linalg3.dot(state.v, state.v)
         moved = linalg3.cross(self.at(t).rate.astype(state.x.dtype), state.x)
-        v = _checks.floating(potential, (), "potential").astype(state.x.dtype)
+        v = _checks.array_of_shape(potential, (), "potential").astype(state.x.dtype)
         return 0.5 * (speed - linalg3.dot(moved, moved)) + v
 
     def compose(self, inner: "MovingFrame") -> "MovingFrame":
@@ -207,16 +207,18 @@ class MovingFrame(eqx.Module):
 
     def place(self, t: ScalarLike) -> Vec3:
         """Return the origin X(t) (3,), m, axes of S."""
-        t = _checks.time(t)
+        t = _checks.checked_time(t)
         if self.origin is None:
             return jnp.zeros(3, t.dtype)
-        return _checks.floating(self.origin(t), (3,), "origin").astype(t.dtype)
+        return _checks.array_of_shape(self.origin(t), (3,), "origin").astype(t.dtype)
 
 
 def require_frame(frame: object, name: str) -> Any:
     """Return `frame` if it is a `MovingFrame`; raise `TypeError` for anything else."""
     hint = "make one from a rotation with MovingFrame(rotation)"
-    return _checks.instance(frame, MovingFrame, name, wanted="a MovingFrame", hint=hint)
+    return _checks.require_instance(
+        frame, MovingFrame, name, requirement="a MovingFrame", hint=hint
+    )
 
 
 class _Composed(eqx.Module):

@@ -23,13 +23,13 @@ class Point(eqx.Module):
     x: Float[Array, "*batch 3"]
     v: Float[Array, "*batch 3"]
 
-    __repr__ = _show.numbers
+    __repr__ = _show.fields_as_text
 
     def __init__(self, x: Vectors, v: Vectors):
         hint = "a plane problem has z = 0; functions take one particle, batch with jax.vmap"
-        x = _checks.floating(x, (3,), "x", batched=True, hint=hint)
-        v = _checks.floating(v, (3,), "v", batched=True, hint=hint)
-        _checks.same_batch(x=(x, 1), v=(v, 1))
+        x = _checks.array_of_shape(x, (3,), "x", batched=True, hint=hint)
+        v = _checks.array_of_shape(v, (3,), "v", batched=True, hint=hint)
+        _checks.require_same_batch(x=(x, 1), v=(v, 1))
         dtype = jnp.promote_types(x.dtype, v.dtype)
         self.x, self.v = x.astype(dtype), v.astype(dtype)
 
@@ -37,7 +37,7 @@ class Point(eqx.Module):
 def require_point(state: PyTree, name: str = "state") -> Any:
     """Return `state` if it has one place and one velocity; raise an error for anything else."""
     if isinstance(state, type) or not (hasattr(state, "x") and hasattr(state, "v")):
-        raise TypeError(f"{name}: wanted a Point(x, v), got {_checks.kind(state)}")
+        raise TypeError(f"{name}: wanted a Point(x, v), got {_checks.type_name(state)}")
     for part in ("x", "v"):
-        _checks.floating(getattr(state, part), (3,), f"{name}.{part}")
+        _checks.array_of_shape(getattr(state, part), (3,), f"{name}.{part}")
     return state

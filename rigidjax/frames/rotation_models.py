@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from rigidjax import _checks
 from rigidjax._types import Mat3, ScalarLike, Vec3
 from rigidjax.rotation import linalg3, quaternion, so3
-from rigidjax.rotation.validation import near_unit, rotation_matrix
+from rigidjax.rotation.validation import require_near_unit, require_rotation_matrix
 
 
 class Uniform(eqx.Module):
@@ -25,15 +25,15 @@ class Uniform(eqx.Module):
     omega: Float[Array, "3"]
 
     def __init__(self, omega: Float[Array, "3"] | object):
-        self.omega = _checks.finite(_checks.floating(omega, (3,), "omega"), "omega")
+        self.omega = _checks.require_finite(_checks.array_of_shape(omega, (3,), "omega"), "omega")
 
     def __call__(self, t: ScalarLike) -> Mat3:
-        t = _checks.time(t)
+        t = _checks.checked_time(t)
         return so3.exp(t * self.omega.astype(t.dtype))
 
     def rate(self, t: ScalarLike) -> Vec3:
         """Return Ω, which is constant."""
-        return self.omega.astype(_checks.time(t).dtype)
+        return self.omega.astype(_checks.checked_time(t).dtype)
 
 
 class AboutAxis(eqx.Module):
@@ -47,25 +47,29 @@ class AboutAxis(eqx.Module):
     angle: Callable[[Any], Any]
 
     def __init__(self, axis: Float[Array, "3"] | object, angle: Callable[[Any], Any]):
-        axis = _checks.finite(_checks.floating(axis, (3,), "axis"), "axis")
+        axis = _checks.require_finite(_checks.array_of_shape(axis, (3,), "axis"), "axis")
         hint = "for a uniform turn take frames.Uniform(omega)"
-        _checks.function(angle, "angle", "of time to rad", hint=hint)
+        _checks.require_function(angle, "angle", "of time to rad", hint=hint)
         length = jnp.sqrt(linalg3.dot(axis, axis))
-        self.axis = _checks.refuse(axis, length == 0, "axis: wanted a direction, got zero") / length
+        self.axis = (
+            _checks.error_if(axis, length == 0, "axis: wanted a direction, got zero") / length
+        )
         self.angle = angle
 
     def __call__(self, t: ScalarLike) -> Mat3:
-        t = _checks.time(t)
-        return so3.exp(_checks.floating(self.angle(t), (), "angle") * self.axis.astype(t.dtype))
+        t = _checks.checked_time(t)
+        return so3.exp(
+            _checks.array_of_shape(self.angle(t), (), "angle") * self.axis.astype(t.dtype)
+        )
 
     def rate(self, t: ScalarLike) -> Vec3:
         """Return Ω (3,), rad/s: the axis times the angle's derivative."""
-        t = _checks.time(t)
+        t = _checks.checked_time(t)
         _, speed = jax.jvp(self.angle, (t,), (jnp.ones_like(t),))
         return speed * self.axis.astype(t.dtype)
 
 
-def differentiable(rotation: PyTree) -> Any:
+def with_forward_solves(rotation: PyTree) -> Any:
     """Return `rotation` with its own solves in forward mode, which dΩ/dt needs."""
 
     def reverse(part: PyTree) -> bool:
@@ -87,7 +91,9 @@ def matrix(rotation: PyTree, t: Array) -> Mat3:
     value = getattr(value, "q", value)
     shape = jnp.shape(value)
     if shape == (4,):
-        q = _checks.floating(value, (4,), "rotation").astype(t.dtype)
-        return quaternion.to_matrix(quaternion.normalise(near_unit(q, "rotation", 1e-3)))
-    m = _checks.floating(value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)")
-    return _checks.if_known(rotation_matrix, m, "rotation").astype(t.dtype)
+        q = _checks.array_of_shape(value, (4,), "rotation").astype(t.dtype)
+        return quaternion.to_matrix(quaternion.normalise(require_near_unit(q, "rotation", 1e-3)))
+    m = _checks.array_of_shape(
+        value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)"
+    )
+    return _checks.check_if_known(require_rotation_matrix, m, "rotation").astype(t.dtype)

@@ -31,7 +31,7 @@ from rigidjax.identify.inference.compare import compare as compare, cross_valida
 from rigidjax.identify.inference.density import LogDensity as LogDensity
 from rigidjax.identify.inference.design import (
     best_first_rate as best_first_rate,
-    expected as expected,
+    expected_quantities as expected_quantities,
     fisher as fisher,
 )
 from rigidjax.identify.inference.draws import (
@@ -91,9 +91,9 @@ __all__ = [
     "Model", "Nuts", "Position", "Posterior", "Principal", "PrincipalRatios", "Range", "Ratios",
     "Recording", "Refit", "Scene", "SensorInput", "SoftL1", "Tensor", "Tolerance", "Unpacked",
     "Velocity", "Walk", "Windows", "best_first_rate", "compare", "cross_validate", "descend",
-    "expected", "filter", "first_belief", "fisher", "fit", "linear_filter", "linear_smooth",
-    "log_likelihood", "posterior", "predict_windows", "profile", "read_table", "refit", "report",
-    "sample", "simulate_readings", "smooth", "step", "windows",
+    "expected_quantities", "filter", "first_belief", "fisher", "fit", "linear_filter",
+    "linear_smooth", "log_likelihood", "posterior", "predict_windows", "profile", "read_table",
+    "refit", "report", "sample", "simulate_readings", "smooth", "step", "windows",
 ]  # fmt: skip
 
 show(__name__)

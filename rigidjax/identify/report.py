@@ -33,7 +33,7 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
     ('Ix/Iz', 3.1, True)
     """
     require_one_fit(fit)
-    scale = _UNITS[_checks.word(rate_unit, tuple(_UNITS), "rate_unit")]
+    scale = _UNITS[_checks.require_option(rate_unit, tuple(_UNITS), "rate_unit")]
     bounds = fit.interval(0.95)
     out: list[Row] = []
     for quantity in fit.quantities:
@@ -56,7 +56,9 @@ def table(lines: list[Row]) -> str:
                  value  95 % interval
     I1          1.2346  1.2000 … 1.2700 kg m²
     """
-    for line in _checks.instance(lines, (list, tuple), "lines", wanted="a list of rows"):
+    for line in _checks.require_instance(
+        lines, (list, tuple), "lines", requirement="a list of rows"
+    ):
         if not isinstance(line, tuple) or len(line) != 5:
             raise TypeError(f"lines: wanted rows (name, value, low, high, unit), got {line!r}")
     if not lines:
@@ -77,8 +79,8 @@ def numbers(value: float, low: float, high: float) -> list[str]:
     >>> numbers(1.23456, 1.2, 1.27)
     ['1.2346', '1.2000', '1.2700']
     """
-    value = _checks.number(value, "value")
-    low, high = _checks.number(low, "low"), _checks.number(high, "high")
+    value = _checks.known_float(value, "value")
+    low, high = _checks.known_float(low, "low"), _checks.known_float(high, "high")
     wholes = [abs(number) for number in (value, low, high) if np.isfinite(number)]
     size, gaps = max(wholes, default=0.0), (value - low, high - value)
     fixed = size == 0 or 1e-3 <= size < 1e6
@@ -193,7 +195,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
                     )
                 },
             }
-            for one in fit.undetermined
+            for one in fit.undetermined_combinations
         ],
     }
 
@@ -205,9 +207,9 @@ def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
     """
     out = []
     for error, reading in zip(fit.residuals, fit.model.records.readings, strict=True):
-        kept = reading.kept
-        squares = np.where(kept, np.asarray(error).reshape(kept.shape) ** 2, 0.0)
-        mean = squares.sum(axis=(0, 1)) / np.maximum(kept.sum(axis=(0, 1)), 1)
+        mask = reading.channel_mask
+        squares = np.where(mask, np.asarray(error).reshape(mask.shape) ** 2, 0.0)
+        mean = squares.sum(axis=(0, 1)) / np.maximum(mask.sum(axis=(0, 1)), 1)
         sensor = reading.sensor
         out.append((type(sensor).__name__, [float(x) for x in np.sqrt(mean)], sensor.unit))
     return out

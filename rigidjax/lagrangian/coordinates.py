@@ -36,12 +36,12 @@ class Coordinates(eqx.Module):
     def __init__(
         self, q: Float[ArrayLike, "*batch n"] | object, rate: Float[ArrayLike, "*batch n"] | object
     ):
-        self.q = _checks.numbers(q, "q")
+        self.q = _checks.numeric_array(q, "q")
         if self.q.ndim == 0 or self.q.size == 0:
             words = f"wanted generalised coordinates (n,), got {self.q.shape}; for one give [q]"
             raise ValueError(f"q: {words}")
         hint = "one rate for each coordinate"
-        self.rate = _checks.floating(rate, self.q.shape, "rate", hint=hint)
+        self.rate = _checks.array_of_shape(rate, self.q.shape, "rate", hint=hint)
 
 
 class LagrangeEquations(eqx.Module):
@@ -62,8 +62,10 @@ class LagrangeEquations(eqx.Module):
         _, carried = jax.jvp(lambda x: momentum(x, rate), (q,), (rate,))
         push = jax.grad(self._value)(q, rate) - carried
         if self.force is not None:
-            push = push + _checks.floating(self.force(t, q, rate), q.shape, "force")
-        return Coordinates(rate, _solve(jax.jacfwd(lambda v: momentum(q, v))(rate), push))
+            push = push + _checks.array_of_shape(self.force(t, q, rate), q.shape, "force")
+        return Coordinates(
+            rate, _solve_for_acceleration(jax.jacfwd(lambda v: momentum(q, v))(rate), push)
+        )
 
     def energy(self, y: Coordinates) -> Scalar:
         """Return Jacobi's integral `q̇·∂L/∂q̇ − L`, J: conserved without a `force`."""
@@ -71,7 +73,9 @@ class LagrangeEquations(eqx.Module):
         return jnp.sum(y.rate * momentum) - self._value(y.q, y.rate)
 
     def _value(self, q: Array, rate: Array) -> Scalar:
-        return _checks.floating(self.lagrangian(q, rate), (), "lagrangian", hint="one number, J")
+        return _checks.array_of_shape(
+            self.lagrangian(q, rate), (), "lagrangian", hint="one number, J"
+        )
 
 
 def equations_of_motion(
@@ -94,9 +98,9 @@ def equations_of_motion(
     >>> pendulum(0.0, Coordinates([jnp.pi / 2], [0.0])).rate
     Array([-9.81], dtype=float64)
     """
-    _checks.function(lagrangian, "lagrangian", "(q, q̇) → L, J")
+    _checks.require_function(lagrangian, "lagrangian", "(q, q̇) → L, J")
     if force is not None:
-        _checks.function(force, "force", "(t, q, q̇) → Q")
+        _checks.require_function(force, "force", "(t, q, q̇) → Q")
     return LagrangeEquations(lagrangian, force)
 
 
@@ -118,7 +122,7 @@ class EulerAngleTop(eqx.Module):
     torque: Torque | None
 
     def __init__(self, inertia: Inertia, torque: Torque | None = None):
-        inertia = validation.single(inertia, Inertia, "inertia")
+        inertia = validation.require_single_body(inertia, Inertia, "inertia")
         if torque is not None:
             require_law(torque)
         if torque is not None and not hasattr(torque, "energy"):
@@ -145,8 +149,8 @@ def to_attitude(y: Coordinates) -> Attitude:
     >>> to_attitude(Coordinates([0.0, 0.0, 0.0], [0.0, 0.0, 2.0])).omega.tolist()
     [0.0, 0.0, 2.0]
     """
-    _checks.instance(y, Coordinates, "y")
-    _checks.floating(y.q, (3,), "y.q", hint="three Euler angles")
+    _checks.require_instance(y, Coordinates, "y")
+    _checks.array_of_shape(y.q, (3,), "y.q", hint="three Euler angles")
     return Attitude(euler.to_quaternion(y.q), euler.rates_to_omega(y.q, y.rate))
 
 
@@ -161,14 +165,16 @@ def from_attitude(state: HasAttitude) -> Coordinates:
     >>> back.rate.round(12).tolist()
     [1.0, 2.0, 3.0]
     """
-    _checks.single(state, HasAttitude, "state", wanted="an Attitude")
+    _checks.require_single(state, HasAttitude, "state", requirement="an Attitude")
     angles = euler.from_quaternion(state.q)
     words = "from_attitude: Euler angles (3-1-3) are singular at sin θ = 0; solve for an Attitude"
-    angles = _checks.refuse(angles, euler.is_singular(angles), words)
+    angles = _checks.error_if(angles, euler.is_singular(angles), words)
     return Coordinates(angles, euler.omega_to_rates(angles, state.omega))
 
 
-def _solve(matrix: Float[Array, "n n"], push: Float[Array, " n"]) -> Float[Array, " n"]:
+def _solve_for_acceleration(
+    matrix: Float[Array, "n n"], push: Float[Array, " n"]
+) -> Float[Array, " n"]:
     n = push.shape[0]
     if n == 1:
         return push / matrix[0]

@@ -29,7 +29,7 @@ class Momentum(eqx.Module):
     pi: Float[Array, "*batch 3"]
 
     def __init__(self, pi: Vectors):
-        self.pi = _checks.floating(pi, (3,), "pi", batched=True)
+        self.pi = _checks.array_of_shape(pi, (3,), "pi", batched=True)
 
 
 class MomentumAndDirection(eqx.Module):
@@ -46,9 +46,9 @@ class MomentumAndDirection(eqx.Module):
     gamma: Float[Array, "*batch 3"]
 
     def __init__(self, pi: Vectors, gamma: Vectors):
-        self.pi = _checks.floating(pi, (3,), "pi", batched=True)
-        self.gamma = _checks.floating(gamma, (3,), "gamma", batched=True)
-        _checks.same_batch(pi=(self.pi, 1), gamma=(self.gamma, 1))
+        self.pi = _checks.array_of_shape(pi, (3,), "pi", batched=True)
+        self.gamma = _checks.array_of_shape(gamma, (3,), "gamma", batched=True)
+        _checks.require_same_batch(pi=(self.pi, 1), gamma=(self.gamma, 1))
 
 
 class LiePoisson(eqx.Module):
@@ -59,7 +59,7 @@ class LiePoisson(eqx.Module):
     hamiltonian: Callable[[Any], Any]
 
     def __call__(self, t: ScalarLike, y: Momentum, args: object = None) -> Momentum:
-        return Momentum(cross(y.pi, jax.grad(lambda p: _number(self.hamiltonian(p)))(y.pi)))
+        return Momentum(cross(y.pi, jax.grad(lambda p: _checked_scalar(self.hamiltonian(p)))(y.pi)))
 
 
 class LiePoissonWithDirection(eqx.Module):
@@ -72,7 +72,7 @@ class LiePoissonWithDirection(eqx.Module):
     def __call__(
         self, t: ScalarLike, y: MomentumAndDirection, args: object = None
     ) -> MomentumAndDirection:
-        value = lambda p, g: _number(self.hamiltonian(p, g))  # noqa: E731
+        value = lambda p, g: _checked_scalar(self.hamiltonian(p, g))  # noqa: E731
         turn, pull = jax.grad(value, argnums=(0, 1))(y.pi, y.gamma)
         return MomentumAndDirection(cross(y.pi, turn) + cross(y.gamma, pull), cross(y.gamma, turn))
 
@@ -89,7 +89,7 @@ def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
     >>> lie_poisson(H)(0.0, Momentum([1.0, 1.0, 1.0])).pi
     Array([ 0. ,  0.5, -0.5], dtype=float64)
     """
-    return LiePoisson(_checks.function(hamiltonian, "hamiltonian", _WANTED))
+    return LiePoisson(_checks.require_function(hamiltonian, "hamiltonian", _WANTED))
 
 
 def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoissonWithDirection:
@@ -105,11 +105,11 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
     >>> field(0.0, MomentumAndDirection([0.0, 0, 1], [1.0, 0, 0])).pi.tolist()
     [0.0, 1.0, 0.0]
     """
-    return LiePoissonWithDirection(_checks.function(hamiltonian, "hamiltonian", _WANTED))
+    return LiePoissonWithDirection(_checks.require_function(hamiltonian, "hamiltonian", _WANTED))
 
 
-def _invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
-    _checks.single(inertia, _inertia.Inertia, "inertia")
+def _require_invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
+    _checks.require_single(inertia, _inertia.Inertia, "inertia")
     return validation.check_body(inertia, inertia.tensor, None, throw=False)
 
 
@@ -126,10 +126,10 @@ class RotationalHamiltonian(eqx.Module):
     inverse: Mat3
 
     def __init__(self, inertia: _inertia.Inertia):
-        self.inverse = _inertia.inverse(_invertible(inertia).tensor)
+        self.inverse = _inertia.inverse(_require_invertible(inertia).tensor)
 
     def __call__(self, pi: Float[ArrayLike, "3"] | list[float]) -> Scalar:
-        pi = _checks.floating(pi, (3,), "pi")
+        pi = _checks.array_of_shape(pi, (3,), "pi")
         return 0.5 * dot(pi, apply(self.inverse, pi))
 
 
@@ -151,15 +151,18 @@ class HeavyTopHamiltonian(eqx.Module):
     top: HeavyTop
 
     def __init__(self, inertia: _inertia.Inertia, top: HeavyTop):
-        self.inertia = _invertible(inertia)
+        self.inertia = _require_invertible(inertia)
         hint = "this Hamiltonian is for gravity alone"
-        self.top = _checks.instance(top, HeavyTop, "top", hint=hint)
+        self.top = _checks.require_instance(top, HeavyTop, "top", hint=hint)
         self.inverse = _inertia.inverse(self.inertia.tensor)
 
     def __call__(
         self, pi: Float[ArrayLike, "3"] | list[float], gamma: Float[ArrayLike, "3"] | list[float]
     ) -> Scalar:
-        pi, gamma = _checks.floating(pi, (3,), "pi"), _checks.floating(gamma, (3,), "gamma")
+        pi, gamma = (
+            _checks.array_of_shape(pi, (3,), "pi"),
+            _checks.array_of_shape(gamma, (3,), "gamma"),
+        )
         return 0.5 * dot(pi, apply(self.inverse, pi)) - self.top.mass * dot(self.top.com, gamma)
 
     def start(self, state: HasAttitude) -> MomentumAndDirection:
@@ -168,5 +171,5 @@ class HeavyTopHamiltonian(eqx.Module):
         return MomentumAndDirection(pi, quaternion.rotate_inverse(state.q, self.top.gravity))
 
 
-def _number(value):
-    return _checks.floating(value, (), "hamiltonian", hint="one number, J")
+def _checked_scalar(value):
+    return _checks.array_of_shape(value, (), "hamiltonian", hint="one number, J")

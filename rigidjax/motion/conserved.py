@@ -14,7 +14,7 @@ from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.torques import AbstractTorque, CentralGravity
 from rigidjax.motion.torques.base import Torque, in_precision, length_or_zero, require_scene
 from rigidjax.motion.torques.composite import parts_of
-from rigidjax.motion.torques.states import Frozen, freeze
+from rigidjax.motion.torques.states import FrozenLaw, freeze
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
 
@@ -38,7 +38,7 @@ def energy(
     >>> energy(rj.Inertia.from_principal(1.0, 1.0, 1.0), start, top)
     Array(10.31, dtype=float64)
     """
-    turning, parts, t = _scene(body, state, torque, t)
+    turning, parts, t = _state_and_torques(body, state, torque, t)
     for part in parts:
         if not hasattr(part, "energy"):
             words = f"energy: wanted torques with a potential, got {type(part).__name__}, which has"
@@ -74,35 +74,37 @@ def conserved(
     >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))
     ['energy', 'momentum_squared']
     """
-    turning, parts, t = _scene(body, state, torque, t)
+    turning, parts, t = _state_and_torques(body, state, torque, t)
     dtype = turning.omega.dtype
     body = in_precision(body, dtype)
-    found: dict[str, Float[Array, "..."]] = {}
+    quantities: dict[str, Float[Array, "..."]] = {}
     if all(hasattr(part, "energy") and getattr(part, "steady", False) for part in parts):
-        found["energy"] = _energy(body, turning, parts, t)
+        quantities["energy"] = _energy(body, turning, parts, t)
     outside = [part for part in parts if not hasattr(part, "internal_momentum")]
     momentum = _momentum(body, turning, parts, t)
     if not outside:
-        found["momentum_squared"] = dot(momentum, momentum)
+        quantities["momentum_squared"] = dot(momentum, momentum)
     if isinstance(turning, HasAttitude):
         momentum = quaternion.rotate(turning.q, momentum)
         axis = getattr(outside[0], "axis", None) if len(outside) == 1 else None
         if not outside:
-            found["momentum"] = momentum
+            quantities["momentum"] = momentum
         elif axis is not None:
             axis = axis.astype(dtype)
             length = length_or_zero(axis)
-            found["momentum_along_axis"] = dot(momentum, axis) / jnp.where(length > 0, length, 1)
+            quantities["momentum_along_axis"] = dot(momentum, axis) / jnp.where(
+                length > 0, length, 1
+            )
     if isinstance(turning, HasPose) and isinstance(body, MassProperties):
-        plain = [(part, part.law if isinstance(part, Frozen) else part) for part in parts]
+        plain = [(part, part.law if isinstance(part, FrozenLaw) else part) for part in parts]
         # A torque whose `feels` is `HasPose` may return a force as well.
         turns = lambda law: isinstance(law, AbstractTorque) and law.feels is not HasPose  # noqa: E731
         pushed = [part for part, law in plain if not turns(law)]
         if not pushed:
-            found["linear_momentum"] = body.mass * turning.v
+            quantities["linear_momentum"] = body.mass * turning.v
         if all(isinstance(part, CentralGravity) for part in [*outside, *pushed]):
-            found["momentum_about_origin"] = body.mass * cross(turning.x, turning.v) + momentum
-    return found
+            quantities["momentum_about_origin"] = body.mass * cross(turning.x, turning.v) + momentum
+    return quantities
 
 
 def drift(
@@ -125,11 +127,11 @@ def drift(
     >>> bool(drift(ts, ys, body)["energy"] < 1e-8)
     True
     """
-    ts = _checks.rows(ts, (), "ts")
+    ts = _checks.array_of_rows(ts, (), "ts")
     if not ts.size:
         raise ValueError("ts: wanted at least one time, got none")
     turning = motion_of(ys)
-    _checks.instance(turning, HasSpin, "ys", wanted="states with a leading time axis")
+    _checks.require_instance(turning, HasSpin, "ys", requirement="states with a leading time axis")
     for leaf in jax.tree.leaves(ys):
         if leaf.shape[:1] != ts.shape:
             words = f"ys: wanted one row for each of {ts.shape[0]} times"
@@ -137,21 +139,21 @@ def drift(
     at_all = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
     kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(turning)
     spin = jax.vmap(lambda t, y: _spin_size(body, y, torque, t))(ts, ys)
-    found = {}
+    drifts = {}
     for name, values in at_all.items():
-        away = _size(values - jax.lax.slice_in_dim(values, 0, 1))
+        away = _row_lengths(values - jax.lax.slice_in_dim(values, 0, 1))
         if name == "energy":
             scale = kinetic
         elif name in ("linear_momentum", "momentum_about_origin"):
-            scale = _size(values)
+            scale = _row_lengths(values)
         else:
             scale = spin**2 if name == "momentum_squared" else spin
         scale = jnp.max(scale)
-        found[name] = jnp.max(away) / jnp.where(scale > 0, scale, 1)
-    return found
+        drifts[name] = jnp.max(away) / jnp.where(scale > 0, scale, 1)
+    return drifts
 
 
-def _scene(
+def _state_and_torques(
     body: Body, state: PyTree, torque: Torque | None, t: ScalarLike
 ) -> tuple[Any, tuple[Any, ...], Scalar]:
     """Return the body's state, its torques with their own states inserted, and the time."""
@@ -160,7 +162,7 @@ def _scene(
     parts = parts_of(torque)
     for part in parts or (None,):
         require_scene(part, state, body)
-    return state, parts, _checks.floating(t, (), "t")
+    return state, parts, _checks.array_of_shape(t, (), "t")
 
 
 def _energy(body: Body, state: HasSpin, parts: tuple[Any, ...], t: Scalar) -> Scalar:
@@ -183,10 +185,10 @@ def _momentum(body: Body, state: HasSpin, parts: tuple[Any, ...], t: ScalarLike)
 
 
 def _spin_size(body: Body, state: PyTree, torque: Torque | None, t: ScalarLike) -> Scalar:
-    state, parts, t = _scene(body, state, torque, t)
+    state, parts, t = _state_and_torques(body, state, torque, t)
     return length_or_zero(_momentum(in_precision(body, state.omega.dtype), state, parts, t))
 
 
-def _size(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:
+def _row_lengths(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:
     """Return the length of each row, or the absolute values of plain numbers."""
     return jnp.abs(values) if values.ndim == 1 else jnp.sqrt(jnp.sum(values**2, axis=-1))

@@ -10,7 +10,7 @@ from rigidjax import _checks
 from rigidjax._types import HasSpin, ScalarLike
 from rigidjax.body.inertia import Body, Inertia, MassProperties
 from rigidjax.motion.torques.base import in_precision
-from rigidjax.motion.torques.states import first_states, freeze, has_states, rates_of
+from rigidjax.motion.torques.states import freeze, has_states, initial_states, rates_of_own_states
 
 
 class Coupled(eqx.Module):
@@ -34,11 +34,13 @@ class Coupled(eqx.Module):
         """Return the `Coupled` of `state0` and the initial states of `torque` (see
         `rigidjax.simulate`) at `t`, s.
         """
-        _checks.single(body, (Inertia, MassProperties), "body")
-        _checks.single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
+        _checks.require_single(body, (Inertia, MassProperties), "body")
+        _checks.require_single(
+            state0, HasSpin, "state0", requirement="a Spin, an Attitude or a Rigid"
+        )
         dtype = state0.omega.dtype
-        t = _checks.floating(t, (), "t").astype(dtype)
-        own = first_states(in_precision(torque, dtype), t, state0, in_precision(body, dtype))
+        t = _checks.array_of_shape(t, (), "t").astype(dtype)
+        own = initial_states(in_precision(torque, dtype), t, state0, in_precision(body, dtype))
         return Coupled(state0, own)
 
 
@@ -50,9 +52,9 @@ class CoupledEquations(eqx.Module):
 
     def __call__(self, t: ScalarLike, y: Coupled, args: object = None) -> Coupled:
         dtype = y.motion.omega.dtype
-        time = _checks.floating(t, (), "t").astype(dtype)
+        time = _checks.array_of_shape(t, (), "t").astype(dtype)
         law, body = in_precision(self.field, dtype), in_precision(self.body, dtype)
-        own = rates_of(law, time, y.own, y.motion, body)
+        own = rates_of_own_states(law, time, y.own, y.motion, body)
         return Coupled(freeze(self.field, y.own)(t, y.motion, args), own)
 
 

@@ -32,10 +32,10 @@ class Spin(eqx.Module):
 
     omega: Float[Array, "*batch 3"]
 
-    __repr__ = _show.numbers
+    __repr__ = _show.fields_as_text
 
     def __init__(self, omega: Vectors):
-        self.omega = _checks.floating(omega, (3,), "omega", batched=True)
+        self.omega = _checks.array_of_shape(omega, (3,), "omega", batched=True)
 
 
 class Attitude(eqx.Module):
@@ -52,12 +52,14 @@ class Attitude(eqx.Module):
     q: Float[Array, "*batch 4"]
     omega: Float[Array, "*batch 3"]
 
-    __repr__ = _show.numbers
+    __repr__ = _show.fields_as_text
 
     def __init__(self, q: _types.Quaternions, omega: Vectors):
-        self.q = _checks.floating(q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)")
-        self.omega = _checks.floating(omega, (3,), "omega", batched=True)
-        _checks.same_batch(q=(self.q, 1), omega=(self.omega, 1))
+        self.q = _checks.array_of_shape(
+            q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)"
+        )
+        self.omega = _checks.array_of_shape(omega, (3,), "omega", batched=True)
+        _checks.require_same_batch(q=(self.q, 1), omega=(self.omega, 1))
 
 
 class Rigid(eqx.Module):
@@ -76,14 +78,18 @@ class Rigid(eqx.Module):
     q: Float[Array, "*batch 4"]
     omega: Float[Array, "*batch 3"]
 
-    __repr__ = _show.numbers
+    __repr__ = _show.fields_as_text
 
     def __init__(self, x: Vectors, v: Vectors, q: _types.Quaternions, omega: Vectors):
-        self.x = _checks.floating(x, (3,), "x", batched=True, unit="m")
-        self.v = _checks.floating(v, (3,), "v", batched=True, unit="m/s")
-        self.q = _checks.floating(q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)")
-        self.omega = _checks.floating(omega, (3,), "omega", batched=True)
-        _checks.same_batch(x=(self.x, 1), v=(self.v, 1), q=(self.q, 1), omega=(self.omega, 1))
+        self.x = _checks.array_of_shape(x, (3,), "x", batched=True, unit="m")
+        self.v = _checks.array_of_shape(v, (3,), "v", batched=True, unit="m/s")
+        self.q = _checks.array_of_shape(
+            q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)"
+        )
+        self.omega = _checks.array_of_shape(omega, (3,), "omega", batched=True)
+        _checks.require_same_batch(
+            x=(self.x, 1), v=(self.v, 1), q=(self.q, 1), omega=(self.omega, 1)
+        )
 
 
 class EulerEquations(eqx.Module):
@@ -99,12 +105,12 @@ class EulerEquations(eqx.Module):
     torque: Torque | None
 
     def __init__(self, inertia: Inertia, torque: Torque | None = None):
-        _checks.single(inertia, Inertia, "inertia", hint=_HINT)
+        _checks.require_single(inertia, Inertia, "inertia", hint=_HINT)
         if torque is not None:
             require_law(torque)
         # Traced numbers are checked when a motion is computed: on its way a fit may reach numbers
         # that no body has.
-        self.inertia = inertia.invertible() if _checks.known(inertia.tensor) else inertia
+        self.inertia = inertia.invertible() if _checks.is_known(inertia.tensor) else inertia
         # The inverse is computed once per solve: a division inside the field costs 25 times as much
         # as the rest of it.
         self.inverse = inverse(inertia.tensor)
@@ -153,7 +159,7 @@ class NewtonEuler(eqx.Module):
     body: MassProperties
 
     def __init__(self, body: MassProperties, torque: Torque | None = None):
-        _checks.single(body, MassProperties, "body", hint="an Inertia has no mass")
+        _checks.require_single(body, MassProperties, "body", hint="an Inertia has no mass")
         self.euler = EulerEquations(body.inertia, torque)
         self.body = body
 
@@ -169,22 +175,24 @@ class NewtonEuler(eqx.Module):
         return Rigid(y.v, acceleration, quaternion.rate(y.q, y.omega), spin)
 
 
-def on_the_group(state: State) -> State:
+def project_to_group(state: State) -> State:
     """Return the state with its quaternion, if it has one, scaled to length 1; refuse a quaternion
     of zero.
     """
     if isinstance(state, Coupled):
-        return eqx.tree_at(lambda s: s.motion, state, on_the_group(state.motion))
+        return eqx.tree_at(lambda s: s.motion, state, project_to_group(state.motion))
     if isinstance(state, HasAttitude):
-        q = _checks.floating(state.q, (4,), "state.q")
-        if _checks.known(q):
+        q = _checks.array_of_shape(state.q, (4,), "state.q")
+        if _checks.is_known(q):
             length = float(np.linalg.norm(np.asarray(q)))
-            _checks.refuse(q, length**2 == 0, f"state.q: wanted a length near 1, got {length:.3g}")
-        return eqx.tree_at(lambda s: s.q, state, _unit(state.q))
+            _checks.error_if(
+                q, length**2 == 0, f"state.q: wanted a length near 1, got {length:.3g}"
+            )
+        return eqx.tree_at(lambda s: s.q, state, _normalise(state.q))
     return state
 
 
-def _unit(q: Quat) -> Quat:
+def _normalise(q: Quat) -> Quat:
     """Return q/|q|, with equal rounding in every program.
 
     XLA replaces q/√n by a product with 1/√n in some programs. Reverse mode runs steps again in

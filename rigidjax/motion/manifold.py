@@ -34,7 +34,9 @@ def names(state: PyTree) -> tuple[str, ...]:
     return tuple(jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths)
 
 
-def parts(state: PyTree, change: Float[Array, "*batch n"]) -> dict[str, Float[Array, "*batch _"]]:
+def parts_by_name(
+    state: PyTree, change: Float[Array, "*batch n"]
+) -> dict[str, Float[Array, "*batch _"]]:
     """Return the numbers of each leaf in a change, by name; a quaternion has three numbers
     there.
     """
@@ -42,7 +44,7 @@ def parts(state: PyTree, change: Float[Array, "*batch n"]) -> dict[str, Float[Ar
     return dict(zip(names(state), cut, strict=True))
 
 
-def turns(state: PyTree) -> tuple[slice, ...]:
+def rotation_slices(state: PyTree) -> tuple[slice, ...]:
     """Return the slices of the rotation vectors in a change, one for each quaternion."""
     pairs = zip(_places(state), _is_quaternion(state), strict=True)
     return tuple(place for place, turned in pairs if turned)
@@ -53,10 +55,10 @@ def plus(state: PyTree, change: Float[Array, " n"]) -> Any:
     0.
     """
 
-    def turned(q: Array, part: Array) -> Array:
+    def rotate(q: Array, part: Array) -> Array:
         return quaternion.multiply(q, vector_to_quaternion(part))
 
-    return _leaf_by_leaf(state, change, turned, jnp.add)
+    return _leaf_by_leaf(state, change, rotate, jnp.add)
 
 
 def minus(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
@@ -90,10 +92,10 @@ def tangent(state: PyTree, change: Float[Array, " n"]) -> Any:
     return _leaf_by_leaf(state, change, quaternion.rate, lambda _, part: part)
 
 
-def coordinates(state: PyTree, along: PyTree) -> Float[Array, " n"]:
-    """Return the change whose `tangent` at `state` is `along`: the inverse of `tangent`."""
+def tangent_to_vector(state: PyTree, tangent_vector: PyTree) -> Float[Array, " n"]:
+    """Return the change whose `tangent` at `state` is `tangent_vector`: its inverse."""
     return _vector(
-        along,
+        tangent_vector,
         state,
         lambda dq, q: 2.0 * quaternion.multiply(quaternion.conjugate(q), dq)[1:],
         lambda part, _: part,

@@ -53,10 +53,10 @@ def family(
     length = np.shape(values)
     if len(length) != 1 or length[0] < 1:
         raise ValueError(f"values: wanted shape (N,), values of {hold}, got shape {length}")
-    values = _checks.finite(_checks.floating(values, length, "values"), "values")
+    values = _checks.require_finite(_checks.array_of_shape(values, length, "values"), "values")
     values = values.astype(start.dtype)
     held = 0.5 * values if hold == "period" else values
-    numbers, left = _at_values(scene, start, held, index, correction.usual_tolerance(start))
+    numbers, left = _members_at_values(scene, start, held, index, correction.usual_tolerance(start))
     where = lambda i: f" at {hold} = {values[i]:.9g}"  # noqa: E731
     advice = "; take smaller steps, or the family turns back there: hold another of x, z, vy, "
     lost = _is_lost(start, numbers, left)
@@ -71,35 +71,37 @@ def _is_lost(start: Array, numbers: Array, left: Array) -> Array:
 
 
 def _orbits_or_error(
-    numbers: Array, lost: Array, where: Callable[[int], str], what: str, advice: str
+    numbers: Array, is_lost: Array, place: Callable[[int], str], message: str, advice: str
 ) -> PeriodicOrbit:
-    """Return the members as orbits; raise an error if one was lost, with `where` of its number if
+    """Return the members as orbits; raise an error if one was lost, with `place` of its number if
     it is known.
     """
-    known = _checks.known(lost) and bool(lost.any())
-    words = what + (where(int(np.argmax(np.asarray(lost)))) if known else "") + advice
-    return jax.vmap(orbit_of)(_checks.refuse(numbers, lost.any(), words))
+    known = _checks.is_known(is_lost) and bool(is_lost.any())
+    words = message + (place(int(np.argmax(np.asarray(is_lost)))) if known else "") + advice
+    return jax.vmap(orbit_of)(_checks.error_if(numbers, is_lost.any(), words))
 
 
 @eqx.filter_jit
-def _at_values(
-    scene: "AbstractReversible", start: Array, held: Array, index: int, tolerance: float
+def _members_at_values(
+    scene: "AbstractReversible", start: Array, held_value: Array, index: int, tolerance: float
 ) -> Any:
     free = np.delete(np.arange(4), index)
     still = jax.tree.map(lambda n: lax.stop_gradient(n) if eqx.is_array(n) else n, scene)
 
-    def step(last: Array, value: Scalar) -> Any:
+    def step(previous: Array, value: Scalar) -> Any:
         # The start of Newton's method has no derivative: the orbit found does not depend on it.
-        last, aim = lax.stop_gradient(last), lax.stop_gradient(value)
-        guess = last[free] + _slope_along_family(still, last, index) * (aim - last[index])
-        found, left = correction.correct_orbit(index, tolerance, scene, guess, value)
-        numbers = correction.insert_held(found, value, index)
+        previous, aim = lax.stop_gradient(previous), lax.stop_gradient(value)
+        guess = previous[free] + _slope_along_family(still, previous, index) * (
+            aim - previous[index]
+        )
+        root, left = correction.correct_orbit(index, tolerance, scene, guess, value)
+        numbers = correction.insert_held(root, value, index)
         return numbers, (numbers, left)
 
     # The guess is corrected first: the tangent is needed at an orbit.
     held_now = lax.stop_gradient(start[index])
-    found, _ = correction.correct_orbit(index, tolerance, still, start[free], held_now)
-    _, out = lax.scan(step, correction.insert_held(found, start[index], index), held)
+    root, _ = correction.correct_orbit(index, tolerance, still, start[free], held_now)
+    _, out = lax.scan(step, correction.insert_held(root, start[index], index), held_value)
     return out
 
 
@@ -117,10 +119,10 @@ def family_slope(
     >>> round(float(hill.family_slope(orbit).period), 3)
     12.076
     """
-    change = _slope(scene, crossing(orbit), index_of_held(hold))
+    change = _family_slope(scene, crossing(orbit), index_of_held(hold))
     turned = ~jnp.isfinite(change.period)
     words = f"family_slope: the family has a fold in {hold} here; take another of x, z, vy, period"
-    return _checks.refuse(change, turned, words)
+    return _checks.error_if(change, turned, words)
 
 
 def _slope_along_family(
@@ -136,7 +138,7 @@ def _slope_along_family(
 
 
 @eqx.filter_jit
-def _slope(scene: "AbstractReversible", numbers: Array, index: int) -> PeriodicOrbit:
+def _family_slope(scene: "AbstractReversible", numbers: Array, index: int) -> PeriodicOrbit:
     unknown = _slope_along_family(scene, numbers, index)
     change = orbit_of(correction.insert_held(unknown, jnp.ones_like(unknown[0]), index))
     # To hold `period` means the whole period; the fourth of `numbers` is half of it.
@@ -163,13 +165,13 @@ def follow(
     family was lost.
     """
     start, index = crossing(orbit), index_of_held(rising)
-    length = _checks.floating(step, (), "step").astype(start.dtype)
+    length = _checks.array_of_shape(step, (), "step").astype(start.dtype)
     bad = ~(jnp.isfinite(length) & (length != 0))
-    length = _checks.refuse(length, bad, "step: wanted a number that is not 0")
+    length = _checks.error_if(length, bad, "step: wanted a number that is not 0")
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"count: wanted the number of members, an integer ≥ 1, got {count!r}")
     tolerance = correction.usual_tolerance(start)
-    numbers, left = _follow(scene, start, length, count, index, tolerance)
+    numbers, left = _follow_family(scene, start, length, count, index, tolerance)
     moved = jnp.diff(jnp.concatenate([start[None], numbers]), axis=0)
     far = jnp.sqrt(jnp.sum(moved * moved, axis=1)) > 2 * jnp.abs(length)
     lost = _is_lost(start, numbers, left) | far
@@ -178,32 +180,32 @@ def follow(
 
 
 @eqx.filter_jit
-def _follow(
+def _follow_family(
     scene: "AbstractReversible", start: Array, step: Array, count: int, index: int, tolerance: float
 ) -> Any:
-    def missed(numbers: Array) -> Array:
+    def residual(numbers: Array) -> Array:
         return correction.periodicity_residual(scene, numbers)
 
-    def tangent(matrix: Array, before: Array) -> Array:
-        """Return the unit direction in which the residual stays 0, on the side of `before`."""
-        rows = jnp.concatenate([matrix, before[None]])
+    def tangent(matrix: Array, previous: Array) -> Array:
+        """Return the unit direction in which the residual stays 0, on the side of `previous`."""
+        rows = jnp.concatenate([matrix, previous[None]])
         along = jnp.linalg.solve(rows, jnp.zeros(4, start.dtype).at[3].set(1))
         return along / jnp.sqrt(jnp.sum(along * along))
 
-    def forward(carry: PyTree, _member: None) -> Any:
+    def next_member(carry: PyTree, _member: None) -> Any:
         last, before = carry
-        _, matrix = correction.value_and_jacobian(missed, last)
+        _, matrix = correction.value_and_jacobian(residual, last)
         along = tangent(matrix, before)
 
         def across(numbers: Array) -> Array:
-            return jnp.append(missed(numbers), jnp.sum(along * (numbers - last)) - step)
+            return jnp.append(residual(numbers), jnp.sum(along * (numbers - last)) - step)
 
-        found = correction.newton(across, last + step * along, tolerance)
-        return (found, along), (found, jnp.max(jnp.abs(missed(found))))
+        root = correction.newton(across, last + step * along, tolerance)
+        return (root, along), (root, jnp.max(jnp.abs(residual(root))))
 
     first = jnp.zeros(4, start.dtype).at[index].set(1)
     carry: Any = start, first
-    _, out = lax.scan(forward, carry, length=count)
+    _, out = lax.scan(next_member, carry, length=count)
     return out
 
 
@@ -246,37 +248,37 @@ def bifurcation(
     place = index_of_held(hold)
     if isinstance(index, bool) or index not in (0, 1):
         raise ValueError(f"index: wanted 0 or 1, which of the two stability indices, got {index!r}")
-    value = _checks.number(value, "value")
+    value = _checks.known_float(value, "value")
     if not np.isfinite(value):
         raise ValueError(f"value: wanted a finite number, got {value}")
     a, b = (float(crossing(one)[place]) for one in (orbit, other))
     left, right = (scene.periodic_orbit(one, hold=hold) for one in (orbit, other))
-    found = {a: left, b: right}
+    orbits = {a: left, b: right}
 
-    def off(held: float) -> float:
-        if held not in found:
-            share = (held - a) / (b - a)
+    def excess(held_value: float) -> float:
+        if held_value not in orbits:
+            share = (held_value - a) / (b - a)
             guess = jax.tree.map(lambda x, y: (1 - share) * x + share * y, left, right)
-            found[held] = scene.periodic_orbit(guess, hold=hold)
-        away = _index(scene, found[held], index) - value
+            orbits[held_value] = scene.periodic_orbit(guess, hold=hold)
+        away = _stability_index(scene, orbits[held_value], index) - value
         return away if abs(away) > 1e-12 * max(1.0, abs(value)) else 0.0
 
-    low, high = off(a), off(b)
+    low, high = excess(a), excess(b)
     if not low * high <= 0:
         ends = f"{low + value:.6g} at one orbit, {high + value:.6g} at the other"
         raise ValueError(f"bifurcation: the index is {ends}: {value:g} does not lie between")
-    root: Any = brentq(off, a, b, xtol=1e-13 * max(1.0, abs(b - a)), maxiter=_MOST)
-    return found[root]
+    root: Any = brentq(excess, a, b, xtol=1e-13 * max(1.0, abs(b - a)), maxiter=_MOST)
+    return orbits[root]
 
 
-def _index(scene: "AbstractReversible", orbit: PeriodicOrbit, index: int) -> float:
-    found = np.asarray(_indices(scene, orbit))[index]
-    if abs(found.imag) > 1e-9 * max(1.0, abs(found)):
+def _stability_index(scene: "AbstractReversible", orbit: PeriodicOrbit, index: int) -> float:
+    stability = np.asarray(_stability_of_orbit(scene, orbit))[index]
+    if abs(stability.imag) > 1e-9 * max(1.0, abs(stability)):
         words = "the stability indices are complex at a member between the orbits"
         raise ValueError(f"bifurcation: {words}; give orbits nearer to each other")
-    return float(found.real)
+    return float(stability.real)
 
 
 @eqx.filter_jit
-def _indices(scene: "AbstractReversible", orbit: PeriodicOrbit) -> Array:
+def _stability_of_orbit(scene: "AbstractReversible", orbit: PeriodicOrbit) -> Array:
     return scene.stability_indices(orbit)

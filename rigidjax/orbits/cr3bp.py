@@ -57,14 +57,14 @@ class ThreeBody(AbstractReversible):
         """Return U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ at `x` (3,) (Szebehely, sec. 1.5, no
         constant).
         """
-        x = _checks.floating(x, (3,), "x")
+        x = _checks.array_of_shape(x, (3,), "x")
         r1, r2 = self.distances(x)
         mu = self.mu.astype(x.dtype)
         return 0.5 * (x[0] * x[0] + x[1] * x[1]) + (1 - mu) / r1 + mu / r2
 
     def distances(self, x: Vector) -> tuple[Scalar, Scalar]:
         """Return the distances of a place (3,) from the first and from the second body."""
-        a, b, c = components(_checks.floating(x, (3,), "x"))
+        a, b, c = components(_checks.array_of_shape(x, (3,), "x"))
         mu = self.mu.astype(a.dtype)
         first, second, flat = a + mu, (a - 1) + mu, b * b + c * c
         return jnp.sqrt(first * first + flat), jnp.sqrt(second * second + flat)
@@ -83,7 +83,7 @@ class ThreeBody(AbstractReversible):
         with this C can be.
         """
         u = self.potential(x)
-        return 2 * u - _checks.floating(jacobi, (), "jacobi").astype(u.dtype)
+        return 2 * u - _checks.array_of_shape(jacobi, (), "jacobi").astype(u.dtype)
 
     def zero_velocity(
         self,
@@ -99,7 +99,7 @@ class ThreeBody(AbstractReversible):
         >>> rj.orbits.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
         [[4.0]]
         """
-        columns, rows = _checks.numbers(xs, "xs"), _checks.numbers(ys, "ys")
+        columns, rows = _checks.numeric_array(xs, "xs"), _checks.numeric_array(ys, "ys")
         if columns.ndim != 1 or rows.ndim != 1 or 0 in (columns.size, rows.size):
             shapes = f"{columns.shape} and {rows.shape}; give the axes, not a mesh"
             raise ValueError(f"zero_velocity: wanted xs (N,) and ys (M,), got {shapes}")
@@ -124,7 +124,7 @@ class ThreeBody(AbstractReversible):
 
     def hessian(self, x: Vector) -> Mat3:
         """Return the second derivatives of U (3, 3) at a place."""
-        return jax.hessian(self.potential)(_checks.floating(x, (3,), "x"))
+        return jax.hessian(self.potential)(_checks.array_of_shape(x, (3,), "x"))
 
     def exponents(self, x: Vector) -> Complex[Array, "6"]:
         """Return the six exponents λ of small motions e^{λt} about an equilibrium in the plane.
@@ -150,9 +150,9 @@ class ThreeBody(AbstractReversible):
     def lyapunov_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
         """Return a start near a planar Lyapunov orbit about L1, L2 or L3, for `periodic_orbit`.
 
-        **Arguments:** `point` 1, 2 or 3; `amplitude` along x. Source: `richardson.guess`.
+        **Arguments:** `point` 1, 2 or 3; `amplitude` along x. Source: `richardson.orbit_guess`.
         """
-        return richardson.guess(self.mu, point, amplitude, None)
+        return richardson.orbit_guess(self.mu, point, amplitude, None)
 
     def halo_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
         """Return a start near a halo orbit about L1, L2 or L3, for `periodic_orbit(…, hold="z")`.
@@ -160,7 +160,7 @@ class ThreeBody(AbstractReversible):
         **Arguments:** `point` 1, 2 or 3; `amplitude` along z, whose sign is that of the branch.
         Source: Richardson 1980, doi:10.1007/BF01229511 (third order).
         """
-        return richardson.guess(self.mu, point, None, amplitude)
+        return richardson.orbit_guess(self.mu, point, None, amplitude)
 
 
 def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> ThreeBody:
@@ -175,12 +175,14 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
     >>> cr3bp(0.5).lagrange_points[3].round(12).tolist()
     [0.0, 0.866025403784, 0.0]
     """
-    ratio = _checks.floating(mu, (), "mu")
+    ratio = _checks.array_of_shape(mu, (), "mu")
     bad = ~((ratio > 0) & (ratio <= 0.5))
     words = "mu: wanted 0 < mu ≤ ½, the mass of the lighter body over the mass of both"
-    ratio = _checks.refuse(ratio, bad, words)
-    radii = _checks.floating(list(radii) if isinstance(radii, tuple) else radii, (2,), "radii")
-    return ThreeBody(ratio, _checks.refuse(radii, ~(radii >= 0), "radii: wanted two numbers ≥ 0"))
+    ratio = _checks.error_if(ratio, bad, words)
+    radii = _checks.array_of_shape(
+        list(radii) if isinstance(radii, tuple) else radii, (2,), "radii"
+    )
+    return ThreeBody(ratio, _checks.error_if(radii, ~(radii >= 0), "radii: wanted two numbers ≥ 0"))
 
 
 class Hill(AbstractReversible):
@@ -240,5 +242,5 @@ def hill(radius: ScalarLike = 0.0) -> Hill:
     >>> hill().lagrange_points[1].round(12).tolist()
     [0.693361274351, 0.0, 0.0]
     """
-    radius = _checks.floating(radius, (), "radius")
-    return Hill(_checks.refuse(radius, ~(radius >= 0), "radius: wanted a number ≥ 0"))
+    radius = _checks.array_of_shape(radius, (), "radius")
+    return Hill(_checks.error_if(radius, ~(radius >= 0), "radius: wanted a number ≥ 0"))

@@ -35,10 +35,10 @@ class PeriodicOrbit(eqx.Module):
     period: Float[Array, "*batch"]
 
     def __init__(self, state: Point, period: ScalarLike):
-        self.state = _checks.instance(state, Point, "state", wanted="a Point(x, v)")
-        _checks.floating(state.x, (3,), "state.x", batched=True)
-        period = _checks.floating(period, (), "period", batched=True)
-        _checks.same_batch(state=(state.x, 1), period=(period, 0))
+        self.state = _checks.require_instance(state, Point, "state", requirement="a Point(x, v)")
+        _checks.array_of_shape(state.x, (3,), "state.x", batched=True)
+        period = _checks.array_of_shape(period, (), "period", batched=True)
+        _checks.require_same_batch(state=(state.x, 1), period=(period, 0))
         self.period = period.astype(state.x.dtype)
 
 
@@ -70,39 +70,39 @@ def periodic_orbit(
     free = np.delete(np.arange(4), index)
     if tolerance is None:
         tolerance = usual_tolerance(numbers)
-    unknown, left = _solve(scene, numbers[free], numbers[index], index, tolerance)
+    unknown, left = _corrected_numbers(scene, numbers[free], numbers[index], index, tolerance)
     bad = ~(left <= tolerance)
-    said = f" ({float(left):.1e} left at half period)" if _checks.known(left) else ""
+    said = f" ({float(left):.1e} left at half period)" if _checks.is_known(left) else ""
     words = f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
     words += "hold another of x, z, vy, period, or loosen the tolerance"
-    unknown = _checks.refuse(unknown, bad, words)
-    found = insert_held(unknown, numbers[index], index)
+    unknown = _checks.error_if(unknown, bad, words)
+    corrected = insert_held(unknown, numbers[index], index)
     # A half period of zero solves the equations of every start.
-    ratio = found[3] / numbers[3]
+    ratio = corrected[3] / numbers[3]
     words = "periodic_orbit: Newton's method went from the guess to an orbit of less than half or "
     words += "more than twice its period; start nearer"
-    found = _checks.refuse(found, ~((ratio > 0.5) & (ratio < 2)), words)
-    return orbit_of(found)
+    corrected = _checks.error_if(corrected, ~((ratio > 0.5) & (ratio < 2)), words)
+    return orbit_of(corrected)
 
 
 def index_of_held(hold: str) -> int:
     """Return the index of `hold` among the four numbers of a crossing."""
-    return _NAMES.index(_checks.word(hold, _NAMES, "hold"))
+    return _NAMES.index(_checks.require_option(hold, _NAMES, "hold"))
 
 
 def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
     """Return the four numbers of an orbit that crosses y = 0 at a right angle: x, z, v_y, T/2."""
     made = "lyapunov_guess and halo_guess make one"
     wanted = "a PeriodicOrbit(state, period)"
-    _checks.instance(guess, PeriodicOrbit, "guess", wanted=wanted, hint=made)
+    _checks.require_instance(guess, PeriodicOrbit, "guess", requirement=wanted, hint=made)
     x, v = guess.state.x, guess.state.v
     if x.ndim != 1:
         raise ValueError(f"guess: wanted one orbit, x of shape (3,), got {x.shape}; use jax.vmap")
     slant = jnp.maximum(jnp.abs(x[1]), jnp.maximum(jnp.abs(v[0]), jnp.abs(v[2])))
     right = "guess: wanted a start that crosses y = 0 at a right angle: y = vx = vz = 0"
-    x, period = _checks.refuse(x, slant > 1e-6, right), guess.period
-    period = _checks.refuse(period, ~(period > 0), "guess: wanted a period that is positive")
-    return _checks.finite(jnp.stack([x[0], x[2], v[1], 0.5 * period]), "guess")
+    x, period = _checks.error_if(x, slant > 1e-6, right), guess.period
+    period = _checks.error_if(period, ~(period > 0), "guess: wanted a period that is positive")
+    return _checks.require_finite(jnp.stack([x[0], x[2], v[1], 0.5 * period]), "guess")
 
 
 def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
@@ -112,12 +112,12 @@ def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
     return PeriodicOrbit(Point(jnp.stack([x, zero, z]), jnp.stack([zero, vy, zero])), 2 * half)
 
 
-def insert_held(unknown: Float[Array, "3"], held: Scalar, index: int) -> Float[Array, "4"]:
+def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> Float[Array, "4"]:
     """Return the four numbers of a crossing: the three unknown ones with the held one inserted at
     `index`.
     """
     parts = list(unknown)
-    parts.insert(index, held)
+    parts.insert(index, held_value)
     return jnp.stack(parts)
 
 
@@ -127,16 +127,16 @@ def usual_tolerance(numbers: Array) -> float:
 
 
 def integrate(
-    scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **how: Any
+    scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **options: Any
 ) -> dfx.Solution:
     """Return the motion from 0 to `t`, with derivatives in forward mode.
 
-    Further arguments `how` are those of `diffrax.diffeqsolve`.
+    Further arguments `options` are those of `diffrax.diffeqsolve`.
     """
     motion = dfx.ODETerm(scene.field), dfx.Dopri8(), jnp.zeros_like(t), t, None, state
-    how |= dict(adjoint=dfx.ForwardMode(), max_steps=100_000, throw=False)
-    how["stepsize_controller"] = dfx.PIDController(rtol=rtol, atol=atol)
-    return dfx.diffeqsolve(*motion, **how)
+    options |= dict(adjoint=dfx.ForwardMode(), max_steps=100_000, throw=False)
+    options["stepsize_controller"] = dfx.PIDController(rtol=rtol, atol=atol)
+    return dfx.diffeqsolve(*motion, **options)
 
 
 @eqx.filter_jit
@@ -149,19 +149,21 @@ def state_after(
     return jnp.concatenate([end.x[0], end.v[0]])
 
 
-def transition(
+def transition_matrix(
     scene: AbstractScene, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
 ) -> Float[Array, "6 6"]:
     """Return the state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) from `state`, by forward
     mode.
     """
-    _checks.instance(state, Point, "state", wanted="a Point(x, v)")
-    t = _checks.finite(_checks.floating(t, (), "t"), "t")
-    return _transition(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
+    _checks.require_instance(state, Point, "state", requirement="a Point(x, v)")
+    t = _checks.require_finite(_checks.array_of_shape(t, (), "t"), "t")
+    return _transition_matrix(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
 
 
 @eqx.filter_jit
-def _transition(scene: AbstractScene, numbers: Array, t: Array, rtol: float, atol: float) -> Array:
+def _transition_matrix(
+    scene: AbstractScene, numbers: Array, t: Array, rtol: float, atol: float
+) -> Array:
     # The tangents are solved along with the motion.
     return jax.jacfwd(lambda n: state_after(scene, n, t, rtol=rtol, atol=atol))(numbers)
 
@@ -187,7 +189,7 @@ def newton(f: Callable[[Array], Array], x: Array, tolerance: float) -> Array:
     tolerance.
     """
 
-    def keep_on(carry: tuple[Array, Array, Array]) -> Any:
+    def is_unfinished(carry: tuple[Array, Array, Array]) -> Any:
         _, left, count = carry
         return (left > 0.1 * tolerance) & (count < MAX_STEPS)
 
@@ -199,44 +201,46 @@ def newton(f: Callable[[Array], Array], x: Array, tolerance: float) -> Array:
         # converges quadratically, so that the result is better still.
         return jnp.where(jnp.isfinite(moved), moved, x), jnp.max(jnp.abs(missed)), count + 1
 
-    return lax.while_loop(keep_on, step, (x, jnp.full_like(x[0], jnp.inf), 0))[0]
+    return lax.while_loop(is_unfinished, step, (x, jnp.full_like(x[0], jnp.inf), 0))[0]
 
 
 # Newton's method itself is not differentiated. The rule below is linear in the tangents, so that
 # one rule serves jacfwd and grad, although the solves inside run in forward mode.
 @eqx.filter_jit
-def _solve(scene: AbstractScene, unknown: Array, held: Array, index: int, tolerance: float) -> Any:
-    return correct_orbit(index, float(tolerance), scene, unknown, held)
+def _corrected_numbers(
+    scene: AbstractScene, unknown: Array, held_value: Array, index: int, tolerance: float
+) -> Any:
+    return correct_orbit(index, float(tolerance), scene, unknown, held_value)
 
 
 @eqx.filter_custom_jvp
 def correct_orbit(
-    index: int, tolerance: float, scene: AbstractScene, unknown: Array, held: Array
+    index: int, tolerance: float, scene: AbstractScene, unknown: Array, held_value: Array
 ) -> Any:
-    def missed(unknown: Array) -> Array:
-        return periodicity_residual(scene, insert_held(unknown, held, index))
+    def residual(unknown: Array) -> Array:
+        return periodicity_residual(scene, insert_held(unknown, held_value, index))
 
-    unknown = newton(missed, unknown, tolerance)
-    return unknown, jnp.max(jnp.abs(missed(unknown)))
+    unknown = newton(residual, unknown, tolerance)
+    return unknown, jnp.max(jnp.abs(residual(unknown)))
 
 
 @correct_orbit.def_jvp
 def _correct_orbit_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents
-    found, left = correct_orbit(index, tolerance, scene, unknown, held)
+    root, left = correct_orbit(index, tolerance, scene, unknown, held)
     # All derivatives of the residual are one matrix, so that the rule stays linear in the tangents
     # and can be transposed.
     numbers, rest = eqx.partition(scene, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(numbers)
-    flat, unflatten = ravel_pytree((leaves, held, found))
+    flat, unflatten = ravel_pytree((leaves, held, root))
 
-    def missed(flat: Array) -> Array:
+    def residual(flat: Array) -> Array:
         leaves, held, unknown = unflatten(flat)
         whole = eqx.combine(jax.tree.unflatten(tree, leaves), rest)
         return periodicity_residual(whole, insert_held(unknown, held, index))
 
-    matrix = jax.jacfwd(missed)(flat)
+    matrix = jax.jacfwd(residual)(flat)
     paths = {path: dot for path, dot in jax.tree.leaves_with_path(scene_dot) if dot is not None}
     # A leaf without a tangent does not change.
     named = jax.tree.leaves_with_path(numbers)
@@ -245,4 +249,4 @@ def _correct_orbit_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
     pushed, _ = ravel_pytree((dots, held_dot))
     moved = jnp.sum(matrix[:, :-3] * pushed[None], axis=1)
     total = -jnp.linalg.solve(matrix[:, -3:], moved)
-    return (found, left), (total, jnp.zeros_like(left))
+    return (root, left), (total, jnp.zeros_like(left))

@@ -68,14 +68,14 @@ def unstable_direction(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Ar
     near = value * (1 + jnp.finfo(value.dtype).eps ** 0.5)
     still, shift = lax.stop_gradient((monodromy, near))
 
-    def closer(_: Array, both: tuple[Array, Array]) -> Any:
+    def square_and_scale(_: Array, both: tuple[Array, Array]) -> Any:
         right, left = both
         right = jnp.linalg.solve(still - shift * eye, right)
         left = jnp.linalg.solve((still - shift * eye).T, left)
         return right / jnp.sqrt(jnp.sum(right**2)), left / jnp.sqrt(jnp.sum(left**2))
 
     first = jnp.asarray(np.full(6, 6**-0.5), monodromy.dtype)
-    right, left = lax.fori_loop(0, _ITERATIONS, closer, (first, first))
+    right, left = lax.fori_loop(0, _ITERATIONS, square_and_scale, (first, first))
     # The bordered system (M − λ) v + m left = 0, right · v = 1 is regular although M − λ is not; it
     # gives v its derivatives.
     top = jnp.concatenate([monodromy - value * eye, left[:, None]], 1)
@@ -96,7 +96,7 @@ def manifold_point(
     distance: Scalar,
 ) -> tuple[Point, Scalar]:
     """Return the start of the manifold at `phase`, and the multiplier: see `manifold_start`."""
-    _checks.word(branch, ("stable", "unstable"), "branch")
+    _checks.require_option(branch, ("stable", "unstable"), "branch")
     if isinstance(side, bool) or side not in (1, -1):
         raise ValueError(f"side: wanted 1 (to larger x at the orbit's start) or -1, got {side!r}")
     crossing(orbit)
@@ -156,17 +156,17 @@ def manifold(
     >>> moon.manifold(orbit, "unstable", count=3, samples=5).states.x.shape
     (3, 5, 3)
     """
-    count, samples = _checks.whole(count, "count", 1), _checks.whole(samples, "samples", 2)
+    count, samples = _checks.integer(count, "count", 1), _checks.integer(samples, "samples", 2)
     dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
-    distance = _positive(distance, "distance", dtype)
+    distance = _positive_distance(distance, "distance", dtype)
     phases = jnp.arange(count).astype(distance.dtype) / count
     starts, value = jax.vmap(lambda p: manifold_point(scene, orbit, p, branch, side, distance))(
         phases
     )
     words = "manifold: the orbit has no multiplier that is real and larger than 1: it is stable to "
     words += "first order, or spirals"
-    value = _checks.refuse(value[0], jnp.isnan(value[0]), words)
-    length = 2 * orbit.period if time is None else _positive(time, "time", dtype)
+    value = _checks.error_if(value[0], jnp.isnan(value[0]), words)
+    length = 2 * orbit.period if time is None else _positive_distance(time, "time", dtype)
     ts = jnp.linspace(jnp.zeros_like(length), length, samples)
     states = _manifold_trajectories(scene, starts, ts, branch)
     return Manifold(ts if branch == "unstable" else -ts, states, phases, value)
@@ -194,14 +194,16 @@ def manifold_start(
     True
     """
     dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
-    where = _checks.time(phase, "phase").astype(dtype)
-    away = _checks.floating(distance, (), "distance").astype(dtype)
+    where = _checks.checked_time(phase, "phase").astype(dtype)
+    away = _checks.array_of_shape(distance, (), "distance").astype(dtype)
     return manifold_point(scene, orbit, where, branch, side, away)[0]
 
 
-def _positive(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
-    found = _checks.floating(value, (), name)
-    return _checks.sign(found if dtype is None else found.astype(dtype), name, "a positive number")
+def _positive_distance(value: ScalarLike, name: str, dtype: DTypeLike | None) -> Array:
+    distance = _checks.array_of_shape(value, (), name)
+    return _checks.require_sign(
+        distance if dtype is None else distance.astype(dtype), name, "a positive number"
+    )
 
 
 @eqx.filter_jit

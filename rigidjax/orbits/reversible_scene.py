@@ -44,7 +44,7 @@ class AbstractReversible(AbstractScene):
     def end_words(self, t: ScalarLike, state: Point) -> str:
         """Return a sentence about a collision: the body, the time, and the distance."""
         gaps = self.approach(t, state)[0]
-        if not _checks.known(gaps):
+        if not _checks.is_known(gaps):
             return "the particle collided with one of the scene's bodies"
         near, when = np.asarray(gaps), float(np.asarray(t))
         which = f"body {int(near.argmin()) + 1} of the scene"
@@ -67,7 +67,7 @@ class AbstractReversible(AbstractScene):
         return continuation.stability_indices(self.monodromy(orbit))
 
     # Functions whose first argument is the scene.
-    transition = differential_correction.transition
+    transition = differential_correction.transition_matrix
     periodic_orbit = differential_correction.periodic_orbit
     family = continuation.family
     family_slope = continuation.family_slope

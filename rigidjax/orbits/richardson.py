@@ -29,14 +29,14 @@ def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """Return the distances of L1 and L2 from the second primary, and of L3 from the first."""
     one = jnp.ones_like(mu)
     hill = jnp.cbrt(mu / (3 * (1 - mu)))
-    between = _root([one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3))
-    beyond = _root([one, 3 - mu, 3 - 2 * mu, -mu, -2 * mu, -mu], hill * (1 + hill / 3))
+    between = _polynomial_root([one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3))
+    beyond = _polynomial_root([one, 3 - mu, 3 - 2 * mu, -mu, -2 * mu, -mu], hill * (1 + hill / 3))
     rest = mu - 1
-    opposite = _root([one, 2 + mu, 1 + 2 * mu, rest, 2 * rest, rest], 1 - 7 * mu / 12)
+    opposite = _polynomial_root([one, 2 + mu, 1 + 2 * mu, rest, 2 * rest, rest], 1 - 7 * mu / 12)
     return between, beyond, opposite
 
 
-def _root(coefficients: list[Scalar], start: Scalar) -> Scalar:
+def _polynomial_root(coefficients: list[Scalar], start: Scalar) -> Scalar:
     """Return a root of a polynomial by Newton's method, highest power first; `start` is near it for
     every μ.
     """
@@ -50,7 +50,7 @@ def _root(coefficients: list[Scalar], start: Scalar) -> Scalar:
     return lax.fori_loop(0, 7, step, start)
 
 
-def guess(
+def orbit_guess(
     mu: Scalar, point: int, along_x: ScalarLike | None, along_z: ScalarLike | None
 ) -> PeriodicOrbit:
     """Return a start on the xz-plane near the orbit about L1, L2 or L3 (`point`) with the given
@@ -106,7 +106,7 @@ def guess(
         a2 = 1.5 * c3 * (a24 - 2 * a22) + 1.125 * c4
         square = -((a2 + 2 * w2 * s2) * az * az + w2 - c2) / (a1 + 2 * w2 * s1)
         words = "halo_guess: no halo orbit of this amplitude by the expansion"
-        square = _checks.refuse(square, ~(square > 0), words)
+        square = _checks.error_if(square, ~(square > 0), words)
         ax = jnp.sqrt(square)
     x2, z2 = ax * ax, az * az
     sweep = w * (1 + s1 * x2 + s2 * z2)
@@ -120,7 +120,7 @@ def guess(
 
 
 def _amplitude(value: ScalarLike | None) -> Scalar:
-    return _checks.finite(_checks.floating(value, (), "amplitude"), "amplitude")
+    return _checks.require_finite(_checks.array_of_shape(value, (), "amplitude"), "amplitude")
 
 
 def _legendre(mu: Scalar, unit: Scalar, point: int, n: int) -> Scalar:

@@ -17,7 +17,15 @@ from rigidjax._types import HasAttitude, NumbersLike
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.principal_axes import principal
-from rigidjax.plot.style import COLOURS, attitudes, cube, matrices, plain, pyplot, times
+from rigidjax.plot.style import (
+    COLOURS,
+    attitudes_on_host,
+    escape_formulas,
+    pyplot,
+    rotation_matrices,
+    set_equal_scales,
+    times_on_host,
+)
 
 # Corners of the cube, and its faces in pairs across x, y, z, seen from outside counter-clockwise.
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
@@ -111,11 +119,11 @@ def tumble(
     >>> tumble(body, sol.ts, sol.ys, fps=2).data[:6]
     b'GIF89a'
     """
-    seconds, pictures = _length(ts, seconds, fps)
-    body = validation.single(body, (Inertia, MassProperties), "body")
-    moments, q = evenly(ts, states, pictures)
-    size = _checks.whole(size, "size", 64)
-    corners, tip, reach = _box(body)
+    seconds, pictures = _duration_and_count(ts, seconds, fps)
+    body = validation.require_single_body(body, (Inertia, MassProperties), "body")
+    moments, q = evenly_spaced_attitudes(ts, states, pictures)
+    size = _checks.integer(size, "size", 64)
+    corners, tip, reach = _box_and_tip(body)
     pyplot()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -127,19 +135,19 @@ def tumble(
     canvas = FigureCanvasAgg(figure)
     ax: Any = figure.add_axes((0.0, 0.08, 0.86, 0.84), projection="3d")
     # The path has every given state: from the states of the pictures alone it would be a zigzag.
-    when, tips = np.asarray(ts, dtype=float), matrices(attitudes(states)) @ tip
+    when, tips = np.asarray(ts, dtype=float), rotation_matrices(attitudes_on_host(states)) @ tip
     unit = ", m" if isinstance(body, MassProperties) else ""
-    cube(ax, reach, (f"x{unit}", f"y{unit}", f"z{unit}"))
+    set_equal_scales(ax, reach, (f"x{unit}", f"y{unit}", f"z{unit}"))
     solid = Poly3DCollection([], edgecolor="0.2", linewidths=0.8, alpha=0.85)
     ax.add_collection3d(solid)
     (trail,) = ax.plot([], [], [], color="0.3", lw=0.9)
     shots = []
-    for moment, rotation in zip(moments, matrices(q), strict=True):
+    for moment, rotation in zip(moments, rotation_matrices(q), strict=True):
         placed = corners @ rotation.T
         solid.set_verts([placed[list(face)] for face in FACES])
         solid.set_facecolor(SHADES)
         trail.set_data_3d(*tips[when <= moment].T)
-        ax.set_title(plain(f"{title}  t = {moment:.3g} s".strip()), fontsize=10)
+        ax.set_title(escape_formulas(f"{title}  t = {moment:.3g} s".strip()), fontsize=10)
         canvas.draw()
         shots.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     # All pictures share one palette, or the grey of the panes flickers. It is made from a dozen of
@@ -154,13 +162,15 @@ def tumble(
     return Film(out.getvalue(), "gif", size)
 
 
-def _length(ts: NumbersLike, seconds: float | int | None, fps: float | int) -> tuple[float, int]:
+def _duration_and_count(
+    ts: NumbersLike, seconds: float | int | None, fps: float | int
+) -> tuple[float, int]:
     """Return the seconds of a film, and its number of pictures."""
     if seconds is None:
-        when = _checks.on_host(ts, "ts")
+        when = _checks.host_array(ts, "ts")
         seconds = min(abs(float(when[-1] - when[0])), 20.0) if when.ndim == 1 and when.size else 1.0
-    seconds = _checks.positive(seconds, "seconds")
-    return seconds, max(round(seconds * _checks.positive(fps, "fps")), 2)
+    seconds = _checks.positive_float(seconds, "seconds")
+    return seconds, max(round(seconds * _checks.positive_float(fps, "fps")), 2)
 
 
 def player(
@@ -179,9 +189,9 @@ def player(
     network or a running kernel, and `.save("tumble.html")` writes it to a file. **Arguments:** as
     `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises** as `tumble`.
     """
-    seconds, pictures = _length(ts, seconds, fps)
-    _, q = evenly(ts, states, pictures)
-    box = _box(body)
+    seconds, pictures = _duration_and_count(ts, seconds, fps)
+    _, q = evenly_spaced_attitudes(ts, states, pictures)
+    box = _box_and_tip(body)
     try:
         import viser
     except ModuleNotFoundError as error:
@@ -217,7 +227,7 @@ def _record(
         how = dict(color=tuple(round(255 * part) for part in shade), flat_shading=True)
         place = f"/body/side{side}"
         scene.add_mesh_simple(place, corners.astype(np.float32), faces, side="double", **how)
-    tips = (matrices(q) @ tip).astype(np.float32)
+    tips = (rotation_matrices(q) @ tip).astype(np.float32)
     lines = np.stack([tips[:-1], tips[1:]], axis=1)
     scene.add_line_segments("/trail", points=lines, colors=(90, 90, 90), thickness=0.01 * reach)
     recording = server.get_scene_serializer()
@@ -227,12 +237,14 @@ def _record(
     return recording.as_html()
 
 
-def evenly(ts: NumbersLike, states: PyTree, count: int) -> tuple[np.ndarray, np.ndarray]:
+def evenly_spaced_attitudes(
+    ts: NumbersLike, states: PyTree, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return `count` evenly spaced times, and the attitudes (count, 4) at these times, along the
     shorter arc.
     """
-    q = attitudes(states)
-    t = times(ts, q.shape[0])
+    q = attitudes_on_host(states)
+    t = times_on_host(ts, q.shape[0])
     if t.size < 2:
         raise ValueError(f"ts: wanted at least two times, got {t.size}")
     # q and −q are one attitude: choose signs so that neighbours are near.
@@ -243,7 +255,7 @@ def evenly(ts: NumbersLike, states: PyTree, count: int) -> tuple[np.ndarray, np.
     return when, between / np.linalg.norm(between, axis=1, keepdims=True)
 
 
-def _box(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray, float]:
+def _box_and_tip(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the corners (8, 3) of the body's box, the end (3,) of its longest axis, and its half
     diagonal.
     """
@@ -268,4 +280,6 @@ def box_of(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
     else:
         size = size / size.max()
     # A plate or rod gets a little thickness, to be visible.
-    return np.maximum(size, 0.02 * size.max()), matrices(np.asarray(q, dtype=float)[None])[0]
+    return np.maximum(size, 0.02 * size.max()), rotation_matrices(np.asarray(q, dtype=float)[None])[
+        0
+    ]

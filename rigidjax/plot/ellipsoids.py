@@ -9,7 +9,7 @@ import numpy as np
 from rigidjax import _checks
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.plot.style import AXES, COLOURS, plain, several_axes
+from rigidjax.plot.style import AXES, COLOURS, axes_of_shape, escape_formulas
 
 _PLANES = ((0, 1), (0, 2), (1, 2))
 
@@ -38,25 +38,25 @@ def inertia_ellipsoid(
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
     ['x, m', 'x, m', 'y, m']
     """
-    best, drawn = _body_and_samples(body, _checks.whole(samples, "samples", 0))
+    best, drawn = _body_and_samples(body, _checks.integer(samples, "samples", 0))
     solid = isinstance(best, MassProperties)
     size = 1.0 if solid else float(np.trace(np.asarray(best.second_moment)))
     if not size > 0:
         raise ValueError("body: wanted a body with an extension, got 𝔖 = 0; there is no ellipsoid")
-    shapes = {"body": np.asarray(_shape(best))[None] / size}
+    shapes = {"body": np.asarray(_drawn_matrix(best))[None] / size}
     if drawn is not None:
-        shapes["cloud"] = np.asarray(jax.vmap(_shape)(drawn)) / size
+        shapes["cloud"] = np.asarray(jax.vmap(_drawn_matrix)(drawn)) / size
     if truth is not None:
-        other = np.asarray(_shape(truth))
+        other = np.asarray(_drawn_matrix(truth))
         # Only the shape is compared if the scale is unknown.
         own = solid and isinstance(truth, MassProperties)
         shapes["truth"] = other[None] / (1.0 if own else float(np.trace(other)))
-    ax = several_axes(ax, (3,), ncols=3, figsize=(10.5, 3.9))
+    ax = axes_of_shape(ax, (3,), ncols=3, figsize=(10.5, 3.9))
     _outlines(ax, shapes, "m" if solid else "relative size")
     if len(shapes) > 1:
         how = dict(loc="outside lower center", ncols=3, frameon=False)
         ax[0].figure.legend(*ax[0].get_legend_handles_labels(), **how)
-    ax[1].set_title(plain(title) or "outline of the body's ellipsoid, body frame")
+    ax[1].set_title(escape_formulas(title) or "outline of the body's ellipsoid, body frame")
     return ax
 
 
@@ -65,15 +65,15 @@ def _body_and_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties
     it is no fit.
     """
     if isinstance(body, Inertia | MassProperties):
-        return validation.single(body, (Inertia, MassProperties), "body"), None
+        return validation.require_single_body(body, (Inertia, MassProperties), "body"), None
     if not hasattr(body, "x") or not hasattr(body, "model"):
         words = "inertia_ellipsoid: wanted an Inertia, a MassProperties or a Fit, got "
-        raise TypeError(words + _checks.kind(body))
+        raise TypeError(words + _checks.type_name(body))
     if isinstance(body.body, dict):
         words = "wanted one body, got a Fit of several: give fit.body[name]"
         raise ValueError(f"inertia_ellipsoid: {words}")
     x = body.derivative_point
-    values, vectors = np.linalg.eigh(np.asarray(body.seen))
+    values, vectors = np.linalg.eigh(np.asarray(body.determined_covariance))
     # With a fixed seed one fit always gives one picture.
     steps = np.random.default_rng(0).standard_normal((samples, values.size))
     steps = jnp.asarray(steps * np.sqrt(np.maximum(values, 0.0)) @ vectors.T, x.dtype)
@@ -103,7 +103,7 @@ def _outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
         one.grid(alpha=0.3)
 
 
-def _shape(body: Inertia | MassProperties) -> Any:
+def _drawn_matrix(body: Inertia | MassProperties) -> Any:
     """Return the matrix whose ellipsoid r·A⁻¹r = 1 is drawn."""
     if isinstance(body, MassProperties):
         return body.second_moment * (5.0 / body.mass)

@@ -7,49 +7,64 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from rigidjax.plot.style import COLOURS, RATES, TIMES, of_fit, plain, pyplot, unit
+from rigidjax.plot.style import (
+    COLOURS,
+    RATES,
+    TIMES,
+    escape_formulas,
+    pyplot,
+    readings_of_fit,
+    unit_factor,
+)
 from rigidjax.rotation import quaternion
 from rigidjax.solve import simulate
 
 
 def fit(
-    found: Any, *, index: int = 0, time_unit: str = "s", rate_unit: str = "rad/s", title: str = ""
+    fit_result: Any,
+    *,
+    index: int = 0,
+    time_unit: str = "s",
+    rate_unit: str = "rad/s",
+    title: str = "",
 ) -> Any:
     """Draw data and fit of each sensor above, and the residuals below.
 
-    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s` or
-    `day`; `rate_unit` `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib figure.
+    **Arguments:** `fit_result` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`
+    or `day`; `rate_unit` `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib figure.
 
     >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> fit(found).axes[-1].get_xlabel()
     'time, s'
     """
     plt = pyplot()
-    seconds = unit(time_unit, TIMES, "time_unit")
-    rate = unit(rate_unit, RATES, "rate_unit")
-    record, left, _ = of_fit(found, index)
+    seconds = unit_factor(time_unit, TIMES, "time_unit")
+    rate = unit_factor(rate_unit, RATES, "rate_unit")
+    record, left, _ = readings_of_fit(fit_result, index)
     count = len(record.readings)
     size, how = (max(6.2 * count, 7.5), 6), dict(squeeze=False, layout="constrained")
     figure, axes = plt.subplots(2, count, figsize=size, sharex=True, height_ratios=(2, 1), **how)
-    dense = _fill_between_samples(found, record, index)
+    dense = _fill_between_samples(fit_result, record, index)
     for column, (reading, errors) in enumerate(zip(record.readings, left, strict=True)):
         upper, lower = axes[:, column]
-        _one_sensor(upper, lower, record.t, reading, errors, dense, (seconds, rate, rate_unit))
+        _draw_sensor(upper, lower, record.t, reading, errors, dense, (seconds, rate, rate_unit))
         lower.axhline(0, color="0.6", lw=0.8)
         lower.set_xlabel(f"time, {time_unit}")
         upper.margins(x=0.02, y=0.2)
         upper.legend(loc="upper right", ncols=3, fontsize="small")
         upper.set_title(f"{type(reading.sensor).__name__}: points read, lines fitted", fontsize=10)
     if title:
-        figure.suptitle(plain(title))
+        figure.suptitle(escape_formulas(title))
     return figure
 
 
-def _fill_between_samples(found: Any, record: Any, index: int) -> tuple[np.ndarray, Any] | None:
+def _fill_between_samples(
+    fit_result: Any, record: Any, index: int
+) -> tuple[np.ndarray, Any] | None:
     """Return the times and states between sparse samples of a free body, for a smooth line; else
     `None`.
     """
-    model, body, state0 = found.model, found.body, found.state0
+    model, body, state0 = fit_result.model, fit_result.body, fit_result.state0
     if model.torque is not None or record.t.shape[0] > 300:
         return None
     if model.count > 1:
@@ -60,16 +75,16 @@ def _fill_between_samples(found: Any, record: Any, index: int) -> tuple[np.ndarr
     return np.asarray(dense), simulate(body, state0, dense).ys
 
 
-def _one_sensor(
+def _draw_sensor(
     upper: Any,
     lower: Any,
     ts: ArrayLike,
     reading: Any,
     errors: np.ndarray,
-    dense: tuple[np.ndarray, PyTree] | None,
+    dense_states: tuple[np.ndarray, PyTree] | None,
     units: tuple[float, float, str],
 ) -> None:
-    (seconds, rate, rate_unit), seen, sensor = units, reading.seen, reading.sensor
+    (seconds, rate, rate_unit), seen, sensor = units, reading.host_mask, reading.sensor
     t = np.asarray(ts) / seconds
     values = np.asarray(reading.values).reshape(len(t), -1)
     names: tuple[str, ...] = ("x", "y", "z")[: values.shape[1]]
@@ -82,8 +97,8 @@ def _one_sensor(
         names = tuple(f"{axis} of body z" for axis in "xyz")
         upper.set_ylabel("body z axis in world axes")
         unit = "deg (body axes)"
-        if dense is not None:
-            line_t, line = dense[0] / seconds, _long_axis(dense[1].q)
+        if dense_states is not None:
+            line_t, line = dense_states[0] / seconds, _long_axis(dense_states[1].q)
     else:
         if sensor.unit == "rad/s":
             scale, unit, names = rate, rate_unit, ("Ωx", "Ωy", "Ωz")
@@ -92,8 +107,8 @@ def _one_sensor(
         line = (values - errors) * scale if whole else None
         upper.set_ylabel("body rate, " + unit if sensor.unit == "rad/s" else f"reading, {unit}")
         bare = getattr(sensor, "bias", None) is None and getattr(sensor, "scale", None) is None
-        if dense is not None and sensor.unit == "rad/s" and bare:
-            line_t, line = dense[0] / seconds, np.asarray(dense[1].omega) * scale
+        if dense_states is not None and sensor.unit == "rad/s" and bare:
+            line_t, line = dense_states[0] / seconds, np.asarray(dense_states[1].omega) * scale
     lower.set_ylabel(f"error, {unit}")
     many = seen.sum() > 100
     mark: dict[str, Any] = {"marker": "." if many else "o", "ls": "", "ms": 2 if many else 5}

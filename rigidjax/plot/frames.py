@@ -10,7 +10,14 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax.frames import AbstractScene, MovingFrame, Point
-from rigidjax.plot.style import AXES, COLOURS, plain, rows, several_axes, times
+from rigidjax.plot.style import (
+    AXES,
+    COLOURS,
+    axes_of_shape,
+    escape_formulas,
+    rows_on_host,
+    times_on_host,
+)
 
 
 def frames(
@@ -40,17 +47,17 @@ def frames(
     """
     moving: Any = getattr(frame, "frame", frame)
     wanted = "a MovingFrame, or a scene with one such as scenes.turntable"
-    _checks.instance(moving, MovingFrame, "frame", wanted=wanted)
-    _checks.instance(inside, Point, "inside")
+    _checks.require_instance(moving, MovingFrame, "frame", requirement=wanted)
+    _checks.require_instance(inside, Point, "inside")
     known = isinstance(plane, str) and set(plane) <= set(AXES)
     if not known or len(plane) != 2 or plane[0] == plane[1]:
         raise ValueError(f"plane: wanted two of x, y, z such as 'xz', got {plane!r}")
     i, j = (AXES.index(name) for name in plane)
-    path = rows(inside.x, 3, "inside.x")
-    kind = _checks.numbers(inside.x, "inside.x").dtype
-    t = jnp.asarray(times(ts, path.shape[0], "the path has"), kind)
+    path = rows_on_host(inside.x, 3, "inside.x")
+    kind = _checks.numeric_array(inside.x, "inside.x").dtype
+    t = jnp.asarray(times_on_host(ts, path.shape[0], "the path has"), kind)
     outside = np.asarray(jax.vmap(moving.to_inertial)(inside, t).x)
-    ax = several_axes(ax, (2,), ncols=2, figsize=(9.6, 4.6))
+    ax = axes_of_shape(ax, (2,), ncols=2, figsize=(9.6, 4.6))
     names = (("moving", path), ("inertial", outside))
     for one, (name, line) in zip(ax, names, strict=True):
         one.plot(line[:, i], line[:, j], color=COLOURS[0], lw=1.2)
@@ -69,9 +76,13 @@ def frames(
         still = jax.tree.map(lambda leaf: jnp.zeros_like(leaf), inside)
         still = Point(still.x + jnp.asarray(here, still.x.dtype)[None], still.v)
         moved = np.asarray(jax.vmap(moving.to_inertial)(still, t).x)
-        ax[0].plot(here[i], here[j], color=colour, marker="s", ms=6, ls="", label=plain(name))
-        ax[1].plot(moved[:, i], moved[:, j], color=colour, lw=0.9, ls="--", label=plain(name))
+        ax[0].plot(
+            here[i], here[j], color=colour, marker="s", ms=6, ls="", label=escape_formulas(name)
+        )
+        ax[1].plot(
+            moved[:, i], moved[:, j], color=colour, lw=0.9, ls="--", label=escape_formulas(name)
+        )
     ax[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)
     if title:
-        ax[0].figure.suptitle(plain(title))
+        ax[0].figure.suptitle(escape_formulas(title))
     return ax

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax.plot.style import COLOURS, plain, several_axes
+from rigidjax.plot.style import COLOURS, axes_of_shape, escape_formulas
 
 _KINDS = {"x": "position, m", "v": "velocity, m/s", "q": "attitude, rad"}
 _KINDS["omega"] = "body rate, rad/s"
@@ -18,7 +18,7 @@ _MEASURES = {
 
 
 def horizons(
-    found: Any,
+    results: Any,
     *,
     step: float | None = None,
     measure: str = "mean_absolute",
@@ -27,41 +27,45 @@ def horizons(
 ) -> Any:
     """Draw open-loop errors against the horizon, one picture for each kind of state.
 
-    **Arguments:** `found` a `Horizons`, as `identify.predict_windows` and `Windows.held` return
-    them, or several by name, to compare models, windows, or a prediction that holds the start;
-    `step` s between samples, for a scale of time instead of steps; `measure` `mean_absolute` (of a
-    component), `mean_norm` or `rms` (of the vector); `title`; `ax` one for each kind. Both scales
-    are linear, since errors start at zero. **Returns** the axes, one for each of position,
+    **Arguments:** `results` a `Horizons`, as `identify.predict_windows` and `Windows.held_horizons`
+    return them, or several by name, to compare models, windows, or a prediction that holds the
+    start; `step` s between samples, for a scale of time instead of steps; `measure` `mean_absolute`
+    (of a component), `mean_norm` or `rms` (of the vector); `title`; `ax` one for each kind. Both
+    scales are linear, since errors start at zero. **Returns** the axes, one for each of position,
     velocity, attitude, body rate in the state. **Raises** `ValueError` for no `Horizons`, for kinds
     that differ, and for a step that is not positive.
 
     >>> t = np.arange(8.0)
     >>> cut = rj.identify.windows(t, rj.Spin(np.ones((8, 3)) * t[:, None]), length=3)
-    >>> horizons({"held": cut.held()})[0].get_ylabel()
+    >>> horizons({"held": cut.held_horizons()})[0].get_ylabel()
     'body rate, rad/s'
     """
-    named = dict(found) if isinstance(found, Mapping) else {"": found}
+    named = dict(results) if isinstance(results, Mapping) else {"": results}
     if not named:
-        raise ValueError("found: wanted at least one Horizons, got none")
+        raise ValueError("results: wanted at least one Horizons, got none")
     for one in named.values():
         if not all(hasattr(one, name) for name in ("steps", *_MEASURES)) or isinstance(one, type):
-            words = "found: wanted a Horizons of rigidjax.identify, or some by name, got "
-            raise TypeError(words + _checks.kind(one))
-    _checks.word(measure, tuple(_MEASURES), "measure")
-    scale = 1.0 if step is None else _checks.positive(step, "step", "a positive time, s")
+            words = "results: wanted a Horizons of rigidjax.identify, or some by name, got "
+            raise TypeError(words + _checks.type_name(one))
+    _checks.require_option(measure, tuple(_MEASURES), "measure")
+    scale = 1.0 if step is None else _checks.positive_float(step, "step", "a positive time, s")
     kinds = [kind for kind in _KINDS if kind in getattr(next(iter(named.values())), measure)]
     for name, one in named.items():
         if sorted(getattr(one, measure)) != sorted(kinds):
             others = f"{name!r} with {sorted(getattr(one, measure))}"
-            raise ValueError(f"found: wanted the same kinds of errors, got {kinds} and {others}")
+            raise ValueError(f"results: wanted the same kinds of errors, got {kinds} and {others}")
     count = len(kinds)
-    ax = several_axes(ax, (count,), ncols=count, figsize=(3.4 * count + 0.6, 3.2))
+    ax = axes_of_shape(ax, (count,), ncols=count, figsize=(3.4 * count + 0.6, 3.2))
     for one_ax, kind in zip(ax, kinds, strict=True):
         for (name, one), colour in zip(named.items(), COLOURS * len(named), strict=False):
-            errors = _checks.on_host(getattr(one, measure)[kind], f"found: {kind}")
-            ahead = np.concatenate([[0.0], scale * _checks.on_host(one.steps, "found: steps")])
+            errors = _checks.host_array(getattr(one, measure)[kind], f"results: {kind}")
+            steps_ahead = np.concatenate(
+                [[0.0], scale * _checks.host_array(one.steps, "results: steps")]
+            )
             line = np.concatenate([[0.0], errors])
-            one_ax.plot(ahead, line, color=colour, lw=1.4, label=plain(name) or None)
+            one_ax.plot(
+                steps_ahead, line, color=colour, lw=1.4, label=escape_formulas(name) or None
+            )
         one_ax.set(xlabel="steps ahead" if step is None else "time ahead, s", ylabel=_KINDS[kind])
         one_ax.margins(x=0)
         one_ax.set_ylim(bottom=0.0)
@@ -69,5 +73,5 @@ def horizons(
     if any(named):
         ax[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     said = _MEASURES[measure]
-    ax[0].set_title(plain(f"{title}: {said}" if title else said), loc="left")
+    ax[0].set_title(escape_formulas(f"{title}: {said}" if title else said), loc="left")
     return ax

@@ -13,7 +13,7 @@ from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion.torques import HeavyTop
 from rigidjax.plot import style
-from rigidjax.plot.style import COLOURS, plain, rows
+from rigidjax.plot.style import COLOURS, escape_formulas, rows_on_host
 
 
 def phase_portrait(
@@ -43,13 +43,15 @@ def phase_portrait(
     >>> phase_portrait(body, top, rj.simulate(body, start, [0.0, 0.1, 0.2], top).ys).get_xlabel()
     'tilt θ, deg'
     """
-    inertia = validation.single(inertia, Inertia, "inertia")
+    inertia = validation.require_single_body(inertia, Inertia, "inertia")
     for name, size in (("mass", ()), ("com", (3,)), ("gravity", (3,))):
-        _checks.floating(getattr(_checks.instance(top, HeavyTop, "top"), name), size, f"top.{name}")
-    levels = _checks.whole(levels, "levels", 1)
+        _checks.array_of_shape(
+            getattr(_checks.require_instance(top, HeavyTop, "top"), name), size, f"top.{name}"
+        )
+    levels = _checks.integer(levels, "levels", 1)
     across, along, axis, weight, up = _symmetric_top(inertia, top)
-    m = style.matrices(style.attitudes(states))
-    omega = np.einsum("tij,tj->ti", m, rows(states.omega, 3, "states.omega"))
+    m = style.rotation_matrices(style.attitudes_on_host(states))
+    omega = np.einsum("tij,tj->ti", m, rows_on_host(states.omega, 3, "states.omega"))
     first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], states)
     about_up = float(np.asarray(spatial_angular_momentum(inertia, first)) @ up)
     about_axis = along * float(np.asarray(first.omega) @ axis)
@@ -85,7 +87,7 @@ def phase_portrait(
     if grid[0] < lowest < grid[-1]:
         ax.plot(np.degrees(lowest), 0, color=COLOURS[1], marker="x", ms=8, ls="", label="steady")
     ax.set(xlabel="tilt θ, deg", ylabel="dθ/dt, rad/s", ylim=(-reach, reach))
-    ax.set_title(plain(title) or "phase portrait; thin: equal energy, same momenta")
+    ax.set_title(escape_formulas(title) or "phase portrait; thin: equal energy, same momenta")
     style.legend_below(ax)
     return ax
 

@@ -13,7 +13,7 @@ from rigidjax._types import HasAttitude, HasSpin
 from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.plot import style
-from rigidjax.plot.style import COLOURS, plain, rows
+from rigidjax.plot.style import COLOURS, escape_formulas, rows_on_host
 
 
 def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
@@ -28,20 +28,20 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     >>> body_axes(sol.ys).get_zlabel()
     'z'
     """
-    m = style.matrices(style.attitudes(states))
+    m = style.rotation_matrices(style.attitudes_on_host(states))
     ax = style.solid_axes(ax)
-    style.globe(ax, "0.8", 0.12)
+    style.draw_sphere(ax, "0.8", 0.12)
     for axis, colour in enumerate(COLOURS[:3]):
         path = m[:, :, axis]
-        style.around_ball(ax, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
+        style.draw_around_ball(ax, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
         ax.plot(*path[:1].T, color=colour, marker="o", ms=6, ls="")
         ax.plot(*path[-1:].T, color=colour, marker="^", ms=7, ls="")
     # The legend of the marks is grey: they belong to no axis.
     for mark, name in (("o", "start"), ("^", "end")):
         ax.plot([], [], [], color="0.4", marker=mark, ms=6, ls="", label=name)
-    style.cube(ax, 1.0, ("x", "y", "z"))
+    style.set_equal_scales(ax, 1.0, ("x", "y", "z"))
     style.legend_below(ax, down=0.06)
-    ax.set_title(plain(title) or "body axes on the unit sphere, world frame")
+    ax.set_title(escape_formulas(title) or "body axes on the unit sphere, world frame")
     return ax
 
 
@@ -70,13 +70,15 @@ def polhode(
     >>> polhode(body, sol.ys).get_zlabel()
     'Π₃ / h'
     """
-    _checks.single(inertia, Inertia, "inertia")
-    _checks.instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
-    energies = _checks.whole(energies, "energies", 0)
+    _checks.require_single(inertia, Inertia, "inertia")
+    _checks.require_instance(
+        states, HasSpin, "states", requirement="a Spin, an Attitude or a Rigid"
+    )
+    energies = _checks.integer(energies, "energies", 0)
     moments, q = inertia.invertible().principal()
     i = np.asarray(moments, dtype=float)
-    turn = style.matrices(np.asarray(q, dtype=float)[None])[0]
-    omega = rows(states.omega, 3, "states.omega")
+    turn = style.rotation_matrices(np.asarray(q, dtype=float)[None])[0]
+    omega = rows_on_host(states.omega, 3, "states.omega")
     pi = omega @ turn * i
     size = float(np.linalg.norm(pi[0]))
     if not size > 0:
@@ -88,18 +90,20 @@ def polhode(
     # The drawing order is set here: matplotlib takes one depth for a whole surface, and would draw
     # the sphere over the path.
     ax.computed_zorder = False
-    style.globe(ax, COLOURS[5], 0.15)
+    style.draw_sphere(ax, COLOURS[5], 0.15)
     semi_axes = np.sqrt(twice_energy * i)
     # The ellipsoid is drawn by meridians and parallels, so that its inside stays visible.
     how: dict[str, Any] = dict(color=COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
-    ax.plot_wireframe(*(semi_axes[:, None, None] * style.ball()), rstride=4, cstride=6, **how)
+    ax.plot_wireframe(
+        *(semi_axes[:, None, None] * style.sphere_grid()), rstride=4, cstride=6, **how
+    )
     # All energies are equal if all moments are equal: there are no lines to draw.
     if i[2] - i[0] > 1e-9 * i[2]:
         _draw_other_energies(ax, i, energies)
     how = dict(behind={"ls": (0, (1, 1)), "lw": 1.8}, label="this motion", zorder=5)
-    style.around_ball(ax, pi, color=COLOURS[1], lw=2.6, **how)
+    style.draw_around_ball(ax, pi, color=COLOURS[1], lw=2.6, **how)
     ax.plot(*pi[:1].T, color=COLOURS[1], marker="o", ms=6, ls="", label="start", zorder=6)
-    style.cube(ax, max(1.0, float(semi_axes.max())), ("Π₁ / h", "Π₂ / h", "Π₃ / h"))
+    style.set_equal_scales(ax, max(1.0, float(semi_axes.max())), ("Π₁ / h", "Π₂ / h", "Π₃ / h"))
     handles, names = ax.get_legend_handles_labels()
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -107,7 +111,7 @@ def polhode(
     handles += [Patch(color=COLOURS[5], alpha=0.4), Line2D([], [], color=COLOURS[4], lw=0.8)]
     names += ["momentum sphere", "energy ellipsoid"]
     style.legend_below(ax, handles, names, down=0.06)
-    ax.set_title(plain(title) or "polhode, principal axes of the body")
+    ax.set_title(escape_formulas(title) or "polhode, principal axes of the body")
     return ax
 
 
@@ -118,7 +122,7 @@ def _draw_other_energies(ax: Any, i: np.ndarray, energies: int) -> None:
     def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
         # The pole is along the axis of the middle moment: no family of loops goes round this axis,
         # so that no curve is cut where the angle jumps.
-        return style.on_sphere(around, down)[[1, 2, 0]]
+        return style.sphere_points(around, down)[[1, 2, 0]]
 
     inverse = 1 / i
     around, down = np.linspace(0, 2 * np.pi, 181), np.linspace(0, np.pi, 91)
@@ -131,7 +135,7 @@ def _draw_other_energies(ax: Any, i: np.ndarray, energies: int) -> None:
         drawn.append((inverse[1], how))
     for value, how in drawn:
         for curve in lines.lines(value):
-            style.around_ball(ax, on_sphere(*np.asarray(curve).T).T, **how)
+            style.draw_around_ball(ax, on_sphere(*np.asarray(curve).T).T, **how)
             how.pop("label", None)
 
 
@@ -148,8 +152,8 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     >>> herpolhode(body, sol.ys).get_xlabel()
     'ω along e₁, rad/s'
     """
-    m = style.matrices(style.attitudes(states))
-    omega = np.einsum("tij,tj->ti", m, rows(states.omega, 3, "states.omega"))
+    m = style.rotation_matrices(style.attitudes_on_host(states))
+    omega = np.einsum("tij,tj->ti", m, rows_on_host(states.omega, 3, "states.omega"))
     each = jax.vmap(lambda state: spatial_angular_momentum(inertia, state))
     momenta = np.asarray(each(jax.tree.map(jnp.asarray, states)), dtype=float)
     size = np.linalg.norm(momenta, axis=1)
@@ -177,6 +181,6 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     ax.plot(0, 0, color="0.2", marker="+", ms=8, ls="", label="momentum")
     ax.set_aspect("equal")
     ax.set(xlabel="ω along e₁, rad/s", ylabel="ω along e₂, rad/s")
-    ax.set_title(plain(title) or "herpolhode, across the angular momentum")
+    ax.set_title(escape_formulas(title) or "herpolhode, across the angular momentum")
     style.legend_below(ax)
     return ax

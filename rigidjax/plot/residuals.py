@@ -4,14 +4,21 @@ from typing import Any
 
 import numpy as np
 
-from rigidjax.plot.style import COLOURS, TIMES, of_fit, plain, several_axes, unit
+from rigidjax.plot.style import (
+    COLOURS,
+    TIMES,
+    axes_of_shape,
+    escape_formulas,
+    readings_of_fit,
+    unit_factor,
+)
 
 # Frequencies of an uneven record, at most.
 _MOST = 2000
 
 
 def residuals(
-    found: Any, *, index: int = 0, time_unit: str = "s", title: str = "", ax: Any = None
+    fit_result: Any, *, index: int = 0, time_unit: str = "s", title: str = "", ax: Any = None
 ) -> Any:
     """Draw residuals of each sensor over its noise: in time, histogram, autocorrelation, spectrum.
 
@@ -21,43 +28,45 @@ def residuals(
     which is 1 at all frequencies for white noise of the given size (Welch's estimate; Lomb's for
     uneven times). A line in the spectrum is a motion or a torque that the model lacks.
 
-    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`,
-    `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
+    **Arguments:** `fit_result` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit`
+    `s`, `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
 
     >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> residuals(found)[0, 2].get_xlabel()
     'lag, samples'
     """
-    seconds = unit(time_unit, TIMES, "time_unit")
-    record, left, noises = of_fit(found, index)
+    seconds = unit_factor(time_unit, TIMES, "time_unit")
+    record, left, noises = readings_of_fit(fit_result, index)
     count = len(record.readings)
-    ax = several_axes(ax, (count, 4), nrows=count, ncols=4, figsize=(14, 3.1 * count))
+    ax = axes_of_shape(ax, (count, 4), nrows=count, ncols=4, figsize=(14, 3.1 * count))
     t = np.asarray(record.t) / seconds
     for row, reading, errors, noise in zip(ax, record.readings, left, noises, strict=True):
-        _one_sensor(row, t, errors / noise, np.asarray(reading.seen))
+        _draw_sensor_residuals(row, t, errors / noise, np.asarray(reading.host_mask))
         row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
         row[0].set_xlabel(f"time, {time_unit}")
         row[3].set_xlabel(f"frequency, {'Hz' if time_unit == 's' else f'1/{time_unit}'}")
-    ax[0, 0].set_title(plain(title) or "residuals of the fit", loc="left")
+    ax[0, 0].set_title(escape_formulas(title) or "residuals of the fit", loc="left")
     return ax
 
 
-def _one_sensor(row: np.ndarray, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -> None:
+def _draw_sensor_residuals(
+    row: np.ndarray, t: np.ndarray, standardised: np.ndarray, mask: np.ndarray
+) -> None:
     over_time, spread, memory, spectrum = row
-    colours, names = COLOURS[: scaled.shape[1]], "xyz"[: scaled.shape[1]]
-    everything = scaled[seen].ravel()
+    colours, names = COLOURS[: standardised.shape[1]], "xyz"[: standardised.shape[1]]
+    everything = standardised[mask].ravel()
     # One wild reading must not press all others into a line: readings beyond `reach` are drawn at
     # the edge.
     reach = float(np.clip(np.abs(everything).max(initial=0.0) * 1.1, 4.0, 8.0))
     beyond = int((np.abs(everything) > reach).sum())
-    shown = np.where(np.abs(scaled[seen]) <= reach, scaled[seen], np.nan)
-    how: dict[str, Any] = dict(ms=2.5 if seen.sum() > 100 else 5, alpha=0.7)
+    shown = np.where(np.abs(standardised[mask]) <= reach, standardised[mask], np.nan)
+    how: dict[str, Any] = dict(ms=2.5 if mask.sum() > 100 else 5, alpha=0.7)
     for values, colour, name in zip(shown.T, colours, names, strict=True):
-        over_time.plot(t[seen], values, ".", color=colour, label=name, **how)
+        over_time.plot(t[mask], values, ".", color=colour, label=name, **how)
     if beyond:
-        for axis, (values, colour) in enumerate(zip(scaled[seen].T, colours, strict=True)):
+        for axis, (values, colour) in enumerate(zip(standardised[mask].T, colours, strict=True)):
             for side, mark in ((1, "^"), (-1, "v")):
-                where = t[seen][side * values > reach]
+                where = t[mask][side * values > reach]
                 # Each axis has a row of its own: one reading is often wild on all axes.
                 at = np.full(where.size, side * reach * (0.95 - 0.09 * axis))
                 over_time.plot(where, at, color=colour, marker=mark, ms=5, ls="")
@@ -82,11 +91,11 @@ def _one_sensor(row: np.ndarray, t: np.ndarray, scaled: np.ndarray, seen: np.nda
     spread.set(xlabel="error / noise", ylabel="density")
     spread.legend(loc="upper right", fontsize=8)
 
-    number = int(seen.sum())
+    number = int(mask.sum())
     lags = np.arange(1, max(2, min(40, number // 2)))
-    for values, colour in zip(scaled[seen].T, colours, strict=True):
+    for values, colour in zip(standardised[mask].T, colours, strict=True):
         memory.plot(lags, _correlation(values, lags), ".-", color=colour, ms=4, lw=0.8)
-        spectrum.plot(*power(t[seen], values), color=colour, lw=1)
+        spectrum.plot(*power_spectrum(t[mask], values), color=colour, lw=1)
     band = 2 / np.sqrt(max(number, 1))
     memory.axhspan(-band, band, color="0.9", zorder=0)
     memory.axhline(0, color="0.6", lw=0.8)
@@ -95,7 +104,7 @@ def _one_sensor(row: np.ndarray, t: np.ndarray, scaled: np.ndarray, seen: np.nda
     spectrum.set(yscale="log", ylabel="power / power of the noise")
 
 
-def power(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def power_spectrum(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the frequencies and power (F,) of residuals over their noise: white noise has power
     1.
     """

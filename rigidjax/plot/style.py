@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax._checks import plain as plain
+from rigidjax._checks import escape_formulas as escape_formulas
 from rigidjax.rotation import quaternion
 
 # Okabe and Ito's colours, distinct also for colour-blind readers (2008, "Color Universal Design").
@@ -29,37 +29,46 @@ def pyplot() -> Any:
     return plt
 
 
-def unit(name: str, known: dict[str, float], what: str) -> float:
-    """Return the factor of a unit to or from SI, by its name; the error for other names lists the
-    known names.
+def unit_factor(unit: str, units: dict[str, float], name: str) -> float:
+    """Return the factor of a unit to or from SI; the error for another unit lists the known ones.
+
+    `name` is that of the argument.
     """
-    return known[_checks.word(name, tuple(known), what)]
+    return units[_checks.require_option(unit, tuple(units), name)]
 
 
-def of_fit(found: Any, index: object) -> tuple[Any, list[np.ndarray], list[np.ndarray]]:
+def readings_of_fit(
+    fit_result: Any, index: object
+) -> tuple[Any, list[np.ndarray], list[np.ndarray]]:
     """Return a recording of a fit, its residuals and their standard deviations; raise an error if
     there is none.
     """
-    if np.shape(getattr(found, "chi2", 0.0)) != ():
-        raise ValueError("found: wanted one Fit, got one with leading axes; draw them one by one")
+    if np.shape(getattr(fit_result, "chi2", 0.0)) != ():
+        raise ValueError(
+            "fit_result: wanted one Fit, got one with leading axes; draw them one by one"
+        )
     wanted = ("model", "x", "residuals")
-    if isinstance(found, type) or not all(hasattr(found, name) for name in wanted):
-        raise TypeError(f"found: wanted a Fit of rigidjax.identify, got {type(found).__name__}")
-    index, count = _checks.whole(index, "index", 0), found.model.count
+    if isinstance(fit_result, type) or not all(hasattr(fit_result, name) for name in wanted):
+        raise TypeError(
+            f"fit_result: wanted a Fit of rigidjax.identify, got {type(fit_result).__name__}"
+        )
+    index, count = _checks.integer(index, "index", 0), fit_result.model.count
     if index >= count:
         raise ValueError(f"index: wanted one of {count} recordings, from 0, got {index}")
-    record, which = found.model.recordings[index], ... if count == 1 else index
-    errors = [np.asarray(e[which])[: record.t.shape[0]] for e in found.residuals]
-    lates = [0.0 if reading.late is None else reading.late for reading in record.readings]
-    noises = zip(found.noise, lates, strict=True)
+    record, which = fit_result.model.recordings[index], ... if count == 1 else index
+    errors = [np.asarray(e[which])[: record.t.shape[0]] for e in fit_result.residuals]
+    lates = [
+        0.0 if reading.jitter_error is None else reading.jitter_error for reading in record.readings
+    ]
+    noises = zip(fit_result.noise, lates, strict=True)
     return record, errors, [np.hypot(noise[which], late) for noise, late in noises]
 
 
-def flat_axes(ax: Any, **how: Any) -> Any:
+def flat_axes(ax: Any, **options: Any) -> Any:
     """Return `ax`, or the axes of a new figure for `None`."""
     if ax is not None:
         return ax
-    return pyplot().subplots(layout="constrained", **{"figsize": (6.4, 4.4), **how})[1]
+    return pyplot().subplots(layout="constrained", **{"figsize": (6.4, 4.4), **options})[1]
 
 
 def solid_axes(ax: Any) -> Any:
@@ -74,15 +83,16 @@ def solid_axes(ax: Any) -> Any:
     return ax
 
 
-def several_axes(ax: Any, shape: tuple[int, ...], **how: Any) -> Any:
-    """Return `ax` if it has this shape, or new axes (`how` of `subplots`) for `None`. **Raises:**
-    `ValueError` for another shape.
+def axes_of_shape(ax: Any, shape: tuple[int, ...], **options: Any) -> Any:
+    """Return `ax` if it has this shape, or new axes (`options` of `subplots`) for `None`.
+
+    **Raises:** `ValueError` for another shape.
     """
     if ax is None:
-        ax = np.reshape(pyplot().subplots(layout="constrained", **how)[1], shape)
+        ax = np.reshape(pyplot().subplots(layout="constrained", **options)[1], shape)
     ax = np.atleast_1d(np.asarray(ax, dtype=object))
     if ax.shape != shape:
-        words = f"{shape[0]} axes" + (" in a row" if "ncols" in how else "")
+        words = f"{shape[0]} axes" + (" in a row" if "ncols" in options else "")
         words = words if len(shape) == 1 else f"{shape} axes, one row for each sensor"
         raise ValueError(f"ax: wanted {words}, got shape {ax.shape}")
     return ax
@@ -96,21 +106,21 @@ def legend_below(ax: Any, *entries: Any, down: float = 0.16) -> None:
     ax.legend(*entries, **place, ncols=3, fontsize=8, frameon=False)
 
 
-def times(ts: object, count: int, what: str = "the states have") -> np.ndarray:
+def times_on_host(ts: object, count: int, name: str = "the states have") -> np.ndarray:
     """Return the times (T,) as NumPy float64. **Raises:** `ValueError` unless there are as many
     times as states.
     """
-    t = _checks.on_host(ts, "ts")
+    t = _checks.host_array(ts, "ts")
     if t.shape != (count,):
-        raise ValueError(f"ts: wanted ({count},) as {what}, got {t.shape}")
+        raise ValueError(f"ts: wanted ({count},) as {name}, got {t.shape}")
     return t
 
 
-def rows(values: object, width: int, name: str) -> np.ndarray:
+def rows_on_host(values: object, width: int, name: str) -> np.ndarray:
     """Return values of one body over time (T, width) as NumPy float64. **Raises:** `ValueError` for
     another shape.
     """
-    out = _checks.on_host(values, name)
+    out = _checks.host_array(values, name)
     if out.ndim != 2 or out.shape[1] != width:
         hint = "; draw one body of a batch at a time" if out.ndim == 3 else ""
         raise ValueError(f"{name}: wanted shape (times, {width}), got {out.shape}{hint}")
@@ -119,58 +129,54 @@ def rows(values: object, width: int, name: str) -> np.ndarray:
     return out
 
 
-def attitudes(states: Any) -> np.ndarray:
+def attitudes_on_host(states: Any) -> np.ndarray:
     """Return the quaternions (T, 4) of states. **Raises:** `TypeError` for states without an
     attitude.
     """
     if not hasattr(states, "q"):
-        found = type(states).__name__
-        raise TypeError(f"states: wanted states with an attitude (Attitude, Rigid), got {found}")
-    return rows(states.q, 4, "states.q")
+        got = type(states).__name__
+        raise TypeError(f"states: wanted states with an attitude (Attitude, Rigid), got {got}")
+    return rows_on_host(states.q, 4, "states.q")
 
 
-def matrices(q: np.ndarray) -> np.ndarray:
+def rotation_matrices(q: np.ndarray) -> np.ndarray:
     """Return rotation matrices (T, 3, 3), body → world, of quaternions (T, 4), for pictures."""
     unit = jnp.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
     return np.asarray(jax.vmap(quaternion.to_matrix)(unit), dtype=float)
 
 
-def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Return places (3, …) on the unit sphere, by the angle `around` z and the angle `down` from
-    z.
-    """
-    ring, height = np.sin(down), np.cos(down)
-    return np.stack(np.broadcast_arrays(np.cos(around) * ring, np.sin(around) * ring, height))
+def sphere_points(longitude: np.ndarray, colatitude: np.ndarray) -> np.ndarray:
+    """Return places (3, …) on the unit sphere, by `longitude` and `colatitude`."""
+    ring, height = np.sin(colatitude), np.cos(colatitude)
+    return np.stack(np.broadcast_arrays(np.cos(longitude) * ring, np.sin(longitude) * ring, height))
 
 
-def around_ball(
-    ax: Any, path: np.ndarray, *, behind: dict[str, Any] | None = None, **how: Any
+def draw_around_ball(
+    ax: Any, path: np.ndarray, *, hidden_style: dict[str, Any] | None = None, **style: Any
 ) -> None:
-    """Draw a line `path` (T, 3) on the unit sphere, in the style `behind` where the sphere hides
-    it.
-    """
+    """Draw a line `path` (T, 3) on the unit sphere, in `hidden_style` where the sphere hides it."""
     up, around = np.radians(ax.elev), np.radians(ax.azim)
     eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
-    front, label = path @ eye > 0, how.pop("label", None)
-    for seen, more in ((front, {"label": label}), (~front, behind or {"alpha": 0.25})):
+    front, label = path @ eye > 0, style.pop("label", None)
+    for seen, more in ((front, {"label": label}), (~front, hidden_style or {"alpha": 0.25})):
         # Each part has one point more on both sides of the edge, so that no gap opens between them.
         wide = seen | np.roll(seen, 1) | np.roll(seen, -1)
         wide[0], wide[-1] = seen[0], seen[-1]
         line = np.where(wide[:, None], path, np.nan)
-        ax.plot(*line.T, **{**how, **more})
+        ax.plot(*line.T, **{**style, **more})
 
 
-def ball() -> np.ndarray:
+def sphere_grid() -> np.ndarray:
     """Return a grid (3, 49, 25) on the unit sphere."""
-    return on_sphere(np.linspace(0, 2 * np.pi, 49)[:, None], np.linspace(0, np.pi, 25))
+    return sphere_points(np.linspace(0, 2 * np.pi, 49)[:, None], np.linspace(0, np.pi, 25))
 
 
-def globe(ax: Any, colour: str, alpha: float) -> None:
+def draw_sphere(ax: Any, colour: str, alpha: float) -> None:
     """Draw the unit sphere, translucent."""
-    ax.plot_surface(*ball(), color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1)
+    ax.plot_surface(*sphere_grid(), color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1)
 
 
-def cube(ax: Any, reach: float, labels: tuple[str, str, str]) -> None:
+def set_equal_scales(ax: Any, reach: float, labels: tuple[str, str, str]) -> None:
     """Set equal scales on all three axes, few ticks, and names that do not run into the ticks."""
     from matplotlib.ticker import MaxNLocator
 

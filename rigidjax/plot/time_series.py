@@ -10,7 +10,7 @@ from jaxtyping import ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import HasSpin
 from rigidjax.plot import style
-from rigidjax.plot.style import COLOURS, RATES, TIMES, plain, rows
+from rigidjax.plot.style import COLOURS, RATES, TIMES, escape_formulas, rows_on_host
 from rigidjax.rotation import euler
 
 
@@ -37,16 +37,18 @@ def motion(
     >>> motion(sol.ts, sol.ys)[0].get_ylabel()
     'body rate Ω, rad/s'
     """
-    turned = style.unit(rate_unit, RATES, "rate_unit")
-    seconds = style.unit(time_unit, TIMES, "time_unit")
-    _checks.instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
-    omega = rows(states.omega, 3, "states.omega") * turned
-    t = style.times(ts, omega.shape[0]) / seconds
+    turned = style.unit_factor(rate_unit, RATES, "rate_unit")
+    seconds = style.unit_factor(time_unit, TIMES, "time_unit")
+    _checks.require_instance(
+        states, HasSpin, "states", requirement="a Spin, an Attitude or a Rigid"
+    )
+    omega = rows_on_host(states.omega, 3, "states.omega") * turned
+    t = style.times_on_host(ts, omega.shape[0]) / seconds
     both = hasattr(states, "q")
     count = 2 if both else 1
-    ax = style.several_axes(ax, (count,), nrows=count, sharex=True, figsize=(7.2, 2.6 * count))
+    ax = style.axes_of_shape(ax, (count,), nrows=count, sharex=True, figsize=(7.2, 2.6 * count))
     if both:
-        _attitude(ax[0], t, style.attitudes(states), attitude)
+        _draw_attitude(ax[0], t, style.attitudes_on_host(states), attitude)
     for values, name, colour in zip(omega.T, "xyz", COLOURS[:3], strict=True):
         ax[-1].plot(t, values, color=colour, label=f"Ω{name}", lw=1.4)
     ax[-1].set(xlabel=f"time, {time_unit}", ylabel=f"body rate Ω, {rate_unit}")
@@ -56,26 +58,26 @@ def motion(
         # The legend is beside the picture: inside it would cover a line.
         one.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     if title:
-        ax[0].set_title(plain(title))
+        ax[0].set_title(escape_formulas(title))
     return ax
 
 
-def _attitude(ax: Any, t: np.ndarray, q: np.ndarray, how: str) -> None:
-    _checks.word(how, ("quaternion", "axes", "angles"), "attitude")
-    if how == "quaternion":
+def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, form: str) -> None:
+    _checks.require_option(form, ("quaternion", "axes", "angles"), "attitude")
+    if form == "quaternion":
         names, lines, label = [f"q{n}" for n in "wxyz"], q.T, "attitude q"
-    elif how == "axes":
+    elif form == "axes":
         names = [f"{n}' · z" for n in "xyz"]
-        lines, label = style.matrices(q)[:, 2, :].T, "body axes along world z"
+        lines, label = style.rotation_matrices(q)[:, 2, :].T, "body axes along world z"
     else:
-        names, lines, label = ["φ", "θ", "ψ"], _angles(q).T, "3-1-3 angles, deg"
+        names, lines, label = ["φ", "θ", "ψ"], _angles_in_degrees(q).T, "3-1-3 angles, deg"
     colours = (COLOURS[6], *COLOURS[:3]) if len(names) == 4 else COLOURS[:3]
     for values, name, colour in zip(lines, names, colours, strict=True):
         ax.plot(t, values, color=colour, label=name, lw=1.4)
     ax.set_ylabel(label)
 
 
-def _angles(q: np.ndarray) -> np.ndarray:
+def _angles_in_degrees(q: np.ndarray) -> np.ndarray:
     degrees = np.degrees(np.asarray(jax.vmap(euler.from_quaternion)(jnp.asarray(q))))
     # Where an angle jumps from 180° to −180° there is a gap: a line across the whole picture would
     # look like a motion.

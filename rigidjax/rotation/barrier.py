@@ -102,14 +102,14 @@ def one_kernel(function: Function) -> Function:
 
 
 @jax.custom_jvp
-def batch_as(out: PyTree, args: PyTree) -> Any:
-    """Return `out` with every leaf batched if any leaf of `args` is batched.
+def batch_as(tree: PyTree, args: PyTree) -> Any:
+    """Return `tree` with every leaf batched if any leaf of `args` is batched.
 
     This repeats what the batching rule of `one_kernel` returns. Under `jit`, JAX takes the axes of
     a batch from the function and the values from the rule for its derivative. Where the two differ,
     arrays have wrong shapes, and no error is raised.
     """
-    return _broadcast(out, args)
+    return _broadcast(tree, args)
 
 
 @batch_as.defjvp
@@ -118,15 +118,15 @@ def _batch_as_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> 
 
 
 @jax.custom_batching.custom_vmap
-def _broadcast(out: PyTree, args: PyTree) -> Any:
+def _broadcast(tree: PyTree, args: PyTree) -> Any:
     del args
-    return out
+    return tree
 
 
 @_broadcast.def_vmap
-def _broadcast_batched(size: int, batched: PyTree, out: PyTree, args: PyTree) -> Any:
+def _broadcast_batched(size: int, batched: PyTree, tree: PyTree, args: PyTree) -> Any:
     del args
     if not any(jax.tree.leaves(batched)):
-        return out, batched[0]
+        return tree, batched[0]
     grow = lambda a, b: a if b else jnp.broadcast_to(a, (size, *a.shape))  # noqa: E731
-    return jax.tree.map(grow, out, batched[0]), jax.tree.map(lambda _: True, out)
+    return jax.tree.map(grow, tree, batched[0]), jax.tree.map(lambda _: True, tree)

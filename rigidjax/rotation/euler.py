@@ -23,8 +23,8 @@ from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.linalg3 import apply, components, cross, dot, near_one
-from rigidjax.rotation.validation import direction, turn
+from rigidjax.rotation.linalg3 import apply, components, cross, dot, power_of_two_scale
+from rigidjax.rotation.validation import require_direction, require_turn
 
 _MANY_TURNS = 8 * np.pi
 
@@ -38,8 +38,8 @@ def to_quaternion(angles: Vec3Like, sequence: str = "ZXZ") -> Quat:
     >>> to_quaternion(jnp.array([0.0, jnp.pi, 0.0])).round(12).tolist()
     [0.0, 1.0, 0.0, 0.0]
     """
-    axes, reverse = _axes(sequence)
-    first, second, third = map(_rotation_about, axes, _in_order(_angles(angles), reverse))
+    axes, reverse = _axis_numbers(sequence)
+    first, second, third = map(_rotation_about, axes, _reverse_if(_checked_angles(angles), reverse))
     return quaternion.multiply(quaternion.multiply(first, second), third)
 
 
@@ -81,9 +81,9 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     >>> from_quaternion(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
     [0.0, 0.0, 0.0]
     """
-    (i, j, k), reverse = _axes(sequence)
-    q = quaternion.canonical(direction(_checks.floating(q, (4,), "q"), "q"))
-    q = near_one(*components(q)) * q
+    (i, j, k), reverse = _axis_numbers(sequence)
+    q = quaternion.canonical(require_direction(_checks.array_of_shape(q, (4,), "q"), "q"))
+    q = power_of_two_scale(*components(q)) * q
     symmetric = i == k
     last = 3 - i - j
     handed = _handedness(i, j)
@@ -118,8 +118,8 @@ def is_singular(angles: Vec3Like, sequence: str = "ZXZ") -> Bool[Array, ""]:
     >>> bool(is_singular(jnp.array([0.1, 0.0, 0.0]), "ZXZ"))
     True
     """
-    axes, _ = _axes(sequence)
-    return _vanishing(_angles(angles)[1], axes)[1]
+    axes, _ = _axis_numbers(sequence)
+    return _singularity(_checked_angles(angles)[1], axes)[1]
 
 
 def rates_to_omega(
@@ -138,11 +138,11 @@ def rates_to_omega(
     >>> rates_to_omega(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 2.0]
     """
-    _checks.word(frame, ("body", "world"), "frame")
-    axes, reverse = _axes(sequence)
-    angles, rates = _angles(angles), _checks.floating(rates, (3,), "rates")
-    first, second, third = _turning_axes(axes, _in_order(angles, reverse))
-    a, b, c = _in_order(rates, reverse)
+    _checks.require_option(frame, ("body", "world"), "frame")
+    axes, reverse = _axis_numbers(sequence)
+    angles, rates = _checked_angles(angles), _checks.array_of_shape(rates, (3,), "rates")
+    first, second, third = _turning_axes(axes, _reverse_if(angles, reverse))
+    a, b, c = _reverse_if(rates, reverse)
     omega = a * first + b * second + c * third
     return omega if frame == "body" else apply(to_matrix(angles, sequence), omega)
 
@@ -163,13 +163,13 @@ def omega_to_rates(
     >>> omega_to_rates(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 2.0]
     """
-    _checks.word(frame, ("body", "world"), "frame")
-    axes, reverse = _axes(sequence)
-    angles, omega = _angles(angles), _checks.floating(omega, (3,), "omega")
+    _checks.require_option(frame, ("body", "world"), "frame")
+    axes, reverse = _axis_numbers(sequence)
+    angles, omega = _checked_angles(angles), _checks.array_of_shape(omega, (3,), "omega")
     if frame == "world":
         omega = apply(to_matrix(angles, sequence).T, omega)
-    first, second, third = _turning_axes(axes, _in_order(angles, reverse))
-    reach, singular = _vanishing(angles[1], axes)
+    first, second, third = _turning_axes(axes, _reverse_if(angles, reverse))
+    reach, singular = _singularity(angles[1], axes)
     # `second` is normal to the other two; `aside` completes it and `third` to a frame.
     aside, along = cross(third, second), dot(first, third)
     a = dot(aside, omega) / jnp.where(singular, 1, reach)
@@ -179,7 +179,7 @@ def omega_to_rates(
     return jnp.stack([c, b, a] if reverse else [a, b, c])
 
 
-def _axes(sequence: str) -> tuple[tuple[int, int, int], bool]:
+def _axis_numbers(sequence: str) -> tuple[tuple[int, int, int], bool]:
     """Return the axis numbers of the three intrinsic turns, and whether the angles are listed in
     reverse.
     """
@@ -200,15 +200,15 @@ def _unknown_sequence(sequence: object, reason: str) -> str:
     )
 
 
-def _angles(angles: Vec3Like) -> Vec3:
-    angles = turn(_checks.floating(angles, (3,), "angles"), "angles")
-    if _checks.known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
+def _checked_angles(angles: Vec3Like) -> Vec3:
+    angles = require_turn(_checks.array_of_shape(angles, (3,), "angles"), "angles")
+    if _checks.is_known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
         words = "are over four turns: are they degrees? use jnp.deg2rad"
         warnings.warn(f"angles {angles.tolist()} rad {words}", stacklevel=3)
     return angles
 
 
-def _in_order(numbers: Vec3, reverse: bool) -> tuple[Scalar, Scalar, Scalar]:
+def _reverse_if(numbers: Vec3, reverse: bool) -> tuple[Scalar, Scalar, Scalar]:
     a, b, c = numbers
     return (c, b, a) if reverse else (a, b, c)
 
@@ -241,7 +241,7 @@ def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3
     return first, quaternion.rotate_inverse(last, second), third
 
 
-def _vanishing(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
+def _singularity(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
     """Return the product first · (third × second) of the axes, and whether it is 0 to round-off."""
     i, j, k = axes
     size = jnp.sin(middle) if i == k else -_handedness(i, j) * jnp.cos(middle)

@@ -25,12 +25,16 @@ from rigidjax.rotation.linalg3 import (
     determinant,
     dot,
     hat,
-    near_one,
+    power_of_two_scale,
     product,
     solve,
     vee,
 )
-from rigidjax.rotation.validation import direction, rotation_matrix, unit_quaternion
+from rigidjax.rotation.validation import (
+    require_direction,
+    require_rotation_matrix,
+    require_unit_quaternion,
+)
 
 # The least weight, relative to the largest, of the first estimate in Wahba's problem.
 _LIGHT = 1e-3
@@ -47,15 +51,15 @@ def project(matrix: Mat3Like) -> Mat3:
     >>> project(2.0 * jnp.eye(3)).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    matrix = _checks.floating(matrix, (3, 3), "matrix")
-    if _checks.known(matrix):
-        _checks.finite(matrix, "matrix")
-        direction(matrix.reshape(9), "matrix")
+    matrix = _checks.array_of_shape(matrix, (3, 3), "matrix")
+    if _checks.is_known(matrix):
+        _checks.require_finite(matrix, "matrix")
+        require_direction(matrix.reshape(9), "matrix")
         size = np.max(np.abs(np.asarray(matrix)))
         # For the matrix over its largest entry: its own determinant may overflow.
-        found = np.linalg.det(np.asarray(matrix) / size)
-        if found <= 0:
-            words = f"left-handed frame or singular, det = {found:.3g}; no rotation is nearest"
+        det = np.linalg.det(np.asarray(matrix) / size)
+        if det <= 0:
+            words = f"left-handed frame or singular, det = {det:.3g}; no rotation is nearest"
             raise ValueError(f"matrix: {words}")
     return nearest_rotation(matrix)
 
@@ -79,12 +83,12 @@ def wahba(
     >>> wahba(jnp.eye(3)[:2], jnp.eye(3)[:2]).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    body = _checks.rows(body, (3,), "body")
-    world = _checks.floating(world, body.shape, "world")
+    body = _checks.array_of_rows(body, (3,), "body")
+    world = _checks.array_of_shape(world, body.shape, "world")
     w = weights_of(weights, body[:, 0], "body")
     for name, rows in (("body", body), ("world", world)):
-        direction(rows.reshape(-1), name)
-    w, world, body = (of_order_one(x) for x in (w, world, body))
+        require_direction(rows.reshape(-1), name)
+    w, world, body = (scale_to_order_one(x) for x in (w, world, body))
     words = "wahba: these directions do not fix the attitude; two that are not parallel are needed"
     heavy, those, these = lax.stop_gradient((w, world, body))
     # In one sum a light direction would lose its digits beside a heavy one.
@@ -110,7 +114,7 @@ def wahba(
     ):
         firmness = determinant(_curvature(turn, b / jnp.sqrt((b * b).sum())))
         loose = loose | ~(firmness > least)
-    return _checks.refuse(best, loose, words)
+    return _checks.error_if(best, loose, words)
 
 
 def _weighted_sum(
@@ -148,8 +152,8 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     >>> align(jnp.array([1.0, 0, 0]), jnp.array([0, 2.0, 0])).round(12)[:, 0].tolist()
     [0.0, 1.0, 0.0]
     """
-    a, b = _checks.floating(a, (3,), "a"), _checks.floating(b, (3,), "b")
-    a, b = (of_order_one(direction(x, name)) for x, name in ((a, "a"), (b, "b")))
+    a, b = _checks.array_of_shape(a, (3,), "a"), _checks.array_of_shape(b, (3,), "b")
+    a, b = (scale_to_order_one(require_direction(x, name)) for x, name in ((a, "a"), (b, "b")))
     a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
     middle = a + b
     n2, normal = dot(middle, middle), cross(a, middle)
@@ -175,8 +179,8 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
     >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    matrices = _checks.rows(matrices, (3, 3), "matrices")
-    _checks.if_known(rotation_matrix, matrices, "matrices")
+    matrices = _checks.array_of_rows(matrices, (3, 3), "matrices")
+    _checks.check_if_known(require_rotation_matrix, matrices, "matrices")
     weights_of(weights, matrices[:, 0, 0], "matrices")
     return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
 
@@ -192,9 +196,9 @@ def mean_quaternion(
     >>> mean_quaternion(jnp.array([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]])).tolist()
     [1.0, 0.0, 0.0, 0.0]
     """
-    q = _checks.rows(quaternions, (4,), "quaternions")
-    _checks.if_known(unit_quaternion, q, "quaternions")
-    return _karcher(q, of_order_one(weights_of(weights, q[:, 0], "quaternions")))
+    q = _checks.array_of_rows(quaternions, (4,), "quaternions")
+    _checks.check_if_known(require_unit_quaternion, q, "quaternions")
+    return _karcher(q, scale_to_order_one(weights_of(weights, q[:, 0], "quaternions")))
 
 
 # Compiled once: outside of `jit` the loop would be compiled again at each call.
@@ -218,27 +222,27 @@ def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
     return quaternion.canonical(quaternion.normalise(start))
 
 
-def of_order_one(x: Array) -> Array:
+def scale_to_order_one(x: Array) -> Array:
     """Return the array multiplied by a power of two that brings its largest entry near 1.
 
     It serves formulas of ratios, in which the scale cancels: no product overflows.
     """
-    return near_one(jnp.max(jnp.abs(x))) * x
+    return power_of_two_scale(jnp.max(jnp.abs(x))) * x
 
 
-def weights_of(weights: ArrayLike | None, like: Array, of: str) -> Array:
-    """Return one weight for each row of `like`, 1 where `weights` is `None`; known weights must
+def weights_of(weights: ArrayLike | None, rows: Array, description: str) -> Array:
+    """Return one weight for each row of `rows`, 1 where `weights` is `None`; known weights must
     have a positive sum.
     """
-    if like.shape[0] == 0:
-        raise ValueError(f"{of}: wanted at least one row, got none")
+    if rows.shape[0] == 0:
+        raise ValueError(f"{description}: wanted at least one row, got none")
     if weights is None:
-        return jnp.ones_like(like)
-    w = _checks.floating(weights, like.shape, "weights")
-    if _checks.known(w):
+        return jnp.ones_like(rows)
+    w = _checks.array_of_shape(weights, rows.shape, "weights")
+    if _checks.is_known(w):
         words = "numbers ≥ 0, at least one of them positive"
-        _checks.sign(_checks.finite(w, "weights"), "weights", words, zero=True)
-        _checks.refuse(w, ~(w > 0).any(), f"weights: wanted {words}")
+        _checks.require_sign(_checks.require_finite(w, "weights"), "weights", words, zero=True)
+        _checks.error_if(w, ~(w > 0).any(), f"weights: wanted {words}")
     return w
 
 
@@ -269,7 +273,7 @@ def _curvature(r: Mat3, b: Mat3) -> Mat3:
 @jax.custom_jvp
 def nearest_rotation(b: Mat3) -> Mat3:
     """Return the rotation R with the largest Tr(Rᵀb), for a matrix of any size."""
-    b = of_order_one(b)
+    b = scale_to_order_one(b)
     b = b / jnp.sqrt((b * b).sum())
     root, zeta = _quartic(b)
     kappa = 0.5 * (root * root - 1)
@@ -288,6 +292,6 @@ def _best_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tupl
     (b,), (db,) = primals, tangents
     r = nearest_rotation(b)
     # `b` may have any size: a common factor for `b` and `db` leaves the derivative unchanged.
-    scale = near_one(jnp.max(jnp.abs(b)))
+    scale = power_of_two_scale(jnp.max(jnp.abs(b)))
     b, db = scale * b, scale * db
     return r, product(r, hat(solve(_curvature(r, b), 2 * vee(product(r.T, db)))))

@@ -17,7 +17,7 @@ from rigidjax.rotation.linalg3 import (
     cross_components,
     dot_components,
     entries,
-    near_one,
+    power_of_two_scale,
     square,
 )
 from rigidjax.rotation.stumpff import arctan_ratio, inverse_kernel, stumpff
@@ -67,7 +67,7 @@ def matrix_to_quaternion(m: Mat3) -> Quat:
 @jax.custom_jvp
 def _log(q: Quat) -> Vec3:
     """Return the shortest rotation vector of q, the same for −q."""
-    w, x, y, z = parts = components(near_one(*components(q)) * q)
+    w, x, y, z = parts = components(power_of_two_scale(*components(q)) * q)
     n2 = x * x + y * y + z * z
     # With n² = x² + y² + z², the tangent of θ/2 is n/|w|, of θ/4 n/a, of θ/8 n times `inverse`:
     # all terms of the sums are positive, so nothing cancels.
@@ -83,7 +83,7 @@ def _log_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple
     (q,), (dq,) = primals, tangents
     v = _log(q)
     # q may have any length: a common factor for q and dq leaves the derivative unchanged.
-    scale = near_one(*components(q))
+    scale = power_of_two_scale(*components(q))
     w, *u = parts = components(scale * q)
     dw, *du = components(scale * dq)
     # First the small turn in the body frame, 2 vec(q̄ dq)/|q|², then the inverse right Jacobian.
@@ -102,7 +102,7 @@ quaternion_to_vector = _compiled(_log)
 @_compiled
 def to_unit_length(q: Quat) -> Quat:
     """Return the quaternion of length 1 in the direction of q."""
-    q = near_one(*components(q)) * q
+    q = power_of_two_scale(*components(q)) * q
     return q / jnp.sqrt(square4(components(q)))
 
 

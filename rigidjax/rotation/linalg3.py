@@ -37,7 +37,7 @@ def cross(a: Vec3Like, b: Vec3Like) -> Vec3:
     >>> cross(jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])).tolist()
     [0.0, 0.0, 1.0]
     """
-    a, b = _checks.floating(a, (3,), "a"), _checks.floating(b, (3,), "b")
+    a, b = _checks.array_of_shape(a, (3,), "a"), _checks.array_of_shape(b, (3,), "b")
     return jnp.stack(cross_components(components(a), components(b)))
 
 
@@ -59,7 +59,7 @@ def square(v: Sequence[Scalar]) -> Scalar:
     return compute_once(dot_components(v, v))
 
 
-def near_one(*parts: Scalar) -> Scalar:
+def power_of_two_scale(*parts: Scalar) -> Scalar:
     """Return a power of two that brings the largest of some scalars near 1, with derivative zero.
 
     It serves formulas that do not depend on the length of their argument. The argument multiplied
@@ -79,7 +79,7 @@ def hat(w: Vec3Like) -> Mat3:
     >>> hat(jnp.array([1.0, 2.0, 3.0])).tolist()
     [[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]]
     """
-    x, y, z = components(_checks.floating(w, (3,), "w"))
+    x, y, z = components(_checks.array_of_shape(w, (3,), "w"))
     zero = jnp.zeros_like(x)
     return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
@@ -91,7 +91,7 @@ def vee(matrix: Mat3Like) -> Vec3:
     >>> vee(hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]
     """
-    _, b, c, d, _, f, g, h, _ = entries(_checks.floating(matrix, (3, 3), "matrix"))
+    _, b, c, d, _, f, g, h, _ = entries(_checks.array_of_shape(matrix, (3, 3), "matrix"))
     return 0.5 * jnp.stack([h - f, c - g, d - b])
 
 
@@ -116,7 +116,7 @@ def product(a: Mat3Like, b: Mat3Like) -> Mat3:
     >>> product(jnp.eye(3), 2.0 * jnp.eye(3)).tolist()
     [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]
     """
-    a, b = _checks.floating(a, (3, 3), "a"), _checks.floating(b, (3, 3), "b")
+    a, b = _checks.array_of_shape(a, (3, 3), "a"), _checks.array_of_shape(b, (3, 3), "b")
     return jnp.sum(a[:, :, None] * b[None], 1)
 
 
@@ -126,7 +126,7 @@ def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
     >>> apply(2.0 * jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [2.0, 4.0, 6.0]
     """
-    a, y = _checks.floating(a, (3, 3), "a"), _checks.floating(y, (3,), "y")
+    a, y = _checks.array_of_shape(a, (3, 3), "a"), _checks.array_of_shape(y, (3,), "y")
     return jnp.sum(a * y[None], 1)
 
 
@@ -136,8 +136,8 @@ def solve(a: Mat3Like, y: Vec3Like) -> Vec3:
     >>> solve(2.0 * jnp.eye(3), jnp.array([2.0, 4.0, 6.0])).tolist()
     [1.0, 2.0, 3.0]
     """
-    m = entries(_checks.floating(a, (3, 3), "a"))
-    parts = components(_checks.floating(y, (3,), "y"))
+    m = entries(_checks.array_of_shape(a, (3, 3), "a"))
+    parts = components(_checks.array_of_shape(y, (3,), "y"))
     p, q, r = m[::3], m[1::3], m[2::3]
     qr, rp, pq = cross_components(q, r), cross_components(r, p), cross_components(p, q)
     return jnp.stack([dot_components(c, parts) for c in (qr, rp, pq)]) / dot_components(p, qr)
@@ -149,7 +149,7 @@ def determinant(a: Mat3Like) -> Scalar:
     >>> float(determinant(jnp.eye(3)))
     1.0
     """
-    m = entries(_checks.floating(a, (3, 3), "a"))
+    m = entries(_checks.array_of_shape(a, (3, 3), "a"))
     return dot_components(m[:3], cross_components(m[3:6], m[6:]))
 
 
@@ -166,5 +166,5 @@ def dot(a: Vec3Like, b: Vec3Like) -> Scalar:
     >>> float(dot(jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 1.0])))
     6.0
     """
-    a, b = _checks.floating(a, (3,), "a"), _checks.floating(b, (3,), "b")
+    a, b = _checks.array_of_shape(a, (3,), "a"), _checks.array_of_shape(b, (3,), "b")
     return dot_components(components(a), components(b))

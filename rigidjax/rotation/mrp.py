@@ -12,8 +12,8 @@ from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.linalg3 import components, cross, dot, near_one
-from rigidjax.rotation.validation import direction
+from rigidjax.rotation.linalg3 import components, cross, dot, power_of_two_scale
+from rigidjax.rotation.validation import require_direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
@@ -34,10 +34,10 @@ def to_quaternion(sigma: Vec3Like) -> Quat:
     >>> to_quaternion(jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    sigma = _checks.finite_floating(sigma, (3,), "sigma")
+    sigma = _checks.finite_array(sigma, (3,), "sigma")
     # Numerator and denominator are multiplied by the square of a power of two, `one`, so that
     # |σ|² does not overflow; the number 1 of the formula becomes `one`².
-    one = jnp.minimum(near_one(*components(sigma)), 1)
+    one = jnp.minimum(power_of_two_scale(*components(sigma)), 1)
     sigma = one * sigma
     s, one2 = dot(sigma, sigma), one * one
     return jnp.concatenate([(one2 - s)[None], 2 * one * sigma]) / (one2 + s)
@@ -68,7 +68,7 @@ def shadow(sigma: Vec3Like) -> Vec3:
     >>> shadow(jnp.array([0.0, 0.5, 0.0])).tolist()
     [-0.0, -2.0, -0.0]
     """
-    return _shadow(direction(_checks.floating(sigma, (3,), "sigma"), "sigma"))
+    return _shadow(require_direction(_checks.array_of_shape(sigma, (3,), "sigma"), "sigma"))
 
 
 def switch(sigma: Vec3Like) -> Vec3:
@@ -77,13 +77,13 @@ def switch(sigma: Vec3Like) -> Vec3:
     >>> switch(jnp.array([0.0, 2.0, 0.0])).tolist()
     [-0.0, -0.5, -0.0]
     """
-    sigma = _checks.floating(sigma, (3,), "sigma")
+    sigma = _checks.array_of_shape(sigma, (3,), "sigma")
     beyond = dot(sigma, sigma) > 1
     return jnp.where(beyond, _shadow(jnp.where(beyond, sigma, 1)), sigma)
 
 
 def _shadow(sigma: Vec3) -> Vec3:
-    scale = near_one(*components(sigma))
+    scale = power_of_two_scale(*components(sigma))
     near = scale * sigma
     return -scale * (near / dot(near, near))
 
@@ -96,8 +96,8 @@ def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
     >>> omega_to_rates(jnp.zeros(3), jnp.array([0.0, 0.0, 4.0])).tolist()
     [0.0, 0.0, 1.0]
     """
-    sigma = _checks.floating(sigma, (3,), "sigma")
-    omega = _checks.floating(omega, (3,), "omega")
+    sigma = _checks.array_of_shape(sigma, (3,), "sigma")
+    omega = _checks.array_of_shape(omega, (3,), "omega")
     s = dot(sigma, sigma)
     return 0.25 * ((1 - s) * omega + 2 * cross(sigma, omega) + 2 * dot(sigma, omega) * sigma)
 
@@ -111,8 +111,8 @@ def rates_to_omega(sigma: Vec3Like, rates: Vec3Like) -> Vec3:
     >>> rates_to_omega(jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 4.0]
     """
-    sigma = _checks.floating(sigma, (3,), "sigma")
-    rates = _checks.floating(rates, (3,), "rates")
+    sigma = _checks.array_of_shape(sigma, (3,), "sigma")
+    rates = _checks.array_of_shape(rates, (3,), "rates")
     s = dot(sigma, sigma)
     turned = (1 - s) * rates - 2 * cross(sigma, rates) + 2 * dot(sigma, rates) * sigma
     return 4 / (1 + s) ** 2 * turned

@@ -42,8 +42,19 @@ from rigidjax.rotation.kernels import (
     to_unit_length,
     vector_to_quaternion,
 )
-from rigidjax.rotation.linalg3 import components, cross_components, dot, dot_components, near_one
-from rigidjax.rotation.validation import direction, rotation_matrix, turn, unit_quaternion
+from rigidjax.rotation.linalg3 import (
+    components,
+    cross_components,
+    dot,
+    dot_components,
+    power_of_two_scale,
+)
+from rigidjax.rotation.validation import (
+    require_direction,
+    require_rotation_matrix,
+    require_turn,
+    require_unit_quaternion,
+)
 
 _HINT = "one quaternion is (w, x, y, z), scalar first; batch with jax.vmap"
 
@@ -58,7 +69,7 @@ def exp(v: Vec3Like) -> Quat:
     >>> exp(jnp.array([0.0, 0.0, jnp.pi])).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    return vector_to_quaternion(turn(_checks.floating(v, (3,), "v"), "v"))
+    return vector_to_quaternion(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
 
 
 def log(q: QuatLike) -> Vec3:
@@ -72,7 +83,9 @@ def log(q: QuatLike) -> Vec3:
     >>> abs(log(jnp.array([0.0, 0.0, 0.0, -1.0]))).round(6).tolist()
     [0.0, 0.0, 3.141593]
     """
-    return quaternion_to_vector(direction(_checks.floating(q, (4,), "q", hint=_HINT), "q"))
+    return quaternion_to_vector(
+        require_direction(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
+    )
 
 
 def multiply(p: QuatLike, q: QuatLike) -> Quat:
@@ -84,8 +97,8 @@ def multiply(p: QuatLike, q: QuatLike) -> Quat:
     >>> multiply(jnp.array([0.0, 1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0, 0.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    first = components(_checks.floating(p, (4,), "p", hint=_HINT))
-    return jnp.stack(product4(first, components(_checks.floating(q, (4,), "q", hint=_HINT))))
+    first = components(_checks.array_of_shape(p, (4,), "p", hint=_HINT))
+    return jnp.stack(product4(first, components(_checks.array_of_shape(q, (4,), "q", hint=_HINT))))
 
 
 def conjugate(q: QuatLike) -> Quat:
@@ -94,7 +107,7 @@ def conjugate(q: QuatLike) -> Quat:
     >>> conjugate(jnp.array([1.0, 2.0, 3.0, 4.0])).tolist()
     [1.0, -2.0, -3.0, -4.0]
     """
-    w, x, y, z = components(_checks.floating(q, (4,), "q", hint=_HINT))
+    w, x, y, z = components(_checks.array_of_shape(q, (4,), "q", hint=_HINT))
     return jnp.stack([w, -x, -y, -z])
 
 
@@ -105,8 +118,8 @@ def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
     >>> rotate(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0])).tolist()
     [-1.0, -2.0, 3.0]
     """
-    w, *u = components(_checks.floating(q, (4,), "q", hint=_HINT))
-    return _turn(w, u, components(_checks.floating(y, (3,), "y")))
+    w, *u = components(_checks.array_of_shape(q, (4,), "q", hint=_HINT))
+    return _rotate_by(w, u, components(_checks.array_of_shape(y, (3,), "y")))
 
 
 def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
@@ -116,8 +129,8 @@ def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
     >>> rotate_inverse(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0])).tolist()
     [-1.0, -2.0, 3.0]
     """
-    w, *u = components(_checks.floating(q, (4,), "q", hint=_HINT))
-    return _turn(-w, u, components(_checks.floating(y, (3,), "y")))
+    w, *u = components(_checks.array_of_shape(q, (4,), "q", hint=_HINT))
+    return _rotate_by(-w, u, components(_checks.array_of_shape(y, (3,), "y")))
 
 
 def check(
@@ -133,7 +146,9 @@ def check(
     >>> check(jnp.array([1.0, 0.0, 0.0, 1e-9])).tolist()[0]
     1.0
     """
-    return unit_quaternion(_checks.floating(q, (4,), name, hint=_HINT, batched=True), name)
+    return require_unit_quaternion(
+        _checks.array_of_shape(q, (4,), name, hint=_HINT, batched=True), name
+    )
 
 
 def from_xyzw(xyzw: Float[ArrayLike, "4"]) -> Quat:
@@ -147,7 +162,7 @@ def from_xyzw(xyzw: Float[ArrayLike, "4"]) -> Quat:
     if _checks.is_rotation(xyzw):
         words = "xyzw: wanted components (x, y, z, w), got a Rotation"
         raise TypeError(f"{words}; pass it as the attitude itself, or give its .as_quat()")
-    return jnp.roll(_checks.floating(xyzw, (4,), "xyzw"), 1)
+    return jnp.roll(_checks.array_of_shape(xyzw, (4,), "xyzw"), 1)
 
 
 def to_xyzw(q: QuatLike) -> Float[Array, "4"]:
@@ -156,7 +171,7 @@ def to_xyzw(q: QuatLike) -> Float[Array, "4"]:
     >>> to_xyzw(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    return jnp.roll(_checks.floating(q, (4,), "q", hint=_HINT), -1)
+    return jnp.roll(_checks.array_of_shape(q, (4,), "q", hint=_HINT), -1)
 
 
 def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
@@ -168,9 +183,11 @@ def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
     >>> about_axis(jnp.array([0.0, 0.0, 2.0]), jnp.pi).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    axis = direction(_checks.floating(axis, (3,), "axis"), "axis")
-    half = 0.5 * turn(_checks.floating(angle, (), "angle").astype(axis.dtype), "angle")
-    axis = near_one(*components(axis)) * axis
+    axis = require_direction(_checks.array_of_shape(axis, (3,), "axis"), "axis")
+    half = 0.5 * require_turn(
+        _checks.array_of_shape(angle, (), "angle").astype(axis.dtype), "angle"
+    )
+    axis = power_of_two_scale(*components(axis)) * axis
     unit = axis / jnp.sqrt(dot(axis, axis))
     return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * unit])
 
@@ -184,10 +201,10 @@ def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
     >>> advance(jnp.array([1.0, 0, 0, 0]), jnp.array([0, 0, jnp.pi]), 1.0).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    q = _checks.floating(q, (4,), "q", hint=_HINT)
-    omega = _checks.floating(omega, (3,), "omega")
-    dt = _checks.floating(dt, (), "dt").astype(omega.dtype)
-    return multiply(q, vector_to_quaternion(turn(dt * omega, "dt * omega")))
+    q = _checks.array_of_shape(q, (4,), "q", hint=_HINT)
+    omega = _checks.array_of_shape(omega, (3,), "omega")
+    dt = _checks.array_of_shape(dt, (), "dt").astype(omega.dtype)
+    return multiply(q, vector_to_quaternion(require_turn(dt * omega, "dt * omega")))
 
 
 def rate(q: QuatLike, omega: Vec3Like) -> Quat:
@@ -197,7 +214,7 @@ def rate(q: QuatLike, omega: Vec3Like) -> Quat:
     >>> float(rate(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))[3])
     1.0
     """
-    q, omega = _checks.floating(q, (4,), "q"), _checks.floating(omega, (3,), "omega")
+    q, omega = _checks.array_of_shape(q, (4,), "q"), _checks.array_of_shape(omega, (3,), "omega")
     w, x, y, z = q[0], q[1], q[2], q[3]
     a, b, c = 0.5 * omega[0], 0.5 * omega[1], 0.5 * omega[2]
     rates = w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a
@@ -215,9 +232,9 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
     >>> bool(abs(interpolate(p, q, 0.5) - exp(jnp.array([0, 0, 1.5]))).max() < 1e-15)
     True
     """
-    p = _checks.floating(p, (4,), "p", hint=_HINT)
-    v = quaternion_to_vector(direction(multiply(conjugate(p), q), "p̄ q"))
-    part = turn(_checks.floating(s, (), "s").astype(v.dtype) * v, "s times the turn")
+    p = _checks.array_of_shape(p, (4,), "p", hint=_HINT)
+    v = quaternion_to_vector(require_direction(multiply(conjugate(p), q), "p̄ q"))
+    part = require_turn(_checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn")
     return multiply(p, vector_to_quaternion(part))
 
 
@@ -230,7 +247,7 @@ def uniform(key: PRNGKeyArray, dtype: DTypeLike = float) -> Quat:
     >>> uniform(jax.random.key(0)).shape
     (4,)
     """
-    return normalise(jax.random.normal(_checks.key(key), (4,), _checks.float_type(dtype)))
+    return normalise(jax.random.normal(_checks.random_key(key), (4,), _checks.float_type(dtype)))
 
 
 def normalise(q: QuatLike) -> Quat:
@@ -239,7 +256,7 @@ def normalise(q: QuatLike) -> Quat:
     >>> normalise(jnp.array([0.0, 4.0, 0.0, 0.0])).tolist()
     [0.0, 1.0, 0.0, 0.0]
     """
-    return to_unit_length(direction(_checks.floating(q, (4,), "q", hint=_HINT), "q"))
+    return to_unit_length(require_direction(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q"))
 
 
 def canonical(q: QuatLike) -> Quat:
@@ -248,7 +265,7 @@ def canonical(q: QuatLike) -> Quat:
     >>> canonical(jnp.array([-1.0, 0.0, 0.0, 0.0])).tolist()
     [1.0, -0.0, -0.0, -0.0]
     """
-    q = _checks.floating(q, (4,), "q", hint=_HINT)
+    q = _checks.array_of_shape(q, (4,), "q", hint=_HINT)
     return jnp.where(is_noncanonical(components(q)), -q, q)
 
 
@@ -262,8 +279,8 @@ def angle(q: QuatLike) -> Scalar:
     >>> round(float(angle(exp(jnp.array([0.0, 1e-9, 0.0]))) * 1e9), 9)
     1.0
     """
-    q = direction(_checks.floating(q, (4,), "q", hint=_HINT), "q")
-    w, *u = components(near_one(*components(q)) * q)
+    q = require_direction(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
+    w, *u = components(power_of_two_scale(*components(q)) * q)
     n2 = dot_components(u, u)
     # At the identity atan2 and the root get ones, not zeros: their derivative would be 0/0 = NaN.
     there = n2 != 0
@@ -278,7 +295,7 @@ def to_matrix(q: QuatLike) -> Mat3:
     >>> to_matrix(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    w, *u = components(_checks.floating(q, (4,), "q", hint=_HINT))
+    w, *u = components(_checks.array_of_shape(q, (4,), "q", hint=_HINT))
     return hat_polynomial(u, 2 * w, 2.0)
 
 
@@ -293,11 +310,11 @@ def from_matrix(matrix: Mat3Like) -> Quat:
     >>> from_matrix(jnp.diag(jnp.array([-1.0, -1.0, 1.0]))).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    matrix = _checks.floating(matrix, (3, 3), "matrix", hint="a rotation matrix is wanted")
-    return matrix_to_quaternion(_checks.if_known(rotation_matrix, matrix, "matrix"))
+    matrix = _checks.array_of_shape(matrix, (3, 3), "matrix", hint="a rotation matrix is wanted")
+    return matrix_to_quaternion(_checks.check_if_known(require_rotation_matrix, matrix, "matrix"))
 
 
-def _turn(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
+def _rotate_by(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
     """Return the vector y turned by the quaternion (w, u): y + 2 (w u×y + u×(u×y))."""
     across = cross_components(u, y)
     again = cross_components(u, across)

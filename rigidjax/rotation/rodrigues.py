@@ -13,8 +13,8 @@ from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.linalg3 import components, cross, dot, near_one
-from rigidjax.rotation.validation import direction
+from rigidjax.rotation.linalg3 import components, cross, dot, power_of_two_scale
+from rigidjax.rotation.validation import require_direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
@@ -26,10 +26,10 @@ def from_quaternion(q: QuatLike) -> Vec3:
     >>> from_quaternion(jnp.array([2.0, 0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 1.0]
     """
-    q = direction(quaternion.canonical(q), "q")
+    q = require_direction(quaternion.canonical(q), "q")
     # The derivative squares the denominator: a q of any length is scaled first, so that nothing
     # overflows.
-    q = near_one(*components(q)) * q
+    q = power_of_two_scale(*components(q)) * q
     return q[1:] / q[0]
 
 
@@ -39,7 +39,7 @@ def to_quaternion(g: Vec3Like) -> Quat:
     >>> to_quaternion(jnp.zeros(3)).tolist()
     [1.0, 0.0, 0.0, 0.0]
     """
-    g = _checks.finite_floating(g, (3,), "g")
+    g = _checks.finite_array(g, (3,), "g")
     return quaternion.normalise(jnp.concatenate([jnp.ones_like(g[:1]), g]))
 
 
@@ -69,7 +69,7 @@ def is_singular(q: QuatLike) -> Bool[Array, ""]:
     >>> bool(is_singular(jnp.array([0.0, 0.0, 0.0, 1.0])))
     True
     """
-    q = _checks.floating(q, (4,), "q")
+    q = _checks.array_of_shape(q, (4,), "q")
     return jnp.abs(q[0]) < 4 * jnp.finfo(q.dtype).eps
 
 
@@ -80,7 +80,7 @@ def omega_to_rates(g: Vec3Like, omega: Vec3Like) -> Vec3:
     >>> omega_to_rates(jnp.zeros(3), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 1.0]
     """
-    g, omega = _checks.floating(g, (3,), "g"), _checks.floating(omega, (3,), "omega")
+    g, omega = _checks.array_of_shape(g, (3,), "g"), _checks.array_of_shape(omega, (3,), "omega")
     return 0.5 * (omega + cross(g, omega) + dot(g, omega) * g)
 
 
@@ -91,7 +91,7 @@ def rates_to_omega(g: Vec3Like, rates: Vec3Like) -> Vec3:
     >>> rates_to_omega(jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 2.0]
     """
-    g, rates = _checks.floating(g, (3,), "g"), _checks.floating(rates, (3,), "rates")
+    g, rates = _checks.array_of_shape(g, (3,), "g"), _checks.array_of_shape(rates, (3,), "rates")
     return 2 / (1 + dot(g, g)) * (rates - cross(g, rates))
 
 

@@ -35,7 +35,7 @@ from rigidjax.rotation.linalg3 import (
     vee as vee,
 )
 from rigidjax.rotation.stumpff import stumpff
-from rigidjax.rotation.validation import rotation_matrix, turn
+from rigidjax.rotation.validation import require_rotation_matrix, require_turn
 
 
 def exp(v: Vec3Like) -> Mat3:
@@ -47,7 +47,7 @@ def exp(v: Vec3Like) -> Mat3:
     >>> exp(jnp.array([0.0, 0.0, jnp.pi / 2])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
     """
-    return vector_to_matrix(turn(_checks.floating(v, (3,), "v"), "v"))
+    return vector_to_matrix(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
 
 
 def log(matrix: Mat3Like) -> Vec3:
@@ -73,7 +73,7 @@ def left_jacobian(v: Vec3Like) -> Mat3:
     >>> left_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    parts = components(turn(_checks.floating(v, (3,), "v"), "v"))
+    parts = components(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
     t = square(parts)
     return hat_polynomial(parts, stumpff(2, t), stumpff(3, t))
 
@@ -85,7 +85,7 @@ def right_jacobian(v: Vec3Like) -> Mat3:
     >>> right_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    return left_jacobian(-_checks.floating(v, (3,), "v"))
+    return left_jacobian(-_checks.array_of_shape(v, (3,), "v"))
 
 
 def left_jacobian_inverse(v: Vec3Like) -> Mat3:
@@ -97,7 +97,7 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
     >>> left_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    return kernels.left_jacobian_inverse(turn(_checks.floating(v, (3,), "v"), "v"))
+    return kernels.left_jacobian_inverse(require_turn(_checks.array_of_shape(v, (3,), "v"), "v"))
 
 
 def right_jacobian_inverse(v: Vec3Like) -> Mat3:
@@ -107,7 +107,7 @@ def right_jacobian_inverse(v: Vec3Like) -> Mat3:
     >>> right_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    return left_jacobian_inverse(-_checks.floating(v, (3,), "v"))
+    return left_jacobian_inverse(-_checks.array_of_shape(v, (3,), "v"))
 
 
 def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
@@ -121,16 +121,16 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
     >>> round(float(distance(jnp.eye(3), exp(jnp.array([0.0, 3e-9, 0.0]))) * 1e9), 9)
     3.0
     """
-    a, b = _checks.floating(a, (3, 3), "a"), _checks.floating(b, (3, 3), "b")
+    a, b = _checks.array_of_shape(a, (3, 3), "a"), _checks.array_of_shape(b, (3, 3), "b")
     return quaternion.angle(matrix_to_quaternion(_relative_rotation(a, b)))
 
 
 def _relative_rotation(a: Mat3, b: Mat3) -> Mat3:
     between = product(a.T, b)
-    if _checks.known(between):
-        _checks.finite(between, "aᵀb")
+    if _checks.is_known(between):
+        _checks.require_finite(between, "aᵀb")
         large = jnp.abs(between).max() > 2
-        _checks.refuse(between, large, "aᵀb: has entries above 1; wanted two rotations, a and b")
+        _checks.error_if(between, large, "aᵀb: has entries above 1; wanted two rotations, a and b")
     return between
 
 
@@ -153,7 +153,7 @@ def adjoint(matrix: Mat3Like) -> Mat3:
     >>> adjoint(jnp.eye(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    return _checks.floating(matrix, (3, 3), "matrix")
+    return _checks.array_of_shape(matrix, (3, 3), "matrix")
 
 
 def to_world(matrix: Mat3Like, y: Vec3Like) -> Vec3:
@@ -163,7 +163,7 @@ def to_world(matrix: Mat3Like, y: Vec3Like) -> Vec3:
     >>> to_world(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [1.0, 2.0, 3.0]
     """
-    return apply(_checks.floating(matrix, (3, 3), "matrix"), y)
+    return apply(_checks.array_of_shape(matrix, (3, 3), "matrix"), y)
 
 
 def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
@@ -173,7 +173,7 @@ def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
     >>> to_body(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [1.0, 2.0, 3.0]
     """
-    return apply(_checks.floating(matrix, (3, 3), "matrix").T, y)
+    return apply(_checks.array_of_shape(matrix, (3, 3), "matrix").T, y)
 
 
 def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
@@ -183,8 +183,8 @@ def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
     >>> conjugate(jnp.eye(3), jnp.eye(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    matrix = _checks.floating(matrix, (3, 3), "matrix")
-    turn = _checks.floating(turn, (3, 3), "turn")
+    matrix = _checks.array_of_shape(matrix, (3, 3), "matrix")
+    turn = _checks.array_of_shape(turn, (3, 3), "turn")
     return product(matrix, product(turn, matrix.T))
 
 
@@ -195,8 +195,8 @@ def rate(matrix: Mat3Like, omega: Vec3Like) -> Mat3:
     >>> rate(jnp.eye(3), jnp.array([0.0, 0.0, 2.0]))[1].tolist()
     [2.0, 0.0, 0.0]
     """
-    matrix = _checks.floating(matrix, (3, 3), "matrix")
-    return product(matrix, hat(_checks.floating(omega, (3,), "omega")))
+    matrix = _checks.array_of_shape(matrix, (3, 3), "matrix")
+    return product(matrix, hat(_checks.array_of_shape(omega, (3,), "omega")))
 
 
 def body_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
@@ -208,8 +208,8 @@ def body_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
     >>> body_rate(jnp.eye(3), hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]
     """
-    rate = _checks.floating(rate, (3, 3), "rate")
-    return vee(product(_checks.floating(matrix, (3, 3), "matrix").T, rate))
+    rate = _checks.array_of_shape(rate, (3, 3), "rate")
+    return vee(product(_checks.array_of_shape(matrix, (3, 3), "matrix").T, rate))
 
 
 def world_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
@@ -222,8 +222,8 @@ def world_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
     >>> world_rate(jnp.eye(3), hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]
     """
-    rate = _checks.floating(rate, (3, 3), "rate")
-    return vee(product(rate, _checks.floating(matrix, (3, 3), "matrix").T))
+    rate = _checks.array_of_shape(rate, (3, 3), "rate")
+    return vee(product(rate, _checks.array_of_shape(matrix, (3, 3), "matrix").T))
 
 
 def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
@@ -235,9 +235,9 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     >>> interpolate(jnp.eye(3), exp(jnp.array([0.0, 0.0, 2.0])), 0.5).round(6)[0].tolist()
     [0.540302, -0.841471, 0.0]
     """
-    a, b = _checks.floating(a, (3, 3), "a"), _checks.floating(b, (3, 3), "b")
+    a, b = _checks.array_of_shape(a, (3, 3), "a"), _checks.array_of_shape(b, (3, 3), "b")
     v = quaternion.log(matrix_to_quaternion(_relative_rotation(a, b)))
-    part = turn(_checks.floating(s, (), "s").astype(v.dtype) * v, "s times the turn")
+    part = require_turn(_checks.array_of_shape(s, (), "s").astype(v.dtype) * v, "s times the turn")
     return product(a, vector_to_matrix(part))
 
 
@@ -264,7 +264,7 @@ def check(
     >>> check(jnp.eye(3)).shape
     (3, 3)
     """
-    return rotation_matrix(_checks.floating(matrix, (3, 3), name, batched=True), name)
+    return require_rotation_matrix(_checks.array_of_shape(matrix, (3, 3), name, batched=True), name)
 
 
 __all__ = [

@@ -16,78 +16,88 @@ def tolerance(dtype: object) -> float:
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
-def direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
+def require_direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
     """Refuse a known vector without a direction: zero, NaN, infinity.
 
     XLA takes a number below the least normal number, 2e-308, for zero on some machines.
     """
-    if _checks.known(v) and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest(v) < np.inf:
-        _checks.finite(v, name)
-        found = "zero" if _largest(v) == 0 else f"less than the least normal number, {least:.2g}"
-        raise ValueError(f"{name}: wanted a direction, got {found}")
+    if (
+        _checks.is_known(v)
+        and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest_component(v) < np.inf
+    ):
+        _checks.require_finite(v, name)
+        got = (
+            "zero"
+            if _largest_component(v) == 0
+            else f"less than the least normal number, {least:.2g}"
+        )
+        raise ValueError(f"{name}: wanted a direction, got {got}")
     return v
 
 
-def turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
+def require_turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
     """Refuse a known rotation vector or angle that is so large that no digit is correct."""
-    if _checks.known(v) and not _largest(v) <= (limit := 1 / float(jnp.finfo(v.dtype).eps)):
-        _checks.finite(v, name)
+    if _checks.is_known(v) and not _largest_component(v) <= (
+        limit := 1 / float(jnp.finfo(v.dtype).eps)
+    ):
+        _checks.require_finite(v, name)
         raise ValueError(
-            f"{name}: a turn by {_largest(v):.3g} rad; beyond {limit:.2g} rad neighbouring "
-            f"{v.dtype} numbers are more than half a radian apart: the attitude is unknown"
+            f"{name}: a turn by {_largest_component(v):.3g} rad; beyond {limit:.2g} rad "
+            f"neighbouring {v.dtype} numbers are more than half a radian apart: the attitude is "
+            "unknown"
         )
     return v
 
 
-def _largest(v: Float[Array, "*n"]) -> float:
+def _largest_component(v: Float[Array, "*n"]) -> float:
     # The result is NaN if an entry is. It is one call of NumPy only, because it runs before every
     # map that is called outside of `jit`.
     return float(np.abs(np.asarray(v)).max())
 
 
-def rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
+def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
     """Refuse any matrix but a rotation, with the determinant or the error in the message."""
-    m = _checks.finite(m, name)
-    known = _checks.known(m)
+    m = _checks.require_finite(m, name)
+    known = _checks.is_known(m)
     xp, values = (np, np.asarray(m)) if known else (jnp, m)
     rows = [values[..., i, :] for i in range(3)]
     # Entries of 1e200 are refused as any others, without NumPy's warning.
     with np.errstate(over="ignore", invalid="ignore"):
         det = (rows[0] * xp.cross(rows[1], rows[2])).sum(-1)
         gram = (values[..., :, :, None] * values[..., :, None, :]).sum(-3)
-    found = f", det = {det.min():.4g}" if known else ""
-    words = f"left-handed frame{found}; a rotation has det = +1 (an axis flipped or swapped?)"
-    m = _checks.refuse(m, (det < 0).any(), f"{name}: {words}")
+    got = f", det = {det.min():.4g}" if known else ""
+    words = f"left-handed frame{got}; a rotation has det = +1 (an axis flipped or swapped?)"
+    m = _checks.error_if(m, (det < 0).any(), f"{name}: {words}")
     error = abs(gram - xp.eye(3, dtype=values.dtype).reshape((1,) * (values.ndim - 2) + (3, 3)))
     limit = tolerance(values.dtype)
-    found = f" is {error.max():.3g}" if known else " is too large"
-    words = f"{name}: not orthogonal, the largest entry of |MᵀM − 1|{found} (limit {limit:g}); "
+    got = f" is {error.max():.3g}" if known else " is too large"
+    words = f"{name}: not orthogonal, the largest entry of |MᵀM − 1|{got} (limit {limit:g}); "
     words += "so3.project gives the nearest rotation"
-    return _checks.refuse(m, ~(error.max() <= limit), words)
+    return _checks.error_if(m, ~(error.max() <= limit), words)
 
 
-def near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"]:
+def require_near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"]:
     """Refuse a known quaternion whose length is not 1 to `limit`."""
-    if _checks.known(q):
+    if _checks.is_known(q):
         length = float(np.linalg.norm(np.asarray(q, float)))
         words = f"{name}: wanted a unit quaternion (w, x, y, z), got one of length {length:.6g}"
         words += "; rigidjax.quaternion.normalise makes it one"
-        _checks.refuse(q, not abs(length - 1) <= limit, words)
+        _checks.error_if(q, not abs(length - 1) <= limit, words)
     return q
 
 
-def unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
+def require_unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
     """Return a quaternion scaled to length 1 if its length is nearly 1; refuse any other."""
-    q = _checks.finite(q, name)
+    q = _checks.require_finite(q, name)
     # Under `jit` JAX traces what is computed from known numbers, too; NumPy does not.
     xp = _checks.namespace(q)
     with np.errstate(over="ignore"):
         length = xp.sqrt((xp.asarray(q) ** 2).sum(-1, keepdims=True))
     words = f"{name}: zero quaternion; it is no rotation (w, x, y, z)"
-    q = _checks.refuse(q, (length == 0).any(), words)
+    q = _checks.error_if(q, (length == 0).any(), words)
     off = xp.abs(length - 1)
     limit = tolerance(q.dtype)
-    found = f", its length is {length.ravel()[off.argmax()]:.6g}" if xp is np else ""
-    words = f"{name}: not a unit quaternion{found} (limit 1 ± {limit:g}); use quaternion.normalise"
-    q = _checks.refuse(q, ~(off.max() <= limit), words)
+    got = f", its length is {length.ravel()[off.argmax()]:.6g}" if xp is np else ""
+    words = f"{name}: not a unit quaternion{got} (limit 1 ± {limit:g}); use quaternion.normalise"
+    q = _checks.error_if(q, ~(off.max() <= limit), words)
     return q / length

@@ -34,7 +34,7 @@ from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, with_own_states
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import missing_state_message
 from rigidjax.solve import crossing_loop, validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
@@ -99,16 +99,18 @@ class Event(eqx.Module):
     def __init__(
         self, condition: Callable[..., Any], direction: int = 0, max_step: ScalarLike | None = None
     ):
-        self.condition = _checks.function(condition, "condition", "(t, state, body) → scalar")
+        self.condition = _checks.require_function(
+            condition, "condition", "(t, state, body) → scalar"
+        )
         if isinstance(direction, bool) or direction not in (-1, 0, 1):
             words = "direction: wanted 1 (on the way up), -1 (on the way down) or 0 (both), got "
             raise ValueError(f"{words}{direction!r}")
         self.direction = int(direction)
         self.max_step = max_step
         if max_step is not None:
-            step = _checks.floating(max_step, (), "max_step")
+            step = _checks.array_of_shape(max_step, (), "max_step")
             words = "max_step: wanted a positive step, s"
-            self.max_step = _checks.refuse(step, ~(step > 0), words)
+            self.max_step = _checks.error_if(step, ~(step > 0), words)
 
 
 class Crossings(eqx.Module, Generic[State]):
@@ -188,11 +190,11 @@ def crossings(
     >>> int(flips.count), bool(flips.full)
     (2, False)
     """
-    many = _checks.whole(max_crossings, "max_crossings", 1)
-    max_steps = _checks.whole(max_steps, "max_steps", 1)
+    many = _checks.integer(max_crossings, "max_crossings", 1)
+    max_steps = _checks.integer(max_steps, "max_steps", 1)
     event = Event(condition, direction, max_step)
-    begin, end = _checks.time(t0, "t0"), _checks.time(t1, "t1")
-    if _checks.known((begin, end)) and float(begin) == float(end):
+    begin, end = _checks.checked_time(t0, "t0"), _checks.checked_time(t1, "t1")
+    if _checks.is_known((begin, end)) and float(begin) == float(end):
         raise ValueError(f"t1: wanted another time than t0, got {float(end):g} for both")
     ts = jnp.stack([begin, end])
     body, state0, times = validation.scene(body, state0, ts, torque, throw=False)
@@ -218,7 +220,9 @@ def checked_start(event: Event, body: Any, state0: Any, torque: Any, t: Array) -
         if told is None:
             raise
         raise TypeError(told) from wrong
-    if _checks.known((event, body, t, state0)) and bool(jnp.isnan(_value(event, body, t, state0))):
+    if _checks.is_known((event, body, t, state0)) and bool(
+        jnp.isnan(_value(event, body, t, state0))
+    ):
         words = "condition: wanted a number wherever the motion goes, got NaN at the start, t = "
         raise ValueError(f"{words}{float(t):g}")
     return state0
@@ -232,7 +236,7 @@ def value(event: Event, body: Any, t: Any, y: Any) -> Array:
             "condition: wanted one real number, zero at the event, got a truth value; give the "
             "difference, not its sign"
         )
-    return _checks.floating(found, (), "condition", hint="one real number, zero at the event")
+    return _checks.array_of_shape(found, (), "condition", hint="one real number, zero at the event")
 
 
 _value = eqx.filter_jit(value)
@@ -243,7 +247,7 @@ def solve_until(
     setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
     """As `solve`, up to the event; and the event's time and state, NaN if there is none."""
-    state0 = on_the_group(state0)
+    state0 = project_to_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
     given = setup.max_steps if isinstance(setup, DiffraxRun) else None
     steps = 1_000_000 if given is None else given
@@ -286,7 +290,7 @@ def _solved(
     setup: ClosedFormRun | DiffraxRun, event: Event, many: int, max_steps: int, state0: Any,
     ts: Array,
 ) -> Crossings:  # fmt: skip
-    state0 = on_the_group(state0)
+    state0 = project_to_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
     found = located(crossed, Search(event.direction, many, max_steps), numbers)
     times, states = _as_found(found.times, found.states, found.jumps, setup, event, state0, ts)
@@ -352,7 +356,7 @@ class Section(NamedTuple):
         return self.tree(y) if self.form is None else self.form.leave(t, self.tree(y))
 
     def project(self, y: Array) -> Array:
-        return ravel_pytree(on_the_group(self.tree(y)))[0]
+        return ravel_pytree(project_to_group(self.tree(y)))[0]
 
     def time(self, s: Array) -> Array:
         """Time t at s, and the other way."""

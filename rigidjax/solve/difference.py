@@ -75,7 +75,7 @@ def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple
 
 def values_at(value: Callable[[Any, Any], Array], sides: Any, tolerances: Array) -> Array:
     """Return the values on both sides, NaN where the function refuses its known numbers."""
-    if not _checks.known((sides, tolerances)):
+    if not _checks.is_known((sides, tolerances)):
         return lax.map(lambda x: value(x, tolerances), sides)
     values: list[Any] = []
     for side in (jax.tree.map(itemgetter(i), sides) for i in range(2)):
@@ -128,7 +128,7 @@ def errors_of_numbers(slopes: Slopes) -> Any:
 
 def warn_of_slopes(slopes: Slopes) -> None:
     """Warn, where the slopes are known and differ, of what derivatives do not see."""
-    if not _checks.known(slopes) or not np.any(slopes.differ):
+    if not _checks.is_known(slopes) or not np.any(slopes.differ):
         return
     index = np.argmax(np.ravel(slopes.differ))
     derivative, difference = (float(np.ravel(a)[index]) for a in slopes[:2])

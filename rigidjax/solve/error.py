@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from rigidjax import _checks, _show
 from rigidjax._types import ScalarLike
-from rigidjax.motion.manifold import minus, names, parts
+from rigidjax.motion.manifold import minus, names, parts_by_name
 from rigidjax.solve import difference, validation
 from rigidjax.solve.linear_map import as_known
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
@@ -75,11 +75,11 @@ class Error(eqx.Module):
     sizes: dict[str, Float[Array, ""]]
 
     def __repr__(self) -> str:
-        if not _checks.known(self) or np.ndim(self.ts) != 1:
+        if not _checks.is_known(self) or np.ndim(self.ts) != 1:
             return eqx.tree_pformat(self)
         last = ", ".join(f"{name} {float(part[-1]):.1e}" for name, part in self.total.items())
         times, t = (self.ts[-1], self.known_until), np.asarray(self.ts)
-        end, until = (_show.time(one, abs(t[-1] - t[0])) for one in times)
+        end, until = (_show.time_as_text(one, abs(t[-1] - t[0])) for one in times)
         return f"Error(at {end} s: {last}; known until {until} s)"
 
     @property
@@ -188,7 +188,7 @@ def _apart(others: Any, ys: Any) -> dict[str, Array]:
 
 
 def _lengths(state: Any, changes: Array) -> dict[str, Array]:
-    named = parts(state, changes).items()
+    named = parts_by_name(state, changes).items()
     return {name.removeprefix("motion."): jnp.linalg.norm(part, axis=-1) for name, part in named}
 
 
@@ -362,7 +362,7 @@ class FunctionError(eqx.Module):
     derivative_error: Any
 
     def __repr__(self) -> str:
-        return _show.numbers(self)
+        return _show.fields_as_text(self)
 
     @property
     def known(self) -> Bool[Array, ""]:
@@ -412,19 +412,19 @@ def error_of(
     >>> bool(found.value_error < 1e-8), bool(found.derivative_error.max() < 1e-7)
     (True, True)
     """
-    _checks.function(f, "f", "f(x) that takes rtol= and atol=")
+    _checks.require_function(f, "f", "f(x) that takes rtol= and atol=")
     try:
         inspect.signature(f).bind(x, rtol=rtol, atol=atol)
     except TypeError as error:
         raise TypeError(f"f: wanted f(x, rtol=…, atol=…), got one where {error}") from None
-    x = jax.tree.map(lambda leaf: _checks.numbers(leaf, "x"), x)
+    x = jax.tree.map(lambda leaf: _checks.numeric_array(leaf, "x"), x)
     dtype = ravel_pytree(x)[0].dtype
     first = jnp.asarray(validation.tolerances(rtol, atol, dtype), dtype)
     eps = float(jnp.finfo(dtype).eps)
     second = first * jnp.maximum(_CLOSER, _DEEPEST * eps / first[0])
 
     def value(x: Any, tolerances: Array) -> Array:
-        return _checks.numbers(f(x, rtol=tolerances[0], atol=tolerances[1]), "f(x, …)")
+        return _checks.numeric_array(f(x, rtol=tolerances[0], atol=tolerances[1]), "f(x, …)")
 
     scalar = jax.eval_shape(value, x, first).shape == ()
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import RealLike
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 from rigidjax.solve import validation
 from rigidjax.solve.runge_kutta import Step, dense_rows, error_estimate, nested, stages
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
@@ -34,7 +34,7 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
         theta = jnp.where(length == 0, jnp.zeros_like(length), (t0 - self.t0) / safe)
 
         value = lambda y, rows: y + nested(theta.astype(y.dtype), rows)  # noqa: E731
-        return on_the_group(jax.tree.map(value, self.y0, self.coefficients))
+        return project_to_group(jax.tree.map(value, self.y0, self.coefficients))
 
 
 def onward(terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike) -> tuple[Array, Array]:
@@ -93,7 +93,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
         step = Step(jnp.asarray(t0), h, jnp.asarray(t1), numbers)
         there = stages(self.tableau, field, [], step)
         # Once, after the stages: inside them it changes the order (jaxsim#192).
-        y1 = on_the_group(tree(there.end))
+        y1 = project_to_group(tree(there.end))
         # Derivatives hold the chosen steps constant: the error of a step is below the tolerance.
         sizes = [leaf.size for leaf in jax.tree.leaves(y0)]
         error = lax.stop_gradient(error_estimate(self.tableau, sizes, h, there.slopes))
@@ -157,4 +157,4 @@ def explicit(solver: AbstractExplicit | None) -> AbstractExplicit:
     """The solver, `DormandPrince8` for `None`; `TypeError` for one that is not explicit."""
     solver = DormandPrince8() if solver is None else solver
     wanted = "an explicit method of rigidjax.solvers"
-    return _checks.instance(solver, AbstractExplicit, "solver", wanted=wanted)
+    return _checks.require_instance(solver, AbstractExplicit, "solver", requirement=wanted)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.motion.coupled import Coupled
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.manifold import dimension, minus_small, plus
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
@@ -88,31 +88,31 @@ def lyapunov_exponents(
     >>> [round(float(value), 9) for value in found.values]
     [0.5, -1.0]
     """
-    _checks.function(field, "field", "f(t, y, args)")
-    intervals = _checks.whole(intervals, "intervals", _PARTS)
-    transient = _checks.whole(transient, "transient", 0)
-    max_steps = _checks.whole(max_steps, "max_steps", 1)
+    _checks.require_function(field, "field", "f(t, y, args)")
+    intervals = _checks.integer(intervals, "intervals", _PARTS)
+    transient = _checks.integer(transient, "transient", 0)
+    max_steps = _checks.integer(max_steps, "max_steps", 1)
     if intervals - transient < _PARTS:
         raise ValueError(
             f"intervals: wanted at least {_PARTS} after the transient, got {intervals} in all and "
             f"a transient of {transient}"
         )
     if not isinstance(state0, eqx.Module):
-        state0 = _checks.numbers(state0, "state0")
+        state0 = _checks.numeric_array(state0, "state0")
     for leaf in jax.tree.leaves(state0):
-        _checks.finite(_checks.numbers(leaf, "state0"), "state0")
+        _checks.require_finite(_checks.numeric_array(leaf, "state0"), "state0")
     size = dimension(state0)
     if not size:
         raise ValueError("state0: wanted an array or a state of numbers, got none")
-    many = size if number is None else _checks.whole(number, "number", 1)
+    many = size if number is None else _checks.integer(number, "number", 1)
     if many > size:
         raise ValueError(f"number: wanted at most {size}, one for each direction, got {many}")
     dtype = validation.one_dtype(state0, "state0")
-    length = _checks.time(time, "time").astype(dtype)
-    length = _checks.refuse(length, ~(length > 0), "time: wanted a positive time, s")
+    length = _checks.checked_time(time, "time").astype(dtype)
+    length = _checks.error_if(length, ~(length > 0), "time: wanted a positive time, s")
     rtol, atol = validation.tolerances(rtol, atol, dtype)
     solver = explicit(solver)
-    begin = _checks.time(t0, "t0").astype(dtype)
+    begin = _checks.checked_time(t0, "t0").astype(dtype)
     shapes = eqx.filter_eval_shape(lambda t, y: field(t, y, None), begin, state0)
     wanted, found = (jax.tree.map(jnp.shape, tree) for tree in (state0, shapes))
     if jax.tree.structure(shapes) != jax.tree.structure(state0) or found != wanted:
@@ -135,7 +135,7 @@ def _solved(
 ) -> Exponents:
     # Whole numbers of Python are no arrays: `filter_jit` compiles for each.
     solver, many, intervals, transient, max_steps = how
-    state0 = on_the_group(state0)
+    state0 = project_to_group(state0)
     step = length / intervals
 
     def along(t: Array, y: Coupled, args: None) -> Coupled:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from rigidjax.motion.torques.inputs import Row, delays_of
+from rigidjax.motion.torques.inputs import InputRow, delays_of
 from rigidjax.rotation.barrier import platform
 from rigidjax.solve.equal_steps import Rolled
 from rigidjax.solve.explicit import AbstractExplicit
@@ -102,7 +102,7 @@ def step(
         # by which the derivative with respect to the delay is multiplied.
         values = [jnp.where(right <= p, a, b) for p, a, b in zip(parts, early, late, strict=True)]
         t, end = at(i) + left * h, jnp.where(right == 1, at(i + 1), at(i) + right * h)
-        return stepper.step(t, end, (right - left) * h, y, Row(now, tuple(values))), None
+        return stepper.step(t, end, (right - left) * h, y, InputRow(now, tuple(values))), None
 
     return lax.scan(part, y, (edges[:-1], edges[1:]))[0]
 
@@ -130,7 +130,7 @@ def first_row(law: Any, h: Array, inputs: Any) -> Any:
         return now
     parts, early, late = delayed_rows(delays, h, jnp.zeros((), jnp.int32), inputs, 0)
     values = [jnp.where(p > 0, a, b) for p, a, b in zip(parts, early, late, strict=True)]
-    return Row(now, tuple(values))
+    return InputRow(now, tuple(values))
 
 
 def _row(a: Array, i: Any) -> Array:

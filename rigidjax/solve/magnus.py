@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from rigidjax._types import RealLike
-from rigidjax.exact.components3 import Four, Triple, cross, plus
+from rigidjax.exact.components3 import Four, Triple, add, cross
 from rigidjax.exact.diffrax_solver import field_of
 from rigidjax.motion import Attitude
-from rigidjax.motion.equations import AttitudeEquations, on_the_group
+from rigidjax.motion.equations import AttitudeEquations, project_to_group
 from rigidjax.motion.torques.base import sees_attitude
 from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import product4
@@ -37,7 +37,7 @@ def change_and_turn(
     Nørsett and Zanna 2000, doi:10.1017/S0962492900002154, section 5.
     """
     change, first = change_and_slope(KUTTA4, slope, t, h, p, end)
-    after = barrier(plus(p, change))
+    after = barrier(add(p, change))
     last = slope(end, after)
     middle = tuple(
         a + 0.5 * b + 0.125 * h * (k - m) for a, b, k, m in zip(p, change, first, last, strict=True)
@@ -115,7 +115,7 @@ class Magnus4(dfx.AbstractSolver):
 
         change, turn = change_and_turn(slope, rate, t0, t1, h, omega)
         change = join((*product4(q, turn), *change), y0)
-        y1 = on_the_group(jax.tree.map(jnp.add, y0, change))
+        y1 = project_to_group(jax.tree.map(jnp.add, y0, change))
         left, right = terms.vf(t0, y0, args), terms.vf(t1, y1, args)
 
         def rows(a: Array, b: Array, k: Array, m: Array) -> Array:

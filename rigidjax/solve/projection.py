@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, Bool, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import RealLike
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 from rigidjax.solve.adaptive_loop import NONFINITE, finite
 
 
@@ -22,7 +22,7 @@ class GroupInterpolation(dfx.AbstractLocalInterpolation):
 
     def evaluate(self, t0: RealLike, t1: RealLike | None = None, left: bool = True) -> Any:
         if t1 is None:
-            return on_the_group(self.inner.evaluate(t0, left=left))
+            return project_to_group(self.inner.evaluate(t0, left=left))
         end, start = self.evaluate(t1, left=left), self.evaluate(t0, left=left)
         return jtu.tree_map(lambda a, b: a - b, end, start)
 
@@ -58,7 +58,7 @@ class Projected(dfx.AbstractWrappedSolver):
     solver: dfx.AbstractSolver
 
     def __check_init__(self) -> None:
-        _checks.instance(self.solver, dfx.AbstractSolver, "solver")
+        _checks.require_instance(self.solver, dfx.AbstractSolver, "solver")
 
     term_structure = _of("solver", "term_structure")
     term_compatible_contr_kwargs = _of("solver", "term_compatible_contr_kwargs")
@@ -108,7 +108,7 @@ class Projected(dfx.AbstractWrappedSolver):
         )
         ill = (result == dfx.RESULTS.successful) & ~finite(y1)
         result = dfx.RESULTS.where(ill, NONFINITE, result)
-        return on_the_group(y1), error, dense, state, result
+        return project_to_group(y1), error, dense, state, result
 
     def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree) -> Any:
         return self.solver.func(terms, t0, y0, args)

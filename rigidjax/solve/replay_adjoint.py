@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax import _checks
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 from rigidjax.solve.adaptive_loop import LoopState, Method, Run
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.explicit import AbstractExplicit
@@ -65,7 +65,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
     otherwise: dfx.AbstractAdjoint = dfx.RecursiveCheckpointAdjoint()
 
     def __check_init__(self) -> None:
-        _checks.instance(self.otherwise, dfx.AbstractAdjoint, "otherwise")
+        _checks.require_instance(self.otherwise, dfx.AbstractAdjoint, "otherwise")
 
     def loop(
         self, *, args: Any, terms: Any, solver: Any, stepsize_controller: Any, event: Any,
@@ -100,7 +100,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         method = Method(
             tableau=solver.tableau,
             field=lambda given, t, y: program.call(given[:count], t, y),
-            project=lambda y: ravel_pytree(on_the_group(tree(y)))[0],
+            project=lambda y: ravel_pytree(project_to_group(tree(y)))[0],
             halt=halt,
             control=_Control(
                 static, given, (lambda y: y) if rows else tree, solver.error_order(terms)

@@ -25,7 +25,7 @@ from rigidjax.motion.equations import (
     AttitudeEquations,
     EulerEquations,
     NewtonEuler,
-    on_the_group,
+    project_to_group,
 )  # fmt: skip
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import validation
@@ -134,7 +134,7 @@ def direction(times: Array) -> Int[Array, ""] | None:
     """Return `None` for times known to increase; else the sign of t's change, known or traced."""
     ends = _checks.namespace(times).asarray(times)
     change = ends[-1] - ends[0]
-    if _checks.known(times) and change > 0:
+    if _checks.is_known(times) and change > 0:
         return None
     # A whole number: derivatives do not carry it along.
     return jnp.asarray(jnp.sign(change), jnp.int32)
@@ -163,7 +163,7 @@ def solve(
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     """Return the states at `ts`, the counts of steps, and the result."""
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
-    state0 = given = on_the_group(state0)
+    state0 = given = project_to_group(state0)
     if isinstance(setup, ClosedFormRun):
         ys, stats, result = _free(setup, state0, ts)
     else:
@@ -240,7 +240,7 @@ def _shortest_step_words(dtype: Any) -> str:
     return (
         "simulate: no step is short enough: the minimum step size, some units of round-off of the "
         f"time, was reached. Does the torque jump or grow without bound? In {np.dtype(dtype)} the "
-        f"times near 1e9 s are {gap:.2g} s apart: {_checks.later_origin(dtype)}"
+        f"times near 1e9 s are {gap:.2g} s apart: {_checks.advice_for_large_times(dtype)}"
     )
 
 
@@ -263,7 +263,7 @@ def refuse(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
 def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) -> None:
     """Warn if a law switches by the time more often than steps can end at its switches."""
     missed = stats.get("switches_missed", False)
-    if not _checks.known((missed, state0, ts)) or not np.any(np.asarray(missed)):
+    if not _checks.is_known((missed, state0, ts)) or not np.any(np.asarray(missed)):
         return
     state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
     form = by_momentum(setup.body, state0, setup.torque)
@@ -281,7 +281,7 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
 @eqx.filter_jit
 def _end_of(setup: DiffraxRun, state0: Any, ts: Array) -> Any:
     """Return where a run ends: time, state, next step, and the number of steps."""
-    state0 = with_own_states(setup.body, on_the_group(state0), setup.torque, ts[0])
+    state0 = with_own_states(setup.body, project_to_group(state0), setup.torque, ts[0])
     *_, stats, _, end = _integrated(setup, None, state0, ts)
     return *end, stats["num_steps"]
 
@@ -294,7 +294,7 @@ def words_of_steps(setup: Any, state0: Any, ts: Array, error: RuntimeError) -> R
     """Return the same error; if a run has taken all its steps, with what they were spent on."""
     if _MANY_STEPS not in str(error) or not isinstance(setup, DiffraxRun):
         return error
-    if not setup.is_replayed or not _checks.known((setup, state0, ts)):
+    if not setup.is_replayed or not _checks.is_known((setup, state0, ts)):
         return error
     t, state, step, count = _end_of(dataclasses.replace(setup, throw=False), state0, ts)
     begun, end, t = float(ts[0]), float(ts[-1]), float(t)
@@ -335,10 +335,10 @@ def _free(setup: ClosedFormRun, state0: Any, ts: Array) -> tuple[Any, dict[str, 
 def refuse_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
     """Return the states `ys` saved at `ts`; an error in the scene's words if it ended the run."""
     ended, advice = stats["ended"], "; give throw=False to keep what came before it"
-    if _checks.known(ended) and not np.any(np.asarray(ended)):
+    if _checks.is_known(ended) and not np.any(np.asarray(ended)):
         return ys
     words = "simulate: " + scene.end_words(stats["end_time"], stats["end_state"])
-    if not _checks.known(ended):
+    if not _checks.is_known(ended):
         return eqx.error_if(ys, ended, words + advice)
     before = np.asarray(ts)[np.asarray(ts) < float(stats["end_time"])]
     last = f"the last of ts before it is {before[-1]:.9g}{advice}" if len(before) else "the start"

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.motion.torques.base import jumps_of, one_law
+from rigidjax.motion.torques.base import jumps_of, require_one_law
 from rigidjax.motion.torques.inputs import Delayed, Lagged
 from rigidjax.motion.torques.piecewise import Held, Linear, Pulses, Tabulated
-from rigidjax.motion.torques.states import has_own
+from rigidjax.motion.torques.states import has_own_states
 from rigidjax.solve.switching import DECLARED
 
 # The laws of this package with jumps of their own; the others pass on those of their parts.
@@ -46,7 +46,7 @@ class Sided(eqx.Module):
         return type(self.law).__name__
 
     def __call__(self, t: Any, *args: Any) -> Any:
-        one_law(self.law)
+        require_one_law(self.law)
         with jax.named_scope(DECLARED):
             return self.law(self.seen(t), *args)
 
@@ -95,6 +95,10 @@ def on_sides(field: Any, sign: Any, sides: Any) -> Any:
         jumps = jnp.asarray(jumps_of(part))
         own = next(stops, None) if jumps.shape[0] else None
         # A law with states of its own has kinks alone, and is looked for by its class.
-        return part if has_own(part) else Sided(part, jumps, own, sign if jumps.shape[0] else None)
+        return (
+            part
+            if has_own_states(part)
+            else Sided(part, jumps, own, sign if jumps.shape[0] else None)
+        )
 
     return jax.tree.map(on_side, field, is_leaf=_declares)

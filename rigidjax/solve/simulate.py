@@ -131,23 +131,23 @@ def simulate(
     >>> bool(abs(rj.simulate(body, start, jnp.linspace(0.0, 9.43, 3)).ys.omega[-1, 1]) < 0.01)
     True
     """
-    max_steps = None if max_steps is None else _checks.whole(max_steps, "max_steps", 1)
+    max_steps = None if max_steps is None else _checks.integer(max_steps, "max_steps", 1)
     body, state0, times = validation.scene(body, state0, ts, torque, throw)
     given = rtol is not None or atol is not None
     if stepsize_controller is not None and (given or accuracy is not None):
         raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
     if accuracy is not None and given:
         raise ValueError("simulate: give either an accuracy or rtol and atol, not both")
-    if accuracy is not None and _checks.known(accuracy):
-        _checks.positive(accuracy, "accuracy")
+    if accuracy is not None and _checks.is_known(accuracy):
+        _checks.positive_float(accuracy, "accuracy")
     if max_step is not None:
         if stepsize_controller is not None:
             raise ValueError(
                 "simulate: give max_step without a stepsize_controller, which has its own limit "
                 "(dtmax of diffrax.PIDController)"
             )
-        if _checks.known(max_step):
-            _checks.positive(max_step, "max_step")
+        if _checks.is_known(max_step):
+            _checks.positive_float(max_step, "max_step")
         max_step = jnp.asarray(max_step, times.dtype)
     if stepsize_controller is None:
         rtol, atol = validation.tolerances(rtol, atol, times.dtype)
@@ -201,7 +201,7 @@ def _adjoint(setup: DiffraxRun) -> dfx.AbstractAdjoint:
     if setup.adjoint is not None:
         return setup.adjoint
     rtol = getattr(setup.step_controller(), "rtol", None)
-    tight = rtol is not None and _checks.known(rtol) and float(rtol) < _TIGHT
+    tight = rtol is not None and _checks.is_known(rtol) and float(rtol) < _TIGHT
     return _EVERY_STEP if tight else ADJOINT
 
 

@@ -17,7 +17,7 @@ from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.conserved import drift
 from rigidjax.motion.coupled import Coupled, motion_of
-from rigidjax.motion.manifold import dimension, minus_small, parts, plus, turns
+from rigidjax.motion.manifold import dimension, minus_small, parts_by_name, plus, rotation_slices
 from rigidjax.motion.torques.states import require_stateless
 from rigidjax.solve.error import Error, error_of_run, largest_in_run
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, solve
@@ -57,10 +57,12 @@ class Solution(eqx.Module, Generic[State]):
     _error: Error | None = None
 
     def __repr__(self) -> str:
-        if not _checks.known((self.ts, self.stats, self.result)) or np.ndim(self.ts) != 1:
+        if not _checks.is_known((self.ts, self.stats, self.result)) or np.ndim(self.ts) != 1:
             return eqx.tree_pformat(self)
         count, t = self.ts.shape[0], np.asarray(self.ts)
-        ends = " … ".join(_show.time(end, abs(t[-1] - t[0])) for end in (t[0], t[-1])) + " s"
+        ends = (
+            " … ".join(_show.time_as_text(end, abs(t[-1] - t[0])) for end in (t[0], t[-1])) + " s"
+        )
         steps = "".join(
             f", {int(self.stats[name])} {words}"
             for name, words in (("num_steps", "steps"), ("num_rejected_steps", "rejected"))
@@ -101,7 +103,7 @@ class Solution(eqx.Module, Generic[State]):
             rtol = getattr(self._setup.step_controller(), "rtol", None)
         if rtol is None:
             rtol = 100 * float(jnp.finfo(self.ts.dtype).eps)
-        if _checks.known((found, rtol, self.ts)):
+        if _checks.is_known((found, rtol, self.ts)):
             lost = np.flatnonzero(np.asarray(found) * float(rtol) > 1)
             if lost.size:
                 i = lost[0]
@@ -160,11 +162,11 @@ class Solution(eqx.Module, Generic[State]):
 
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if `t` is outside.
         """
-        t = _checks.floating(t, (), "t").astype(self.ts.dtype)
+        t = _checks.array_of_shape(t, (), "t").astype(self.ts.dtype)
         way = jnp.sign(self.ts[-1] - self.ts[0])
         along, since = way * self.ts, way * t
         outside = ~((since >= along[0]) & (since <= along[-1]))
-        t = _checks.refuse(t, outside, "evaluate: t lies outside the times that were simulated")
+        t = _checks.error_if(t, outside, "evaluate: t lies outside the times that were simulated")
         index = jnp.searchsorted(along, since, side="right") - 1
         index = jnp.clip(index, 0, self.ts.shape[0] - 1)
         start = jax.tree.map(lambda leaf: leaf[index], self._states)
@@ -187,7 +189,7 @@ def with_error(sol: Solution, error: Error, accuracy: Any) -> Solution:
 
 
 def _say(error: Error, most: Any, words: str) -> None:
-    if not _checks.known((error, most)) or not np.any(np.asarray(error.relative) > most):
+    if not _checks.is_known((error, most)) or not np.any(np.asarray(error.relative) > most):
         return
     i = int(np.argmax(np.asarray(error.relative) > most))
     steps, off = (
@@ -225,12 +227,12 @@ def _transition(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[
 def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, " times"]:
     """The largest singular value of dy(t)/dy(t0), each part relative to its largest size."""
     start = jax.tree.map(lambda leaf: leaf[0], ys)
-    each = parts(start, jnp.ones(dimension(start), ts.dtype)).values()
+    each = parts_by_name(start, jnp.ones(dimension(start), ts.dtype)).values()
     both = zip(each, jax.tree.leaves(ys), strict=True)
     sizes = jnp.concatenate([a.reshape(-1) * largest_in_run(b) for a, b in both])
     sizes = jnp.where(sizes > 0, sizes, 1)
     # A turn by δθ changes q by half of it.
-    for turned in turns(start):
+    for turned in rotation_slices(start):
         sizes = sizes.at[turned].multiply(2)
     change = _transition(setup, ts, ys) * (sizes[None] / sizes[:, None])[None]
     return jnp.linalg.norm(change, ord=2, axis=(1, 2))

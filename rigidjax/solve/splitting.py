@@ -14,10 +14,18 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from rigidjax._types import RealLike
-from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, plus, times, turned_back
+from rigidjax.exact.components3 import (
+    Six,
+    Triple,
+    add,
+    adjugate,
+    change_by_inverse_rotation,
+    determinant,
+    matvec,
+)
 from rigidjax.exact.derivatives import flow
 from rigidjax.exact.diffrax_solver import field_of
-from rigidjax.exact.principal_axes import components_along, out_of, principal_frame
+from rigidjax.exact.principal_axes import combine_columns, components_along, principal_frame
 from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import evaluate, sees_rate
@@ -93,7 +101,7 @@ def rate_of(weights: Six, p: Triple) -> Triple:
 @rate_of.defjvp
 def rate_of_jvp(primals, tangents):
     (weights, p), (dw, dp) = primals, tangents
-    return rate_of(weights, p), plus(rate_of(weights, dp), times(dw, p))
+    return rate_of(weights, p), add(rate_of(weights, dp), matvec(dw, p))
 
 
 class AbstractSplitting(dfx.AbstractSolver):
@@ -199,12 +207,12 @@ def frame_of(field: Any, y0: Any) -> Frame:
 
 def enter(frame: Frame, omega: Array) -> Triple:
     """Π in principal axes."""
-    return times(frame.moments, components_along(frame.axes, omega))
+    return matvec(frame.moments, components_along(frame.axes, omega))
 
 
 def leave(frame: Frame, momentum: Triple) -> Array:
     """Ω in body axes."""
-    return jnp.stack(out_of(frame.axes, rate_of(frame.weights, momentum)))
+    return jnp.stack(combine_columns(frame.axes, rate_of(frame.weights, momentum)))
 
 
 def compose(
@@ -221,18 +229,20 @@ def compose(
         torque = components_along(
             frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia)
         )
-        return plus(change, tuple(weight * a for a in torque))
+        return add(change, tuple(weight * a for a in torque))
 
     # A loop, not twelve copies: the flow is long to compile.
     def stage(carry: Any, weights: tuple[Array, Array]) -> tuple[Any, None]:
         t, dq, change = carry
         drift, kick = weights
         length = drift.astype(dtype)
-        momentum = plus(state[1], change)
+        momentum = add(state[1], change)
         _, (w, x, y, z) = flow(frame.moments, momentum, length)
         # What the turn changes: momentum keeps its length to the last digit of this change.
-        change = plus(change, turned_back((w, x, y, z), momentum))
-        turn = jnp.stack([-(x * x + y * y + z * z) / (1 + w), *out_of(frame.axes, (x, y, z))])
+        change = add(change, change_by_inverse_rotation((w, x, y, z), momentum))
+        turn = jnp.stack(
+            [-(x * x + y * y + z * z) / (1 + w), *combine_columns(frame.axes, (x, y, z))]
+        )
         dq = dq + quaternion.multiply(state[0] + dq, turn)
         t = t + drift
         return (t, dq, kicked(t, kick.astype(dtype), state[0] + dq, change)), None

@@ -17,8 +17,8 @@ from jaxtyping import Array
 
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia
-from rigidjax.exact.components3 import Six, Triple, cross, half_product, plus, times
-from rigidjax.exact.principal_axes import out_of
+from rigidjax.exact.components3 import Six, Triple, add, cross, half_product, matvec
+from rigidjax.exact.principal_axes import combine_columns
 from rigidjax.motion import Attitude, Spin
 from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.equations import AttitudeEquations, EulerEquations
@@ -149,7 +149,7 @@ def _free(body: Inertia, state0: Attitude) -> Stepper:
 
     def state(y: Atoms) -> Attitude:
         # The numbers are the turn since the start, seen from the axes: Aᵀ…A turns its vector.
-        turn = jnp.stack([y[0], *out_of(axes, y[1:4])])
+        turn = jnp.stack([y[0], *combine_columns(axes, y[1:4])])
         q = quaternion.normalise(quaternion.multiply(state0.q, turn))
         return Attitude(q, splitting.leave(frame, y[4:]))
 
@@ -166,7 +166,7 @@ def _free_slope(weights: Six, gaps: Triple, p: Triple) -> Triple:
 def _free_slope_jvp(primals, tangents):
     (weights, gaps, p), (dw, _, dp) = primals, tangents
     rate, turning = splitting.rate_of_jvp((weights, p), (dw, dp))
-    return _free_slope(weights, gaps, p), plus(cross(dp, rate), cross(p, turning))
+    return _free_slope(weights, gaps, p), add(cross(dp, rate), cross(p, turning))
 
 
 def _entries(a: Array) -> Six:
@@ -177,7 +177,7 @@ def _entries(a: Array) -> Six:
 
 def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
     body, weights, torque = turning
-    start, rate = split(state0), partial(times, weights)
+    start, rate = split(state0), partial(matvec, weights)
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         law = bind(torque, inputs)
@@ -186,7 +186,7 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
             omega = barrier(rate(p))
             # It gets no attitude that it could look at.
             value = evaluate(law, t, Spin(jnp.stack(omega)), body)
-            return plus(cross(p, omega), split(value))
+            return add(cross(p, omega), split(value))
 
         dp, turn = change_and_turn(slope, rate, t, end, h, y[4:])
         return (*product4(y[:4], turn), *dp)
@@ -194,7 +194,7 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
     def state(y: Atoms) -> Attitude:
         return Attitude(quaternion.normalise(jnp.stack(y[:4])), jnp.stack(rate(y[4:])))
 
-    return Stepper((*start[:4], *times(_entries(body.tensor), start[4:])), change, state)
+    return Stepper((*start[:4], *matvec(_entries(body.tensor), start[4:])), change, state)
 
 
 def _explicit(solver: AbstractExplicit | Rolled, turning: _Turning, state0: Any) -> Stepper:
@@ -208,19 +208,19 @@ def _explicit(solver: AbstractExplicit | Rolled, turning: _Turning, state0: Any)
         def slope(t: Any, y: Atoms) -> Atoms:
             q, p = y[:many], y[many:]
             # Shared by attitude and momentum; fenced: else each of seven results computes it again.
-            omega = barrier(times(weights, p))
+            omega = barrier(matvec(weights, p))
             pushed = cross(p, omega)
             if law is not None:
                 value = evaluate(law, t, join((*q, *omega), state0), body)
-                pushed = plus(pushed, split(value))
+                pushed = add(pushed, split(value))
             return (*half_product(q, omega), *pushed) if many else pushed
 
         return slope
 
     def state(y: Atoms) -> Any:
-        return join((*y[:many], *times(weights, y[many:])), state0)
+        return join((*y[:many], *matvec(weights, y[many:])), state0)
 
-    momentum = times(_entries(body.tensor), start[many:])
+    momentum = matvec(_entries(body.tensor), start[many:])
     return _of_slope(solver, slope_under, (*start[:many], *momentum), state, state0)
 
 

@@ -17,7 +17,7 @@ from rigidjax.frames import AbstractScene, BodyInFrame, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.torques import ChangingInertia, GravityGradient
-from rigidjax.motion.torques.base import require_rung
+from rigidjax.motion.torques.base import require_state_type
 from rigidjax.motion.torques.composite import parts_of
 from rigidjax.rotation.validation import tolerance
 
@@ -52,7 +52,7 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
     if isinstance(state0, Point):
         scene_of(torque)
     if torque is not None and not isinstance(torque, AbstractScene | MovingFrame):
-        require_rung(torque, state0)
+        require_state_type(torque, state0)
         _require_one_frame(torque)
     if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
         raise TypeError(
@@ -65,7 +65,7 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
             + ("; pass body.inertia" if isinstance(body, MassProperties) else _body_of(body))
         )
     if body is not None:
-        _checks.single(body, type(body), "body")
+        _checks.require_single(body, type(body), "body")
 
 
 def _require_one_frame(torque: Any) -> None:
@@ -130,10 +130,10 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     if rtol is None and atol is None:
         return usual
     rtol, atol = (u if g is None else g for u, g in zip(usual, (rtol, atol), strict=True))
-    if not _checks.known((rtol, atol)):
+    if not _checks.is_known((rtol, atol)):
         return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
     # Floats of Python: those of NumPy would lift a float32 run to float64.
-    rtol, atol = _checks.number(rtol, "rtol"), _checks.number(atol, "atol")
+    rtol, atol = _checks.known_float(rtol, "rtol"), _checks.known_float(atol, "atol")
     if not 0 < rtol < np.inf or not 0 <= atol < np.inf:
         raise ValueError(f"simulate: wanted rtol > 0 and atol >= 0, got rtol={rtol}, atol={atol}")
     floor = 100 * float(jnp.finfo(dtype).eps)
@@ -159,9 +159,9 @@ def times(ts: Any, throw: bool) -> Array:
         length = ()
     if len(length) != 1 or length[0] < 2:
         raise ValueError(f"ts: wanted at least two times, shape (T,), got shape {length}")
-    found = _checks.floating(ts, length, "ts")
-    if throw or _checks.known(found):
-        found = _checks.finite(found, "ts")
+    found = _checks.array_of_shape(ts, length, "ts")
+    if throw or _checks.is_known(found):
+        found = _checks.require_finite(found, "ts")
     xp = _checks.namespace(found)
     numbers = xp.asarray(found)
     back = numbers[-1] < numbers[0]
@@ -173,10 +173,10 @@ def times(ts: Any, throw: bool) -> Array:
     if not ahead.all():
         i = int(np.argmin(ahead)) + 1
         where = f"; ts[{i}] is not {'below' if back else 'above'} the one before"
-        if _checks.known(ts) and (float(ts[i]) - float(ts[i - 1])) * (-1 if back else 1) > 0:
+        if _checks.is_known(ts) and (float(ts[i]) - float(ts[i - 1])) * (-1 if back else 1) > 0:
             where += (
                 f" in {found.dtype}, which cannot tell {ts[i - 1]!r} from {ts[i]!r}: "
-                + _checks.later_origin(found.dtype)
+                + _checks.advice_for_large_times(found.dtype)
             )
     kind = "decreasing" if back else "increasing"
     return _guard(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
@@ -184,9 +184,9 @@ def times(ts: Any, throw: bool) -> Array:
 
 def first_step(dt0: Any, times: Array) -> Array:
     """The length of `dt0` in the precision of `times`; refused if it is no step to go on with."""
-    step = _checks.floating(dt0, (), "dt0").astype(times.dtype)
-    known = _checks.known(times)
-    if not _checks.known(step):
+    step = _checks.array_of_shape(dt0, (), "dt0").astype(times.dtype)
+    known = _checks.is_known(times)
+    if not _checks.is_known(step):
         return jnp.abs(step)
     back = not known or bool(times[-1] < times[0])
     if not 0 < abs(float(step)) < np.inf or (float(step) < 0 and not back):
@@ -199,7 +199,8 @@ def first_step(dt0: Any, times: Array) -> Array:
         if abs(float(step)) < 8 * gap:
             raise ValueError(
                 f"dt0: steps of {dt0} s are too short for {times.dtype}, whose times near "
-                f"{float(far):g} s are {gap:.2g} s apart; " + _checks.later_origin(times.dtype)
+                f"{float(far):g} s are {gap:.2g} s apart; "
+                + _checks.advice_for_large_times(times.dtype)
             )
     return abs(step)
 
@@ -207,10 +208,12 @@ def first_step(dt0: Any, times: Array) -> Array:
 def start(state0: Any, throw: bool) -> Any:
     """`state0` of one body, finite, with a unit quaternion; or NaN, as for `times`."""
     wanted = "Spin, Attitude or Rigid, or Point without a body"
-    _checks.single(state0, (Spin, Attitude, Rigid, Point), "state0", wanted=wanted)
+    _checks.require_single(state0, (Spin, Attitude, Rigid, Point), "state0", requirement=wanted)
     named, tree = jax.tree.flatten_with_path(state0)
     leaves = [
-        _checks.finite(leaf, str(path[-1]).lstrip(".")) if throw or _checks.known(leaf) else leaf
+        _checks.require_finite(leaf, str(path[-1]).lstrip("."))
+        if throw or _checks.is_known(leaf)
+        else leaf
         for path, leaf in named
     ]
     state0 = tree.unflatten(leaves)
@@ -229,7 +232,7 @@ def start(state0: Any, throw: bool) -> Any:
 
 
 def _guard(value: Array, bad: Any, message: str, throw: bool) -> Array:
-    """As `_checks.refuse`; but one bad body in a batch must not end the run of the others."""
-    if throw or _checks.known(bad):
-        return _checks.refuse(value, bad, message)
+    """As `_checks.error_if`; but one bad body in a batch must not end the run of the others."""
+    if throw or _checks.is_known(bad):
+        return _checks.error_if(value, bad, message)
     return jnp.where(bad, jnp.full_like(value, jnp.nan), value)

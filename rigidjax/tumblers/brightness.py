@@ -18,8 +18,8 @@ from rigidjax.tumblers.scattering import (
     Geometric as Geometric,
     Lambert as Lambert,
     LommelSeeliger as LommelSeeliger,
-    direction,
     law_of,
+    unit_direction,
 )
 
 
@@ -46,9 +46,12 @@ def ellipsoid(
     6.0
     """
     law = law_of(scattering)
-    a = _checks.floating(semi_axes, (3,), "semi_axes", unit="m")
-    a = _checks.sign(a, "semi_axes", "three positive lengths, m")
-    s, o = direction(sun, "sun").astype(a.dtype), direction(observer, "observer").astype(a.dtype)
+    a = _checks.array_of_shape(semi_axes, (3,), "semi_axes", unit="m")
+    a = _checks.require_sign(a, "semi_axes", "three positive lengths, m")
+    s, o = (
+        unit_direction(sun, "sun").astype(a.dtype),
+        unit_direction(observer, "observer").astype(a.dtype),
+    )
     # The fourth power of the axes would overflow: scale them by a power of two.
     size = exponent_of(a)
     a = times_power_of_two(a, -size)
@@ -78,12 +81,12 @@ def mesh(
     0.5
     """
     law = law_of(scattering)
-    corners = _checks.rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
-    if _checks.known(corners):
-        _checks.finite(corners, "vertices")
+    corners = _checks.array_of_rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
+    if _checks.is_known(corners):
+        _checks.require_finite(corners, "vertices")
     table = faces_of(faces, corners.shape[0])
-    s = direction(sun, "sun").astype(corners.dtype)
-    o = direction(observer, "observer").astype(corners.dtype)
+    s = unit_direction(sun, "sun").astype(corners.dtype)
+    o = unit_direction(observer, "observer").astype(corners.dtype)
     first, second, third = (corners[table[:, k]] for k in range(3))
     double = jnp.cross(second - first, third - first)
     to_sun, to_observer = (double * s[None, :]).sum(axis=1), (double * o[None, :]).sum(axis=1)

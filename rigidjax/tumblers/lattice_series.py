@@ -38,7 +38,7 @@ class Sums(NamedTuple):
     total: Float[Array, ""]
 
 
-def sums(light: tuple[Array, ...], highest: float) -> Sums:
+def sum_table(light: tuple[Array, ...], highest: float) -> Sums:
     """Return the table up to the frequency `highest`, 1/span.
 
     `light` holds the times over the span, the values over their noise, and one over the noise.
@@ -115,7 +115,7 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
     return jax.lax.map(one, pairs, batch_size=BATCH)
 
 
-def remainder(rows: Array, z: Array) -> tuple[Float[Array, ""], Float[Array, " k"]]:
+def least_squares_remainder(rows: Array, z: Array) -> tuple[Float[Array, ""], Float[Array, " k"]]:
     """Return the least `|z − cᵀ rows|²` for rows (k, T), and the coefficients c (k,)."""
     gram, side = rows @ rows.T, rows @ z
     gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(side.size, dtype=z.dtype)

@@ -159,11 +159,11 @@ def fit_light_curve(
     sensors, several recordings or a torque; `TypeError` under a trace.
     """
     reading = _only_reading(model)
-    _checks.whole(count, "count", 1)
-    _checks.positive(tolerance, "tolerance")
+    _checks.integer(count, "count", 1)
+    _checks.positive_float(tolerance, "tolerance")
     say = lambda line: None  # noqa: E731
     if progress is not None:
-        say = _checks.function(progress, "progress", "of a line of text, such as print")
+        say = _checks.require_function(progress, "progress", "of a line of text, such as print")
     t, flux, noise = relative_flux(model, reading)
     squares, sigma = flux**2, None if noise is None else 2.0 * flux * noise
     pairs = two_frequencies(t, squares, sigma, shortest=shortest, count=count)
@@ -172,7 +172,7 @@ def fit_light_curve(
     starts = starts_of(model, reading, t, squares, sigma, pairs.frequencies[:used])
     say(f"{used} pairs of frequencies, χ² {pairs.misfits[0]:.6g} of {pairs.dof}")
     say(f"{len(starts)} starts")
-    whole = stacking.of_few_lengths(model)
+    whole = stacking.pad_to_few_lengths(model)
     ends = search_from(whole, starts, noise_of(reading, flux, pairs.scatter), tolerance)
     aliases = _aliases(whole, ends)
     say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
@@ -187,7 +187,7 @@ def fit_light_curve(
 def _only_reading(model: Model) -> Reading:
     """Return the reading of the model's only sensor; raise an error for another kind of model."""
     require_one(model)
-    if not _checks.known(model):
+    if not _checks.is_known(model):
         words = "got traced ones; call it outside of jax.jit, jax.grad and jax.vmap"
         raise TypeError(f"model: wanted known numbers, {words}")
     readings = model.records.readings
@@ -222,7 +222,7 @@ def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Arr
 
 
 @eqx.filter_jit
-def _slopes(x: Float[Array, " n"], model: Model) -> Float[Array, "4 n"]:
+def _period_derivatives(x: Float[Array, " n"], model: Model) -> Float[Array, "4 n"]:
     """Return the derivatives of the logarithms of both periods and both ratios."""
     return jax.jacfwd(lambda x: _periods_and_ratios(x, model)[0])(x)
 
@@ -253,10 +253,10 @@ def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
     return out
 
 
-def _is_same_motion(a: Alias, b: Alias, near: np.ndarray) -> bool:
-    """Return whether two motions are the same: of one mode, and `near` in the four logarithms."""
+def _is_same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
+    """Return whether two motions have one mode, and logarithms within `tolerance`."""
     one, other = (np.log([m.rotation, m.precession, *m.ratios]) for m in (a, b))
-    return a.mode == b.mode and bool((np.abs(one - other) < near).all())
+    return a.mode == b.mode and bool((np.abs(one - other) < tolerance).all())
 
 
 @eqx.filter_jit
@@ -267,14 +267,14 @@ def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
     motion, t = exact.FreeBody(Inertia(tensor_of(body)), state0), model.records.t[0]
     sensor = stacking.pick_records(model.records.readings[0], 0).sensor
 
-    def at(now: Array) -> Array:
+    def bisector_at(now: Array) -> Array:
         state: Any = motion(now - t[0])
         return quaternion.rotate_inverse(state.q, bisector(sensor, now))
 
-    return jax.vmap(at)(t)
+    return jax.vmap(bisector_at)(t)
 
 
-def _with_shape(best: Fit) -> Fit:
+def _allow_for_shape(best: Fit) -> Fit:
     """Return the fit with a covariance that allows for a body that is no ellipsoid."""
     linear: Any = best.linear
     reading, weight = stacking.pick_records(best.model.records.readings[0], 0), linear.weights[0][0]
@@ -286,24 +286,36 @@ def _with_shape(best: Fit) -> Fit:
     kept = weight > 0
     white = uncertainty.white_covariance(linear).covariance
     shift = white @ slopes[kept].T @ change[kept].reshape(-1, 9)
-    covariance, seen = (np.asarray(c) + shift @ shift.T for c in (best.covariance, best.seen))
+    covariance, seen = (
+        np.asarray(c) + shift @ shift.T for c in (best.covariance, best.determined_covariance)
+    )
     null = np.asarray(best.null_directions)
     numbers = values_and_slopes(best.model, best.x, best.near)
-    freedom = best.degrees(numbers[1])
+    freedom = best.degrees_of_freedom(numbers[1])
     return dataclasses.replace(
         best,
         covariance=jnp.asarray(covariance),
-        seen=jnp.asarray(seen),
+        determined_covariance=jnp.asarray(seen),
         covariance_kind=f"sandwich: a shape {SHAPE:.0%} off the ellipsoid; {best.covariance_kind}",
         quantities=quantities(best.model, numbers, seen, null, best.limits, freedom),
     )
 
 
-def _result(best: Fit, aliases: list[Alias], pairs: TwoFrequencies, cut: bool) -> LightCurve:
-    """Return the result from the `best` fit and all motions; `cut` if not all pairs were tried."""
-    slopes, wider = np.asarray(_slopes(best.derivative_point, best.model)), _with_shape(best)
+def _result(
+    best: Fit, aliases: list[Alias], pairs: TwoFrequencies, is_incomplete: bool
+) -> LightCurve:
+    """Return the result from the `best` fit and all motions.
+
+    It `is_incomplete` if not all pairs were tried.
+    """
+    slopes, wider = (
+        np.asarray(_period_derivatives(best.derivative_point, best.model)),
+        _allow_for_shape(best),
+    )
     own, deviations = (
-        standard_deviations(slopes, np.asarray(one.seen), np.asarray(one.null_directions))
+        standard_deviations(
+            slopes, np.asarray(one.determined_covariance), np.asarray(one.null_directions)
+        )
         for one in (best, wider)
     )
     # A search that stopped on its way to the best motion is no rival.
@@ -312,7 +324,7 @@ def _result(best: Fit, aliases: list[Alias], pairs: TwoFrequencies, cut: bool) -
     first = _alias(best.model, best.x, aliases[0].cost)
     others = [alias for alias in aliases if not _is_same_motion(alias, first, near)]
     # Misfits count for less if the errors are larger than the noise, or autocorrelated.
-    count = int(best.model.records.readings[0].seen.sum())
+    count = int(best.model.records.readings[0].host_mask.sum())
     margin = MARGIN * max(1.0, 2.0 * first.cost / count) * max(best.correlation, 1.0)
     marked = tuple(
         eqx.tree_at(lambda a: a.explains, alias, alias.cost <= first.cost + margin)
@@ -323,7 +335,7 @@ def _result(best: Fit, aliases: list[Alias], pairs: TwoFrequencies, cut: bool) -
     if rivals and search.word != NOT_ENDED and explanation.word != FAILS:
         who = "another motion explains" if rivals == 1 else f"{rivals} other motions explain"
         search = Answer(NOT_ALONE, (f"{who} the light curve nearly as well",))
-    elif cut and best.ok:
+    elif is_incomplete and best.ok:
         search = Answer(NOT_ENDED, ("more pairs of frequencies fit than were tried",))
     # Outliers dominate χ² under a robust loss.
     above = best.chi2 - best.dof if best.model.loss is None else 0.0

@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._names import show
-from rigidjax.plot.style import COLOURS, TIMES, plain, several_axes, unit
+from rigidjax.plot.style import COLOURS, TIMES, axes_of_shape, escape_formulas, unit_factor
 
 # The colour map of the cycles, from the first to the last.
 _MAP = "viridis"
@@ -49,22 +49,22 @@ def light_curve(
     >>> light_curve(t, 15 + 0.1 * np.cos(2 * np.pi * t / 3600), 3600.0)[1].get_xlabel()
     'phase, in periods of 1 h'
     """
-    seconds = unit(time_unit, TIMES, "time_unit")
-    _checks.word(quantity, ("mag", "flux"), "quantity")
-    t, read = _checks.on_host(ts, "ts"), _checks.on_host(values, "values")
+    seconds = unit_factor(time_unit, TIMES, "time_unit")
+    _checks.require_option(quantity, ("mag", "flux"), "quantity")
+    t, read = _checks.host_array(ts, "ts"), _checks.host_array(values, "values")
     if t.ndim != 1 or read.shape != t.shape:
         raise ValueError(f"values: wanted (T,) as ts has, got shapes {t.shape} and {read.shape}")
     if not np.isfinite(read).any():
         raise ValueError("values: nothing to draw, every value is NaN or infinite")
-    predicted = None if model is None else _checks.on_host(model, "model")
+    predicted = None if model is None else _checks.host_array(model, "model")
     if predicted is not None and predicted.shape != t.shape:
         raise ValueError(f"model: wanted (T,) as ts has, got {predicted.shape}")
-    several = np.atleast_1d(_checks.on_host(periods, "periods"))
+    several = np.atleast_1d(_checks.host_array(periods, "periods"))
     if several.ndim != 1:
         raise ValueError(f"periods: wanted one or a row of them, s, got shape {several.shape}")
-    folds = [_checks.positive(period, "periods", "positive periods, s") for period in several]
+    folds = [_checks.positive_float(period, "periods", "positive periods, s") for period in several]
     count = 1 + len(folds)
-    ax = several_axes(ax, (count,), nrows=count, figsize=(7.2, 2.5 * count))
+    ax = axes_of_shape(ax, (count,), nrows=count, figsize=(7.2, 2.5 * count))
     label = "magnitude" if quantity == "mag" else "flux"
     ax[0].plot(t / seconds, read, ".", color=COLOURS[6], ms=3, label="read")
     if predicted is not None:
@@ -90,7 +90,7 @@ def light_curve(
         if quantity == "mag" and not one.yaxis_inverted():
             one.invert_yaxis()
     if title:
-        ax[0].set_title(plain(title))
+        ax[0].set_title(escape_formulas(title))
     return ax
 
 

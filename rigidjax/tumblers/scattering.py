@@ -70,7 +70,7 @@ class Geometric(AbstractScattering):
         return emission
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-        p, _, more, _, _ = _sides(shape, sun, observer)
+        p, _, more, _, _ = _side_products(shape, sun, observer)
         return 0.5 * math.pi * _ratio_or_zero(more, p)
 
 
@@ -92,7 +92,7 @@ class LommelSeeliger(AbstractScattering):
         return 2.0 * incidence * emission / (incidence + emission)
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-        p, q, more, w, rest = _sides(shape, sun, observer)
+        p, q, more, w, rest = _side_products(shape, sun, observer)
         return math.pi * _ratio_or_zero(more, p + q) * (1.0 - rest * _excess(w, rest))
 
 
@@ -119,23 +119,25 @@ def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
     if scattering is None:
         return LommelSeeliger()
     wanted = "LommelSeeliger(), Geometric() or Lambert()"
-    return _checks.instance(scattering, AbstractScattering, "scattering", wanted=wanted)
+    return _checks.require_instance(
+        scattering, AbstractScattering, "scattering", requirement=wanted
+    )
 
 
-def direction(value: Vec3Like | Numbers, name: str) -> Vec3:
+def unit_direction(value: Vec3Like | Numbers, name: str) -> Vec3:
     """Return the unit vector along `value` (3,).
 
     Raise `ValueError` for a length of zero, NaN or a wrong shape.
     """
-    v = _checks.finite(_checks.floating(value, (3,), name), name)
+    v = _checks.require_finite(_checks.array_of_shape(value, (3,), name), name)
     words = f"{name}: wanted a direction, got a vector of length zero"
-    v = _checks.refuse(v, ~(jnp.abs(v) > 0).any(), words)
+    v = _checks.error_if(v, ~(jnp.abs(v) > 0).any(), words)
     # The square of a distance of 1e200 m would overflow: scale it by a power of two.
     v = times_power_of_two(v, -exponent_of(v))
     return v / jnp.sqrt(dot(v, v))
 
 
-def _sides(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
+def _side_products(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
     """Return |p|, |q|, |p||q| + p·q, z² and 1 − z² of `LommelSeeliger`.
 
     p and q are multiplied by the product of the semi-axes.
@@ -143,7 +145,7 @@ def _sides(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
     minors = cofactors(shape)
     of_sun, turned = apply(minors, sun), cross(sun, observer)
     pq = dot(observer, of_sun)
-    p, q = _root(dot(sun, of_sun)), _root(dot(observer, apply(minors, observer)))
+    p, q = _root_or_zero(dot(sun, of_sun)), _root_or_zero(dot(observer, apply(minors, observer)))
     # Of |p||q| ± p·q take the smaller one from |p × q|², which is computed without subtraction: it
     # keeps its digits at zero phase, and opposite to it.
     across = dot(turned, apply(shape, turned)) * determinant(shape)
@@ -155,8 +157,8 @@ def _sides(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
     return p, q, more, 1.0 - rest, rest
 
 
-def _excess(w: Array, rest: Array) -> Array:
-    """Return `(artanh(√w)/√w − 1)/w`, with `rest` = 1 − w; 1/3 at w = 0.
+def _excess(w: Array, complement: Array) -> Array:
+    """Return `(artanh(√w)/√w − 1)/w`, with `complement` = 1 − w; 1/3 at w = 0.
 
     The numbers may be complex.
     """
@@ -167,10 +169,10 @@ def _excess(w: Array, rest: Array) -> Array:
         series = series * few + 1.0 / (2 * k + 3)
     far = jnp.where(near, 0.5, w)
     z = jnp.sqrt(far)
-    lone = jnp.abs(rest) > 0
+    lone = jnp.abs(complement) > 0
     # At rest = 0, zero phase, the result is multiplied by rest: take 0 for the limit of x ln x. Its
     # derivative is right as well, since rest has a minimum there.
-    logarithm = jnp.where(lone, jnp.log(jnp.where(lone, rest, 1.0)), 0.0)
+    logarithm = jnp.where(lone, jnp.log(jnp.where(lone, complement, 1.0)), 0.0)
     return jnp.where(near, series, ((jnp.log1p(z) - 0.5 * logarithm) / z - 1.0) / far)
 
 
@@ -204,7 +206,7 @@ def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
 def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
     """Return `∫ (n·sun)(n·observer)/(n·En)² dn` over normals n with two positive factors."""
     pole = cross(sun, observer)
-    sine, apart = _root(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
+    sine, apart = _root_or_zero(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
     # If sun and observer are nearly in line, any pole across them will do.
     least = jnp.eye(3, dtype=pole.dtype)[jnp.argmin(jnp.abs(sun))]
     pole = jnp.where(apart, pole, cross(sun, least))
@@ -249,7 +251,7 @@ def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scal
     return jnp.sum(weight * s * jnp.sin(width - angle) * inner / d)
 
 
-def _root(x: Scalar) -> Scalar:
+def _root_or_zero(x: Scalar) -> Scalar:
     """Return √x, with the derivative 0 at zero: an ellipsoid without thickness, seen edge on."""
     is_positive = x > 0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)

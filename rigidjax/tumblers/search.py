@@ -12,8 +12,8 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.free import leaf_at
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.normal import Normal
-from rigidjax.identify.model.terms import Noise, template
+from rigidjax.identify.model.normal import NormalMatrix
+from rigidjax.identify.model.terms import Noise, scene_template
 from rigidjax.identify.search.least_squares import CAREFUL, Settings, minimise
 from rigidjax.identify.search.stages import Attempt
 from rigidjax.rotation import quaternion
@@ -38,7 +38,7 @@ def relative_flux(
     The noise is `None` if it is not known.
     """
     t = np.asarray(model.records.t[0])
-    mask: np.ndarray = reading.seen
+    mask: np.ndarray = reading.host_mask
     sensor: Any = reading.sensor
     values = np.asarray(reading.values, float)[mask]
     noise = None if sensor.noise is None else float(np.asarray(sensor.noise)[0])
@@ -90,13 +90,13 @@ def starts_of(
     return [_free_numbers(model, one, turn) for one in chosen]
 
 
-def _free_numbers(model: Model, one: starts.Candidate, turn: np.ndarray) -> Array:
+def _free_numbers(model: Model, candidate: starts.Candidate, turn: np.ndarray) -> Array:
     """Return the free numbers (n,) of a candidate; `turn` leads from principal to body axes."""
-    moments = turn @ np.diag(one.moments) @ turn.T
+    moments = turn @ np.diag(candidate.moments) @ turn.T
     start = model.start(Inertia(jnp.asarray(moments)))
     reference = model.reference
-    step = _rotation_vector(jnp.asarray(one.q), jnp.asarray(turn), reference.state.q[0])
-    spin = jnp.asarray(turn @ one.omega) / reference.rate[0]
+    step = _rotation_vector(jnp.asarray(candidate.q), jnp.asarray(turn), reference.state.q[0])
+    spin = jnp.asarray(turn @ candidate.omega) / reference.rate[0]
     # The free numbers of an initial `Attitude`: the turn from the reference, and the rate.
     return start.at[model.index.start[0]].set(jnp.concatenate([step, spin]))
 
@@ -166,12 +166,12 @@ def _search_from_each(
         def errors(point: Array) -> Array:
             return model.errors(point)[0][:, 0] / noise[0][0, 0]
 
-        def evaluate(point: Array) -> tuple[tuple[()], Array, Normal, Array]:
+        def evaluate(point: Array) -> tuple[tuple[()], Array, NormalMatrix, Array]:
             steps = jnp.concatenate([jnp.zeros((1, start.size)), jnp.eye(start.size)])
             moved = point[None] + DIFFERENCE * steps
             e = jax.lax.map(errors, moved)
             rows = (e[1:] - e[:1]) / DIFFERENCE
-            return (), 0.5 * jnp.sum(e[0] ** 2), Normal(rows @ rows.T), rows @ e[0]
+            return (), 0.5 * jnp.sum(e[0] ** 2), NormalMatrix(rows @ rows.T), rows @ e[0]
 
         steps = jnp.where(number < jnp.asarray(count), settings.steps, 0)
         mine = eqx.tree_at(lambda s: s.steps, settings, steps)
@@ -184,7 +184,7 @@ def _search_from_each(
 @eqx.filter_jit
 def _with_best_level(starts: Float[Array, "starts n"], model: Model) -> Float[Array, "starts n"]:
     """Return the starts, each with the level of brightness that fits it best, if that is free."""
-    scene = template(model, model.records)
+    scene = scene_template(model, model.records)
     path = leaf_at(lambda s: s.sensors[0].level, scene, "level", "the sensor")[0]
     mine = [slot for slot in model.slots if slot.path == path and slot.shared is not None]
     if not mine:

@@ -18,7 +18,7 @@ from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import determinant, dot
 from rigidjax.tumblers.brightness import AbstractScattering
-from rigidjax.tumblers.scattering import direction, law_of
+from rigidjax.tumblers.scattering import law_of, unit_direction
 
 UNITS = ("flux", "mag")
 
@@ -88,32 +88,37 @@ class Brightness(AbstractSensor):
         semi_axes: NumbersLike | None = None,
         offset: NumbersLike | None = None,
     ):
-        self.sun, self.observer = _source(sun, "sun"), _source(observer, "observer")
-        self.scattering, self.noise = law_of(scattering), base.deviations(1)(noise)
-        self.unit = _checks.word(unit, UNITS, "unit")
+        self.sun, self.observer = (
+            _direction_source(sun, "sun"),
+            _direction_source(observer, "observer"),
+        )
+        self.scattering, self.noise = law_of(scattering), base.deviations_field(1)(noise)
+        self.unit = _checks.require_option(unit, UNITS, "unit")
         usual = 1.0 if unit == "flux" else 0.0
-        checked_level = base.required("level", ())(usual if level is None else level)
+        checked_level = base.array_field("level", ())(usual if level is None else level)
         if unit == "flux":
             words = "level: wanted a positive flux"
-            checked_level = _checks.refuse(checked_level, ~(checked_level > 0), words)
+            checked_level = _checks.error_if(checked_level, ~(checked_level > 0), words)
         self.level = checked_level
         if semi_axes is not None:
-            semi_axes = _checks.floating(semi_axes, (3,), "semi_axes").astype(float)
-            semi_axes = _checks.sign(semi_axes, "semi_axes", "three positive lengths")
+            semi_axes = _checks.array_of_shape(semi_axes, (3,), "semi_axes").astype(float)
+            semi_axes = _checks.require_sign(semi_axes, "semi_axes", "three positive lengths")
         self.semi_axes = semi_axes
-        self.offset = base.optional("offset", ())(offset)
+        self.offset = base.optional_array_field("offset", ())(offset)
 
-    def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
-        return (reading - self.predicted(now))[None]
+    def error(self, motion: SensorInput, reading: Array) -> Float[Array, "1"]:
+        return (reading - self.predict(motion))[None]
 
-    def predicted(self, now: SensorInput) -> Scalar:
+    def predict(self, motion: SensorInput) -> Scalar:
         """Return the reading of a state without noise."""
-        shape = now.body.second_moment
+        shape = motion.body.second_moment
         if self.semi_axes is not None:
             shape = jnp.diag(self.semi_axes * self.semi_axes)
         shape = shape / jnp.trace(shape)
-        q = now.state.q
-        sun, observer = (quaternion.rotate_inverse(q, v) for v in directions(self, now.t, q.dtype))
+        q = motion.state.q
+        sun, observer = (
+            quaternion.rotate_inverse(q, v) for v in directions(self, motion.t, q.dtype)
+        )
         area = self.scattering.of_ellipsoid(shape, sun, observer)
         relative = area / (math.pi * jnp.cbrt(determinant(shape)))
         if self.unit == "flux":
@@ -150,28 +155,28 @@ class Brightness(AbstractSensor):
 def directions(sensor: Brightness, t: ScalarLike, dtype: DTypeLike | None = None) -> list[Vec3]:
     """Return the unit vectors to sun and observer at the time `t`, world frame."""
     vectors = vector_at(sensor.sun, t, "sun"), vector_at(sensor.observer, t, "observer")
-    return [_unit(v if dtype is None else v.astype(dtype)) for v in vectors]
+    return [_unit_vector(v if dtype is None else v.astype(dtype)) for v in vectors]
 
 
 def bisector(sensor: Brightness, t: ScalarLike) -> Vec3:
     """Return the unit vector half way between sun and observer at the time `t`, world frame."""
     sun, observer = directions(sensor, t)
-    return _unit(sun + observer)
+    return _unit_vector(sun + observer)
 
 
-def _unit(v: Vec3) -> Vec3:
+def _unit_vector(v: Vec3) -> Vec3:
     """Return the unit vector along v."""
     return v / jnp.sqrt(dot(v, v))
 
 
-def _source(source: NumbersLike | Callable[..., Any], name: str) -> Any:
+def _direction_source(source: NumbersLike | Callable[..., Any], name: str) -> Any:
     """Return a direction as a unit vector, or a function of time as it is; else raise an error."""
     if callable(source):
-        return _checks.function(source, name, "of time to (3,)")
-    shape = _checks.numbers(source, name).shape
+        return _checks.require_function(source, name, "of time to (3,)")
+    shape = _checks.numeric_array(source, name).shape
     if len(shape) == 2 and shape[1] == 3:
         raise ValueError(
             f"{name}: wanted a direction (3,) or a function of time, got shape {shape}; one row "
             "for each time is rigidjax.torques.Linear(times, directions)"
         )
-    return direction(source, name).astype(jnp.result_type(float))
+    return unit_direction(source, name).astype(jnp.result_type(float))

@@ -22,7 +22,7 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.motion import Attitude
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.kernels import product4
-from rigidjax.tumblers.lattice_series import remainder
+from rigidjax.tumblers.lattice_series import least_squares_remainder
 
 # The grid: ratios b/a and c/b of the semi-axes, and the number of phases in half a rotation.
 MIDDLE, SHORT, PHASES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9), (0.5, 0.65, 0.8, 0.93), 12
@@ -82,12 +82,12 @@ def candidates(
         if not np.isfinite(least[k]):
             continue
         at = k, phase[k]
-        in_world = (np.array(product4(q0, q[at])) for q0 in _turns(sides[at], bisector))
+        in_world = (np.array(product4(q0, q[at])) for q0 in _turns_to_world(sides[at], bisector))
         out += [Candidate(moments[k], one, omega[at], float(least[k])) for one in in_world]
     return out
 
 
-def _turns(side: np.ndarray, bisector: np.ndarray) -> list[tuple[Any, ...]]:
+def _turns_to_world(side: np.ndarray, bisector: np.ndarray) -> list[tuple[Any, ...]]:
     """Return the quaternions that turn the frame of the momentum to the world.
 
     n in the frame of the momentum is the leading eigenvector of the matrix with the six numbers
@@ -111,7 +111,7 @@ def _shortest_turn(u: Any, v: Any, xp: ModuleType) -> Any:
     return q / xp.sqrt((q * q).sum())
 
 
-def _rate(moments: Array, d: Array) -> Float[Array, "3"]:
+def _rate_from_energy(moments: Array, d: Array) -> Float[Array, "3"]:
     """Return the rate of momentum h = 1 and `h²/2T = d` without a part along the middle axis.
 
     T is the kinetic energy; the first and the last of the ascending `moments` have the other axes.
@@ -121,18 +121,18 @@ def _rate(moments: Array, d: Array) -> Float[Array, "3"]:
     return jnp.stack([jnp.sqrt(x), jnp.zeros_like(x), jnp.sqrt(1.0 - x)]) / moments
 
 
-def _rate_of_ratio(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array, Array]:
+def _rate_of_ratio(moments: Array, ratio: Array, long_axis: Array) -> tuple[Array, Array, Array]:
     """Return a rate whose precession and rotation period have this `ratio`.
 
-    Its precession period is returned, too, and whether there is such a rate in the mode (`long` for
-    the long axis). The energy is found by bisection.
+    Its precession period is returned, too, and whether there is such a rate in the mode
+    (`long_axis` for the long axis). The energy is found by bisection.
     """
-    body, pure = Inertia(jnp.diag(moments)), jnp.where(long, moments[0], moments[2])
+    body, pure = Inertia(jnp.diag(moments)), jnp.where(long_axis, moments[0], moments[2])
 
     def bisect(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high = state[:2]
         part = 0.5 * (low + high)
-        omega = _rate(moments, pure + part * (moments[1] - pure))
+        omega = _rate_from_energy(moments, pure + part * (moments[1] - pure))
         precession = exact.precession_period(body, omega)
         quotient = precession / exact.body_period(body, omega) / ratio
         low, high = jnp.where(quotient > 1, part, low), jnp.where(quotient > 1, high, part)
@@ -149,7 +149,13 @@ def _rate_of_ratio(moments: Array, ratio: Array, long: Array) -> tuple[Array, Ar
 
 @jax.jit
 def _grid(
-    long: Array, moments: Array, forms: Array, pair: Array, t: Array, squares: Array, weights: Array
+    long_axis: Array,
+    moments: Array,
+    forms: Array,
+    pair: Array,
+    t: Array,
+    squares: Array,
+    weights: Array,
 ) -> tuple[Array, Array, Array, Array]:
     """Return misfits (S, phases), n nᵀ times the level (…, 6), attitudes and rates of S bodies.
 
@@ -159,7 +165,7 @@ def _grid(
 
     def shape(one: tuple[Array, Array]) -> tuple[Array, ...]:
         body, form = one
-        omega, precession, exists = _rate_of_ratio(body, ratio, long)
+        omega, precession, exists = _rate_of_ratio(body, ratio, long_axis)
         omega = omega * (precession * pair[0])
         h = body * omega
         # Turn the momentum to z of the world. It is not opposite to z: no part of it is negative.
@@ -182,7 +188,7 @@ def _grid(
             # Compute the first state together with the others: alone it would compile once more.
             states: Any = jax.vmap(motion)(since + jnp.concatenate([jnp.zeros(1, t.dtype), t]))
             rows = jax.vmap(row)(states.q[1:]).T * weights[None, :]
-            misfit, n = remainder(rows, squares * weights)
+            misfit, n = least_squares_remainder(rows, squares * weights)
             return jnp.where(exists, misfit, jnp.inf), n, states.q[0], states.omega[0]
 
         parts = jnp.arange(PHASES, dtype=t.dtype) / PHASES

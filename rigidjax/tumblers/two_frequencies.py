@@ -14,10 +14,10 @@ from rigidjax.tumblers.lattice_series import (
     FIRST,
     Sums,
     lattice_chi2,
+    least_squares_remainder,
     pad_rows,
-    remainder,
     side_peaks,
-    sums,
+    sum_table,
 )
 
 # A pair must explain one of the LINES strongest lines; the first frequency is on a grid of this
@@ -104,8 +104,8 @@ def two_frequencies(
     >>> bool(pairs.misfits[0] < 0.1)
     True
     """
-    t, y = _checks.on_host(t, "t"), _checks.on_host(values, "values")
-    order, count = _checks.whole(order, "order", 1), _checks.whole(count, "count", 1)
+    t, y = _checks.host_array(t, "t"), _checks.host_array(values, "values")
+    order, count = _checks.integer(order, "order", 1), _checks.integer(count, "count", 1)
     unknowns = (2 * FIRST + 1) * (2 * order + 1) + 2
     if t.ndim != 1 or y.shape != t.shape:
         raise ValueError(f"values: wanted (T,) as t has, got shapes {t.shape} and {y.shape}")
@@ -117,7 +117,7 @@ def two_frequencies(
         raise ValueError("t: wanted increasing times")
     sigma = np.ones(t.shape)
     if noise is not None:
-        sigma = _checks.on_host(noise, "noise")
+        sigma = _checks.host_array(noise, "noise")
         if sigma.shape not in ((), t.shape):
             raise ValueError(f"noise: wanted one number or (T,) as t has, got shape {sigma.shape}")
         if not (np.isfinite(sigma) & (sigma > 0)).all():
@@ -131,7 +131,7 @@ def two_frequencies(
             f"squares are added, got {worst:.3g}; give both in another unit"
         )
     span, typical = float(t[-1] - t[0]), float(np.median(np.diff(t)))
-    least = 4.0 * typical if shortest is None else _checks.positive(shortest, "shortest")
+    least = 4.0 * typical if shortest is None else _checks.positive_float(shortest, "shortest")
     if span / least > MOST:
         words = f"{least:.3g} s, and a light curve of {span:.3g} s"
         raise ValueError(f"shortest: {words}: wanted at most {MOST:.0e} periods in it")
@@ -139,11 +139,13 @@ def two_frequencies(
     lines = strongest_lines(light, span / least, 2 * LINES)
     highest = SECOND * float(lines[:LINES].max())
     # The table holds all multiples of a pair, and the steps of the refinement beyond the highest.
-    table = sums(light, 2 * (FIRST + order) * (highest + 1.0))
-    pairs, misfits = _scan(table, lines, order)
-    pairs, misfits = refine(table, pairs[distinct(pairs, misfits, count * TRIED)], order)
+    table = sum_table(light, 2 * (FIRST + order) * (highest + 1.0))
+    pairs, misfits = _scan_pairs(table, lines, order)
+    pairs, misfits = refine_pairs(
+        table, pairs[distinct_pairs(pairs, misfits, count * TRIED)], order
+    )
     pairs, misfits = with_aliases(table, pairs, misfits, highest, order)
-    keep = distinct(pairs, misfits, count)
+    keep = distinct_pairs(pairs, misfits, count)
     dof = t.size - unknowns
     best = max(float(misfits[keep[0]]), 1e-300)
     scatter = float(np.sqrt(best / dof / np.mean(1.0 / sigma**2)))
@@ -181,12 +183,14 @@ def _strongest_line(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tu
         angle = 2.0 * math.pi * f * x
         return jnp.stack([jnp.ones_like(x), jnp.cos(angle), jnp.sin(angle)])
 
-    left, c = jax.lax.map(lambda f: remainder(rows(f) * w[None], z), grid, batch_size=BATCH)
+    left, c = jax.lax.map(
+        lambda f: least_squares_remainder(rows(f) * w[None], z), grid, batch_size=BATCH
+    )
     best = jnp.argmin(left)
     return grid[best], c[best] @ rows(grid[best])
 
 
-def _scan(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+def _scan_pairs(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
     """Return all pairs on a grid that give one of the `lines`, and their misfits."""
     highest = float(lines[:LINES].max())
     grid = np.arange(0.5, 0.8 * highest + 0.5, STEP)
@@ -227,13 +231,13 @@ def with_aliases(
     """Return the pairs with aliases of the best of them, in rounds until none is better."""
     peaks = side_peaks(table, highest)
     for _ in range(ROUNDS):
-        seeds = pairs[distinct(pairs, misfits, SEEDS)]
+        seeds = pairs[distinct_pairs(pairs, misfits, SEEDS)]
         more = (aliases_of(seeds, peaks)[:, None] + 0.2 * AROUND).reshape(-1, 2)
         more = more[((more > 0.5) & (more < highest)).all(axis=1)]
         if not len(more):
             break
-        best = distinct(more, lattice_chi2(table, more, order), 2 * SEEDS)
-        more, new = refine(table, more[best], order)
+        best = distinct_pairs(more, lattice_chi2(table, more, order), 2 * SEEDS)
+        more, new = refine_pairs(table, more[best], order)
         before = misfits.min()
         pairs, misfits = np.concatenate([pairs, more]), np.concatenate([misfits, new])
         if not new.min() < before * (1 - 1e-3):
@@ -241,7 +245,7 @@ def with_aliases(
     return pairs, misfits
 
 
-def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
+def distinct_pairs(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
     """Return the indices of `count` pairs that differ, in the order of their misfits."""
     chosen: list[int] = []
     for index in np.argsort(misfits)[:20_000]:
@@ -252,7 +256,7 @@ def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
     return chosen
 
 
-def refine(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+def refine_pairs(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
     """Move each pair from neighbour to neighbour down to a minimum; return pairs and misfits.
 
     The steps become shorter whenever no neighbour is lower.

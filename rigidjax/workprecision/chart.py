@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from rigidjax._checks import plain
-from rigidjax.workprecision.pareto import first_answers, front
+from rigidjax._checks import escape_formulas
+from rigidjax.workprecision.pareto import first_answers, pareto_front
 from rigidjax.workprecision.record import Measurement, list_records
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
     for row, name in zip(axes, names, strict=True):
         if asked:
             _draw_reached_errors(row[-1], [r for r in asked if r.scene == name], labels)
-            row[-1].set_title(plain(f"{name}: asked and reached"), fontsize=10)
+            row[-1].set_title(escape_formulas(f"{name}: asked and reached"), fontsize=10)
         for axis, (kind, words, times) in zip(row, panels, strict=False):
             of = [r for r in times if (r.scene, r.kind) == (name, kind)]
             if not of:
@@ -63,13 +63,13 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
             if name in ("foucault", "arenstorf") and kind == "value":
                 what = "relative error of the place"
             axis.set(xlabel=what, ylabel="compile and run, ms" if words else "time, ms")
-            axis.set_title(plain(f"{name}: {kind}{words}"), fontsize=10)
+            axis.set_title(escape_formulas(f"{name}: {kind}{words}"), fontsize=10)
     if title:
-        figure.suptitle(plain(title))
+        figure.suptitle(escape_formulas(title))
     return figure
 
 
-def _places(records: list[Measurement]) -> tuple[list[float], list[float]]:
+def _errors_and_times(records: list[Measurement]) -> tuple[list[float], list[float]]:
     """Return the errors and the times, ms."""
     return [max(r.error, 1e-16) for r in records], [1e3 * r.time for r in records]
 
@@ -90,7 +90,7 @@ def _curves(
         yield (
             of,
             dict(
-                label=plain(label), color=colours(same.index(label) % colours.N),
+                label=escape_formulas(label), color=colours(same.index(label) % colours.N),
                 marker=_MARKS[i % len(_MARKS)], markersize=4,
                 linewidth=1.6 if group == "ours" else 0.9,
                 linestyle="-" if group == "ours" else "--" if group == "jax" else ":",
@@ -106,7 +106,7 @@ def _draw_reached_errors(
     wanted = sorted(r.setting for r in records)
     axis.plot(wanted, wanted, color="0.6", linewidth=6, alpha=0.3, zorder=0, label="as asked")
     axis.set(xlabel="tolerance or accuracy asked for", ylabel="error reached")
-    _dressed(axis)
+    _style_axis(axis)
 
 
 def _draw_times(axis: "Axes", records: list[Measurement], labels: list[tuple[str, str]]) -> None:
@@ -115,18 +115,26 @@ def _draw_times(axis: "Axes", records: list[Measurement], labels: list[tuple[str
             [max(1e3 * (r.time - r.time_low), 0.0) for r in of],
             [max(1e3 * (r.time_high - r.time), 0.0) for r in of],
         ]
-        axis.errorbar(*_places(of), bars, elinewidth=0.6, **how)
+        axis.errorbar(*_errors_and_times(of), bars, elinewidth=0.6, **how)
     for best, colour, what in (
-        (front(records), "0.6", "front"),
-        (front(r for r in records if r.group != "peer"), "tab:cyan", "front in JAX"),
+        (pareto_front(records), "0.6", "front"),
+        (pareto_front(r for r in records if r.group != "peer"), "tab:cyan", "front in JAX"),
     ):
-        axis.plot(*_places(best), "-", color=colour, linewidth=6, alpha=0.3, zorder=0, label=what)
+        axis.plot(
+            *_errors_and_times(best),
+            "-",
+            color=colour,
+            linewidth=6,
+            alpha=0.3,
+            zorder=0,
+            label=what,
+        )
     ringed: dict[str, Any] = dict(color="k", markerfacecolor="none", markersize=9, zorder=5)
-    axis.plot(*_places(front(records)), "o", **ringed)
-    _dressed(axis)
+    axis.plot(*_errors_and_times(pareto_front(records)), "o", **ringed)
+    _style_axis(axis)
 
 
-def _dressed(axis: "Axes") -> None:
+def _style_axis(axis: "Axes") -> None:
     axis.set(xscale="log", yscale="log")
     # Better is to the right and down.
     axis.invert_xaxis()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rigidjax.workprecision import chart, pareto
-from rigidjax.workprecision.measurement import in_float32, long_drift, measure
+from rigidjax.workprecision.measurement import long_drift, measure, to_float32
 from rigidjax.workprecision.peers import methods
 from rigidjax.workprecision.record import (
     Measurement,
@@ -59,7 +59,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_subcommand(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand to an `argparse` parser's commands."""
     parser = commands.add_parser(
         "workprecision",
@@ -74,7 +74,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         parser.add_argument(name, **how)
 
 
-def run(options: argparse.Namespace) -> int:
+def run_subcommand(options: argparse.Namespace) -> int:
     """Run the subcommand. **Returns** the exit code: 0 good, 1 something moved, 2 bad input."""
     try:
         known = [*scenes(), DRIFT]
@@ -114,7 +114,7 @@ def run(options: argparse.Namespace) -> int:
 def _measure(options: argparse.Namespace) -> list[Measurement]:
     quick = options.quick or options.check is not None or options.keep is not None
     names = options.scene or (QUICK if quick else [n for n, m in scenes().items() if not m().slow])
-    found: list[Measurement] = []
+    records: list[Measurement] = []
     begin = time.perf_counter()
 
     def say(line: str) -> None:
@@ -122,7 +122,7 @@ def _measure(options: argparse.Namespace) -> list[Measurement]:
 
     for name in names:
         if name == DRIFT:
-            found += long_drift(progress=say)
+            records += long_drift(progress=say)
             continue
         alone = options.no_peers or options.float32
         chosen = [m for m in methods() if not (alone and m.group == "peer")]
@@ -132,9 +132,9 @@ def _measure(options: argparse.Namespace) -> list[Measurement]:
             chosen = [m._replace(gradients=s) for m, s in zip(chosen, slopes, strict=True)]
         graded = not options.no_gradients and (name in GRADED or bool(options.scene))
         scene, thin = scenes()[name](), 4 if quick else options.thin
-        scene = in_float32(scene, graded) if options.float32 else scene
-        found += measure(scene, chosen, gradients=graded, progress=say, thin=thin)
-    return found
+        scene = to_float32(scene, graded) if options.float32 else scene
+        records += measure(scene, chosen, gradients=graded, progress=say, thin=thin)
+    return records
 
 
 def summary(records: Iterable[Measurement]) -> str:
@@ -151,8 +151,8 @@ def summary(records: Iterable[Measurement]) -> str:
             of = [r for r in records if (r.scene, r.kind) == (scene, kind)]
             if not of:
                 continue
-            best = {r.label for r in pareto.front(of)}
-            near = {r.label for r in pareto.front(r for r in of if r.group != "peer")}
+            best = {r.label for r in pareto.pareto_front(of)}
+            near = {r.label for r in pareto.pareto_front(r for r in of if r.group != "peer")}
             wanted = "".join(f"{f'{e:.0e}':>10s}" for e in pareto.WANTED)
             lines.append(f"\n{scene}, {kind}: µs to an error of{wanted}   best error  compile, s")
             for label in dict.fromkeys(r.label for r in of):

@@ -11,29 +11,29 @@ Number = Any
 Torque = Callable[[Number, Any, Any], tuple[Number, Number, Number]]
 
 
-def heavy(
+def heavy_top_torque(
     inertia: Sequence[Number],
     constants: Sequence[Number],
     sin: Callable[[Number], Number],
     cos: Callable[[Number], Number],
-    into: Callable[..., tuple[Number, Number, Number]],
+    to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
     """Return the torque `τ = c m × Rᵀg`; constants m c (3) and g (3)."""
     cx, cy, cz, gx, gy, gz = constants
 
     def torque(t, q, w):
-        ux, uy, uz = into(q, gx, gy, gz)
+        ux, uy, uz = to_body(q, gx, gy, gz)
         return cy * uz - cz * uy, cz * ux - cx * uz, cx * uy - cy * ux
 
     return torque
 
 
-def gradient(
+def gravity_gradient_torque(
     inertia: Sequence[Number],
     constants: Sequence[Number],
     sin: Callable[[Number], Number],
     cos: Callable[[Number], Number],
-    into: Callable[..., tuple[Number, Number, Number]],
+    to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
     """Return the torque `τ = 3n² r × I r`, r the direction of the planet on a circular orbit;
     constants n.
@@ -42,7 +42,7 @@ def gradient(
     ixx, iyy, izz, ixy, ixz, iyz = inertia
 
     def torque(t, q, w):
-        rx, ry, rz = into(q, cos(n * t), sin(n * t), 0.0)
+        rx, ry, rz = to_body(q, cos(n * t), sin(n * t), 0.0)
         lx = ixx * rx + ixy * ry + ixz * rz
         ly = ixy * rx + iyy * ry + iyz * rz
         lz = ixz * rx + iyz * ry + izz * rz
@@ -52,12 +52,12 @@ def gradient(
     return torque
 
 
-def gyrostat(
+def gyrostat_torque(
     inertia: Sequence[Number],
     constants: Sequence[Number],
     sin: Callable[[Number], Number],
     cos: Callable[[Number], Number],
-    into: Callable[..., tuple[Number, Number, Number]],
+    to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
     """Return the torque `τ = h × Ω − c Ω` of a wheel at constant speed and damping; constants h
     (3), c (3).
@@ -75,7 +75,7 @@ def gyrostat(
     return torque
 
 
-def into_body(q, x, y, z):
+def to_body_axes(q, x, y, z):
     """Return `Rᵀ(x, y, z)` for a unit quaternion q."""
     a, b, c, d = q
     return (
@@ -115,7 +115,7 @@ def body_rates(inertia: Sequence[Number], torque: Torque | None) -> Callable[[Nu
     return rates
 
 
-def foucault(
+def foucault_rates(
     constants: Sequence[Number], sqrt: Callable[[Number], Number]
 ) -> Callable[[Number, Any], Any]:
     """Return the rates of a pendulum on the turning Earth, axes east, north, up; constants g, Ω
@@ -136,7 +136,7 @@ def foucault(
     return rates
 
 
-def three_body(
+def three_body_rates(
     constants: Sequence[Number], sqrt: Callable[[Number], Number]
 ) -> Callable[[Number, Any], Any]:
     """Return the rates of the circular restricted problem in the turning frame; constants μ."""

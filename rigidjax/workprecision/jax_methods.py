@@ -16,7 +16,7 @@ from rigidjax.exact import FreeBody
 from rigidjax.solve import adaptive, equations_of_motion, fixed, simulate, solvers
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.splitting import AbstractSplitting
-from rigidjax.workprecision.scene import BenchmarkScene, Ready, TimedMethod
+from rigidjax.workprecision.scene import BenchmarkScene, PreparedMethod, TimedMethod
 
 TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 EIGHT = (40, 60, 80, 120, 170, 240, 340, 480, 680, 1000)
@@ -29,7 +29,7 @@ Flow = Callable[[Any, Any], tuple[Any, Any]]
 Make = Callable[[BenchmarkScene], Flow | None]
 
 
-def compiled(scene: BenchmarkScene, flow: Flow) -> Ready:
+def compile_flow(scene: BenchmarkScene, flow: Flow) -> PreparedMethod:
     """Return one compiled call for all settings.
 
     It is timed as a user would call it: only numbers go in.
@@ -49,7 +49,7 @@ def compiled(scene: BenchmarkScene, flow: Flow) -> Ready:
             there[setting] = jnp.asarray(float(setting), numbers.dtype)
         return jax.block_until_ready(ready(numbers, there[setting]))
 
-    return Ready(run, spent, held)
+    return PreparedMethod(run, spent, held)
 
 
 def flow_of(scene: BenchmarkScene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]) -> Flow:
@@ -58,14 +58,14 @@ def flow_of(scene: BenchmarkScene, run: Callable[[Any, Any, Any, Any], tuple[Any
     """
 
     def flow(numbers: Array, setting: Array) -> tuple[Any, Any]:
-        body, start = scene.assembled(numbers)
+        body, start = scene.assemble(numbers)
         ys, steps = run(body, start, jnp.array([0.0, scene.end], numbers.dtype), setting)
-        return scene.flat(jax.tree.map(lambda leaf: leaf[-1], ys)), steps
+        return scene.flatten(jax.tree.map(lambda leaf: leaf[-1], ys)), steps
 
     return flow
 
 
-def _closed(scene: BenchmarkScene) -> Flow | None:
+def _closed_form_flow(scene: BenchmarkScene) -> Flow | None:
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         end: Any = FreeBody(body, start)(ts[1])
         return jax.tree.map(lambda leaf: leaf[None], end), jnp.zeros(())
@@ -73,7 +73,7 @@ def _closed(scene: BenchmarkScene) -> Flow | None:
     return flow_of(scene, run) if scene.torque is None and scene.body is not None else None
 
 
-def _simulate(scene: BenchmarkScene, accuracy: bool = False) -> Flow | None:
+def _simulate_flow(scene: BenchmarkScene, accuracy: bool = False) -> Flow | None:
     """Return the flow of `simulate` with its defaults, except for the tolerance, which is traced so
     that one program does.
     """
@@ -87,7 +87,7 @@ def _simulate(scene: BenchmarkScene, accuracy: bool = False) -> Flow | None:
     return None if scene.torque is None else flow_of(scene, run)
 
 
-def _adaptive(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
+def _adaptive_flow(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
     """Return the flow of the loop in which `simulate` runs under a torque, in both modes."""
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -98,7 +98,7 @@ def _adaptive(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
     return flow_of(scene, run)
 
 
-def equal_steps(scene: BenchmarkScene, solver: AbstractExplicit | AbstractSplitting) -> Flow:
+def fixed_steps_flow(scene: BenchmarkScene, solver: AbstractExplicit | AbstractSplitting) -> Flow:
     """Return the flow of `solver` with a number of equal steps, which is the setting."""
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -108,7 +108,7 @@ def equal_steps(scene: BenchmarkScene, solver: AbstractExplicit | AbstractSplitt
     return flow_of(scene, run)
 
 
-def _in_diffrax(
+def _flow_in_diffrax(
     scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
     """Return the flow of our field and state in diffrax's loop."""
@@ -120,7 +120,7 @@ def _in_diffrax(
     return flow_of(scene, run)
 
 
-def _diffrax(
+def _handwritten_flow(
     scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
     """Return the flow of a user's own code: equations written by hand, one array, constants
@@ -128,10 +128,10 @@ def _diffrax(
     """
     plain = scene.plain
     if plain is None:
-        return _in_diffrax(scene, solver, adjoint)
+        return _flow_in_diffrax(scene, solver, adjoint)
 
     def flow(numbers: Array, setting: Array) -> tuple[Any, Any]:
-        start = scene.flat(scene.assembled(numbers)[1])
+        start = scene.flatten(scene.assemble(numbers)[1])
         rates = plain(tuple(numbers), jnp.sin, jnp.cos, jnp.sqrt)
         zero = jnp.zeros((), start.dtype)
         by_hand, constants = jax.closure_convert(lambda t, y: jnp.stack(rates(t, y)), zero, start)
@@ -163,7 +163,9 @@ def _solve_field(
     return out.ys, out.stats["num_steps"]
 
 
-def _prepare(make: Make, take: Callable[..., Any] | None, scene: BenchmarkScene) -> Ready | None:
+def _prepare(
+    make: Make, take: Callable[..., Any] | None, scene: BenchmarkScene
+) -> PreparedMethod | None:
     """Return the flow prepared for a scene, or with `take` its gradient of the scene's scalar;
     `None` if it cannot run.
     """
@@ -180,7 +182,7 @@ def _prepare(make: Make, take: Callable[..., Any] | None, scene: BenchmarkScene)
         return take(loss, has_aux=True)(numbers)
 
     try:
-        return compiled(scene, flow if take is None else slopes)
+        return compile_flow(scene, flow if take is None else slopes)
     except TypeError as refused:
         # A splitting refuses a torque that depends on the rate: the scene is left out.
         if "Splitting" in str(refused):
@@ -200,17 +202,19 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Ti
     >>> diffrax_method(dfx.Heun()).name
     'diffrax Heun'
     """
-    _checks.instance(solver, dfx.AbstractSolver, "solver", wanted="a solver of diffrax")
+    _checks.require_instance(
+        solver, dfx.AbstractSolver, "solver", requirement="a solver of diffrax"
+    )
     ways = {
         "forward": (dfx.ForwardMode(), jax.jacfwd),
         "checkpointed": (dfx.RecursiveCheckpointAdjoint(), jax.grad),
         "backsolve": (dfx.BacksolveAdjoint(), jax.grad),
     }
     slopes = {
-        name: partial(_prepare, partial(_diffrax, solver=solver, adjoint=adjoint), take)
+        name: partial(_prepare, partial(_handwritten_flow, solver=solver, adjoint=adjoint), take)
         for name, (adjoint, take) in ways.items()
     }
-    value = partial(_prepare, partial(_diffrax, solver=solver), None)
+    value = partial(_prepare, partial(_handwritten_flow, solver=solver), None)
     name = f"diffrax {type(solver).__name__}"
     return TimedMethod(name, "jax", TOLERANCES, value, slopes if gradients else {})
 
@@ -231,17 +235,17 @@ def methods_in_jax() -> list[TimedMethod]:
     eight = solvers.DormandPrince8()
     equal = ((EIGHT, eight), (FOUR, solvers.RungeKutta4()))
     equal += ((EIGHT, solvers.Splitting4()), (EIGHT, solvers.Splitting6()))
-    five, there = solvers.Tsitouras5(), partial(_in_diffrax, solver=eight)
+    five, there = solvers.Tsitouras5(), partial(_flow_in_diffrax, solver=eight)
     return [
-        _own_method("closed form", (0.0,), _closed, MODES),
-        _own_method("simulate", TOLERANCES, _simulate, MODES),
-        _own_method("simulate, accuracy", TOLERANCES, partial(_simulate, accuracy=True)),
-        _own_method("DormandPrince8", TOLERANCES, partial(_adaptive, solver=eight), MODES),
-        _own_method("Tsitouras5", TOLERANCES, partial(_adaptive, solver=five)),
+        _own_method("closed form", (0.0,), _closed_form_flow, MODES),
+        _own_method("simulate", TOLERANCES, _simulate_flow, MODES),
+        _own_method("simulate, accuracy", TOLERANCES, partial(_simulate_flow, accuracy=True)),
+        _own_method("DormandPrince8", TOLERANCES, partial(_adaptive_flow, solver=eight), MODES),
+        _own_method("Tsitouras5", TOLERANCES, partial(_adaptive_flow, solver=five)),
         *(
             _own_method(
                 f"{type(solver).__name__}, equal steps", counts,
-                partial(equal_steps, solver=solver), equal=True,
+                partial(fixed_steps_flow, solver=solver), equal=True,
             )
             for counts, solver in equal
         ),

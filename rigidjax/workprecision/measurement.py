@@ -21,9 +21,15 @@ from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques import HeavyTop
 from rigidjax.solve import fixed, solvers
 from rigidjax.workprecision import peers as known
-from rigidjax.workprecision.jax_methods import equal_steps
+from rigidjax.workprecision.jax_methods import fixed_steps_flow
 from rigidjax.workprecision.record import Measurement
-from rigidjax.workprecision.scene import BenchmarkScene, Ready, Reference, TimedMethod, distance
+from rigidjax.workprecision.scene import (
+    BenchmarkScene,
+    PreparedMethod,
+    Reference,
+    TimedMethod,
+    state_errors,
+)
 
 # Runs longer than LONG, s, are timed three times; runs shorter than SHORT are timed three times as
 # often as the others.
@@ -48,7 +54,7 @@ _PARTS = ("body", "state0", "torque")
 
 class _Job(NamedTuple):
     record: Measurement
-    ready: Ready
+    ready: PreparedMethod
     times: list[float]
 
 
@@ -76,13 +82,15 @@ def measure(
     **Raises:** `TypeError` for something that is no `BenchmarkScene` or `TimedMethod`.
     """
     made = 'standard ones are made by rj.workprecision.scenes()["heavy-top"]()'
-    _checks.instance(scene, BenchmarkScene, "scene", wanted="a BenchmarkScene", hint=made)
+    _checks.require_instance(
+        scene, BenchmarkScene, "scene", requirement="a BenchmarkScene", hint=made
+    )
     chosen = [*(known.methods() if methods is None else methods), *peers]
     for method in chosen:
-        _checks.instance(
-            method, TimedMethod, "methods", wanted="methods of workprecision.methods()"
+        _checks.require_instance(
+            method, TimedMethod, "methods", requirement="methods of workprecision.methods()"
         )
-    right = scene.reference if scene.reference is not None else worked_out(scene, gradients)
+    right = scene.reference if scene.reference is not None else compute_reference(scene, gradients)
     jobs: list[_Job] = []
     for method in chosen:
         for adjoint, make in {"": method.value, **(method.gradients if gradients else {})}.items():
@@ -94,17 +102,17 @@ def measure(
             if progress is not None:
                 progress(f"{scene.name}: {method.name} {adjoint or 'value'}")
             for setting in _settings(scene, method, thin * (2 if adjoint else 1)):
-                jobs += _looked_at(scene, method, adjoint, setting, ready, right)
+                jobs += _inspect_run(scene, method, adjoint, setting, ready, right)
     _time_jobs(jobs, rounds)
-    found = []
+    records = []
     for job in jobs:
         low, middle, high = (float(p) for p in np.percentile(job.times[1:], [25, 50, 75]))
         times = dict(time=middle, time_low=low, time_high=high)
-        found.append(dataclasses.replace(job.record, **times))
-    return found
+        records.append(dataclasses.replace(job.record, **times))
+    return records
 
 
-def worked_out(scene: BenchmarkScene, gradients: bool = True) -> Reference:
+def compute_reference(scene: BenchmarkScene, gradients: bool = True) -> Reference:
     """Return a reference for a scene without one: order 8 with fixed steps, compared with half as
     many steps.
 
@@ -113,7 +121,7 @@ def worked_out(scene: BenchmarkScene, gradients: bool = True) -> Reference:
     """
     counts = (4000, 2000)
     numbers, scale = scene.numbers, max(1.0, _turn(scene) / 50)
-    flow = equal_steps(scene, solvers.DormandPrince8())
+    flow = fixed_steps_flow(scene, solvers.DormandPrince8())
     run = jax.jit(flow)
     take = jax.jit(jax.jacfwd(lambda p, count: scene.loss(flow(p, count)[0])))
     ends, slopes = [], []
@@ -129,20 +137,22 @@ def worked_out(scene: BenchmarkScene, gradients: bool = True) -> Reference:
     return Reference(tuple(map(float, ends[0])), error, slope, off, source)
 
 
-def in_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
+def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
     """Return the scene in single precision; its reference is computed in double precision from the
     rounded numbers.
     """
 
-    def cast(given: BenchmarkScene, dtype: DTypeLike) -> BenchmarkScene:
+    def cast(scene: BenchmarkScene, dtype: DTypeLike) -> BenchmarkScene:
         def one(a: PyTree) -> Any:
             return jnp.asarray(a, dtype) if eqx.is_inexact_array(a) else a
 
-        parts = {name: jax.tree.map(one, getattr(given, name)) for name in _PARTS}
-        return dataclasses.replace(given, **parts)
+        parts = {name: jax.tree.map(one, getattr(scene, name)) for name in _PARTS}
+        return dataclasses.replace(scene, **parts)
 
     low = cast(scene, jnp.float32)
-    right = worked_out(dataclasses.replace(cast(low, jnp.float64), reference=None), gradients)
+    right = compute_reference(
+        dataclasses.replace(cast(low, jnp.float64), reference=None), gradients
+    )
     # Without `plain`: the equations written by hand have constants in double precision.
     return dataclasses.replace(low, name=f"{scene.name}, float32", reference=right, plain=None)
 
@@ -153,53 +163,55 @@ def _turn(scene: BenchmarkScene) -> float:
 
 
 def _settings(scene: BenchmarkScene, method: TimedMethod, thin: int) -> list[float]:
-    found = list(method.settings)[::-1][::thin][::-1]
+    settings = list(method.settings)[::-1][::thin][::-1]
     if method.equal:
-        return [float(round(s * _turn(scene) / 50)) for s in found]
+        return [float(round(s * _turn(scene) / 50)) for s in settings]
     # A tolerance below ten units of round-off rejects every step.
     least = 10 * float(jnp.finfo(scene.numbers.dtype).eps)
-    return [float(s) for s in found if s == 0 or s > least]
+    return [float(s) for s in settings if s == 0 or s > least]
 
 
-def _looked_at(
+def _inspect_run(
     scene: BenchmarkScene,
     method: TimedMethod,
     adjoint: str,
     setting: float,
-    ready: Ready,
-    right: Reference,
+    prepared: PreparedMethod,
+    reference: Reference,
 ) -> list[_Job]:
-    ready.run(setting)
+    prepared.run(setting)
     begin = time.perf_counter()
-    end, steps = ready.run(setting)
+    end, steps = prepared.run(setting)
     first = time.perf_counter() - begin
-    errors = (_gradient_errors if adjoint else _errors)(scene, end, right)
+    errors = (_gradient_errors if adjoint else _relative_errors)(scene, end, reference)
     if not errors["error"] < WRONG:
         return []
     record = Measurement(
         scene.name, method.name, method.group, "gradient" if adjoint else "value", adjoint,
-        setting, steps=float(steps), compile=ready.compile, memory=ready.memory, **errors,
+        setting, steps=float(steps), compile=prepared.compile, memory=prepared.memory, **errors,
     )  # fmt: skip
-    return [_Job(record, ready, [first])]
+    return [_Job(record, prepared, [first])]
 
 
-def _errors(scene: BenchmarkScene, end: np.ndarray | Array, right: Reference) -> dict[str, float]:
-    error, rate = distance(scene, end, right.end)
-    energy, momentum = drifts(scene, np.asarray(end))
+def _relative_errors(
+    scene: BenchmarkScene, final_state: np.ndarray | Array, reference: Reference
+) -> dict[str, float]:
+    error, rate = state_errors(scene, final_state, reference.end)
+    energy, momentum = drifts(scene, np.asarray(final_state))
     return {"error": error, "error_rate": rate, "energy": energy, "momentum": momentum}
 
 
 def _gradient_errors(
-    scene: BenchmarkScene, slope: np.ndarray | Array, right: Reference
+    scene: BenchmarkScene, slope: np.ndarray | Array, reference: Reference
 ) -> dict[str, float]:
-    found, wanted = np.asarray(slope, float), np.asarray(right.gradient)
+    gradient, wanted = np.asarray(slope, float), np.asarray(reference.gradient)
 
-    def off(part: slice) -> float:
-        miss, size = np.linalg.norm(found[part] - wanted[part]), np.linalg.norm(wanted[part])
+    def relative_error(part: slice) -> float:
+        miss, size = np.linalg.norm(gradient[part] - wanted[part]), np.linalg.norm(wanted[part])
         return float(miss / max(size, 1e-300))
 
-    parts = {key: off(part) for key, part in scene.blocks.items()}
-    return {"error": off(slice(None)), **parts}
+    parts = {key: relative_error(part) for key, part in scene.blocks.items()}
+    return {"error": relative_error(slice(None)), **parts}
 
 
 def drifts(scene: BenchmarkScene, end: np.ndarray | Array) -> tuple[float, float]:
@@ -242,7 +254,7 @@ def _time_jobs(jobs: list[_Job], rounds: int) -> None:
 
 def long_drift(
     steps: int = STEPS,
-    only: Sequence[str] | None = None,
+    names: Sequence[str] | None = None,
     *,
     progress: Callable[[str], None] | None = None,
 ) -> list[Measurement]:
@@ -258,13 +270,13 @@ def long_drift(
     start = Attitude([0.955336489125606, 0.29552020666133955, 0.0, 0.0], [0.4, 0.3, 1.2])
     law = HeavyTop(1.0, [0.05, 0.1, 0.3], [0.0, 0.0, -1.0])
     field = AttitudeEquations(body, law)
-    unknown = sorted(set(only or ()) - set(RUNS))
+    unknown = sorted(set(names or ()) - set(RUNS))
     if unknown:
         raise ValueError(f"long_drift: no method {unknown[0]!r}; there are {', '.join(RUNS)}")
     if steps < 100 * (LOOKS - 1):
         raise ValueError(f"long_drift: wanted {100 * (LOOKS - 1)} steps or more, got {steps}")
-    found = []
-    for name in RUNS if only is None else [name for name in RUNS if name in only]:
+    drifts_by_method = []
+    for name in RUNS if names is None else [name for name in RUNS if name in names]:
         h, solver = RUNS[name]
         if progress is not None:
             progress(f"long-drift: {name}")
@@ -281,7 +293,7 @@ def long_drift(
             away = {k: float(v) for k, v in drift(ts / part, ys, body, law).items()}
             if not np.isfinite(list(away.values())).all():
                 raise FloatingPointError(f"long_drift: {name} gave no numbers: {away}")
-            found.append(
+            drifts_by_method.append(
                 Measurement(
                     scene, f"{name}, equal steps", "ours", "value", "", h, error=away["energy"],
                     energy=away["energy"], momentum=away["momentum_along_axis"],
@@ -289,4 +301,4 @@ def long_drift(
                     compile=compiling,
                 )
             )  # fmt: skip
-    return found
+    return drifts_by_method

@@ -12,7 +12,7 @@ from rigidjax.workprecision.record import Measurement, list_records
 WANTED = (1e-4, 1e-7, 1e-10)
 
 
-def front(records: Iterable[Measurement]) -> list[Measurement]:
+def pareto_front(records: Iterable[Measurement]) -> list[Measurement]:
     """Return the records of one scene and kind on the Pareto front of error and time.
 
     A record is compared with the curves of the others, log–log between their settings, not only
@@ -49,7 +49,7 @@ def time_to(records: Iterable[Measurement], error: float) -> float:
     This is the time of the coarsest setting if its error is already smaller, and NaN if no setting
     reaches the error.
     """
-    error = _checks.positive(error, "error")
+    error = _checks.positive_float(error, "error")
     rungs = sorted((r for r in list_records(records) if r.error == r.error), key=lambda r: r.time)
     # Errors need not fall with every setting: only the least error up to a time counts.
     least, seen = math.inf, []
@@ -106,20 +106,23 @@ def choose(records: Iterable[Measurement], wanted: Sequence[float] = WANTED) -> 
     return [_choice([r for r in records if r.scene == s], s, e) for s in scenes for e in wanted]
 
 
-def _choice(here: list[Measurement], scene: str, error: float) -> Choice:
-    values, slopes = times_by_method(here, "value", error), times_by_method(here, "gradient", error)
-    ours = {r.label for r in here if r.group == "ours"}
+def _choice(records: list[Measurement], scene: str, error: float) -> Choice:
+    values, slopes = (
+        times_by_method(records, "value", error),
+        times_by_method(records, "gradient", error),
+    )
+    ours = {r.label for r in records if r.group == "ours"}
 
-    def first(times: dict[str, float], own: bool = True) -> tuple[str, float]:
+    def quickest(times: dict[str, float], own: bool = True) -> tuple[str, float]:
         return next(((n, t) for n, t in times.items() if (n in ours) == own), ("", math.nan))
 
-    best, elsewhere = first(values), first(values, own=False)
+    best, elsewhere = quickest(values), quickest(values, own=False)
     if elsewhere[1] >= best[1]:
         elsewhere = "", math.nan
-    default = "closed form" if any(r.method == "closed form" for r in here) else "simulate"
+    default = "closed form" if any(r.method == "closed form" for r in records) else "simulate"
     its = [t for n, t in slopes.items() if n.split(", ")[0] == default]
     defaults = values.get(default, math.nan), min(its, default=math.nan)
-    return Choice(scene, error, *best, *first(slopes), *defaults, *elsewhere)
+    return Choice(scene, error, *best, *quickest(slopes), *defaults, *elsewhere)
 
 
 def times_by_method(records: Iterable[Measurement], kind: str, error: float) -> dict[str, float]:
@@ -147,15 +150,16 @@ def table(lines: Iterable[Choice]) -> str:
     if isinstance(lines, str) or not isinstance(lines, Iterable):
         raise TypeError(f"lines: wanted what choose returns, got {type(lines).__name__}")
     for c in lines:
-        _checks.instance(c, Choice, "lines", wanted="lines of choose")
-        peer = f"{c.peer}, {_micro(c.peer_time)}" if c.peer else ""
+        _checks.require_instance(c, Choice, "lines", requirement="lines of choose")
+        peer = f"{c.peer}, {_in_microseconds(c.peer_time)}" if c.peer else ""
         rows.append(
-            f"| {c.scene} | {c.wanted:.0e} | {c.method or 'none'} | {_micro(c.time)} | "
-            f"{c.gradient or 'none'} | {_micro(c.gradient_time)} | {_micro(c.default)} "
-            f"({_micro(c.default_gradient)}) | {peer} |"
+            f"| {c.scene} | {c.wanted:.0e} | {c.method or 'none'} | {_in_microseconds(c.time)} | "
+            f"{c.gradient or 'none'} | {_in_microseconds(c.gradient_time)} | "
+            f"{_in_microseconds(c.default)} "
+            f"({_in_microseconds(c.default_gradient)}) | {peer} |"
         )
     return "\n".join(rows)
 
 
-def _micro(seconds: float) -> str:
+def _in_microseconds(seconds: float) -> str:
     return "–" if seconds != seconds else f"{seconds * 1e6:.3g}"

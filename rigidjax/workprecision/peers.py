@@ -19,20 +19,20 @@ from jaxtyping import Array
 from rigidjax import _checks
 from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.workprecision.jax_methods import methods_in_jax
-from rigidjax.workprecision.scene import BenchmarkScene, Ready, TimedMethod
+from rigidjax.workprecision.scene import BenchmarkScene, PreparedMethod, TimedMethod
 
 TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
 TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
 
 
-def _rates(scene: BenchmarkScene, numbers: np.ndarray, **how: Any) -> Any:
+def _rates(scene: BenchmarkScene, numbers: np.ndarray, **options: Any) -> Any:
     """Return the plain equations of a scene on Python's floats."""
     plain: Any = scene.plain
-    return plain(tuple(map(float, numbers)), math.sin, math.cos, math.sqrt, **how)
+    return plain(tuple(map(float, numbers)), math.sin, math.cos, math.sqrt, **options)
 
 
-def _written_out(scene: BenchmarkScene) -> bool:
+def _is_written_out(scene: BenchmarkScene) -> bool:
     return scene.plain is not None
 
 
@@ -40,13 +40,13 @@ def _has_weight(scene: BenchmarkScene) -> bool:
     return scene.notes is not None and "com" in scene.notes and scene.body is not None
 
 
-def _in_double(scene: BenchmarkScene) -> bool:
+def _is_in_double(scene: BenchmarkScene) -> bool:
     # Importing gradsolve sets JAX to float64: it is refused for other scenes.
     return scene.plain is not None and scene.numbers.dtype == jnp.float64
 
 
-def _peer(
-    module: str, can: Callable[[BenchmarkScene], bool] = _written_out
+def _peer_decorator(
+    module: str, can: Callable[[BenchmarkScene], bool] = _is_written_out
 ) -> Callable[[Any], Any]:
     """Return a decorator that makes a method's `value` from `make(scene, numbers, start, module) →
     run`.
@@ -55,14 +55,14 @@ def _peer(
     """
 
     def wrapped(make: Callable[[BenchmarkScene, np.ndarray, np.ndarray, Any], Any]) -> Any:
-        def ready(scene: BenchmarkScene) -> Ready | None:
+        def ready(scene: BenchmarkScene) -> PreparedMethod | None:
             if not can(scene):
                 return None
-            numbers, start = (np.asarray(v) for v in (scene.numbers, scene.flat(scene.state0)))
+            numbers, start = (np.asarray(v) for v in (scene.numbers, scene.flatten(scene.state0)))
             loaded = importlib.import_module(module)
             begin = time.perf_counter()
             run = make(scene, numbers, start.astype(float), loaded)
-            return Ready(run, time.perf_counter() - begin)
+            return PreparedMethod(run, time.perf_counter() - begin)
 
         return ready
 
@@ -86,13 +86,13 @@ def _run_of_stepper(
     return run
 
 
-@_peer("scipy.integrate")
+@_peer_decorator("scipy.integrate")
 def _scipy(scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, _: ModuleType) -> Any:
     rates = _rates(scene, numbers)
     return _run_of_stepper(scene.end, start, lambda t, y: np.array(rates(t, y)))
 
 
-@_peer("numba")
+@_peer_decorator("numba")
 def _numba(scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, numba: ModuleType) -> Any:
     rates = _rates(scene, numbers, wrap=numba.njit)
 
@@ -104,7 +104,7 @@ def _numba(scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, numba:
     return _run_of_stepper(scene.end, start, f)
 
 
-@_peer("mujoco", _has_weight)
+@_peer_decorator("mujoco", _has_weight)
 def _mujoco(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, mujoco: ModuleType
 ) -> Any:
@@ -148,7 +148,7 @@ def _system(scene: BenchmarkScene, hy: ModuleType, numbers: Sequence[Any]) -> An
 
 
 def _run_of_propagator(
-    hy: ModuleType, end: float, start: np.ndarray, system: Any, **how: Any
+    hy: ModuleType, end: float, start: np.ndarray, system: Any, **options: Any
 ) -> Any:
     """Return the run tolerance → (state at the end, steps). Order and code depend on the tolerance:
     each is compiled.
@@ -157,7 +157,7 @@ def _run_of_propagator(
 
     def run(setting: float) -> tuple[Any, Any]:
         if setting not in made:
-            stepper = hy.taylor_adaptive(system, start, tol=setting, **how)
+            stepper = hy.taylor_adaptive(system, start, tol=setting, **options)
             made[setting] = stepper, stepper.state.copy()
         stepper, first = made[setting]
         stepper.state[:], stepper.time = first, 0.0
@@ -168,13 +168,13 @@ def _run_of_propagator(
     return run
 
 
-@_peer("heyoka")
+@_peer_decorator("heyoka")
 def _taylor(scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, hy: ModuleType) -> Any:
     system = _system(scene, hy, list(map(float, numbers)))
     return _run_of_propagator(hy, scene.end, start, system)
 
 
-@_peer("heyoka")
+@_peer_decorator("heyoka")
 def _variational(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, hy: ModuleType
 ) -> Any:
@@ -190,7 +190,7 @@ def _variational(
         hy, scene.end, start, varied, pars=numbers[:size], compact_mode=True
     )
     n = len(start)
-    chain = np.asarray(jax.jacfwd(lambda p: scene.flat(scene.assembled(p)[1]))(scene.numbers))
+    chain = np.asarray(jax.jacfwd(lambda p: scene.flatten(scene.assemble(p)[1]))(scene.numbers))
     pull = jax.jit(jax.grad(scene.loss))
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -198,9 +198,9 @@ def _variational(
         slope = np.asarray(pull(state[:n])) @ state[n:].reshape(n, -1)
         # The derivative by the initial state is carried on to the numbers of the scene; then the
         # derivative by the parameters is added.
-        found = slope[:n] @ chain
-        found[:size] += slope[n : n + size]
-        return found, steps
+        gradient = slope[:n] @ chain
+        gradient[:size] += slope[n : n + size]
+        return gradient, steps
 
     return run
 
@@ -226,26 +226,26 @@ class _Ensemble:
         assert self.plain is not None
         return jnp.stack(self.plain(tuple(p), jnp.sin, jnp.cos, jnp.sqrt)(t, y))
 
-    def call(self, name: str, setting: float, **how: Any) -> Any:
-        how |= dict(engine="vern7_replay", fused=False, rtol=setting, atol=1e-3 * setting)
-        return getattr(self.module, name)(self, self.start, self.numbers, **how)
+    def call(self, name: str, setting: float, **options: Any) -> Any:
+        options |= dict(engine="vern7_replay", fused=False, rtol=setting, atol=1e-3 * setting)
+        return getattr(self.module, name)(self, self.start, self.numbers, **options)
 
 
-@_peer("gradsolve", _in_double)
+@_peer_decorator("gradsolve", _is_in_double)
 def _solve_and_record(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
 ) -> Any:
     ensemble = _Ensemble(scene, numbers, start, module)
 
     def run(setting: float) -> tuple[Any, Any]:
-        found = ensemble.call("solve", setting)
-        return found.y_final[0], int(found.accepted_steps[0])
+        solution = ensemble.call("solve", setting)
+        return solution.y_final[0], int(solution.accepted_steps[0])
 
     run(TOLERANCES[0])
     return run
 
 
-@_peer("gradsolve", _in_double)
+@_peer_decorator("gradsolve", _is_in_double)
 def _replay(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
 ) -> Any:
@@ -260,7 +260,7 @@ def _replay(
         count = int(ensemble.call("solve", setting).accepted_steps[0])
 
         def loss(numbers: Array) -> Any:
-            first = scene.flat(scene.assembled(numbers)[1])
+            first = scene.flatten(scene.assemble(numbers)[1])
             return scene.loss(end(first[None], numbers[None])[0])
 
         return jax.jit(jax.grad(loss)).lower(scene.numbers).compile(), count
@@ -305,6 +305,6 @@ def methods(group: str | None = None) -> list[TimedMethod]:
     ['closed form', 'simulate']
     """
     if group is not None:
-        _checks.word(group, ("ours", "jax", "peer"), "group")
-    found = [*methods_in_jax(), *methods_outside()]
-    return [method for method in found if group in (None, method.group)]
+        _checks.require_option(group, ("ours", "jax", "peer"), "group")
+    available = [*methods_in_jax(), *methods_outside()]
+    return [method for method in available if group in (None, method.group)]

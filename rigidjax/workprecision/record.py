@@ -66,11 +66,11 @@ _WORDS = ("scene", "method", "group", "kind", "adjoint")
 
 def list_records(records: Iterable[Measurement], name: str = "records") -> list[Measurement]:
     """Return the records as a list. **Raises:** `TypeError` if something else is among them."""
-    _checks.instance(records, Iterable, name, wanted="records")
-    found = list(records)
-    for record in found:
-        _checks.instance(record, Measurement, name)
-    return found
+    _checks.require_instance(records, Iterable, name, requirement="records")
+    items = list(records)
+    for record in items:
+        _checks.require_instance(record, Measurement, name)
+    return items
 
 
 def write_csv(records: Iterable[Measurement], path: str | Path) -> None:
@@ -122,13 +122,13 @@ def differences(
         new = now.get(key)
         if new is None:
             if old.scene in scenes and old.error < 0.1:
-                wrong.append(f"{_name(old)}: not there any more")
+                wrong.append(f"{_scene_and_label(old)}: not there any more")
             continue
         a, b = max(old.error, FLOOR), max(new.error, FLOOR)
         if not 1 / WORSE <= b / a <= WORSE or math.isnan(new.error) != math.isnan(old.error):
-            wrong.append(f"{_name(old)}: error was {old.error:.2g}, is {new.error:.2g}")
+            wrong.append(f"{_scene_and_label(old)}: error was {old.error:.2g}, is {new.error:.2g}")
         if not math.isnan(old.steps) and abs(new.steps - old.steps) > max(STEPS * old.steps, 1):
-            wrong.append(f"{_name(old)}: steps were {old.steps:g}, are {new.steps:g}")
+            wrong.append(f"{_scene_and_label(old)}: steps were {old.steps:g}, are {new.steps:g}")
     before, after = _ratios(then, set(now)), _ratios(now, set(then))
     for label, ratio in after.items():
         if label in before and not 1 / SLOWER <= ratio / before[label] <= SLOWER:
@@ -142,7 +142,7 @@ def records_to_store(records: Iterable[Measurement]) -> list[Measurement]:
     `BASE`.
     """
     records = [r for r in records if r.group != "peer"]
-    middle = _middles(records)
+    middle = _median_times(records)
     bases = [middle.get((r.scene, "value", BASE), math.nan) for r in records]
     return [
         dataclasses.replace(
@@ -157,11 +157,11 @@ def _key(record: Measurement) -> tuple[str, ...]:
     return (record.scene, record.kind, record.label, f"{record.setting:.6g}")
 
 
-def _name(record: Measurement) -> str:
+def _scene_and_label(record: Measurement) -> str:
     return f"{record.scene}, {record.kind}, {record.label} at {record.setting:g}"
 
 
-def _middles(records: Iterable[Measurement]) -> dict[tuple[str, str, str], float]:
+def _median_times(records: Iterable[Measurement]) -> dict[tuple[str, str, str], float]:
     """Return the median time of each scene, kind and label."""
     times: dict[tuple[str, str, str], list[float]] = {}
     for r in records:
@@ -172,7 +172,7 @@ def _middles(records: Iterable[Measurement]) -> dict[tuple[str, str, str], float
 
 def _ratios(table: dict, common: set) -> dict[tuple[str, str, str], float]:
     """Return the median over common settings of each label's time, divided by that of `BASE`."""
-    middle = _middles(record for key, record in table.items() if key in common)
+    middle = _median_times(record for key, record in table.items() if key in common)
     return {
         label: spent / middle[label[0], "value", BASE]
         for label, spent in middle.items()

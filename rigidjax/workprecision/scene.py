@@ -95,10 +95,12 @@ class BenchmarkScene(eqx.Module):
             )
         hint = "errors are angles between attitudes, or distances"
         wanted = "an Attitude or a Point"
-        _checks.instance(self.state0, (Attitude, Point), "state0", wanted=wanted, hint=hint)
+        _checks.require_instance(
+            self.state0, (Attitude, Point), "state0", requirement=wanted, hint=hint
+        )
         if self.body is not None:
-            validation.single(self.body, Inertia, "body", hint="or None with a Point")
-        _checks.positive(self.end, "end", "an end > 0, s")
+            validation.require_single_body(self.body, Inertia, "body", hint="or None with a Point")
+        _checks.positive_float(self.end, "end", "an end > 0, s")
 
     @property
     def numbers(self) -> Float[Array, " parameters"]:
@@ -120,14 +122,14 @@ class BenchmarkScene(eqx.Module):
             return {"by_attitude": slice(0, 3), "by_rate": slice(3, 6)}
         return {"by_inertia": slice(0, 6), "by_rate": slice(6, 9), "by_attitude": slice(9, 13)}
 
-    def assembled(self, numbers: Float[Array, " parameters"]) -> tuple[Any, Any]:
+    def assemble(self, numbers: Float[Array, " parameters"]) -> tuple[Any, Any]:
         """Return the body and the initial state with these `numbers`."""
         if self.body is None:
             return None, Point(numbers[:3], numbers[3:])
         tensor = from_components(*(numbers[i] for i in range(6)))
         return Inertia(tensor), Attitude(quaternion.normalise(numbers[9:]), numbers[6:9])
 
-    def flat(self, state: PyTree) -> Float[Array, " state"]:
+    def flatten(self, state: PyTree) -> Float[Array, " state"]:
         """Return a state as one vector, (7,) or (6,)."""
         return jnp.concatenate(jax.tree.leaves(state))
 
@@ -149,27 +151,29 @@ class BenchmarkScene(eqx.Module):
         return jnp.sum(a * quaternion.rotate(end[:4], b)) + jnp.sum(c * end[4:]) / two
 
 
-def distance(
-    scene: BenchmarkScene, end: ArrayLike | Sequence[float], right: ArrayLike | Sequence[float]
+def state_errors(
+    scene: BenchmarkScene,
+    final_state: ArrayLike | Sequence[float],
+    reference: ArrayLike | Sequence[float],
 ) -> tuple[float, float]:
     """Return the errors of attitude (an angle, rad) and of Ω; for a point those of position and
     velocity, all relative.
     """
-    end, right = np.asarray(end, float), np.asarray(right, float)
+    final_state, reference = np.asarray(final_state, float), np.asarray(reference, float)
     one, two = scene.size
     if scene.body is None:
-        first, second = end[:3] - right[:3], end[3:] - right[3:]
+        first, second = final_state[:3] - reference[:3], final_state[3:] - reference[3:]
         return float(np.linalg.norm(first)) / one, float(np.linalg.norm(second)) / two
-    if not np.isfinite(end).all():
+    if not np.isfinite(final_state).all():
         return float("nan"), float("nan")
-    (a, *u), (b, *v) = end[:4] / np.linalg.norm(end[:4]), right[:4]
+    (a, *u), (b, *v) = final_state[:4] / np.linalg.norm(final_state[:4]), reference[:4]
     u, v = np.asarray(u), np.asarray(v)
     turn = a * v - b * u + np.cross(v, u)
     angle = 2 * float(np.arctan2(np.linalg.norm(turn), abs(a * b + u @ v)))
-    return angle, float(np.linalg.norm(end[4:] - right[4:])) / two
+    return angle, float(np.linalg.norm(final_state[4:] - reference[4:])) / two
 
 
-class Ready(NamedTuple):
+class PreparedMethod(NamedTuple):
     """Hold a method prepared for a scene.
 
     **Fields:** `run` setting → (the last state, or the gradient, as one vector; steps taken),
@@ -205,6 +209,6 @@ class TimedMethod(NamedTuple):
     name: str
     group: str
     settings: Sequence[float | int]
-    value: Callable[[BenchmarkScene], Ready | None]
-    gradients: dict[str, Callable[[BenchmarkScene], Ready | None]] = {}  # noqa: RUF012
+    value: Callable[[BenchmarkScene], PreparedMethod | None]
+    gradients: dict[str, Callable[[BenchmarkScene], PreparedMethod | None]] = {}  # noqa: RUF012
     equal: bool = False

@@ -33,24 +33,24 @@ BODIES: dict[str, tuple[str, Any, Any, float, Any, Any]] = {
     ),
     "heavy-top": (
         "heavy symmetric top", (1.0, 1.0, 0.7), (0.3, 0.2, 5.0), 50.0,
-        equations.heavy, (0.0, 0.0, 0.5, *WEIGHT),
+        equations.heavy_top_torque, (0.0, 0.0, 0.5, *WEIGHT),
     ),
     "asymmetric-top": (
         "heavy asymmetric top", (1.0, 1.3, 0.8), (0.3, 0.2, 5.0), 50.0,
-        equations.heavy, (0.1, 0.05, 0.5, *WEIGHT),
+        equations.heavy_top_torque, (0.1, 0.05, 0.5, *WEIGHT),
     ),
     "gravity-gradient": (
         "gravity gradient on a circular orbit", (1.0, 1.3, 0.7), (0.1, 0.2, 0.7), 100.0,
-        equations.gradient, (0.1,),
+        equations.gravity_gradient_torque, (0.1,),
     ),
     "damped-gyrostat": (
         "damped gyrostat", (1.0, 1.3, 0.7), (1.0, 0.5, 2.0), 50.0,
-        equations.gyrostat, (0.0, 0.3, 0.1, 0.01, 0.02, 0.01),
+        equations.gyrostat_torque, (0.0, 0.3, 0.1, 0.01, 0.02, 0.01),
     ),
     **{
         f"spinning-top-1e{power}": (
             f"top spun at {10.0**power:g} rad/s", (1.0, 1.0, 0.7), (0.0, 0.0, 10.0**power), 1.0,
-            equations.heavy, (0.0, 0.0, 0.5, *WEIGHT),
+            equations.heavy_top_torque, (0.0, 0.0, 0.5, *WEIGHT),
         )
         for power in (2, 3, 4)
     },
@@ -69,24 +69,24 @@ class Circle(eqx.Module):
         return self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), zero])
 
 
-def _identity(x: Any) -> Any:
+def _unchanged(x: Any) -> Any:
     return x
 
 
-def _torque(kind: Callable[..., Any] | None, constants: Sequence[float]) -> Any:
+def _torque_of_equation(kind: Callable[..., Any] | None, constants: Sequence[float]) -> Any:
     """Return the library's torque for an equation of `workprecision.equations`."""
-    if kind is equations.heavy:
+    if kind is equations.heavy_top_torque:
         return HeavyTop(1.0, constants[:3], constants[3:])
-    if kind is equations.gyrostat:
+    if kind is equations.gyrostat_torque:
         return Sum(Flywheel(constants[:3]), Damping(constants[3:]))
-    if kind is equations.gradient:
+    if kind is equations.gravity_gradient_torque:
         (rate,) = constants
         circle = Circle(jnp.asarray(RADIUS), jnp.asarray(rate))
         return GravityGradient(rate**2 * RADIUS**3, circle)
     return None
 
 
-def _body(
+def _body_scene(
     name: str,
     title: str,
     moments: Sequence[float],
@@ -100,26 +100,28 @@ def _body(
         sin: Callable[..., Any],
         cos: Callable[..., Any],
         sqrt: Callable[..., Any],
-        wrap: Callable[..., Any] = _identity,
-        number: Callable[..., Any] = _identity,
+        wrap: Callable[..., Any] = _unchanged,
+        number: Callable[..., Any] = _unchanged,
     ) -> Any:
         exact = tuple(number(c) for c in constants)
         torque = None
         if kind is not None:
-            torque = wrap(kind(numbers[:6], exact, sin, cos, wrap(equations.into_body)))
+            torque = wrap(kind(numbers[:6], exact, sin, cos, wrap(equations.to_body_axes)))
         return wrap(equations.body_rates(numbers[:6], torque))
 
     # MuJoCo can do scenes with weight alone, or without torque.
-    com, gravity = (constants[:3], constants[3:]) if kind is equations.heavy else ((0.0,) * 3,) * 2
-    weighs = kind in (None, equations.heavy)
+    com, gravity = (
+        (constants[:3], constants[3:]) if kind is equations.heavy_top_torque else ((0.0,) * 3,) * 2
+    )
+    weighs = kind in (None, equations.heavy_top_torque)
     return BenchmarkScene(
         name, title, Inertia.from_principal(*moments), Attitude(TILTED, omega),
-        _torque(kind, constants), end, plain, stored_answer(name), slow=omega[2] > 1e3,
+        _torque_of_equation(kind, constants), end, plain, stored_answer(name), slow=omega[2] > 1e3,
         notes={"mass": 1.0, "com": com, "gravity": gravity} if weighs else None,
     )  # fmt: skip
 
 
-def _point(
+def _point_scene(
     name: str,
     title: str,
     start: Point,
@@ -133,8 +135,8 @@ def _point(
         sin: Callable[..., Any],
         cos: Callable[..., Any],
         sqrt: Callable[..., Any],
-        wrap: Callable[..., Any] = _identity,
-        number: Callable[..., Any] = _identity,
+        wrap: Callable[..., Any] = _unchanged,
+        number: Callable[..., Any] = _unchanged,
     ) -> Any:
         return wrap(kind(tuple(number(c) for c in constants), sqrt))
 
@@ -145,18 +147,18 @@ def _foucault() -> BenchmarkScene:
     """Return Foucault's pendulum, released at rest, for ten minutes."""
     law = places.foucault(0.85, 67.0)
     _, north, up = (float(w) for w in law.place.angular_velocity())
-    return _point(
-        "foucault", "Foucault's pendulum", law.start(3.0, 0.0), 600.0, law, equations.foucault,
-        (float(law.place.gravity), north, up),
+    return _point_scene(
+        "foucault", "Foucault's pendulum", law.start(3.0, 0.0), 600.0, law,
+        equations.foucault_rates, (float(law.place.gravity), north, up),
     )  # fmt: skip
 
 
 def _arenstorf() -> BenchmarkScene:
     """Return Arenstorf's orbit about Earth and Moon, for one period."""
     mu, x, v, period = ARENSTORF
-    return _point(
+    return _point_scene(
         "arenstorf", "Arenstorf's orbit", Point([x, 0.0, 0.0], [0.0, v, 0.0]), period,
-        orbits.cr3bp(mu), equations.three_body, (mu,),
+        orbits.cr3bp(mu), equations.three_body_rates, (mu,),
     )  # fmt: skip
 
 
@@ -170,5 +172,5 @@ def scenes() -> dict[str, Callable[[], BenchmarkScene]]:
     >>> sorted(scenes())[:3]
     ['arenstorf', 'asymmetric-top', 'damped-gyrostat']
     """
-    bodies = {name: functools.partial(_body, name, *row) for name, row in BODIES.items()}
+    bodies = {name: functools.partial(_body_scene, name, *row) for name, row in BODIES.items()}
     return {**bodies, "foucault": _foucault, "arenstorf": _arenstorf}

@@ -126,9 +126,9 @@ def test_many_rows_are_checked_where_they_are():
     with pytest.raises(ValueError, match="for body 4321"):
         jax.jit(lambda h: rj.batch.rollout(bodies, rj.Attitude(bad, start.omega), h, 1))(0.1)
     for rows in (jnp.ones((count, 3)), jnp.ones((5, 3))):
-        assert _checks.finite(rows, "rows") is rows
+        assert _checks.require_finite(rows, "rows") is rows
         with pytest.raises(ValueError, match=r"rows: contains NaN or infinity at index \(4, 1\)"):
-            _checks.finite(rows.at[4, 1].set(jnp.nan), "rows")
+            _checks.require_finite(rows.at[4, 1].set(jnp.nan), "rows")
 
 
 def test_a_small_fit_on_a_machine_with_a_gpu(monkeypatch):
@@ -137,15 +137,15 @@ def test_a_small_fit_on_a_machine_with_a_gpu(monkeypatch):
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), jnp.ones((9, 3))))
     model = rj.identify.Model(record, rj.identify.PrincipalRatios())
     cpu = jax.devices("cpu")[0]
-    assert fits._quicker_place(model) is None
+    assert fits._faster_device(model) is None
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert platform() == "gpu"
-    assert fits._quicker_place(model) == cpu
+    assert fits._faster_device(model) == cpu
     with jax.default_device(cpu):
         assert platform() == "cpu"
-        assert fits._quicker_place(model) is None
+        assert fits._faster_device(model) is None
     monkeypatch.setattr(fits, "_FEW", 10)
-    assert fits._quicker_place(model) is None
+    assert fits._faster_device(model) is None
 
 
 def test_the_benchmark_in_small():

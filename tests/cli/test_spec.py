@@ -10,7 +10,7 @@ from rigidjax.cli.logs.errors import LogError, LogWarning
 
 T = np.round(0.02 * np.arange(100), 9)
 RATES = np.stack([np.cos(3 * T), np.sin(2 * T), 0.5 + 0 * T], axis=1)
-GYRO = [spec.channel("gyro=wx,wy,wz")]
+GYRO = [spec.parse_channel("gyro=wx,wy,wz")]
 
 
 @pytest.fixture(autouse=True)
@@ -59,19 +59,19 @@ def test_the_names_of_the_columns_say_the_units_of_sensors_and_wheels(tmp_path):
     values = np.column_stack([np.degrees(RATES), RATES, 60.0 + 0 * T])
     path = written(tmp_path, T, values, head)
     channels = [
-        spec.channel("gyro=x (°/s),y (°/s),z (°/s)"),
-        spec.channel("accelerometer=ax [g],ay [g],az [g]"),
+        spec.parse_channel("gyro=x (°/s),y (°/s),z (°/s)"),
+        spec.parse_channel("accelerometer=ax [g],ay [g],az [g]"),
     ]
-    record = spec.read_log(path, channels, wheels=[spec.wheel("motor (rpm):1e-6:x")])
+    record = spec.read_log(path, channels, wheels=[spec.parse_wheel("motor (rpm):1e-6:x")])
     np.testing.assert_allclose(record.readings[0].values, RATES, atol=1e-9)
     np.testing.assert_allclose(record.readings[1].values, 9.80665 * RATES, atol=1e-7)
     (speed,) = record.inputs.values()
     np.testing.assert_allclose(speed(0.5), 2 * np.pi, rtol=1e-12)
     for text, named in (("gyro=x (°/s),y (°/s),z (°/s):rad/s", "deg/s"),):
         with pytest.raises(LogError, match=f"is in {named} by its name, and rad/s is stated"):
-            spec.read_log(path, [spec.channel(text)])
+            spec.read_log(path, [spec.parse_channel(text)])
     with pytest.raises(LogError, match=r"'motor .rpm.' is in rpm by its name, and rad/s is stated"):
-        spec.read_log(path, channels, wheels=[spec.wheel("motor (rpm):1e-6:x:rad/s")])
+        spec.read_log(path, channels, wheels=[spec.parse_wheel("motor (rpm):1e-6:x:rad/s")])
 
 
 @pytest.mark.parametrize("bad", [{40: 38}, {40: 39, 70: 2}, {0: 99}, {99: 5}])
@@ -93,7 +93,7 @@ def test_bad_stamps_outside_the_window_are_no_matter_to_sensors_and_wheels(tmp_p
     t[[3, 80]] = T[[2, 10]]
     speeds = np.column_stack([RATES, 100.0 + 7 * T])
     path = written(tmp_path, t, speeds, "t,wx,wy,wz,s")
-    record = spec.read_log(path, GYRO, window=(0.4, 1.2), wheels=[spec.wheel("s:1e-6")])
+    record = spec.read_log(path, GYRO, window=(0.4, 1.2), wheels=[spec.parse_wheel("s:1e-6")])
     np.testing.assert_allclose(record.t, T[20:61], atol=1e-12)
     (speed,) = record.inputs.values()
     np.testing.assert_allclose(speed(1.7), 100 + 7 * 1.7, rtol=1e-6)
@@ -106,7 +106,7 @@ def test_a_wheel_is_read_where_rows_are_left_out_or_stamps_are_rounded(begin, tm
     speeds = np.column_stack([RATES, 100.0 + 7 * T])
     path = written(tmp_path, t, speeds, "t,wx,wy,wz,s", stamp="%.6f")
     with pytest.warns(LogWarning, match="1 of 100 rows are left out"):
-        record = spec.read_log(path, GYRO, wheels=[spec.wheel("s:1e-6")])
+        record = spec.read_log(path, GYRO, wheels=[spec.parse_wheel("s:1e-6")])
     (speed,) = record.inputs.values()
     times = np.array([0.3, 0.97, 1.0, 1.03, 1.9])
     np.testing.assert_allclose([speed(t) for t in times], 100 + 7 * times, rtol=1e-7)
@@ -116,7 +116,7 @@ def test_a_wheel_at_uneven_times_is_refused(tmp_path):
     speeds = np.column_stack([RATES, 100.0 + 7 * T])
     path = written(tmp_path, T + 0.004 * np.sin(9 * T), speeds, "t,wx,wy,wz,s")
     with pytest.raises(LogError, match="column 's': Series: wanted evenly spaced"):
-        spec.read_log(path, GYRO, wheels=[spec.wheel("s:1e-6")])
+        spec.read_log(path, GYRO, wheels=[spec.parse_wheel("s:1e-6")])
 
 
 def test_a_missing_stamp_is_a_row_that_is_left_out(tmp_path):
@@ -142,7 +142,7 @@ def test_times_in_another_unit_are_remarked_upon(tmp_path):
 @pytest.mark.parametrize("kind", ["gyro-x", "euler", "eulerZYX", "accelerometer-1", ""])
 def test_a_kind_of_sensor_that_is_none_is_refused(kind):
     with pytest.raises(LogError, match="wanted gyro, accelerometer, quaternion or euler-SEQUENCE"):
-        spec.channel(f"{kind}=a,b,c")
+        spec.parse_channel(f"{kind}=a,b,c")
 
 
 @pytest.mark.parametrize("window", [None, (0.5, 1.0)])

@@ -134,7 +134,7 @@ if __name__ == "__main__":
     parser.add_argument("--only", default="", help="fit the runs whose name begins so")
     options = parser.parse_args()
     runs = {path.stem: path for path in sorted(options.folder.glob("*.csv"))}
-    train = identify.Windows.joined(
+    train = identify.Windows.join(
         *(
             cut(path, 50, options.stride)
             for name, path in runs.items()
@@ -153,8 +153,8 @@ if __name__ == "__main__":
         print(f"{one.name} {one.value:.3g} ± {one.deviation:.2g}")
     print("I =", np.asarray(found.body.inertia.tensor), "kg m²")
     of_each = {name: cut(runs[name], 50, 1) for name in HELD_OUT}
-    for name, test in {"both": identify.Windows.joined(*of_each.values()), **of_each}.items():
-        model, held = identify.predict_windows(found, test), test.held()
+    for name, test in {"both": identify.Windows.join(*of_each.values()), **of_each}.items():
+        model, held = identify.predict_windows(found, test), test.held_horizons()
         for measure in ("mean_absolute", "mean_norm"):
             print(name, measure)
             shown("model", getattr(model, measure))

@@ -79,7 +79,7 @@ def filters(count):
         belief = jax.tree.map(lambda leaf: leaf[-1], run.belief)
         hits, halves = [], []
         for k in range(READ + 9, STEPS.size, 10):
-            belief = identify.step(model, belief, STEPS[k], jnp.zeros(3), seen=[False])
+            belief = identify.step(model, belief, STEPS[k], jnp.zeros(3), mask=[False])
             reach = 1.96 * belief.deviation
             hits.append(held((belief.state.omega - reach, belief.state.omega + reach), real[k]))
             halves.append(reach[0])

@@ -134,7 +134,7 @@ def with_torque(found, law):
 
 def drawn(best, key, count=1000):
     """Tensors (count, 3, 3) drawn from the posterior of one throw."""
-    if best.effective >= 100:
+    if best.effective_count >= 100:
         x = jax.random.choice(key, best.draws, (count,), p=best.weights)
     else:
         x = jax.random.multivariate_normal(key, best.x, best.covariance, (count,))
@@ -156,7 +156,7 @@ def throws_with_torque(law, joint, records, levers, whole=False):
         evidence = sum(evidence_of(best) for best in found)
         print(
             f"{name}, {law} torque: {sum(bool(best.converged) for best in found)} of {len(found)} "
-            f"converged, independent draws {min(float(best.effective) for best in found):.0f} and "
+            f"converged, independent draws {min(float(best.effective_count) for best in found):.0f} and "
             f"more, log evidence {evidence:.0f}, density {np.median(densities):.1e} N² m² s"
         )
         if law == "correlated":

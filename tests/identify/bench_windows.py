@@ -83,7 +83,7 @@ def numbers(fit):
 def cut(folder, count):
     runs = [p for p in sorted(folder.glob("*.csv")) if p.stem not in nanodrone.HELD_OUT]
     for stride in range(40, 0, -1):
-        found = identify.Windows.joined(*(nanodrone.cut(p, LENGTH, stride) for p in runs))
+        found = identify.Windows.join(*(nanodrone.cut(p, LENGTH, stride) for p in runs))
         if found.count >= count:
             break
     # Evenly chosen where there are more.

@@ -114,7 +114,7 @@ def test_a_plate_in_any_axes_is_found_and_told(thin):
     (told,) = [line for line in found.identifiability if "flat" in line]
     assert "(I1 + I2 − I3)/I3 ≤" in told
     (limit,) = found.limits
-    bound = limit.bound(np.asarray(found.seen))
+    bound = limit.bound(np.asarray(found.determined_covariance))
     assert 0 <= limit.flatness <= bound < 0.1
 
     def flatness(point):
@@ -147,7 +147,7 @@ def test_windows_say_that_a_body_is_flat_and_what_is_not_known():
         "A flat body fits as well: (I1 + I2 − I3)/I3 ≤" in one for one in found.identifiability
     )
     # A free body does not show its scale.
-    (both,) = found.undetermined
+    (both,) = found.undetermined_combinations
     assert set(both.names) >= {"I1", "I2", "I3"}
     np.testing.assert_allclose(
         found.body.moments / found.body.moments[2], [0.3, 0.7, 1.0], atol=1e-3

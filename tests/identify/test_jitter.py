@@ -8,7 +8,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.filtering.steps import require_sensors
-from rigidjax.identify.model.terms import independent
+from rigidjax.identify.model.terms import decorrelate
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
 TRUTH = np.array([1.0 / 2.1, 1.6 / 2.1])
@@ -38,8 +38,8 @@ def test_independent_errors_are_those_of_choleskys_factor(dtype, size):
         v = (size * v).astype(dtype)
         covariance = np.eye(k) + np.outer(v.astype(float), v.astype(float))
         lower = np.linalg.cholesky(covariance)
-        found, logs = independent(jnp.asarray(e), jnp.asarray(v))
-        slope = jax.jacfwd(lambda e, v=v: independent(e, jnp.asarray(v))[0])(jnp.asarray(e))
+        found, logs = decorrelate(jnp.asarray(e), jnp.asarray(v))
+        slope = jax.jacfwd(lambda e, v=v: decorrelate(e, jnp.asarray(v))[0])(jnp.asarray(e))
         digits = 1e-9 if dtype is np.float64 else 2e-4
         wanted, scale = np.linalg.inv(lower), max(1.0, size)
         np.testing.assert_allclose(found, wanted @ e, rtol=digits, atol=digits)
@@ -97,7 +97,7 @@ def test_a_known_jitter_widens_what_is_expected():
         record = identify.Recording(TS, (identify.Gyro(SIGMA, jitter=jitter), np.ones((101, 3))))
         problem = identify.Model(record, identify.PrincipalRatios())
         plan = problem.start(BODY, [5.0, 4.0, 4.0])
-        return identify.expected(problem, plan)[0].deviation
+        return identify.expected_quantities(problem, plan)[0].deviation
 
     assert 1.05 * deviation(None) < deviation(TAU)
     with pytest.raises(ValueError, match="known jitter"):
@@ -136,7 +136,7 @@ def test_where_jitter_has_no_meaning_it_is_refused_in_words():
 def test_the_log_density_is_that_of_the_full_covariance():
     found = fitted(identify.Gyro(SIGMA, jitter="estimated"), throw(3))
     wanted = 0.0
-    late = np.asarray(found.model.records.readings[0].late[0])
+    late = np.asarray(found.model.records.readings[0].jitter_error[0])
     for e, v in zip(np.asarray(found.residuals[0]), late, strict=True):
         covariance = SIGMA**2 * np.eye(3) + np.outer(v, v)
         wanted -= 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]

@@ -192,11 +192,13 @@ def test_a_design_expects_what_a_fit_then_finds(short_record):
     problem = identify.Model(short_record, identify.PrincipalRatios())
     found = identify.fit(problem, starts=1)
     plan = problem.start(BODY, [0.4, 1.2, -0.3])
-    for before, after in zip(identify.expected(problem, plan), found.quantities, strict=True):
+    for before, after in zip(
+        identify.expected_quantities(problem, plan), found.quantities, strict=True
+    ):
         np.testing.assert_allclose(before.deviation, after.deviation, rtol=0.05)
     silent = identify.Recording(short_record.t, (identify.Gyro(), short_record.readings[0].values))
     with pytest.raises(ValueError, match="a Gyro with known noise"):
-        identify.expected(identify.Model(silent, identify.PrincipalRatios()), plan)
+        identify.expected_quantities(identify.Model(silent, identify.PrincipalRatios()), plan)
 
 
 @pytest.mark.slow
@@ -204,7 +206,7 @@ def test_the_best_first_rate_shows_more(free_record):
     problem = identify.Model(free_record, identify.PrincipalRatios())
     start = [0.05, 0.1, 1.3]
     rate, promise = identify.best_first_rate(problem, BODY, start)
-    poor = identify.expected(problem, problem.start(BODY, start))
+    poor = identify.expected_quantities(problem, problem.start(BODY, start))
     np.testing.assert_allclose(jnp.linalg.norm(rate), np.linalg.norm(start), rtol=1e-9)
     doubts = [np.prod([q.deviation / q.value for q in qs[:2]]) for qs in (promise, poor)]
     assert doubts[0] < 0.5 * doubts[1]
@@ -283,8 +285,8 @@ def test_sensors_and_wheels_of_one_kind_have_names_of_their_own(tmp_path):
     path, rng = tmp_path / "log.csv", np.random.default_rng(0)
     table = np.column_stack([np.arange(20.0), rng.normal(size=(20, 8))])
     np.savetxt(path, table, delimiter=",", header="t,a,b,c,d,e,f,s,r")
-    channels = [spec.channel(text) for text in ("gyro=a,b,c", "gyro=d,e,f")]
-    wheels = [spec.wheel(text) for text in ("s:1e-6:x", "r:1e-6:y")]
+    channels = [spec.parse_channel(text) for text in ("gyro=a,b,c", "gyro=d,e,f")]
+    wheels = [spec.parse_wheel(text) for text in ("s:1e-6:x", "r:1e-6:y")]
     free = ("bias", "delay")
     record = spec.read_log(path, channels, wheels=wheels, free=free)
     slots = spec.model_of([record], "tensor", wheels=wheels, free=free).slots

@@ -77,7 +77,7 @@ def test_the_weights_of_a_network_are_fitted_to_recordings():
 
 def test_the_weights_of_a_network_are_fitted_to_windows():
     cut = [identify.windows(TS, rates(start), length=5, stride=3) for start in STARTS]
-    windows = identify.Windows.joined(*cut)
+    windows = identify.Windows.join(*cut)
     model = identify.Model(windows, identify.Known(BODY), torque=network(), free=WEIGHTS)
     fit = identify.fit(model, max_steps=60)
     assert fitted(fit).net.activation is jnp.tanh and distance(fitted(fit)) < 0.1

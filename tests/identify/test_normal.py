@@ -9,7 +9,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.model.model import AbstractPull, with_parts
-from rigidjax.identify.model.normal import Alone, Normal, normal_of
+from rigidjax.identify.model.normal import NormalMatrix, OwnBlocks, normal_of
 from rigidjax.identify.search.stages import errors_and_slopes
 from rigidjax.identify.uncertainty import covariance as uncertainty
 
@@ -90,7 +90,7 @@ def test_it_is_the_whole_matrix(dtype):
         np.testing.assert_allclose(found.diagonal, np.diag(wanted), rtol=exact)
         np.testing.assert_allclose(found @ jnp.asarray(x), wanted @ x, rtol=exact, atol=100 * exact)
         whole = wanted * np.outer(unit, unit) + np.diag(more)
-        made = found.in_units(jnp.asarray(unit)).plus(jnp.asarray(more))
+        made = found.in_units(jnp.asarray(unit)).add_diagonal(jnp.asarray(more))
         for side in (x, sides):
             solved = np.linalg.solve(whole, side)
             near = exact * np.abs(solved).max()
@@ -105,9 +105,9 @@ def test_it_is_the_whole_matrix(dtype):
 
 def test_a_matrix_that_is_not_positive_has_no_solution():
     core = jnp.asarray([[1.0, 2.0], [2.0, 1.0]])
-    assert not jnp.isfinite(Normal(core).solve(jnp.ones(2))).all()
+    assert not jnp.isfinite(NormalMatrix(core).solve(jnp.ones(2))).all()
     own, sides = jnp.ones((1, 1, 1)), jnp.asarray([[[2.0]]])
-    arrow = Normal(jnp.ones((1, 1)), Alone(own, sides, jnp.asarray([[1]])))
+    arrow = NormalMatrix(jnp.ones((1, 1)), OwnBlocks(own, sides, jnp.asarray([[1]])))
     assert not jnp.isfinite(arrow.solve(jnp.ones(2))).all()
 
 
@@ -235,6 +235,6 @@ def test_many_recordings_are_fitted_as_few_are():
     assert found.search.word == "found"
     blocks = errors_and_slopes(problem, found.x)
     linear = uncertainty.linearise(problem, found.x, found.noises, blocks)
-    step = found.seen @ linear.slope
+    step = found.determined_covariance @ linear.slope
     # At the least misfit the gradient vanishes, in standard deviations.
-    assert np.abs(step / np.sqrt(np.diag(np.asarray(found.seen)))).max() < 1e-3
+    assert np.abs(step / np.sqrt(np.diag(np.asarray(found.determined_covariance)))).max() < 1e-3

@@ -62,7 +62,7 @@ def test_a_negative_variance_gives_no_interval():
 
 def test_an_indefinite_information_is_told():
     found = fitted()
-    seen = np.asarray(found.seen).copy()
+    seen = np.asarray(found.determined_covariance).copy()
     seen[0, 0] = -seen[0, 0]
     numbers = quantities(
         found.model,
@@ -70,7 +70,9 @@ def test_an_indefinite_information_is_told():
         seen,
         np.asarray(found.null_directions),
     )
-    wrong = eqx.tree_at(lambda f: (f.seen, f.quantities), found, (jnp.asarray(seen), numbers))
+    wrong = eqx.tree_at(
+        lambda f: (f.determined_covariance, f.quantities), found, (jnp.asarray(seen), numbers)
+    )
     assert np.isnan(wrong.interval()["Ix/Iz"]).all()
     low, high = wrong.interval_of(lambda point: point.body.moments[:1])
     assert np.isnan(low).all() and np.isnan(high).all()
@@ -88,7 +90,7 @@ def test_a_fitted_number_has_a_width():
     exact = quantities(
         found.model,
         values_and_slopes(found.model, found.x, None),
-        1e-40 * np.asarray(found.seen),
+        1e-40 * np.asarray(found.determined_covariance),
         np.zeros((0, 5)),
     )
     for number in exact:
@@ -155,7 +157,7 @@ def test_the_deviation_of_a_positive_number_is_in_its_unit(size):
         where = lambda s: s.torque.coefficient
         free = identify.Free(where, "damping", scale=scale, positive=positive)
         problem = identify.Model(record, identify.Known(body), torque=law, free=[free])
-        planned.append(identify.expected(problem, problem.start(None, start))[3:])
+        planned.append(identify.expected_quantities(problem, problem.start(None, start))[3:])
     for plain, positive in zip(*planned, strict=True):
         assert plain.value == pytest.approx(size) == positive.value and positive.positive
         assert 1e-3 < positive.deviation / size < 0.2

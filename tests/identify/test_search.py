@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.model.normal import Normal
+from rigidjax.identify.model.normal import NormalMatrix
 from rigidjax.identify.model.terms import all_errors
 from rigidjax.identify.search import least_squares, stages
 from rigidjax.identify.search.least_squares import LMState, Settings
@@ -42,7 +42,7 @@ def an_end(point, cost, converged):
     """A search that began at a cost of one, and keeps nothing of where it ended."""
     one, line, no = jnp.asarray(1.0), jnp.zeros(5), jnp.asarray(False)
     return LMState(
-        one, point, jnp.asarray(cost), Normal(jnp.zeros((5, 5))), line, line, one, one, one,
+        one, point, jnp.asarray(cost), NormalMatrix(jnp.zeros((5, 5))), line, line, one, one, one,
         jnp.asarray(1), no, jnp.asarray(converged), (), no, one,
     )  # fmt: skip
 
@@ -168,7 +168,7 @@ def test_a_search_ends_in_the_noise_of_its_cost():
     def evaluated(x):
         error = scale * (x - 0.5)
         cost = 1e3 + 0.5 * jnp.sum(error**2) + 0.1 * jnp.sin(7e11 * x.sum())
-        return (), cost, Normal(jnp.diag(scale**2)), scale * error
+        return (), cost, NormalMatrix(jnp.diag(scale**2)), scale * error
 
     settings = Settings(1e-15, 1.0, 100)
     end = jax.jit(lambda x: least_squares.minimise(evaluated, x, jnp.ones(3), settings, ()))(

@@ -7,7 +7,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.data.full_scale import plateau
+from rigidjax.identify.data.full_scale import full_scale_of
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
 PLATE = rj.Inertia.from_principal(0.7, 1.3, 1.95)
@@ -266,14 +266,14 @@ def test_axes_that_are_known_to_be_turned_are_not_called_misread():
 def test_a_plateau_is_one_only_where_readings_are_cut_off():
     t = np.linspace(0.0, 10.0, 200)
     wave = np.sin(2 * t) + 0.3 * np.sin(5 * t)
-    assert plateau(wave) is None
-    assert plateau(wave.clip(-0.9, 0.9)) == 0.9
-    assert plateau((wave - 0.5).clip(-0.9, 0.9)) == 0.9
+    assert full_scale_of(wave) is None
+    assert full_scale_of(wave.clip(-0.9, 0.9)) == 0.9
+    assert full_scale_of((wave - 0.5).clip(-0.9, 0.9)) == 0.9
     # A slow wave in few digits is flat at its top.
-    assert plateau(np.round(np.sin(0.7 * t), 3)) is None
-    assert plateau(np.round(np.sin(0.7 * t) * 8) / 8) is None
-    assert plateau(np.full(200, 2.0)) is None
-    assert plateau(np.zeros(200)) is None
+    assert full_scale_of(np.round(np.sin(0.7 * t), 3)) is None
+    assert full_scale_of(np.round(np.sin(0.7 * t) * 8) / 8) is None
+    assert full_scale_of(np.full(200, 2.0)) is None
+    assert full_scale_of(np.zeros(200)) is None
 
 
 def test_time_stamps_that_scatter_are_named_and_can_be_a_sensor():

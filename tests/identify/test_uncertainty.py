@@ -35,7 +35,7 @@ def test_a_real_flat_body_has_intervals_with_a_width(toss):
     found = identify.fit(identify.Model(toss, identify.Ratios()))
     for low, high in found.interval().values():
         assert low < high
-    values = np.linalg.eigvalsh(np.asarray(found.seen))
+    values = np.linalg.eigvalsh(np.asarray(found.determined_covariance))
     assert values.min() > -1e-15 * values.max()
     words = " ".join(found.identifiability)
     assert "±0 " not in words and "I1/I3 is well determined" not in words

@@ -65,7 +65,9 @@ def test_combinations_are_told_apart_and_named():
     first, step_rate = probe.state0.q, 1 / probe.model.typical_rate
     assert rj.quaternion.angle(first) > 0.1  # so that the world's axes are not the body's
     mix = np.random.default_rng(0).normal(size=(3, 3))
-    found = fit_with(identify.Principal(1.5), [grown, heading, spun], mix=mix).undetermined
+    found = fit_with(
+        identify.Principal(1.5), [grown, heading, spun], mix=mix
+    ).undetermined_combinations
     assert sorted(one.in_words for one in found) == [
         "Ix, Iy and Iz rise together: only their ratios are determined.",
         "No reading changes where these change together: Ωz by +0.0005 rad/s, bias z by "
@@ -84,7 +86,7 @@ def test_axes_that_turn_are_named_by_the_tensor():
 
         return moved(model, range(6), (vector(1e-6) - vector(0.0)) / 1e-6)
 
-    (one,) = fit_with(chart, [tilted]).undetermined
+    (one,) = fit_with(chart, [tilted]).undetermined_combinations
     assert one.names == ("Ixy",)
     assert one.in_words == "Ixy is not determined: no reading changes with it."
 
@@ -137,6 +139,6 @@ def test_a_number_that_switches_a_torque_is_named():
         jnp.ones(null.shape[1]), jnp.asarray(null), (), Answer("found"),
         Answer("explains the readings"), (),
     )  # fmt: skip
-    words = [one.in_words for one in fit.undetermined]
+    words = [one.in_words for one in fit.undetermined_combinations]
     assert words[0].startswith("Readings change with end, but derivatives do not see it: a torque")
     assert words[1] == "Gain is not determined: no reading changes with it."

@@ -100,7 +100,7 @@ def test_known_numbers_come_back():
     ahead = identify.predict_windows(found, cut)
     assert ahead.steps.tolist() == list(range(1, 9))
     assert max(e.max() for e in ahead.mean_absolute.values()) < 1e-7
-    held = cut.held()
+    held = cut.held_horizons()
     rise = np.abs(np.asarray(states.omega)[1::8] - np.asarray(states.omega)[:-1:8]).mean()
     np.testing.assert_allclose(held.mean_absolute["omega"][0], rise, rtol=1e-12)
     # Of other windows, of another length, too.
@@ -135,7 +135,7 @@ def test_what_windows_do_not_show_has_an_infinite_deviation():
     found = fitted(cut, Slow(0.1, 0.1, 0.0), free, BALL)
     assert float(found.values["a"] + found.values["b"]) == pytest.approx(0.3, abs=0.02)
     assert {deviation(found, name) for name in "ab"} == {np.inf}
-    (both,) = found.undetermined
+    (both,) = found.undetermined_combinations
     assert both.names == ("a", "b")
 
 
@@ -156,7 +156,7 @@ def test_a_body_at_rest_shows_nothing_of_its_damping():
     )
     found = fitted(still, Slow(0.1, 0.0, 0.0), [Free(lambda s: s.torque.a, "a")])
     assert np.isinf(deviation(found, "a"))
-    assert [one.names for one in found.undetermined] == [("a",)]
+    assert [one.names for one in found.undetermined_combinations] == [("a",)]
 
 
 @pytest.mark.parametrize("apart", [1e-3, 1e-5, 3e-6])
@@ -212,7 +212,7 @@ def test_a_number_that_one_stretch_shows_is_named():
     # All of the push lies in the third of five stretches: the others do not show its size.
     assert np.isinf(deviation(found, "gain x")) and deviation(found, "damping") < 0.05
     assert "only windows 16 … 23 show gain x" in found.search.reasons
-    assert found.undetermined == ()
+    assert found.undetermined_combinations == ()
     low, high = found.interval_of(lambda point: point.values["gain"][0])
     assert np.isinf(low) and np.isinf(high)
     apart = fitted(cut, law, [GAIN, DAMPING], BALL, stretches=20)
@@ -266,9 +266,9 @@ def test_no_window_goes_across_a_gap():
     spins = rj.Spin(np.arange(30.0).reshape(10, 3))
     cut = identify.windows(t, spins, length=3)
     assert np.asarray(cut.starts.omega)[:, 0].tolist() == [0.0, 3.0, 6.0, 18.0]
-    both = identify.Windows.joined(cut, cut)
+    both = identify.Windows.join(cut, cut)
     assert both.count == 8
-    assert identify.Windows.joined(cut) is cut
+    assert identify.Windows.join(cut) is cut
 
 
 def test_a_fit_that_is_stopped_returns_its_best_point():
@@ -304,8 +304,8 @@ TIMES = np.arange(10.0)
         (lambda: identify.windows(TIMES, rj.Attitude(np.ones((10, 4)), np.ones((10, 3))), length=2), "q: wanted quaternions of length 1, scalar first, got another in row 0"),
         (lambda: identify.windows(TIMES, SPINS, length=2, noise={"q": 1.0}), "noise: wanted a number for each of"),
         (lambda: Model(identify.windows(TIMES, SPINS, {"u": np.ones(10)}, length=2), Known(BODY), torque=Push([1.0, 0, 0], 0.0, torques.Delayed(torques.Input("u"), -3.0))), r"inputs\['u'\]: a delay of -3 s reaches beyond the end of windows of 2 s"),
-        (lambda: identify.Windows.joined(), "wanted at least one"),
-        (lambda: identify.Windows.joined(*(identify.windows(TIMES, SPINS, length=k) for k in (2, 3))), "wanted one step, length"),
+        (lambda: identify.Windows.join(), "wanted at least one"),
+        (lambda: identify.Windows.join(*(identify.windows(TIMES, SPINS, length=k) for k in (2, 3))), "wanted one step, length"),
         (lambda: Model(identify.windows(TIMES, SPINS, length=2), Known(BODY), torque=GUESS), "the torque reads 'u', got none"),
         (lambda: Model(identify.windows(TIMES, SPINS, {"v": np.ones(10)}, length=2), Known(BODY), torque=GUESS), "the torque reads 'u', got 'v'"),
         (lambda: Model(identify.windows(TIMES, SPINS, length=2), Known(BODY), torque=torques.Damping(jnp.ones(3)), integrator=identify.FixedSteps(2)), "integrator: samples as inputs are held"),

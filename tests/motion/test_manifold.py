@@ -10,18 +10,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rigidjax as rj
-from rigidjax.identify.filtering.steps import Extended
+from rigidjax.identify.filtering.steps import ExtendedState
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.manifold import (
-    coordinates,
     dimension,
     minus,
     minus_small,
     names,
-    parts,
+    parts_by_name,
     plus,
+    rotation_slices,
     tangent,
-    turns,
+    tangent_to_vector,
 )
 
 Q = np.array([0.5, -0.1, 0.7, 0.3])
@@ -41,8 +41,8 @@ STATES = {
         0,
         ("motion.q", "motion.omega", "own.0", "own.1"),
     ),
-    "Extended": (
-        Extended(ATTITUDE, (jnp.ones(3),), (jnp.ones((2, 2)),)),
+    "ExtendedState": (
+        ExtendedState(ATTITUDE, (jnp.ones(3),), (jnp.ones((2, 2)),)),
         13,
         0,
         ("motion.q", "motion.omega", "torques.0", "walks.0"),
@@ -64,9 +64,9 @@ def test_size_and_names(kind):
     state, size, at, wanted = STATES[kind]
     assert dimension(state) == size
     assert names(state) == wanted
-    assert turns(state) == (() if at is None else (slice(at, at + 3),))
+    assert rotation_slices(state) == (() if at is None else (slice(at, at + 3),))
     change = change_of(state)
-    cut = parts(state, jnp.stack([change, 2 * change]))
+    cut = parts_by_name(state, jnp.stack([change, 2 * change]))
     assert tuple(cut) == wanted
     np.testing.assert_array_equal(np.concatenate(list(cut.values()), 1)[1], 2 * change)
 
@@ -104,7 +104,7 @@ def test_tangents(kind):
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-15), tangent(state, change), along
     )
-    np.testing.assert_allclose(coordinates(state, along), change, atol=1e-15)
+    np.testing.assert_allclose(tangent_to_vector(state, along), change, atol=1e-15)
     back = jax.jvp(lambda y: minus(y, state), (state,), (along,))[1]
     np.testing.assert_allclose(back, change, atol=1e-14)
 

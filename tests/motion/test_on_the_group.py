@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 
 Q = np.array([0.5, -0.7, 0.1, 0.5])
 
 
 def scaled(q):
-    return on_the_group(rj.Attitude(q, jnp.zeros(3, q.dtype))).q
+    return project_to_group(rj.Attitude(q, jnp.zeros(3, q.dtype))).q
 
 
 all_of = jax.jit(lambda q: (scaled(q), jax.jacfwd(scaled)(q), jax.jacrev(scaled)(q)))

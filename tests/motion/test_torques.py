@@ -94,7 +94,7 @@ def _drag_by_hand():
     ],
 )  # fmt: skip
 def test_values_by_hand(law, state, wanted):
-    base.require_rung(law, state)
+    base.require_state_type(law, state)
     found = base.evaluate(law, 0.5, state, INERTIA)
     np.testing.assert_allclose(found, wanted, rtol=1e-14, atol=1e-15)
 
@@ -371,15 +371,15 @@ def test_energy_adds_up():
         (lambda: torques.Sum(), "at least one torque"),
         (lambda: torques.Sum([TOP, WHEEL]), r"got list; several go in a Sum: Sum\(a, b\)"),
         (lambda: torques.Sum(TOP, torques.Damping), r"wanted an object, got the class Damping; make Damping\(\.\.\.\)"),
-        (lambda: base.require_rung([TOP], ATTITUDE), r"torque: wanted a torque.*got list"),
+        (lambda: base.require_state_type([TOP], ATTITUDE), r"torque: wanted a torque.*got list"),
         (lambda: base.require_law([0.0, 0.0, 1.0]), r"got list; a constant one is ConstantTorque\(\["),
-        (lambda: base.require_rung(torques.Damping, SPIN), "torque: wanted an object, got the class Damping"),
+        (lambda: base.require_state_type(torques.Damping, SPIN), "torque: wanted an object, got the class Damping"),
         (lambda: torques.Damping([1.0, np.nan, 1.0]), "coefficient: contains NaN"),
         (lambda: torques.GravityGradient(1.0, np.zeros(3)), "position: .*got zero"),
         (lambda: torques.FromPotential(3.0), "wanted a function q → U, J, got float"),
-        (lambda: base.require_rung(TOP, SPIN), "HeavyTop needs a state with HasAttitude, got Spin; take Attitude"),
-        (lambda: base.require_rung(torques.Sum(WHEEL, TOP), SPIN), "Sum needs.*HasAttitude"),
-        (lambda: base.require_rung(FALL, ATTITUDE), "UniformGravity needs a state with HasPose"),
+        (lambda: base.require_state_type(TOP, SPIN), "HeavyTop needs a state with HasAttitude, got Spin; take Attitude"),
+        (lambda: base.require_state_type(torques.Sum(WHEEL, TOP), SPIN), "Sum needs.*HasAttitude"),
+        (lambda: base.require_state_type(FALL, ATTITUDE), "UniformGravity needs a state with HasPose"),
         (lambda: NewtonEuler(BODY, TOP)(0.0, RIGID), "fixed point.*use UniformGravity"),
         (lambda: base.evaluate(lambda t, s, b: torques.Wrench([0.0, 0, 1]), 0.0, SPIN, INERTIA), "wanted a Rigid state"),
         (lambda: base.evaluate(lambda t, s, b: s.omega[:2], 0.0, SPIN, INERTIA), "body-frame N m"),

@@ -28,7 +28,9 @@ def closed():
 
 
 def test_lines_are_the_errors():
-    ax = rj.plot.horizons({"held": CUT.held(), "again": CUT.held()}, step=0.05, measure="rms")
+    ax = rj.plot.horizons(
+        {"held": CUT.held_horizons(), "again": CUT.held_horizons()}, step=0.05, measure="rms"
+    )
     assert [one.get_ylabel() for one in ax] == [
         "position, m", "velocity, m/s", "attitude, rad", "body rate, rad/s",
     ]  # fmt: skip
@@ -37,25 +39,25 @@ def test_lines_are_the_errors():
     np.testing.assert_allclose(velocity.get_ydata(), 10.0 * T[:11], atol=1e-12)
     assert [one.get_label() for one in ax[0].lines] == ["held", "again"]
     assert ax[0].get_xlabel() == "time ahead, s"
-    alone = rj.plot.horizons(CUT.held())
+    alone = rj.plot.horizons(CUT.held_horizons())
     assert alone[0].get_xlabel() == "steps ahead"
     # A third of the rms of a vector with one component.
     np.testing.assert_allclose(alone[1].lines[0].get_ydata(), 10.0 * T[:11] / 3, atol=1e-12)
-    assert rj.plot.horizons(CUT.held(), ax=ax) is not None
+    assert rj.plot.horizons(CUT.held_horizons(), ax=ax) is not None
 
 
-SPIN = identify.windows(T, rj.Spin(FALL.omega), length=10).held()
+SPIN = identify.windows(T, rj.Spin(FALL.omega), length=10).held_horizons()
 
 
 @pytest.mark.parametrize(
     ("given", "kind", "words"),
     [
-        (dict(found={}), ValueError, "at least one Horizons"),
-        (dict(found=CUT), TypeError, "wanted a Horizons of rigidjax.identify.*got Windows"),
-        (dict(found={"a": CUT.held(), "b": SPIN}), ValueError, "the same kinds of errors"),
-        (dict(found=SPIN, measure="worst"), ValueError, "measure: wanted one of mean_absolute, mean_norm"),
-        (dict(found=SPIN, step=0.0), ValueError, "step: wanted a positive time"),
-        (dict(found=SPIN, ax=[None, None]), ValueError, "wanted 1 axes in a row"),
+        (dict(results={}), ValueError, "at least one Horizons"),
+        (dict(results=CUT), TypeError, "wanted a Horizons of rigidjax.identify.*got Windows"),
+        (dict(results={"a": CUT.held_horizons(), "b": SPIN}), ValueError, "the same kinds of errors"),
+        (dict(results=SPIN, measure="worst"), ValueError, "measure: wanted one of mean_absolute, mean_norm"),
+        (dict(results=SPIN, step=0.0), ValueError, "step: wanted a positive time"),
+        (dict(results=SPIN, ax=[None, None]), ValueError, "wanted 1 axes in a row"),
     ],
 )  # fmt: skip
 def test_mistakes_are_named(given, kind, words):

@@ -16,7 +16,7 @@ import rigidjax as rj
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-from rigidjax.plot.residuals import power
+from rigidjax.plot.residuals import power_spectrum
 
 BODY = rj.Inertia.from_principal(1.0, 2.0, 3.0)
 SOLID = rj.Inertia.from_principal(1.0, 2.0, 2.5)
@@ -167,7 +167,7 @@ def stand_in():
     errors = 0.01 * np.random.default_rng(2).standard_normal((101, 3))
     errors[7] = 1.0
     reading = SimpleNamespace(
-        sensor=rj.identify.Gyro(0.01), seen=np.ones(101, dtype=bool), late=None
+        sensor=rj.identify.Gyro(0.01), host_mask=np.ones(101, dtype=bool), jitter_error=None
     )
     shaped = lambda p: rj.Inertia.from_second_moment(jnp.diag(jnp.exp(p)))
     return SimpleNamespace(
@@ -181,7 +181,7 @@ def stand_in():
         noise=(np.full(3, 0.01),),
         x=jnp.zeros(3),
         derivative_point=jnp.zeros(3),
-        seen=0.01 * np.eye(3),
+        determined_covariance=0.01 * np.eye(3),
         body=shaped(jnp.zeros(3)),
     )
 
@@ -203,11 +203,11 @@ def test_the_spectrum_of_white_noise_is_one_and_a_line_stands_out(jitter):
     random = np.random.default_rng(0)
     t = 0.01 * (np.arange(2000) + random.uniform(-jitter, jitter, 2000))
     noise = random.standard_normal(2000)
-    frequencies, level = power(t, noise)
+    frequencies, level = power_spectrum(t, noise)
     # 2000 readings, about 1000 independent powers, each with a relative spread of one.
     np.testing.assert_allclose(level.mean(), 1.0, atol=0.1)
     np.testing.assert_allclose(frequencies[-1], 50.0, rtol=0.05)
-    frequencies, lined = power(t, noise + np.sin(2 * np.pi * 7.0 * t))
+    frequencies, lined = power_spectrum(t, noise + np.sin(2 * np.pi * 7.0 * t))
     assert abs(frequencies[lined.argmax()] - 7.0) < 0.25
     assert lined.max() > 20
     # As much power as the sine's variance, 1/2, more: over all frequencies up to 50 Hz it is 1.
@@ -216,7 +216,7 @@ def test_the_spectrum_of_white_noise_is_one_and_a_line_stands_out(jitter):
 
 
 def test_a_short_record_has_no_spectrum():
-    assert power(np.arange(5.0), np.ones(5))[0].size == 0
+    assert power_spectrum(np.arange(5.0), np.ones(5))[0].size == 0
 
 
 def test_the_cloud_of_outlines_is_as_wide_as_the_covariance_says():
@@ -302,14 +302,14 @@ def test_the_box_of_a_box_is_itself():
 
 
 def test_between_saved_times_a_film_stays_on_the_group():
-    from rigidjax.plot.animation import evenly
+    from rigidjax.plot.animation import evenly_spaced_attitudes
 
     ts = jnp.linspace(0.0, 6.0, 40)
     turning = jax.vmap(lambda t: rj.quaternion.exp(jnp.array([0.0, 0.0, 1.0]) * t))(ts)
     # The same attitudes with signs as they may come out of a logarithm.
     signs = jnp.where(jnp.arange(40) % 3 == 0, -1.0, 1.0)[:, None]
     states = rj.Attitude(turning * signs, jnp.zeros((40, 3)))
-    times, q = evenly(ts, states, 23)
+    times, q = evenly_spaced_attitudes(ts, states, 23)
     exact = np.stack([np.cos(times / 2), 0 * times, 0 * times, np.sin(times / 2)], axis=-1)
     apart = np.abs(np.einsum("ti,ti->t", q, exact))
     np.testing.assert_allclose(apart, 1.0, atol=1e-6)

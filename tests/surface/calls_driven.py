@@ -19,7 +19,7 @@ def wheels() -> rj.torques.ReactionWheels:
 
 def held() -> Horizons:
     t = np.arange(8.0)
-    return rj.identify.windows(t, rj.Spin(np.outer(t, V)), length=3).held()
+    return rj.identify.windows(t, rj.Spin(np.outer(t, V)), length=3).held_horizons()
 
 
 def coupled() -> Coupled:
@@ -77,7 +77,7 @@ row(
 )
 row(
     "plot.horizons",
-    lambda: dict(found=held(), step=0.1, measure="rms"),
+    lambda: dict(results=held(), step=0.1, measure="rms"),
     groups=KINDS,
     transforms=(),
 )

@@ -50,7 +50,7 @@ row(
 for name in ("filter", "smooth", "log_likelihood"):
     row(
         f"identify.{name}",
-        lambda: dict(model=model(), first=belief(), x=model().start()),
+        lambda: dict(model=model(), belief=belief(), x=model().start()),
         groups=("stranger",),
         transforms=(),
     )
@@ -98,7 +98,7 @@ leave_out(
     "what a function returns",
     *(
         f"identify.{name}"
-        for name in ("Filtered", "Smoothed", "Push", "Sampled", "Read", "Extended")
+        for name in ("Filtered", "Smoothed", "Push", "Sampled", "ReadNumbers", "ExtendedState")
     ),
     "identify.LinearEstimate",
 )

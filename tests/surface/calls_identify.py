@@ -125,7 +125,7 @@ row(
     transforms=("jit", "grad"),
 )
 row(
-    "identify.expected",
+    "identify.expected_quantities",
     lambda: dict(model=s.model(), x=plan()),
     groups=("stranger", "nan"),
     **HOST,
@@ -168,7 +168,7 @@ row(
 row("identify.Fit.interval", lambda: dict(self=s.found(), level=0.9), arguments=("level",), **HOST)
 row(
     "identify.Fit.interval_of",
-    lambda: dict(self=s.found(), of=lambda point: point.state0.omega, level=0.9),
+    lambda: dict(self=s.found(), function=lambda point: point.state0.omega, level=0.9),
     arguments=("of", "level"),
     **HOST,
 )
@@ -181,7 +181,7 @@ records = (
     "Comparison",
     "Limit",
     "Freedom",
-    "Linearised",
+    "Linearisation",
     "Scene",
     "Unpacked",
     "Consideration",
@@ -317,10 +317,15 @@ row(
     ),
     transforms=(),
 )  # fmt: skip
-row("plot.fit", lambda: dict(found=s.found(), index=0, time_unit="s"), groups=KINDS, transforms=())
+row(
+    "plot.fit",
+    lambda: dict(fit_result=s.found(), index=0, time_unit="s"),
+    groups=KINDS,
+    transforms=(),
+)
 row(
     "plot.residuals",
-    lambda: dict(found=s.found(), index=0, time_unit="s"),
+    lambda: dict(fit_result=s.found(), index=0, time_unit="s"),
     groups=KINDS,
     transforms=(),
 )
@@ -370,5 +375,8 @@ row(
 leave_out("minutes of measuring: tests/workprecision", "workprecision.measure")
 leave_out(
     "a record that is filled as it comes",
-    *(f"workprecision.{n}" for n in ("Choice", "Measurement", "Ready", "Reference", "TimedMethod")),
+    *(
+        f"workprecision.{n}"
+        for n in ("Choice", "Measurement", "PreparedMethod", "Reference", "TimedMethod")
+    ),
 )

@@ -68,7 +68,7 @@ def our_frame(axis, k, place, t, x, u, f):
         frame.centrifugal(x, t), frame.coriolis(u, t), frame.euler_acceleration(x, t),
         frame.translation(t), frame.acceleration(x, u, t, f),
         frame.acceleration_to_inertial(x, u, f, t), frame.force_to_inertial(f, t),
-        frame.force_from_inertial(f, t), now.outward(f), now.inward(f),
+        frame.force_from_inertial(f, t), now.to_inertial_axes(f), now.from_inertial_axes(f),
         frame.jacobi_integral(rj.Point(x, u), t, k), frames.AboutAxis(axis, Quadratic(k)).rate(t),
         frames.AboutAxis(axis, Quadratic(k))(t),
     ]  # fmt: skip
@@ -79,8 +79,8 @@ way(
         f"frames.{name}"
         for name in (
             "AboutAxis", "AboutAxis.rate", "Instant", "Instant.centrifugal", "Instant.coriolis",
-            "Instant.euler_acceleration", "Instant.fictitious", "Instant.inward",
-            "Instant.outward", "Instant.translation", "MovingFrame", "MovingFrame.acceleration",
+            "Instant.euler_acceleration", "Instant.fictitious", "Instant.from_inertial_axes",
+            "Instant.to_inertial_axes", "Instant.translation", "MovingFrame", "MovingFrame.acceleration",
             "MovingFrame.acceleration_to_inertial", "MovingFrame.angular_velocity",
             "MovingFrame.at", "MovingFrame.centrifugal", "MovingFrame.coriolis",
             "MovingFrame.euler_acceleration", "MovingFrame.force_from_inertial",

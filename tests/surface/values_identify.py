@@ -256,11 +256,11 @@ def our_light(sun, observer, q, axes, level):
     now = _still(q)
     flux = tumblers.Brightness(sun, observer, noise=0.1, level=level, semi_axes=axes)
     mag = tumblers.Brightness(sun, observer, noise=0.1, level=level, semi_axes=axes, unit="mag")
-    return flux.predicted(now), mag.predicted(now), flux.error(now, jnp.asarray(1.0))
+    return flux.predict(now), mag.predict(now), flux.error(now, jnp.asarray(1.0))
 
 
 way(
-    "tumblers.Brightness tumblers.Brightness.predicted tumblers.Brightness.error",
+    "tumblers.Brightness tumblers.Brightness.predict tumblers.Brightness.error",
     our_light, (v.ordinary, v.ordinary, v.quaternion, between(0.5, 2.0, 3), between(1, 3)), light,
     norm=True, ulps=32, cost=2,
 )  # fmt: skip
@@ -472,7 +472,7 @@ def our_fit(y, noise):
     fit = identify.fit(model, starts=1)
     low, high = zip(*fit.interval().values(), strict=True)
     ends = fit.interval_of(lambda point: point.state0.omega)
-    planned = identify.expected(model, fit.x)
+    planned = identify.expected_quantities(model, fit.x)
     return [
         fit.state0.omega, np.array([q.deviation for q in fit.quantities[-3:]]), fit.chi2, fit.dof,
         fit.residuals[0], np.array(low[-3:]), np.array(high[-3:]), *ends,
@@ -484,7 +484,7 @@ def our_fit(y, noise):
 way(
     "identify.fit identify.Fit identify.Fit.interval identify.Fit.interval_of identify.Fit.body "
     "identify.Fit.state0 identify.Fit.residuals identify.Model identify.Model.motion "
-    "identify.Model.unpack identify.expected identify.Quantity",
+    "identify.Model.unpack identify.expected_quantities identify.Quantity",
     our_fit,
     (back_and_forth, fixed(0.01)), fitted,
     batched=False, rtol=1e-6, cost=2,
@@ -532,8 +532,8 @@ def our_states(i, q, w, c, d):
     ts = jnp.asarray(TIMES_OF_RUN)
     found = [
         way_of.states(body, start, ts, law)
-        for way_of in (identify.Adaptive(1e-9, 1e-12).finer(),
-                       identify.FixedSteps(20, rj.solvers.DormandPrince8()).finer())
+        for way_of in (identify.Adaptive(1e-9, 1e-12).refine(),
+                       identify.FixedSteps(20, rj.solvers.DormandPrince8()).refine())
     ]  # fmt: skip
     read = identify.simulate_readings(
         identify.Gyro(0.1, bias=c, scale=1.0 + d), body, start, ts, law
@@ -547,8 +547,8 @@ def states(i, q, w, c, d):
 
 
 way(
-    "identify.Adaptive identify.Adaptive.states identify.Adaptive.finer identify.FixedSteps "
-    "identify.FixedSteps.states identify.FixedSteps.finer "
+    "identify.Adaptive identify.Adaptive.states identify.Adaptive.refine identify.FixedSteps "
+    "identify.FixedSteps.states identify.FixedSteps.refine "
     "identify.simulate_readings",
     our_states, TOP, states, plain=True, rtol=1e-8, batched=False, cost=4,
 )  # fmt: skip
@@ -579,12 +579,12 @@ def cut(w, u, j):
 
 def our_cut(w, u, j):
     made = identify.windows(0.5 * np.arange(8), rj.Spin(w), {"u": u}, length=3, stride=2)
-    held = made.held()
+    held = made.held_horizons()
     return [
         made.starts.omega, made.wanted.omega, made.inputs["u"], np.array([made.count]) * 1.0,
         np.array([made.length]) * 1.0, held.mean_absolute["omega"], held.mean_norm["omega"],
         held.rms["omega"],
-        identify.Windows.joined(made, made).starts.omega,
+        identify.Windows.join(made, made).starts.omega,
     ]  # fmt: skip
 
 
@@ -603,7 +603,7 @@ def our_window_fit(w, j):
 
 way(
     "identify.windows identify.Windows identify.Windows.count identify.Windows.length "
-    "identify.Windows.held identify.Windows.joined identify.Horizons",
+    "identify.Windows.held_horizons identify.Windows.join identify.Horizons",
     our_cut, (v.normal(8, 3), v.normal(8, 2), between(0.5, 2.0)), lambda *a: cut(*a)[:-2],
     batched=False, norm=True, cost=2,
 )  # fmt: skip
@@ -677,7 +677,7 @@ leave_out(
 leave_out(
     "holds what it was given, or numbers of a row above",
     "identify.Belief.torques", "identify.Belief.walks", "identify.Filtered.t",
-    "identify.Smoothed.t", "identify.Walk", "identify.Push", "identify.Extended", "identify.Start",
+    "identify.Smoothed.t", "identify.Walk", "identify.Push", "identify.ExtendedState", "identify.Start",
     "identify.Model.recording", "identify.Model.recordings", "identify.Scene",
     "identify.Model.bodies", "identify.Model.scenes", "identify.Tolerance",
     "identify.Windows.records", "identify.Windows.scales",
@@ -697,19 +697,19 @@ leave_out(
     "errors that are considered, against refits of readings that are off: "
     "tests/identify/uncertainty/test_considered.py",
     "identify.Consideration",
-    "identify.Freedom.of_estimated",
+    "identify.Freedom.estimated_degrees",
 )
 leave_out(
     "the errors and derivatives of a fit, from which its covariance follows: "
     "tests/identify/test_uncertainty.py",
-    "identify.Linearised",
-    *(f"identify.Linearised.{name}" for name in (
+    "identify.Linearisation",
+    *(f"identify.Linearisation.{name}" for name in (
         "squared_change", "blocks", "dense", "first_times", "information", "rows", "scores", "size",
         "slope", "to_all_numbers")),
 )  # fmt: skip
 leave_out(
     "compared with the intervals of Welch and Student: tests/identify/test_freedom.py",
-    "identify.Fit.degrees", "identify.Freedom", "identify.Freedom.of",
+    "identify.Fit.degrees_of_freedom", "identify.Freedom", "identify.Freedom.degrees",
 )  # fmt: skip
 leave_out(
     "abstract: made by subclassing",
@@ -723,16 +723,16 @@ leave_out(
 )  # fmt: skip
 leave_out(
     "draws, and statistics of draws: tests/identify hold them against densities that are known",
-    "identify.posterior", "identify.Posterior", "identify.Posterior.ess", "identify.Posterior.of",
+    "identify.posterior", "identify.Posterior", "identify.Posterior.ess", "identify.Posterior.map",
     "identify.Posterior.points", "identify.Posterior.rhat", "identify.Posterior.to_arviz",
-    "identify.Nuts", "identify.refit", "identify.Refit", "identify.Refit.effective",
+    "identify.Nuts", "identify.refit", "identify.Refit", "identify.Refit.effective_count",
     "identify.Refit.interval_of", "identify.Refit.point", "identify.LogDensity",
     "identify.LogDensity.unpack", "identify.Unpacked",
-    "identify.Filtered.nis", "identify.Read",
+    "identify.Filtered.nis", "identify.ReadNumbers",
 )  # fmt: skip
 leave_out(
     "searches of many fits, tens of seconds each: tests/identify hold them against motions known",
     "identify.best_first_rate", "identify.compare", "identify.cross_validate",
     "identify.profile", "tumblers.fit_light_curve", "identify.Fit.identifiability",
-    "identify.Fit.undetermined",
+    "identify.Fit.undetermined_combinations",
 )  # fmt: skip

@@ -14,7 +14,12 @@ import rigidjax as rj
 from rigidjax import lagrangian, torques as laws
 from rigidjax.lagrangian.hamiltonian import MomentumAndDirection
 from rigidjax.motion.coupled import Coupled
-from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler, on_the_group
+from rigidjax.motion.equations import (
+    AttitudeEquations,
+    EulerEquations,
+    NewtonEuler,
+    project_to_group,
+)
 from rigidjax.motion.torques.states import freeze
 from rigidjax.rotation import quaternion as q4
 
@@ -449,7 +454,7 @@ way(
     ),
     norm=True,
 )  # fmt: skip
-way("Attitude (on the group)", lambda q, w: on_the_group(rj.Attitude(q, w)),
+way("Attitude (on the group)", lambda q, w: project_to_group(rj.Attitude(q, w)),
     (lambda rng, i: v.quaternion(rng, i) * 10.0 ** rng.uniform(-20, 20), v.vector),
     lambda q, w: (q / v.norm(q), w))  # fmt: skip
 

@@ -25,7 +25,7 @@ def curve(moments, omega, ts):
     sensor = Brightness([1.0, 0, 0], [0.8, 0.6, 0.0], noise=0.02)
 
     def at(t):
-        return sensor.predicted(SensorInput(t, motion(t), body, lambda t, y, args: y))
+        return sensor.predict(SensorInput(t, motion(t), body, lambda t, y, args: y))
 
     return jax.vmap(at)(ts)
 

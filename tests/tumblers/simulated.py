@@ -42,7 +42,7 @@ def brightness(sensor, moments, state, ts):
     motion = exact.FreeBody(body, state)
 
     def at(t):
-        return sensor.predicted(SensorInput(t, motion(t), body, lambda t, y, args: y))
+        return sensor.predict(SensorInput(t, motion(t), body, lambda t, y, args: y))
 
     return jax.vmap(at)(ts)
 

@@ -15,7 +15,7 @@ LIGHT = tuple(jnp.asarray(v) for v in (T, Y / SIGMA, 1 / SIGMA))
 @pytest.mark.parametrize("order", [1, 2])
 def test_its_misfit_is_that_of_dense_least_squares(order):
     pairs = np.array([[7.3, 4.1], [3.2, 9.9], [0.9, 17.2]])
-    table = lattice_series.sums(LIGHT, 120.0)
+    table = lattice_series.sum_table(LIGHT, 120.0)
     found = lattice_series.lattice_chi2(table, pairs, order)
     for pair, misfit in zip(pairs, found, strict=True):
         columns = [np.ones_like(T)]
@@ -30,7 +30,7 @@ def test_its_misfit_is_that_of_dense_least_squares(order):
 
 
 def test_the_table_is_the_sum_between_its_entries():
-    table = lattice_series.sums(LIGHT, 60.0)
+    table = lattice_series.sum_table(LIGHT, 60.0)
     f = RNG.uniform(-60.0, 60.0, 200)
     turns = np.exp(2j * np.pi * f[:, None] * (T - 0.5))
     for values, weights in ((table.window, SIGMA**-2), (table.data, Y / SIGMA**2)):
@@ -43,7 +43,7 @@ def window(days):
     """The table of readings at these times, days, and their span."""
     span = days[-1] - days[0]
     one = jnp.ones(days.size)
-    return lattice_series.sums((jnp.asarray((days - days[0]) / span), one, one), 60.0), span
+    return lattice_series.sum_table((jnp.asarray((days - days[0]) / span), one, one), 60.0), span
 
 
 def test_side_peaks_of_nights_are_at_one_and_two_a_day():

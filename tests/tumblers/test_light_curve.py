@@ -11,7 +11,7 @@ from tumblers import simulated
 
 from rigidjax import identify, tumblers
 from rigidjax.identify import Gyro
-from rigidjax.identify.data.stacking import of_few_lengths
+from rigidjax.identify.data.stacking import pad_to_few_lengths
 from rigidjax.tumblers import Brightness, lattice_series, two_frequencies
 from rigidjax.tumblers.two_frequencies import with_aliases
 
@@ -73,7 +73,7 @@ def test_from_any_alias_alone_the_right_pair_is_found(shift):
     t, y, pair, day = daily(1)
     span = t[-1]
     x, sigma = jnp.asarray(t / span), jnp.full(t.size, 0.1)
-    table = lattice_series.sums((x, jnp.asarray(y) / sigma, 1 / sigma), 610.0)
+    table = lattice_series.sum_table((x, jnp.asarray(y) / sigma, 1 / sigma), 610.0)
     wrong = (pair + np.array(shift) / day)[None] * span
     misfits = lattice_series.lattice_chi2(table, wrong, 1)
     pairs, misfits = with_aliases(table, wrong, misfits, 100.0, 1)
@@ -116,7 +116,7 @@ def test_another_length_is_the_same_program(caplog):
     # Of the readings as they were given.
     assert found.fit.residuals[0].shape == (380, 1) and found.fit.independent == 380
     assert found.fit.model.recording.t.shape == (380,)
-    errors = of_few_lengths(of(380)).errors(found.fit.x)[0]
+    errors = pad_to_few_lengths(of(380)).errors(found.fit.x)[0]
     np.testing.assert_allclose(errors[:380], found.fit.residuals[0], rtol=0, atol=1e-12)
     assert errors.shape == (432, 1) and not errors[380:].any()
 

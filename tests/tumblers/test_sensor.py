@@ -35,7 +35,7 @@ def test_it_reads_the_ellipsoid_that_turns_as_the_body_does(unit):
     level = 3.0 if unit == "flux" else 15.0
     for axes in (None, 7.0 * AXES):
         sensor = Brightness(SUN, OBSERVER, unit=unit, level=level, semi_axes=axes)
-        np.testing.assert_allclose(sensor.predicted(moment(q)), wanted, rtol=1e-13)
+        np.testing.assert_allclose(sensor.predict(moment(q)), wanted, rtol=1e-13)
     np.testing.assert_allclose(sensor.error(moment(q), jnp.asarray(wanted + 0.5)), [0.5])
 
 
@@ -43,7 +43,7 @@ def test_directions_may_move():
     table = rj.torques.Linear([0.0, 10.0], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     moving, still = Brightness(table, OBSERVER), Brightness([0.5, 0.5, 0.0], OBSERVER)
     at = moment([0.8, 0.6, 0.0, 0.0], t=5.0)
-    np.testing.assert_allclose(moving.predicted(at), still.predicted(at), rtol=1e-14)
+    np.testing.assert_allclose(moving.predict(at), still.predict(at), rtol=1e-14)
 
 
 def test_tables_of_other_lengths_are_stacked():
@@ -64,7 +64,7 @@ def tumbling(unit="mag"):
     state = rj.Attitude([1.0, 0.0, 0.0, 0.0], [0.3, 1.0, 0.4])
     motion = rj.simulate(BODY, state, TS).ys
     clean = once(
-        jax.vmap(lambda t, y: sensor.predicted(SensorInput(t, y, BODY, lambda t, y, args: y)))
+        jax.vmap(lambda t, y: sensor.predict(SensorInput(t, y, BODY, lambda t, y, args: y)))
     )
     values = np.asarray(clean(jnp.asarray(TS), motion))
     return sensor, values + 0.02 * np.random.default_rng(0).normal(size=TS.size)
@@ -88,7 +88,7 @@ def test_a_fit_and_a_design():
     assert fit.ok and abs(fit.chi2 - fit.dof) < 5 * np.sqrt(2 * fit.dof)
     moments = np.asarray(BODY.moments)
     truth = {"Ix/Iz": moments[0] / moments[2], "Iy/Iz": moments[1] / moments[2], "level": 0.0}
-    planned = identify.expected(problem, fit.x)
+    planned = identify.expected_quantities(problem, fit.x)
     for quantity, bound in zip(fit.quantities, planned, strict=True):
         np.testing.assert_allclose(quantity.deviation, bound.deviation, rtol=0.2)
         if quantity.name in truth:
@@ -100,7 +100,7 @@ def test_derivatives_by_the_attitude():
     turn = jnp.array([0.2, -0.4, 0.7])
 
     def seen(v):
-        return sensor.predicted(moment(rj.quaternion.exp(v)))
+        return sensor.predict(moment(rj.quaternion.exp(v)))
 
     slope, h = once(jax.grad(seen))(turn), 1e-6
     quick = once(seen)

@@ -83,11 +83,11 @@ def loss(scene, end):
     dot = lambda u, v: sum(x * y for x, y in zip(u, v, strict=True))
     if scene.body is None:
         return dot(a, end[:3]) / one + dot(c, end[3:]) / two
-    from rigidjax.workprecision.equations import into_body
+    from rigidjax.workprecision.equations import to_body_axes
 
     length = mp.sqrt(sum(x * x for x in end[:4]))
     w, x, y, z = (p / length for p in end[:4])
-    return dot(a, into_body((w, -x, -y, -z), *b)) + dot(c, end[4:]) / two
+    return dot(a, to_body_axes((w, -x, -y, -z), *b)) + dot(c, end[4:]) / two
 
 
 def run(scene, numbers, tolerance):

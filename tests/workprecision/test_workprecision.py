@@ -24,10 +24,10 @@ from rigidjax.workprecision import (
     scenes,
     table,
 )
-from rigidjax.workprecision.measurement import in_float32, long_drift, worked_out
-from rigidjax.workprecision.pareto import front, time_to
+from rigidjax.workprecision.measurement import compute_reference, long_drift, to_float32
+from rigidjax.workprecision.pareto import pareto_front, time_to
 from rigidjax.workprecision.record import Measurement, differences, read_csv, write_csv
-from rigidjax.workprecision.scene import Ready, TimedMethod, distance
+from rigidjax.workprecision.scene import PreparedMethod, TimedMethod, state_errors
 
 NAMES = list(scenes())
 
@@ -43,9 +43,9 @@ def test_the_plain_equations_are_those_of_the_library(name):
     numbers = [float(x) for x in scene.numbers]
     plain = scene.plain(numbers, math.sin, math.cos, math.sqrt)
     field = rj.equations_of_motion(scene.body, scene.state0, scene.torque)
-    start = np.asarray(scene.flat(scene.state0))
+    start = np.asarray(scene.flatten(scene.state0))
     for t in (0.0, 1.3):
-        ours = scene.flat(field(jnp.asarray(t), scene.state0, None))
+        ours = scene.flatten(field(jnp.asarray(t), scene.state0, None))
         np.testing.assert_allclose(ours, plain(t, start), rtol=1e-13, atol=1e-14)
 
 
@@ -106,8 +106,8 @@ def test_the_defaults_of_simulate_keep_what_the_table_promises(name):
     scene = scenes()[name]()
     ts = jnp.array([0.0, scene.end])
     out = rj.simulate(scene.body, scene.state0, ts, scene.torque)
-    end = scene.flat(jax.tree.map(lambda leaf: leaf[-1], out.ys))
-    error, _ = distance(scene, end, scene.reference.end)
+    end = scene.flatten(jax.tree.map(lambda leaf: leaf[-1], out.ys))
+    error, _ = state_errors(scene, end, scene.reference.end)
     print(f"{name}: {error:.1e}")
     assert error < PROMISED[name]
 
@@ -118,19 +118,21 @@ def test_a_scene_and_a_method_of_ones_own():
         "ball", "a ball slowed down", rj.Inertia.from_principal(2.0, 2.0, 2.0),
         rj.Attitude([1.0, 0, 0, 0], [0.3, -0.4, 0.5]), rj.torques.Damping([0.1] * 3), 6.0,
     )  # fmt: skip
-    right = worked_out(scene, gradients=False)
+    right = compute_reference(scene, gradients=False)
     scene = dataclasses.replace(scene, reference=right)
     slowed = np.exp(-0.05 * 6.0) * np.array([0.3, -0.4, 0.5])
     np.testing.assert_allclose(right.end[4:], slowed, rtol=1e-13)
     turn = (1 - np.exp(-0.3)) / 0.05 * np.array([0.3, -0.4, 0.5])
     exact = np.concatenate([np.asarray(rj.quaternion.exp(jnp.asarray(turn))), slowed])
     # The angle is told to 1e-13 of a radian, whatever the sign of the quaternion.
-    assert distance(scene, -exact, right.end)[0] < 1e-13
+    assert state_errors(scene, -exact, right.end)[0] < 1e-13
     off = np.concatenate(
         [rj.quaternion.multiply(exact[:4], rj.quaternion.exp(jnp.array([3e-9, 0, 0]))), slowed]
     )
-    np.testing.assert_allclose(distance(scene, off, exact)[0], 3e-9, rtol=1e-6)
-    guess = TimedMethod("a guess", "peer", (1e-3,), lambda scene: Ready(lambda setting: (off, 1.0)))
+    np.testing.assert_allclose(state_errors(scene, off, exact)[0], 3e-9, rtol=1e-6)
+    guess = TimedMethod(
+        "a guess", "peer", (1e-3,), lambda scene: PreparedMethod(lambda setting: (off, 1.0))
+    )
     chosen = [m for m in methods("jax") if m.name == "diffrax Tsit5"]
     found = measure(scene, chosen, peers=[guess], gradients=False, thin=5, rounds=1)
     assert {r.method for r in found} == {"diffrax Tsit5", "a guess"}
@@ -156,9 +158,9 @@ def test_the_gradient_is_compared_with_the_reference():
 def test_a_scene_in_single_precision():
     """Its truth is that of the rounded numbers."""
     double = scenes()["heavy-top"]()
-    scene = in_float32(double, gradients=False)
+    scene = to_float32(double, gradients=False)
     assert {leaf.dtype for leaf in jax.tree.leaves(scene.torque)} == {jnp.dtype("float32")}
-    rounded, _ = distance(double, scene.reference.end, double.reference.end)
+    rounded, _ = state_errors(double, scene.reference.end, double.reference.end)
     chosen = [m for m in methods() if m.name in ("RungeKutta4, equal steps", "simulate, accuracy")]
     records = measure(scene, chosen, gradients=False, thin=3, rounds=1)
     stepped = [r.error for r in records if r.method.startswith("Runge")]
@@ -171,14 +173,14 @@ def test_a_scene_in_single_precision():
 def test_the_front_and_the_table():
     ladder = [line("a", 1e-2, 1.0), line("a", 1e-6, 2.0), line("a", 1e-12, 8.0)]
     other = [line("b", 1e-4, 1.2, group="jax"), line("b", 1e-8, 9.0, group="jax")]
-    best = front(ladder + other)
+    best = pareto_front(ladder + other)
     assert [(r.method, r.error) for r in best] == [
         ("a", 1e-2), ("b", 1e-4), ("a", 1e-6), ("a", 1e-12),
     ]  # fmt: skip
     # The curve of a passes 1e-9 at 4 s: what takes longer is not on the front, nor what is worse.
     late, soon = line("c", 1e-9, 4.5, group="jax"), line("c", 1e-9, 3.9, group="jax")
-    assert "c" not in {r.method for r in front([*ladder, late])}
-    assert "c" in {r.method for r in front([*ladder, soon])}
+    assert "c" not in {r.method for r in pareto_front([*ladder, late])}
+    assert "c" in {r.method for r in pareto_front([*ladder, soon])}
     assert time_to(ladder, 1e-9) == pytest.approx(4.0)
     assert math.isnan(time_to(ladder, 1e-13))
     (choice,) = choose(ladder + other, [1e-4])
@@ -186,7 +188,7 @@ def test_the_front_and_the_table():
     assert (choice.time, choice.peer_time) == pytest.approx((math.sqrt(2), 1.2))
     assert "| s | 1e-04 | a |" in table([choice])
     with pytest.raises(ValueError, match="front: wanted records of one scene and kind"):
-        front([*ladder, line(scene="elsewhere")])
+        pareto_front([*ladder, line(scene="elsewhere")])
 
 
 def test_what_moved_is_said():

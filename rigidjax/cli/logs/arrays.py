@@ -8,14 +8,14 @@ import numpy as np
 from rigidjax.cli.logs.columns import Columns
 
 
-def npz(path: Path, columns: Sequence[str]) -> Columns:
+def read_npz(path: Path, columns: Sequence[str]) -> Columns:
     """Return the names of the arrays in a `.npz` file, and the wanted ones."""
     # Open the file here: NumPy does not close a file that it opened and cannot read.
     with path.open("rb") as raw, np.load(raw) as file:
         return file.files, {name: file[name] for name in columns if name in file.files}
 
 
-def mat(path: Path, columns: Sequence[str]) -> Columns:
+def read_mat(path: Path, columns: Sequence[str]) -> Columns:
     """Return the names of the arrays in a `.mat` file, and the wanted ones."""
     from scipy.io import loadmat, whosmat
 

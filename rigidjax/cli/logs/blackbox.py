@@ -29,7 +29,7 @@ _END_MARK = b"End of log\0"
 _ERASED = re.compile(rb"[\xff\0]*\Z")
 
 
-def blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
+def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
     """Return the names of all fields, and the wanted ones, of one flight in a Blackbox log.
 
     Rates are in deg/s and accelerations in g, by the scales in the header, as in the flight
@@ -38,7 +38,7 @@ def blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> C
     frame, are left out with a warning. **Raises** `LogError` if there are several flights and none
     is chosen.
     """
-    library = _checks.library("orangebox.reader", "blackbox", str(path))
+    library = _checks.import_library("orangebox.reader", "blackbox", str(path))
     pointers = library.Reader(str(path)).log_pointers
     if flight is None and len(pointers) > 1 and columns:
         ends = [*pointers[1:], path.stat().st_size]
@@ -92,8 +92,8 @@ class _Flight:
     """
 
     def __init__(self, reader: Any, data: bytes):
-        types = _checks.library("orangebox.types", "blackbox", "a Blackbox log")
-        context = _checks.library("orangebox.context", "blackbox", "a Blackbox log").Context
+        types = _checks.import_library("orangebox.types", "blackbox", "a Blackbox log")
+        context = _checks.import_library("orangebox.context", "blackbox", "a Blackbox log").Context
         self.headers: Mapping[str, Any] = reader.headers
         self.fields: Mapping[Any, Sequence[Any]] = reader.field_defs
         self.context = context(self.headers, self.fields)

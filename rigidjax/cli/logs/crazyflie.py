@@ -12,7 +12,7 @@ from rigidjax.cli.logs.columns import Columns
 FIRST_BYTE = 0xBC
 
 
-def crazyflie(path: Path, columns: Sequence[str]) -> Columns:
+def read_crazyflie(path: Path, columns: Sequence[str]) -> Columns:
     """Return the variables of a Crazyflie's µSD log by name (`gyro.x`), and their `timestamp`, µs.
 
     A log holds several events, each with variables of its own: the one with most of the wanted
@@ -25,9 +25,9 @@ def crazyflie(path: Path, columns: Sequence[str]) -> Columns:
         raise ValueError(f"wanted a µSD log of version 1 or 2, got {data[0]:#x}, {version}")
     at, events = 5, {}
 
-    def text(at: int) -> tuple[str, int]:
-        end = data.index(b"\0", at)
-        return data[at:end].decode(), end + 1
+    def text(start: int) -> tuple[str, int]:
+        end = data.index(b"\0", start)
+        return data[start:end].decode(), end + 1
 
     for _ in range(count):
         key = struct.unpack_from("<H", data, at)[0]

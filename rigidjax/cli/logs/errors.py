@@ -13,7 +13,7 @@ class LogError(ValueError):
 
     def __str__(self) -> str:
         """Return the message without control characters: a name may hold those of a terminal."""
-        return _checks.printable(super().__str__())
+        return _checks.escape_controls(super().__str__())
 
 
 class LogWarning(UserWarning):
@@ -22,4 +22,4 @@ class LogWarning(UserWarning):
 
 def warn(words: str) -> None:
     """Warn by a `LogWarning` with these words."""
-    warnings.warn(LogWarning(_checks.printable(words)), stacklevel=3)
+    warnings.warn(LogWarning(_checks.escape_controls(words)), stacklevel=3)

@@ -49,13 +49,13 @@ def imu_columns_of(path: str | Path) -> ImuColumns:
     # Suppress errors here: the reader of the log raises them with better words.
     with contextlib.suppress(Exception):
         if kind_of(path) in BINARY:
-            return _of_binary(path) or USUAL
+            return _imu_columns_of_binary(path) or USUAL
         with open_text(path) as file:
-            return _of_names(read_header(file).names) or USUAL
+            return _columns_by_name(read_header(file).names) or USUAL
     return USUAL
 
 
-def _of_names(names: list[str]) -> ImuColumns | None:
+def _columns_by_name(names: list[str]) -> ImuColumns | None:
     """Return the one time and the three rates, about x, y and z, that have units in their names.
 
     Return `None` unless there is exactly one of each.
@@ -70,7 +70,7 @@ def _of_names(names: list[str]) -> ImuColumns | None:
     return ImuColumns((time, x, y, z), str(rates[x]), str(time_unit))
 
 
-def _of_binary(path: Path) -> ImuColumns | None:
+def _imu_columns_of_binary(path: Path) -> ImuColumns | None:
     """Return the columns of a binary log, or `None` if it has no rates."""
     columns = _columns_of_binary(path)
     if columns is None:

@@ -12,14 +12,14 @@ from rigidjax import _checks
 from rigidjax.cli.logs.columns import Columns
 
 
-def mcap(path: Path, columns: Sequence[str]) -> Columns:
+def read_mcap(path: Path, columns: Sequence[str]) -> Columns:
     """Return the fields of JSON and ROS 2 messages, such as `/imu.angular_velocity.x`.
 
     The times `topic.log_time` and `topic.stamp` (the latter of the header of a message) are in s
     from the first message of the file.
     """
-    make_reader = _checks.library("mcap.reader", "mcap", str(path)).make_reader
-    ros = _checks.library("mcap_ros2.decoder", "mcap", str(path)).DecoderFactory
+    make_reader = _checks.import_library("mcap.reader", "mcap", str(path)).make_reader
+    ros = _checks.import_library("mcap_ros2.decoder", "mcap", str(path)).DecoderFactory
     names: dict[str, None] = {}
     arrays: dict[str, array] = {name: array("d") for name in columns}
     first = None

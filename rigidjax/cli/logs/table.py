@@ -11,15 +11,21 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.cli.logs import text
-from rigidjax.cli.logs.arrays import mat, npz
-from rigidjax.cli.logs.blackbox import blackbox
-from rigidjax.cli.logs.crazyflie import FIRST_BYTE, crazyflie
+from rigidjax.cli.logs.arrays import read_mat, read_npz
+from rigidjax.cli.logs.blackbox import read_blackbox
+from rigidjax.cli.logs.crazyflie import FIRST_BYTE, read_crazyflie
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.mcap import mcap
-from rigidjax.cli.logs.ulog import ulog
+from rigidjax.cli.logs.mcap import read_mcap
+from rigidjax.cli.logs.ulog import read_ulog
 
-BINARY = {".bbl": blackbox, ".bfl": blackbox, ".ulg": ulog, ".mcap": mcap, ".usd": crazyflie}
-_READERS = {".npz": npz, ".mat": mat} | BINARY
+BINARY = {
+    ".bbl": read_blackbox,
+    ".bfl": read_blackbox,
+    ".ulg": read_ulog,
+    ".mcap": read_mcap,
+    ".usd": read_crazyflie,
+}
+_READERS = {".npz": read_npz, ".mat": read_mat} | BINARY
 
 
 def read_table(
@@ -57,8 +63,8 @@ def read_table(
     Traceback (most recent call last):
     rigidjax.cli.logs.errors.LogError: missing.csv: no such file
     """
-    path = _checks.path(path)
-    _checks.instance(columns, Sequence, "columns", wanted="a sequence of names")
+    path = _checks.file_path(path)
+    _checks.require_instance(columns, Sequence, "columns", requirement="a sequence of names")
     if isinstance(columns, str) or not columns or not all(isinstance(c, str) for c in columns):
         raise TypeError(f"columns: wanted a sequence of names, got {columns!r}")
     twice = [name for name in columns if columns.count(name) > 1]
@@ -102,8 +108,8 @@ def _require_one_flight(path: Path, flight: int | None) -> None:
 def _arrays(path: Path, columns: Sequence[str], flight: int | None) -> dict[str, np.ndarray]:
     """Read columns of a log that is not text."""
     read: Any = _READERS[kind_of(path)]
-    if read is blackbox:
-        read = functools.partial(blackbox, flight=flight)
+    if read is read_blackbox:
+        read = functools.partial(read_blackbox, flight=flight)
     else:
         _require_one_flight(path, flight)
     # The readers raise many kinds of errors for an empty or a cut file.

@@ -50,7 +50,7 @@ def mask_of_increasing(t: np.ndarray) -> np.ndarray:
     return keep
 
 
-def kept_rows(
+def rows_to_use(
     path: str | Path, t: np.ndarray, name: str, window: tuple[float, float] | None
 ) -> np.ndarray:
     """Return the indices of the rows to use: those in the window whose times increase.

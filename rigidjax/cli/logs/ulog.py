@@ -7,12 +7,12 @@ from rigidjax import _checks
 from rigidjax.cli.logs.columns import Columns
 
 
-def ulog(path: Path, columns: Sequence[str]) -> Columns:
+def read_ulog(path: Path, columns: Sequence[str]) -> Columns:
     """Return the fields of a ULog of PX4 as `topic.field`, such as `sensor_combined.gyro_rad[0]`.
 
     The fields of a second instance of a topic are `topic#1.field`; times are in µs.
     """
-    reader, arrays = _checks.library("pyulog", "ulog", str(path)).ULog, {}
+    reader, arrays = _checks.import_library("pyulog", "ulog", str(path)).ULog, {}
     # Open the file here: the library does not close a file that it opened and cannot read.
     with path.open("rb") as file:
         topics = reader(file).data_list

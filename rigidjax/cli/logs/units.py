@@ -49,29 +49,33 @@ def unit_in(name: str, allowed: Sequence[str]) -> str | None:
     """
     brackets = _IN_BRACKETS.search(name)
     if brackets:
-        return _UNIT_OF.get(_plain(brackets[1]))
+        return _UNIT_OF.get(_usual_spelling(brackets[1]))
     endings = (name[match.end() :] for match in re.finditer(r"[\s,_]+", name))
-    units = (_UNIT_OF.get(_plain(ending)) for ending in endings)
+    units = (_UNIT_OF.get(_usual_spelling(ending)) for ending in endings)
     return next((unit for unit in units if unit in allowed), None)
 
 
-def _plain(word: str) -> str:
+def _usual_spelling(word: str) -> str:
     """Return a unit in the spelling of `_SPELLINGS`; a capital G, which is gauss, stays."""
     return word.translate(_SIGNS).lower() if word.strip() != "G" else word
 
 
 def unit_of(
-    names: Sequence[str], stated: str | None, usual: str, allowed: Sequence[str], where: str
+    names: Sequence[str],
+    stated_unit: str | None,
+    usual_unit: str,
+    allowed: Sequence[str],
+    place: str,
 ) -> str:
     """Return the unit of columns: the one that their names or the user state, else the usual one.
 
     **Arguments:**
 
     - `names`: of the columns.
-    - `stated`: the unit that the user states, or `None`.
-    - `usual`: the unit if neither names nor user state one.
+    - `stated_unit`: the unit that the user states, or `None`.
+    - `usual_unit`: the unit if neither names nor user state one.
     - `allowed`: the units that such a column may have.
-    - `where`: the first words of messages.
+    - `place`: the first words of messages.
 
     **Raises** `LogError` if names and user, or two names, state different units, or if a name
     states a unit that is not allowed. It **warns** of a unit in brackets that it does not know.
@@ -80,20 +84,25 @@ def unit_of(
     for name, unit in in_names.items():
         if unit not in allowed:
             wanted = " or ".join(allowed)
-            raise LogError(f"{where}: column {name!r} is in {unit}; wanted {wanted}")
-        if stated is not None and unit != stated:
+            raise LogError(f"{place}: column {name!r} is in {unit}; wanted {wanted}")
+        if stated_unit is not None and unit != stated_unit:
             raise LogError(
-                f"{where}: column {name!r} is in {unit} by its name, and {stated} is stated: "
+                f"{place}: column {name!r} is in {unit} by its name, and {stated_unit} is stated: "
                 "which one? state the same unit, or none"
             )
     # Keep one column for each unit, to name it in the message.
     columns = {unit: name for name, unit in in_names.items()}
     if len(columns) > 1:
         (one, first), (other, second) = list(columns.items())[:2]
-        raise LogError(f"{where}: column {first!r} is in {one}, column {second!r} in {other}")
-    unit = stated or next(iter(in_names.values()), usual)
+        raise LogError(f"{place}: column {first!r} is in {one}, column {second!r} in {other}")
+    unit = stated_unit or next(iter(in_names.values()), usual_unit)
     for name in names:
         brackets = _IN_BRACKETS.search(name)
-        if stated is None and brackets and name not in in_names and _UNKNOWN.search(brackets[1]):
-            warn(f"{where}: column {name!r}: its unit is not known; it is read in {unit}")
+        if (
+            stated_unit is None
+            and brackets
+            and name not in in_names
+            and _UNKNOWN.search(brackets[1])
+        ):
+            warn(f"{place}: column {name!r}: its unit is not known; it is read in {unit}")
     return unit

@@ -77,7 +77,7 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
             (abs(one.value) for one in quantities if f"{one.name} ".startswith(f"{slot.name} ")),
             default=0.0,
         )
-        rows = np.asarray(reading.values)[reading.seen]
+        rows = np.asarray(reading.values)[reading.host_mask]
         size = float(np.sqrt(np.mean(np.sum(rows.reshape(len(rows), -1) ** 2, axis=1))))
         if largest > REMARKABLE * size:
             out.append(

@@ -18,10 +18,10 @@ from rigidjax.identify.answer.answers import (
     NOT_ENDED,
     Answer,
 )
-from rigidjax.identify.answer.causes import clock
+from rigidjax.identify.answer.causes import clock_cause
 from rigidjax.identify.answer.result import Fit, Start
 from rigidjax.identify.data.recording import Reading
-from rigidjax.identify.model.model import Model, words_on_delays
+from rigidjax.identify.model.model import Model, describe_delays
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.search.noise import median_of_chi2
 from rigidjax.identify.search.stages import (
@@ -31,12 +31,12 @@ from rigidjax.identify.search.stages import (
     nominal_count,
 )
 from rigidjax.identify.uncertainty import considered, covariance as uncertainty, flat_limit
-from rigidjax.identify.uncertainty.covariance import CorrelationTimes, Linearised, scatter
+from rigidjax.identify.uncertainty.covariance import CorrelationTimes, Linearisation, scatter
 from rigidjax.identify.uncertainty.degrees_of_freedom import freedom_of
 from rigidjax.identify.uncertainty.flat_limit import unreal_bodies
 from rigidjax.identify.uncertainty.quantities import (
     Quantity,
-    charts,
+    charts_by_suffix,
     quantities as quantities_of,
     values_and_slopes,
 )
@@ -56,7 +56,11 @@ HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
 def goodness(
-    model: Model, noise: Noise, linear: Linearised, times: CorrelationTimes, covariance: np.ndarray
+    model: Model,
+    noise: Noise,
+    linear: Linearisation,
+    times: CorrelationTimes,
+    covariance: np.ndarray,
 ) -> tuple[float, int, Answer, tuple[int, ...]]:
     """Return χ², its degrees of freedom, the answer on the model, and the unexplained sensors.
 
@@ -70,30 +74,30 @@ def goodness(
     words: list[str] = []
     sensors: list[int] = []
     own, readings = linear.blocks(covariance), model.records.readings
-    parts = zip(readings, linear.raw, linear.errors, linear.weights, linear.kept, strict=True)
-    for index, (reading, error, e, weight, kept) in enumerate(parts):
-        given = reading.sensor.noise is not None
-        left, varies, tiny = _sizes(reading, error, kept)
+    parts = zip(readings, linear.raw, linear.errors, linear.weights, linear.mask, strict=True)
+    for index, (reading, error, e, weight, mask) in enumerate(parts):
+        has_noise = reading.sensor.noise is not None
+        left, varies, tiny = _sums_of_squares(reading, error, mask)
         factor = 1.0
-        if given:
-            total, many = float(np.sum((weight[..., None] * e**2)[kept])), int(kept.sum())
+        if has_noise:
+            total, many = float(np.sum((weight[..., None] * e**2)[mask])), int(mask.sum())
             chi2, count = chi2 + total, count + many
             dof = max(many - free, 1)
             factor = float(np.sqrt(total / dof)) if total > dof + 5 * np.sqrt(2 * dof) else 1.0
             if model.loss is not None and many:
-                squares = np.sum(e[kept.all(axis=-1)] ** 2, axis=-1)
-                factor = _median_above(squares, e.shape[-1])
+                squares = np.sum(e[mask.all(axis=-1)] ** 2, axis=-1)
+                factor = _excess_by_median(squares, e.shape[-1])
         root = np.sqrt(weight)[..., None]
         slope = linear.slopes[index] * root[..., None]
-        white = left <= tiny or _white(e * root, kept, slope, own, given)
-        late = left > tiny and clock(model, noise, linear, index) is not None
+        white = left <= tiny or _is_white(e * root, mask, slope, own, has_noise)
+        has_clock_error = left > tiny and clock_cause(model, noise, linear, index) is not None
         # Errors below a given noise, or small ones, cannot hide a missing part of the model.
-        small = given or left <= QUARTER * varies + tiny
-        if factor == 1.0 and white and small and not late:
+        small = has_noise or left <= QUARTER * varies + tiny
+        if factor == 1.0 and white and small and not has_clock_error:
             continue
         lasting = max(times.closeness, 0.0) * left
         missed = left > HALF * varies + tiny or lasting > TENTH * varies + tiny
-        if missed and (factor > 1.0 or not given):
+        if missed and (factor > 1.0 or not has_noise):
             word = FAILS
         word = LEAVES if word == EXPLAINS else word
         sensors.append(index)
@@ -101,15 +105,15 @@ def goodness(
         alike = int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
         share = left / varies if varies > tiny and alike else None
         span = None if white else times.longest
-        words.append(_in_words(model, reading, error, kept, factor, share, span))
+        words.append(_describe_errors(model, reading, error, mask, factor, share, span))
     return chi2, max(count - free, 1), Answer(word, tuple(words)), tuple(sensors)
 
 
-def _in_words(
+def _describe_errors(
     model: Model,
     reading: Reading,
     error: np.ndarray,
-    kept: np.ndarray,
+    mask: np.ndarray,
     factor: float,
     share: float | None,
     span: float | None,
@@ -118,31 +122,31 @@ def _in_words(
 
     **Arguments:**
 
-    - `error`, `kept`: (R, T, k) the errors, and which of them count.
+    - `error`, `mask`: (R, T, k) the errors, and which of them count.
     - `factor`: their size in units of the noise; 1 is not reported.
     - `share`: their share of the variance of the readings, `None` if there is none.
     - `span`: the samples over which they are autocorrelated, `None` for white errors.
     """
-    sensor, many = reading.sensor, max(int(kept.any(axis=-1).sum()), 1)
-    size = np.sqrt(np.sum(error[kept] ** 2) / many)
+    sensor, many = reading.sensor, max(int(mask.any(axis=-1).sum()), 1)
+    size = np.sqrt(np.sum(error[mask] ** 2) / many)
     words = [f"the errors of the {type(sensor).__name__} are {size:.3g} {sensor.unit}"]
     if share is not None:
         words.append(f"{100 * np.sqrt(share):.2g} % of what varies in its readings")
     if factor > 1.0:
         words.append(f"{factor:.3g} times the noise")
     if span is not None:
-        channels = [np.moveaxis(x, -1, 0).reshape(-1, x.shape[1]) for x in (error, kept)]
+        channels = [np.moveaxis(x, -1, 0).reshape(-1, x.shape[1]) for x in (error, mask)]
         rows = [row[mask] for row, mask in zip(*channels, strict=True)]
         apart = scatter(rows)
         over = np.sqrt(np.mean(np.concatenate(rows) ** 2) / apart) if apart > 0 else np.inf
         words.append(f"{over:.3g} times their scatter between neighbours")
         words.append(f"autocorrelated over {span:.0f} samples")
-    return f"{', '.join(words)}, {_describe_interval(model, error, kept)}"
+    return f"{', '.join(words)}, {_describe_interval(model, error, mask)}"
 
 
-def _describe_interval(model: Model, error: np.ndarray, kept: np.ndarray) -> str:
+def _describe_interval(model: Model, error: np.ndarray, mask: np.ndarray) -> str:
     """Describe the shortest interval of time that holds half of the sum of squared errors."""
-    squares = np.sum(np.where(kept, error, 0.0) ** 2, axis=-1)
+    squares = np.sum(np.where(mask, error, 0.0) ** 2, axis=-1)
     row = int(np.argmax(squares.sum(axis=1)))
     count = int(model.counts[row])
     t, total = np.asarray(model.records.t)[row, :count], np.cumsum(squares[row, :count])
@@ -151,19 +155,21 @@ def _describe_interval(model: Model, error: np.ndarray, kept: np.ndarray) -> str
     begin, end = t[first], t[min(last[first], count - 1)]
     if end - begin > 0.4 * (t[-1] - t[0]):
         return "all along"
-    of = f" of recording {row}" if model.count > 1 else ""
-    times = " to ".join(_show.time(when, t[-1] - t[0], 4) for when in (begin, end))
-    return f"half of the squared ones from {times} s{of}"
+    of_recording = f" of recording {row}" if model.count > 1 else ""
+    times = " to ".join(_show.time_as_text(when, t[-1] - t[0], 4) for when in (begin, end))
+    return f"half of the squared ones from {times} s{of_recording}"
 
 
-def _sizes(reading: Reading, error: np.ndarray, kept: np.ndarray) -> tuple[float, float, float]:
+def _sums_of_squares(
+    reading: Reading, error: np.ndarray, mask: np.ndarray
+) -> tuple[float, float, float]:
     """Return three sums of squares: of errors, of readings about their mean, and of round-off."""
-    values = np.asarray(reading.values)[reading.seen]
+    values = np.asarray(reading.values)[reading.host_mask]
     varies = float(np.sum((values - values.mean(axis=0)) ** 2))
-    return float(np.sum(error[kept] ** 2)), varies, 1e-12 * float(np.sum(values**2))
+    return float(np.sum(error[mask] ** 2)), varies, 1e-12 * float(np.sum(values**2))
 
 
-def _median_above(squares: np.ndarray, size: int) -> float:
+def _excess_by_median(squares: np.ndarray, size: int) -> float:
     """Return the size of whitened errors over that of noise, by the median of their `squares`.
 
     It is 1 unless the difference is significant. Under a robust loss outliers are expected, and
@@ -178,27 +184,27 @@ def _median_above(squares: np.ndarray, size: int) -> float:
     return float(np.sqrt(middle / half)) if middle > half + 5 * wide else 1.0
 
 
-def _white(
-    e: np.ndarray, kept: np.ndarray, slope: np.ndarray, covariance: np.ndarray, given: bool
+def _is_white(
+    e: np.ndarray, used: np.ndarray, slope: np.ndarray, covariance: np.ndarray, has_noise: bool
 ) -> bool:
     """Return whether whitened errors `e` (R, T, k) are white, by Ljung and Box's test.
 
     Fitted numbers take the part `slope covariance slopeᵀ` out of white errors and so correlate
     them, which shows in many short recordings (Box and Pierce 1970,
-    doi:10.1080/01621459.1970.10481180); the test allows for it. If the noise is `given`, errors far
-    below it are no evidence.
+    doi:10.1080/01621459.1970.10481180); the test allows for it. If the noise is known
+    (`has_noise`), errors far below it are no evidence.
     """
     from scipy.special import chdtrc
 
     total, degrees = 0.0, 0
     for channel in range(e.shape[-1]):
-        long = kept[..., channel].sum(axis=1) >= 2 * LAGS
-        mask = kept[long, :, channel]
+        long = used[..., channel].sum(axis=1) >= 2 * LAGS
+        mask = used[long, :, channel]
         x = _packed_about_mean(e[long, :, channel, None], mask)[..., 0]
         j = _packed_about_mean(slope[long, :, channel], mask)
         taken, count = j @ covariance[long], len(mask)
         size, own = int(mask.sum()), float(np.sum(x * x))
-        squares = max(own, float(size)) if given else own
+        squares = max(own, float(size)) if has_noise else own
         if not squares > 0:
             continue
         for lag in range(1, LAGS + 1):
@@ -223,13 +229,13 @@ def _packed_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
 AT_THE_END = 0.05
 
 
-def _search(
-    best_cost: float, done: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
+def _search_answer(
+    best_cost: float, ended: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
 ) -> Answer:
     """Return the answer on the search; `rivals` names the starts that fit as well elsewhere."""
     if not np.isfinite(best_cost):
         return Answer(NOT_ENDED, ("no start gave a finite misfit",))
-    if not done:
+    if not ended:
         why = interrupted or ("max_steps reached",)
         return Answer(NOT_ENDED, (*why, *remarks, "this is the best point found"))
     if rivals:
@@ -237,12 +243,12 @@ def _search(
     return Answer(FOUND, (*interrupted, *remarks))
 
 
-def _rivals(
-    good: Sequence[Start], best_cost: float, margin: float, linear: Linearised, x: Array
+def _count_rivals(
+    starts: Sequence[Start], best_cost: float, margin: float, linear: Linearisation, x: Array
 ) -> int:
-    """Count the starts of `good` that ended far from the best point x, by more than a `margin`."""
+    """Count the `starts` that ended far from the best point x, by more than a `margin`."""
     count = 0
-    for item in good:
+    for item in starts:
         if item.converged and item.cost > best_cost + 0.01 * margin:
             away = item.x - x
             # Two points of a flat valley differ, but give the same readings: they are no rivals.
@@ -256,7 +262,7 @@ def assess(
     noise: Noise,
     attempts: list[Attempt],
     best_cost: float,
-    shown: Model,
+    original: Model,
     interrupted: Sequence[str],
     remarks: Sequence[str],
 ) -> Fit:
@@ -267,7 +273,7 @@ def assess(
     - `model`, `noise`: the model that was fitted, and its noise.
     - `best`: the best point; `attempts`: the ends of all starts; `best_cost`: the least of their
       costs.
-    - `shown`: the model that the `Fit` holds, with the readings as they were given.
+    - `original`: the model that the `Fit` holds, with the readings as they were given.
     - `interrupted`, `remarks`: reasons for the answer on the search, in words.
     """
     x = best.x
@@ -277,19 +283,21 @@ def assess(
     times = uncertainty.correlation_times(linear)
     white = uncertainty.white_covariance(linear)
     stretches = stretches_of(model, linear)
-    numbers, of = values_and_slopes(model, x, near), charts(model)
+    numbers, of = values_and_slopes(model, x, near), charts_by_suffix(model)
     hidden = np.zeros((0, linear.size))
     if stretches is None:
         covariance = uncertainty.covariance_of(linear, times, white)
     else:
-        covariance, hidden = jackknife(stretches, white), stretches.hidden
+        covariance, hidden = jackknife(stretches, white), stretches.hidden_directions
         remarks = (*remarks, *remarks_on(stretches, model, numbers, white))
-    remarks = (*remarks, *words_on_delays(model, x))
+    remarks = (*remarks, *describe_delays(model, x))
     parts = considered.considerations(model, linear, noise, white.determined)
     covariance = _with_considered(covariance, parts, model)
     shifts = considered.stacked_shifts(parts, linear.size)
     freedom = freedom_of(model, linear, times, white.determined, shifts)
-    limits = flat_limit.limits(model, numbers, -white.determined @ linear.slope, [n for n, _ in of])
+    limits = flat_limit.flat_limits(
+        model, numbers, -white.determined @ linear.slope, [n for n, _ in of]
+    )
     # In a long curved valley steps stay short, although there is hardly anything left to gain: the
     # distance to the minimum of the linearised problem says that the search has ended.
     held = [limit.slope for limit in limits if limit.free < 0]
@@ -308,7 +316,7 @@ def assess(
     level = best_cost + margin if believable else -np.inf
     ends = [(one.x, float(one.cost), bool(one.converged)) for one in attempts]
     starts = [Start(*end, end[1] <= level) for end in ends]
-    rivals = _rivals([s for s in starts if s.fits], best_cost, margin, linear, x)
+    rivals = _count_rivals([s for s in starts if s.fits], best_cost, margin, linear, x)
     rival = f"{rivals} of {len(starts)} starts fit as well elsewhere" if rivals else ""
     if believable and not any(start.fits for start in starts):
         remarks = ("no single start came near the best point", *remarks)
@@ -321,12 +329,12 @@ def assess(
         covariance.determined,
         np.concatenate([covariance.null_directions, hidden]),
         limits,
-        freedom.of(numbers[1]),
+        freedom.degrees(numbers[1]),
     )
     words = _allowance(model, linear, noise, white.determined, parts, quantities, numbers[1])
     words = f"{words} {describe_large_biases(model, quantities)}".rstrip()
     return Fit(
-        shown,
+        original,
         x,
         jnp.asarray(covariance.covariance),
         jnp.asarray(covariance.determined),
@@ -340,13 +348,13 @@ def assess(
         jnp.asarray(covariance.singular_values),
         jnp.asarray(covariance.null_directions),
         quantities,
-        _search(best_cost, done, rival, interrupted, remarks),
+        _search_answer(best_cost, done, rival, interrupted, remarks),
         explanation,
         left,
         limits,
         near,
         freedom,
-        linear.first_times(shown.records.t.shape[1]),
+        linear.first_times(original.records.t.shape[1]),
         parts,
         words,
         jnp.asarray(hidden),
@@ -355,7 +363,7 @@ def assess(
 
 def _allowance(
     model: Model,
-    linear: Linearised,
+    linear: Linearisation,
     noise: Noise,
     covariance: np.ndarray,
     parts: tuple[considered.Consideration, ...],
@@ -363,7 +371,7 @@ def _allowance(
     slopes: np.ndarray,
 ) -> str:
     """Say what the intervals of the moments and ratios allow for, or of the `Free`s without any."""
-    bodies = {log + name for name, chart in charts(model) for log in chart.log_names}
+    bodies = {log + name for name, chart in charts_by_suffix(model) for log in chart.log_names}
     free = {slot.name for slot in model.slots}
     rows = [i for i, one in enumerate(quantities) if one.name in bodies and one.name != "mass"]
     rows = rows or [i for i, one in enumerate(quantities) if one.name.split(" ")[0] in free]

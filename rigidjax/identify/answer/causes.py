@@ -20,10 +20,14 @@ from rigidjax.identify.data.reference_states import attitudes, rates_of
 from rigidjax.identify.model.charts import as_list, tensor_of
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, in_deviations
-from rigidjax.identify.search.starts import balance, depends_on_rate_only, tensor_and_margin
+from rigidjax.identify.search.starts import (
+    balance_of_momentum,
+    depends_on_rate_only,
+    tensor_and_margin,
+)
 from rigidjax.identify.sensors import AbstractSensor, Gyro
 from rigidjax.identify.uncertainty.considered import slope_in_time
-from rigidjax.identify.uncertainty.covariance import Linearised
+from rigidjax.identify.uncertainty.covariance import Linearisation
 from rigidjax.motion.torques.base import Torque
 
 # A correction of the rates counts if it leaves less than the share BETTER of the error of the rates
@@ -71,18 +75,20 @@ def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause 
         return None
     known = [attitudes(recording) for recording in recordings]
     if all(len(t) > 10 for t, _ in known):
-        bound = BETTER * _of_attitudes(recordings, known, _SAME)
-        ratios = {name: _of_attitudes(recordings, known, turn) for name, turn in RATES.items()}
+        bound = BETTER * _rate_difference(recordings, known, _SAME)
+        ratios = {name: _rate_difference(recordings, known, turn) for name, turn in RATES.items()}
         for name, change in ATTITUDES.items():
             changed = [(t, change(q)) for t, q in known]
-            ratios[name] = _of_attitudes(recordings, changed, _SAME)
+            ratios[name] = _rate_difference(recordings, changed, _SAME)
     elif depends_on_rate_only(torque):
-        bound, margin = _of_euler(recordings, torque, _SAME)
+        bound, margin = _euler_residual(recordings, torque, _SAME)
         # Sensor errors alone can make the best body slightly unreal, but not far from real ones.
         bound *= BETTER if margin > -0.8 else EQUAL
-        fits = {name: _of_euler(recordings, torque, turn) for name, turn in RATES.items()}
+        fits = {name: _euler_residual(recordings, torque, turn) for name, turn in RATES.items()}
         if torque is not None:
-            fits["the torque with the other sign"] = _of_euler(recordings, torque, _SAME, -1.0)
+            fits["the torque with the other sign"] = _euler_residual(
+                recordings, torque, _SAME, -1.0
+            )
         # A margin near 1 is that of a ball, to which every constant rate is a free motion.
         ratios = {name: left if -0.01 < m < 0.8 else np.inf for name, (left, m) in fits.items()}
     else:
@@ -94,35 +100,38 @@ def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause 
     return Cause("misread", "Gyro", 1.0, f"most likely {words}", f"read the log again: {words}")
 
 
-def _of_euler(
+def _euler_residual(
     recordings: Sequence[Recording], torque: Torque | None, turn: np.ndarray, sign: float = 1.0
 ) -> tuple[float, float]:
     """Return the relative residual of Euler's equations and the best body's margin of being real.
 
     The rates are multiplied by the matrix `turn`, the torque by `sign`.
     """
-    balances = [balance(recording, torque, turn) for recording in recordings]
+    balances = [balance_of_momentum(recording, torque, turn) for recording in recordings]
     matrix, side, momentum = (np.concatenate(part) for part in zip(*balances, strict=True))
     components, margin = tensor_and_margin(matrix, sign * side)
     left = np.linalg.norm(matrix @ components - sign * side)
     return float(left / np.linalg.norm(momentum @ components)), margin
 
 
-def _of_attitudes(
+def _rate_difference(
     recordings: Sequence[Recording],
-    known: Sequence[tuple[np.ndarray, np.ndarray]],
+    attitudes: Sequence[tuple[np.ndarray, np.ndarray]],
     turn: np.ndarray,
 ) -> float:
     """Return the relative difference between rates, times `turn`, and rates between attitudes.
 
-    `known` holds the times (n,) and the attitudes (n, 4) of each recording.
+    `attitudes` holds the times (n,) and the attitudes (n, 4) of each recording.
     """
     left, size = 0.0, 1e-300
-    for recording, (t, q) in zip(recordings, known, strict=True):
+    for recording, (t, q) in zip(recordings, attitudes, strict=True):
         when, wanted = rates_of(t, jnp.asarray(q))
         reading = readings_of(recording, Gyro)[0]
-        at, w = np.asarray(recording.t)[reading.seen], np.asarray(reading.values)[reading.seen]
-        shown = np.stack([np.interp(when, at, axis) for axis in (w @ turn.T).T], axis=1)
+        gyro_times, w = (
+            np.asarray(recording.t)[reading.host_mask],
+            np.asarray(reading.values)[reading.host_mask],
+        )
+        shown = np.stack([np.interp(when, gyro_times, axis) for axis in (w @ turn.T).T], axis=1)
         left += float(np.sum((shown - wanted) ** 2))
         size += float(np.sum(wanted**2))
     return float(np.sqrt(left / size))
@@ -144,11 +153,13 @@ def causes(
     model: Model,
     x: Float[Array, " n"],
     noise: Noise,
-    linear: Linearised,
+    linear: Linearisation,
     indices: Sequence[int],
 ) -> tuple[Cause, ...]:
     """Return the most likely cause of the errors of each sensor in `indices`, if it has one."""
-    given = zip(stacking.on_host(model.records, model.counts), model.body_names, strict=True)
+    given = zip(
+        stacking.recordings_on_host(model.records, model.counts), model.body_names, strict=True
+    )
     mine = [recording for recording, name in given if name == model.body_names[0]]
     wrong = misreading(mine, model.torque)
     if wrong is not None:
@@ -159,29 +170,29 @@ def causes(
     out = []
     for index in indices:
         sensor: Any = model.records.readings[index].sensor
-        cause = clock(model, noise, linear, index)
-        if cause is None and _of_three(sensor):
-            rows = _table(model, x, noise, linear, index)
+        cause = clock_cause(model, noise, linear, index)
+        if cause is None and _is_vector_error(sensor):
+            rows = _candidate_causes(model, x, noise, linear, index)
             given = model, noise, linear, index, free
             shares = [_explained_share(*given, row[1]) for row in rows]
-            cause = _largest(sensor, rows, shares)
+            cause = _largest_cause(sensor, rows, shares)
         if cause is None and hasattr(sensor, "suspect"):
             cause = Cause(sensor.suspect[0], type(sensor).__name__, None, *sensor.suspect[1:])
         out += [] if cause is None else [cause]
     return tuple(out)
 
 
-def clock(model: Model, noise: Noise, linear: Linearised, index: int) -> Cause | None:
+def clock_cause(model: Model, noise: Noise, linear: Linearisation, index: int) -> Cause | None:
     """Return the cause "clock" if time stamps scatter by more than the jitter of the sensor.
 
     A late time stamp makes an error along the change of the readings in time, dy/dt.
     """
     sensor, error = model.records.readings[index].sensor, linear.raw[index]
-    kept = linear.kept[index].all(axis=-1)
-    if not (_of_three(sensor) and error[kept].any()):
+    kept = linear.mask[index].all(axis=-1)
+    if not (_is_vector_error(sensor) and error[kept].any()):
         return None
     slope = slope_in_time(model, np.asarray(model.records.readings[index].values) - error)
-    late = model.records.readings[index].late
+    late = model.records.readings[index].jitter_error
     both = np.asarray(in_deviations(np.stack([error, slope], -1), noise[index], late))
     error, slope = both[..., 0], both[..., 1]
     moved = np.sum(slope**2, axis=-1) * kept
@@ -209,12 +220,12 @@ def _cause(name: str, sensor: AbstractSensor, share: float, words: str, remedy: 
     return Cause(name, kind, share, f"most likely {words}: {explained}", remedy)
 
 
-def _largest(
+def _largest_cause(
     sensor: AbstractSensor, rows: Sequence[tuple], shares: Sequence[tuple]
 ) -> Cause | None:
     """Return the cause that explains the most, joined with those that explain nearly as much.
 
-    `rows` are those of `_table`, `shares` the results of `_explained_share` for them.
+    `rows` are those of `_candidate_causes`, `shares` the results of `_explained_share` for them.
     """
     candidates = [
         (share, name, words.format(size=", ".join(f"{x:.2g}" for x in size)), remedy)
@@ -232,13 +243,13 @@ def _largest(
     return _cause(names, sensor, most, words, remedies)
 
 
-def _of_three(sensor: AbstractSensor) -> bool:
+def _is_vector_error(sensor: AbstractSensor) -> bool:
     """Return whether errors of the sensor are readings minus predictions along three axes."""
     return sensor.reading_shape == (3,) and sensor.components == 3
 
 
-def _table(
-    model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearised, index: int
+def _candidate_causes(
+    model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearisation, index: int
 ) -> tuple[tuple[str, np.ndarray, str, str], ...]:
     """Return name, direction (R, T, 3, c), words and remedy of each cause for one sensor.
 
@@ -274,7 +285,7 @@ def _table(
 
 
 def _response(
-    model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearised, index: int
+    model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearisation, index: int
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return the function from torques τ (R, T, 3, c) to the changes of the body rate by them.
 
@@ -303,32 +314,34 @@ def _response(
 def _explained_share(
     model: Model,
     noise: Noise,
-    linear: Linearised,
+    linear: Linearisation,
     index: int,
-    free: np.ndarray,
+    free_columns: np.ndarray,
     direction: np.ndarray,
 ) -> tuple[float, np.ndarray]:
     """Return the share of a sensor's squared errors that a direction explains, and its size.
 
-    The `direction` (R, T, k, c) counts only by its part outside of the orthonormal columns `free`
-    (R, N, m), which span what the free numbers can change. The size (c,) is the least-squares
-    coefficient of the direction.
+    The `direction` (R, T, k, c) counts only by its part outside of the orthonormal columns
+    `free_columns` (R, N, m), which span what the free numbers can change. The size (c,) is the
+    least-squares coefficient of the direction.
     """
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]
-    late = model.records.readings[index].late
-    scaled = np.asarray(in_deviations(direction, noise[index], late)) * roots[index][..., None]
+    jitter_error = model.records.readings[index].jitter_error
+    scaled = (
+        np.asarray(in_deviations(direction, noise[index], jitter_error)) * roots[index][..., None]
+    )
     size = np.sqrt(np.sum(scaled**2, axis=(0, 1, 2)))
     size[size == 0] = 1.0
     columns = [np.zeros((*error.shape, size.size)) for error in errors]
     columns[index] = scaled / size
 
-    def outside(parts: Sequence[np.ndarray], width: int) -> np.ndarray:
+    def residual_of_free(parts: Sequence[np.ndarray], width: int) -> np.ndarray:
         x = np.concatenate([part.reshape(len(part), -1, width) for part in parts], axis=1)
-        return (x - free @ (free.swapaxes(1, 2) @ x)).reshape(-1, width)
+        return (x - free_columns @ (free_columns.swapaxes(1, 2) @ x)).reshape(-1, width)
 
-    u, s, v = np.linalg.svd(outside(columns, size.size), full_matrices=False)
-    projection = np.where(s > APART, u.T @ outside(errors, 1)[:, 0], 0.0)
+    u, s, v = np.linalg.svd(residual_of_free(columns, size.size), full_matrices=False)
+    projection = np.where(s > APART, u.T @ residual_of_free(errors, 1)[:, 0], 0.0)
     total = float(np.sum(errors[index] ** 2))
     share = min(float(projection @ projection) / total, 1.0)
     return share, v.T @ (projection / np.maximum(s, APART)) / size

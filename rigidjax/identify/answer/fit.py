@@ -26,7 +26,7 @@ from rigidjax.identify.search.checkpoint import (
     require_folder,
     without_arrays,
 )
-from rigidjax.identify.search.noise import estimate_noise, first_noise
+from rigidjax.identify.search.noise import estimate_noise, initial_noise
 from rigidjax.identify.search.stages import (
     Attempt,
     Task,
@@ -112,19 +112,19 @@ def fit(
     ...                                  jnp.diag(jnp.array([1.0, 2.0, 2.5])), atol=1e-6))
     ('ok', True)
     """
-    _checks.instance(model, Model, "fit", wanted="a Model")
-    starts = _checks.whole(starts, "starts", 1)
-    max_steps = _checks.whole(max_steps, "max_steps", 1)
-    tolerance = _checks.positive(tolerance, "tolerance")
-    key = None if key is None else _checks.key(key)
+    _checks.require_instance(model, Model, "fit", requirement="a Model")
+    starts = _checks.integer(starts, "starts", 1)
+    max_steps = _checks.integer(max_steps, "max_steps", 1)
+    tolerance = _checks.positive_float(tolerance, "tolerance")
+    key = None if key is None else _checks.random_key(key)
     if initial is not None:
         initial = require_numbers(model, initial)
     if progress is not None:
-        _checks.function(progress, "progress", "of a line of text, such as print")
+        _checks.require_function(progress, "progress", "of a line of text, such as print")
     if checkpoint is not None:
         require_folder(checkpoint)
     wanted = "a Descent(optimiser, …) or None"
-    _checks.instance(descent, (Descent, NoneType), "fit", wanted=wanted)
+    _checks.require_instance(descent, (Descent, NoneType), "fit", requirement=wanted)
     shared = model.size - len(model.index.alone) * model.count
     if shared > MOST_SHARED:
         raise ValueError(
@@ -133,15 +133,15 @@ def fit(
             "identify.descend(model, Descent(optax.adam(1e-2), steps=…, batch=…)), which takes "
             "gradients of a few recordings at a time"
         )
-    if (cpu := _quicker_place(model)) is not None:
+    if (cpu := _faster_device(model)) is not None:
         with jax.default_device(cpu):
             result = fit(
                 model, starts=starts, initial=initial, key=key, tolerance=tolerance,
                 max_steps=max_steps, descent=descent, checkpoint=checkpoint, progress=progress,
             )  # fmt: skip
         return dataclasses.replace(result, place=_ON_CPU)
-    padded = stacking.of_few_lengths(model)
-    task = Task(padded, first_noise(padded), tolerance, max_steps)
+    padded = stacking.pad_to_few_lengths(model)
+    task = Task(padded, initial_noise(padded), tolerance, max_steps)
     points = [] if initial is None else [initial]
     if starts > len(points):
         points += starting_points(model, starts - len(points), key)
@@ -150,20 +150,20 @@ def fit(
         # Choose the tolerance before the search: the errors of long steps would slow it down, and
         # another tolerance compiles no other program.
         first = Attempt(points[0], blocks=errors_and_slopes(padded, points[0]))
-        finer = _finer_integrator(first, task, rough)
+        finer = _converged_integrator(first, task, rough)
         task = task if rough else task._replace(model=_with_integrator(padded, finer))
     if descent is not None:
         points = _descend_from_each(points, task, descent, key, progress, interrupts)
-    attempts = _from_each(points, task, checkpoint, progress, interrupts)
+    attempts = _search_from_each(points, task, checkpoint, progress, interrupts)
     best = min(attempts, key=_cost)
     lowest = float(best.cost)
-    for estimated in (_with_noise, _with_widths):
+    for estimated in (_estimate_noise_in_turn, _estimate_widths_in_turn):
         best, task = estimated(best, task)
     best = _with_blocks(best, task.model)
     rough.clear()
-    while (finer := _finer_integrator(best, task, rough)) is not None:
+    while (finer := _converged_integrator(best, task, rough)) is not None:
         task = task._replace(model=_with_integrator(task.model, finer))
-        best, task = _with_noise(polish(Attempt(best.x), task), task)
+        best, task = _estimate_noise_in_turn(polish(Attempt(best.x), task), task)
         best = _with_blocks(best, task.model)
     shown = model if task.model is padded else _with_original_readings(model, task.model)
     return assess(task.model, best, task.noise, attempts, lowest, shown, interrupts, rough)
@@ -172,7 +172,7 @@ def fit(
 _ON_CPU = "computed on the CPU, which is faster than a GPU for so few readings"
 
 
-def _quicker_place(model: Model) -> Any:
+def _faster_device(model: Model) -> Any:
     """Return the CPU for a small model on a machine with a GPU, unless a device was chosen.
 
     A device is chosen by `jax.default_device`, or by arrays that were put on a device.
@@ -186,13 +186,13 @@ def _quicker_place(model: Model) -> Any:
     return jax.devices("cpu")[0]
 
 
-def _with_original_readings(given: Model, fitted: Model) -> Model:
-    """Return the `fitted` model with the unpadded readings of the `given` one, and their jitter."""
-    records = given.records
+def _with_original_readings(original: Model, fitted: Model) -> Model:
+    """Return the `fitted` model with the unpadded readings of the `original`, and their jitter."""
+    records = original.records
     for index, r in enumerate(fitted.records.readings):
-        if r.late is not None:
+        if r.jitter_error is not None:
             one, jitter = records.readings[index], cast(Any, r.sensor).jitter
-            one = one.with_jitter(r.late[:, : one.mask.shape[1]], jitter.deviation)
+            one = one.with_jitter(r.jitter_error[:, : one.mask.shape[1]], jitter.deviation)
             records = eqx.tree_at(lambda a, i=index: a.readings[i], records, one)
     return eqx.tree_at(lambda m: m.records, fitted, records)
 
@@ -203,12 +203,12 @@ def _cost(attempt: Attempt) -> float:
     return cost if np.isfinite(cost) else np.inf
 
 
-def _with_noise(best: Attempt, task: Task) -> tuple[Attempt, Task]:
+def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     """Estimate the unknown noise and the best point in turn; return the point, and the new task."""
     if all(reading.known_noise for reading in task.model.records.readings):
         return best, task
 
-    def estimated(best: Attempt, task: Task) -> Task:
+    def estimate(best: Attempt, task: Task) -> Task:
         blocks = _with_blocks(best, task.model).blocks
         model, noise = estimate_noise(task.model, best.x, blocks, task.noise)
         return task._replace(model=model, noise=noise)
@@ -216,7 +216,7 @@ def _with_noise(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     # Repeat it: the weights, the robust loss and the degrees of freedom that the fit takes from few
     # readings depend on the noise.
     for turn in range(_ROUNDS):
-        before, task = task.noise, estimated(best, task)
+        before, task = task.noise, estimate(best, task)
         pairs = zip(before, task.noise, strict=True)
         if turn > 1 and all(np.allclose(b, a, rtol=_SETTLED, atol=0.0) for a, b in pairs):
             break
@@ -247,7 +247,7 @@ def _descend_from_each(
     return out
 
 
-def _from_each(
+def _search_from_each(
     points: list[Array],
     task: Task,
     checkpoint: str | Path | None,
@@ -315,14 +315,16 @@ def _with_integrator(model: Model, integrator: AbstractIntegrator | None) -> Mod
     return eqx.tree_at(lambda m: m.integrator, model, integrator)
 
 
-def _finer_integrator(best: Attempt, task: Task, rough: list[str]) -> AbstractIntegrator | None:
+def _converged_integrator(
+    best: Attempt, task: Task, remarks: list[str]
+) -> AbstractIntegrator | None:
     """Return the integrator whose predictions shorter steps do not change, `None` for the present.
 
-    If even the shortest steps change them, a line is added to the remarks `rough`.
+    If even the shortest steps change them, a line is added to `remarks`.
     """
     model, (errors, _) = task.model, best.blocks
     steps, apart = model.integrator, 0.0
-    while steps is not None and (finer := steps.finer()) is not None:
+    while steps is not None and (finer := steps.refine()) is not None:
         closer = _with_integrator(model, finer)
         if jax.tree.structure(finer) == jax.tree.structure(model.integrator):
             exact, _ = errors_and_slopes(closer, best.x)
@@ -341,25 +343,27 @@ def _finer_integrator(best: Attempt, task: Task, rough: list[str]) -> AbstractIn
             break
     else:
         if apart > _MATTERS:
-            rough.append(f"the shortest steps still change readings by {apart:.1g} of their noise")
+            remarks.append(
+                f"the shortest steps still change readings by {apart:.1g} of their noise"
+            )
     return None if steps is model.integrator else steps
 
 
-def _with_widths(best: Attempt, task: Task) -> tuple[Attempt, Task]:
+def _estimate_widths_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     """Estimate the widths of deviations and the best point in turn; return the point and the task.
 
     These are the widths of the `Free`s whose deviations between recordings are to be estimated.
     """
-    wanted = [index for index, slot in enumerate(task.model.slots) if slot.estimated]
-    if not wanted:
+    indices = [index for index, slot in enumerate(task.model.slots) if slot.estimated]
+    if not indices:
         return best, task
-    before = np.asarray([task.model.slots[i].spread for i in wanted], float)
+    before = np.asarray([task.model.slots[i].spread for i in indices], float)
     least = _LEAST * before
     for _ in range(_ROUNDS):
         best = _with_blocks(best, task.model)
-        new = np.maximum(_expected_widths(best, task, wanted), least)
+        new = np.maximum(_expected_widths(best, task, indices), least)
         widths = [jnp.asarray(width) for width in new]
-        model = eqx.tree_at(lambda m: [m.slots[i].spread for i in wanted], task.model, widths)
+        model = eqx.tree_at(lambda m: [m.slots[i].spread for i in indices], task.model, widths)
         task = task._replace(model=model)
         best = polish(Attempt(best.x), task)
         if (np.abs(new - before) < _SETTLED * before).all() or (new <= least).all():
@@ -368,12 +372,12 @@ def _with_widths(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     return best, task
 
 
-def _expected_widths(best: Attempt, task: Task, wanted: list[int]) -> np.ndarray:
-    """Return the expected root mean square of the deviations of each slot in `wanted`.
+def _expected_widths(best: Attempt, task: Task, indices: list[int]) -> np.ndarray:
+    """Return the expected root mean square of the deviations of each slot in `indices`.
 
     The expectation is over the posterior, which Laplace's method takes as normal.
     """
     linear = linearise(task.model, best.x, task.noise, best.blocks)
     variance, x = np.diag(white_covariance(linear).determined), np.asarray(best.x)
-    places = [np.ravel(task.model.slots[i].own).astype(int) for i in wanted]
+    places = [np.ravel(task.model.slots[i].own).astype(int) for i in indices]
     return np.sqrt([np.mean(x[mine] ** 2) + np.mean(variance[mine]) for mine in places])

@@ -14,11 +14,11 @@ from rigidjax import _checks
 from rigidjax.identify.answer import answers, undetermined as identifiability
 from rigidjax.identify.answer.answers import Answer, Cause
 from rigidjax.identify.answer.causes import causes
-from rigidjax.identify.answer.undetermined import Combination, undetermined
+from rigidjax.identify.answer.undetermined import Combination, undetermined_combinations
 from rigidjax.identify.model.model import Model, Unpacked, unpack_with_slopes
 from rigidjax.identify.model.terms import Noise
 from rigidjax.identify.uncertainty.considered import Consideration
-from rigidjax.identify.uncertainty.covariance import Linearised
+from rigidjax.identify.uncertainty.covariance import Linearisation
 from rigidjax.identify.uncertainty.degrees_of_freedom import Freedom, quantile
 from rigidjax.identify.uncertainty.flat_limit import Limit
 from rigidjax.identify.uncertainty.quantities import Quantity, interval_about
@@ -54,7 +54,8 @@ class Fit(eqx.Module):
     - `model`: the model that was fitted.
     - `x`: (n,) the free numbers at the best point.
     - `covariance`: (n, n) of x; infinite for undetermined numbers.
-    - `seen`: (n, n) the part of the covariance within the directions that the data determine.
+    - `determined_covariance`: (n, n) the part of the covariance within the directions that the data
+      determine.
     - `covariance_kind`: the method of the covariance, in words.
     - `noises`: (R, k) for each sensor, the standard deviations of R recordings.
     - `starts`: a `Start` for each starting point.
@@ -75,8 +76,8 @@ class Fit(eqx.Module):
     - `linear`: errors and derivatives at the best point, from which all of this is computed.
     - `considered`: the sensor errors that the covariance allows for by a `Tolerance`.
     - `allowance`: the sentences on what the intervals allow for.
-    - `hidden`: (k, n) the directions that one stretch of windows alone shows, whose variance is
-      infinite; for a fit of windows.
+    - `hidden_directions`: (k, n) the directions that one stretch of windows alone shows, whose
+      variance is infinite; for a fit of windows.
     - `place`: where it was computed, in words, if that is not JAX's default device.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
@@ -87,7 +88,7 @@ class Fit(eqx.Module):
     model: Model
     x: Float[Array, " n"]
     covariance: Float[Array, "n n"]
-    seen: Float[Array, "n n"]
+    determined_covariance: Float[Array, "n n"]
     covariance_kind: str
     noises: Noise
     starts: tuple[Start, ...]
@@ -104,10 +105,10 @@ class Fit(eqx.Module):
     limits: tuple[Limit, ...] = ()
     near: Float[Array, " n"] | None = None
     freedom: Freedom | None = None
-    linear: Linearised | None = None
+    linear: Linearisation | None = None
     considered: tuple[Consideration, ...] = ()
     allowance: str = ""
-    hidden: Float[Array, "hidden n"] | None = None
+    hidden_directions: Float[Array, "hidden n"] | None = None
     place: str = ""
 
     @property
@@ -229,8 +230,10 @@ class Fit(eqx.Module):
         out = []
         errors = self._errors
         for error, reading in zip(errors, self.model.records.readings, strict=True):
-            kept = reading.kept.all(axis=-1)
-            lengths = np.sum(np.asarray(error) ** 2, axis=-1)[kept if kept.any() else reading.seen]
+            mask = reading.channel_mask.all(axis=-1)
+            lengths = np.sum(np.asarray(error) ** 2, axis=-1)[
+                mask if mask.any() else reading.host_mask
+            ]
             out.append(float(np.sqrt(lengths.mean())))
         return tuple(out)
 
@@ -244,7 +247,7 @@ class Fit(eqx.Module):
         return {quantity.name: quantity.interval(level) for quantity in self.quantities}
 
     def interval_of(
-        self, of: Callable[[Unpacked], Any], level: float = 0.95
+        self, function: Callable[[Unpacked], Any], level: float = 0.95
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the interval (low, high) of a differentiable function of the fit.
 
@@ -252,13 +255,13 @@ class Fit(eqx.Module):
 
         **Arguments:**
 
-        - `of`: the function, from `Unpacked` to an array.
+        - `function`: from `Unpacked` to an array.
         - `level`: the probability that the interval holds the true value.
 
         **Raises** as `interval`.
         """
-        _checks.function(of, "of", "of `Unpacked` to an array")
-        if not _checks.known(self.x):
+        _checks.require_function(function, "function", "of `Unpacked` to an array")
+        if not _checks.is_known(self.x):
             raise TypeError(
                 "Fit: wanted known numbers, got traced ones; intervals are made on the host: call "
                 "interval_of outside of jax.jit, jax.grad and jax.vmap"
@@ -266,7 +269,7 @@ class Fit(eqx.Module):
 
         def value(point: Unpacked) -> Array:
             point = dataclasses.replace(point, noise=self.noises)
-            return _checks.numbers(of(point), "of(point)")
+            return _checks.numeric_array(function(point), "function(point)")
 
         # Compile one program for what x represents: outside of a trace each operation of JAX is a
         # program of its own, and some ninety of them took seconds to compile.
@@ -276,29 +279,33 @@ class Fit(eqx.Module):
         def change(step: Unpacked) -> Array:
             return jax.jvp(value, (point,), (step,))[1]
 
-        middle = np.asarray(_checks.finite(value(best), "of(point)"))
+        middle = np.asarray(_checks.require_finite(value(best), "function(point)"))
         slope = np.asarray(jax.vmap(change, in_axes=-1, out_axes=-1)(slopes))
-        seen, null = np.asarray(self.seen), np.asarray(self.null_directions)
-        if self.hidden is not None:
-            null = np.concatenate([null, np.asarray(self.hidden)])
-        reach = quantile(level, self.degrees(slope))
-        return interval_about(middle, slope, seen, null, reach, self.limits)
+        determined, null = np.asarray(self.determined_covariance), np.asarray(self.null_directions)
+        if self.hidden_directions is not None:
+            null = np.concatenate([null, np.asarray(self.hidden_directions)])
+        reach = quantile(level, self.degrees_of_freedom(slope))
+        return interval_about(middle, slope, determined, null, reach, self.limits)
 
-    def degrees(self, slope: np.ndarray) -> np.ndarray:
+    def degrees_of_freedom(self, slope: np.ndarray) -> np.ndarray:
         """Return the degrees of freedom of the variances of functions with derivative `slope`.
 
         The `slope` (…, n) is taken with respect to the free numbers.
         """
-        return np.full(slope.shape[:-1], np.inf) if self.freedom is None else self.freedom.of(slope)
+        return (
+            np.full(slope.shape[:-1], np.inf)
+            if self.freedom is None
+            else self.freedom.degrees(slope)
+        )
 
     @property
-    def undetermined(self) -> tuple[Combination, ...]:
+    def undetermined_combinations(self) -> tuple[Combination, ...]:
         """Return the combinations of numbers that the data do not determine at all.
 
         There are none if the data determine all numbers. Each combination has `names`, `changes`
         and `in_words`.
         """
-        return undetermined(self)
+        return undetermined_combinations(self)
 
     @property
     def identifiability(self) -> tuple[str, ...]:
@@ -308,7 +315,7 @@ class Fit(eqx.Module):
 
 def require_one_fit(fit: PyTree, name: str = "fit") -> Fit:
     """Return the `fit`; raise `TypeError` or `ValueError` unless it is one `Fit`, not a batch."""
-    _checks.instance(fit, Fit, name)
+    _checks.require_instance(fit, Fit, name)
     if np.shape(fit.chi2) != ():
         raise ValueError(
             f"{name}: wanted one Fit, as identify.fit returns it, got a batch with a chi2 of shape "

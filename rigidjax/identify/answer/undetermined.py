@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.answer.answers import FAILS, NOT_ENDED
-from rigidjax.identify.data.full_scale import in_words
+from rigidjax.identify.data.full_scale import describe_full_scale
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.model.charts import BASIS, COMPONENTS, Bodies, Tensor, as_list
 from rigidjax.identify.model.model import Model, without_samples
@@ -22,15 +22,15 @@ from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 from rigidjax.identify.uncertainty.flat_limit import bodies_of
 from rigidjax.identify.uncertainty.quantities import (
     Quantity,
-    charts,
+    charts_by_suffix,
     labels,
+    quantity_vector,
     recording_names,
     reported_deviation,
     reports_starts,
     value_and_slope,
-    vector,
 )
-from rigidjax.motion.manifold import minus, parts
+from rigidjax.motion.manifold import minus, parts_by_name
 from rigidjax.rotation import quaternion
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class Combination(eqx.Module):
 TENSOR = dict(zip(Tensor.plain_names, COMPONENTS, strict=True))
 
 
-def undetermined(fit: "Fit") -> tuple[Combination, ...]:
+def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
     """Return the combinations that the data do not determine at all, each of few numbers.
 
     By the reduced echelon form each combination has a number that no other has. Initial attitudes
@@ -117,8 +117,10 @@ def undetermined(fit: "Fit") -> tuple[Combination, ...]:
     if not null.size:
         return ()
     best = basis = None
-    slopes, values = map(np.asarray, _slopes(without_samples(fit.model), fit.derivative_point))
-    names, many = _names(fit.model), len(charts(fit.model))
+    slopes, values = map(
+        np.asarray, _values_and_slopes(without_samples(fit.model), fit.derivative_point)
+    )
+    names, many = _names_and_units(fit.model), len(charts_by_suffix(fit.model))
     first, turns = len(labels(fit.model)), 3 * fit.model.count
     for other in (1, 0):
         # Attitudes about the world's axes, or about the body's.
@@ -141,7 +143,7 @@ def undetermined(fit: "Fit") -> tuple[Combination, ...]:
     rows = sorted((row for row in best[0] if row.any()), key=lambda row: np.flatnonzero(row)[0])
     switches = [_readings_change(fit, np.linalg.lstsq(basis.T, row)[0] @ null) for row in rows]
     both = zip(rows, switches, strict=True)
-    return tuple(_combination(row, *best[1:], switch) for row, switch in both)
+    return tuple(_combination_of_row(row, *best[1:], switch) for row, switch in both)
 
 
 def _readings_change(fit: "Fit", direction: np.ndarray) -> bool:
@@ -162,7 +164,7 @@ def _readings_change(fit: "Fit", direction: np.ndarray) -> bool:
     return total > CHANGED**2
 
 
-def _combination(
+def _combination_of_row(
     row: np.ndarray,
     names: list[tuple[str, str, bool]],
     size: np.ndarray,
@@ -188,10 +190,13 @@ def _combination(
     )
 
 
-def _names(model: Model) -> list[tuple[str, str, bool]]:
-    """Return name and unit of the numbers of `_slopes`, and whether their changes are relative."""
+def _names_and_units(model: Model) -> list[tuple[str, str, bool]]:
+    """Return name and unit of the numbers of `_values_and_slopes`.
+
+    The third part is whether the changes of a number are relative.
+    """
     out = labels(model)
-    for name, chart in charts(model):
+    for name, chart in charts_by_suffix(model):
         unit = chart.unit.replace("SI", "kg m²")
         out += [(f"{part}{name}", unit, False) for part in TENSOR]
     for part, name, unit in (
@@ -207,7 +212,7 @@ def _names(model: Model) -> list[tuple[str, str, bool]]:
 
 
 @eqx.filter_jit
-def _slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
+def _values_and_slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
     """Return the derivatives (M, n) and the values (M,) of all numbers that a report may name.
 
     These are the reported numbers, the tensors of the bodies and the initial states, at a `point`
@@ -219,14 +224,14 @@ def _slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
     def initial_states(x: Array) -> list[Array]:
         states = jax.vmap(ReferenceStates.start_at)(reference, x[model.index.start])
         one, numbers = jax.tree.map(lambda leaf: leaf[0], states), []
-        change = parts(one, jax.vmap(minus)(states, start))
-        offset = parts(one, jax.vmap(minus)(states, reference.state))
+        change = parts_by_name(one, jax.vmap(minus)(states, start))
+        offset = parts_by_name(one, jax.vmap(minus)(states, reference.state))
         if "q" in change:
             numbers += [jax.vmap(quaternion.rotate)(start.q, change["q"]), change["q"]]
         return [*numbers, *(offset[name] for name in ("x", "v") if name in offset)]
 
     def value(x: Array) -> Array:
-        numbers = [vector(model, x)]
+        numbers = [quantity_vector(model, x)]
         for body in as_list(model.bodies(x)):
             tensor = tensor_of(body)
             numbers.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
@@ -244,7 +249,7 @@ def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.nda
     """
     rows = bodies_of(fit.model, fit.derivative_point)
     mask = np.ones(len(names), bool)
-    for (where, chart), body in zip(charts(fit.model), rows, strict=True):
+    for (where, chart), body in zip(charts_by_suffix(fit.model), rows, strict=True):
         # A chart may report the components itself; the last entries of the name are ours.
         every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]
         places = [some[-1] for some in every]
@@ -292,14 +297,14 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         ]
         # Undetermined directions are the likely reason why a search did not end: name them.
         out += [] if lost else _list_undetermined(fit)
-        return (*out, *in_words(fit.model.records.readings))
+        return (*out, *describe_full_scale(fit.model.records.readings))
     out = []
     moments, first = [], 0
-    for _, chart in charts(fit.model):
+    for _, chart in charts_by_suffix(fit.model):
         moments += fit.quantities[first : first + len(chart.log_names)]
         first += len(chart.log_names) + len(chart.plain_names)
     for quantity in moments:
-        wide = _half(quantity)
+        wide = _half_width(quantity)
         # The half-width of the logarithm is relative if narrow, and a factor if wide.
         if not np.isfinite(wide) or wide > 1.5:
             out.append(f"{quantity.name} is not determined by these data.")
@@ -310,16 +315,16 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
             )
         else:
             out.append(f"{quantity.name} is well determined, to ±{wide:.2g} of its value.")
-    seen = np.asarray(fit.seen)
+    determined = np.asarray(fit.determined_covariance)
     out += [
         f"A flat body{limit.where} fits as well: (I1 + I2 − I3)/I3 ≤ "
-        f"{limit.bound(seen):.2g} (95 %). Intervals end at the limit of real bodies."
+        f"{limit.bound(determined):.2g} (95 %). Intervals end at the limit of real bodies."
         for limit in fit.limits
-        if limit.is_near(seen, float(quantile(0.95, fit.degrees(limit.slope))))
+        if limit.is_near(determined, float(quantile(0.95, fit.degrees_of_freedom(limit.slope))))
     ]
     count = fit.model.count
     if reports_starts(fit.model):
-        out.append(_rate(fit.quantities[first : first + 3 * count], count))
+        out.append(_describe_rates(fit.quantities[first : first + 3 * count], count))
     out += _list_undetermined(fit)
     out += correlations(fit)
     if fit.model.torque is None:
@@ -332,22 +337,22 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
                 "Rates of free motion with an axis mirrored or two axes swapped fit another body "
                 "as well: they cannot show such a mistake."
             )
-    out += in_words(fit.model.records.readings)
+    out += describe_full_scale(fit.model.records.readings)
     return tuple(out)
 
 
-def _half(quantity: Quantity) -> float:
+def _half_width(quantity: Quantity) -> float:
     """Return half the width of the 95 % interval, of the logarithm of a positive quantity."""
     return float(quantile(0.95, quantity.freedom)) * reported_deviation(quantity)
 
 
-def _rate(rates: Sequence[Quantity], count: int) -> str:
+def _describe_rates(rates: Sequence[Quantity], count: int) -> str:
     """Say how well the initial body rates of `count` recordings are determined."""
     shares = []
     for index in range(count):
         three = rates[3 * index : 3 * index + 3]
         length = np.linalg.norm([q.value for q in three])
-        shares.append(np.max([_half(q) for q in three]) / max(length, 1e-300))
+        shares.append(np.max([_half_width(q) for q in three]) / max(length, 1e-300))
     wide = np.max(shares)
     what = "The initial body rate is" if count == 1 else "The initial body rates are"
     if not wide < 1.0:
@@ -359,7 +364,7 @@ def _rate(rates: Sequence[Quantity], count: int) -> str:
 
 def _list_undetermined(fit: "Fit") -> list[str]:
     """List what the data do not determine, a sentence each."""
-    combinations = undetermined(fit)
+    combinations = undetermined_combinations(fit)
     if not combinations:
         return []
     out = []
@@ -380,7 +385,7 @@ def scale_is_unseen(fit: "Fit") -> bool:
         return False
     first = len(labels(fit.model))
     slopes, values = (
-        np.asarray(a) for a in _slopes(without_samples(fit.model), fit.derivative_point)
+        np.asarray(a) for a in _values_and_slopes(without_samples(fit.model), fit.derivative_point)
     )
     here, moved = values[first : first + 6], slopes[first : first + 6] @ null.T
     wanted, *_ = np.linalg.lstsq(moved, here, rcond=None)
@@ -393,10 +398,12 @@ def correlations(fit: "Fit") -> list[str]:
     Components of the tensor are left out: they follow from the moments and axes.
     """
     slope = np.asarray(value_and_slope(fit.model, fit.derivative_point)[1])[: len(fit.quantities)]
-    covariance = slope @ np.asarray(fit.seen) @ slope.T
+    covariance = slope @ np.asarray(fit.determined_covariance) @ slope.T
     deviation = np.array([reported_deviation(quantity) for quantity in fit.quantities])
     good = np.isfinite(deviation) & (deviation > 0)
-    follow = {f"{plain}{name}" for name, c in charts(fit.model) for plain in c.plain_names}
+    follow = {
+        f"{plain}{name}" for name, c in charts_by_suffix(fit.model) for plain in c.plain_names
+    }
     names = [quantity.name for quantity in fit.quantities]
     good &= np.array([name not in follow or name.startswith("com") for name in names])
     scaled = np.where(good, deviation, 1.0)

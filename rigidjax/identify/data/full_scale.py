@@ -15,7 +15,7 @@ RUN = 3
 MOST = 0.7
 
 
-def plateau(values: np.ndarray) -> float | None:
+def full_scale_of(values: np.ndarray) -> float | None:
     """Return the full scale of one channel (T,), `None` unless its largest readings are cut off.
 
     They are cut off if more readings in a row are equal than at the top of a smooth wave. There
@@ -47,8 +47,8 @@ def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
                 sensor: Any = reading.sensor
                 plain = sensor.reading_shape == (sensor.components,)
                 if plain and getattr(sensor, "limit", 0) is None:
-                    values = np.asarray(reading.values)[reading.seen]
-                    levels = [plateau(channel) for channel in values.T]
+                    values = np.asarray(reading.values)[reading.host_mask]
+                    levels = [full_scale_of(channel) for channel in values.T]
                     limits_by_place[place] = np.array(
                         [np.inf if one is None else one for one in levels]
                     )
@@ -64,11 +64,11 @@ def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
     return out
 
 
-def in_words(readings: Sequence[Any]) -> list[str]:
+def describe_full_scale(readings: Sequence[Any]) -> list[str]:
     """List the readings at full scale, a sentence for each sensor that has some."""
     out = []
     for reading in readings:
-        count = (reading.seen[..., None] & ~reading.kept).sum(axis=(0, 1))
+        count = (reading.host_mask[..., None] & ~reading.channel_mask).sum(axis=(0, 1))
         if not count.any():
             continue
         sensor = reading.sensor

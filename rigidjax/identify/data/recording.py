@@ -23,8 +23,8 @@ class Reading(eqx.Module):
     - `sensor`: the sensor.
     - `values`: (T, …) the readings.
     - `mask`: (T,) true where there is a reading.
-    - `late`: (T, k) for a sensor with jitter: the error that a time stamp makes if it is one
-      standard deviation late, by the last fit; else `None`.
+    - `jitter_error`: (T, k) for a sensor with jitter: the error that a time stamp makes if it is
+      one standard deviation late, by the last fit; else `None`.
 
     Inside a `Model` all arrays have a leading axis over recordings.
 
@@ -36,43 +36,45 @@ class Reading(eqx.Module):
     sensor: AbstractSensor
     values: Float[Array, "..."]
     mask: Bool[Array, "*records times"]
-    late: Float[Array, "*records times k"] | None = None
+    jitter_error: Float[Array, "*records times k"] | None = None
 
     def __post_init__(self) -> None:
-        if self.late is None and getattr(self.sensor, "jitter", None) is not None:
+        if self.jitter_error is None and getattr(self.sensor, "jitter", None) is not None:
             shape = (*np.shape(self.mask), self.sensor.components)
-            self.late = jnp.asarray(np.zeros(shape, self.values.dtype))
+            self.jitter_error = jnp.asarray(np.zeros(shape, self.values.dtype))
 
     @property
-    def seen(self) -> np.ndarray:
+    def host_mask(self) -> np.ndarray:
         """Return the mask as a NumPy array, for work outside of `jit`."""
         return np.asarray(self.mask)
 
     @property
-    def kept(self) -> np.ndarray:
+    def channel_mask(self) -> np.ndarray:
         """Return the mask (…, T, k) of the channels that were read and are not at full scale."""
-        seen = np.broadcast_to(self.seen[..., None], (*self.mask.shape, self.sensor.components))
+        mask = np.broadcast_to(
+            self.host_mask[..., None], (*self.mask.shape, self.sensor.components)
+        )
         limit = getattr(self.sensor, "limit", None)
         if limit is None:
-            return seen
-        return seen & (np.abs(self.values) < np.asarray(limit)[..., None, :] * (1 - 1e-6))
+            return mask
+        return mask & (np.abs(self.values) < np.asarray(limit)[..., None, :] * (1 - 1e-6))
 
-    def with_jitter(self, late: Array, deviation: Array) -> "Reading":
-        """Return these readings with another jitter: its error `late` and its `deviation`, s.
+    def with_jitter(self, jitter_error: Array, deviation: Array) -> "Reading":
+        """Return these readings with another `jitter_error`, and jitter of another `deviation`, s.
 
-        A search holds `late` constant. If it did not, errors would count less wherever a motion
-        changes quickly, and the search would prefer such motions.
+        A search holds `jitter_error` constant. If it did not, errors would count less wherever a
+        motion changes quickly, and the search would prefer such motions.
         """
 
         def parts(reading: PyTree) -> Any:
-            return reading.late, reading.sensor.jitter.deviation
+            return reading.jitter_error, reading.sensor.jitter.deviation
 
-        return eqx.tree_at(parts, self, (late, deviation))
+        return eqx.tree_at(parts, self, (jitter_error, deviation))
 
     @property
     def known_noise(self) -> bool:
         """Return whether the size of the errors is known before the fit."""
-        return self.sensor.noise is not None and self.late is None
+        return self.sensor.noise is not None and self.jitter_error is None
 
 
 class Recording(eqx.Module):
@@ -113,12 +115,12 @@ class Recording(eqx.Module):
                     "Recording: wanted pairs (sensor, values) or (sensor, values, mask) after the "
                     f"times, got {type(pair).__name__}; as in Recording(t, (sensor, values))"
                 )
-        if not _checks.known((t, [reading[1:] for reading in readings])):
+        if not _checks.is_known((t, [reading[1:] for reading in readings])):
             raise TypeError(
                 "Recording: wanted known numbers for t and the readings, got traced ones; make the "
                 "recording outside of jit, vmap and grad, and give it to them as an argument"
             )
-        t = _checks.on_host(t, "t")
+        t = _checks.host_array(t, "t")
         if t.ndim != 1 or t.size < 2:
             raise ValueError(f"t: wanted at least two times, shape (T,), got shape {t.shape}")
         if not np.isfinite(t).all():
@@ -129,7 +131,7 @@ class Recording(eqx.Module):
             raise ValueError(f"t: wanted increasing times; t[{index}] is not above the one before")
         if not readings:
             raise ValueError("Recording: wanted at least one pair (sensor, values)")
-        rows = [_reading(t, *reading) for reading in readings]
+        rows = [_checked_reading(t, *reading) for reading in readings]
         self.inputs = _checked_inputs(t, {} if inputs is None else inputs)
         read = np.any([mask for _, _, mask, _ in rows], axis=0)
         if read.sum() < 2:
@@ -153,14 +155,14 @@ class Recording(eqx.Module):
         )
 
     def __repr__(self) -> str:
-        if not _checks.known(self) or np.ndim(self.t) != 1:
+        if not _checks.is_known(self) or np.ndim(self.t) != 1:
             return eqx.tree_pformat(self)
         t = np.asarray(self.t)
-        ends = " … ".join(_show.time(end, t[-1] - t[0]) for end in (t[0], t[-1])) + " s"
+        ends = " … ".join(_show.time_as_text(end, t[-1] - t[0]) for end in (t[0], t[-1])) + " s"
         parts = [f"{self.t.shape[0]} times {ends}"]
         for reading in self.readings:
-            first = _show.as_text(np.asarray(reading.values)[int(np.argmax(reading.seen))])
-            name, count = type(reading.sensor).__name__, int(reading.seen.sum())
+            first = _show.as_text(np.asarray(reading.values)[int(np.argmax(reading.host_mask))])
+            name, count = type(reading.sensor).__name__, int(reading.host_mask.sum())
             parts.append(f"{name}: {count} readings from {first}")
         if self.inputs:
             parts.append(f"inputs: {', '.join(self.inputs)}")
@@ -206,24 +208,26 @@ def sources_of(recording: Recording) -> dict[str, Any]:
 
 def count_of(reading: Reading) -> int:
     """Return how many numbers were read: unmasked readings times the components of an error."""
-    return reading.sensor.components * int(reading.seen.sum())
+    return reading.sensor.components * int(reading.host_mask.sum())
 
 
 def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
     """Return the inputs by name: functions of time unchanged, checked samples (T, …) as arrays."""
-    _checks.instance(inputs, Mapping, "inputs", wanted="samples or functions of time by name")
+    _checks.require_instance(
+        inputs, Mapping, "inputs", requirement="samples or functions of time by name"
+    )
     out = {}
     for name, source in inputs.items():
-        _checks.instance(name, str, "inputs: name")
+        _checks.require_instance(name, str, "inputs: name")
         if not callable(source):
-            samples = _checks.on_host(source, f"inputs[{name!r}]")
+            samples = _checks.host_array(source, f"inputs[{name!r}]")
             if samples.shape[:1] != t.shape:
                 raise ValueError(
                     f"inputs[{name!r}]: wanted a sample for each of {t.size} times, got shape "
                     f"{samples.shape}; for samples at other times give a function of time such as "
                     "rigidjax.torques.Series(times, samples)"
                 )
-            source = jnp.asarray(_checks.finite(samples, f"inputs[{name!r}]"))
+            source = jnp.asarray(_checks.require_finite(samples, f"inputs[{name!r}]"))
         out[name] = source
     return out
 
@@ -239,7 +243,7 @@ def _require_digits(t: np.ndarray, dtype: np.dtype) -> None:
     index = int(np.argmax(off))
     words = (
         f"t: {dtype} changes the step of {steps[index]:.3g} s after {t[index]} s to "
-        f"{held[index]:.3g} s; {_checks.later_origin(dtype)}"
+        f"{held[index]:.3g} s; {_checks.advice_for_large_times(dtype)}"
     )
     if off[index] >= 1:
         raise ValueError(words)
@@ -247,7 +251,7 @@ def _require_digits(t: np.ndarray, dtype: np.dtype) -> None:
         warnings.warn(words, stacklevel=5)
 
 
-def _reading(
+def _checked_reading(
     t: np.ndarray, sensor: AbstractSensor, values: Any, mask: NumbersLike | None = None
 ) -> tuple[AbstractSensor, np.ndarray, np.ndarray, np.ndarray]:
     """Return the sensor, its checked values and mask, and the rows that a masked array hides."""
@@ -260,7 +264,7 @@ def _reading(
             f"for each component of the error, or None, got shape {np.shape(sensor.noise)}"
         )
     values, no_value = _checks.data_and_mask(values)
-    values = _checks.on_host(values, f"{name}: readings")
+    values = _checks.host_array(values, f"{name}: readings")
     rows_hidden = None if no_value is None else no_value.reshape(len(no_value), -1).any(axis=1)
     if rows_hidden is not None:
         values[rows_hidden] = np.nan

@@ -42,11 +42,11 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """
     t = np.asarray(recording.t)
     for reading in readings_of(recording, AttitudeSensor):
-        q, mounting = np.asarray(reading.values)[reading.seen], reading.sensor.mounting
+        q, mounting = np.asarray(reading.values)[reading.host_mask], reading.sensor.mounting
         if mounting is not None:
             back = quaternion.exp(-mounting)
             q = np.asarray(jax.vmap(quaternion.multiply, (0, None))(jnp.asarray(q), back))
-        return t[reading.seen], q
+        return t[reading.host_mask], q
     body, world, mask = [], [], np.ones(t.shape, bool)
     markers = readings_of(recording, Marker)
     if len(markers) >= 3:
@@ -55,14 +55,14 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
         size = np.linalg.norm(places - places.mean(axis=0), axis=1).max() or 1.0
         body.append(np.broadcast_to((places - places.mean(axis=0)) / size, there.shape))
         world.append((there - there.mean(axis=1, keepdims=True)) / size)
-        mask = mask & np.all([r.seen for r in markers], axis=0)
+        mask = mask & np.all([r.host_mask for r in markers], axis=0)
     for reading in readings_of(recording, Direction):
         along, sensor = np.asarray(reading.values), reading.sensor
         if sensor.mounting is not None:
             along = along @ np.asarray(so3.exp(sensor.mounting)).T
         body.append(along[:, None, :])
         world.append(np.broadcast_to(np.asarray(sensor.world), along.shape)[:, None, :])
-        mask = mask & reading.seen
+        mask = mask & reading.host_mask
     if not body:
         return np.zeros(0), np.zeros((0, 4))
     rows, sides = np.concatenate(body, axis=1)[mask], np.concatenate(world, axis=1)[mask]
@@ -90,7 +90,9 @@ def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     If the readings show neither, n is 0.
     """
     for reading in readings_of(recording, Gyro):
-        return np.asarray(recording.t)[reading.seen], np.asarray(reading.values)[reading.seen]
+        return np.asarray(recording.t)[reading.host_mask], np.asarray(reading.values)[
+            reading.host_mask
+        ]
     return rates_of(*attitudes(recording))
 
 
@@ -149,7 +151,7 @@ class ReferenceStates(eqx.Module):
 def reference_of(recordings: Sequence[Recording], state_type: type) -> ReferenceStates:
     """Return the reference states, of type `state_type`, from the first readings of recordings."""
     turns = [[*attitudes(r)[1], np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
-    places = [_first_place(r) for r in recordings]
+    places = [_first_position(r) for r in recordings]
     dtype = recordings[0].t.dtype
     # Make arrays: with floats each recording would compile a program of its own.
     x, v, length = (jnp.asarray(np.stack(part), dtype) for part in zip(*places, strict=True))
@@ -173,12 +175,12 @@ def _typical_rate(recording: Recording) -> float:
         sensor: Any = reading.sensor
         if hasattr(sensor, "typical_rate"):
             t, values = np.asarray(recording.t), np.asarray(reading.values)
-            rate = sensor.typical_rate(t[reading.seen], values[reading.seen])
+            rate = sensor.typical_rate(t[reading.host_mask], values[reading.host_mask])
             break
     return rate if rate > 0 else 1.0
 
 
-def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
+def _first_position(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the first position, m, the first velocity, m/s, and a typical length, m.
 
     They are those of the centre of mass, or of the origin of the body frame if only markers were
@@ -189,33 +191,35 @@ def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     ranges = readings_of(recording, Range)
     speeds = [r for r in readings_of(recording, Velocity) if r.sensor.mounting is None]
     if positions:
-        when, x = t[positions[0].seen], np.asarray(positions[0].values)[positions[0].seen]
+        when, x = t[positions[0].host_mask], np.asarray(positions[0].values)[positions[0].host_mask]
     elif markers:
-        when, x = _from_markers(recording, markers)
+        when, x = _places_by_markers(recording, markers)
     elif ranges:
-        seen = np.all([r.seen for r in ranges], axis=0)
+        mask = np.all([r.host_mask for r in ranges], axis=0)
         stations = np.stack([np.asarray(r.sensor.station) for r in ranges])
-        lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[seen]
-        when, x = t[seen], _from_ranges(stations, lengths)
+        lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[mask]
+        when, x = t[mask], _places_by_ranges(stations, lengths)
     if speeds and (positions or not markers):
-        v = np.asarray(speeds[0].values)[speeds[0].seen][0]
+        v = np.asarray(speeds[0].values)[speeds[0].host_mask][0]
     else:
-        v = _first_speed(when, x)
+        v = _first_velocity(when, x)
     x = x if when.size else np.zeros((1, 3))
     # The length is the largest distance from the mean place, 1 if all places are the same.
     return x[0], v, float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
 
 
-def _from_markers(recording: Recording, markers: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+def _places_by_markers(
+    recording: Recording, markers: Sequence[Any]
+) -> tuple[np.ndarray, np.ndarray]:
     """Return times (n,) and the places (n, 3) of the body's origin by its markers.
 
     If the markers are never all read at once, the first one stands for all.
     """
-    seen = np.all([r.seen for r in markers], axis=0)
-    if not seen.any():
-        markers, seen = markers[:1], markers[0].seen
-    t = np.asarray(recording.t)[seen]
-    x = np.mean([np.asarray(r.values)[seen] for r in markers], axis=0)
+    mask = np.all([r.host_mask for r in markers], axis=0)
+    if not mask.any():
+        markers, mask = markers[:1], markers[0].host_mask
+    t = np.asarray(recording.t)[mask]
+    x = np.mean([np.asarray(r.values)[mask] for r in markers], axis=0)
     place = np.mean([np.asarray(r.sensor.place) for r in markers], axis=0)
     known, q = attitudes(recording)
     if np.isin(t, known).all():
@@ -224,13 +228,13 @@ def _from_markers(recording: Recording, markers: Sequence[Any]) -> tuple[np.ndar
     return t, x
 
 
-def _first_speed(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+def _first_velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return the slope (3,) of a line through the first places x (n, 3); zero for one place."""
     few = slice(0, max(2, min(5, t.size)))
     return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
 
 
-def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+def _places_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Return the places x (n, 3) at the distances d = `lengths` (n, k) from k stations.
 
     The equations `|x|² − 2 s·x + |s|² = d²`, less their mean over the stations s, are linear in x.
@@ -251,12 +255,12 @@ def first_rates(
     The rates that a gyro reads are returned for traced recordings, too.
     """
     for reading in readings_of(records, Gyro):
-        xp: Any = np if _checks.known(reading) else jnp
+        xp: Any = np if _checks.is_known(reading) else jnp
         first = xp.argmax(xp.asarray(reading.mask), axis=1)[:, None, None]
         return jnp.asarray(xp.take_along_axis(xp.asarray(reading.values), first, axis=1)[:, 0])
-    if not _checks.known(records):
+    if not _checks.is_known(records):
         return jnp.zeros((len(counts), 3), records.t.dtype)
-    each = [first_rate(recording) for recording in stacking.on_host(records, counts)]
+    each = [first_rate(recording) for recording in stacking.recordings_on_host(records, counts)]
     return jnp.asarray(np.stack(each), records.t.dtype)
 
 

@@ -21,8 +21,8 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
     with the last value.
     """
     counts = np.array([r.t.shape[0] for r in recordings], np.int32)
-    rows = max(_rows(recording, 0) for recording in recordings)
-    alike = [lengthened(r, int(counts.max()), rows) for r in recordings]
+    rows = max(_count_rows(recording, 0) for recording in recordings)
+    alike = [pad_recording(r, int(counts.max()), rows) for r in recordings]
     # An input may hold things that are no numbers, such as functions: they must be the same.
     numbers, others = zip(*(eqx.partition(r, _is_number) for r in alike), strict=True)
     shapes = [[np.shape(x) for x in jax.tree.leaves(r)] for r in numbers]
@@ -41,7 +41,7 @@ def _is_number(leaf: PyTree) -> bool:
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | complex)
 
 
-def of_few_lengths(model: PyTree) -> Any:
+def pad_to_few_lengths(model: PyTree) -> Any:
     """Return the model with its recordings padded by masked readings to one of few lengths.
 
     There are four such lengths an octave, so that few programs are compiled. Windows are all of one
@@ -50,18 +50,20 @@ def of_few_lengths(model: PyTree) -> Any:
     records = model.records
     if model.clusters is not None:
         return model
-    longer = lengthened(records, _length(records.t.shape[1]), _length(_rows(records, 1)), 1)
+    longer = pad_recording(
+        records, _padded_length(records.t.shape[1]), _padded_length(_count_rows(records, 1)), 1
+    )
     return eqx.tree_at(lambda m: m.records, model, longer)
 
 
-def _rows(recording: Recording, axis: int) -> int:
+def _count_rows(recording: Recording, axis: int) -> int:
     """Count the rows of the longest table of time in the inputs and sensors; 0 without a table."""
     parts = recording.inputs, recording.sensors
     tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))
     return max((int(table.values.shape[axis]) for table in tables), default=0)
 
 
-def _length(count: int) -> int:
+def _padded_length(count: int) -> int:
     """Return the least multiple of 16, of four an octave, that is not below `count`."""
     if not count:
         return 0
@@ -73,8 +75,8 @@ def _length(count: int) -> int:
 def _stack_leaves(*leaves: PyTree) -> Any:
     """Stack leaves along a new first axis."""
     # Use NumPy if the numbers are known: JAX would compile a program for each shape.
-    if _checks.known(leaves):
-        return _constant(np.stack([np.asarray(leaf) for leaf in leaves]))
+    if _checks.is_known(leaves):
+        return _constant_array(np.stack([np.asarray(leaf) for leaf in leaves]))
     return jnp.stack(leaves)
 
 
@@ -84,28 +86,30 @@ def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "
     def pick(leaf: PyTree) -> Any:
         if not eqx.is_array(leaf):
             return leaf
-        known = _checks.known((leaf, index))
-        return _constant(np.asarray(leaf)[index]) if known else leaf[index]
+        known = _checks.is_known((leaf, index))
+        return _constant_array(np.asarray(leaf)[index]) if known else leaf[index]
 
     return jax.tree.map(pick, records)
 
 
-def _constant(array: np.ndarray | np.generic) -> Array:
+def _constant_array(array: np.ndarray | np.generic) -> Array:
     """Return a JAX array whose numbers stay known also within a trace."""
     with jax.ensure_compile_time_eval():
         return jnp.asarray(array)
 
 
-def on_host(records: Recording, counts: Int[ArrayLike, " records"]) -> tuple[Recording, ...]:
+def recordings_on_host(
+    records: Recording, counts: Int[ArrayLike, " records"]
+) -> tuple[Recording, ...]:
     """Return the recordings one by one with NumPy arrays, so that work on them compiles nothing."""
     known = jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, records)
     return tuple(
-        cut(jax.tree.map(lambda x, i=i: x[i] if isinstance(x, np.ndarray) else x, known), n)
+        take_rows(jax.tree.map(lambda x, i=i: x[i] if isinstance(x, np.ndarray) else x, known), n)
         for i, n in enumerate(np.asarray(counts).tolist())
     )
 
 
-def cut(recording: Recording, end: int, begin: int = 0, axis: int = 0) -> Recording:
+def take_rows(recording: Recording, end: int, begin: int = 0, axis: int = 0) -> Recording:
     """Return the rows of a recording from `begin` to before `end`.
 
     Times are along `axis`: 0 for one recording, 1 for several with a leading axis.
@@ -114,11 +118,13 @@ def cut(recording: Recording, end: int, begin: int = 0, axis: int = 0) -> Record
         return recording
     rows = (slice(None),) * axis + (slice(begin, end),)
 
-    def long(r: Recording) -> list[Any]:
-        parts = [(reading.values, reading.mask, reading.late) for reading in r.readings]
+    def arrays_over_time(r: Recording) -> list[Any]:
+        parts = [(reading.values, reading.mask, reading.jitter_error) for reading in r.readings]
         return jax.tree.leaves((r.t, parts))
 
-    shorter = eqx.tree_at(long, recording, [leaf[rows] for leaf in long(recording)])
+    shorter = eqx.tree_at(
+        arrays_over_time, recording, [leaf[rows] for leaf in arrays_over_time(recording)]
+    )
     inputs = {
         name: source[rows] if eqx.is_array(source) else source
         for name, source in recording.inputs.items()
@@ -131,7 +137,7 @@ def _is_table(node: PyTree) -> bool:
     return isinstance(node, Linear | Series)
 
 
-def lengthened(recording: Recording, count: int, rows: int = 0, axis: int = 0) -> Recording:
+def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0) -> Recording:
     """Return the recording padded to `count` times, and its tables of time to `rows`.
 
     The padding is masked readings at the last time, and the last value of tables. Times are along
@@ -140,12 +146,12 @@ def lengthened(recording: Recording, count: int, rows: int = 0, axis: int = 0) -
     missing = count - recording.t.shape[axis]
     # Not only inputs hold tables of time: so do sensors that read a moving object.
     inputs, sensors = jax.tree.map(
-        lambda node: _lengthened_table(node, rows, axis) if _is_table(node) else node,
+        lambda node: _pad_table(node, rows, axis) if _is_table(node) else node,
         (recording.inputs, recording.sensors),
         is_leaf=_is_table,
     )
     t = recording.t
-    parts = [(r.values, r.mask, r.late) for r in recording.readings]
+    parts = [(r.values, r.mask, r.jitter_error) for r in recording.readings]
     if missing:
         inputs = {
             name: _repeat_last(source, missing, axis) if eqx.is_array(source) else source
@@ -168,7 +174,7 @@ def lengthened(recording: Recording, count: int, rows: int = 0, axis: int = 0) -
     )
 
 
-def _lengthened_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
+def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
     """Return a table of time with `rows`, its last value repeated after its last time."""
     missing = rows - table.values.shape[axis]
     if missing <= 0:
@@ -184,12 +190,12 @@ def _lengthened_table(table: Linear | Series, rows: int, axis: int) -> Linear | 
 
 
 def _repeat_last(
-    values: ArrayLike, count: int, axis: int, last: float | bool | None = None
+    values: ArrayLike, count: int, axis: int, fill: float | bool | None = None
 ) -> Array:
-    """Append the last entry along `axis`, or the number `last`, `count` times to `values`."""
+    """Append the last entry along `axis`, or the number `fill`, `count` times to `values`."""
     # Use NumPy where the numbers are known: JAX would compile a program for each shape.
-    xp: Any = np if _checks.known(values) else jnp
+    xp: Any = np if _checks.is_known(values) else jnp
     array = xp.asarray(values)
     edge = array[(slice(None),) * axis + (slice(-1, None),)]
-    more = xp.repeat(edge if last is None else xp.full_like(edge, last), count, axis)
+    more = xp.repeat(edge if fill is None else xp.full_like(edge, fill), count, axis)
     return jnp.asarray(xp.concatenate([array, more], axis))

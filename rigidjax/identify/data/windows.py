@@ -19,7 +19,7 @@ from rigidjax.identify.data.recording import Reading, Recording, recording_of
 from rigidjax.identify.data.reference_states import ReferenceStates
 from rigidjax.identify.sensors.states import StateSensor
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.manifold import minus_small, names, parts
+from rigidjax.motion.manifold import minus_small, names, parts_by_name
 from rigidjax.motion.torques.inputs import delays_of
 
 
@@ -37,8 +37,8 @@ class Horizons(NamedTuple):
 
     >>> t = np.arange(6.0)
     >>> spin = rj.Spin(np.stack([t, 0 * t, 0 * t], 1))
-    >>> rj.identify.windows(t, spin, length=2).held().rms["omega"].tolist()  # it grows by 1 a step
-    [1.0, 2.0]
+    >>> rj.identify.windows(t, spin, length=2).held_horizons().rms["omega"].tolist()  # it grows by
+    1 a step [1.0, 2.0]
     """
 
     steps: np.ndarray
@@ -47,9 +47,9 @@ class Horizons(NamedTuple):
     rms: dict[str, np.ndarray]
 
 
-def by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"]) -> Horizons:
+def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"]) -> Horizons:
     """Average the `errors` of states over windows; `starts` has the type of the states."""
-    by_kind = parts(jax.tree.map(lambda leaf: leaf[0], starts), errors)
+    by_kind = parts_by_name(jax.tree.map(lambda leaf: leaf[0], starts), errors)
     absolute = {k: np.asarray(jnp.mean(jnp.abs(v), (0, 2))) for k, v in by_kind.items()}
     squares = {k: jnp.sum(v * v, 2) for k, v in by_kind.items()}
     norm = {k: np.asarray(jnp.mean(jnp.sqrt(v), 0)) for k, v in squares.items()}
@@ -58,15 +58,15 @@ def by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"]) -> Hori
 
 
 @jax.jit
-def held_errors(starts: HasSpin, wanted: HasSpin) -> Float[Array, "windows steps n"]:
-    """Return the errors of a prediction that holds each start, against the `wanted` states."""
-    return jax.vmap(jax.vmap(minus_small, (None, 0)))(starts, wanted)
+def held_errors(starts: HasSpin, measured: HasSpin) -> Float[Array, "windows steps n"]:
+    """Return the errors of a prediction that holds each start, against the `measured` states."""
+    return jax.vmap(jax.vmap(minus_small, (None, 0)))(starts, measured)
 
 
 class Windows(eqx.Module):
     """Windows of a record: short runs of one length, each from a measured start.
 
-    `windows` cuts a record into windows; `Windows.joined` joins those of several records.
+    `windows` cuts a record into windows; `Windows.join` joins those of several records.
 
     **Fields:**
 
@@ -137,18 +137,18 @@ class Windows(eqx.Module):
         }
         return recording_of(jnp.asarray(t), (reading,), inputs)
 
-    def held(self) -> Horizons:
+    def held_horizons(self) -> Horizons:
         """Return the errors of a prediction that holds each start: a model must beat them."""
-        return by_horizon(self.starts, held_errors(self.starts, self.wanted))
+        return average_by_horizon(self.starts, held_errors(self.starts, self.wanted))
 
     @staticmethod
-    def joined(*parts: "Windows") -> "Windows":
+    def join(*parts: "Windows") -> "Windows":
         """Join the windows of several records, all of one step and one length.
 
         **Raises:** `ValueError` for none, or for steps, lengths or inputs that differ.
         """
         if not parts:
-            raise ValueError("Windows.joined: wanted at least one Windows")
+            raise ValueError("Windows.join: wanted at least one Windows")
         kinds = {
             (
                 p.step,
@@ -168,7 +168,7 @@ class Windows(eqx.Module):
                 for k in kinds
             ]
             raise ValueError(
-                "Windows.joined: wanted one step, length, kind of state and the same inputs, got "
+                "Windows.join: wanted one step, length, kind of state and the same inputs, got "
                 + "; ".join(got)
             )
         if len(parts) == 1:
@@ -213,10 +213,10 @@ def windows(
     >>> windows(t, Spin(np.ones((6, 3))), length=2, stride=2).count
     2
     """
-    times = _checks.on_host(t, "t")
-    length, stride = _checks.whole(length, "length", 1), _checks.whole(stride, "stride", 1)
-    before = _checks.whole(before, "before", 0)
-    _checks.instance(states, (Spin, Attitude, Rigid), "states")
+    times = _checks.host_array(t, "t")
+    length, stride = _checks.integer(length, "length", 1), _checks.integer(stride, "stride", 1)
+    before = _checks.integer(before, "before", 0)
+    _checks.require_instance(states, (Spin, Attitude, Rigid), "states")
     if times.ndim != 1 or times.size < length + 1:
         raise ValueError(
             f"t: wanted at least length + 1 = {length + 1} times (T,), got shape {times.shape}"
@@ -242,14 +242,14 @@ def windows(
     samples = {k: np.asarray(v, kind) for k, v in inputs.items()}
     kinds = names(states)
     if noise is not None:
-        noise = _by_kind(noise, kinds, "noise", _checks.positive)
+        noise = _checked_by_kind(noise, kinds, "noise", _checks.positive_float)
     if starts is not None:
         if noise is None:
             raise ValueError(
                 "starts: deviations of the starts need the noise of the readings: give noise={…}, "
                 "too"
             )
-        starts = _by_kind(starts, kinds, "starts", _deviation)
+        starts = _checked_by_kind(starts, kinds, "starts", _start_deviation)
     return Windows(
         round(h, 12),
         jax.tree.map(lambda a: jnp.asarray(a[begin]), arrays),
@@ -261,19 +261,19 @@ def windows(
     )
 
 
-def _by_kind(
+def _checked_by_kind(
     numbers: object, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
 ) -> dict[str, float]:
     """Return the numbers of a mapping whose keys are `kinds`, each one checked by `check`."""
-    by_kind = _checks.instance(numbers, Mapping, name, wanted="numbers by kind")
+    by_kind = _checks.require_instance(numbers, Mapping, name, requirement="numbers by kind")
     if set(by_kind) != set(kinds):
         raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(by_kind)}")
     return {kind: float(check(by_kind[kind], f"{name}[{kind!r}]")) for kind in kinds}
 
 
-def _deviation(value: object, name: str) -> float:
+def _start_deviation(value: object, name: str) -> float:
     """Return the deviation of a start; raise `ValueError` unless it is positive, maybe infinite."""
-    number = _checks.number(value, name)
+    number = _checks.known_float(value, name)
     if not number > 0:
         raise ValueError(
             f"{name}: wanted a positive deviation, or infinity for a start that is free, got "
@@ -324,23 +324,25 @@ def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
 
 def require_windows(windows: PyTree) -> None:
     """Raise `TypeError` or `ValueError` unless these are several windows of finite numbers."""
-    _checks.instance(windows, Windows, "windows", wanted="what identify.windows returns")
+    _checks.require_instance(
+        windows, Windows, "windows", requirement="what identify.windows returns"
+    )
     for name, wanted in (("starts", 2), ("wanted", 3)):
         for leaf in jax.tree.leaves(getattr(windows, name)):
             if leaf.ndim != wanted or not leaf.shape[0]:
                 raise ValueError(
                     f"windows: wanted a row for each of N windows in {name}, got {leaf.shape}"
                 )
-            _checks.finite(leaf, f"windows: {name}")
+            _checks.require_finite(leaf, f"windows: {name}")
 
 
-def mistakes_of_delays(law: PyTree, known: float, length: float) -> list[str]:
+def mistakes_of_delays(law: PyTree, history: float, length: float) -> list[str]:
     """Describe each delay of a torque that reads an input outside of the samples of a window.
 
     **Arguments:**
 
     - `law`: the torque.
-    - `known`: s, for how long before a window its inputs are known.
+    - `history`: s, for how long before a window its inputs are known.
     - `length`: s, of a window.
     """
     out = []
@@ -351,10 +353,10 @@ def mistakes_of_delays(law: PyTree, known: float, length: float) -> list[str]:
                 f"inputs[{name!r}]: a delay of {least:.6g} s reaches beyond the end of windows "
                 f"of {length:.6g} s; is it in seconds?"
             )
-        elif most > known:
+        elif most > history:
             out.append(
                 f"inputs[{name!r}]: a delay of {most:.6g} s, and inputs that are known "
-                f"{known:.6g} s before a window: cut them with windows(…, before=k)"
+                f"{history:.6g} s before a window: cut them with windows(…, before=k)"
             )
     return out
 

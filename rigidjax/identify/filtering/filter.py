@@ -19,8 +19,8 @@ from rigidjax.identify.data.reference_states import attitudes
 from rigidjax.identify.filtering import roots, steps
 from rigidjax.identify.filtering.steps import (
     Dynamics,
-    Extended,
-    Read,
+    ExtendedState,
+    ReadNumbers,
     Stops,
     coloured_parts,
     dynamics_of,
@@ -28,9 +28,9 @@ from rigidjax.identify.filtering.steps import (
 from rigidjax.identify.model.model import Model, require_numbers, require_one
 from rigidjax.identify.model.scene import Process, Scene
 from rigidjax.identify.model.terms import scene_of, torque_of_scene
-from rigidjax.identify.model.walks import Drift, drifting_values, in_shape
+from rigidjax.identify.model.walks import Drift, broadcast_to_shape, drifting_values
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.equations import on_the_group
+from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.manifold import names, plus
 
 
@@ -43,14 +43,14 @@ class Belief(eqx.Module):
     **Fields:**
 
     - `t`: s.
-    - `x`: the `Extended` state.
+    - `x`: the `ExtendedState` state.
     - `root`: S (n, n). Its rows are the errors of Ω for a `Spin`; of δθ (body frame, rad) and Ω for
       an `Attitude`; of x, v, δθ and Ω for a `Rigid`; then three for each `CorrelatedTorque`, then
       those of the walks.
     """
 
     t: Float[Array, "*times"]
-    x: Extended
+    x: ExtendedState
     root: Float[Array, "*times n n"]
 
     @property
@@ -117,8 +117,8 @@ def first_belief(
     start: Any = scene.start if state is None else state
     if state is None and x is None:
         _require_shown_attitude(record, start)
-    _checks.single(start, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
-    start = on_the_group(start)
+    _checks.require_single(start, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid")
+    start = project_to_group(start)
     deviations = {"attitude": attitude, "rate": rate, "position": position, "velocity": velocity}
     words = {"x": "position", "v": "velocity", "q": "attitude", "omega": "rate"}
     kind, wanted = type(start).__name__, [words[part] for part in names(start)]
@@ -130,7 +130,7 @@ def first_belief(
                 f"{name}: wanted the standard deviation of the initial one, got None; a {kind} "
                 "needs " + ", ".join(wanted)
             )
-    parts = [in_shape(deviations[name], (3,), name) for name in wanted]
+    parts = [broadcast_to_shape(deviations[name], (3,), name) for name in wanted]
     return belief_at(record.t[0], start, jnp.concatenate(parts), scene, model.walks)
 
 
@@ -151,12 +151,14 @@ def belief_at(
     parts = [deviations, *(law.deviation for law in coloured)]
     parts += [drift.deviation.reshape(-1) for drift in drifts]
     root = jnp.diag(jnp.concatenate([part.astype(dtype) for part in parts]))
-    return Belief(t, Extended(state, tuple(jnp.zeros(3, dtype) for _ in coloured), walks), root)
+    return Belief(
+        t, ExtendedState(state, tuple(jnp.zeros(3, dtype) for _ in coloured), walks), root
+    )
 
 
 def _require_shown_attitude(recording: Recording, state: HasSpin | None) -> None:
     """Raise an error if the state has an attitude that the readings do not show."""
-    if not _checks.known(recording):
+    if not _checks.is_known(recording):
         raise TypeError("state: wanted a state; a traced recording shows none")
     if isinstance(state, HasAttitude) and not len(attitudes(recording)[1]):
         raise ValueError(
@@ -223,19 +225,19 @@ class Grid(NamedTuple):
 
 
 def grid_of(
-    process: Process | None, recording: Recording, first: Belief, substeps: int | None
+    process: Process | None, recording: Recording, belief: Belief, substeps: int | None
 ) -> Grid:
-    """Return the times of the steps from the `first` belief through the recording."""
-    xp = _checks.namespace((recording.t, first.t))
-    t, t0 = xp.asarray(recording.t), xp.asarray(first.t)
+    """Return the times of the steps from the `belief` belief through the recording."""
+    xp = _checks.namespace((recording.t, belief.t))
+    t, t0 = xp.asarray(recording.t), xp.asarray(belief.t)
     if xp is np:
         words = (
             f"recording: readings are out of order: the first is at {t[0]:g} s, before the time "
             f"of the belief it starts from, {t0:g} s"
         )
-        _checks.refuse(t, t[0] < t0, words)
+        _checks.error_if(t, t[0] < t0, words)
     ends = xp.concatenate([t0[None], t])
-    counts = steps.steps_of(process, ends, first.x.motion, substeps, recording)
+    counts = steps.steps_of(process, ends, belief.x.motion, substeps, recording)
     index = np.repeat(np.arange(counts.size), counts)
     rows = np.cumsum(counts) - 1
     part = (np.arange(index.size) - np.repeat(rows - counts, counts)) / counts[index]
@@ -274,14 +276,14 @@ class Filtered(eqx.Module):
     **Fields:**
 
     - `belief`: a `Belief` at each time of the recording, after its readings.
-    - `readings`: for each sensor a `Read`: `innovation`, `variance` and `seen`, (T, k).
+    - `readings`: for each sensor `ReadNumbers`: `innovation`, `variance` and `mask`, (T, k).
     - `log_likelihood`: of all readings.
     - `status`: 0 followed, 1 lost, 2 stopped; `words` is the same in words.
     - `lost_at`: s, NaN unless the filter was lost.
     """
 
     belief: Belief
-    readings: tuple[Read, ...]
+    readings: tuple[ReadNumbers, ...]
     log_likelihood: Scalar
     status: Int[Array, ""]
     lost_at: Scalar
@@ -309,13 +311,13 @@ class Filtered(eqx.Module):
         (Bar-Shalom, Li and Kirubarajan, Estimation (2001), §5.4).
         """
         return tuple(
-            jnp.sum(jnp.where(r.seen, r.innovation**2 / r.variance, 0), -1) for r in self.readings
+            jnp.sum(jnp.where(r.mask, r.innovation**2 / r.variance, 0), -1) for r in self.readings
         )
 
 
 def filter(
     model: Model,
-    first: Belief,
+    belief: Belief,
     x: Float[Array, " n"] | None = None,
     *,
     substeps: int | None = None,
@@ -333,7 +335,7 @@ def filter(
 
     - `model`: a `Model` of one recording, whose sensors have their noise. Masked readings and
       channels at full scale are left out; a sensor's `offset` is allowed for.
-    - `first`: the belief before the first reading, of `first_belief`.
+    - `belief`: the belief before the first reading, of `first_belief`.
     - `x`: (n,) the free numbers of the model, such as `fit(model).x`: body, torques and sensors are
       those of the scene at x. `None` for a model whose body is known.
     - `substeps`: the number of fixed steps from one time to the next; `None` chooses them by the
@@ -341,11 +343,11 @@ def filter(
     - `throw`: `False` raises no error for what happens during the run; look at `status`.
 
     **Returns** `belief`, `readings`, `log_likelihood`, `status` and `lost_at` (`Filtered`). It may
-    be jitted, differentiated, and batched over `first`, `x`, and readings that `equinox.tree_at`
+    be jitted, differentiated, and batched over `belief`, `x`, and readings that `equinox.tree_at`
     puts in the model.
 
     **Raises:** `ValueError` for several recordings, a sensor without noise, and readings before
-    `first`; with `throw` also for a lost filter: no reading was within 6 deviations of its
+    `belief`; with `throw` also for a lost filter: no reading was within 6 deviations of its
     prediction for a second and three readings.
 
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
@@ -355,24 +357,24 @@ def filter(
     >>> run.states.omega.shape, run.readings[0].innovation.shape, run.words
     ((2, 3), (2, 3), 'followed')
     """
-    run = _filter(checked_input(model, first, x, substeps))
+    run = _filter(checked_input(model, belief, x, substeps))
     return raise_if_lost(run) if throw else run
 
 
 def raise_if_lost(run: Any) -> Any:
     """Return the run of a filter; raise `ValueError` if it was lost or stopped."""
     status = run.status
-    at = f" (at {float(run.lost_at):g} s)" if _checks.known(run.lost_at) else ""
+    at = f" (at {float(run.lost_at):g} s)" if _checks.is_known(run.lost_at) else ""
     advice = (
         "; is the noise or density too small, or the initial state far off? throw=False returns it"
     )
-    run = _checks.refuse(run, status == 1, f"filter: {WORDS[1]}{at}{advice}")
-    return _checks.refuse(run, status == 2, f"filter: {WORDS[2]}{advice}")
+    run = _checks.error_if(run, status == 1, f"filter: {WORDS[1]}{at}{advice}")
+    return _checks.error_if(run, status == 2, f"filter: {WORDS[2]}{advice}")
 
 
 def log_likelihood(
     model: Model,
-    first: Belief,
+    belief: Belief,
     x: Float[Array, " n"] | None = None,
     *,
     substeps: int | None = None,
@@ -383,7 +385,7 @@ def log_likelihood(
     doi:10.1109/TIT.1965.1053737). Maximise it over moments, the density of a torque, a noise, or an
     initial state: it is differentiable in forward and reverse mode.
 
-    **Arguments:** `model`, `first`, `x`, `substeps` as for `filter`. **Raises** the errors of
+    **Arguments:** `model`, `belief`, `x`, `substeps` as for `filter`. **Raises** the errors of
     `filter`.
 
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(1.0), [[1.0, 0, 0]] * 2))
@@ -393,7 +395,7 @@ def log_likelihood(
     >>> log_likelihood(model, first).round(6)
     Array(-5.513631, dtype=float64)
     """
-    return _log_likelihood(checked_input(model, first, x, substeps))
+    return _log_likelihood(checked_input(model, belief, x, substeps))
 
 
 def step(
@@ -401,7 +403,7 @@ def step(
     belief: Belief,
     t: ScalarLike,
     *readings: NumbersLike,
-    seen: Sequence[Any] | None = None,
+    mask: Sequence[Any] | None = None,
     x: Float[Array, " n"] | None = None,
 ) -> Belief:
     """Return the belief at the time t, after the readings at t: a filter while the body moves.
@@ -415,7 +417,7 @@ def step(
     - `belief`: the result of `first_belief` or of the last `step`.
     - `t`: s, not before the time of the belief.
     - `readings`: one of each sensor, in the order of the recording.
-    - `seen`: a truth value for each sensor; false if there is no reading, and its number does not
+    - `mask`: a truth value for each sensor; false if there is no reading, and its number does not
       count. `None` for all true.
     - `x`: (n,) the free numbers of the model; `None` for a model whose body is known.
 
@@ -430,30 +432,30 @@ def step(
     Array(0.1, dtype=float64)
     """
     scene, _ = scene_at(model, x)
-    _checks.instance(belief, Belief, "belief", hint="identify.first_belief makes it")
+    _checks.require_instance(belief, Belief, "belief", hint="identify.first_belief makes it")
     if belief.t.shape != ():
         raise ValueError(
             f"belief: wanted one, got times of shape {belief.t.shape}; for many use jax.vmap"
         )
-    when = _checks.time(t).astype(belief.t.dtype)
-    if _checks.known((when, belief.t)):
+    when = _checks.checked_time(t).astype(belief.t.dtype)
+    if _checks.is_known((when, belief.t)):
         words = f"t: readings are out of order: {float(when):g} s is before {float(belief.t):g} s"
-        _checks.refuse(when, when < belief.t, words)
-    flags = (True,) * len(readings) if seen is None else tuple(seen)
-    for name, items in (("readings", readings), ("seen", flags)):
+        _checks.error_if(when, when < belief.t, words)
+    flags = (True,) * len(readings) if mask is None else tuple(mask)
+    for name, items in (("readings", readings), ("mask", flags)):
         if len(items) != len(scene.sensors):
             kinds = ", ".join(type(sensor).__name__ for sensor in scene.sensors)
             raise ValueError(f"{name}: wanted one for each sensor ({kinds}), got {len(items)}")
     values, masks = [], []
     for sensor, reading, flag in zip(scene.sensors, readings, flags, strict=True):
         name = type(sensor).__name__
-        value = _checks.floating(reading, sensor.reading_shape, f"{name}: reading")
-        mask = jnp.asarray(flag)
-        if _checks.known((value, mask)) and bool(mask):
-            words = f"{name}: the reading contains NaN; give seen=(…, False, …) if it is a gap"
-            _checks.refuse(value, not np.isfinite(np.asarray(value)).all(), words)
+        value = _checks.array_of_shape(reading, sensor.reading_shape, f"{name}: reading")
+        is_read = jnp.asarray(flag)
+        if _checks.is_known((value, is_read)) and bool(is_read):
+            words = f"{name}: the reading contains NaN; give mask=(…, False, …) if it is a gap"
+            _checks.error_if(value, not np.isfinite(np.asarray(value)).all(), words)
         values.append(value)
-        masks.append(mask)
+        masks.append(is_read)
     return _step(scene, model.walks, belief, Stops(when, tuple(values), tuple(masks)))
 
 
@@ -468,7 +470,9 @@ def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) 
     return _predict_and_update(dynamics, belief, stop._replace(values=values))[0]
 
 
-def _predict_and_update(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, Read]:
+def _predict_and_update(
+    dynamics: Dynamics, belief: Belief, stop: Stops
+) -> tuple[Belief, ReadNumbers]:
     """Return the belief at a stop, after its readings, and what was read."""
     dtype = belief.root.dtype
     # Subtract times before they are rounded to the dtype of the state: after a thousand seconds the
@@ -476,14 +480,16 @@ def _predict_and_update(dynamics: Dynamics, belief: Belief, stop: Stops) -> tupl
     since = (stop.t - belief.t).astype(dtype)
     x, grown, noise = dynamics.predict(belief.t.astype(dtype), since, belief.x)
     root = roots.predicted_root(grown, belief.root, noise)
-    matrix, error, deviation, seen = steps.linearise_readings(dynamics, stop, x)
+    matrix, error, deviation, mask = steps.linearise_readings(dynamics, stop, x)
     e = jnp.zeros_like(root[0])
-    e, root, innovation, variance = roots.update(e, root, matrix, error, deviation**2, seen)
-    return Belief(stop.t, plus(x, e), steps.reset(x, e, root)), Read(innovation, variance, seen)
+    e, root, innovation, variance = roots.update(e, root, matrix, error, deviation**2, mask)
+    return Belief(stop.t, plus(x, e), steps.moved_root(x, e, root)), ReadNumbers(
+        innovation, variance, mask
+    )
 
 
 def scan_filter(
-    run: FilterInput, keep: Callable[[Belief, Read], PyTree[Array]]
+    run: FilterInput, keep: Callable[[Belief, ReadNumbers], PyTree[Array]]
 ) -> tuple[Dynamics, Stops, PyTree[Array]]:
     """Run the filter over all stops by `lax.scan`.
 
@@ -510,26 +516,26 @@ def _filter(run: FilterInput) -> Filtered:
     """Return the result of `filter` from its checked arguments, as one program."""
     both = scan_filter(run, lambda belief, read: (belief, read))[2]
     beliefs, read = run.grid.at_rows(both)
-    reads = steps.by_sensor(run.scene.sensors, read)
-    total = roots.terms(*read).log_density
+    reads = steps.split_by_sensor(run.scene.sensors, read)
+    total = roots.innovation_terms(*read).log_density
     return Filtered(beliefs, reads, total, *status_of(beliefs, reads, run.first.t))
 
 
 @eqx.filter_jit
 def _log_likelihood(run: FilterInput) -> Scalar:
     """Return the result of `log_likelihood` from its checked arguments, as one program."""
-    return roots.terms(*scan_filter(run, lambda _, read: read)[2]).log_density
+    return roots.innovation_terms(*scan_filter(run, lambda _, read: read)[2]).log_density
 
 
-def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Array, Array]:
+def status_of(beliefs: Belief, reads: tuple[ReadNumbers, ...], t0: Array) -> tuple[Array, Array]:
     """Return the status of a run that starts at `t0`, and the time at which it was lost or NaN."""
     t, times = beliefs.t, jnp.arange(beliefs.t.shape[0])
     lost = jnp.zeros(t.shape, bool)
     for read in reads:
-        size = jnp.where(read.seen, read.innovation**2, 0) > LOST_BEYOND**2 * read.variance
-        seen = read.seen.any(-1)
-        bad = seen & size.any(-1)
-        good = seen & ~bad
+        size = jnp.where(read.mask, read.innovation**2, 0) > LOST_BEYOND**2 * read.variance
+        is_read = read.mask.any(-1)
+        bad = is_read & size.any(-1)
+        good = is_read & ~bad
         since = lax.cummax(jnp.where(good, t, jnp.where(times == 0, t0, -jnp.inf)))
         count = jnp.cumsum(bad)
         before = lax.cummax(jnp.where(good, count, 0))
@@ -541,14 +547,14 @@ def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Arra
 
 
 def checked_input(
-    model: Model, first: Belief, x: Float[Array, " n"] | None, substeps: int | None
+    model: Model, belief: Belief, x: Float[Array, " n"] | None, substeps: int | None
 ) -> FilterInput:
     """Return the checked arguments of `filter` and `smooth`."""
     scene, recording = scene_at(model, x)
-    _checks.instance(first, Belief, "first", hint="identify.first_belief makes it")
+    _checks.require_instance(belief, Belief, "first", hint="identify.first_belief makes it")
     for sensor in scene.sensors:
-        if not isinstance(first.x.motion, sensor.feels):
-            kind, got = sensor.feels.__name__, type(first.x.motion).__name__
+        if not isinstance(belief.x.motion, sensor.feels):
+            kind, got = sensor.feels.__name__, type(belief.x.motion).__name__
             raise TypeError(f"first: a sensor needs a state with {kind}, got a {got}")
-    grid = grid_of(scene.process, recording, first, substeps)
-    return FilterInput(scene, model.walks, recording, first, grid)
+    grid = grid_of(scene.process, recording, belief, substeps)
+    return FilterInput(scene, model.walks, recording, belief, grid)

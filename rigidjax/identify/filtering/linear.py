@@ -58,16 +58,19 @@ class LinearModel(eqx.Module):
         push: Parameter | None = None,
         offset: Parameter | None = None,
     ):
-        self.transition = _checks.numbers(transition, "transition")
-        self.noise, self.matrix = _checks.numbers(noise, "noise"), _checks.numbers(matrix, "matrix")
-        sigma = _checks.numbers(deviation, "deviation")
+        self.transition = _checks.numeric_array(transition, "transition")
+        self.noise, self.matrix = (
+            _checks.numeric_array(noise, "noise"),
+            _checks.numeric_array(matrix, "matrix"),
+        )
+        sigma = _checks.numeric_array(deviation, "deviation")
         words = (
             "deviation: wanted positive standard deviations; a measurement without noise is "
             "singular: leave the numbers that it fixes out of the state"
         )
-        self.deviation = _checks.refuse(sigma, ~(sigma > 0).all(), words)
-        self.push = None if push is None else _checks.numbers(push, "push")
-        self.offset = None if offset is None else _checks.numbers(offset, "offset")
+        self.deviation = _checks.error_if(sigma, ~(sigma > 0).all(), words)
+        self.push = None if push is None else _checks.numeric_array(push, "push")
+        self.offset = None if offset is None else _checks.numeric_array(offset, "offset")
         if self.transition.ndim < 2:
             got = self.transition.shape
             raise ValueError(f"transition: wanted a matrix (n, n), got shape {got}")
@@ -140,7 +143,7 @@ Mask = Bool[ArrayLike, "times k"] | Numbers | None
 
 
 def linear_filter(
-    model: LinearModel, readings: Readings, mean: Mean, root: Root, seen: Mask = None
+    model: LinearModel, readings: Readings, mean: Mean, root: Root, mask: Mask = None
 ) -> LinearEstimate:
     """Return the state of a `LinearModel` at each time from the readings so far (Kalman filter).
 
@@ -150,7 +153,7 @@ def linear_filter(
     - `readings`: y (T, k).
     - `mean`: (n,) the mean of the state at the first time, before its reading.
     - `root`: (n, n) a root of its covariance.
-    - `seen`: (T, k) true for the numbers that count; `None` for all.
+    - `mask`: (T, k) true for the numbers that count; `None` for all.
 
     **Returns** `mean`, `root`, `innovation`, `variance` and `log_likelihood` (`LinearEstimate`).
     **Raises:** `ValueError` for shapes that do not fit, and for NaN that is not masked.
@@ -160,11 +163,11 @@ def linear_filter(
     >>> estimate.mean[0].tolist(), estimate.innovation[0].tolist()
     ([0.5], [1.0])
     """
-    return solve(*_checked_arguments(model, readings, mean, root, seen), smooth=False)
+    return linear_estimate(*_checked_parts(model, readings, mean, root, mask), smooth=False)
 
 
 def linear_smooth(
-    model: LinearModel, readings: Readings, mean: Mean, root: Root, seen: Mask = None
+    model: LinearModel, readings: Readings, mean: Mean, root: Root, mask: Mask = None
 ) -> LinearEstimate:
     """Return the state at each time, and the noise of each step, from all readings.
 
@@ -179,34 +182,37 @@ def linear_smooth(
     >>> bool(estimate.mean[0, 0] > 0.5), estimate.kicks.shape
     (True, (2, 1))
     """
-    return solve(*_checked_arguments(model, readings, mean, root, seen), smooth=True)
+    return linear_estimate(*_checked_parts(model, readings, mean, root, mask), smooth=True)
 
 
-def _checked_arguments(
-    model: LinearModel, readings: Readings, mean: Mean, root: Root, seen: Mask
+def _checked_parts(
+    model: LinearModel, readings: Readings, mean: Mean, root: Root, mask: Mask
 ) -> tuple[Parts, Array, Array, Array, Array]:
     """Return the parts of the model, and the other arguments as checked arrays."""
-    _checks.instance(model, LinearModel, "model")
+    _checks.require_instance(model, LinearModel, "model")
     n, k = model.size, model.deviation.shape[-1]
-    readings = _checks.rows(readings, (k,), "readings")
-    mean, root = _checks.floating(mean, (n,), "mean"), _checks.floating(root, (n, n), "root")
+    readings = _checks.array_of_rows(readings, (k,), "readings")
+    mean, root = (
+        _checks.array_of_shape(mean, (n,), "mean"),
+        _checks.array_of_shape(root, (n, n), "root"),
+    )
     times = readings.shape[0]
     if not times:
         raise ValueError("readings: wanted at least one row, got none")
-    if seen is None:
-        seen = jnp.ones(readings.shape, bool)
-    seen = jnp.asarray(seen)
-    if seen.dtype != bool or seen.shape != readings.shape:
-        raise ValueError(f"seen: wanted truth values {readings.shape}, got {seen.shape}")
-    bad = seen & ~jnp.isfinite(readings)
-    words = "readings: contains NaN or infinity; mask it by `seen` if it is a gap"
-    readings = jnp.where(seen, _checks.refuse(readings, bad.any(), words), 0)
+    if mask is None:
+        mask = jnp.ones(readings.shape, bool)
+    mask = jnp.asarray(mask)
+    if mask.dtype != bool or mask.shape != readings.shape:
+        raise ValueError(f"mask: wanted truth values {readings.shape}, got {mask.shape}")
+    bad = mask & ~jnp.isfinite(readings)
+    words = "readings: contains NaN or infinity; mask it if it is a gap"
+    readings = jnp.where(mask, _checks.error_if(readings, bad.any(), words), 0)
     parts = {name: getattr(model, name) for name in _AXES}
     for name, part in _time_varying(parts).items():
         wanted = times - 1 if name in _STEPS else times
         if part.shape[0] != wanted:
             raise ValueError(f"{name}: wanted {wanted} rows for {times} times, got {part.shape[0]}")
-    return parts, readings, mean, root, seen
+    return parts, readings, mean, root, mask
 
 
 def _time_varying(parts: Parts) -> Parts:
@@ -215,8 +221,8 @@ def _time_varying(parts: Parts) -> Parts:
 
 
 @partial(jax.jit, static_argnames="smooth")
-def solve(
-    parts: Parts, readings: Array, mean: Array, root: Array, seen: Array, *, smooth: bool
+def linear_estimate(
+    parts: Parts, readings: Array, mean: Array, root: Array, mask: Array, *, smooth: bool
 ) -> LinearEstimate:
     """Return the estimate of the Kalman filter or, with `smooth`, of the smoother.
 
@@ -227,13 +233,13 @@ def solve(
     times = {name: part for name, part in _time_varying(parts).items() if name not in _STEPS}
 
     def read(row: tuple, mean: Array, root: Array) -> roots.Update:
-        times, y, seen = row
-        now: dict[str, Any] = parts | times
-        error = y if now["offset"] is None else y - now["offset"]
-        return roots.update(mean, root, now["matrix"], error, now["deviation"] ** 2, seen)
+        times, y, mask = row
+        at_time: dict[str, Any] = parts | times
+        error = y if at_time["offset"] is None else y - at_time["offset"]
+        return roots.update(mean, root, at_time["matrix"], error, at_time["deviation"] ** 2, mask)
 
-    def body(carry: tuple[Array, Array], now: tuple[Parts, tuple]) -> tuple[Any, Any]:
-        (mean, root), (steps, row) = carry, now
+    def advance(carry: tuple[Array, Array], row_of_step: tuple[Parts, tuple]) -> tuple[Any, Any]:
+        (mean, root), (steps, row) = carry, row_of_step
         of_step: dict[str, Any] = parts | steps
         transition, noise, push = (of_step[name] for name in ("transition", "noise", "push"))
         predicted = jnp.sum(transition * mean[None], 1)
@@ -244,13 +250,15 @@ def solve(
         update = read(row, predicted, before)
         return (update.step, update.root), (update, predicted, joint)
 
-    rows = times, readings, seen
-    now, later = (jax.tree.map(lambda leaf, at=at: leaf[at], rows) for at in (0, slice(1, None)))
-    first = read(now, mean, root)
-    _, (rest, predicted, joint) = lax.scan(body, (first.step, first.root), (steps, later))
+    rows = times, readings, mask
+    first_row, later_rows = (
+        jax.tree.map(lambda leaf, at=at: leaf[at], rows) for at in (0, slice(1, None))
+    )
+    first = read(first_row, mean, root)
+    _, (rest, predicted, joint) = lax.scan(advance, (first.step, first.root), (steps, later_rows))
     updates = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
     means, all_roots, innovation, variance = updates
-    total, kicks = roots.terms(innovation, variance, seen).log_density, (None, None)
+    total, kicks = roots.innovation_terms(innovation, variance, mask).log_density, (None, None)
     if smooth:
         end, noise = (means[-1], all_roots[-1]), parts["noise"]
         means, all_roots, *kicks = backward_pass(joint, means[:-1], predicted, noise, end)
@@ -276,7 +284,7 @@ def joint_roots(transition: Array, noise: Array, root: Array) -> Joint:
     doi:10.1080/00207179508921582).
     """
     n, m = noise.shape
-    upper = jnp.concatenate([roots.product(transition, root), noise], 1)
+    upper = jnp.concatenate([roots.matrix_product(transition, root), noise], 1)
     whole = jnp.concatenate([upper, jnp.pad(root, ((0, 0), (0, m)))])
     # A triangle of 2n rows needs as many columns.
     whole = roots.triangular_root(jnp.pad(whole, ((0, 0), (0, max(0, n - m)))))
@@ -285,7 +293,7 @@ def joint_roots(transition: Array, noise: Array, root: Array) -> Joint:
 
 
 def backward_pass(
-    joint: Joint, mean: Array, predicted: Array, noise: Array, end: tuple[Array, Array]
+    joint: Joint, mean: Array, predicted: Array, noise: Array, last: tuple[Array, Array]
 ) -> tuple[Array, Array, Array, Array]:
     """Return the smoothed means and roots, and means and covariances of the noise of all steps.
 
@@ -299,27 +307,31 @@ def backward_pass(
     - `mean`: (T − 1, n) the filtered means before each step.
     - `predicted`: (T − 1, n) the predicted means after it.
     - `noise`: G, of all steps or of each.
-    - `end`: mean and root at the last time.
+    - `last`: mean and root at the last time.
     """
 
-    def kick(noise: Array, lower: Array, off: Array, root: Array) -> tuple[Array, Array]:
+    def noise_estimate(
+        noise: Array, predicted_root: Array, error: Array, root: Array
+    ) -> tuple[Array, Array]:
         m = noise.shape[1]
-        both = roots.divide(lower, jnp.concatenate([noise, off[:, None], root], 1))
+        both = roots.divide(predicted_root, jnp.concatenate([noise, error[:, None], root], 1))
         whitened, mean, scaled_root = both[:, :m], both[:, m], both[:, m + 1 :]
         mean = jnp.sum(whitened * mean[:, None], 0)
-        left = jnp.eye(m, dtype=noise.dtype) - roots.product(whitened.T, whitened)
-        known = roots.product(whitened.T, scaled_root)
-        return mean, left + roots.product(known, known.T)
+        left = jnp.eye(m, dtype=noise.dtype) - roots.matrix_product(whitened.T, whitened)
+        known = roots.matrix_product(whitened.T, scaled_root)
+        return mean, left + roots.matrix_product(known, known.T)
 
-    def step_back(later: tuple[Array, Array], now: tuple) -> tuple[Any, Any]:
-        joint, mean, predicted, own_noise = now
-        off, root = later[0] - predicted, later[1]
-        kicks = kick(noise if own_noise is None else own_noise, joint.predicted, off, root)
+    def step_back(state_after: tuple[Array, Array], row: tuple) -> tuple[Any, Any]:
+        joint, mean, predicted, own_noise = row
+        off, root = state_after[0] - predicted, state_after[1]
+        kicks = noise_estimate(
+            noise if own_noise is None else own_noise, joint.predicted, off, root
+        )
         mean = mean + jnp.sum(joint.gain * off[None], 1)
         out = mean, roots.predicted_root(joint.gain, root, joint.rest)
         return out, (*out, *kicks)
 
     own_noise = noise if noise.ndim > 2 else None
-    _, before = lax.scan(step_back, end, (joint, mean, predicted, own_noise), reverse=True)
-    means, all_roots = (jnp.concatenate([a, b[None]]) for a, b in zip(before, end, strict=False))
+    _, before = lax.scan(step_back, last, (joint, mean, predicted, own_noise), reverse=True)
+    means, all_roots = (jnp.concatenate([a, b[None]]) for a, b in zip(before, last, strict=False))
     return means, all_roots, *before[2:]

@@ -38,16 +38,16 @@ def predicted_root(
 
     F is the `transition`, G the `noise`, and P the covariance of this `root`.
     """
-    return triangular_root(jnp.concatenate([product(transition, root), noise], 1))
+    return triangular_root(jnp.concatenate([matrix_product(transition, root), noise], 1))
 
 
-def inverse_root(x: Array, least: ScalarLike = 0.0) -> Array:
-    """Return 1/√x where x is above `least`, else zero with zero derivatives."""
-    there = x > least
+def inverse_root(x: Array, threshold: ScalarLike = 0.0) -> Array:
+    """Return 1/√x where x is above `threshold`, else zero with zero derivatives."""
+    there = x > threshold
     return jnp.where(there, 1 / jnp.sqrt(jnp.where(there, x, 1)), 0)
 
 
-def product(a: Float[Array, "n m"], b: Float[Array, "m k"]) -> Float[Array, "n k"]:
+def matrix_product(a: Float[Array, "n m"], b: Float[Array, "m k"]) -> Float[Array, "n k"]:
     """Return the matrix product `a b`, in full precision, and cheap for a few rows."""
     return jnp.sum(a[:, :, None] * b[None], 1)
 
@@ -76,28 +76,28 @@ def update(
     matrix: Float[Array, "k n"],
     error: Float[Array, " k"],
     variance: Float[Array, " k"],
-    seen: Bool[Array, " k"],
+    mask: Bool[Array, " k"],
 ) -> Update:
     """Update mean and root of errors e by k numbers `error = h · e + noise`, one after the other.
 
     Potter's formula for a row h of `matrix` and the `variance` r of its noise: `s = |Sᵀh|² + r`,
     `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh` (Battin, Astronautical Guidance (1964), §9.6;
     Bierman, Factorization Methods (1977), §II.4). `step` is the mean of e, `root` the S before, and
-    numbers that are not `seen` do not count.
+    numbers that are not `mask` do not count.
     """
 
-    def absorb(now: tuple[Array, Array], number: tuple) -> tuple[Any, Any]:
-        (step, root), (row, error, variance, seen) = now, number
-        across = jnp.where(seen, jnp.sum(row[:, None] * root, 0), 0)
-        variance = jnp.where(seen, variance, 1)
+    def absorb(state: tuple[Array, Array], number: tuple) -> tuple[Any, Any]:
+        (step, root), (row, error, variance, mask) = state, number
+        across = jnp.where(mask, jnp.sum(row[:, None] * root, 0), 0)
+        variance = jnp.where(mask, variance, 1)
         total = jnp.sum(across * across) + variance
-        innovation = jnp.where(seen, error - jnp.sum(row * step), 0)
+        innovation = jnp.where(mask, error - jnp.sum(row * step), 0)
         along = jnp.sum(root * across[None], 1)
         step = step + along * (innovation / total)
         shrink = 1 / (total + jnp.sqrt(total * variance))
         return (step, root - (along * shrink)[:, None] * across[None]), (innovation, total)
 
-    numbers = (matrix, error, variance, seen)
+    numbers = (matrix, error, variance, mask)
     (step, root), (innovation, total) = lax.scan(absorb, (step, root), numbers)
     return Update(step, root, innovation, total)
 
@@ -118,25 +118,25 @@ class Terms(NamedTuple):
         return -0.5 * jnp.sum(self.error**2 + self.log_variance)
 
 
-def terms(innovation: Array, variance: Array, seen: Array) -> Terms:
-    """Return the terms of innovations with these variances, zero where not `seen`."""
-    error = jnp.where(seen, innovation * lax.rsqrt(variance), 0)
-    return Terms(error, jnp.where(seen, jnp.log(2 * math.pi * variance), 0))
+def innovation_terms(innovation: Array, variance: Array, mask: Array) -> Terms:
+    """Return the terms of innovations with these variances, zero where not `mask`."""
+    error = jnp.where(mask, innovation * lax.rsqrt(variance), 0)
+    return Terms(error, jnp.where(mask, jnp.log(2 * math.pi * variance), 0))
 
 
-def divide(lower: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
+def divide(lower: Float[Array, "n n"], rhs: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """Return `lower⁻¹ right` by forward substitution; a row is zero where the diagonal is."""
 
-    def forward_substitution_step(right: Array, k: Array) -> tuple[Array, Array]:
+    def forward_substitution_step(rhs: Array, k: Array) -> tuple[Array, Array]:
         column = lax.dynamic_index_in_dim(lower, k, 1, keepdims=False)
         there = column[k] > 0
-        row = right[k] * jnp.where(there, 1 / jnp.where(there, column[k], 1), 0)
-        return right - column[:, None] * row[None], row
+        row = rhs[k] * jnp.where(there, 1 / jnp.where(there, column[k], 1), 0)
+        return rhs - column[:, None] * row[None], row
 
-    return lax.scan(forward_substitution_step, right, jnp.arange(lower.shape[0]))[1]
+    return lax.scan(forward_substitution_step, rhs, jnp.arange(lower.shape[0]))[1]
 
 
-def divide_right(left: Float[Array, "m n"], lower: Float[Array, "n n"]) -> Float[Array, "m n"]:
+def divide_right(numerator: Float[Array, "m n"], lower: Float[Array, "n n"]) -> Float[Array, "m n"]:
     """Return `left lower⁻¹`; a column is zero where the diagonal is."""
-    turned = divide(lower[::-1, ::-1].T, left[:, ::-1].T)
+    turned = divide(lower[::-1, ::-1].T, numerator[:, ::-1].T)
     return turned.T[:, ::-1]

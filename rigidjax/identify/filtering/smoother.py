@@ -20,8 +20,8 @@ from rigidjax.identify.filtering.filter import (
     scan_filter,
     status_of,
 )
-from rigidjax.identify.filtering.linear import LinearEstimate, solve
-from rigidjax.identify.filtering.steps import Dynamics, Extended, Read, Stops
+from rigidjax.identify.filtering.linear import LinearEstimate, linear_estimate
+from rigidjax.identify.filtering.steps import Dynamics, ExtendedState, ReadNumbers, Stops
 from rigidjax.identify.model.model import Model
 from rigidjax.motion.manifold import minus, plus
 
@@ -46,7 +46,7 @@ class Smoothed(eqx.Module):
       apart, some between.
     - `rows`: (T,) the indices of the recorded times among the stops.
     - `pushes`: a `Push` for each `RandomTorque`; a `CorrelatedTorque` is in `belief.torques`.
-    - `readings`: a `Read` (N, k) for each sensor, of the last linearisation.
+    - `readings`: `ReadNumbers` (N, k) for each sensor, of the last linearisation.
     - `log_likelihood`: of all readings, by Laplace's method about this motion.
     - `change`: the largest change by the last iteration, in standard deviations.
     - `iterations`: their number.
@@ -56,7 +56,7 @@ class Smoothed(eqx.Module):
     belief: Belief
     rows: Int[Array, " times"]
     pushes: tuple[Push, ...]
-    readings: tuple[Read, ...]
+    readings: tuple[ReadNumbers, ...]
     log_likelihood: Scalar
     change: Scalar
     iterations: Int[Array, ""]
@@ -81,7 +81,7 @@ class Smoothed(eqx.Module):
 
 def smooth(
     model: Model,
-    first: Belief,
+    belief: Belief,
     x: Float[Array, " n"] | None = None,
     *,
     iterations: int = 10,
@@ -96,7 +96,7 @@ def smooth(
     motion of `filter`. It solves the linear problem exactly, by a Kalman filter and the pass back
     of Rauch, Tung and Striebel (Bell 1994, doi:10.1137/0804035).
 
-    **Arguments:** `model`, `first`, `x`, `substeps` and `throw` of `filter`, and
+    **Arguments:** `model`, `belief`, `x`, `substeps` and `throw` of `filter`, and
 
     - `iterations`: the largest number of iterations.
     - `tolerance`: the iteration ends when no number moves by more than this part of its standard
@@ -114,9 +114,9 @@ def smooth(
     >>> best.pushes[0].mean.shape, best.rows.tolist()  # of three stops two are readings
     ((3, 3), [0, 2])
     """
-    _checks.whole(iterations, "iterations", 1)
-    _checks.positive(tolerance, "tolerance")
-    run = _smooth(checked_input(model, first, x, substeps), iterations, tolerance)
+    _checks.integer(iterations, "iterations", 1)
+    _checks.positive_float(tolerance, "tolerance")
+    run = _smooth(checked_input(model, belief, x, substeps), iterations, tolerance)
     if not throw:
         return run
     words = (
@@ -124,7 +124,7 @@ def smooth(
         "more iterations, a better initial state, or a model that the readings fit; throw=False "
         "returns it"
     )
-    return _checks.refuse(raise_if_lost(run), run.change > 1, words)
+    return _checks.error_if(raise_if_lost(run), run.change > 1, words)
 
 
 @eqx.filter_jit
@@ -133,7 +133,7 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
     sensors, first, grid = run.scene.sensors, run.first, run.grid
     dynamics, stops, kept = scan_filter(run, lambda belief, read: (belief, read))
     beliefs, read = grid.at_rows(kept)
-    status, lost_at = status_of(beliefs, steps.by_sensor(sensors, read), first.t)
+    status, lost_at = status_of(beliefs, steps.split_by_sensor(sensors, read), first.t)
     path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, kept[0].x)
 
     def is_running(state: tuple) -> Array:
@@ -162,44 +162,46 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
         variance = jnp.diagonal(estimate.kick_covariance, axis1=1, axis2=2)[:, mine]
         pushes.append(Push(size * estimate.kicks[:, mine], size * jnp.sqrt(variance)))
     belief = Belief(stops.t, jax.tree.map(lambda leaf: leaf[1:], path), estimate.root[1:])
-    last_read = Read(estimate.innovation[1:], estimate.variance[1:], kept[1].seen)
-    reads = steps.by_sensor(sensors, last_read)
+    last_read = ReadNumbers(estimate.innovation[1:], estimate.variance[1:], kept[1].mask)
+    reads = steps.split_by_sensor(sensors, last_read)
     status = jnp.where(jnp.isfinite(change), status, 2)
     total = estimate.log_likelihood
     return Smoothed(belief, grid.rows, tuple(pushes), reads, total, change, count, status, lost_at)
 
 
 def _iterate(
-    dynamics: Dynamics, first: Belief, stops: Stops, path: Extended, kicks: Array
-) -> tuple[Extended, LinearEstimate, Scalar]:
+    dynamics: Dynamics, belief: Belief, stops: Stops, path: ExtendedState, kicks: Array
+) -> tuple[ExtendedState, LinearEstimate, Scalar]:
     """Linearise about the states `path` and the `kicks` between them, and solve exactly.
 
     Returns the new states, the estimate of their changes, and the largest change in standard
     deviations.
     """
-    dtype = first.root.dtype
+    dtype = belief.root.dtype
 
-    def linearise(now: tuple) -> tuple:
+    def linearise(row: tuple) -> tuple:
         """Linearise the step to a stop, and its readings, about the path."""
-        t0, stop, x, y, kick = now
+        t0, stop, x, y, kick = row
         after, grown, noise = dynamics.predict(
             t0.astype(dtype), (stop.t - t0).astype(dtype), x, kick
         )
         off = minus(after, y)
-        grown, noise = (steps.reset(y, off, part, back=True) for part in (grown, noise))
+        grown, noise = (steps.moved_root(y, off, part, inverse=True) for part in (grown, noise))
         push = off - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
         return (grown, noise, push), steps.linearise_readings(dynamics, stop, y)
 
-    before = jnp.concatenate([first.t[None], stops.t[:-1]])
+    before = jnp.concatenate([belief.t[None], stops.t[:-1]])
     x0, earlier, later = (
         jax.tree.map(lambda leaf, at=at: leaf[at], path) for at in (0, slice(-1), slice(1, None))
     )
     moves, rows = lax.map(linearise, (before, stops, earlier, later, kicks))
     # The first time is that of the first belief, at which nothing is read.
-    matrix, error, deviation, seen = (jnp.pad(a, [(1, 0)] + [(0, 0)] * (a.ndim - 1)) for a in rows)
+    matrix, error, deviation, mask = (jnp.pad(a, [(1, 0)] + [(0, 0)] * (a.ndim - 1)) for a in rows)
     parts = dict(zip(("transition", "noise", "push"), moves, strict=True))
     parts |= {"matrix": matrix, "deviation": deviation, "offset": None}
-    off = minus(x0, first.x)
-    out = solve(parts, error, -off, steps.reset(x0, off, first.root), seen, smooth=True)
+    off = minus(x0, belief.x)
+    out = linear_estimate(
+        parts, error, -off, steps.moved_root(x0, off, belief.root), mask, smooth=True
+    )
     change = jnp.max(jnp.abs(out.mean) * roots.inverse_root(jnp.sum(out.root**2, -1)))
     return jax.vmap(plus)(path, out.mean), out, change

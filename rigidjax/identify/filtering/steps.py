@@ -30,8 +30,8 @@ from rigidjax.identify.model.scene import (
 from rigidjax.identify.model.walks import Drift
 from rigidjax.identify.sensors import AbstractSensor, Gyro, SensorInput
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.equations import on_the_group
-from rigidjax.motion.manifold import coordinates, dimension, tangent, turns
+from rigidjax.motion.equations import project_to_group
+from rigidjax.motion.manifold import dimension, rotation_slices, tangent, tangent_to_vector
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
 from rigidjax.motion.torques.base import Torque, in_precision, require_law, tensor_of
 from rigidjax.motion.torques.composite import parts_of
@@ -42,7 +42,7 @@ from rigidjax.solve.equal_steps import advance
 from rigidjax.solve.tableaus import KUTTA4
 
 
-class Extended(eqx.Module):
+class ExtendedState(eqx.Module):
     """The state that a filter follows.
 
     **Fields:** `motion` a `Spin`, `Attitude` or `Rigid`; `torques` the value (3,) of each
@@ -114,7 +114,7 @@ class Dynamics(eqx.Module):
         spin = change.omega + jnp.sum(self.inverse * sum(torques[1:], torques[0])[None], 1)
         return eqx.tree_at(lambda s: s.omega, change, spin)
 
-    def advance(self, t: Scalar, h: Scalar, x: Extended, kicks: Array) -> Extended:
+    def advance(self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array) -> ExtendedState:
         """Return the state a time `h` after x, driven by the unit normal numbers `kicks`.
 
         White noise within the step is replaced by its first two Legendre polynomials,
@@ -125,26 +125,28 @@ class Dynamics(eqx.Module):
         safe = jnp.where(h > 0, h, 1)
         pairs = kicks.reshape(-1, 2, 3) * roots.inverse_root(h)
 
-        def push(pair: Array, share: Scalar) -> Array:
+        def noise_at(pair: Array, share: Scalar) -> Array:
             return pair[0] + 3.0**0.5 * share * pair[1]
 
-        def rate(since: Scalar, now: tuple[Any, tuple]) -> tuple[Any, tuple]:
-            motion, torques = now
-            share = 1.0 - 2.0 * since / safe
-            white = [r * push(pair, share) for r, pair in zip(self.white, pairs, strict=False)]
+        def rate(elapsed: Scalar, state: tuple[Any, tuple]) -> tuple[Any, tuple]:
+            motion, torques = state
+            share = 1.0 - 2.0 * elapsed / safe
+            white = [r * noise_at(pair, share) for r, pair in zip(self.white, pairs, strict=False)]
             later = zip(self.coloured, pairs[len(self.white) :], torques, strict=True)
-            slopes = tuple((r * push(pair, share) - tau) / time for (r, time), pair, tau in later)
-            change = self.field(t + since, motion, None)
+            slopes = tuple(
+                (r * noise_at(pair, share) - tau) / time for (r, time), pair, tau in later
+            )
+            change = self.field(t + elapsed, motion, None)
             return self.with_torques(change, [*white, *torques]), slopes
 
         motion, torques = advance(KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques))
         if isinstance(motion, HasAttitude):
             motion = eqx.tree_at(lambda s: s.q, motion, to_unit_length(motion.q))
-        return Extended(motion, torques, x.walks)
+        return ExtendedState(motion, torques, x.walks)
 
     def predict(
-        self, t: Scalar, h: Scalar, x: Extended, kicks: Array | None = None
-    ) -> tuple[Extended, Float[Array, "n n"], Float[Array, "n m"]]:
+        self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array | None = None
+    ) -> tuple[ExtendedState, Float[Array, "n n"], Float[Array, "n m"]]:
         """Return the state a time `h` after x, and the matrices F and G of its errors.
 
         F (n, n) carries the errors of x over the step; G (n, m) is a root of the covariance that
@@ -153,14 +155,14 @@ class Dynamics(eqx.Module):
         """
         kicks = jnp.zeros(self.kicks, x.motion.omega.dtype) if kicks is None else kicks
         after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
-        moving = Extended(x.motion, x.torques, ())
+        moving = ExtendedState(x.motion, x.torques, ())
         size, drifting = dimension(moving), dimension(x) - dimension(moving)
         still = tuple(jnp.zeros_like(w) for w in x.walks)
 
         def column(unit: Array) -> Array:
             along = tangent(moving, unit[:size])
-            moved = push(Extended(along.motion, along.torques, still), unit[size:])
-            return coordinates(after, moved)[:size]
+            moved = push(ExtendedState(along.motion, along.torques, still), unit[size:])
+            return tangent_to_vector(after, moved)[:size]
 
         both = jax.vmap(column, out_axes=1)(jnp.eye(size + self.kicks, dtype=kicks.dtype))
         grown, noise = both[:, :size], both[:, size:]
@@ -171,7 +173,7 @@ class Dynamics(eqx.Module):
         return after, block_diag(grown, same), block_diag(noise, strewn)
 
 
-def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: Extended) -> Dynamics:
+def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: ExtendedState) -> Dynamics:
     """Return the equations of a filter from a scene whose torque reads no `Input`.
 
     The state `x` gives their dtype and the type of the state.
@@ -202,18 +204,18 @@ def coloured_parts(process: Process | None) -> tuple[CorrelatedTorque, ...]:
     return tuple(part for part in parts_of(process) if isinstance(part, CorrelatedTorque))
 
 
-def reset(
-    x: Extended, e: Float[Array, " n"], root: Float[Array, "n m"], *, back: bool = False
+def moved_root(
+    x: ExtendedState, e: Float[Array, " n"], root: Float[Array, "n m"], *, inverse: bool = False
 ) -> Float[Array, "n m"]:
     """Return the root of the errors about `x ⊕ e`, from the `root` of the errors about x.
 
     Errors δ of a turn e become `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, here to second order in e
-    (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848). With `back` the root is multiplied by
-    `J_r(e)⁻¹`, to third order, which is the derivative of `log(exp(e) exp(δ))` by δ.
+    (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848). With `inverse` the root is multiplied
+    by `J_r(e)⁻¹`, to third order, which is the derivative of `log(exp(e) exp(δ))` by δ.
     """
-    first, second = (0.5, 1 / 12) if back else (-0.5, 1 / 6)
+    first, second = (0.5, 1 / 12) if inverse else (-0.5, 1 / 6)
     across = jax.vmap(cross, (None, 1), 1)
-    for rows in turns(x):
+    for rows in rotation_slices(x):
         turn, mine = e[rows], root[rows]
         once = across(turn, mine)
         mine = mine + first * once + second * across(turn, once)
@@ -233,12 +235,12 @@ class Stops(NamedTuple):
 
 
 def linearise_readings(
-    dynamics: Dynamics, stop: Stops, x: Extended
+    dynamics: Dynamics, stop: Stops, x: ExtendedState
 ) -> tuple[Float[Array, "k n"], Float[Array, " k"], Float[Array, " k"], Bool[Array, " k"]]:
     """Linearise all k numbers read at one time about the state x.
 
     Returns the derivatives (k, n) of their predictions, their errors (k,), the standard deviations
-    of the errors, and a mask of those that are seen.
+    of the errors, and a mask of those that were read.
     """
     dtype = x.motion.omega.dtype
     t = stop.t.astype(dtype)
@@ -247,7 +249,7 @@ def linearise_readings(
     for index, (value, mask) in enumerate(zip(stop.values, stop.masks, strict=True)):
         sensor = in_precision(dynamics.scene.sensors[index], dtype)
 
-        def error(y: Extended, index: int = index, value: Array = value) -> Array:
+        def error(y: ExtendedState, index: int = index, value: Array = value) -> Array:
             drifted = in_precision(dynamics.sensors_at(y.walks)[index], dtype)
 
             def field(t: Array, state: PyTree, args: object = None) -> PyTree:
@@ -261,32 +263,36 @@ def linearise_readings(
 
         value_of_error, push = jax.linearize(error, x)
         matrix = -jax.vmap(push, out_axes=1)(basis)
-        seen = jnp.broadcast_to(mask, value_of_error.shape)
+        mask = jnp.broadcast_to(mask, value_of_error.shape)
         limit = getattr(sensor, "limit", None)
         if limit is not None:
-            seen = seen & (jnp.abs(value) < limit * (1 - 1e-6))
+            mask = mask & (jnp.abs(value) < limit * (1 - 1e-6))
         assert sensor.noise is not None
-        out.append((matrix, value_of_error, sensor.noise, seen))
-    matrix, errors, noise, seen = (jnp.concatenate(parts) for parts in zip(*out, strict=True))
-    return matrix, errors, noise, seen
+        out.append((matrix, value_of_error, sensor.noise, mask))
+    matrix, errors, noise, mask = (jnp.concatenate(parts) for parts in zip(*out, strict=True))
+    return matrix, errors, noise, mask
 
 
-class Read(NamedTuple):
+class ReadNumbers(NamedTuple):
     """The numbers that a filter read of one sensor.
 
     **Fields:** `innovation` each number minus its prediction from all numbers read before;
-    `variance` of the innovation; `seen` whether the number was read.
+    `variance` of the innovation; `mask` whether the number was read.
     """
 
     innovation: Float[Array, "*times k"]
     variance: Float[Array, "*times k"]
-    seen: Bool[Array, "*times k"]
+    mask: Bool[Array, "*times k"]
 
 
-def by_sensor(sensors: Sequence[AbstractSensor], read: Read) -> tuple[Read, ...]:
-    """Split the `Read` of all numbers in a row into one of each sensor."""
+def split_by_sensor(
+    sensors: Sequence[AbstractSensor], numbers: ReadNumbers
+) -> tuple[ReadNumbers, ...]:
+    """Split the `ReadNumbers` of all numbers in a row into one of each sensor."""
     ends = np.cumsum([sensor.components for sensor in sensors])[:-1]
-    return tuple(Read(*own) for own in zip(*(jnp.split(a, ends, -1) for a in read), strict=True))
+    return tuple(
+        ReadNumbers(*own) for own in zip(*(jnp.split(a, ends, -1) for a in numbers), strict=True)
+    )
 
 
 # The longest step, as a fraction of the correlation time of a torque.
@@ -306,14 +312,14 @@ def steps_of(
     by the correlation times of the process; it is one if these are traced.
     """
     if substeps is not None:
-        return np.full(ts.shape[0] - 1, _checks.whole(substeps, "substeps", 1))
+        return np.full(ts.shape[0] - 1, _checks.integer(substeps, "substeps", 1))
     coloured = coloured_parts(process)
-    if not _checks.known((ts, state.omega, coloured)):
+    if not _checks.is_known((ts, state.omega, coloured)):
         return np.ones(ts.shape[0] - 1, int)
     rate = float(np.linalg.norm(np.asarray(state.omega, float)))
     for reading in () if recording is None else recording.readings:
         if isinstance(reading.sensor, Gyro):
-            values = np.asarray(reading.values, float)[reading.seen]
+            values = np.asarray(reading.values, float)[reading.host_mask]
             rate = max(rate, float(np.quantile(np.linalg.norm(values, axis=1), 0.99)))
     times = [MEMORY_A_STEP * float(law.time) for law in coloured]
     longest = min([TURN_OF_A_FILTER_STEP / rate if rate > 0 else math.inf, *times])
@@ -370,21 +376,21 @@ def sample(
     >>> drawn.states.omega.shape, drawn.torques  # white noise has no value at a time
     ((3, 3), ())
     """
-    _checks.key(key)
-    body = validation.single(body, (Inertia, MassProperties), "body")
-    _checks.single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
+    _checks.random_key(key)
+    body = validation.require_single_body(body, (Inertia, MassProperties), "body")
+    _checks.require_single(state0, HasSpin, "state0", requirement="a Spin, an Attitude or a Rigid")
     require_process(process)
     if torque is not None:
         require_law(torque)
     require_known_torque(torque)
-    times = _checks.rows(ts, (), "ts")
+    times = _checks.array_of_rows(ts, (), "ts")
     if times.shape[0] < 2:
         raise ValueError(f"ts: wanted at least two times, got {times.shape[0]}")
-    if _checks.known(times):
+    if _checks.is_known(times):
         words = "ts: wanted increasing times"
-        _checks.refuse(times, not (np.diff(np.asarray(times)) > 0).all(), words)
+        _checks.error_if(times, not (np.diff(np.asarray(times)) > 0).all(), words)
     pieces = int(steps_of(process, times, state0, substeps).max())
-    scene = Scene(body, torque, process, (), on_the_group(state0))
+    scene = Scene(body, torque, process, (), project_to_group(state0))
     return _sample(key, scene, times, pieces)
 
 
@@ -401,23 +407,25 @@ def _sample(
         law.deviation.astype(dtype) * jax.random.normal(one, (3,), dtype)
         for law, one in zip(coloured, keys, strict=True)
     )
-    x0 = Extended(state0, torques, ())
+    x0 = ExtendedState(state0, torques, ())
     dynamics = dynamics_of(scene, (), x0)
 
-    def span(x: Extended, now: tuple[Array, Array, Array]) -> tuple[Extended, Extended]:
-        left, right, one = now
+    def cross_interval(
+        x: ExtendedState, row: tuple[Array, Array, Array]
+    ) -> tuple[ExtendedState, ExtendedState]:
+        left, right, one = row
         # Subtract times before they are rounded to the dtype of the state.
         h = ((right - left) / pieces).astype(dtype)
         left = left.astype(dtype)
         kicks = jax.random.normal(one, (pieces, dynamics.kicks), dtype)
 
-        def move(x: Extended, piece: tuple[Array, Array]) -> tuple[Extended, None]:
+        def move(x: ExtendedState, piece: tuple[Array, Array]) -> tuple[ExtendedState, None]:
             return dynamics.advance(left + piece[0] * h, h, x, piece[1]), None
 
         x, _ = lax.scan(move, x, (jnp.arange(pieces, dtype=dtype), kicks))
         return x, x
 
     keys = jax.random.split(later, ts.shape[0] - 1)
-    _, rest = lax.scan(span, x0, (ts[:-1], ts[1:], keys))
+    _, rest = lax.scan(cross_interval, x0, (ts[:-1], ts[1:], keys))
     xs = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), x0, rest)
     return Sampled(ts, xs.motion, xs.torques)

@@ -20,19 +20,19 @@ from rigidjax.identify.model.normal import normal_of
 from rigidjax.identify.model.scene import Scene
 from rigidjax.identify.model.terms import (
     BodyIndex,
-    blocks,
     by_recording,
+    errors_and_jacobians,
     errors_of_scene,
     prior_residuals,
     scene_of,
-    standardised,
+    standardised_errors,
     torque_of_scene,
     with_jacobian,
 )
 from rigidjax.motion.manifold import dimension
 
 
-def terms_of_one(
+def terms_of_recording(
     model: Model, row: Array, record: Recording, reference: ReferenceStates, body_index: BodyIndex
 ) -> Terms:
     """Return the terms of the readings of one recording.
@@ -54,7 +54,7 @@ def terms_of_one(
     grid = grid_of(scene.process, record, first, model.filter_steps)
     run = FilterInput(scene, model.walks, record, first, grid)
     _, _, read = scan_filter(run, lambda _, read: read)
-    return jax.tree.map(jnp.ravel, roots.terms(*read))
+    return jax.tree.map(jnp.ravel, roots.innovation_terms(*read))
 
 
 def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
@@ -64,30 +64,30 @@ def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
     for reading, sensor, error in zip(record.readings, scene.sensors, errors, strict=True):
         limit: Any = getattr(sensor, "limit", None)
         noise: Any = sensor.noise
-        one, full, wider = standardised(
-            reading.values, reading.mask, error, noise, limit, reading.late
+        one, full, wider = standardised_errors(
+            reading.values, reading.mask, error, noise, limit, reading.jitter_error
         )
         scaled.append(one)
         # A channel at its limit counts by a probability, which has no logarithm of a variance.
-        seen = reading.mask[:, None] & ~full
+        mask = reading.mask[:, None] & ~full
         logs = jnp.log(2 * math.pi * noise**2)[None]
-        log_variance.append(jnp.where(seen, logs if wider is None else logs + wider, 0))
+        log_variance.append(jnp.where(mask, logs if wider is None else logs + wider, 0))
     return Terms(
         *(jnp.concatenate([a.reshape(-1) for a in part]) for part in (scaled, log_variance))
     )
 
 
-def terms(model: Model, x: Float[Array, " n"]) -> Terms:
+def reading_terms(model: Model, x: Float[Array, " n"]) -> Terms:
     """Return the terms (R, N) of all readings of a model at the free numbers x.
 
     Derivatives by x are computed recording by recording, in forward mode.
     """
-    return by_recording(model.index.rows(x), model, terms_of_one)
+    return by_recording(model.index.rows(x), model, terms_of_recording)
 
 
 def log_density(model: Model, x: Float[Array, " n"]) -> Scalar:
     """Return the logarithm of the density of all readings and of the priors of x."""
-    return terms(model, x).log_density - 0.5 * jnp.sum(prior_residuals(model, x) ** 2)
+    return reading_terms(model, x).log_density - 0.5 * jnp.sum(prior_residuals(model, x) ** 2)
 
 
 class Curvature(NamedTuple):
@@ -109,7 +109,7 @@ def curvature(model: Model, x: Float[Array, " n"]) -> Curvature:
     plus `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta and Mehra 1974,
     doi:10.1109/TAC.1974.1100714, for the filter).
     """
-    value, slopes = blocks(model, x, terms_of_one)
+    value, slopes = errors_and_jacobians(model, x, terms_of_recording)
     # dν/√s from the derivative of ν/√s: d(ν/√s) = dν/√s − ½ ν/√s d(log s).
     moved = slopes.error + 0.5 * value.error[..., None] * slopes.log_variance
     both = jnp.concatenate([moved, 0.5**0.5 * slopes.log_variance], axis=1)

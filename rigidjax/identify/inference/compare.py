@@ -17,7 +17,7 @@ from rigidjax.identify.model.charts import Known, places_of
 from rigidjax.identify.model.free import with_steps
 from rigidjax.identify.model.index import index_of
 from rigidjax.identify.model.model import Model, with_parts
-from rigidjax.identify.model.terms import independent, template, whiten
+from rigidjax.identify.model.terms import decorrelate, scene_template, whiten
 from rigidjax.identify.search.stages import errors_and_slopes
 
 
@@ -58,9 +58,9 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     >>> best.name, best.free, best.information  # free: two ratios, initial attitude and rate
     ('one', 8, 0.0)
     """
-    _checks.instance(fits, Mapping, "fits", wanted="a dict of name → Fit")
+    _checks.require_instance(fits, Mapping, "fits", requirement="a dict of name → Fit")
     for name, one in fits.items():
-        _checks.instance(one, Fit, f"fits[{name!r}]")
+        _checks.require_instance(one, Fit, f"fits[{name!r}]")
     if not fits:
         raise ValueError("compare: wanted at least one fit")
     readings = {name: one.model.records.readings for name, one in fits.items()}
@@ -97,9 +97,11 @@ def _log_squares(fit: Fit) -> np.ndarray:
     for index, (reading, e, sigma) in enumerate(
         zip(model.records.readings, white, fit.noises, strict=True)
     ):
-        if reading.late is not None:
-            wider = np.asarray(independent(e, reading.late / sigma[:, None])[1])[reading.seen]
-            squares = np.sum(np.asarray(e * sigma[:, None])[reading.seen] ** 2, axis=-1)
+        if reading.jitter_error is not None:
+            wider = np.asarray(decorrelate(e, reading.jitter_error / sigma[:, None])[1])[
+                reading.host_mask
+            ]
+            squares = np.sum(np.asarray(e * sigma[:, None])[reading.host_mask] ** 2, axis=-1)
             out[index] = np.log(squares.mean()) + wider.mean()
     return out
 
@@ -125,10 +127,12 @@ def cross_validate(
     Traceback (most recent call last):
     ValueError: cross_validate: wanted at least two recordings, got 0
     """
-    _checks.function(build, "build", "of a sequence of recordings → Model")
-    _checks.instance(recordings, Sequence, "recordings", wanted="a sequence of Recording")
+    _checks.require_function(build, "build", "of a sequence of recordings → Model")
+    _checks.require_instance(
+        recordings, Sequence, "recordings", requirement="a sequence of Recording"
+    )
     for item in recordings:
-        _checks.instance(item, Recording, "recordings")
+        _checks.require_instance(item, Recording, "recordings")
     if len(recordings) < 2:
         raise ValueError(f"cross_validate: wanted at least two recordings, got {len(recordings)}")
     out = []
@@ -147,7 +151,7 @@ def _with_shared(model: Model, of_others: Fit) -> Model:
         if slot.shared is not None and fitted.shared is not None:
             x = x.at[slot.shared].set(of_others.x[fitted.shared])
     record = stacking.pick_records(model.records, 0)
-    scene = with_steps(template(model, record), model.slots, model.index.rows(x)[0])
+    scene = with_steps(scene_template(model, record), model.slots, model.index.rows(x)[0])
     sensors = jax.tree.map(lambda leaf: leaf[None] if eqx.is_array(leaf) else leaf, scene.sensors)
     own = [
         slot if slot.each else dataclasses.replace(slot, each=True, prior=slot.spread, spread=None)

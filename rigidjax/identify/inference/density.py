@@ -28,7 +28,7 @@ from rigidjax.identify.model.model import (
     with_parts,
 )
 from rigidjax.identify.model.scene import Process, Scene, require_process
-from rigidjax.identify.model.terms import Noise, template
+from rigidjax.identify.model.terms import Noise, scene_template
 from rigidjax.identify.uncertainty.covariance import white_covariance
 from rigidjax.motion.torques.composite import parts_of
 
@@ -97,7 +97,9 @@ class LogDensity(eqx.Module):
         *,
         deviation: float | None = 2.0,
     ):
-        _checks.instance(fit, Fit, "LogDensity: fit", wanted="what identify.fit returns")
+        _checks.require_instance(
+            fit, Fit, "LogDensity: fit", requirement="what identify.fit returns"
+        )
         model = fit.model
         process = model.process if process is None else process
         if process is not None:
@@ -108,17 +110,17 @@ class LogDensity(eqx.Module):
                 f"{type(model.loss).__name__}; fit with loss=None"
             )
         if not np.isfinite(np.asarray(fit.covariance)).all():
-            what = " ".join(one.in_words for one in fit.undetermined)
+            what = " ".join(one.in_words for one in fit.undetermined_combinations)
             hint = "" if process is None else _GUESS
             raise ValueError(
                 "fit: neither the data nor a prior determine some direction, so there is no "
                 f"posterior; give a prior or fewer free numbers{hint}. {what}".rstrip()
             )
         known = process is None or deviation is None
-        prior = None if known else jnp.asarray(_checks.positive(deviation, "deviation"))
+        prior = None if known else jnp.asarray(_checks.positive_float(deviation, "deviation"))
         noise_slots, variances = _noise_slots(model)
         process_slots = [] if prior is None else _process_slots(process, prior)
-        total = sum(int(reading.seen.sum()) for reading in model.records.readings)
+        total = sum(int(reading.host_mask.sum()) for reading in model.records.readings)
         variances += [np.full(1, 1 / math.sqrt(total)) for _ in process_slots]
         new_slots = [*noise_slots, *process_slots]
         self.model, places = _with_slots(model, fit.noises, process, new_slots)
@@ -139,7 +141,7 @@ class LogDensity(eqx.Module):
         return self.x0.size
 
     def __call__(self, x: Float[Array, " n"]) -> Scalar:
-        return log_density(self.model, _checks.floating(x, self.x0.shape, "x"))
+        return log_density(self.model, _checks.array_of_shape(x, self.x0.shape, "x"))
 
     def unpack(self, x: Float[Array, " n"]) -> Unpacked:
         """Return the quantities that x (n,) represents.
@@ -147,7 +149,7 @@ class LogDensity(eqx.Module):
         These are the body, the initial states, the values of the `Free`s, the noise (R, k) of each
         sensor, and the process.
         """
-        x = _checks.floating(x, self.x0.shape, "x")
+        x = _checks.array_of_shape(x, self.x0.shape, "x")
         scenes, point = scenes_of(self.model, x), unpack_numbers(self.model, x)
         noise: Any = tuple(sensor.noise for sensor in scenes.sensors)
         process = stacking.pick_records(scenes.process, 0)
@@ -155,7 +157,7 @@ class LogDensity(eqx.Module):
 
 
 @eqx.filter_jit
-def of_draws(
+def map_draws(
     function: Callable[[Unpacked], Any], density: LogDensity, x: Float[Array, "m n"]
 ) -> Any:
     """Return `function(point)` of each draw x (m, n), as one program for densities of one form."""
@@ -171,7 +173,7 @@ def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
     for index, reading in enumerate(model.records.readings):
         if reading.sensor.noise is not None:
             continue
-        rows = np.bincount(groups, np.asarray(reading.seen.sum(axis=1)))
+        rows = np.bincount(groups, np.asarray(reading.host_mask.sum(axis=1)))
         # The logarithm of a standard deviation has the variance 1/(2n) for n numbers read.
         variances.append(0.5 / np.maximum(rows * reading.sensor.components, 1))
         path = _path_of(model, lambda s, index=index: s.sensors[index].noise)
@@ -212,7 +214,7 @@ def _factor(
 
 def _path_of(model: Model, where: Callable[[Scene], Any]) -> tuple[Any, ...]:
     """Return the path of the leaf of a scene that `where` picks, even if the leaf is `None`."""
-    scene = template(model, model.records)
+    scene = scene_template(model, model.records)
     marked = eqx.tree_at(where, scene, 0.0, is_leaf=lambda node: node is None)
     pairs = jax.tree.leaves_with_path(eqx.tree_at(where, marked, _MARK))
     return next(path for path, leaf in pairs if leaf is _MARK)

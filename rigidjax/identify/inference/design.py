@@ -14,13 +14,13 @@ from rigidjax._types import Scalar, Vec3, Vector
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.model.model import Model, require_numbers, require_one
 from rigidjax.identify.model.normal import normal_of
-from rigidjax.identify.model.terms import blocks, changes, in_deviations
+from rigidjax.identify.model.terms import delay_derivatives, errors_and_jacobians, in_deviations
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.covariance import covariance_root
 from rigidjax.identify.uncertainty.quantities import Quantity, quantities, values_and_slopes
 
 
-def expected(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, ...]:
+def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, ...]:
     """Return the quantities that a fit of planned recordings would report, with deviations.
 
     **Arguments:**
@@ -74,12 +74,12 @@ def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
     """Return the result of `fisher` without its checks, as one program."""
     sensors = model.records.sensors
     noises: list[Any] = [sensor.noise for sensor in sensors]
-    _, slopes = blocks(model, x)
+    _, slopes = errors_and_jacobians(model, x)
     rows = []
     for index, (sensor, noise, block) in enumerate(zip(sensors, noises, slopes, strict=True)):
         jitter, late = getattr(sensor, "jitter", None), None
         if jitter is not None:
-            late = jitter.deviation[:, None, None] * changes(model, x)[index]
+            late = jitter.deviation[:, None, None] * delay_derivatives(model, x)[index]
         rows.append(in_deviations(block, noise, late))
     return normal_of(rows, model.index.places, model.size).core
 
@@ -98,7 +98,7 @@ def _require_noise(model: Model, x: Float[Array, " n"]) -> None:
 
 def _require_known(model: Model, motion: PyTree) -> None:
     """Raise `TypeError` for a model or a motion of traced numbers."""
-    if not _checks.known((model, motion)):
+    if not _checks.is_known((model, motion)):
         raise TypeError(
             "model, x, body, omega: wanted known numbers, got traced ones; call it outside of "
             "jax.jit, jax.grad and jax.vmap, or differentiate identify.fisher"
@@ -125,17 +125,18 @@ def best_first_rate(
       the rate, that is how fast the body can be thrown.
     - `max_steps`: the largest number of steps of the search.
 
-    **Returns** the rate (3,), and the result of `expected` for it. **Raises:** as `fisher`.
+    **Returns** the rate (3,), and the result of `expected_quantities` for it. **Raises:** as
+    `fisher`.
     """
     require_one(model)
-    max_steps = _checks.whole(max_steps, "max_steps", 1)
+    max_steps = _checks.integer(max_steps, "max_steps", 1)
     _require_known(model, (body, omega))
     _require_noise(model, model.start(body, omega))
-    start = _checks.floating(omega, (3,), "omega").astype(model.records.t.dtype)
+    start = _checks.array_of_shape(omega, (3,), "omega").astype(model.records.t.dtype)
     size = jnp.sqrt(jnp.sum(start**2))
     best = _best_direction(model, body, start / size, size, max_steps)
     rate = size * best / jnp.sqrt(jnp.sum(best**2))
-    return rate, expected(model, model.start(body, rate))
+    return rate, expected_quantities(model, model.start(body, rate))
 
 
 @eqx.filter_jit

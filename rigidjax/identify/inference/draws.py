@@ -19,9 +19,9 @@ from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.body.inertia import tensor_of
 from rigidjax.identify.filtering.terms import curvature
-from rigidjax.identify.inference.density import LogDensity, of_draws
+from rigidjax.identify.inference.density import LogDensity, map_draws
 from rigidjax.identify.model.model import Unpacked
-from rigidjax.identify.model.normal import Normal
+from rigidjax.identify.model.normal import NormalMatrix
 from rigidjax.identify.search.least_squares import Settings, minimise
 from rigidjax.identify.search.stages import is_order_one
 from rigidjax.identify.uncertainty.quantities import interval_about
@@ -30,7 +30,7 @@ from rigidjax.motion.torques.composite import parts_of
 # A sampler: a function of a key, a log-density of z, and a first z (n,) to draws (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 
-# The arguments of `_checks.library`: the module, the extra that installs it, the function.
+# The arguments of `_checks.import_library`: the module, the extra that installs it, the function.
 _BLACKJAX = ("blackjax", "posterior", "posterior")
 
 # The weight of the first mass matrix, in draws. It counts, since Laplace's method made it.
@@ -65,13 +65,13 @@ class Nuts(eqx.Module):
     acceptance: float = eqx.field(static=True, default=0.8)
 
     def __check_init__(self):
-        _checks.whole(self.samples, "samples", 1)
-        _checks.whole(self.warmup, "warmup", 1)
+        _checks.integer(self.samples, "samples", 1)
+        _checks.integer(self.warmup, "warmup", 1)
         _checks.fraction(self.acceptance, "acceptance")
 
     def __call__(self, key: PRNGKeyArray, density: Callable[[Array], Array], start: Array) -> Array:
         """Return the draws (samples, n) of one chain that begins at `start` (n,)."""
-        blackjax = _checks.library(*_BLACKJAX)
+        blackjax = _checks.import_library(*_BLACKJAX)
         adaptation = blackjax.adaptation
         # Do the warm-up of `blackjax.window_adaptation` in one loop with the draws. In a loop of
         # its own it compiles the density once more, which takes longer than the draws.
@@ -80,26 +80,32 @@ class Nuts(eqx.Module):
         metric_begin, metric_add, metric_end = metric
         kernel = blackjax.nuts.build_kernel()
 
-        def warm(tuning: tuple, state: PyTree, accepted: Array, slow: Array, ends: Array) -> tuple:
+        def adapt(
+            tuning: tuple, state: PyTree, accepted: Array, in_slow_window: Array, window_ends: Array
+        ) -> tuple:
             steps, scale, _ = tuning
             steps = tune(steps, accepted)
-            scale = lax.cond(slow, lambda: metric_add(scale, state.position), lambda: scale)
+            scale = lax.cond(
+                in_slow_window, lambda: metric_add(scale, state.position), lambda: scale
+            )
 
-            def end() -> tuple:
+            def end_window() -> tuple:
                 restarted = begin(settle(steps))
                 return restarted, metric_end(scale), jnp.exp(restarted.log_step_size)
 
-            return lax.cond(ends, end, lambda: (steps, scale, jnp.exp(steps.log_step_size)))
+            return lax.cond(
+                window_ends, end_window, lambda: (steps, scale, jnp.exp(steps.log_step_size))
+            )
 
-        def body(carry: tuple, now: tuple) -> tuple[tuple, Array]:
+        def body(carry: tuple, row: tuple) -> tuple[tuple, Array]:
             state, (steps, scale, size) = carry
-            key, drawing, slow, ends = now
+            key, drawing, slow, ends = row
             size = jnp.where(drawing, settle(steps), size)
             state, info = kernel(key, state, density, size, scale.inverse_mass_matrix)
             tuning = lax.cond(
                 drawing,
                 lambda: (steps, scale, size),
-                lambda: warm((steps, scale, size), state, info.acceptance_rate, slow, ends),
+                lambda: adapt((steps, scale, size), state, info.acceptance_rate, slow, ends),
             )
             return (state, tuning), state.position
 
@@ -132,26 +138,28 @@ class Posterior(eqx.Module):
     @property
     def rhat(self) -> Float[Array, " n"]:
         """Return the potential scale reduction of the chains, near 1 if they agree (blackjax)."""
-        return _checks.library(*_BLACKJAX).diagnostics.potential_scale_reduction(self.x)
+        return _checks.import_library(*_BLACKJAX).diagnostics.potential_scale_reduction(self.x)
 
     @property
     def ess(self) -> Float[Array, " n"]:
         """Return the effective number of independent draws (blackjax)."""
-        return _checks.library(*_BLACKJAX).diagnostics.effective_sample_size(self.x)
+        return _checks.import_library(*_BLACKJAX).diagnostics.effective_sample_size(self.x)
 
     @property
     def points(self) -> Unpacked:
         """Return bodies, states and values of the draws, with axes of chains and samples first."""
-        return self.of(_identity)
+        return self.map(_identity)
 
-    def of(self, function: Callable[[Unpacked], Any]) -> Any:
+    def map(self, function: Callable[[Unpacked], Any]) -> Any:
         """Return `function(point)` of each draw, with leading axes of chains and samples.
 
         An example is `drawn.of(lambda point: point.body.moments)`. **Raises** `TypeError` for
         anything but a `function`.
         """
-        _checks.function(function, "function", "of `Unpacked`, such as lambda point: point.body")
-        rows = of_draws(function, self.density, self.x.reshape(-1, self.x.shape[-1]))
+        _checks.require_function(
+            function, "function", "of `Unpacked`, such as lambda point: point.body"
+        )
+        rows = map_draws(function, self.density, self.x.reshape(-1, self.x.shape[-1]))
         return jax.tree.map(lambda leaf: leaf.reshape(*self.x.shape[:2], *leaf.shape[1:]), rows)
 
     def to_arviz(self) -> Any:
@@ -159,7 +167,7 @@ class Posterior(eqx.Module):
 
         **Raises:** `ImportError` without arviz, which needs Python 3.12.
         """
-        arviz = _checks.library("arviz", "posterior", "to_arviz (Python 3.12)")
+        arviz = _checks.import_library("arviz", "posterior", "to_arviz (Python 3.12)")
         points = self.points
         out = dict(points.values)
         out["omega0"] = points.state0.omega
@@ -204,12 +212,14 @@ def posterior(
     >>> drawn.x.shape, bool((drawn.rhat < 1.05).all())  # four chains that agree
     ((4, 200, 8), True)
     """
-    _checks.instance(density, LogDensity, "density", hint="identify.LogDensity(fit) makes one")
-    _checks.key(key)
-    chains = _checks.whole(chains, "chains", 2)
-    sample = Nuts() if sampler is None else _checks.function(sampler, "sampler", "of a key")
+    _checks.require_instance(
+        density, LogDensity, "density", hint="identify.LogDensity(fit) makes one"
+    )
+    _checks.random_key(key)
+    chains = _checks.integer(chains, "chains", 2)
+    sample = Nuts() if sampler is None else _checks.require_function(sampler, "sampler", "of a key")
     if isinstance(sample, Nuts):
-        _checks.library(*_BLACKJAX)
+        _checks.import_library(*_BLACKJAX)
     root = jnp.linalg.cholesky(density.covariance)
     x = _draw(density, root, jax.random.split(key, chains), sample)
     return Posterior(density, x)
@@ -222,13 +232,13 @@ def _draw(density: LogDensity, root: Array, keys: Array, sampler: Sampler) -> Ar
     Chains are sampled in the vector z with `x = x0 + root z`.
     """
 
-    def unscaled(z: Array) -> Array:
+    def to_numbers(z: Array) -> Array:
         return density.x0 + jnp.sum(root * z[None], 1)
 
     def chain(key: Array) -> Array:
         first, later = jax.random.split(key)
         start = 0.5 * jax.random.normal(first, density.x0.shape, density.x0.dtype)
-        return jax.vmap(unscaled)(sampler(later, lambda z: density(unscaled(z)), start))
+        return jax.vmap(to_numbers)(sampler(later, lambda z: density(to_numbers(z)), start))
 
     # Chains that run together wait for the longest trajectory among them in each step.
     if density.model.count >= _FULL:
@@ -275,7 +285,7 @@ class Refit(eqx.Module):
         return self.density.unpack(self.x)
 
     @property
-    def effective(self) -> Scalar:
+    def effective_count(self) -> Scalar:
         """Return the number of independent draws that the weighted draws are worth, 1/Σw².
 
         Source: Kish, Survey Sampling (1965).
@@ -283,7 +293,7 @@ class Refit(eqx.Module):
         return 1.0 / jnp.sum(self.weights**2)
 
     def interval_of(
-        self, of: Callable[[Unpacked], Any], level: float = 0.95
+        self, function: Callable[[Unpacked], Any], level: float = 0.95
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the interval (low, high), with equal tails, of a function of the posterior.
 
@@ -292,20 +302,20 @@ class Refit(eqx.Module):
         must then be differentiable: take the logarithm of a positive quantity. Such an interval is
         too narrow on short records.
 
-        **Arguments:** `of` the function, from `Unpacked` to an array; `level` the probability that
-        the interval holds the true value. **Raises** `ValueError` for a level outside (0, 1), and
-        if too few draws are independent and the search did not converge either.
+        **Arguments:** `function` from `Unpacked` to an array; `level` the probability
+        that the interval holds the true value. **Raises** `ValueError` for a level outside (0, 1),
+        and if too few draws are independent and the search did not converge either.
         """
         level = _checks.fraction(level, "level", "a probability between 0 and 1")
-        _checks.function(of, "of", "of `Unpacked` to an array")
-        if not (float(self.effective) >= _LEAST or bool(self.converged)):
+        _checks.require_function(function, "function", "of `Unpacked` to an array")
+        if not (float(self.effective_count) >= _LEAST or bool(self.converged)):
             raise ValueError(
                 "interval_of: the search did not reach the maximum of the density, and fewer than "
                 "100 draws are independent: give refit more max_steps, or its fit a better "
                 "start, or draw from the density (identify.posterior)"
             )
-        if float(self.effective) >= _LEAST:
-            each = np.asarray(of_draws(of, self.density, self.draws))
+        if float(self.effective_count) >= _LEAST:
+            each = np.asarray(map_draws(function, self.density, self.draws))
             tails = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
             weights = np.asarray(self.weights)
 
@@ -318,7 +328,7 @@ class Refit(eqx.Module):
             return np.asarray(low), np.asarray(high)
 
         def value(x: Array) -> Array:
-            return jnp.asarray(of(self.density.unpack(x)))
+            return jnp.asarray(function(self.density.unpack(x)))
 
         centre, slope = (np.asarray(a) for a in (value(self.x), jax.jacfwd(value)(self.x)))
         null, reach = np.zeros((0, self.x.size)), NormalDist().inv_cdf(0.5 + 0.5 * level)
@@ -363,9 +373,11 @@ def refit(
     >>> bool((low < high).all())
     True
     """
-    _checks.instance(density, LogDensity, "density", hint="identify.LogDensity(fit) makes one")
-    steps, count = _checks.whole(max_steps, "max_steps", 1), _checks.whole(draws, "draws", 1)
-    drawing = jax.random.key(0) if key is None else _checks.key(key)
+    _checks.require_instance(
+        density, LogDensity, "density", hint="identify.LogDensity(fit) makes one"
+    )
+    steps, count = _checks.integer(max_steps, "max_steps", 1), _checks.integer(draws, "draws", 1)
+    drawing = jax.random.key(0) if key is None else _checks.random_key(key)
     return _refit(density, Settings(_SMALL, _DAMPING, steps), drawing, count)
 
 
@@ -373,9 +385,9 @@ def refit(
 def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: int) -> Refit:
     """Return the result of `refit` with `count` draws, as one program."""
 
-    def evaluate(x: Array) -> tuple[None, Array, Normal, Array]:
+    def evaluate(x: Array) -> tuple[None, Array, NormalMatrix, Array]:
         cost, gram, slope = curvature(density.model, x)
-        return None, cost, Normal(gram), slope
+        return None, cost, NormalMatrix(gram), slope
 
     order_one = is_order_one(density.model, density.x0.dtype)
     end = minimise(evaluate, density.x0, order_one, settings, None)
@@ -386,16 +398,16 @@ def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: in
 
 
 def _weighted_draws(
-    density: LogDensity, top: Array, covariance: Array, key: PRNGKeyArray, count: int
+    density: LogDensity, mode: Array, covariance: Array, key: PRNGKeyArray, count: int
 ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-    """Return `count` draws of Student's t about the maximum `top`, and their weights."""
-    size, kind = top.size, top.dtype
+    """Return `count` draws of Student's t about the maximum `mode`, and their weights."""
+    size, kind = mode.size, mode.dtype
     normal, square = jax.random.split(key)
     z = jax.random.normal(normal, (count, size), kind)
     shrunk = jax.random.chisquare(square, _FREEDOM, (count, 1), kind) / _FREEDOM
     z = z / jnp.sqrt(shrunk)
     root = _WIDER * jnp.linalg.cholesky(covariance)
-    draws = top[None] + z @ root.T
+    draws = mode[None] + z @ root.T
     wanted = lax.map(density, draws)
     drawn_from = -0.5 * (_FREEDOM + size) * jnp.log1p(jnp.sum(z * z, 1) / _FREEDOM)
     # A draw so far out that the density is NaN gets no weight.

@@ -10,7 +10,7 @@ from rigidjax.identify.answer.result import Fit, require_one_fit
 from rigidjax.identify.data.windows import (
     Horizons,
     Windows,
-    by_horizon,
+    average_by_horizon,
     require_windows,
     starts_of_windows,
 )
@@ -27,7 +27,7 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
 
     **Arguments:** `fit` of a `Model` of windows; `windows` the same ones, or others with the same
     kind of state and inputs. **Returns** `steps`, and by kind `mean_absolute`, `mean_norm` and
-    `rms` (`Horizons`); a good model has smaller errors than `windows.held()`. **Raises:**
+    `rms` (`Horizons`); a good model has smaller errors than `windows.held_horizons()`. **Raises:**
     `TypeError` for a fit of other recordings than windows, `ValueError` for a `Free` with a value
     for each window and for missing inputs.
 
@@ -51,11 +51,11 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
             "predict_windows: wanted a fit whose numbers all windows share, got a Free with a "
             "value for each window, which other windows do not have"
         )
-    _checks.instance(windows.starts, type(model.reference.state), "windows.starts")
+    _checks.require_instance(windows.starts, type(model.reference.state), "windows.starts")
     require_inputs_of_windows(model.torque, windows)
     model_on_windows, x = _on_windows(model, fit.x, windows)
     errors = _errors(model_on_windows, x)[0]
-    return by_horizon(windows.starts, errors[:, 1:])
+    return average_by_horizon(windows.starts, errors[:, 1:])
 
 
 def _on_windows(

@@ -32,7 +32,7 @@ class Pull(AbstractPull):
     width: Scalar
 
     def __call__(self, model: Model, x: Float[Array, " n"]) -> Float[Array, "1"]:
-        value = quantities.vector(model, x)[self.index]
+        value = quantities.quantity_vector(model, x)[self.index]
         return ((value - self.target) / self.width)[None]
 
 
@@ -72,7 +72,7 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     wide = np.log(1e3) if quantity.positive else 1e3 * max(abs(middle), 1e-12)
     if not np.isfinite(deviation) or deviation <= 0:
         deviation = wide / 10
-    model, kind = stacking.of_few_lengths(fit.model), fit.model.records.t.dtype
+    model, kind = stacking.pad_to_few_lengths(fit.model), fit.model.records.t.dtype
     bottom = 2.0 * cost_of(model, fit.x, fit.noises)
     shares = max(fit.correlation, 1.0)
     ends = []
@@ -80,7 +80,7 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
         point = fit.x
 
         @functools.cache
-        def pulled(steps: float, side: float = side) -> tuple[float, float]:
+        def pull_to(steps: float, side: float = side) -> tuple[float, float]:
             # The pull is weak, so the quantity ends between the target and its best value. That is
             # no error: the point has the least misfit of all points with its value.
             nonlocal point
@@ -94,31 +94,31 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
             grown = (2.0 * cost_of(model, point, fit.noises) - bottom) / shares - reach**2
             return grown, float(_value(model, point)[index])
 
-        ends.append(_end(pulled, reach, wide / deviation, side))
+        ends.append(_interval_end(pull_to, reach, wide / deviation, side))
     low, high = (np.exp(end) if quantity.positive else end for end in ends)
     return float(low), float(high)
 
 
-_value = eqx.filter_jit(quantities.vector)
+_value = eqx.filter_jit(quantities.quantity_vector)
 
 
-def _end(
-    pulled: Callable[[float], tuple[float, float]], reach: float, most: float, side: float
+def _interval_end(
+    pull_to: Callable[[float], tuple[float, float]], reach: float, largest: float, side: float
 ) -> float:
     """Return the value of the quantity at which the misfit has grown enough.
 
-    **Arguments:** `pulled` a function from the distance of the target to the excess of the misfit
-    and the value; `reach` the first distance; `most` the largest; `side` the sign of infinity.
+    **Arguments:** `pull_to` a function from the distance of the target to the excess of the misfit
+    and the value; `reach` the first distance; `largest` the last one; `side` the sign of infinity.
     """
     from scipy.optimize import brentq
 
     inner, outer = 0.0, reach
-    while pulled(outer)[0] < 0:
+    while pull_to(outer)[0] < 0:
         inner, outer = outer, 2.0 * outer
-        if outer > max(most, 4.0 * reach):
+        if outer > max(largest, 4.0 * reach):
             return side * np.inf
 
-    def grown(steps: float) -> float:
-        return pulled(steps)[0] if steps > 0 else -(reach**2)
+    def excess(steps: float) -> float:
+        return pull_to(steps)[0] if steps > 0 else -(reach**2)
 
-    return pulled(brentq(grown, inner, outer, xtol=1e-2 * reach))[1]  # pyright: ignore
+    return pull_to(brentq(excess, inner, outer, xtol=1e-2 * reach))[1]  # pyright: ignore

@@ -151,7 +151,7 @@ def _typical_moments(value: object) -> Array:
             f"{type(value).__name__}; give a known body as Known(body), an initial guess by "
             "fit(initial=model.start(body))"
         )
-    size = _checks.positive(value, "typical", "a positive moment of inertia, kg m²")
+    size = _checks.positive_float(value, "typical", "a positive moment of inertia, kg m²")
     return jnp.asarray(size, jnp.result_type(float))
 
 
@@ -250,12 +250,12 @@ class Mass(AbstractBodyChart):
     unit: ClassVar[str] = "SI"
 
     def __init__(self, guess: MassProperties, free: Sequence[str] = tuple(_PARTS)):
-        self.guess = _checks.single(guess, MassProperties, "guess")
+        self.guess = _checks.require_single(guess, MassProperties, "guess")
         wanted = "some of mass, inertia, com"
-        _checks.instance(free, Sequence, "free", wanted=wanted)
+        _checks.require_instance(free, Sequence, "free", requirement=wanted)
         chosen = [free] if isinstance(free, str) else list(free)
         for name in chosen:
-            _checks.word(name, tuple(_PARTS), "free")
+            _checks.require_option(name, tuple(_PARTS), "free")
         if not chosen:
             raise ValueError("free: wanted mass, inertia or com, got none; see Known")
         self.free = tuple(name for name in _PARTS if name in chosen)
@@ -320,7 +320,7 @@ class Known(AbstractBodyChart):
     log_names: ClassVar[tuple[str, ...]] = ()
 
     def __check_init__(self) -> None:
-        validation.single(self.known, (Inertia, MassProperties), "known")
+        validation.require_single_body(self.known, (Inertia, MassProperties), "known")
 
     def body(self, vector: Numbers) -> Inertia | MassProperties:
         return self.known
@@ -332,9 +332,9 @@ class Known(AbstractBodyChart):
         return jnp.zeros(0)
 
 
-def _pad(x: Float[Array, "*rows n"], before: int, after: int) -> Float[Array, "*rows m"]:
-    """Return x with zeros `before` and `after` it along the last axis."""
-    return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(before, after)])
+def _pad(x: Float[Array, "*rows n"], leading: int, trailing: int) -> Float[Array, "*rows m"]:
+    """Return x with zeros `leading` and `trailing` it along the last axis."""
+    return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(leading, trailing)])
 
 
 class Bodies(eqx.Module):
@@ -438,14 +438,14 @@ def body_of_recording(
     return body.body(vector, body_index)
 
 
-def charts_of(body: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...]:
+def chart_list(body: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...]:
     """Return the charts of one body or of several."""
     return body.charts if isinstance(body, Bodies) else (body,)
 
 
 def numbers_of(body: AbstractBodyChart | Bodies, vector: Array | np.ndarray) -> list[Any]:
     """Split the numbers `vector` of one body or of several into those of each chart."""
-    sizes = [chart.size for chart in charts_of(body)]
+    sizes = [chart.size for chart in chart_list(body)]
     return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
 
 

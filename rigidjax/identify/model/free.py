@@ -64,18 +64,20 @@ class Free(eqx.Module):
         spread: float | str | None = None,
         unit: str | None = None,
     ):
-        _checks.function(where, "where", "of a scene, such as lambda s: s.torque.coefficient")
-        _checks.instance(name, str, "name")
+        _checks.require_function(
+            where, "where", "of a scene, such as lambda s: s.torque.coefficient"
+        )
+        _checks.require_instance(name, str, "name")
         self.where, self.name = where, name
         here = f"Free {name!r}"
-        self.unit = None if unit is None else _checks.instance(unit, str, f"{here}: unit")
-        self.scale = _checks.positive(scale, f"{here}: scale")
+        self.unit = None if unit is None else _checks.require_instance(unit, str, f"{here}: unit")
+        self.scale = _checks.positive_float(scale, f"{here}: scale")
         self.each = checked_labels(each, f"{here}: each")
         self.positive = positive
-        self.prior = None if prior is None else _checks.positive(prior, f"{here}: prior")
+        self.prior = None if prior is None else _checks.positive_float(prior, f"{here}: prior")
         if spread is not None and spread != "estimated":
             wanted = 'a positive number or "estimated"'
-            spread = _checks.positive(spread, f"{here}: spread", wanted)
+            spread = _checks.positive_float(spread, f"{here}: spread", wanted)
         self.spread = spread
         if each is True and spread is not None:
             raise ValueError(
@@ -89,9 +91,9 @@ def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
     if isinstance(each, bool):
         return each
     if isinstance(each, str):
-        return _checks.word(each, ("body",), name)
+        return _checks.require_option(each, ("body",), name)
     wanted = 'True, False, "body", or a sequence of labels, one for each recording'
-    return tuple(_checks.instance(each, Sequence, name, wanted=wanted))
+    return tuple(_checks.require_instance(each, Sequence, name, requirement=wanted))
 
 
 class Slot(eqx.Module):
@@ -171,7 +173,7 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
     """Return the slot of each `Free` in a scene; `bodies` (R,) names each recording's body."""
     slots: list[Slot] = []
     for item in free:
-        _checks.instance(item, Free, "free", wanted="Free(where, name)")
+        _checks.require_instance(item, Free, "free", requirement="Free(where, name)")
         here = f"Free {item.name!r}"
         path, value = leaf_at(item.where, scene, here, "it")
         if any(slot.path == path for slot in slots):
@@ -194,7 +196,7 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
         groups, labels = None, ()
         if not isinstance(item.each, bool):
             groups, labels = group_of_each(item.each, bodies, here)
-        unit = _unit_of(scene, path) if item.unit is None else item.unit
+        unit = _implied_unit(scene, path) if item.unit is None else item.unit
         slots.append(
             Slot(
                 path,
@@ -215,11 +217,11 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
 
 
 def leaf_at(
-    where: Callable[[Any], Any], tree: PyTree, name: str, what: str
+    where: Callable[[Any], Any], tree: PyTree, name: str, role: str
 ) -> tuple[tuple[Any, ...], Any]:
     """Return the path of the leaf of a tree that `where` picks, and the leaf, an array of numbers.
 
-    `name` and `what` are words for errors: the object that has `where`, and the one that needs a
+    `name` and `role` are words for errors: the object that has `where`, and the one that needs a
     starting value.
     """
     pairs, structure = jax.tree.flatten_with_path(tree)
@@ -230,7 +232,7 @@ def leaf_at(
         raise ValueError(f"{name}: nothing is there ({error})") from None
     if index is None:
         raise ValueError(
-            f"{name}: None is there; give {what} a starting value, such as "
+            f"{name}: None is there; give {role} a starting value, such as "
             "Gyro(bias=[0.0, 0.0, 0.0])"
         )
     if not isinstance(index, int):
@@ -245,7 +247,7 @@ def leaf_at(
 _UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place": "m"}
 
 
-def _unit_of(scene: Scene, path: tuple[Any, ...]) -> str:
+def _implied_unit(scene: Scene, path: tuple[Any, ...]) -> str:
     """Return the unit of a leaf of a scene, if its name implies one."""
     *way, last = path
     name = getattr(last, "name", "")

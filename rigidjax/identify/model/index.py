@@ -67,16 +67,18 @@ def index_of(
     """
     count, end = len(bodies), size
 
-    def take(*shape: int) -> np.ndarray:
+    def take_places(*shape: int) -> np.ndarray:
         nonlocal end
         places = end + np.arange(int(np.prod(shape, dtype=int)))
         end += places.size
         return places.reshape(shape)
 
-    shared = [None if s.each else take(max(len(s.labels), 1), *s.shape) for s in slots]
+    shared = [None if s.each else take_places(max(len(s.labels), 1), *s.shape) for s in slots]
     first_alone = end
-    start = np.concatenate([np.zeros((count, 0), int), *(take(count, 3) for _ in range(kinds))], 1)
-    own = [take(count, *s.shape) if s.each or s.spread is not None else None for s in slots]
+    start = np.concatenate(
+        [np.zeros((count, 0), int), *(take_places(count, 3) for _ in range(kinds))], 1
+    )
+    own = [take_places(count, *s.shape) if s.each or s.spread is not None else None for s in slots]
     blocks, twice, columns, column = [bodies], [], [], bodies.shape[1]
     placed = []
     for slot, of_all, of_each in zip(slots, shared, own, strict=True):

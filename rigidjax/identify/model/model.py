@@ -29,7 +29,7 @@ from rigidjax.identify.data.windows import (
 from rigidjax.identify.model.charts import (
     AbstractBodyChart,
     Bodies,
-    charts_of,
+    chart_list,
     has_mass,
     places_of,
     scaled_body,
@@ -44,7 +44,7 @@ from rigidjax.identify.model.terms import (
     motion_of_scene,
     over_records,
     scene_of,
-    template,
+    scene_template,
     with_jacobian,
 )
 from rigidjax.identify.model.walks import Drift, Walk, find_drifts
@@ -185,7 +185,7 @@ class Model(eqx.Module):
     ):
         windows = recording if isinstance(recording, Windows) else None
         if windows is None:
-            recordings, charts, names = _by_body(recording, chart)
+            recordings, charts, names = _charts_and_names(recording, chart)
         else:
             require_windows(windows)
             recordings, names = [], ("",) * windows.count
@@ -251,7 +251,7 @@ class Model(eqx.Module):
     def recordings(self) -> tuple[Recording, ...]:
         """Return the recordings, one by one."""
         return tuple(
-            stacking.cut(stacking.pick_records(self.records, index), count)
+            stacking.take_rows(stacking.pick_records(self.records, index), count)
             for index, count in enumerate(np.asarray(self.counts).tolist())
         )
 
@@ -289,18 +289,21 @@ class Model(eqx.Module):
             if not isinstance(body, Mapping | None) or set(by_name) - set(names):
                 raise ValueError(f"body: wanted bodies by name, of {', '.join(names)}, or None")
             vector = jnp.concatenate(
-                [_numbers(chart, by_name.get(n)) for n, chart in zip(names, charts, strict=True)]
+                [
+                    _numbers_in_chart(chart, by_name.get(n))
+                    for n, chart in zip(names, charts, strict=True)
+                ]
             )
         else:
-            vector = _numbers(self.chart, body)
+            vector = _numbers_in_chart(self.chart, body)
         kind = jnp.result_type(float)
         if omega is None and not self.index.start.size:
             rates = np.zeros((1, 3))
         elif omega is None:
             rates = first_rates(self.records, self.counts)
         else:
-            rates = _checks.floating(omega, (3,), "omega").astype(kind)[None]
-        xp: Any = np if _checks.known((vector, rates, self.reference.rate)) else jnp
+            rates = _checks.array_of_shape(omega, (3,), "omega").astype(kind)[None]
+        xp: Any = np if _checks.is_known((vector, rates, self.reference.rate)) else jnp
         spin = xp.asarray(rates) / xp.asarray(self.reference.rate)[:, None]
         spin = xp.broadcast_to(spin, (self.count, 3)).astype(kind)
         spin = spin if self.index.start.size else spin[:, :0]
@@ -346,11 +349,11 @@ class Model(eqx.Module):
         """
         x = require_numbers(self, x)
 
-        def of_one(row: Array, record: Recording, *rest: PyTree) -> Any:
-            scene = scene_of(self, row, record, *rest)
+        def motion_of_recording(row: Array, record: Recording, *others: PyTree) -> Any:
+            scene = scene_of(self, row, record, *others)
             return motion_of(motion_of_scene(self, scene, record)[0])
 
-        states = over_records(of_one, self, self.index.rows(x))
+        states = over_records(motion_of_recording, self, self.index.rows(x))
         return stacking.pick_records(states, 0) if self.count == 1 else states
 
     def errors(self, x: Float[Array, " n"]) -> tuple[Float[Array, "*records times _"], ...]:
@@ -410,7 +413,7 @@ def _data_of_windows(
     records = windows.records()
     counts = np.full(windows.count, windows.length + 1, np.int32)
     state_kind = _state_kind(records.sensors, torque, charts)
-    stretches = _checks.whole(stretches, "stretches", 2)
+    stretches = _checks.integer(stretches, "stretches", 2)
     reference, weight, clusters = starts_of_windows(windows, stretches)
     _require_states(windows, state_kind)
     kinds = 0 if weight is None else dimension(stacking.pick_records(reference.state, 0)) // 3
@@ -427,25 +430,25 @@ def _require_parts(
     integrator: object,
 ) -> None:
     """Raise `TypeError` unless the parts of a model are of their types."""
-    for one in charts_of(charts):
+    for one in chart_list(charts):
         known = isinstance(one, Inertia | MassProperties)
         hint = "give a known body as Known(body)" if known else ""
         hint = "was () forgotten?" if isinstance(one, type) else hint
         wanted = "what of the body is free, such as Ratios() or PrincipalRatios()"
-        _checks.instance(one, AbstractBodyChart, "Model", wanted=wanted, hint=hint)
-    _checks.instance(free, Sequence, "free", wanted="a sequence of Free(where, name)")
+        _checks.require_instance(one, AbstractBodyChart, "Model", requirement=wanted, hint=hint)
+    _checks.require_instance(free, Sequence, "free", requirement="a sequence of Free(where, name)")
     for name, value, kind in (
         ("loss", loss, AbstractLoss),
         ("prior", prior, Entropic),
         ("integrator", integrator, AbstractIntegrator),
     ):
         if value is not None:
-            _checks.instance(value, kind, name)
+            _checks.require_instance(value, kind, name)
 
 
 def _require_own_names(slots: Sequence[Slot], charts: AbstractBodyChart | Bodies) -> None:
     """Raise `ValueError` for a `Free` with the name of a quantity of the body."""
-    taken = {name for one in charts_of(charts) for name in (*one.log_names, *one.plain_names)}
+    taken = {name for one in chart_list(charts) for name in (*one.log_names, *one.plain_names)}
     for slot in slots:
         if slot.name in taken | {"Ωx", "Ωy", "Ωz"}:
             words = "a quantity of the body has this name; give another"
@@ -478,17 +481,19 @@ def without_samples(model: Model) -> Model:
     once, and not again for recordings of another length.
     """
     records = jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, model.records)
-    return with_parts(model, records=stacking.cut(records, 1, axis=1))
+    return with_parts(model, records=stacking.take_rows(records, 1, axis=1))
 
 
 def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
     """Return the result of `Model.scenes`, without a check of x."""
 
-    def of_one(row: Array, *rest: PyTree) -> Scene:
+    def scene_of_recording(row: Array, *rest: PyTree) -> Scene:
         return scene_of(model, row, *rest)
 
     rows = model.index.rows(x)
-    return eqx.filter_vmap(of_one)(rows, model.records, model.reference, model.body_indices)
+    return eqx.filter_vmap(scene_of_recording)(
+        rows, model.records, model.reference, model.body_indices
+    )
 
 
 def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
@@ -514,7 +519,7 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
 
 def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
     """Return the starting value of each slot in each recording."""
-    leaves, out = dict(jax.tree.leaves_with_path(template(model, model.records))), []
+    leaves, out = dict(jax.tree.leaves_with_path(scene_template(model, model.records))), []
     for slot in model.slots:
         leaf = jnp.asarray(leaves[slot.path])
         of_each = slot.path[0].name == "sensors"
@@ -533,7 +538,7 @@ def filter_steps_of(model: Model) -> int:
 
 def require_one(model: PyTree) -> Model:
     """Return `model`; raise `TypeError` or `ValueError` unless it is one `Model`, not a batch."""
-    _checks.instance(model, Model, "model")
+    _checks.require_instance(model, Model, "model")
     records, rate = model.records, model.reference.rate
     shapes = {records.t.shape, *(reading.mask.shape for reading in records.readings)}
     if len(shapes) > 1 or records.t.ndim != 2 or rate.shape != records.t.shape[:1]:
@@ -541,9 +546,9 @@ def require_one(model: PyTree) -> Model:
             "model: wanted one, as Model(recording, …) makes it, got times and masks of shapes "
             f"{sorted(shapes)}; give many one by one"
         )
-    _checks.numbers(records.t, "model")
-    if _checks.known(rate):
-        _checks.finite(rate, "model: its typical rate")
+    _checks.numeric_array(records.t, "model")
+    if _checks.is_known(rate):
+        _checks.require_finite(rate, "model: its typical rate")
     return model
 
 
@@ -551,7 +556,7 @@ def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
     """Return the free numbers x; raise an error unless they are numbers of this model."""
     require_one(model)
     hint = "model.start(body) makes them"
-    numbers = _checks.numbers(x, "x")
+    numbers = _checks.numeric_array(x, "x")
     if numbers.shape != (model.size,):
         raise ValueError(
             f"x: wanted the {model.size} free numbers of this model, got shape {numbers.shape}; "
@@ -561,8 +566,8 @@ def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
         raise TypeError(
             f"x: wanted {model.records.t.dtype}, as the recordings have, got {numbers.dtype}"
         )
-    if _checks.known(numbers):
-        _checks.finite(numbers, "x")
+    if _checks.is_known(numbers):
+        _checks.require_finite(numbers, "x")
     return numbers
 
 
@@ -613,18 +618,18 @@ def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
         raise ValueError("; ".join(wrong))
 
 
-def words_on_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
+def describe_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
     """Describe the delays that at the free numbers x read beyond their windows; none otherwise."""
     if model.clusters is None or not delays_of(model.torque):
         return []
     t, rows = np.asarray(model.records.t)[0], max(len(a[0]) for a in model.records.inputs.values())
     step = float(t[1] - t[0])
     known, length = (rows - t.size) * step, (t.size - 1) * step
-    return mistakes_of_delays(_scenes(model, x).torque, known, length)
+    return mistakes_of_delays(_scenes_program(model, x).torque, known, length)
 
 
 @eqx.filter_jit
-def _scenes(model: Model, x: Float[Array, " n"]) -> Scene:
+def _scenes_program(model: Model, x: Float[Array, " n"]) -> Scene:
     """Return the result of `scenes_of` by one program.
 
     Outside of a trace each operation of JAX takes as long as a run of 100 steps.
@@ -658,7 +663,7 @@ def _require_held_steps(integrator: object) -> None:
         )
 
 
-def _by_body(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
+def _charts_and_names(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
     """Return all recordings, the chart or charts, and the name of the body of each recording."""
     if isinstance(recording, Mapping) or isinstance(body, Mapping):
         if not (isinstance(recording, Mapping) and isinstance(body, Mapping)):
@@ -672,7 +677,9 @@ def _by_body(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str
                 f"charts of {sorted(body)}"
             )
         for chart in body.values():
-            _checks.instance(chart, AbstractBodyChart, "body", wanted="a chart such as Tensor()")
+            _checks.require_instance(
+                chart, AbstractBodyChart, "body", requirement="a chart such as Tensor()"
+            )
         rows, of = [], []
         for name in body:
             of_body = recording[name]
@@ -693,8 +700,8 @@ def _require_recordings(recordings: Sequence[Any]) -> None:
     if not recordings:
         raise ValueError("Model: wanted at least one Recording, got an empty sequence")
     for item in recordings:
-        _checks.instance(item, Recording, "Model", wanted="a Recording")
-        if not _checks.known((item.t, [reading.values for reading in item.readings])):
+        _checks.require_instance(item, Recording, "Model", requirement="a Recording")
+        if not _checks.is_known((item.t, [reading.values for reading in item.readings])):
             raise TypeError(
                 "recording: wanted known readings, got traced ones; make the Model outside "
                 "of jax.jit, jax.grad and jax.vmap, and give it to them as an argument"
@@ -705,19 +712,19 @@ def _require_recordings(recordings: Sequence[Any]) -> None:
                 "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
                 f"shapes {sorted(lengths)}; for many give a sequence"
             )
-        _checks.numbers(item.t, "recording")
+        _checks.numeric_array(item.t, "recording")
 
 
-def _numbers(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " chart"]:
+def _numbers_in_chart(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " chart"]:
     """Return the numbers of a body in a chart; zeros, the start of the chart, for `None`."""
     if body is None:
-        return _zeros(chart.size)
-    one = validation.single(body, (Inertia, MassProperties), "body")
-    if _checks.known(one):
-        jax.tree.map(lambda leaf: _checks.finite(leaf, "body"), one)
+        return _host_zeros(chart.size)
+    one = validation.require_single_body(body, (Inertia, MassProperties), "body")
+    if _checks.is_known(one):
+        jax.tree.map(lambda leaf: _checks.require_finite(leaf, "body"), one)
     vector = eqx.filter_jit(chart.vector)(one)
-    if _checks.known(vector):
-        _checks.refuse(
+    if _checks.is_known(vector):
+        _checks.error_if(
             vector,
             not np.isfinite(vector).all(),
             f"body: {type(chart).__name__} has no finite numbers for it; wanted principal "
@@ -726,7 +733,7 @@ def _numbers(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " char
     return vector
 
 
-def _zeros(*shape: int) -> Array:
+def _host_zeros(*shape: int) -> Array:
     """Return zeros, made by NumPy: JAX would compile a program for each shape."""
     return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
 
@@ -743,7 +750,7 @@ def _state_kind(
         needed.append(getattr(torque, "feels", HasAttitude))
     forced = any(isinstance(part, AbstractForce) for part in parts_of(torque))
     if HasPose in needed or forced:
-        for chart in charts_of(body):
+        for chart in chart_list(body):
             if not has_mass(chart):
                 raise ValueError(
                     "Model: a sensor or force needs a body that moves, whose mass is known or "

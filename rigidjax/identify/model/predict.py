@@ -65,7 +65,7 @@ class AbstractIntegrator(eqx.Module):
         They are a `motion.Coupled` if the torque has states of its own.
         """
 
-    def finer(self) -> "AbstractIntegrator | None":
+    def refine(self) -> "AbstractIntegrator | None":
         """Return an integrator of shorter steps, for comparison; `None` if there is none."""
         return None
 
@@ -90,8 +90,10 @@ class FixedSteps(AbstractIntegrator):
     last: Int[Array, ""] | None = eqx.field(default=None, repr=False)
 
     def __check_init__(self):
-        _checks.whole(self.substeps, "substeps", 1)
-        _checks.instance(self.solver, AbstractExplicit, "solver", wanted="one of rigidjax.solvers")
+        _checks.integer(self.substeps, "substeps", 1)
+        _checks.require_instance(
+            self.solver, AbstractExplicit, "solver", requirement="one of rigidjax.solvers"
+        )
 
     def states(
         self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
@@ -100,15 +102,15 @@ class FixedSteps(AbstractIntegrator):
         field = equations_of_motion(body, y0, torque)
         return fixed(in_a_loop(self.solver), field, ts, y0, self.substeps, self.last)
 
-    def finer(self) -> AbstractIntegrator:
+    def refine(self) -> AbstractIntegrator:
         if self.substeps > FINEST:
             return Adaptive()
         return FixedSteps(2 * self.substeps, self.solver, self.last)
 
 
-def _tolerance(name: str) -> Callable[[ScalarLike], Array]:
+def _tolerance_field(name: str) -> Callable[[ScalarLike], Array]:
     """Return a converter of a field to an array, so that another value compiles no new program."""
-    return lambda value: jnp.asarray(_checks.number(value, name), jnp.result_type(float))
+    return lambda value: jnp.asarray(_checks.known_float(value, name), jnp.result_type(float))
 
 
 class Adaptive(AbstractIntegrator):
@@ -121,12 +123,12 @@ class Adaptive(AbstractIntegrator):
     1e-09
     """
 
-    rtol: Float[Array, ""] = eqx.field(converter=_tolerance("rtol"), default=1e-9)
-    atol: Float[Array, ""] = eqx.field(converter=_tolerance("atol"), default=1e-12)
+    rtol: Float[Array, ""] = eqx.field(converter=_tolerance_field("rtol"), default=1e-9)
+    atol: Float[Array, ""] = eqx.field(converter=_tolerance_field("atol"), default=1e-12)
 
     def __check_init__(self):
-        _checks.positive(self.rtol, "rtol")
-        _checks.not_negative(self.atol, "atol")
+        _checks.positive_float(self.rtol, "rtol")
+        _checks.nonnegative_float(self.atol, "atol")
 
     def states(
         self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
@@ -147,7 +149,7 @@ class Adaptive(AbstractIntegrator):
         )
         return out.ys if out.own is None else Coupled(out.ys, out.own)
 
-    def finer(self) -> "Adaptive | None":
+    def refine(self) -> "Adaptive | None":
         if self.rtol <= _LEAST:
             return None
         rtol = jnp.maximum(_CLOSER * self.rtol, _LEAST)
@@ -214,20 +216,20 @@ class HeldSteps(AbstractIntegrator):
         field = equations_of_motion(body, start, torque)
         stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
 
-        def one(y: PyTree, i: Array) -> tuple[PyTree, PyTree]:
+        def take_step(y: PyTree, i: Array) -> tuple[PyTree, PyTree]:
             y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
             return y, stepper.state(y)
 
         def warm_up(y: PyTree, i: Array) -> tuple[PyTree, None]:
             # The torque's own states follow the inputs; the body keeps its initial state.
-            y, _ = one(y, i)
+            y, _ = take_step(y, i)
             return split(Coupled(start.motion, stepper.state(y).own)), None
 
         y0 = stepper.start
         if before and isinstance(start, Coupled):
             y0, _ = lax.scan(warm_up, y0, jnp.arange(-before, 0, dtype=jnp.int32))
         still = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *jnp.shape(a))), start)
-        later = first_rows(count if self.last is None else self.last, one, y0, still)
+        later = first_rows(count if self.last is None else self.last, take_step, y0, still)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, later)
 
 
@@ -254,7 +256,7 @@ def sensor_inputs(
     ts: Array,
     state0: State,
     states: PyTree,
-    late: Array | None = None,
+    delay: Array | None = None,
 ) -> tuple[Array, PyTree, Callable[[Array, PyTree], SensorInput]]:
     """Return the times and states that a sensor reads, and a function to its input at one time.
 
@@ -265,13 +267,13 @@ def sensor_inputs(
     - `ts`: (T,) the times of the readings.
     - `state0`, `states`: the initial state, and the states at `ts`; `Coupled` if a torque has
       states of its own.
-    - `late`: s, a further delay, one number or (T,).
+    - `delay`: s, a further delay, one number or (T,).
     """
     turned = body_of_equations(body, type(state0))
     field = equations_of_motion(turned, state0, torque)
     offset, times = getattr(sensor, "offset", None), ts
-    if late is not None:
-        offset = late if offset is None else offset + late
+    if delay is not None:
+        offset = delay if offset is None else offset + delay
     if offset is not None:
         times = ts + offset
         if torque is None:
@@ -308,13 +310,13 @@ def errors_along(
     return values + lowpass(times, jax.vmap(error)(times, states, jnp.zeros_like(values)))
 
 
-def _error_of(sensor: AbstractSensor, now: SensorInput, value: Array) -> Array:
+def _error_of(sensor: AbstractSensor, motion: SensorInput, value: Array) -> Array:
     """Return the error of a reading, checked: a user may have written the method `error`."""
     name = type(sensor).__name__
     try:
-        error = sensor.error(now, value)
+        error = sensor.error(motion, value)
     except AttributeError as wrong:
-        if type(now.state).__name__ not in str(wrong):
+        if type(motion.state).__name__ not in str(wrong):
             raise
         raise TypeError(
             f"{name}.error: {wrong}; it has feels = {sensor.feels.__name__}, but it reads more "
@@ -366,7 +368,7 @@ def simulate_readings(
     (2, 3)
     """
     order = "the order is sensor, body, state0, ts"
-    _checks.instance(state0, (Spin, Attitude, Rigid), "state0", hint=order)
+    _checks.require_instance(state0, (Spin, Attitude, Rigid), "state0", hint=order)
     several = isinstance(sensor, Sequence)
     sensors = tuple(sensor) if several else (sensor,)
     if not sensors:
@@ -377,7 +379,7 @@ def simulate_readings(
     sol = simulate(body_of_equations(body, type(state0)), start, ts, torque)
     states = sol.ys if sol.own is None else Coupled(sol.ys, sol.own)
     count = len(sensors)
-    keys = [None] * count if key is None else jax.random.split(_checks.key(key), count)
+    keys = [None] * count if key is None else jax.random.split(_checks.random_key(key), count)
     motion = body, torque, sol.ts, start, states
     out = tuple(_readings(one, *motion, key=own) for one, own in zip(sensors, keys, strict=True))
     return out if several else out[0]
@@ -418,7 +420,7 @@ def _readings(
 def _require_sensor(sensor: PyTree, state0: State, key: object) -> None:
     """Raise an error for anything but a sensor that can read this state, with noise for a key."""
     name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
-    _checks.instance(sensor, AbstractSensor, "sensor", wanted=wanted)
+    _checks.require_instance(sensor, AbstractSensor, "sensor", requirement=wanted)
     if not isinstance(state0, sensor.feels):
         raise TypeError(
             f"{name} needs a state with {sensor.feels.__name__}, got {type(state0).__name__}; take "
@@ -441,6 +443,6 @@ def _require_sensor(sensor: PyTree, state0: State, key: object) -> None:
     if not hasattr(sensor, "reading_of") and math.prod(sensor.reading_shape) != sensor.components:
         raise ValueError(
             f"{name}: its readings of shape {sensor.reading_shape} are not its error of "
-            f"{sensor.components} numbers plus a prediction; write a method reading_of(now, "
+            f"{sensor.components} numbers plus a prediction; write a method reading_of(motion, "
             "error), the reading whose error is this one"
         )

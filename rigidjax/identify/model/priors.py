@@ -36,7 +36,7 @@ class AbstractLoss(eqx.Module):
         """Return dρ/ds, the weight of the reading in the normal equations: 1 for a small error."""
 
 
-_scale = partial(_checks.positive, name="scale")
+_scale = partial(_checks.positive_float, name="scale")
 
 
 class SoftL1(AbstractLoss):
@@ -87,9 +87,9 @@ class Huber(AbstractLoss):
         return 1.0 / jnp.sqrt(jnp.maximum(s, 1.0))
 
 
-def _weight(value: float) -> Scalar:
+def _checked_weight(value: float) -> Scalar:
     """Return the weight of a prior as an array; raise `ValueError` unless it is positive."""
-    return jnp.asarray(_checks.positive(value, "weight"), jnp.result_type(float))
+    return jnp.asarray(_checks.positive_float(value, "weight"), jnp.result_type(float))
 
 
 class Entropic(eqx.Module):
@@ -110,29 +110,31 @@ class Entropic(eqx.Module):
     """
 
     guess: Inertia | MassProperties
-    weight: Scalar = eqx.field(converter=_weight)
+    weight: Scalar = eqx.field(converter=_checked_weight)
 
     def __check_init__(self) -> None:
-        validation.single(self.guess, (Inertia, MassProperties), "guess")
+        validation.require_single_body(self.guess, (Inertia, MassProperties), "guess")
 
-    def residuals(self, body: Inertia | MassProperties, scaled: bool = True) -> Float[Array, " n"]:
-        """Return numbers whose squares add up to `2 w D`; `scaled` false compares shapes alone."""
+    def residuals(
+        self, body: Inertia | MassProperties, to_scale: bool = True
+    ) -> Float[Array, " n"]:
+        """Return numbers whose squares add up to `2 w D`; shapes alone unless `to_scale`."""
         if isinstance(body, MassProperties) and isinstance(self.guess, MassProperties):
             here, there = _pseudo_inertia(body), _pseudo_inertia(self.guess)
         else:
             here, there = body.second_moment, self.guess.second_moment
-        if not scaled:
+        if not to_scale:
             here, there = here / jnp.trace(here), there / jnp.trace(there)
         root = jnp.linalg.cholesky(there)
         half = jnp.linalg.solve(root, here)
         factor = jnp.linalg.cholesky(jnp.linalg.solve(root, half.T))
         n = factor.shape[0]
         rows, columns = jnp.tril_indices(n, -1)
-        parts = jnp.concatenate([factor[rows, columns], _root(jnp.diagonal(factor))])
+        parts = jnp.concatenate([factor[rows, columns], _root_of_divergence(jnp.diagonal(factor))])
         return jnp.sqrt(2.0 * self.weight) * parts
 
 
-def _root(c: Float[Array, " n"]) -> Float[Array, " n"]:
+def _root_of_divergence(c: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return `√(c² − 1 − 2 log c)` with the sign of c − 1, which is smooth through c = 1."""
     x = c - 1.0
     near = jnp.abs(x) < 1e-2

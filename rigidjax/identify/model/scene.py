@@ -46,7 +46,9 @@ def require_process(process: PyTree) -> None:
     """Raise `TypeError` unless `process` is an unknown torque or a `Sum` of them."""
     wanted = "a RandomTorque, a CorrelatedTorque or a Sum of them"
     for part in parts_of(process) or (process,):
-        _checks.instance(part, (RandomTorque, CorrelatedTorque), "process", wanted=wanted)
+        _checks.require_instance(
+            part, (RandomTorque, CorrelatedTorque), "process", requirement=wanted
+        )
 
 
 def require_known_torque(torque: Torque | None) -> None:

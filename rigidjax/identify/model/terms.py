@@ -39,7 +39,7 @@ Blocks = tuple[tuple[Array, ...], tuple[Array, ...]]
 Noise = tuple[Float[Array, "records _"], ...]
 
 
-def template(model: "Model", record: Recording) -> Scene:
+def scene_template(model: "Model", record: Recording) -> Scene:
     """Return the scene of a recording with the starting values of all free numbers."""
     return Scene(None, model.torque, model.process, record.sensors, None)
 
@@ -48,7 +48,7 @@ def scene_of(
     model: "Model", row: Row, record: Recording, reference: ReferenceStates, body_index: BodyIndex
 ) -> Scene:
     """Return the scene of one recording from the row of its free numbers."""
-    scene = with_steps(template(model, record), model.slots, row)
+    scene = with_steps(scene_template(model, record), model.slots, row)
     body = body_of_recording(model.chart, row, body_index)
     start = reference.start_at(row[model.index.first :])
     return Scene(body, scene.torque, scene.process, scene.sensors, start)
@@ -74,13 +74,13 @@ def torque_of_scene(scene: Scene, record: Recording) -> Torque | None:
     return bind(scene.torque, sources_of(record))
 
 
-def errors_of_one(
+def errors_of_recording(
     model: "Model",
     row: Row,
     record: Recording,
     reference: ReferenceStates,
     body_index: BodyIndex,
-    late: Array | None = None,
+    delay: Array | None = None,
 ) -> tuple[Array, ...]:
     """Return the errors (T, k) of each sensor in one recording, in its unit; zero where masked.
 
@@ -89,21 +89,21 @@ def errors_of_one(
     - `row`: the free numbers of the recording.
     - `record`, `reference`: its readings, and its reference state.
     - `body_index`: the index of its body.
-    - `late`: s, by which all clocks are behind, in addition to their offsets.
+    - `delay`: s, by which all clocks are behind, in addition to their offsets.
     """
     scene = scene_of(model, row, record, reference, body_index)
-    return errors_of_scene(model, scene, record, late)
+    return errors_of_scene(model, scene, record, delay)
 
 
 def errors_of_scene(
-    model: "Model", scene: Scene, record: Recording, late: Array | None = None
+    model: "Model", scene: Scene, record: Recording, delay: Array | None = None
 ) -> tuple[Array, ...]:
-    """Return the errors of `errors_of_one` from the scene of the recording."""
+    """Return the errors of `errors_of_recording` from the scene of the recording."""
     states, torque = motion_of_scene(model, scene, record)
     assert scene.body is not None and scene.start is not None
     out, motion = [], (scene.body, torque, record.t, scene.start, states)
     for reading, sensor in zip(record.readings, scene.sensors, strict=True):
-        errors = errors_along(sensor, reading.values, *sensor_inputs(sensor, *motion, late))
+        errors = errors_along(sensor, reading.values, *sensor_inputs(sensor, *motion, delay))
         out.append(jnp.where(reading.mask[:, None], errors, 0.0))
     return tuple(out)
 
@@ -117,15 +117,17 @@ def over_records(function: Callable[..., PyTree], model: "Model", *rows: PyTree)
     trees = *rows, model.records, model.reference, model.body_indices
     arrays, rest = eqx.partition(trees, eqx.is_array)
 
-    def of_one(part: PyTree[Array]) -> PyTree:
+    def function_of_recording(part: PyTree[Array]) -> PyTree:
         return function(*eqx.combine(part, rest))
 
     if model.count == 1:
         # One recording needs no loop: the program is smaller.
-        return jax.tree.map(lambda leaf: leaf[None], of_one(stacking.pick_records(arrays, 0)))
+        return jax.tree.map(
+            lambda leaf: leaf[None], function_of_recording(stacking.pick_records(arrays, 0))
+        )
     if platform() == "cpu":
-        return lax.map(of_one, arrays, batch_size=1)
-    return jax.vmap(of_one)(arrays)
+        return lax.map(function_of_recording, arrays, batch_size=1)
+    return jax.vmap(function_of_recording)(arrays)
 
 
 def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
@@ -133,7 +135,7 @@ def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
 
     Derivatives by x are computed recording by recording, in forward mode.
     """
-    return by_recording(model.index.rows(x), model, errors_of_one)
+    return by_recording(model.index.rows(x), model, errors_of_recording)
 
 
 @eqx.filter_custom_jvp
@@ -142,13 +144,13 @@ def by_recording(
 ) -> Any:
     """Return `function(model, row, record, reference, which)` of every recording.
 
-    Only derivatives by the rows are defined; they are those of `blocks`.
+    Only derivatives by the rows are defined; they are those of `errors_and_jacobians`.
     """
 
-    def of_one(row: Row, *rest: PyTree) -> Any:
+    def function_of_row(row: Row, *rest: PyTree) -> Any:
         return function(model, row, *rest)
 
-    return batch_as(over_records(of_one, model, rows), rows)
+    return batch_as(over_records(function_of_row, model, rows), rows)
 
 
 @by_recording.def_jvp
@@ -160,48 +162,50 @@ def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree
             "model: wanted derivatives in the free numbers x alone, not in the numbers of the "
             "model; make them free by a Free(where, name)"
         )
-    out, slopes = _with_slopes(model, rows, function)
+    out, slopes = _values_and_jacobians(model, rows, function)
     along = jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, step), slopes)
     return batch_as(out, rows), along
 
 
-def blocks(
-    model: "Model", x: Float[Array, " n"], function: Callable[..., PyTree] = errors_of_one
+def errors_and_jacobians(
+    model: "Model", x: Float[Array, " n"], function: Callable[..., PyTree] = errors_of_recording
 ) -> tuple[Any, Any]:
     """Return `function` of every recording, and its derivatives (R, …, m) by the free numbers.
 
     The m derivatives are in the columns of `model.index`. No other place differentiates readings by
     free numbers.
     """
-    out, slopes = _with_slopes(model, model.index.rows(x), function)
+    out, slopes = _values_and_jacobians(model, model.index.rows(x), function)
     columns = jnp.asarray(model.index.columns, jnp.int32)
     if columns.size > model.index.width:
         slopes = jax.tree.map(lambda block: block[..., columns], slopes)
     return out, slopes
 
 
-def _with_slopes(
+def _values_and_jacobians(
     model: "Model", rows: Array, function: Callable[..., PyTree[Array]]
 ) -> tuple[PyTree[Array], PyTree[Array]]:
     """Return `function` of every recording, and its derivatives by the columns of the rows."""
 
-    def of_one(row: Row, *rest: PyTree) -> tuple[PyTree, PyTree]:
+    def value_and_jacobian(row: Row, *rest: PyTree) -> tuple[PyTree, PyTree]:
         # For a dozen numbers and one long loop forward mode is cheaper to compile and to run.
         slopes, out = with_jacobian(lambda row: function(model, row, *rest), row)
         return out, slopes
 
-    return over_records(of_one, model, rows)
+    return over_records(value_and_jacobian, model, rows)
 
 
 @eqx.filter_jit
-def changes(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
+def delay_derivatives(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
     """Return the derivative (R, T, k) of the errors of each sensor by a delay of its clock."""
 
-    def of_one(row: Row, *rest: PyTree) -> Any:
+    def derivative_of_recording(row: Row, *rest: PyTree) -> Any:
         now = jnp.zeros((), model.records.t.dtype)
-        return jax.jvp(lambda s: errors_of_one(model, row, *rest, late=s), (now,), (now + 1,))[1]
+        return jax.jvp(
+            lambda s: errors_of_recording(model, row, *rest, delay=s), (now,), (now + 1,)
+        )[1]
 
-    return over_records(of_one, model, model.index.rows(x))
+    return over_records(derivative_of_recording, model, model.index.rows(x))
 
 
 def with_jacobian(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tuple[Any, Any]:
@@ -215,16 +219,16 @@ def with_jacobian(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tu
 
 
 def whiten(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors (R, T, k) of each sensor in standard deviations, by `standardised`."""
+    """Return the errors (R, T, k) of each sensor by `standardised_errors`."""
     out = []
     for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
         limit = getattr(reading.sensor, "limit", None)
-        parts = reading.values, reading.mask, error, sigma, limit, reading.late
-        out.append(jax.vmap(standardised)(*parts)[0])
+        parts = reading.values, reading.mask, error, sigma, limit, reading.jitter_error
+        out.append(jax.vmap(standardised_errors)(*parts)[0])
     return tuple(out)
 
 
-def independent(
+def decorrelate(
     e: Float[Array, "*rows k"], v: Float[Array, "*rows k"]
 ) -> tuple[Float[Array, "*rows k"], Float[Array, "*rows k"]]:
     """Make errors e (…, k) of covariance `1 + v vᵀ` independent and of variance one.
@@ -240,26 +244,26 @@ def independent(
 
 
 def in_deviations(
-    x: Array | np.ndarray, sigma: Array | np.ndarray, late: Array | None
+    x: Array | np.ndarray, sigma: Array | np.ndarray, jitter_error: Array | None
 ) -> Float[Array, "..."] | Float[np.ndarray, "..."]:
     """Return changes x (R, T, k, n) of a sensor's errors in standard deviations.
 
-    They are scaled as `standardised` scales the errors, with the noise `sigma` (R, k) and the error
-    `late` (R, T, k) by a time stamp.
+    They are scaled as `standardised_errors` scales the errors, with the noise `sigma` (R, k) and
+    the error `jitter_error` (R, T, k) by a time stamp.
     """
     x = x / sigma[:, None, :, None]
-    if late is None:
+    if jitter_error is None:
         return x
-    return jax.vmap(lambda e: independent(e, late / sigma[:, None])[0], -1, -1)(x)
+    return jax.vmap(lambda e: decorrelate(e, jitter_error / sigma[:, None])[0], -1, -1)(x)
 
 
-def standardised(
+def standardised_errors(
     values: Float[Array, "times *components"],
     mask: Bool[Array, " times"],
     error: Float[Array, "times k"],
     sigma: Float[Array, " k"],
     limit: Float[Array, " k"] | None,
-    late: Float[Array, "times k"] | None,
+    jitter_error: Float[Array, "times k"] | None,
 ) -> tuple[Float[Array, "times k"], Bool[Array, "times k"], Float[Array, "times k"] | None]:
     """Return errors of one sensor in standard deviations, and a mask of saturated channels.
 
@@ -273,17 +277,17 @@ def standardised(
     - `error`: (T, k) in the unit of the sensor.
     - `sigma`: (k,) the noise.
     - `limit`: (k,) the full scale, or `None`.
-    - `late`: (T, k) the error that a time stamp makes if it is one standard deviation late, or
-      `None`.
+    - `jitter_error`: (T, k) the error that a time stamp makes if it is one standard deviation late,
+      or `None`.
     """
     scaled, wider = error / sigma[None], None
     full = jnp.zeros(scaled.shape, bool)
     if limit is not None:
         full = (jnp.abs(values) >= limit[None] * (1 - 1e-6)) & mask[:, None]
-    if late is not None:
-        v = late / sigma[None]
+    if jitter_error is not None:
+        v = jitter_error / sigma[None]
         # The reading of a channel at full scale does not tell the error of its time stamp.
-        white, wider = independent(scaled, jnp.where(full, 0.0, v))
+        white, wider = decorrelate(scaled, jnp.where(full, 0.0, v))
         scaled = jnp.where(full, scaled / jnp.sqrt(1.0 + v * v), white)
     if limit is None:
         return scaled, full, wider
@@ -309,10 +313,12 @@ def reading_residuals(
     return tuple(out)
 
 
-def with_rows(of: Callable[[tuple], tuple], errors: tuple, slopes: tuple) -> tuple[tuple, tuple]:
+def residuals_and_jacobians(
+    function: Callable[[tuple], tuple], errors: tuple, slopes: tuple
+) -> tuple[tuple, tuple]:
     """Return `of(errors)`, and its derivatives (R, T, k, n) from the `slopes` of the errors."""
     # Each residual depends on the errors of its own reading alone, so this is cheap.
-    value, push = jax.linearize(of, errors)
+    value, push = jax.linearize(function, errors)
     return value, jax.vmap(push, in_axes=-1, out_axes=-1)(slopes)
 
 
@@ -338,7 +344,7 @@ def extra_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]
     if model.prior is not None:
         assert not isinstance(model.chart, Bodies)
         body = model.chart.body(x[: model.index.bodies])
-        out.append(model.prior.residuals(body, scaled=model.chart.unit != "").reshape(-1))
+        out.append(model.prior.residuals(body, to_scale=model.chart.unit != "").reshape(-1))
     if model.pull is not None:
         out.append(model.pull(model, x))
     return jnp.concatenate(out)

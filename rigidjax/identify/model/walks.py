@@ -39,9 +39,9 @@ class Walk(eqx.Module):
         self, where: Callable[[Scene], Any], deviation: NumbersLike, density: NumbersLike = 0.0
     ):
         words = "of a scene, such as lambda s: s.sensors[0].bias"
-        self.where = _checks.function(where, "where", words)
-        self.deviation = not_negative(deviation, "deviation")
-        self.density = not_negative(density, "density")
+        self.where = _checks.require_function(where, "where", words)
+        self.deviation = require_nonnegative(deviation, "deviation")
+        self.density = require_nonnegative(density, "density")
 
 
 class Drift(eqx.Module):
@@ -61,10 +61,10 @@ class Drift(eqx.Module):
 def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]:
     """Return the drift of each `Walk` in a scene."""
     wanted = "a sequence of Walk(where, deviation)"
-    _checks.instance(walks, (Walk, Sequence), "walks", wanted=wanted)
+    _checks.require_instance(walks, (Walk, Sequence), "walks", requirement=wanted)
     drifts: list[Drift] = []
     for walk in (walks,) if isinstance(walks, Walk) else tuple(walks):
-        _checks.instance(walk, Walk, "walks", wanted=wanted)
+        _checks.require_instance(walk, Walk, "walks", requirement=wanted)
         path, value = leaf_at(walk.where, scene, "Walk", "the sensor")
         if path[0].name != "sensors":
             raise ValueError(
@@ -75,7 +75,7 @@ def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]
             raise ValueError("Walk: another Walk moves the same numbers")
         value = jnp.asarray(value)
         parts = (
-            in_shape(number, value.shape, name).astype(value.dtype)
+            broadcast_to_shape(number, value.shape, name).astype(value.dtype)
             for number, name in ((walk.deviation, "deviation"), (walk.density, "density"))
         )
         drifts.append(Drift(path, *parts))
@@ -87,20 +87,20 @@ def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
     return leaves_at(scene, [drift.path for drift in drifts])
 
 
-def not_negative(value: NumbersLike, name: str) -> Array:
+def require_nonnegative(value: NumbersLike, name: str) -> Array:
     """Return finite numbers, if none is below zero; else raise `ValueError`."""
-    array, wanted = _checks.numbers(value, name), "a finite number that is not below zero"
+    array, wanted = _checks.numeric_array(value, name), "a finite number that is not below zero"
     if not array.size:
         raise ValueError(f"{name}: wanted {wanted}, got none")
-    return _checks.sign(array, name, wanted, zero=True)
+    return _checks.require_sign(array, name, wanted, zero=True)
 
 
-def in_shape(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
+def broadcast_to_shape(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
     """Return one number, or numbers of this `shape`, as an array of this shape.
 
     Raise `ValueError` for another shape, or for a number below zero.
     """
-    numbers = not_negative(value, name)
+    numbers = require_nonnegative(value, name)
     if numbers.shape not in ((), shape):
         raise ValueError(f"{name}: wanted one number or shape {shape}, got {numbers.shape}")
     return jnp.broadcast_to(numbers, shape)

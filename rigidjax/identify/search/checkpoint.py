@@ -74,31 +74,31 @@ class Checkpoint:
     **Arguments:**
 
     - `path`: of the file, `None` for no file.
-    - `like`: an `Attempt` with the shapes of those in the file.
+    - `example`: an `Attempt` with the shapes of those in the file.
     - `print_of`: the `fingerprint` of everything that the search depends on.
 
     The file of another model raises `ValueError`, and is not overwritten. A file that cannot be
     written makes a warning.
     """
 
-    def __init__(self, path: str | Path | None, like: Attempt, print_of: str):
-        self.path, self.like = None if path is None else Path(path), like
+    def __init__(self, path: str | Path | None, example: Attempt, print_of: str):
+        self.path, self.like = None if path is None else Path(path), example
         self.print_of = print_of
         self.done: list[Attempt] = []
         if self.path is not None and self.path.exists():
             self._read(self.path)
 
-    def save(self, done: Sequence[Attempt]) -> None:
-        """Save the finished starts `done`, replacing the file in one step."""
+    def save(self, attempts: Sequence[Attempt]) -> None:
+        """Save the finished `attempts`, replacing the file in one step."""
         if self.path is None:
             return
-        head = dict(print_of=self.print_of, done=len(done))
+        head = dict(print_of=self.print_of, done=len(attempts))
         # The temporary file has a unique name: another program may write to the same checkpoint.
         part = self.path.with_name(f"{self.path.name}.{uuid.uuid4().hex}.part")
         try:
             with part.open("xb") as file:
                 file.write(json.dumps(head).encode() + b"\n")
-                eqx.tree_serialise_leaves(file, [without_arrays(item) for item in done])
+                eqx.tree_serialise_leaves(file, [without_arrays(item) for item in attempts])
             part.replace(self.path)
         except OSError as error:
             warnings.warn(
@@ -117,8 +117,8 @@ class Checkpoint:
                 head = json.loads(file.readline())
                 same = head["print_of"] == self.print_of
                 if same:
-                    like = [self.like] * int(head["done"])
-                    self.done = eqx.tree_deserialise_leaves(file, like)
+                    example = [self.like] * int(head["done"])
+                    self.done = eqx.tree_deserialise_leaves(file, example)
         except Exception as error:
             raise ValueError(
                 f"{path}: wanted the checkpoint of a fit, got another file or a damaged one "

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from rigidjax.identify.model.normal import Normal
+from rigidjax.identify.model.normal import NormalMatrix
 
 # The damping of the first step, in units of the diagonal of the normal equations (Marquardt's): a
 # damping of one makes a step half as long as a Gauss–Newton step.
@@ -39,7 +39,7 @@ NOISY, LITTLE = 10.0, 1e-4
 EXACT = 1e-6
 
 
-def _float(value: ArrayLike) -> np.ndarray:
+def _setting_as_array(value: ArrayLike) -> np.ndarray:
     """Return a setting as a NumPy array.
 
     Outside of a trace each conversion by JAX takes as long as a run of 100 steps.
@@ -65,13 +65,13 @@ class Settings(eqx.Module):
       what a fit gains from noise alone.
     """
 
-    tolerance: Any = eqx.field(converter=_float)
-    damping: Any = eqx.field(converter=_float)
+    tolerance: Any = eqx.field(converter=_setting_as_array)
+    damping: Any = eqx.field(converter=_setting_as_array)
     steps: Any = eqx.field(converter=lambda steps: np.asarray(steps, np.int32))
-    aim: Any = eqx.field(converter=_float, default=0.0)
-    near: Any = eqx.field(converter=_float, default=0.0)
-    count: Any = eqx.field(converter=_float, default=0.0)
-    level: Any = eqx.field(converter=_float, default=0.0)
+    aim: Any = eqx.field(converter=_setting_as_array, default=0.0)
+    near: Any = eqx.field(converter=_setting_as_array, default=0.0)
+    count: Any = eqx.field(converter=_setting_as_array, default=0.0)
+    level: Any = eqx.field(converter=_setting_as_array, default=0.0)
 
 
 class LMState(eqx.Module):
@@ -87,8 +87,8 @@ class LMState(eqx.Module):
     - `pace`: the mean fall of the logarithm of the cost in a step.
     - `taken`: the number of evaluations.
     - `done`, `converged`: whether the search has ended, and whether it converged.
-    - `kept`, `kept_at_best`: the values kept from the last evaluation, and whether it was at the
-      best point.
+    - `evaluation`, `evaluated_at_best`: the values kept from the last evaluation, and whether it
+      was at the best point.
     - `rise`: the rise of the cost at the last trial over its predicted gain; zero if the trial was
       better.
     """
@@ -96,7 +96,7 @@ class LMState(eqx.Module):
     first: Float[Array, ""]
     point: Float[Array, " n"]
     cost: Float[Array, ""]
-    normal: Normal
+    normal: NormalMatrix
     slope: Float[Array, " n"]
     trial: Float[Array, " n"]
     hoped: Float[Array, ""]
@@ -105,19 +105,19 @@ class LMState(eqx.Module):
     taken: Int[Array, ""]
     done: Bool[Array, ""]
     converged: Bool[Array, ""]
-    kept: Any
-    kept_at_best: Bool[Array, ""]
+    evaluation: Any
+    evaluated_at_best: Bool[Array, ""]
     rise: Float[Array, ""]
 
 
 def minimise(
-    evaluate: Callable[[Array], tuple[PyTree, Array, Normal, Array]],
+    evaluate: Callable[[Array], tuple[PyTree, Array, NormalMatrix, Array]],
     start: Float[Array, " n"],
     order_one: Float[Array, " n"],
     settings: Settings,
-    nothing: PyTree,
-    empty: Normal | None = None,
-    gain_of_noise: Callable[[Any, Normal], Array] | None = None,
+    zeros: PyTree,
+    zero_normal: NormalMatrix | None = None,
+    gain_of_noise: Callable[[Any, NormalMatrix], Array] | None = None,
 ) -> LMState:
     """Minimise a cost from `start`, and return the last state of the search.
 
@@ -133,8 +133,8 @@ def minimise(
     - `start`: (n,) the first point; with no steps it alone is evaluated.
     - `order_one`: (n,) one for numbers of order one, which no step moves far, else zero.
     - `settings`: the settings.
-    - `nothing`: zeros of the shapes of the kept values.
-    - `empty`: zeros of the shapes of the normal matrix, if it has more than a core.
+    - `zeros`: zeros of the shapes of the kept values.
+    - `zero_normal`: zeros of the shapes of the normal matrix, if it has more than a core.
     - `gain_of_noise`: a function from the kept values and the normal matrix to the gain of a fit
       from noise alone (see `Settings`), or `None`.
     """
@@ -143,7 +143,7 @@ def minimise(
         jnp.asarray(jnp.inf, kind),
         start,
         jnp.asarray(jnp.inf, kind),
-        Normal(jnp.zeros((number, number), kind)) if empty is None else empty,
+        NormalMatrix(jnp.zeros((number, number), kind)) if zero_normal is None else zero_normal,
         jnp.zeros(number, kind),
         start,
         jnp.zeros((), kind),
@@ -152,48 +152,52 @@ def minimise(
         jnp.zeros((), jnp.int32),
         jnp.asarray(False),
         jnp.asarray(False),
-        nothing,
+        zeros,
         jnp.asarray(False),
         jnp.zeros((), kind),
     )
 
-    def step(now: LMState) -> LMState:
-        return _next_state(now, evaluate(now.trial), order_one, settings, gain_of_noise)
+    def step(state: LMState) -> LMState:
+        return _next_state(state, evaluate(state.trial), order_one, settings, gain_of_noise)
 
     return lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
 
 
 def _next_state(
-    now: LMState,
-    trial: tuple[Any, Array, Normal, Array],
+    state: LMState,
+    evaluation: tuple[Any, Array, NormalMatrix, Array],
     order_one: Array,
     settings: Settings,
-    gain_of_noise: Callable[[Any, Normal], Array] | None,
+    gain_of_noise: Callable[[Any, NormalMatrix], Array] | None,
 ) -> LMState:
     """Return the state after an evaluation of the trial point, with the next trial."""
-    kept, cost, normal, slope = trial
+    values, cost, normal, slope = evaluation
     parts = jax.tree.leaves((cost, normal, slope))
     finite = jnp.stack([jnp.isfinite(part).all() for part in parts]).all()
-    first = now.taken == 0
-    better = finite & ((cost < now.cost) | first)
-    ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
+    first = state.taken == 0
+    better = finite & ((cost < state.cost) | first)
+    ratio = (state.cost - cost) / jnp.where(state.hoped > 0, state.hoped, 1.0)
     grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > FAIR, 0.5, 2.0))
     # If the misfit falls like that of a linear problem, damping only makes steps shorter.
-    linear = (jnp.abs(ratio - 1.0) < LINEAR) & (now.damping > FREE)
+    linear = (jnp.abs(ratio - 1.0) < LINEAR) & (state.damping > FREE)
     grown = jnp.where(linear, 0.01, grown)
-    damping = now.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
+    damping = state.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
     damping = jnp.maximum(damping, 1e-12)
-    fell = jnp.where(better & ~first, jnp.log(jnp.abs(now.cost / cost)), 0.0)
-    pace = jnp.where(first, now.pace, 0.5 * (now.pace + fell))
-    flat = better & ~first & (ratio > FAIR) & (now.damping <= FREE)
+    fell = jnp.where(better & ~first, jnp.log(jnp.abs(state.cost / cost)), 0.0)
+    pace = jnp.where(first, state.pace, 0.5 * (state.pace + fell))
+    flat = better & ~first & (ratio > FAIR) & (state.damping <= FREE)
     if gain_of_noise is not None:
-        flat = flat & (now.cost - cost < settings.level * gain_of_noise(kept, normal))
+        flat = flat & (state.cost - cost < settings.level * gain_of_noise(values, normal))
     rise = jnp.where(better | ~finite, 0.0, -ratio)
-    noisy = (now.rise > 0) & (rise > jnp.maximum(now.rise, NOISY)) & (now.hoped < LITTLE * now.cost)
+    noisy = (
+        (state.rise > 0)
+        & (rise > jnp.maximum(state.rise, NOISY))
+        & (state.hoped < LITTLE * state.cost)
+    )
     point, cost, normal, slope = jax.tree.map(
         lambda new, old: jnp.where(better, new, old),
-        (now.trial, cost, normal, slope),
-        (now.point, now.cost, now.normal, now.slope),
+        (state.trial, cost, normal, slope),
+        (state.point, state.cost, state.normal, state.slope),
     )
     move, root = _damped_step(normal, slope, order_one, damping)
     sound = jnp.isfinite(move).all()
@@ -212,7 +216,7 @@ def _next_state(
     done = done | ((settings.near > 0) & (cost <= settings.near))
     damping = jnp.where(sound, damping, 8.0 * damping)
     return LMState(
-        jnp.where(first & finite, cost, now.first),
+        jnp.where(first & finite, cost, state.first),
         point,
         cost,
         normal,
@@ -221,17 +225,17 @@ def _next_state(
         hoped,
         damping,
         pace,
-        now.taken + 1,
+        state.taken + 1,
         done,
         converged,
-        kept,
+        values,
         better,
         rise,
     )
 
 
 def _damped_step(
-    normal: Normal, slope: Array, order_one: Array, damping: Array
+    normal: NormalMatrix, slope: Array, order_one: Array, damping: Array
 ) -> tuple[Array, Array]:
     """Return the damped step (n,), and the root (n,) of the diagonal of the normal matrix."""
     diagonal = normal.diagonal
@@ -239,6 +243,6 @@ def _damped_step(
     # Scale columns to length one, so that Cholesky's factor loses no digits to units.
     root = jnp.sqrt(diagonal)
     damped = damping * jnp.maximum(diagonal, order_one) / root**2
-    move = -normal.in_units(1.0 / root).plus(damped).solve(slope / root) / root
+    move = -normal.in_units(1.0 / root).add_diagonal(damped).solve(slope / root) / root
     far = jnp.max(jnp.abs(move) * order_one)
     return move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300)), root

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.terms import Blocks, Noise, changes, weights_of
+from rigidjax.identify.model.terms import Blocks, Noise, delay_derivatives, weights_of
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
 
@@ -28,51 +28,51 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
     **Arguments:**
 
     - `x`: (n,) the free numbers of the `model`.
-    - `blocks`: the errors and derivatives at x, as `terms.blocks` returns them.
+    - `blocks`: the errors and derivatives at x, as `terms.errors_and_jacobians` returns them.
     - `noise`: the present estimate.
     """
     errors = blocks[0]
     weights = weights_of(model, errors, noise)
     groups, out = np.asarray(model.noise_groups), []
-    shares = _shares(model, x, blocks, noise)
+    shares = _shares_left(model, x, blocks, noise)
     readings = list(model.records.readings)
     for index, (reading, error, sigma, weight, share) in enumerate(
         zip(readings, errors, noise, weights, shares, strict=True)
     ):
         # A reading at full scale has an error that is no noise.
-        sensor, kept = cast(Any, reading.sensor), reading.kept
+        sensor, mask = cast(Any, reading.sensor), reading.channel_mask
         known = sensor.noise is not None
         if known:
             sigma = sensor.noise
         else:
-            squares = np.sum(np.where(kept, np.asarray(error) ** 2, 0.0), axis=2)
+            squares = np.sum(np.where(mask, np.asarray(error) ** 2, 0.0), axis=2)
             if model.loss is None:
                 parts = np.bincount(groups, squares.sum(axis=1))
-                variance = parts / np.maximum(np.bincount(groups, kept.sum(axis=(1, 2))), 1)
+                variance = parts / np.maximum(np.bincount(groups, mask.sum(axis=(1, 2))), 1)
             else:
-                variance = _by_median(squares, kept, groups)
+                variance = _variance_by_median(squares, mask, groups)
             # Noise is at least round-off: errors of perfect data are divided by it.
             floor = 1e-15 * float(np.abs(np.asarray(reading.values)).max() + 1e-300)
             each = np.maximum(np.sqrt(variance / share), floor)[groups]
             each = np.broadcast_to(each[:, None], sigma.shape)
             sigma = jnp.asarray(each.astype(sigma.dtype))
-        if reading.late is not None:
-            change = changes(model, x)[index]
+        if reading.jitter_error is not None:
+            change = delay_derivatives(model, x)[index]
             root = np.sqrt(np.asarray(weight, float) / share[groups][:, None])
             size = np.asarray(sigma, float)
-            e, u = (np.where(kept, np.asarray(x) / size[:, None], 0.0) for x in (error, change))
+            e, u = (np.where(mask, np.asarray(x) / size[:, None], 0.0) for x in (error, change))
             tau = None if sensor.jitter.estimated else np.asarray(sensor.jitter.deviation)
-            both = _jitter(e * root[..., None], u, kept.sum(axis=-1), groups, known, tau)
+            both = _noise_and_jitter(e * root[..., None], u, mask.sum(axis=-1), groups, known, tau)
             grown, tau = (jnp.asarray(each, sigma.dtype) for each in both)
             sigma = sigma * grown[:, None]
             readings[index] = reading.with_jitter(tau[:, None, None] * change, tau)
         out.append(sigma)
-    if any(reading.late is not None for reading in readings):
+    if any(reading.jitter_error is not None for reading in readings):
         model = eqx.tree_at(lambda p: p.records.readings, model, tuple(readings))
     return model, tuple(out)
 
 
-def first_noise(model: Model) -> Noise:
+def initial_noise(model: Model) -> Noise:
     """Return the noise of each sensor, a tenth of its signal if the noise is to be estimated."""
     out = []
     for reading in model.records.readings:
@@ -87,15 +87,15 @@ def first_noise(model: Model) -> Noise:
     return tuple(out)
 
 
-def _by_median(squares: np.ndarray, kept: np.ndarray, groups: np.ndarray) -> np.ndarray:
+def _variance_by_median(squares: np.ndarray, mask: np.ndarray, groups: np.ndarray) -> np.ndarray:
     """Return the variance of each group by the median over readings, which outliers do not change.
 
     An estimate with the weights of the loss would be too small without outliers, and too large with
-    many. **Arguments:** `squares` (R, T) the squared lengths of errors; `kept` (R, T, k) the
+    many. **Arguments:** `squares` (R, T) the squared lengths of errors; `mask` (R, T, k) the
     channels that count; `groups` (R,) of the recordings.
     """
-    half, _ = median_of_chi2(kept.shape[-1])
-    whole = kept.all(axis=-1)
+    half, _ = median_of_chi2(mask.shape[-1])
+    whole = mask.all(axis=-1)
     rows = (squares[groups == g][whole[groups == g]] for g in range(groups.max() + 1))
     return np.array([np.median(row) / half if row.size else 0.0 for row in rows])
 
@@ -110,10 +110,10 @@ def median_of_chi2(size: int) -> tuple[float, float]:
     return median, float(density)
 
 
-def _shares(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[np.ndarray]:
+def _shares_left(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[np.ndarray]:
     """Return for each sensor and group the share of squared errors that fitted numbers leave."""
     groups, readings = np.asarray(model.noise_groups), model.records.readings
-    sizes = [np.bincount(groups, one.kept.sum(axis=(1, 2))) for one in readings]
+    sizes = [np.bincount(groups, one.channel_mask.sum(axis=(1, 2))) for one in readings]
     held = model.prior, model.pull, *((slot.prior, slot.spread) for slot in model.slots)
     if len(readings) * sizes[0].size == 1 and not jax.tree.leaves(held):
         # Without priors, and with one noise, all numbers are taken from these readings.
@@ -125,12 +125,12 @@ def _shares(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[np.nda
     return [np.maximum(1.0 - n / np.maximum(m, 1), 0.1) for n, m in zip(taken, sizes, strict=True)]
 
 
-def _jitter(
+def _noise_and_jitter(
     e: np.ndarray,
     u: np.ndarray,
     count: np.ndarray,
     groups: np.ndarray,
-    known: bool,
+    known_noise: bool,
     tau: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the most likely σ and τ (R,) of errors of covariance `σ² + τ² u uᵀ`.
@@ -143,7 +143,7 @@ def _jitter(
     - `e`: (R, T, k) the errors; `u`: (R, T, k) the change of the prediction in time.
     - `count`: (R, T) the number of channels that were read.
     - `groups`: (R,) the groups of recordings, which share σ and τ.
-    - `known`: whether σ is known; it is then 1.
+    - `known_noise`: whether σ is known; it is then 1.
     - `tau`: a known τ, else `None`.
     """
     size, total = np.sum(u**2, axis=-1), np.sum(e**2, axis=-1)
@@ -160,7 +160,7 @@ def _jitter(
         before, weight = (p, q), (p + q * size) ** -2.0
         if tau is None:
             q = np.maximum(ratio(weight * size * (along - p), weight * size**2), 0.0)
-        if not known:
+        if not known_noise:
             wide = p + q * size
             delay, unsure = q * dot / wide, p * q / wide
             left = total - 2 * delay * dot + size * (delay**2 + unsure)

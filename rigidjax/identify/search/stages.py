@@ -14,9 +14,9 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.data.recording import Reading, count_of
 from rigidjax.identify.model import terms
-from rigidjax.identify.model.charts import charts_of, numbers_of
+from rigidjax.identify.model.charts import chart_list, numbers_of
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.normal import Normal, normal_of
+from rigidjax.identify.model.normal import NormalMatrix, normal_of
 from rigidjax.identify.model.predict import FixedSteps, HeldSteps
 from rigidjax.identify.model.terms import Blocks, Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
@@ -44,11 +44,11 @@ PARTS, SHORTEST, FEW = (9, 3), 5, 10
 _BEYOND = 2
 
 
-class Kept(NamedTuple):
+class Evaluation(NamedTuple):
     """The values that a search keeps of the last evaluation.
 
-    **Fields:** `blocks` the errors of all readings and their derivatives (`terms.blocks`); `pulls`
-    (R, m) the part of each of R recordings in the gradient.
+    **Fields:** `blocks` the errors of all readings and their derivatives
+    (`terms.errors_and_jacobians`); `pulls` (R, m) the part of each of R recordings in the gradient.
     """
 
     blocks: Blocks
@@ -63,7 +63,8 @@ class Attempt(eqx.Module):
     - `x`: (n,) the free numbers.
     - `cost`: half the sum of squares at x.
     - `converged`: whether the search converged.
-    - `blocks`: the errors and their derivatives at x (`terms.blocks`), `None` if not known.
+    - `blocks`: the errors and their derivatives at x (`terms.errors_and_jacobians`), `None` if not
+      known.
     """
 
     x: Float[Array, " n"]
@@ -110,9 +111,9 @@ def least_squares_from(
     prior = terms.prior_weights(model)
     alone = np.asarray(model.index.alone, int) if model.count >= MANY else None
 
-    def evaluate(x: Array) -> tuple[Kept, Array, Normal, Array]:
-        errors, slopes = terms.blocks(model, x)
-        residuals, rows = terms.with_rows(
+    def evaluate(x: Array) -> tuple[Evaluation, Array, NormalMatrix, Array]:
+        errors, slopes = terms.errors_and_jacobians(model, x)
+        residuals, rows = terms.residuals_and_jacobians(
             lambda e: terms.reading_residuals(model, e, noise, weights), errors, slopes
         )
         total, pulls = jnp.zeros((), kind), jnp.zeros(places.shape, kind)
@@ -122,23 +123,23 @@ def least_squares_from(
             flat = row.reshape(model.count, -1, places.shape[1])
             pulls = pulls + (e.reshape(model.count, 1, -1) @ flat)[:, 0]
         slope = jnp.zeros(number + 1, kind).at[places].add(pulls)
-        normal = normal_of(rows, places, number, alone).plus(prior**2)
+        normal = normal_of(rows, places, number, alone).add_diagonal(prior**2)
         total, slope = total + jnp.sum((prior * x) ** 2), slope[:-1] + prior**2 * x
         row, e = terms.with_jacobian(lambda x: terms.extra_residuals(model, x), x)
         if e.size:
             total, slope = total + jnp.sum(e**2), slope + e @ row
             normal = normal.with_rows(row)
-        normal = normal.with_rows(_bends(model, x, slope))
-        return Kept((errors, slopes), pulls), 0.5 * total, normal, slope
+        normal = normal.with_rows(_curvature_rows(model, x, slope))
+        return Evaluation((errors, slopes), pulls), 0.5 * total, normal, slope
 
-    nothing = _zeros_of_kept(model, kind)
-    empty = normal_of(
+    zeros = _zeros_of_evaluation(model, kind)
+    zero_normal = normal_of(
         (jnp.zeros((places.shape[0], 0, 0, places.shape[1]), kind),), places, number, alone
     )
     windows = model.clusters is not None
     by_noise = partial(_gain_of_noise, model) if windows else None
     order_one = is_order_one(model, kind)
-    end = minimise(evaluate, x, order_one, settings, nothing, empty, by_noise)
+    end = minimise(evaluate, x, order_one, settings, zeros, zero_normal, by_noise)
     # A cost that is never finite, not even at the start, leaves the start as the best point.
     lost = ~jnp.isfinite(end.cost)
     return dataclasses.replace(
@@ -149,7 +150,7 @@ def least_squares_from(
     )
 
 
-def _gain_of_noise(model: Model, kept: Kept, normal: Normal) -> Float[Array, ""]:
+def _gain_of_noise(model: Model, evaluation: Evaluation, normal: NormalMatrix) -> Float[Array, ""]:
     """Return ½ tr(K G⁻¹), the mean excess of the cost at the true numbers, of windows.
 
     G is the normal matrix of the shared numbers, without the starts of the windows; K adds up
@@ -160,12 +161,14 @@ def _gain_of_noise(model: Model, kept: Kept, normal: Normal) -> Float[Array, ""]
     assert model.clusters is not None
     # Make a row for each window: the number of stretches, which is smaller, is not known here.
     slopes = jnp.zeros((model.count, model.size), normal.core.dtype)
-    slopes = slopes.at[model.clusters[:, None], model.index.places].add(kept.pulls, mode="drop")
+    slopes = slopes.at[model.clusters[:, None], model.index.places].add(
+        evaluation.pulls, mode="drop"
+    )
     starts = jnp.asarray(model.index.start).reshape(-1)
     slopes = slopes.at[:, starts].set(0.0)
     diagonal = normal.diagonal
     root = jnp.sqrt(jnp.maximum(diagonal, 1e-12 * jnp.max(diagonal)))
-    definite = normal.in_units(1.0 / root).plus(jnp.full_like(root, 1e-12))
+    definite = normal.in_units(1.0 / root).add_diagonal(jnp.full_like(root, 1e-12))
     scaled = slopes / root[None, :]
     return 0.5 * jnp.sum(scaled * definite.solve(scaled.T).T)
 
@@ -179,13 +182,13 @@ def is_order_one(model: Model, kind: DTypeLike) -> Float[Array, " n"]:
     return ones.at[model.index.start].set(1.0)
 
 
-def _bends(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
+def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
     """Return the rows (m, n) that the curvature of the bodies' charts adds to the Jacobian.
 
     `slope` (n,) is the gradient of the cost (`AbstractBodyChart.bend`).
     """
     count = model.index.bodies
-    parts = (charts_of(model.chart), *(numbers_of(model.chart, y[:count]) for y in (x, slope)))
+    parts = (chart_list(model.chart), *(numbers_of(model.chart, y[:count]) for y in (x, slope)))
     rows = block_diag(*(chart.bend(*mine) for chart, *mine in zip(*parts, strict=True)))
     return jnp.pad(rows, ((0, 0), (0, slope.size - rows.shape[1])))
 
@@ -202,14 +205,17 @@ def _until_last_weight(model: Model, weights: Float[Array, "records times"]) -> 
     return eqx.tree_at(lambda m: m.integrator, model, shorter)
 
 
-def _zeros_of_kept(model: Model, kind: DTypeLike) -> Kept:
-    """Return zeros of the shapes that are kept: to trace `terms.blocks` once more takes seconds."""
+def _zeros_of_evaluation(model: Model, kind: DTypeLike) -> Evaluation:
+    """Return zeros of the shapes of an `Evaluation`.
+
+    They are made from the shapes alone: to trace `terms.errors_and_jacobians` takes seconds.
+    """
     count, times = model.records.t.shape
     columns = model.index.places.shape[1]
     shapes = [(count, times, sensor.components) for sensor in model.records.sensors]
     errors = tuple(jnp.zeros(shape, kind) for shape in shapes)
     slopes = tuple(jnp.zeros((*shape, columns), kind) for shape in shapes)
-    return Kept((errors, slopes), jnp.zeros(model.index.places.shape, kind))
+    return Evaluation((errors, slopes), jnp.zeros(model.index.places.shape, kind))
 
 
 def whole_record(model: Model) -> Float[Array, "records times"]:
@@ -225,25 +231,25 @@ def weights_of_beginning(model: Model, part: float) -> Float[Array, "records tim
     return jnp.asarray((since <= part * length).astype(t.dtype))
 
 
-def _attempt(end: LMState) -> Attempt:
-    blocks = end.kept.blocks if bool(end.kept_at_best) else None
-    return Attempt(end.point, end.cost, end.converged, blocks)
+def _attempt_of(state: LMState) -> Attempt:
+    blocks = state.evaluation.blocks if bool(state.evaluated_at_best) else None
+    return Attempt(state.point, state.cost, state.converged, blocks)
 
 
-def _search(
+def _search_stride(
     x: Float[Array, " n"],
     task: Task,
     weights: Float[Array, "records times"],
     damping: float,
     aim: float = 0.0,
-    near: float = 0.0,
+    margin: float = 0.0,
     steps: int | None = None,
     level: float | None = None,
 ) -> LMState:
     """Return the last state after a stride of `steps` from x; `Settings` names the arguments."""
     steps, count = task.stride if steps is None else steps, nominal_count(task.model)
     level = (TOLERANCES * task.tolerance) ** 2 if level is None else level
-    settings = Settings(task.tolerance, damping, steps, aim, near, count, level)
+    settings = Settings(task.tolerance, damping, steps, aim, margin, count, level)
     return least_squares_from(task.model, x, task.noise, weights, settings)
 
 
@@ -253,10 +259,10 @@ def _evaluate_at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
 
 
 def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Blocks:
-    """Return errors and derivatives at x (`terms.blocks`), by the program of the search."""
+    """Return `terms.errors_and_jacobians` at x, by the program of the search."""
     kind, sensors = model.records.t.dtype, model.records.sensors
     ones = (np.ones((model.count, sensor.components), kind) for sensor in sensors)
-    return _evaluate_at(model, x, tuple(map(jnp.asarray, ones))).kept.blocks
+    return _evaluate_at(model, x, tuple(map(jnp.asarray, ones))).evaluation.blocks
 
 
 def cost_of(model: Model, x: Float[Array, " n"], noise: Noise) -> float:
@@ -288,13 +294,13 @@ def polish(
     attempt, weights = begin, whole_record(task.model)
     for first in range(0, task.max_steps, STRIDE):
         before = float(attempt.cost)
-        end = _search(attempt.x, task, weights, BOLD if first else damping, aim)
+        end = _search_stride(attempt.x, task, weights, BOLD if first else damping, aim)
         if not np.isfinite(float(end.cost)):
             # The misfit is not finite any more: go back to the point before this stride.
             attempt = Attempt(attempt.x, cost_of(task.model, attempt.x, task.noise))
             watch(attempt)
             break
-        attempt = _attempt(end)
+        attempt = _attempt_of(end)
         # At the minimum every step is refused, by round-off: test whether the misfit still falls.
         # One or two steps alone, of a small `max_steps`, are also refused where they are too long.
         stands = before - float(attempt.cost) < SETTLED * (1.0 + abs(before))
@@ -331,8 +337,8 @@ def fit_in_stages(
     model, noise, *_ = task
     if model.clusters is not None:
         return _fit_windows(x, task, aim, watch)
-    end = _search(x, task, whole_record(model), CAREFUL, aim)
-    at_once = _attempt(end)
+    end = _search_stride(x, task, whole_record(model), CAREFUL, aim)
+    at_once = _attempt_of(end)
     if bool(end.converged) and float(end.cost) <= sufficient_misfit(model):
         watch(at_once)
         return at_once
@@ -340,7 +346,7 @@ def fit_in_stages(
     for part in HORIZONS[:-1]:
         # A part of the record need not be fitted to convergence.
         weights = weights_of_beginning(model, part)
-        end = _search(x, task, weights, CAREFUL, aim * part, aim * part)
+        end = _search_stride(x, task, weights, CAREFUL, aim * part, aim * part)
         # A point that explains only a part may be far off later: a drag of the wrong sign, say.
         after = cost_of(model, end.point, noise)
         if after < WILD * max(level, 1e-300):
@@ -371,7 +377,7 @@ def _fit_windows(
         steps = length // part
         if steps >= SHORTEST:
             weights = weights_of_beginning(model, (steps + 0.5) / length)
-            end = _search(begin, task, weights, BOLD, steps=FEW, level=ROUGH)
+            end = _search_stride(begin, task, weights, BOLD, steps=FEW, level=ROUGH)
             begin = end.point if np.isfinite(float(end.cost)) else begin
     attempt = polish(Attempt(begin), task, aim=aim, watch=watch)
     if begin is not x and not float(attempt.cost) <= cost_of(model, x, task.noise):

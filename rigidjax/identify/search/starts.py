@@ -25,7 +25,9 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
     The others scatter about the regression or over the whole chart of the body, and their initial
     rates by a tenth. A `Free` starts at its given value.
     """
-    recordings = stacking.on_host(model.records, model.counts) if model.index.bodies else ()
+    recordings = (
+        stacking.recordings_on_host(model.records, model.counts) if model.index.bodies else ()
+    )
     if isinstance(model.chart, Bodies):
         rows = list(zip(recordings, model.body_names, strict=True))
         bodies_by_name = {
@@ -66,7 +68,7 @@ def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) ->
             return None
         if not depends_on_rate_only(torque):
             return None
-        balances.append(balance(recording, torque, np.eye(3)))
+        balances.append(balance_of_momentum(recording, torque, np.eye(3)))
     matrix, side, _ = (np.concatenate(part) for part in zip(*balances, strict=True))
     components, _ = tensor_and_margin(matrix, side)
     if not components[:3].sum() > 0:
@@ -78,14 +80,14 @@ def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) ->
     return Inertia(jnp.asarray(np.trace(second_moment) * np.eye(3) - second_moment))
 
 
-def tensor_and_margin(matrix: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, float]:
+def tensor_and_margin(matrix: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the components (6,) of a tensor by least squares, and its margin of being real.
 
     If all sides are zero, the tensor has the trace one. The margin is the smallest eigenvalue of
     the second moment over the largest: it is positive for a real body.
     """
-    if np.abs(side).max() > 0:
-        components = np.linalg.lstsq(matrix, side, rcond=None)[0]
+    if np.abs(rhs).max() > 0:
+        components = np.linalg.lstsq(matrix, rhs, rcond=None)[0]
     else:
         components = np.linalg.svd(matrix, full_matrices=False)[2][-1]
         components = components * np.sign(components[:3].sum())
@@ -100,7 +102,7 @@ def depends_on_rate_only(torque: Torque | None) -> bool:
     return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
 
 
-def balance(
+def balance_of_momentum(
     recording: Recording, torque: Torque | None, turn: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Euler's equations integrated over a recording, of rates times the matrix `turn`.
@@ -118,13 +120,13 @@ def balance(
     integral = np.concatenate([np.zeros_like(turned[:1]), np.cumsum(steps, axis=0)])
     total, impulse = momenta + integral[:, :-1], integral[:, -1:]
 
-    def about_the_mean(x: np.ndarray) -> np.ndarray:
+    def less_mean(x: np.ndarray) -> np.ndarray:
         # The integral of the equations is a constant: compare each sample with the mean over the
         # record. Sixty samples are enough.
         samples = (x - x.mean(axis=0))[:: max(1, t.size // 60)]
         return samples.transpose(0, 2, 1).reshape(-1, x.shape[1])
 
-    return about_the_mean(total), about_the_mean(impulse)[:, 0], about_the_mean(momenta)
+    return less_mean(total), less_mean(impulse)[:, 0], less_mean(momenta)
 
 
 @eqx.filter_jit

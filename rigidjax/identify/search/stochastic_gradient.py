@@ -20,7 +20,7 @@ from rigidjax.identify.model.terms import (
     reading_residuals,
 )
 from rigidjax.identify.search.checkpoint import report_progress
-from rigidjax.identify.search.noise import first_noise
+from rigidjax.identify.search.noise import initial_noise
 
 if TYPE_CHECKING:
     import optax
@@ -59,9 +59,14 @@ class Descent(eqx.Module):
         import optax
 
         wanted = "an optimiser of optax such as optax.adam(1e-2)"
-        _checks.instance(optimiser, optax.GradientTransformation, "Descent", wanted=wanted)
+        _checks.require_instance(
+            optimiser, optax.GradientTransformation, "Descent", requirement=wanted
+        )
         self.optimiser = optimiser
-        self.steps, self.batch = _checks.whole(steps, "steps", 1), _checks.whole(batch, "batch", 1)
+        self.steps, self.batch = (
+            _checks.integer(steps, "steps", 1),
+            _checks.integer(batch, "batch", 1),
+        )
 
 
 def descend(
@@ -104,13 +109,15 @@ def descend(
     >>> bool(jnp.abs(model.values(x)["drag"] - 0.3).max() < 0.02)
     True
     """
-    _checks.instance(model, Model, "descend", wanted="a Model")
-    _checks.instance(descent, Descent, "descend", wanted="a Descent(optimiser, steps=…, batch=…)")
+    _checks.require_instance(model, Model, "descend", requirement="a Model")
+    _checks.require_instance(
+        descent, Descent, "descend", requirement="a Descent(optimiser, steps=…, batch=…)"
+    )
     x = model.start() if initial is None else require_numbers(model, initial)
-    random: Any = jax.random.key(0) if key is None else _checks.key(key)
+    random: Any = jax.random.key(0) if key is None else _checks.random_key(key)
     if progress is not None:
-        _checks.function(progress, "progress", "of a line of text, such as print")
-    return descend_from(x, model, first_noise(model), descent, random, progress)[0]
+        _checks.require_function(progress, "progress", "of a line of text, such as print")
+    return descend_from(x, model, initial_noise(model), descent, random, progress)[0]
 
 
 def descend_from(
@@ -135,7 +142,7 @@ def descend_from(
         for first in range(0, descent.steps, STRIDE):
             key, own = jax.random.split(key)
             keys = jax.random.split(own, min(STRIDE, descent.steps - first))
-            after, memory, costs = _make_steps(x, memory, model, noise, descent, keys)
+            after, memory, costs = _take_steps(x, memory, model, noise, descent, keys)
             if not np.isfinite(np.asarray(costs)).all():
                 break
             x = after
@@ -148,7 +155,7 @@ def descend_from(
 
 
 @eqx.filter_jit
-def _make_steps(
+def _take_steps(
     x: Float[Array, " n"], memory: PyTree, model: Model, noise: Noise, descent: Descent, keys: Array
 ) -> tuple[Float[Array, " n"], PyTree, Float[Array, " steps"]]:
     """Return point, memory of the optimiser and misfits after one step for each of the `keys`."""

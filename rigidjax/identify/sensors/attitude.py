@@ -42,17 +42,17 @@ class AttitudeSensor(ClockedSensor):
     reading_shape: ClassVar[tuple[int, ...]] = (4,)
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "rad"
-    noise: Vec3 | None = eqx.field(converter=base.deviations(), default=None)
+    noise: Vec3 | None = eqx.field(converter=base.deviations_field(), default=None)
     _: dataclasses.KW_ONLY
-    mounting: Vec3 | None = eqx.field(converter=base.optional("mounting"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=base.optional_array_field("mounting"), default=None)
 
-    def error(self, now: SensorInput, reading: Array) -> Vec3:
-        q = _mounted_attitude(now.state.q, self.mounting)
+    def error(self, motion: SensorInput, reading: Array) -> Vec3:
+        q = _mounted_attitude(motion.state.q, self.mounting)
         return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
 
-    def reading_of(self, now: SensorInput, error: Vec3) -> Float[Array, "4"]:
+    def reading_of(self, motion: SensorInput, error: Vec3) -> Float[Array, "4"]:
         """Return the reading (4,) that has the `error` (3,), rad."""
-        q = _mounted_attitude(now.state.q, self.mounting)
+        q = _mounted_attitude(motion.state.q, self.mounting)
         return quaternion.multiply(q, quaternion.exp(error))
 
     def readings(self, values: np.ndarray) -> np.ndarray:
@@ -62,7 +62,7 @@ class AttitudeSensor(ClockedSensor):
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         """Return the rows that are no unit quaternions, (T,) true where wrong, and why."""
         wanted = "wanted (w, x, y, z) with the scalar first"
-        return _not_unit(values), f"the quaternion at index {{index}} is not unit; {wanted}"
+        return _is_not_unit(values), f"the quaternion at index {{index}} is not unit; {wanted}"
 
 
 def _quaternions(matrices: np.ndarray) -> np.ndarray:
@@ -86,12 +86,12 @@ def _mounted_attitude(q: Array, mounting: Vec3 | None) -> Array:
     return q if mounting is None else quaternion.multiply(q, quaternion.exp(mounting))
 
 
-def _unit(world: NumbersLike) -> Vec3:
+def _unit_vector(world: NumbersLike) -> Vec3:
     """Return the unit vector along `world`; raise `ValueError` for a length of zero."""
-    vector = base.required("world")(world)
+    vector = base.array_field("world")(world)
     length = jnp.sqrt(dot(vector, vector))
     words = "world: wanted a direction, got a vector of length zero"
-    return vector / _checks.refuse(length, ~(length > 0), words)
+    return vector / _checks.error_if(length, ~(length > 0), words)
 
 
 class Direction(ClockedSensor):
@@ -116,13 +116,13 @@ class Direction(ClockedSensor):
     components: ClassVar[int] = 2
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "rad"
-    world: Vec3 = eqx.field(converter=_unit)
-    noise: Float[Array, "2"] | None = eqx.field(converter=base.deviations(2), default=None)
+    world: Vec3 = eqx.field(converter=_unit_vector)
+    noise: Float[Array, "2"] | None = eqx.field(converter=base.deviations_field(2), default=None)
     _: dataclasses.KW_ONLY
-    mounting: Vec3 | None = eqx.field(converter=base.optional("mounting"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=base.optional_array_field("mounting"), default=None)
 
-    def error(self, now: SensorInput, reading: Array) -> Float[Array, "2"]:
-        predicted = self._predict(now)
+    def error(self, motion: SensorInput, reading: Array) -> Float[Array, "2"]:
+        predicted = self._predict(motion)
         # The axes across the reading are data: no derivative passes through them. Axes across the
         # prediction would jump as the motion changes.
         first, second = _orthogonal_pair(reading)
@@ -130,29 +130,31 @@ class Direction(ClockedSensor):
         half = jnp.sqrt(jnp.maximum(0.5 * (1.0 + dot(predicted, reading)), 1e-12))
         return -jnp.stack([dot(first, predicted), dot(second, predicted)]) / half
 
-    def reading_of(self, now: SensorInput, error: Float[Array, "2"]) -> Vec3:
+    def reading_of(self, motion: SensorInput, error: Float[Array, "2"]) -> Vec3:
         """Return a reading (3,) whose error has the length of `error` (2,).
 
         The components are the same to first order: here they are taken along axes across the
         prediction, which are turned from those across the reading by the angle between the two.
         """
-        predicted = self._predict(now)
+        predicted = self._predict(motion)
         first, second = _orthogonal_pair(predicted)
         # |error| is a chord: cos θ = 1 − ½ |error|², sin θ = |error| cos ½θ.
         square = jnp.minimum(error[0] * error[0] + error[1] * error[1], 4.0)
         half = jnp.sqrt(1.0 - 0.25 * square)
         return (1.0 - 0.5 * square) * predicted + half * (error[0] * first + error[1] * second)
 
-    def _predict(self, now: SensorInput) -> Vec3:
+    def _predict(self, motion: SensorInput) -> Vec3:
         """Return the predicted direction (3,) in the sensor's axes."""
-        return quaternion.rotate_inverse(_mounted_attitude(now.state.q, self.mounting), self.world)
+        return quaternion.rotate_inverse(
+            _mounted_attitude(motion.state.q, self.mounting), self.world
+        )
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         """Return the rows that are no unit vectors, (T,) true where wrong, and why."""
-        return _not_unit(values), "the direction at index {index} is not of length 1"
+        return _is_not_unit(values), "the direction at index {index} is not of length 1"
 
 
-def _not_unit(rows: np.ndarray) -> np.ndarray:
+def _is_not_unit(rows: np.ndarray) -> np.ndarray:
     """Return whether each row is longer or shorter than 1."""
     return np.abs(np.linalg.norm(rows, axis=1) - 1) > 1e-6
 
@@ -180,23 +182,23 @@ class Marker(ClockedSensor):
 
     >>> body = rj.MassProperties(1.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([2.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
-    >>> now = rj.identify.SensorInput(jnp.asarray(0.0), state, body, lambda t, y, args: y)
-    >>> Marker([0.5, 0.0, 0.0]).error(now, jnp.array([2.75, 0.0, 0.0])).tolist()
+    >>> motion = rj.identify.SensorInput(jnp.asarray(0.0), state, body, lambda t, y, args: y)
+    >>> Marker([0.5, 0.0, 0.0]).error(motion, jnp.array([2.75, 0.0, 0.0])).tolist()
     [0.25, 0.0, 0.0]
     """
 
     # The place of a body on a pivot is known: only its attitude is needed.
     feels: ClassVar[Any] = property(lambda self: HasPose if self.origin is None else HasAttitude)
     unit: ClassVar[str] = "m"
-    place: Vec3 = eqx.field(converter=base.required("place"), default=None)
-    noise: Vec3 | None = eqx.field(converter=base.deviations(), default=None)
+    place: Vec3 = eqx.field(converter=base.array_field("place"), default=None)
+    noise: Vec3 | None = eqx.field(converter=base.deviations_field(), default=None)
     _: dataclasses.KW_ONLY
-    origin: Vec3 | None = eqx.field(converter=base.optional("origin"), default=None)
+    origin: Vec3 | None = eqx.field(converter=base.optional_array_field("origin"), default=None)
 
-    def error(self, now: SensorInput, reading: Array) -> Vec3:
-        state = now.state
+    def error(self, motion: SensorInput, reading: Array) -> Vec3:
+        state = motion.state
         start = state.x if self.origin is None else self.origin
-        return reading - (start + quaternion.rotate(state.q, now.lever(self.place)))
+        return reading - (start + quaternion.rotate(state.q, motion.lever(self.place)))
 
 
 class Position(ClockedSensor):
@@ -218,12 +220,12 @@ class Position(ClockedSensor):
 
     feels: ClassVar[type] = HasPose
     unit: ClassVar[str] = "m"
-    noise: Vec3 | None = eqx.field(converter=base.deviations(), default=None)
+    noise: Vec3 | None = eqx.field(converter=base.deviations_field(), default=None)
     _: dataclasses.KW_ONLY
-    bias: Vec3 | None = eqx.field(converter=base.optional("bias"), default=None)
+    bias: Vec3 | None = eqx.field(converter=base.optional_array_field("bias"), default=None)
 
-    def error(self, now: SensorInput, reading: Array) -> Vec3:
-        x = now.state.x
+    def error(self, motion: SensorInput, reading: Array) -> Vec3:
+        x = motion.state.x
         return reading - (x if self.bias is None else x + self.bias)
 
 
@@ -251,17 +253,17 @@ class Velocity(ClockedSensor):
 
     feels: ClassVar[type] = HasPose
     unit: ClassVar[str] = "m/s"
-    noise: Vec3 | None = eqx.field(converter=base.deviations(), default=None)
+    noise: Vec3 | None = eqx.field(converter=base.deviations_field(), default=None)
     _: dataclasses.KW_ONLY
-    place: Vec3 | None = eqx.field(converter=base.optional("place"), default=None)
-    mounting: Vec3 | None = eqx.field(converter=base.optional("mounting"), default=None)
-    bias: Vec3 | None = eqx.field(converter=base.optional("bias"), default=None)
+    place: Vec3 | None = eqx.field(converter=base.optional_array_field("place"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=base.optional_array_field("mounting"), default=None)
+    bias: Vec3 | None = eqx.field(converter=base.optional_array_field("bias"), default=None)
 
-    def error(self, now: SensorInput, reading: Array) -> Vec3:
-        state = now.state
+    def error(self, motion: SensorInput, reading: Array) -> Vec3:
+        state = motion.state
         velocity = state.v
         if self.place is not None:
-            arm = now.lever(self.place)
+            arm = motion.lever(self.place)
             velocity = velocity + quaternion.rotate(state.q, cross(state.omega, arm))
         if self.mounting is not None:
             velocity = quaternion.rotate_inverse(
@@ -294,17 +296,17 @@ class Range(ClockedSensor):
     components: ClassVar[int] = 1
     feels: ClassVar[type] = HasPose
     unit: ClassVar[str] = "m"
-    station: Vec3 = eqx.field(converter=base.required("station"), default=None)
-    noise: Float[Array, "1"] | None = eqx.field(converter=base.deviations(1), default=None)
+    station: Vec3 = eqx.field(converter=base.array_field("station"), default=None)
+    noise: Float[Array, "1"] | None = eqx.field(converter=base.deviations_field(1), default=None)
     _: dataclasses.KW_ONLY
-    place: Vec3 | None = eqx.field(converter=base.optional("place"), default=None)
-    bias: Scalar | None = eqx.field(converter=base.optional("bias", ()), default=None)
+    place: Vec3 | None = eqx.field(converter=base.optional_array_field("place"), default=None)
+    bias: Scalar | None = eqx.field(converter=base.optional_array_field("bias", ()), default=None)
 
-    def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
-        state = now.state
+    def error(self, motion: SensorInput, reading: Array) -> Float[Array, "1"]:
+        state = motion.state
         line = state.x - self.station
         if self.place is not None:
-            line = line + quaternion.rotate(state.q, now.lever(self.place))
+            line = line + quaternion.rotate(state.q, motion.lever(self.place))
         # At the station itself the distance has no derivative; it is set to 0.
         square = dot(line, line)
         length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

@@ -27,8 +27,9 @@ class SensorInput(eqx.Module):
     - `own`: these states, in the order of `Solution.own`, for a sensor of a wheel or a motor.
 
     >>> body, state = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
-    >>> now = SensorInput(jnp.asarray(0.0), state, body, rj.equations_of_motion(body, state, None))
-    >>> rj.identify.Gyro(0.1).error(now, jnp.array([0.0, 0.0, 1.5])).tolist()
+    >>> field = rj.equations_of_motion(body, state, None)
+    >>> motion = SensorInput(jnp.asarray(0.0), state, body, field)
+    >>> rj.identify.Gyro(0.1).error(motion, jnp.array([0.0, 0.0, 1.5])).tolist()
     [0.0, 0.0, 0.5]
     """
 
@@ -70,7 +71,7 @@ class AbstractSensor(eqx.Module):
       wrong, and why.
     - `typical_rate(t, values)`: a method that returns the rough rate of the body, rad/s, from the
       unmasked readings, if no other sensor shows it.
-    - `reading_of(now, error)`: a method that returns the reading with this error, for
+    - `reading_of(motion, error)`: a method that returns the reading with this error, for
       `simulate_readings`, if the error is not reading minus prediction.
     - `suspect`: name, words and remedy of the cause that a fit names for the errors of this sensor
       if it finds no other cause.
@@ -78,8 +79,8 @@ class AbstractSensor(eqx.Module):
     >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s
     ...     reading_shape, components, unit = (), 1, "rad/s"
     ...     feels, noise = rj.motion.HasSpin, None
-    ...     def error(self, now, reading):
-    ...         return (reading - jnp.sqrt(jnp.sum(now.state.omega**2)))[None]
+    ...     def error(self, motion, reading):
+    ...         return (reading - jnp.sqrt(jnp.sum(motion.state.omega**2)))[None]
     >>> rj.identify.Recording([0.0, 1.0], (Tachometer(), [3.0, 3.0])).readings[0].values.shape
     (2,)
     """
@@ -91,51 +92,53 @@ class AbstractSensor(eqx.Module):
     noise: eqx.AbstractVar[Array | None]
 
     @abc.abstractmethod
-    def error(self, now: SensorInput, reading: Array) -> Float[Array, " k"]:
+    def error(self, motion: SensorInput, reading: Array) -> Float[Array, " k"]:
         """Return reading minus prediction (k,), in the sensor's unit."""
 
 
-def required(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]:
+def array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]:
     """Return a converter of a field to finite numbers of this shape, for `eqx.field`.
 
     The numbers are an array, so that a fit may move them.
     """
 
-    def converted(value: NumbersLike) -> Array:
+    def convert(value: NumbersLike) -> Array:
         if value is None:
             raise ValueError(f"{name}: wanted three numbers, got None")
-        return _checks.finite(_checks.floating(value, shape, name), name)
+        return _checks.require_finite(_checks.array_of_shape(value, shape, name), name)
 
-    return converted
+    return convert
 
 
-def optional(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array | None]:
-    """Return the converter of `required` for a field that may be `None`."""
-    converted = required(name, shape)
+def optional_array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array | None]:
+    """Return the converter of `array_field` for a field that may be `None`."""
+    converted = array_field(name, shape)
     return lambda value: None if value is None else converted(value)
 
 
-def deviations(size: int = 3) -> Callable[[Any], Array | None]:
+def deviations_field(size: int = 3) -> Callable[[Any], Array | None]:
     """Return a converter of one number, or `size` numbers, to standard deviations (size,).
 
     `None` stays `None`.
     """
-    return lambda value: positive(value, "noise", "a positive standard deviation", size)
+    return lambda value: positive_numbers(value, "noise", "a positive standard deviation", size)
 
 
-def positive(value: NumbersLike | None, name: str, wanted: str, size: int) -> Array | None:
+def positive_numbers(
+    value: NumbersLike | None, name: str, requirement: str, size: int
+) -> Array | None:
     """Return one number, or `size` numbers, as an array (size,) of positive numbers.
 
-    `None` stays `None`; `name` and `wanted` are words of the error that is raised for others.
+    `None` stays `None`; `name` and `requirement` are words of the error that is raised for others.
     """
     if value is None:
         return None
-    numbers = _checks.numbers(value, name).astype(jnp.result_type(float))
+    numbers = _checks.numeric_array(value, name).astype(jnp.result_type(float))
     if numbers.shape not in ((), (size,)):
         count = {1: "one", 2: "two", 3: "three"}.get(size, str(size))
         raise ValueError(f"{name}: wanted one number or {count}, got shape {numbers.shape}")
     numbers = jnp.broadcast_to(numbers, (size,))
-    return _checks.refuse(numbers, ~(numbers > 0), f"{name}: wanted {wanted}")
+    return _checks.error_if(numbers, ~(numbers > 0), f"{name}: wanted {requirement}")
 
 
 class Jitter(eqx.Module):
@@ -157,7 +160,7 @@ def jitter_of(jitter: object) -> Jitter | None:
         if jitter != "estimated":
             raise ValueError(f"jitter: wanted {wanted}, got {jitter!r}")
         return Jitter(jnp.zeros(()), True)
-    return Jitter(jnp.asarray(_checks.positive(jitter, "jitter", wanted)), False)
+    return Jitter(jnp.asarray(_checks.positive_float(jitter, "jitter", wanted)), False)
 
 
 class ClockedSensor(AbstractSensor):
@@ -169,5 +172,5 @@ class ClockedSensor(AbstractSensor):
     reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 3
     _: dataclasses.KW_ONLY
-    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
+    offset: Scalar | None = eqx.field(converter=optional_array_field("offset", ()), default=None)
     jitter: Jitter | None = eqx.field(converter=jitter_of, default=None)

@@ -46,10 +46,10 @@ class LowPass(eqx.Module):
     order: int = eqx.field(static=True)
 
     def __init__(self, cutoff: ScalarLike, order: int = 1):
-        cutoff = _checks.floating(cutoff, (), "cutoff")
-        cutoff = _checks.sign(cutoff, "cutoff", "a positive frequency, Hz")
+        cutoff = _checks.array_of_shape(cutoff, (), "cutoff")
+        cutoff = _checks.require_sign(cutoff, "cutoff", "a positive frequency, Hz")
         self.cutoff = cutoff.astype(jnp.result_type(float))
-        if _checks.whole(order, "order", 1) > 2:
+        if _checks.integer(order, "order", 1) > 2:
             raise ValueError(f"order: wanted 1 or 2, got {order}")
         self.order = order
 
@@ -62,12 +62,12 @@ class LowPass(eqx.Module):
         `ValueError` for times that do not increase, NaN, and numbers whose cubes overflow, if they
         are known.
         """
-        values = _checks.numbers(values, "values")
+        values = _checks.numeric_array(values, "values")
         if values.ndim != 2:
             raise ValueError(f"values: wanted (T, k), got shape {values.shape}")
-        t = _checks.floating(t, values.shape[:1], "t", hint="a time for each row of values")
+        t = _checks.array_of_shape(t, values.shape[:1], "t", hint="a time for each row of values")
         t = t.astype(values.dtype)
-        if _checks.known((t, values)):
+        if _checks.is_known((t, values)):
             _require_in_range(np.asarray(t, float), np.asarray(values, float))
         if values.shape[0] < 2:
             return values
@@ -75,11 +75,11 @@ class LowPass(eqx.Module):
         gaps = jnp.diff(t)
         # The padding of a shorter record repeats its last time: give it usual intervals. Its
         # samples are masked, so that their values do not matter.
-        beyond = gaps <= 0
-        usual = jnp.nanmedian(jnp.where(beyond, jnp.nan, gaps))
-        gaps = jnp.where(beyond, usual, gaps)
-        fresh = gaps > _GAP * usual
-        before, after = _slopes(gaps, jnp.diff(values, axis=0), fresh, beyond)
+        is_last = gaps <= 0
+        usual = jnp.nanmedian(jnp.where(is_last, jnp.nan, gaps))
+        gaps = jnp.where(is_last, usual, gaps)
+        after_gap = gaps > _GAP * usual
+        before, after = _end_slopes(gaps, jnp.diff(values, axis=0), after_gap, is_last)
         # On each interval u = u₀ + b s + c s² + d s³, s from its begin.
         h = gaps[:, None]
         chord = jnp.diff(values, axis=0) / h
@@ -90,14 +90,14 @@ class LowPass(eqx.Module):
         begin = y0[0]
         if gaps.size > 2:
             first = particular(values[:1], _first_derivatives(gaps, chord))[0]
-            begin = jnp.where(jnp.any(fresh[:3]), begin, first)
-        return _solve(begin, y0, y1, partial(_propagator, self.order, w), gaps, fresh)
+            begin = jnp.where(jnp.any(after_gap[:3]), begin, first)
+        return _filter_samples(begin, y0, y1, partial(_propagator, self.order, w), gaps, after_gap)
 
 
 def lowpass_of(lowpass: object) -> LowPass | None:
     """Return `lowpass` if it is a `LowPass` or `None`; raise `TypeError` for others."""
     wanted = "LowPass(cutoff in Hz) or None"
-    return _checks.instance(lowpass, (LowPass, NoneType), "lowpass", wanted=wanted)
+    return _checks.require_instance(lowpass, (LowPass, NoneType), "lowpass", requirement=wanted)
 
 
 def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
@@ -110,16 +110,16 @@ def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
         raise ValueError("t: wanted increasing times")
 
 
-def _slopes(gaps: Array, steps: Array, fresh: Array, beyond: Array) -> tuple[Array, Array]:
+def _end_slopes(gaps: Array, steps: Array, after_gap: Array, is_last: Array) -> tuple[Array, Array]:
     """Return du/dt at the begin and at the end of each interval.
 
     They are those of the parabola through three samples, and of a straight line next to a gap.
     """
     h, chord = gaps[:, None], steps / gaps[:, None]
-    apart = (fresh[1:] | fresh[:-1])[:, None]
+    apart = (after_gap[1:] | after_gap[:-1])[:, None]
     bend = jnp.where(apart, 0.0, jnp.diff(chord, axis=0) / (h[1:] + h[:-1]))
     # The last interval of a record has no next one: take the parabola before it.
-    bend = jnp.where(beyond[1:, None], jnp.roll(bend, 1, axis=0), bend)
+    bend = jnp.where(is_last[1:, None], jnp.roll(bend, 1, axis=0), bend)
     begin = jnp.concatenate([bend[:1] * h[:1], bend * h[1:]]) if bend.shape[0] else 0.0 * chord
     end = jnp.concatenate([bend * h[:-1], bend[-1:] * h[-1:]]) if bend.shape[0] else 0.0 * chord
     return chord - begin, chord + end
@@ -157,18 +157,18 @@ def _propagator(order: int, w: Array, h: Array) -> Array:
     return e * jnp.stack([jnp.stack([c + s, _ROOT * s]), jnp.stack([-_ROOT * s, c - s])])
 
 
-def _solve(
+def _filter_samples(
     begin: Array,
     y0: Array,
     y1: Array,
     propagator: Callable[[Array], Array],
     gaps: Array,
-    fresh: Array,
+    after_gap: Array,
 ) -> Array:
     """Return the filtered samples, solved from interval to interval.
 
     **Arguments:** `begin` the first state; `y0`, `y1` the particular solutions at begin and end of
-    each interval; `propagator` a function of its length; `gaps` the lengths; `fresh` true for a
+    each interval; `propagator` a function of its length; `gaps` the lengths; `after_gap` true for a
     gap, after which the state is the particular solution of the next interval.
     """
 
@@ -179,5 +179,5 @@ def _solve(
         return state, state[:, 0]
 
     following = jnp.concatenate([y0[1:], y1[-1:]])
-    _, rest = lax.scan(step, begin, (y0, y1, following, gaps, fresh))
+    _, rest = lax.scan(step, begin, (y0, y1, following, gaps, after_gap))
     return jnp.concatenate([begin[None, :, 0], rest])

@@ -53,6 +53,6 @@ class StateSensor(AbstractSensor):
         """Return the protocol of the smallest state that has the parts that are read."""
         return _FEELS[self.kind]
 
-    def error(self, now: SensorInput, reading: Array) -> Float[Array, " k"]:
+    def error(self, motion: SensorInput, reading: Array) -> Float[Array, " k"]:
         leaves = jnp.split(reading, _CUTS[self.kind])
-        return minus_small(self.kind(*leaves), now.state)
+        return minus_small(self.kind(*leaves), motion.state)

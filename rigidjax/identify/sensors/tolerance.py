@@ -8,12 +8,12 @@ from rigidjax import _checks
 from rigidjax._types import NumbersLike, Scalar
 
 
-def _deviation(value: NumbersLike | None) -> Scalar | None:
+def _tolerance_value(value: NumbersLike | None) -> Scalar | None:
     """Return a positive standard deviation as an array; `None` stays `None`."""
     if value is None:
         return None
     wanted = "a positive standard deviation"
-    return jnp.asarray(np.asarray(_checks.positive(value, "tolerance", wanted)))
+    return jnp.asarray(np.asarray(_checks.positive_float(value, "tolerance", wanted)))
 
 
 class Tolerance(eqx.Module):
@@ -39,7 +39,7 @@ class Tolerance(eqx.Module):
     (0.01, None)
     """
 
-    scale: Scalar | None = eqx.field(converter=_deviation, default=None)
-    cross_axis: Scalar | None = eqx.field(converter=_deviation, default=None)
-    bias: Scalar | None = eqx.field(converter=_deviation, default=None)
-    clock: Scalar | None = eqx.field(converter=_deviation, default=None)
+    scale: Scalar | None = eqx.field(converter=_tolerance_value, default=None)
+    cross_axis: Scalar | None = eqx.field(converter=_tolerance_value, default=None)
+    bias: Scalar | None = eqx.field(converter=_tolerance_value, default=None)
+    clock: Scalar | None = eqx.field(converter=_tolerance_value, default=None)

@@ -19,14 +19,14 @@ from rigidjax.rotation.linalg3 import apply, cross
 class VectorSensor(ClockedSensor):
     """A sensor that reads a vector in its own axes: `scale · S exp(−mounting) v + bias`."""
 
-    noise: Vec3 | None = eqx.field(converter=base.deviations(), default=None)
+    noise: Vec3 | None = eqx.field(converter=base.deviations_field(), default=None)
     _: dataclasses.KW_ONLY
-    bias: Vec3 | None = eqx.field(converter=base.optional("bias"), default=None)
-    scale: Vec3 | None = eqx.field(converter=base.optional("scale"), default=None)
-    mounting: Vec3 | None = eqx.field(converter=base.optional("mounting"), default=None)
-    skew: Vec3 | None = eqx.field(converter=base.optional("skew"), default=None)
+    bias: Vec3 | None = eqx.field(converter=base.optional_array_field("bias"), default=None)
+    scale: Vec3 | None = eqx.field(converter=base.optional_array_field("scale"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=base.optional_array_field("mounting"), default=None)
+    skew: Vec3 | None = eqx.field(converter=base.optional_array_field("skew"), default=None)
     limit: Vec3 | None = eqx.field(
-        converter=lambda limit: base.positive(limit, "limit", "a positive full scale", 3),
+        converter=lambda limit: base.positive_numbers(limit, "limit", "a positive full scale", 3),
         default=None,
     )
     lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
@@ -82,10 +82,10 @@ class Gyro(VectorSensor):
     unit: ClassVar[str] = "rad/s"
     _: dataclasses.KW_ONLY
     g_sensitivity: Float[Array, "3 3"] | None = eqx.field(
-        converter=base.optional("g_sensitivity", (3, 3)), default=None
+        converter=base.optional_array_field("g_sensitivity", (3, 3)), default=None
     )
-    place: Vec3 | None = eqx.field(converter=base.optional("place"), default=None)
-    gravity: Vec3 | None = eqx.field(converter=base.optional("gravity"), default=None)
+    place: Vec3 | None = eqx.field(converter=base.optional_array_field("place"), default=None)
+    gravity: Vec3 | None = eqx.field(converter=base.optional_array_field("gravity"), default=None)
     # The attitude is needed only to turn gravity into the body frame.
     feels: type = eqx.field(static=True, init=False, default=HasSpin)
 
@@ -97,23 +97,23 @@ class Gyro(VectorSensor):
         elif self.place is None:
             self.place = jnp.zeros(3)
 
-    def error(self, now: SensorInput, reading: Array) -> Vec3:
-        prediction = self._predict(now.state.omega)
+    def error(self, motion: SensorInput, reading: Array) -> Vec3:
+        prediction = self._predict(motion.state.omega)
         if self.g_sensitivity is not None:
             assert self.place is not None
-            force = specific_force(now, self.place, self.gravity)
+            force = specific_force(motion, self.place, self.gravity)
             prediction = prediction + apply(self.g_sensitivity, force)
         return reading - prediction
 
 
-def specific_force(now: SensorInput, place: Vec3, gravity: Vec3 | None) -> Vec3:
+def specific_force(motion: SensorInput, place: Vec3, gravity: Vec3 | None) -> Vec3:
     """Return the specific force at a place of the body, m/s², body frame.
 
     It is `Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)`, with r the vector to the `place` and g the
     `gravity`; without gravity only the terms of r.
     """
-    state, rate = now.state, now.rate
-    r = now.lever(place)
+    state, rate = motion.state, motion.rate
+    r = motion.lever(place)
     force = cross(rate.omega, r) + cross(state.omega, cross(state.omega, r))
     if gravity is None:
         return force
@@ -148,11 +148,11 @@ class Accelerometer(VectorSensor):
     feels: ClassVar[Any] = property(lambda self: HasSpin if self.gravity is None else HasAttitude)
     unit: ClassVar[str] = "m/s²"
     _: dataclasses.KW_ONLY
-    place: Vec3 = eqx.field(converter=base.required("place"), default=None)
-    gravity: Vec3 | None = eqx.field(converter=base.optional("gravity"), default=None)
+    place: Vec3 = eqx.field(converter=base.array_field("place"), default=None)
+    gravity: Vec3 | None = eqx.field(converter=base.optional_array_field("gravity"), default=None)
 
-    def error(self, now: SensorInput, reading: Array) -> Vec3:
-        return reading - self._predict(specific_force(now, self.place, self.gravity))
+    def error(self, motion: SensorInput, reading: Array) -> Vec3:
+        return reading - self._predict(specific_force(motion, self.place, self.gravity))
 
 
 class Magnetometer(VectorSensor):
@@ -177,8 +177,8 @@ class Magnetometer(VectorSensor):
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "of the field"
     _: dataclasses.KW_ONLY
-    field: Vec3 = eqx.field(converter=base.required("field"), default=None)
+    field: Vec3 = eqx.field(converter=base.array_field("field"), default=None)
 
-    def error(self, now: SensorInput, reading: Array) -> Vec3:
-        field = quaternion.rotate(quaternion.conjugate(now.state.q), self.field)
+    def error(self, motion: SensorInput, reading: Array) -> Vec3:
+        field = quaternion.rotate(quaternion.conjugate(motion.state.q), self.field)
         return reading - self._predict(field)

@@ -16,7 +16,7 @@ from rigidjax.identify.model.model import Model
 from rigidjax.identify.model.terms import Noise, in_deviations
 from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.identify.sensors.vectors import VectorSensor
-from rigidjax.identify.uncertainty.covariance import Linearised
+from rigidjax.identify.uncertainty.covariance import Linearisation
 
 # The errors whose effect a report states for a sensor of unknown tolerance: 1 % of scale, 1°
 # between axes.
@@ -55,7 +55,7 @@ class Consideration(eqx.Module):
 
 
 def considerations(
-    model: Model, linear: Linearised, noise: Noise, covariance: np.ndarray
+    model: Model, linear: Linearisation, noise: Noise, covariance: np.ndarray
 ) -> tuple[Consideration, ...]:
     """Return the considered errors of all sensors: those with a tolerance that no `Free` moves.
 
@@ -86,7 +86,7 @@ def slot_of(model: Model, index: int, member: str) -> Slot | None:
 
 def shifts_of(
     model: Model,
-    linear: Linearised,
+    linear: Linearisation,
     noise: Noise,
     covariance: np.ndarray,
     index: int,
@@ -98,9 +98,9 @@ def shifts_of(
     by `−H⁻¹ Jᵀ W D`, with `H⁻¹` the `covariance`.
     """
     direction = _directions(model, linear, index, kind)
-    late = model.records.readings[index].late
+    jitter_error = model.records.readings[index].jitter_error
     # In NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
-    scaled = np.asarray(in_deviations(direction, np.asarray(noise[index]), late))
+    scaled = np.asarray(in_deviations(direction, np.asarray(noise[index]), jitter_error))
     pulls = np.einsum(
         "rtkm,rt,rtkc->rmc", linear.slopes[index], linear.weights[index], scaled, optimize=True
     )
@@ -110,7 +110,7 @@ def shifts_of(
 
 
 def _directions(
-    model: Model, linear: Linearised, index: int, kind: str
+    model: Model, linear: Linearisation, index: int, kind: str
 ) -> Float[np.ndarray, "records times 3 ways"]:
     """Return the changes of the readings of a sensor by unit errors of one kind."""
     reading = model.records.readings[index]
@@ -173,7 +173,7 @@ def describe_considered(parts: tuple[Consideration, ...], sensors: Sequence[Abst
 
 def unit_moves(
     model: Model,
-    linear: Linearised,
+    linear: Linearisation,
     noise: Noise,
     covariance: np.ndarray,
     slopes: Float[np.ndarray, "quantities n"],

@@ -15,10 +15,10 @@ from rigidjax.identify.model.terms import (
     Noise,
     extra_residuals,
     prior_weights,
+    residuals_and_jacobians,
     weights_of,
     whiten,
     with_jacobian,
-    with_rows,
 )
 
 # A direction is undetermined if its singular value is below this share of the largest one.
@@ -28,7 +28,7 @@ BLIND = 1e-8
 WEAKEST = 1e-6
 
 
-class Linearised(eqx.Module):
+class Linearisation(eqx.Module):
     """The errors of a model at one point, and their derivatives by its n free numbers.
 
     **Fields**, the first six for each sensor:
@@ -37,7 +37,7 @@ class Linearised(eqx.Module):
     - `raw_slopes`: (R, T, k, m) their derivatives by the m numbers of each recording.
     - `errors`, `slopes`: the same, whitened.
     - `weights`: (R, T) the weights of the robust loss.
-    - `kept`: (R, T, k) true if an error has a weight and its reading is below full scale.
+    - `mask`: (R, T, k) true if an error has a weight and its reading is below full scale.
     - `places`: (R, m) the places of each recording's numbers among all n.
     - `prior_residuals`: (n,) the free numbers over the deviations of their priors.
     - `prior_weights`: (n,) one over these deviations, zero without a prior.
@@ -54,7 +54,7 @@ class Linearised(eqx.Module):
     errors: tuple[np.ndarray, ...]
     slopes: tuple[np.ndarray, ...]
     weights: tuple[np.ndarray, ...]
-    kept: tuple[np.ndarray, ...]
+    mask: tuple[np.ndarray, ...]
     places: np.ndarray
     prior_residuals: np.ndarray
     prior_weights: np.ndarray
@@ -66,9 +66,9 @@ class Linearised(eqx.Module):
         """Return the number of free numbers."""
         return int(self.extra_slopes.shape[-1])
 
-    def first_times(self, count: int) -> "Linearised":
+    def first_times(self, count: int) -> "Linearisation":
         """Return the part of the first `count` times, without the padding of a fit."""
-        long = ("raw", "raw_slopes", "errors", "slopes", "weights", "kept")
+        long = ("raw", "raw_slopes", "errors", "slopes", "weights", "mask")
         parts = {name: tuple(a[:, :count] for a in getattr(self, name)) for name in long}
         return dataclasses.replace(self, **parts)
 
@@ -88,7 +88,7 @@ class Linearised(eqx.Module):
     def rows(self) -> list[np.ndarray]:
         """Return the weighted slopes (R, T k, m) of each sensor, a row for each error."""
         return [
-            _flat(slope * np.sqrt(weight)[..., None, None])
+            _flatten_rows(slope * np.sqrt(weight)[..., None, None])
             for slope, weight in zip(self.slopes, self.weights, strict=True)
         ]
 
@@ -120,13 +120,13 @@ class Linearised(eqx.Module):
     def scores(self) -> np.ndarray:
         """Return the part (R, m) of each recording in the gradient of the misfit."""
         total: Any = sum(
-            ((error * weight[..., None]).reshape(len(error), 1, -1) @ _flat(slope))[:, 0]
+            ((error * weight[..., None]).reshape(len(error), 1, -1) @ _flatten_rows(slope))[:, 0]
             for error, slope, weight in zip(self.errors, self.slopes, self.weights, strict=True)
         )
         return total
 
 
-def _flat(slopes: np.ndarray) -> np.ndarray:
+def _flatten_rows(slopes: np.ndarray) -> np.ndarray:
     """Return slopes (R, T, k, m) as rows (R, T k, m), one for each error."""
     return slopes.reshape(len(slopes), -1, slopes.shape[-1])
 
@@ -135,7 +135,7 @@ def _flat(slopes: np.ndarray) -> np.ndarray:
 def _linearise_parts(model: Model, x: Array, noise: Noise, blocks: Blocks) -> PyTree[Array]:
     """Return the parts of `linearise` as one program: of readings, places, of other residuals."""
     errors, slopes = blocks
-    out, slopes = with_rows(lambda e: whiten(model, e, noise), errors, slopes)
+    out, slopes = residuals_and_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
     extra_slopes, extra = with_jacobian(lambda x: extra_residuals(model, x), x)
     weights, prior = weights_of(model, errors, noise), prior_weights(model)
     return (out, slopes, weights), model.index.places, (prior * x, prior, extra, extra_slopes)
@@ -147,14 +147,14 @@ def linearise(
     noise: Noise,
     blocks: Blocks,
     thickened: tuple[Array, Blocks] | None = None,
-) -> Linearised:
+) -> Linearisation:
     """Return errors, derivatives and weights at x as NumPy arrays.
 
     **Arguments:**
 
     - `model`, `noise`: the model, and the noise of its sensors.
     - `x`: (n,) the free numbers.
-    - `blocks`: the errors and derivatives at x, as `terms.blocks` returns them.
+    - `blocks`: the errors and derivatives at x, as `terms.errors_and_jacobians` returns them.
     - `thickened`: if a body is flat at x, the point with a thicker body at which derivatives are
       taken, and the `blocks` there.
     """
@@ -166,8 +166,8 @@ def linearise(
         thick = linearise(model, thickened[0], noise, thickened[1])
         slopes, others = thick.slopes, (*others[:-1], thick.extra_slopes)
     pairs = zip(model.records.readings, weights, strict=True)
-    kept = tuple(reading.kept & (weight > 0)[..., None] for reading, weight in pairs)
-    return Linearised(raw, raw_slopes, errors, slopes, weights, kept, places, *others)
+    mask = tuple(reading.channel_mask & (weight > 0)[..., None] for reading, weight in pairs)
+    return Linearisation(raw, raw_slopes, errors, slopes, weights, mask, places, *others)
 
 
 class Root(eqx.Module):
@@ -191,7 +191,7 @@ class Root(eqx.Module):
     ties: np.ndarray
     null: np.ndarray
 
-    def sandwich(self, rows: np.ndarray, where: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    def sandwich(self, rows: np.ndarray, places: np.ndarray, middle: np.ndarray) -> np.ndarray:
         """Return the sandwich covariance `H⁻¹ M H⁻¹` (n, n).
 
         M is the information of priors plus the sum over recordings of `rowsᵀ middle rows`.
@@ -199,14 +199,14 @@ class Root(eqx.Module):
         **Arguments:**
 
         - `rows`: (R, q, m) rows for the m numbers of each recording.
-        - `where`: (R, m) the places of these numbers among all n.
+        - `places`: (R, m) the places of these numbers among all n.
         - `middle`: (R, q, q).
         """
         wide, lift = (np.concatenate([x, 0 * x[:1]]) for x in (1.0 / self.size, self.lift))
-        rows, inverse = rows * wide[where][:, None, :], self.core @ self.core.T
+        rows, inverse = rows * wide[places][:, None, :], self.core @ self.core.T
         total = inverse @ self.ties.T @ self.ties @ inverse
         cross, blocks = np.zeros_like(self.lift), []
-        for (mine, root, ties), columns, one, m in zip(self.own, where, rows, middle, strict=True):
+        for (mine, root, ties), columns, one, m in zip(self.own, places, rows, middle, strict=True):
             count, alone = mine.size, root @ root.T
             mine_in_row = _indices_in(columns, mine)
             read = alone @ one[:, mine_in_row].T, inverse @ (one @ lift[columns]).T
@@ -230,18 +230,18 @@ class Root(eqx.Module):
             out[np.ix_(mine, mine)] += root @ root.T
         return self._in_units(out)
 
-    def _in_units(self, inner: np.ndarray) -> np.ndarray:
+    def _in_units(self, covariance: np.ndarray) -> np.ndarray:
         """Return a covariance in the units of the numbers, without undetermined directions."""
         if len(self.null):
-            inner = inner - self.null.T @ (self.null @ inner)
-            inner = inner - (inner @ self.null.T) @ self.null
-        return inner / np.outer(self.size, self.size)
+            covariance = covariance - self.null.T @ (self.null @ covariance)
+            covariance = covariance - (covariance @ self.null.T) @ self.null
+        return covariance / np.outer(self.size, self.size)
 
 
-def _indices_in(columns: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return the index in `columns` of each number of `wanted`."""
+def _indices_in(columns: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return the index in `columns` of each number of `numbers`."""
     order = np.argsort(columns)
-    return order[np.searchsorted(columns[order], wanted)]
+    return order[np.searchsorted(columns[order], numbers)]
 
 
 class Covariance(eqx.Module):
@@ -265,7 +265,7 @@ class Covariance(eqx.Module):
     root: Root | None
 
 
-def white_covariance(linear: Linearised) -> Covariance:
+def white_covariance(linear: Linearisation) -> Covariance:
     """Return the covariance for white errors, `(JᵀWJ)⁻¹`.
 
     Directions of singular values below 1e-8 of the largest are not determined. The numbers of one
@@ -322,7 +322,7 @@ def white_covariance(linear: Linearised) -> Covariance:
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     covariance = root.covariance
     return Covariance(
-        infinite_along(directions, covariance),
+        with_infinite_variance(directions, covariance),
         covariance,
         "Gauss–Newton",
         np.concatenate([singular, *values]),
@@ -332,7 +332,7 @@ def white_covariance(linear: Linearised) -> Covariance:
 
 
 def _rows_of_shared(
-    linear: Linearised,
+    linear: Linearisation,
     triangles: np.ndarray,
     size: np.ndarray,
     selected: np.ndarray,
@@ -355,7 +355,7 @@ def _rows_of_shared(
     return np.linalg.qr(rows[:, shared], mode="r")
 
 
-def _owners(linear: Linearised) -> np.ndarray:
+def _owners(linear: Linearisation) -> np.ndarray:
     """Return for each number the recording (n,) that alone changes with it, −1 if several do.
 
     It is −1, too, for numbers of several recordings that one of the other residuals ties together.
@@ -385,9 +385,9 @@ def _decompose(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
 
 
 def covariance_of(
-    linear: Linearised, times: "CorrelationTimes", white: Covariance | None = None
+    linear: Linearisation, times: "CorrelationTimes", white: Covariance | None = None
 ) -> Covariance:
-    """Return the covariance: `white` for white errors, else the sandwich `H⁻¹ M H⁻¹`.
+    """Return the covariance for white errors, or the sandwich `H⁻¹ M H⁻¹` for correlated ones.
 
     M is `Jᵀ C J` plus the information of priors, C the covariance of the errors in time. In each
     channel the part of the variance that second differences show is white, the rest decays
@@ -402,11 +402,11 @@ def covariance_of(
         return white
     covariance = _sandwich(linear, white, times)
     kind = f"sandwich: the errors are autocorrelated over {times.longest:.0f} samples"
-    shown = infinite_along(white.null_directions, covariance)
+    shown = with_infinite_variance(white.null_directions, covariance)
     return dataclasses.replace(white, covariance=shown, determined=covariance, kind=kind)
 
 
-def infinite_along(null: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def with_infinite_variance(null: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return the covariance, infinite for each number that changes along directions of `null`."""
     shown = covariance.copy()
     blind = np.abs(null).max(axis=0, initial=0.0) > 1e-6
@@ -429,21 +429,22 @@ def covariance_root(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def distance_to_minimum(
-    linear: Linearised, white: Covariance, held: Sequence[np.ndarray] = ()
+    linear: Linearisation, white: Covariance, directions: Sequence[np.ndarray] = ()
 ) -> float:
     """Return the distance to the least misfit in standard deviations, `√(gᵀ(JᵀWJ)⁻¹g)`.
 
     g is the gradient of the misfit; MINUIT ends a search by this distance (James and Roos 1975,
-    doi:10.1016/0010-4655(75)90039-9). Functions whose derivatives (n,) are in `held` stay constant.
+    doi:10.1016/0010-4655(75)90039-9). Functions whose derivatives (n,) are in `directions` stay
+    constant.
     """
     covariance = white.determined
-    for row in held:
+    for row in directions:
         across = covariance @ row
         covariance = covariance - np.outer(across, across) / max(row @ across, 1e-300)
     return float(np.sqrt(max(linear.slope @ covariance @ linear.slope, 0.0)))
 
 
-def _sandwich(linear: Linearised, white: Covariance, times: "CorrelationTimes") -> np.ndarray:
+def _sandwich(linear: Linearisation, white: Covariance, times: "CorrelationTimes") -> np.ndarray:
     """Return the sandwich covariance of `covariance_of`, of errors that are not independent.
 
     Products of derivatives are taken in orthonormal columns: otherwise round-off could make
@@ -471,7 +472,7 @@ def _sandwich(linear: Linearised, white: Covariance, times: "CorrelationTimes") 
     return out * np.outer(factor, factor)
 
 
-def _spectra(linear: Linearised, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _spectra(linear: Linearisation, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the spectra of the `columns` of all k channels, and the smooth shares of the errors.
 
     The spectra are real and imaginary parts (R, k, 2, T + 1, m) by frequency, multiplied by the
@@ -545,14 +546,14 @@ class CorrelationTimes(eqx.Module):
         return max(span for sensor in self.spans for span in sensor)
 
 
-def correlation_times(linear: Linearised) -> CorrelationTimes:
+def correlation_times(linear: Linearisation) -> CorrelationTimes:
     """Return the autocorrelation time of each channel, `1 + 2 Σ ρ_l` over lags l.
 
     The sum ends at the first correlation ρ below twice its standard deviation. Readings at full
     scale take no part.
     """
     spans, longest, closest, independent = [], 1.0, 0.0, 0.0
-    for error, weight, kept in zip(linear.errors, linear.weights, linear.kept, strict=True):
+    for error, weight, kept in zip(linear.errors, linear.weights, linear.mask, strict=True):
         weighted, of_sensor = error * np.sqrt(weight)[..., None], []
         for channel in range(error.shape[-1]):
             mask = kept[..., channel]

@@ -7,7 +7,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.uncertainty.covariance import CorrelationTimes, Linearised
+from rigidjax.identify.uncertainty.covariance import CorrelationTimes, Linearisation
 
 # With more degrees of freedom a 95 % interval is at most 1.3 % wider than with infinitely many.
 PLENTY = 100.0
@@ -37,7 +37,7 @@ class Freedom(eqx.Module):
     widths: tuple[tuple[np.ndarray, float, float], ...]
     considered: np.ndarray
 
-    def of(self, slope: np.ndarray) -> np.ndarray:
+    def degrees(self, slope: np.ndarray) -> np.ndarray:
         """Return the degrees of freedom of the variances of functions with derivative `slope`.
 
         The `slope` (…, n) is taken with respect to the free numbers. Considered errors add a known
@@ -46,9 +46,9 @@ class Freedom(eqx.Module):
         estimated = np.sum((slope @ self.covariance) * slope, axis=-1)
         known = np.sum((slope @ self.considered) ** 2, axis=-1)
         grown = (1.0 + known / np.maximum(estimated, 1e-300)) ** 2
-        return np.asarray(self.of_estimated(slope) * grown)
+        return np.asarray(self.estimated_degrees(slope) * grown)
 
-    def of_estimated(self, slope: np.ndarray) -> np.ndarray:
+    def estimated_degrees(self, slope: np.ndarray) -> np.ndarray:
         """Return the degrees of freedom of the part of each variance that noise and widths make.
 
         They follow from the share of each noise and each width in the variance (Satterthwaite
@@ -77,7 +77,7 @@ class Freedom(eqx.Module):
 
 def freedom_of(
     model: Model,
-    linear: Linearised,
+    linear: Linearisation,
     times: CorrelationTimes,
     covariance: np.ndarray,
     considered: np.ndarray,
@@ -97,12 +97,12 @@ def freedom_of(
         none = np.zeros_like(groups)
         return Freedom(covariance, linear.places, none, blocks[:1], (degrees,), (), considered)
     taken = leverages(linear, blocks, covariance)
-    for sensor, kept, spans, lost in zip(
-        model.records.sensors, linear.kept, times.spans, taken, strict=True
+    for sensor, mask, spans, lost in zip(
+        model.records.sensors, linear.mask, times.spans, taken, strict=True
     ):
-        counts = np.bincount(groups, np.sum(kept.sum(axis=1) / np.asarray(spans), axis=1) - lost)
-        given = cast(Any, sensor).noise is not None and times.longest <= 1.5
-        left.append(np.full(counts.shape, np.inf) if given else np.maximum(counts, 1.0))
+        counts = np.bincount(groups, np.sum(mask.sum(axis=1) / np.asarray(spans), axis=1) - lost)
+        has_noise = cast(Any, sensor).noise is not None and times.longest <= 1.5
+        left.append(np.full(counts.shape, np.inf) if has_noise else np.maximum(counts, 1.0))
     widths = []
     for slot in model.slots:
         if slot.estimated:
@@ -115,7 +115,7 @@ def freedom_of(
 
 
 def leverages(
-    linear: Linearised, information: tuple[np.ndarray, ...], covariance: np.ndarray
+    linear: Linearisation, information: tuple[np.ndarray, ...], covariance: np.ndarray
 ) -> list[np.ndarray]:
     """Return how many free numbers the readings of each sensor determine, (R,) by recording."""
     known = linear.blocks(covariance)

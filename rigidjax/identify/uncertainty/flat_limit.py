@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PyTree
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import swap_trace
-from rigidjax.identify.model.charts import AbstractBodyChart, as_list, charts_of, numbers_of
+from rigidjax.identify.model.charts import AbstractBodyChart, as_list, chart_list, numbers_of
 from rigidjax.identify.model.model import Model, without_samples
 
 # Derivatives are taken at a body whose least second moment is at least this share of the trace.
@@ -50,7 +50,7 @@ class Limit(eqx.Module):
 
 
 def interval_ends(
-    reach: np.ndarray | float, correlation: np.ndarray | float, away: float
+    reach: np.ndarray | float, correlation: np.ndarray | float, flatness: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends of an interval that ends at a flat body, in standard deviations.
 
@@ -61,17 +61,17 @@ def interval_ends(
 
     - `reach`: the quantile of the interval.
     - `correlation`: of the number y with the flatness z.
-    - `away`: the flatness at the minimum of the linear model, over its standard deviation.
+    - `flatness`: the flatness at the minimum of the linear model, over its standard deviation.
     """
     rho = np.clip(np.asarray(correlation), -1.0, 1.0)
-    past = min(away, 0.0)
+    past = min(flatness, 0.0)
     middle, square = rho * past, reach**2 + past**2
 
     def end(side: float) -> np.ndarray:
         free = middle + side * np.sqrt(square)
-        held = middle - rho * away
-        held = held + side * np.sqrt((1.0 - rho**2) * np.maximum(square - away**2, 0.0))
-        return np.where(away + rho * (free - middle) >= 0, free, held)
+        held = middle - rho * flatness
+        held = held + side * np.sqrt((1.0 - rho**2) * np.maximum(square - flatness**2, 0.0))
+        return np.where(flatness + rho * (free - middle) >= 0, free, held)
 
     return end(-1.0), end(1.0)
 
@@ -82,7 +82,7 @@ def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     The derivative of a chart is zero at a flat body. The information on the tensor itself is
     regular there, and hardly differs between a flat body and one of so small a thickness.
     """
-    thick = list(map(_thicken_chart, charts_of(model.chart), bodies_of(model, x)))
+    thick = list(map(_thicken_chart, chart_list(model.chart), bodies_of(model, x)))
     if all(one is None for one in thick):
         return None
     pairs = zip(numbers_of(model.chart, x[: model.index.bodies]), thick, strict=True)
@@ -136,7 +136,7 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
     """Return (I1 + I2 − I3) / I3 of each body; 1 for a body whose moments are not free."""
     out = []
     bodies = as_list(model.bodies(x))
-    for chart, body in zip(charts_of(model.chart), bodies, strict=True):
+    for chart, body in zip(chart_list(model.chart), bodies, strict=True):
         if not _has_limit(chart):
             out.append(jnp.ones((), x.dtype))
             continue
@@ -149,7 +149,7 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
     return jnp.stack(out)
 
 
-def limits(
+def flat_limits(
     model: Model, numbers: tuple[np.ndarray, np.ndarray], step: np.ndarray, names: list[str]
 ) -> tuple[Limit, ...]:
     """Return the limit of each body whose moments are free.
@@ -163,7 +163,7 @@ def limits(
     - `names`: the suffix of the names of each body's quantities.
     """
     rows = zip(names, *(part[-len(names) :] for part in numbers), strict=True)
-    have_limits = [_has_limit(chart) for chart in charts_of(model.chart)]
+    have_limits = [_has_limit(chart) for chart in chart_list(model.chart)]
     return tuple(
         Limit(name, float(value), float(value + min(slope @ step, 0.0)), slope)
         for (name, value, slope), has_limit in zip(rows, have_limits, strict=True)

@@ -89,9 +89,9 @@ def cut_ends(reach: np.ndarray | float, cuts: Sequence[tuple[Any, float]]) -> tu
 
 
 def labels(model: Model) -> list[tuple[str, str, bool]]:
-    """Return name, unit and whether positive, of the quantities in the order of `vector`."""
+    """Return name, unit and whether positive, of the quantities of `quantity_vector`, in order."""
     out = []
-    for name, chart in charts(model):
+    for name, chart in charts_by_suffix(model):
         out += [(f"{log}{name}", chart.unit, True) for log in chart.log_names]
         out += [(f"{plain}{name}", chart.unit, False) for plain in chart.plain_names]
     names = recording_names(model)
@@ -112,7 +112,7 @@ def reports_starts(model: Model) -> bool:
     return model.clusters is None
 
 
-def charts(model: Model) -> list[tuple[str, AbstractBodyChart]]:
+def charts_by_suffix(model: Model) -> list[tuple[str, AbstractBodyChart]]:
     """Return the chart of each body, after the suffix of the names of its quantities."""
     if not isinstance(model.chart, Bodies):
         return [("", model.chart)]
@@ -138,10 +138,10 @@ def _component(index: tuple[int, ...]) -> str:
     return "xyz"[index[0]] if len(index) == 1 and index[0] < 3 else str(index)
 
 
-def vector(model: Model, x: Float[Array, " n"]) -> Array:
+def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
     """Return the reported quantities as a vector, with the logarithms of positive ones."""
     parts, bodies = [jnp.zeros(0, x.dtype)], as_list(model.bodies(x))
-    for (_, chart), body in zip(charts(model), bodies, strict=True):
+    for (_, chart), body in zip(charts_by_suffix(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
     if reports_starts(model):
         rates = x[model.index.start[:, -3:]] * model.reference.rate[:, None]
@@ -164,22 +164,22 @@ def _value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]
     """Return the result of `value_and_slope`, as one program."""
 
     def value(x: Array) -> Array:
-        return jnp.concatenate([vector(model, x), flat_limit.flatness(model, x)])
+        return jnp.concatenate([quantity_vector(model, x), flat_limit.flatness(model, x)])
 
     slope, values = with_jacobian(value, x)
     return values, slope
 
 
 def values_and_slopes(
-    model: Model, x: Float[Array, " n"], near: Float[Array, " n"] | None
+    model: Model, x: Float[Array, " n"], derivative_point: Float[Array, " n"] | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the reported quantities and the flatness of each body, with their derivatives.
 
-    Derivatives are taken at x or, if a body is flat at x, at the point `near`.
+    Derivatives are taken at x or, if a body is flat at x, at the point `derivative_point`.
     """
     values, slopes = (np.asarray(part) for part in value_and_slope(model, x))
-    if near is not None:
-        slopes = np.asarray(value_and_slope(model, near)[1])
+    if derivative_point is not None:
+        slopes = np.asarray(value_and_slope(model, derivative_point)[1])
     return values, slopes
 
 
@@ -224,21 +224,21 @@ def quantities(
 
 
 def interval_about(
-    middle: np.ndarray,
+    value: np.ndarray,
     slope: np.ndarray,
     covariance: np.ndarray,
     null: np.ndarray,
     reach: np.ndarray | float,
     limits: tuple[flat_limit.Limit, ...] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the interval (low, high) of functions of value `middle` and derivative `slope`.
+    """Return the interval (low, high) of functions with this `value` and derivative `slope`.
 
     **Arguments:** `reach` the half-width in standard deviations; `covariance`, `null` and `limits`
     as for `quantities`.
     """
     wide = standard_deviations(slope, covariance, null)
     low, high = cut_ends(reach, cuts_of(slope, covariance, wide, limits))
-    return np.asarray(middle + low * wide), np.asarray(middle + high * wide)
+    return np.asarray(value + low * wide), np.asarray(value + high * wide)
 
 
 def cuts_of(

@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.uncertainty.covariance import (
     Covariance,
-    Linearised,
+    Linearisation,
     covariance_root,
-    infinite_along,
+    with_infinite_variance,
 )
 from rigidjax.identify.uncertainty.quantities import labels
 
@@ -42,12 +42,12 @@ class Stretches(eqx.Module):
     null: tuple[Float[np.ndarray, "k n"], ...]
 
     @property
-    def hidden(self) -> Float[np.ndarray, "k n"]:
+    def hidden_directions(self) -> Float[np.ndarray, "k n"]:
         """Return the directions whose scatter between stretches is not known."""
         return np.concatenate(self.null)
 
 
-def stretches_of(model: Model, linear: Linearised) -> Stretches | None:
+def stretches_of(model: Model, linear: Linearisation) -> Stretches | None:
     """Return the `Stretches` of a fit of windows; `None` for other recordings.
 
     The numbers of one window alone are eliminated window by window (Schur complement).
@@ -98,7 +98,8 @@ def stretches_of(model: Model, linear: Linearised) -> Stretches | None:
 def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
     """Return the covariance of the shared numbers by the scatter of the steps.
 
-    `white` is the covariance for white errors, which is kept for the numbers of one window alone.
+    `white` is the covariance for white errors, which is kept for the numbers of
+    one window alone.
     """
     count, places = len(stretches.steps), stretches.places
     covariance = np.array(white.determined)
@@ -106,8 +107,8 @@ def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
     covariance[places], covariance[:, places] = 0.0, 0.0
     square = (count - 1) / count * stretches.steps.T @ stretches.steps
     covariance[np.ix_(places, places)] = square
-    null = np.concatenate([white.null_directions, stretches.hidden])
-    shown = infinite_along(null, covariance)
+    null = np.concatenate([white.null_directions, stretches.hidden_directions])
+    shown = with_infinite_variance(null, covariance)
     kind = f"jackknife: one of {count} stretches of windows left out"
     return dataclasses.replace(white, covariance=shown, determined=covariance, kind=kind)
 

@@ -24,7 +24,7 @@ from rigidjax._types import (
     Vector,
 )
 from rigidjax.body.inertia import Body, Inertia, MassProperties, tensor_of as tensor_of
-from rigidjax.motion.torques.states import Frozen, require_frozen
+from rigidjax.motion.torques.states import FrozenLaw, require_frozen
 
 
 class Wrench(eqx.Module):
@@ -41,9 +41,9 @@ class Wrench(eqx.Module):
     torque: Vec3
 
     def __init__(self, force: Vector, torque: Vector | None = None):
-        self.force = _checks.floating(force, (3,), "force", hint="world-frame N")
+        self.force = _checks.array_of_shape(force, (3,), "force", hint="world-frame N")
         torque = jnp.zeros_like(self.force) if torque is None else torque
-        self.torque = _checks.floating(torque, (3,), "torque", hint="body-frame N m")
+        self.torque = _checks.array_of_shape(torque, (3,), "torque", hint="body-frame N m")
 
 
 class AbstractTorque(eqx.Module):
@@ -102,7 +102,7 @@ class AbstractForce(eqx.Module):
         """
 
 
-class OfTime(AbstractTorque):
+class AbstractTimeTorque(AbstractTorque):
     """Define a torque with vectors as fields, each of which may be a function of time."""
 
     @property
@@ -141,7 +141,7 @@ def require_law(torque: object, name: str = "torque") -> None:
             f"body), got {type(torque).__name__}{advice}"
         )
     if not isinstance(torque, eqx.Module):  # A torque with states takes these, too.
-        _checks.function(torque, name, "(t, state, body) → torque (3,), N m, body frame")
+        _checks.require_function(torque, name, "(t, state, body) → torque (3,), N m, body frame")
 
 
 def sees_attitude(torque: Torque | None) -> bool:
@@ -160,7 +160,7 @@ def sees_rate(torque: Torque | None) -> bool:
     return torque is not None and not getattr(torque, "rate_free", False)
 
 
-def require_rung(torque: Torque, state: object) -> None:
+def require_state_type(torque: Torque, state: object) -> None:
     """Raise `TypeError` unless `torque` can be called and `state` has the parts that the torque
     reads.
     """
@@ -177,12 +177,12 @@ def require_scene(law: Torque | None, state: object, body: object) -> None:
     """Raise an error unless the arguments are a torque or `None`, a state that it can act on, and a
     body.
     """
-    _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
+    _checks.require_single(state, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid")
     if law is not None:
-        require_rung(law, state)
+        require_state_type(law, state)
         require_frozen(law)
-        one_law(law.law if isinstance(law, Frozen) else law)
-    _checks.single(body, (Inertia, MassProperties), "body")
+        require_one_law(law.law if isinstance(law, FrozenLaw) else law)
+    _checks.require_single(body, (Inertia, MassProperties), "body")
 
 
 def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
@@ -206,11 +206,11 @@ def force_and_torque(
     """
     require_scene(law, state, body)
     dtype = state.omega.dtype
-    t = _checks.floating(t, (), "t").astype(dtype)
+    t = _checks.array_of_shape(t, (), "t").astype(dtype)
     name = f"torque {getattr(law, 'law_name', type(law).__name__)}"
     # A table in float64 must not lift a float32 solve, nor stop it under strict promotion.
     try:
-        found = in_precision(law, dtype)(t, state, in_precision(body, dtype))
+        result = in_precision(law, dtype)(t, state, in_precision(body, dtype))
     except AttributeError as wrong:
         told = missing_state_message(name, wrong)
         if told is None:
@@ -219,9 +219,9 @@ def force_and_torque(
         raise TypeError(told + hint) from wrong
     # The test is not by class: torques of moving frames return forces of a class of their own,
     # since they do not import this module.
-    if hasattr(found, "force"):
-        return found.force.astype(dtype), found.torque.astype(dtype)
-    value = _checks.floating(found, (3,), name, hint="body-frame N m")
+    if hasattr(result, "force"):
+        return result.force.astype(dtype), result.torque.astype(dtype)
+    value = _checks.array_of_shape(result, (3,), name, hint="body-frame N m")
     return None, value.astype(dtype)
 
 
@@ -233,18 +233,18 @@ _HIGHER = {
 }
 
 
-def missing_state_message(who: str, wrong: AttributeError) -> str | None:
+def missing_state_message(caller: str, error: AttributeError) -> str | None:
     """Return the message for a user's function that read a part which its state lacks; `None` for
     any other error.
     """
-    if wrong.name not in _HIGHER or not isinstance(wrong.obj, HasSpin):
+    if error.name not in _HIGHER or not isinstance(error.obj, HasSpin):
         return None
-    what, higher = _HIGHER[wrong.name]
-    has_none = f"the {what}, and {type(wrong.obj).__name__} has none"
-    return f"{who} looks at state.{wrong.name}, {has_none}: start from {higher}"
+    what, higher = _HIGHER[error.name]
+    has_none = f"the {what}, and {type(error.obj).__name__} has none"
+    return f"{caller} looks at state.{error.name}, {has_none}: start from {higher}"
 
 
-def one_law(law: Torque) -> None:
+def require_one_law(law: Torque) -> None:
     """Raise `ValueError` for a field whose shape is not that of one torque, such as a batch made by
     `jax.vmap`.
     """
@@ -273,20 +273,20 @@ def in_precision(tree: PyTree, dtype: DTypeLike) -> Any:
 
 def vector_at(source: PyTree, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:
     """Return `source`, a constant vector, or its value at `t` if it is a function of time."""
-    return _checks.floating(source(t), (size,), f"{name}(t)") if callable(source) else source
+    return _checks.array_of_shape(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
-def vector(name: str, *, hint: str = "") -> Callable[[Any], Array]:
+def vector_converter(name: str, *, hint: str = "") -> Callable[[Any], Array]:
     """Return a converter to a field of three numbers, for `equinox.field(converter=…)`."""
-    return lambda value: _checks.finite_floating(value, (3,), name, hint=hint)
+    return lambda value: _checks.finite_array(value, (3,), name, hint=hint)
 
 
-def number(name: str) -> Callable[[Any], Array]:
+def number_converter(name: str) -> Callable[[Any], Array]:
     """Return a converter to a field of one number."""
-    return lambda value: _checks.finite_floating(value, (), name)
+    return lambda value: _checks.finite_array(value, (), name)
 
 
-def source(name: str) -> Callable[[Any], Any]:
+def source_converter(name: str) -> Callable[[Any], Any]:
     """Return a converter to a field that is a vector, or a function of time to a vector."""
     return lambda value: constant_or_callable(value, name)
 
@@ -294,16 +294,16 @@ def source(name: str) -> Callable[[Any], Any]:
 def constant_or_callable(source: object, name: str, size: int = 3) -> Any:
     """Return `source` unchanged if it can be called with a time; otherwise as a vector (size,)."""
     if callable(source):
-        return _checks.function(source, name, f"of time to ({size},)")
-    return _checks.finite_floating(source, (size,), name)
+        return _checks.require_function(source, name, f"of time to ({size},)")
+    return _checks.finite_array(source, (size,), name)
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:
     """Return the times at which a torque or a function of time jumps, s; empty if there are
     none.
     """
-    found = getattr(source, "jump_times", None)
-    return jnp.zeros(0) if found is None else found
+    times = getattr(source, "jump_times", None)
+    return jnp.zeros(0) if times is None else times
 
 
 def jumps_in(*sources: object) -> Float[Array, " n"]:
@@ -322,33 +322,33 @@ def jumps_of_parts(law: object) -> Float[Array, " n"]:
 
 def unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array, "n 3"]:
     """Return directions (count, 3); known directions must be unit vectors."""
-    rows = _checks.finite_floating(value, (count, 3), name)
-    if _checks.known(rows):
+    rows = _checks.finite_array(value, (count, 3), name)
+    if _checks.is_known(rows):
         lengths = np.linalg.norm(np.asarray(rows, float), axis=1)
         if abs(lengths - 1).max() > 1e-6:
             raise ValueError(f"{name}: wanted unit vectors, got lengths {lengths}")
     return rows
 
 
-def count_of(value: NumbersLike, name: str, one: str) -> int:
+def row_count(value: NumbersLike, name: str, one: str) -> int:
     """Return the number of rows (x, y, z) in `value`, one row for each `one`; at least one row is
     wanted.
     """
-    shape = _checks.numbers(value, name).shape
+    shape = _checks.numeric_array(value, name).shape
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
         raise ValueError(f"{name}: wanted (R, 3), one row for each {one}, got shape {shape}")
     return shape[0]
 
 
-def one_or_each(value: NumbersLike, count: int, name: str) -> Array:
+def broadcast_to_each(value: NumbersLike, count: int, name: str) -> Array:
     """Return one number for all, or one number for each of `count`, by the shape of `value`."""
-    return _checks.finite_floating(
-        value, (count,) if _checks.numbers(value, name).ndim else (), name
+    return _checks.finite_array(
+        value, (count,) if _checks.numeric_array(value, name).ndim else (), name
     )
 
 
 def length_or_zero(v: Vec3) -> Scalar:
     """Return |v|, with derivative 0 at v = 0, as a factor of |v| v."""
-    v = _checks.floating(v, (3,), "v")
+    v = _checks.array_of_shape(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

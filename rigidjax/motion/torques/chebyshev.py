@@ -39,17 +39,17 @@ class Chebyshev(eqx.Module):
         step: ScalarLike,
         coefficients: Float[ArrayLike, "n k terms"] | Sequence[Any],
     ):
-        rows = _checks.numbers(coefficients, "coefficients")
+        rows = _checks.numeric_array(coefficients, "coefficients")
         if rows.ndim != 3 or 0 in rows.shape:
             raise ValueError(f"coefficients: wanted (intervals, k, terms), got {rows.shape}")
         dtype = jnp.result_type(float)
-        self.coefficients = _checks.finite(rows, "coefficients").astype(dtype)
+        self.coefficients = _checks.require_finite(rows, "coefficients").astype(dtype)
         self.start, step = (
-            _checks.finite_floating(start, (), "start"),
-            _checks.finite_floating(step, (), "step"),
+            _checks.finite_array(start, (), "start"),
+            _checks.finite_array(step, (), "step"),
         )
         self.start = self.start.astype(dtype)
-        self.step = _checks.sign(step, "step", "a positive length, s").astype(dtype)
+        self.step = _checks.require_sign(step, "step", "a positive length, s").astype(dtype)
 
     def __call__(self, t: ScalarLike) -> Any:
         """Return the value at `t` (s), (k,)."""

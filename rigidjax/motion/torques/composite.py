@@ -114,7 +114,7 @@ class ChangingInertia(eqx.Module):
         if hasattr(inertia, "feels"):
             base.require_law(inertia, "inertia")
         else:
-            _checks.function(inertia, "inertia", "of time to (3, 3), kg m²")
+            _checks.require_function(inertia, "inertia", "of time to (3, 3), kg m²")
             require_no_jumps(inertia, "inertia")
         self.inertia = inertia
         if torque is not None:
@@ -132,9 +132,9 @@ class ChangingInertia(eqx.Module):
     def tensor(self, t: ScalarLike, state: PyTree = None, body: Body | None = None) -> Mat3:
         """Return I, (3, 3), kg m²; a function of time needs no `state` and `body`."""
         seen = (t, state, body) if hasattr(self.inertia, "feels") else (t,)
-        found = self.inertia(*seen)
-        found = found.tensor if isinstance(found, Inertia) else found
-        return _checks.floating(found, (3, 3), "inertia(t)")
+        inertia = self.inertia(*seen)
+        inertia = inertia.tensor if isinstance(inertia, Inertia) else inertia
+        return _checks.array_of_shape(inertia, (3, 3), "inertia(t)")
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: Body) -> Vec3 | base.Wrench:
         omega = state.omega
@@ -196,11 +196,11 @@ class Tide(eqx.Module):
     """
 
     feels: ClassVar[type] = HasAttitude
-    response: Scalar = eqx.field(converter=base.number("response"))
-    delay: Scalar = eqx.field(converter=base.number("delay"))
-    mu: Scalar = eqx.field(converter=base.number("mu"))
-    position: Any = eqx.field(converter=base.source("position"))
-    mean_rate: Scalar = eqx.field(converter=base.number("mean_rate"), default=0.0)
+    response: Scalar = eqx.field(converter=base.number_converter("response"))
+    delay: Scalar = eqx.field(converter=base.number_converter("delay"))
+    mu: Scalar = eqx.field(converter=base.number_converter("mu"))
+    position: Any = eqx.field(converter=base.source_converter("position"))
+    mean_rate: Scalar = eqx.field(converter=base.number_converter("mean_rate"), default=0.0)
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: Body) -> Mat3:
         before = quaternion.multiply(state.q, quaternion.exp(-self.delay * state.omega))

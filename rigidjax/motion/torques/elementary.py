@@ -25,13 +25,13 @@ class ConstantTorque(base.AbstractTorque):
     feels: ClassVar[type] = HasSpin
     rate_free: ClassVar[bool] = True
     steady: ClassVar[bool] = True
-    torque: Float[Array, "3"] = eqx.field(converter=base.vector("torque"))
+    torque: Float[Array, "3"] = eqx.field(converter=base.vector_converter("torque"))
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         return self.torque
 
 
-class InSpace(base.OfTime):
+class InSpace(base.AbstractTimeTorque):
     """Apply a torque given in the world frame: `τ = Rᵀ τ_w`.
 
     **Arguments:** `torque` τ_w, N m, world frame: (3,), or a callable Module of time, t → (3,),
@@ -45,23 +45,23 @@ class InSpace(base.OfTime):
 
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True
-    torque: eqx.Module | Float[Array, "3"] = eqx.field(converter=base.source("torque"))
+    torque: eqx.Module | Float[Array, "3"] = eqx.field(converter=base.source_converter("torque"))
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
         return quaternion.rotate_inverse(state.q, base.vector_at(self.torque, t, "torque"))
 
 
-class _Against(base.AbstractTorque):
+class _AbstractRateTorque(base.AbstractTorque):
     """Define a torque against the body rate, with a coefficient for each body axis."""
 
     feels: ClassVar[type] = HasSpin
     steady: ClassVar[bool] = True
     coefficient: Float[Array, "3"] = eqx.field(
-        converter=base.vector("coefficient", hint="one number for each body axis")
+        converter=base.vector_converter("coefficient", hint="one number for each body axis")
     )
 
 
-class Damping(_Against):
+class Damping(_AbstractRateTorque):
     """Apply linear damping `τ = −c Ω`, component by component.
 
     **Arguments:** `coefficient` (3,) c along the body axes, N m s/rad. The rate of a sphere of
@@ -76,7 +76,7 @@ class Damping(_Against):
         return -self.coefficient * state.omega
 
 
-class QuadraticDamping(_Against):
+class QuadraticDamping(_AbstractRateTorque):
     """Apply quadratic damping `τ = −c |Ω| Ω`, component by component: drag at a large Reynolds
     number.
 

@@ -31,7 +31,9 @@ class UniformGravity(base.AbstractForce):
 
     feels: ClassVar[type] = HasPose
     steady: ClassVar[bool] = True
-    gravity: Float[Array, "3"] = eqx.field(converter=base.vector("gravity", hint=base.WORLD))
+    gravity: Float[Array, "3"] = eqx.field(
+        converter=base.vector_converter("gravity", hint=base.WORLD)
+    )
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
         """Return the potential energy, J: `U = −m g·x`, zero at the world's origin."""
@@ -60,7 +62,7 @@ class CentralGravity(base.AbstractForce):
 
     feels: ClassVar[type] = HasPose
     steady: ClassVar[bool] = True
-    mu: Float[Array, ""] = eqx.field(converter=base.number("mu"))
+    mu: Float[Array, ""] = eqx.field(converter=base.number_converter("mu"))
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
         """Return the potential energy, J, which is zero at infinity."""
@@ -100,9 +102,9 @@ class Drag(base.AbstractForce):
 
     feels: ClassVar[type] = HasPose
     steady: ClassVar[bool] = True
-    coefficient: Float[Array, ""] = eqx.field(converter=base.number("coefficient"))
-    centre: Float[Array, "3"] = eqx.field(converter=base.vector("centre"), default=_NONE)
-    wind: Float[Array, "3"] = eqx.field(converter=base.vector("wind"), default=_NONE)
+    coefficient: Float[Array, ""] = eqx.field(converter=base.number_converter("coefficient"))
+    centre: Float[Array, "3"] = eqx.field(converter=base.vector_converter("centre"), default=_NONE)
+    wind: Float[Array, "3"] = eqx.field(converter=base.vector_converter("wind"), default=_NONE)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         u = state.v - self.wind
@@ -147,15 +149,15 @@ class Rotors(base.AbstractForce):
         drag: NumbersLike,
         speeds: NumbersLike | Callable[..., Any],
     ):
-        count = base.count_of(positions, "positions", "rotor")
-        self.positions = _checks.finite_floating(positions, (count, 3), "positions")
+        count = base.row_count(positions, "positions", "rotor")
+        self.positions = _checks.finite_array(positions, (count, 3), "positions")
         self.directions = base.unit_rows(directions, "directions", count)
-        self.spins = _checks.finite_floating(spins, (count,), "spins")
-        if _checks.known(self.spins) and (abs(np.asarray(self.spins)) != 1).any():
+        self.spins = _checks.finite_array(spins, (count,), "spins")
+        if _checks.is_known(self.spins) and (abs(np.asarray(self.spins)) != 1).any():
             raise ValueError(f"spins: wanted 1 or -1 for each rotor, got {np.asarray(self.spins)}")
         self.thrust, self.drag = (
-            base.one_or_each(thrust, count, "thrust"),
-            base.one_or_each(drag, count, "drag"),
+            base.broadcast_to_each(thrust, count, "thrust"),
+            base.broadcast_to_each(drag, count, "drag"),
         )
         self.speeds = base.constant_or_callable(speeds, "speeds", count)
 
@@ -193,10 +195,12 @@ class BodyDrag(base.AbstractForce):
 
     feels: ClassVar[type] = HasPose
     steady: ClassVar[bool] = True
-    linear: Float[Array, "3"] = eqx.field(converter=base.vector("linear"))
-    quadratic: Float[Array, "3"] = eqx.field(converter=base.vector("quadratic"), default=_NONE)
-    centre: Float[Array, "3"] = eqx.field(converter=base.vector("centre"), default=_NONE)
-    wind: Float[Array, "3"] = eqx.field(converter=base.vector("wind"), default=_NONE)
+    linear: Float[Array, "3"] = eqx.field(converter=base.vector_converter("linear"))
+    quadratic: Float[Array, "3"] = eqx.field(
+        converter=base.vector_converter("quadratic"), default=_NONE
+    )
+    centre: Float[Array, "3"] = eqx.field(converter=base.vector_converter("centre"), default=_NONE)
+    wind: Float[Array, "3"] = eqx.field(converter=base.vector_converter("wind"), default=_NONE)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         u = quaternion.rotate_inverse(state.q, state.v - self.wind)

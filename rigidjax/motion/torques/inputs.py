@@ -40,7 +40,7 @@ class Input(eqx.Module):
         )
 
 
-class _Now(eqx.Module):
+class _ConstantFunction(eqx.Module):
     """Hold a value that does not depend on time."""
 
     value: Array
@@ -72,12 +72,12 @@ class Delayed(eqx.Module):
     delay: Float[Array, ""]
 
     def __init__(self, source: object, delay: ScalarLike):
-        source = _checks.function(source, "source", "of time")
+        source = _checks.require_function(source, "source", "of time")
         if has_states(source):
             words = "has states, whose past is not kept; delay its input"
             words += ": Lagged(Delayed(source, delay), time)"
             raise TypeError(f"Delayed: {type(source).__name__} {words}")
-        self.delay = _checks.finite_floating(delay, (), "delay").astype(jnp.result_type(float))
+        self.delay = _checks.finite_array(delay, (), "delay").astype(jnp.result_type(float))
         if isinstance(source, Delayed):
             source, self.delay = source.source, self.delay + source.delay
         if not isinstance(source, Input) and inputs_of(source):
@@ -85,7 +85,7 @@ class Delayed(eqx.Module):
             raise TypeError(f"Delayed: {type(source).__name__} {words}")
         self.source = source
         times = getattr(source, "times", None)
-        if times is not None and _checks.known((times, self.delay)):
+        if times is not None and _checks.is_known((times, self.delay)):
             length = float(times[-1] - times[0])
             if abs(float(self.delay)) >= length:
                 words = f"{float(self.delay):.6g} s is as long as the record of {length:.6g} s"
@@ -123,11 +123,13 @@ class Lagged(eqx.Module):
     start: Array | None
 
     def __init__(self, source: object, time: NumbersLike, start: NumbersLike | None = None):
-        self.source = _checks.function(source, "source", "of time")
+        self.source = _checks.require_function(source, "source", "of time")
         kind = jnp.result_type(float)
-        time = _checks.if_known(_checks.sign, _channels(time, "time"), "time", "a positive time, s")
+        time = _checks.check_if_known(
+            _checks.require_sign, _checked_channels(time, "time"), "time", "a positive time, s"
+        )
         self.time = time.astype(kind)
-        self.start = None if start is None else _channels(start, "start").astype(kind)
+        self.start = None if start is None else _checked_channels(start, "start").astype(kind)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -140,7 +142,7 @@ class Lagged(eqx.Module):
 
     def rate(self, t: ScalarLike, own: Array, state: PyTree, body: Body) -> Array:
         """Return dy/dt, in the source's unit per second."""
-        wanted = _checks.numbers(self.source(t), "source(t)").astype(own.dtype)
+        wanted = _checks.numeric_array(self.source(t), "source(t)").astype(own.dtype)
         if wanted.shape != own.shape:
             raise ValueError(f"Lagged: start has the shape {own.shape}, the source {wanted.shape}")
         return (wanted - own) / self.time
@@ -155,25 +157,29 @@ def require_no_jumps(source: PyTree, name: str) -> None:
 
     An `Input` is checked when it has a value: `bind` may give it a smooth function of time.
     """
-    jumping = (Held, _Now)
+    jumping = (Held, _ConstantFunction)
     nodes = jax.tree.leaves(source, is_leaf=lambda node: isinstance(node, jumping))
     for node in nodes:
         if isinstance(node, jumping):
-            what = "an Input with held samples" if isinstance(node, _Now) else type(node).__name__
+            what = (
+                "an Input with held samples"
+                if isinstance(node, _ConstantFunction)
+                else type(node).__name__
+            )
             raise TypeError(
                 f"{name}: wanted a function of time without jumps, since its derivative acts on "
                 f"the body, got {what}; take Linear(times, values) or Series(times, values)"
             )
 
 
-def _channels(value: NumbersLike, name: str) -> Array:
-    array = _checks.numbers(value, name)
+def _checked_channels(value: NumbersLike, name: str) -> Array:
+    array = _checks.numeric_array(value, name)
     if not array.size:
         raise ValueError(f"{name}: wanted one number, or one a channel, got none")
-    return _checks.if_known(_checks.finite, array, name)
+    return _checks.check_if_known(_checks.require_finite, array, name)
 
 
-class Row(NamedTuple):
+class InputRow(NamedTuple):
     """Hold the inputs in (a part of) a step: `values` by name, and `delayed` of each `Delayed`
     input.
     """
@@ -182,7 +188,7 @@ class Row(NamedTuple):
     delayed: tuple[Any, ...]
 
 
-def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
+def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
     """Return the torque with values instead of its `Input`s.
 
     **Arguments:** `law` a torque, a force, or a tree of them; `inputs` by name an array, which is
@@ -195,22 +201,22 @@ def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
     if inputs is None:
         return law
 
-    values, later = inputs if isinstance(inputs, Row) else (inputs, None)
+    values, later = inputs if isinstance(inputs, InputRow) else (inputs, None)
     queue = list(later or ())
 
     def value(node: PyTree) -> Any:
         if _is_delayed(node):
             if later is not None:
-                return _Now(jnp.asarray(queue.pop(0)))
-            found = value(node.source)
-            return found if isinstance(found, _Now) else Delayed(found, node.delay)
+                return _ConstantFunction(jnp.asarray(queue.pop(0)))
+            bound = value(node.source)
+            return bound if isinstance(bound, _ConstantFunction) else Delayed(bound, node.delay)
         if not isinstance(node, Input):
             return node
         if node.name not in values:
-            found = ", ".join(map(repr, values)) or "none"
-            raise ValueError(f"inputs: the torque reads {node.name!r}, got {found}")
-        found = values[node.name]
-        return found if callable(found) else _Now(jnp.asarray(found))
+            names = ", ".join(map(repr, values)) or "none"
+            raise ValueError(f"inputs: the torque reads {node.name!r}, got {names}")
+        bound = values[node.name]
+        return bound if callable(bound) else _ConstantFunction(jnp.asarray(bound))
 
     return jax.tree.map(value, law, is_leaf=lambda n: isinstance(n, Input) or _is_delayed(n))
 
@@ -235,12 +241,12 @@ def require_inputs(law: PyTree, inputs: object) -> Mapping[str, Any]:
     """Return `inputs` as a mapping, empty for `None`. **Raises:** `ValueError` unless they are
     exactly those that the torque reads.
     """
-    read, found = inputs_of(law), {} if inputs is None else inputs
-    if not isinstance(found, Mapping):
-        raise TypeError(f"inputs: wanted arrays by name, got {type(found).__name__}")
-    if set(read) != set(found):
+    read, mapping = inputs_of(law), {} if inputs is None else inputs
+    if not isinstance(mapping, Mapping):
+        raise TypeError(f"inputs: wanted arrays by name, got {type(mapping).__name__}")
+    if set(read) != set(mapping):
         raise ValueError(
             f"inputs: the torque reads {', '.join(map(repr, read)) or 'none'}, got "
-            f"{', '.join(map(repr, found)) or 'none'}"
+            f"{', '.join(map(repr, mapping)) or 'none'}"
         )
-    return found
+    return mapping

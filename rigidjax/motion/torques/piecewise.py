@@ -23,7 +23,7 @@ class _Table(eqx.Module):
     values: Float[Array, "n *k"]
 
     def __init__(self, times: Times, values: Float[ArrayLike, "rows *k"] | Sequence[Any]):
-        self.times, self.values = _rows("times", times, "values", values)
+        self.times, self.values = _checked_rows("times", times, "values", values)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -50,7 +50,9 @@ class Linear(_Table):
     def __call__(self, t: ScalarLike) -> Array:
         """Return the value at `t` (s), (*k)."""
         t = jnp.asarray(t, self.times.dtype)
-        return _line(self.times, self.values, jnp.clip(t, self.times[0], self.times[-1]))
+        return _interpolate_line(
+            self.times, self.values, jnp.clip(t, self.times[0], self.times[-1])
+        )
 
 
 class Held(_Table):
@@ -67,7 +69,7 @@ class Held(_Table):
 
     def __call__(self, t: ScalarLike) -> Array:
         """Return the value at `t` (s), (*k)."""
-        i = _row(self.times, jnp.asarray(t, self.times.dtype))
+        i = _row_index(self.times, jnp.asarray(t, self.times.dtype))
         return self.values[jnp.clip(i, 0, self.times.shape[0] - 1)]
 
 
@@ -92,7 +94,7 @@ class Tabulated(AbstractTorque):
     torques: Float[Array, "n 3"]
 
     def __init__(self, times: Times, torques: Rows):
-        self.times, self.torques = _rows("times", times, "torques", torques, extra=0)
+        self.times, self.torques = _checked_rows("times", times, "torques", torques, extra=0)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -102,7 +104,7 @@ class Tabulated(AbstractTorque):
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         t = jnp.asarray(t, self.times.dtype)
         inside = (t >= self.times[0]) & (t < self.times[-1])
-        value = _line(self.times, self.torques, t)
+        value = _interpolate_line(self.times, self.torques, t)
         return jnp.where(inside, value, jnp.zeros_like(value))
 
 
@@ -127,7 +129,7 @@ class Pulses(AbstractTorque):
     torques: Float[Array, "n 3"]
 
     def __init__(self, edges: Times, torques: Rows):
-        self.edges, self.torques = _rows("edges", edges, "torques", torques, extra=1)
+        self.edges, self.torques = _checked_rows("edges", edges, "torques", torques, extra=1)
 
     @property
     def jump_times(self) -> Float[Array, " edges"]:
@@ -142,11 +144,11 @@ class Pulses(AbstractTorque):
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         t = jnp.asarray(t, self.edges.dtype)
         inside = (t >= self.edges[0]) & (t < self.edges[-1])
-        value = self.torques[jnp.clip(_row(self.edges, t), 0, self.torques.shape[0] - 1)]
+        value = self.torques[jnp.clip(_row_index(self.edges, t), 0, self.torques.shape[0] - 1)]
         return jnp.where(inside, value, jnp.zeros_like(value))
 
 
-def _row(times: Float[Array, " n"], t: Scalar) -> Any:
+def _row_index(times: Float[Array, " n"], t: Scalar) -> Any:
     """Return the index of the last row whose time is not after t. At a jump this is the piece that
     begins.
     """
@@ -156,14 +158,14 @@ def _row(times: Float[Array, " n"], t: Scalar) -> Any:
     return jnp.searchsorted(times, t, side="right", method=method) - 1
 
 
-def _line(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar) -> Array:
+def _interpolate_line(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar) -> Array:
     """Return the value at `t` of the straight line between the rows around it."""
-    i = jnp.clip(_row(times, t), 0, times.shape[0] - 2)
+    i = jnp.clip(_row_index(times, t), 0, times.shape[0] - 2)
     part = (t - times[i]) / (times[i + 1] - times[i])
     return rows[i] + part * (rows[i + 1] - rows[i])
 
 
-def _rows(
+def _checked_rows(
     name: str, times: NumbersLike, other: str, values: NumbersLike, extra: int | None = None
 ) -> tuple[Array, Array]:
     """Return the times and rows after checks.
@@ -171,7 +173,7 @@ def _rows(
     `extra` is the number of times beyond the number of rows, of 3 numbers each; with `None` both
     numbers are equal and rows may have any shape.
     """
-    edges, rows = _checks.rows(times, (), name), _checks.numbers(values, other)
+    edges, rows = _checks.array_of_rows(times, (), name), _checks.numeric_array(values, other)
     count = edges.shape[0]
     if count < 2:
         raise ValueError(f"{name}: wanted at least 2 times, shape (n,), got {edges.shape}")
@@ -183,12 +185,12 @@ def _rows(
         advice = pieces if extra else lines
         words = f"{other}: wanted {count - extra} rows of 3"
         raise ValueError(f"{words}, got shape {rows.shape}; {advice}")
-    edges, rows = _checks.finite(edges, name), _checks.finite(rows, other)
+    edges, rows = _checks.require_finite(edges, name), _checks.require_finite(rows, other)
     ordered = _checks.namespace(edges).asarray(edges)
     falling = ordered[1:] <= ordered[:-1]
     where = ""
-    if _checks.known(falling) and falling.any():
+    if _checks.is_known(falling) and falling.any():
         where = f"; {name}[{int(np.argmax(falling)) + 1}] is not above the one before"
-    edges = _checks.refuse(edges, falling.any(), f"{name}: wanted increasing times, s{where}")
+    edges = _checks.error_if(edges, falling.any(), f"{name}: wanted increasing times, s{where}")
     dtype = jnp.result_type(edges, rows)
     return edges.astype(dtype), rows.astype(dtype)

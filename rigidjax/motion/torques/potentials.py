@@ -40,9 +40,11 @@ class HeavyTop(base.AbstractTorque):
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True
     steady: ClassVar[bool] = True
-    mass: Float[Array, ""] = eqx.field(converter=base.number("mass"))
-    com: Float[Array, "3"] = eqx.field(converter=base.vector("com"))
-    gravity: Float[Array, "3"] = eqx.field(converter=base.vector("gravity", hint=base.WORLD))
+    mass: Float[Array, ""] = eqx.field(converter=base.number_converter("mass"))
+    com: Float[Array, "3"] = eqx.field(converter=base.vector_converter("com"))
+    gravity: Float[Array, "3"] = eqx.field(
+        converter=base.vector_converter("gravity", hint=base.WORLD)
+    )
 
     @property
     def axis(self) -> Vec3:
@@ -63,7 +65,7 @@ class HeavyTop(base.AbstractTorque):
         return cross(self.mass * self.com, quaternion.rotate_inverse(state.q, self.gravity))
 
 
-class GravityGradient(base.OfTime):
+class GravityGradient(base.AbstractTimeTorque):
     """Apply the torque of a far point mass: `τ = (3μ/r³) u × Iu − Σ (μ/rⁿ⁺¹) u × ∇Hₙ(u)`, `u =
     Rᵀr/r`.
 
@@ -91,14 +93,14 @@ class GravityGradient(base.OfTime):
     harmonics: tuple[Float[Array, " orders"], ...]
 
     def __init__(self, mu: ScalarLike, position: object, harmonics: Sequence[ArrayLike] = ()):
-        self.mu = _checks.finite_floating(mu, (), "mu")
+        self.mu = _checks.finite_array(mu, (), "mu")
         self.position = base.constant_or_callable(position, "position")
         self.harmonics = tuple(
-            _checks.finite_floating(row, (2 * n + 1,), f"harmonics: degree {n}")
+            _checks.finite_array(row, (2 * n + 1,), f"harmonics: degree {n}")
             for n, row in enumerate(harmonics, 3)
         )
         at: Any = self.position
-        if not callable(at) and _checks.known(at) and not np.asarray(at).any():
+        if not callable(at) and _checks.is_known(at) and not np.asarray(at).any():
             words = "the vector between the body and the central body"
             raise ValueError(f"position: wanted {words}, got zero")
 
@@ -113,7 +115,7 @@ class GravityGradient(base.OfTime):
         Hₙ(u)`.
         """
         tensor = tensor_of(body)
-        u, strength, slopes = self._seen(t, state)
+        u, strength, slopes = self._point_mass_in_body(t, state)
         trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
         potential = 0.5 * strength * (3 * dot(u, apply(tensor, u)) - trace)
         for n, slope in enumerate(slopes, 3):
@@ -121,13 +123,13 @@ class GravityGradient(base.OfTime):
         return potential
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Vec3:
-        u, strength, slopes = self._seen(t, state)
+        u, strength, slopes = self._point_mass_in_body(t, state)
         pull = 3 * strength * apply(tensor_of(body), u)
         for slope in slopes:
             pull = pull - slope
         return cross(u, pull)
 
-    def _seen(self, t, state):
+    def _point_mass_in_body(self, t, state):
         """Return the direction of the point mass in body axes, μ/r³, and (μ/rⁿ⁺¹) ∇Hₙ of each
         degree.
         """
@@ -137,13 +139,13 @@ class GravityGradient(base.OfTime):
         strength = self.mu / distance / distance / distance
         u = quaternion.rotate_inverse(state.q, r / distance)
         slopes, factor = [], strength
-        for slope in _slopes(self.harmonics, u):
+        for slope in _harmonic_gradients(self.harmonics, u):
             factor = factor / distance
             slopes.append(factor * slope)
         return u, strength, slopes
 
 
-def _slopes(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
+def _harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
     """Return ∇Hₙ at a unit vector, n = 3, 4, … (Cunningham 1970, doi:10.1007/BF01229495)."""
     x, y, z = components(u)
     zero = jnp.zeros_like(z)
@@ -153,7 +155,7 @@ def _slopes(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
     out = []
     for n in range(1, len(harmonics) + 3):
         if n >= 3:
-            out.append(_slope(components(harmonics[n - 3]), n, here))
+            out.append(_harmonic_gradient(components(harmonics[n - 3]), n, here))
         k = 2 * n - 1
         (re, im), following = here[n - 1], []
         for m in range(n):
@@ -164,7 +166,9 @@ def _slopes(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
     return out
 
 
-def _slope(row: Sequence[Scalar], n: int, lower: Sequence[tuple[Scalar, Scalar]]) -> Vec3:
+def _harmonic_gradient(
+    row: Sequence[Scalar], n: int, lower: Sequence[tuple[Scalar, Scalar]]
+) -> Vec3:
     """Return ∇Hₙ from the coefficients of one degree and the solid harmonics of the degree
     below.
     """
@@ -179,7 +183,7 @@ def _slope(row: Sequence[Scalar], n: int, lower: Sequence[tuple[Scalar, Scalar]]
     return jnp.stack([flat_x, flat_y, along])
 
 
-class MagneticDipole(base.OfTime):
+class MagneticDipole(base.AbstractTimeTorque):
     """Apply the torque on a magnetic moment fixed in the body, in a uniform field: `τ = m × RᵀB`,
     `U = −m·RᵀB`.
 
@@ -194,8 +198,8 @@ class MagneticDipole(base.OfTime):
 
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True
-    moment: Float[Array, "3"] = eqx.field(converter=base.vector("moment"))
-    field: eqx.Module | Float[Array, "3"] = eqx.field(converter=base.source("field"))
+    moment: Float[Array, "3"] = eqx.field(converter=base.vector_converter("moment"))
+    field: eqx.Module | Float[Array, "3"] = eqx.field(converter=base.source_converter("field"))
 
     @property
     def axis(self) -> Vec3 | None:
@@ -236,7 +240,7 @@ class FromPotential(base.AbstractTorque):
     potential: Callable[[Any], Any]
 
     def __init__(self, potential: Callable[[Any], Any]):
-        self.potential = _checks.function(potential, "potential", "q → U, J")
+        self.potential = _checks.require_function(potential, "potential", "q → U, J")
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
         """Return the potential energy, J."""
@@ -247,4 +251,4 @@ class FromPotential(base.AbstractTorque):
         return -0.5 * quaternion.multiply(quaternion.conjugate(state.q), slope)[1:]
 
     def _value(self, q):
-        return _checks.floating(self.potential(q), (), "potential", hint="one number, J")
+        return _checks.array_of_shape(self.potential(q), (), "potential", hint="one number, J")

@@ -59,8 +59,8 @@ class CorrelatedTorque(AbstractTorque):
 
     def __init__(self, density: NumbersLike, time: NumbersLike):
         self.density = density_of(density)
-        number = _checks.floating(time, (), "time").astype(self.density.dtype)
-        self.time = _checks.sign(number, "time", "a positive correlation time, s")
+        number = _checks.array_of_shape(time, (), "time").astype(self.density.dtype)
+        self.time = _checks.require_sign(number, "time", "a positive correlation time, s")
 
     @property
     def deviation(self) -> Vec3:
@@ -75,8 +75,8 @@ def density_of(value: NumbersLike, name: str = "density", size: int = 3) -> Arra
     """Return a spectral density (size,) from one number or `size` numbers, none of them
     negative.
     """
-    density = _checks.numbers(value, name)
+    density = _checks.numeric_array(value, name)
     if density.shape not in ((), (size,)):
         raise ValueError(f"{name}: wanted one number or {size}, got shape {density.shape}")
     density = jnp.broadcast_to(density, (size,)).astype(density.dtype)
-    return _checks.sign(density, name, "a finite number that is not below zero", zero=True)
+    return _checks.require_sign(density, name, "a finite number that is not below zero", zero=True)

@@ -43,22 +43,27 @@ class Series(eqx.Module):
     slopes: Float[Array, "n *channels"]
 
     def __init__(self, times: Float[ArrayLike, " n"] | Sequence[Any], values: Samples):
-        t, rows = _numbers(times, "times"), _numbers(values, "values")
+        t, rows = _known_numbers(times, "times"), _known_numbers(values, "values")
         if t.ndim != 1 or t.size < 4 or rows.shape[:1] != t.shape:
             words = f"got shapes {t.shape} and {rows.shape}"
             raise ValueError(f"Series: wanted at least four times and as many rows, {words}")
-        t, rows = _checks.finite(t, "Series: times"), _checks.finite(rows, "Series: values")
+        t, rows = (
+            _checks.require_finite(t, "Series: times"),
+            _checks.require_finite(rows, "Series: values"),
+        )
         step = (t[-1] - t[0]) / (t.size - 1)
         kind = np.dtype(getattr(times, "dtype", float))
         kind = kind if kind == jnp.bfloat16 else np.promote_types(kind, np.float16)
         slack = 1e-6 * step + 4 * float(jnp.finfo(kind).eps) * abs(t).max()
         uneven = ~((step > 0) & (abs(t[1:] - t[:-1] - step).max() <= slack))
         words = "Series: wanted evenly spaced, increasing times; resample, or use Linear"
-        step = _checks.refuse(step, uneven, words)
+        step = _checks.error_if(step, uneven, words)
         dtype = jnp.result_type(float)
         self.start, self.step = jnp.asarray(t[0], dtype), jnp.asarray(step, dtype)
         self.values = jnp.asarray(rows, dtype)
-        self.slopes = _checks.finite(_slopes(self.values), "Series: slopes of the values")
+        self.slopes = _checks.require_finite(
+            _slopes_at_samples(self.values), "Series: slopes of the values"
+        )
 
     def __call__(self, t: ScalarLike) -> Any:
         """Return the value at `t` (s), () or (k,)."""
@@ -77,16 +82,16 @@ class Series(eqx.Module):
         return left + s * (out + s * (bend + s * twist))
 
 
-def _numbers(value: NumbersLike, name: str) -> Any:
+def _known_numbers(value: NumbersLike, name: str) -> Any:
     """Return the numbers, as NumPy's float64 if they are known: times of a log have more than seven
     digits.
     """
-    if _checks.known(value):
-        return _checks.on_host(value, f"Series: {name}")
-    return _checks.numbers(value, f"Series: {name}").astype(jnp.result_type(float))
+    if _checks.is_known(value):
+        return _checks.host_array(value, f"Series: {name}")
+    return _checks.numeric_array(value, f"Series: {name}").astype(jnp.result_type(float))
 
 
-def _slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
+def _slopes_at_samples(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
     """Return the change per step at each sample, s_i.
 
     It solves s₋ + 4 s + s₊ = 3 (v₊ − v₋) for the neighbours − and + of each sample; at the ends the
@@ -137,21 +142,19 @@ class Wheel(eqx.Module):
         delay: ScalarLike | None = None,
         tilt: NumbersLike | None = None,
     ):
-        direction = _checks.floating(axis, (3,), "axis")
+        direction = _checks.array_of_shape(axis, (3,), "axis")
         x, y, z = _checks.namespace(direction).asarray(direction)
-        found = f", got {np.asarray(direction)}" if _checks.known(direction) else ""
+        got = f", got {np.asarray(direction)}" if _checks.is_known(direction) else ""
         off = ~(abs(x * x + y * y + z * z - 1) < 2e-6)
-        direction = _checks.refuse(direction, off, f"axis: wanted a unit vector (3,){found}")
-        _checks.function(speed, "speed", "of time to rad/s")
+        direction = _checks.error_if(direction, off, f"axis: wanted a unit vector (3,){got}")
+        _checks.require_function(speed, "speed", "of time to rad/s")
         kind = jnp.result_type(float)
-        self.inertia = _checks.finite_floating(inertia, (), "inertia").astype(kind)
+        self.inertia = _checks.finite_array(inertia, (), "inertia").astype(kind)
         self.axis, self.speed = direction.astype(kind), speed
         self.delay = (
-            None if delay is None else _checks.finite_floating(delay, (), "delay").astype(kind)
+            None if delay is None else _checks.finite_array(delay, (), "delay").astype(kind)
         )
-        self.tilt = (
-            None if tilt is None else _checks.finite_floating(tilt, (2,), "tilt").astype(kind)
-        )
+        self.tilt = None if tilt is None else _checks.finite_array(tilt, (2,), "tilt").astype(kind)
 
     @property
     def direction(self) -> Vec3:

@@ -23,7 +23,7 @@ Tree = TypeVar("Tree")
 _OF_STATES = ("energy", "internal_momentum")
 
 
-class Frozen(eqx.Module):
+class FrozenLaw(eqx.Module):
     """Wrap a torque or function of time `law` with its states inserted; `freeze` makes it."""
 
     law: Any
@@ -36,25 +36,25 @@ class Frozen(eqx.Module):
         # The torque's members (`feels`, `jump_times`, …), except those of its states.
         if name.startswith("_") or name in ("law", "own", "state0", "rate"):
             raise AttributeError(name)
-        found = getattr(self.law, name)
-        return Frozen(found, self.own) if name in _OF_STATES else found
+        attribute = getattr(self.law, name)
+        return FrozenLaw(attribute, self.own) if name in _OF_STATES else attribute
 
 
-def has_own(node: object) -> bool:
+def has_own_states(node: object) -> bool:
     """Return whether this torque, or function of time, itself has states: `state0` and `rate`."""
     return not isinstance(node, type) and hasattr(node, "state0") and hasattr(node, "rate")
 
 
 def has_states(law: PyTree) -> bool:
     """Return whether a torque, or any part of it, has states of its own."""
-    return any(map(has_own, jax.tree.leaves(law, is_leaf=_stop)))
+    return any(map(has_own_states, jax.tree.leaves(law, is_leaf=_stop)))
 
 
-def require_stateless(law: PyTree, what: str) -> None:
-    """Raise `ValueError` for a torque with states: `what` does not integrate them."""
+def require_stateless(law: PyTree, user: str) -> None:
+    """Raise `ValueError` for a torque with states: `user` does not integrate them."""
     if has_states(law):
         raise ValueError(
-            f"{what}: wanted a torque without states of its own, got one that has some (such as "
+            f"{user}: wanted a torque without states of its own, got one that has some (such as "
             "ReactionWheels or Lagged); integrate rigidjax.equations_of_motion with "
             "diffrax.diffeqsolve and diffrax.Event"
         )
@@ -74,74 +74,74 @@ def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
             raise ValueError(f"own: no states for {type(node).__name__}")
         return queue.pop(0)
 
-    frozen = _visit(law, own_of)
+    frozen = _insert_states(law, own_of)
     if queue:
         raise ValueError(f"own: the torque has {len(own) - len(queue)} with states, got {len(own)}")
     return frozen
 
 
-def first_states(law: PyTree, t: ScalarLike, state: PyTree, body: Body) -> tuple[Any, ...]:
+def initial_states(law: PyTree, t: ScalarLike, state: PyTree, body: Body) -> tuple[Any, ...]:
     """Return the initial states of a torque, in the precision of the body's state: see `freeze`."""
-    found: list[Any] = []
+    states: list[Any] = []
 
     def begin(node: PyTree) -> Any:
         here = node.state0(t, state, body) if callable(node.state0) else node.state0
-        own = _numbers(here, f"state0 of {type(node).__name__}", state.omega.dtype)
+        own = _checked_numbers(here, f"state0 of {type(node).__name__}", state.omega.dtype)
         if not jax.tree.leaves(own):
             raise ValueError(f"state0 of {type(node).__name__}: wanted a tree of arrays, got none")
-        found.append(own)
+        states.append(own)
         return own
 
-    _visit(law, begin)
-    return tuple(found)
+    _insert_states(law, begin)
+    return tuple(states)
 
 
-def rates_of(
+def rates_of_own_states(
     law: PyTree, t: ScalarLike, own: tuple[Any, ...], state: PyTree, body: Body
 ) -> tuple[Any, ...]:
     """Return the derivative of each state in `own`. **Raises:** `ValueError` for a shape other than
     that of `state0`.
     """
-    queue, found = list(own), []
+    queue, rates = list(own), []
 
     def one(node: PyTree) -> Any:
         here = queue.pop(0)
         name = f"rate of {type(node).__name__}"
-        rate = _numbers(node.rate(t, here, state, body), name, state.omega.dtype)
+        rate = _checked_numbers(node.rate(t, here, state, body), name, state.omega.dtype)
         wanted, shapes = (jax.tree.map(jnp.shape, tree) for tree in (here, rate))
         if wanted != shapes:
             raise ValueError(f"{name}: wanted arrays as in state0, {wanted}, got {shapes}")
-        found.append(rate)
+        rates.append(rate)
         return here
 
-    _visit(law, one)
-    return tuple(found)
+    _insert_states(law, one)
+    return tuple(rates)
 
 
 def require_frozen(law: PyTree) -> None:
     """Raise `TypeError` for a torque with states that is called without them."""
-    if has_own(law):
+    if has_own_states(law):
         words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate and "
         words += "identify.fit integrate them; elsewhere call it with its states last"
         raise TypeError(f"{type(law).__name__} {words}: law(t, state, body, own)")
 
 
-def _visit(tree: PyTree, own_of: Callable[[Any], Any]) -> Any:
+def _insert_states(tree: PyTree, own_of: Callable[[Any], Any]) -> Any:
     """Return the tree with all states inserted; `own_of(node)` gives them, inner parts first."""
 
     def stop(node: PyTree) -> bool:
         return node is not tree and _stop(node)
 
     def inside(node: PyTree) -> Any:
-        return _visit(node, own_of) if node is not tree and has_own(node) else node
+        return _insert_states(node, own_of) if node is not tree and has_own_states(node) else node
 
     within = jax.tree.map(inside, tree, is_leaf=stop)
-    return Frozen(within, (own_of(within),)) if has_own(tree) else within
+    return FrozenLaw(within, (own_of(within),)) if has_own_states(tree) else within
 
 
 def _stop(node: PyTree) -> bool:
-    return isinstance(node, Frozen) or has_own(node)
+    return isinstance(node, FrozenLaw) or has_own_states(node)
 
 
-def _numbers(tree: PyTree, name: str, dtype: DTypeLike) -> Any:
-    return jax.tree.map(lambda leaf: _checks.numbers(leaf, name).astype(dtype), tree)
+def _checked_numbers(tree: PyTree, name: str, dtype: DTypeLike) -> Any:
+    return jax.tree.map(lambda leaf: _checks.numeric_array(leaf, name).astype(dtype), tree)

@@ -24,7 +24,7 @@ from rigidjax.rotation.linalg3 import cross
 _FADE = 0.05
 
 
-class Flywheel(base.OfTime):
+class Flywheel(base.AbstractTimeTorque):
     """Apply the torque of internal wheels to the body: `τ = h × Ω − dh/dt`.
 
     **Arguments:** `momentum` h, N m s, body frame, the sum over all wheels: (3,) for wheels of
@@ -137,20 +137,22 @@ class ReactionWheels(base.AbstractTorque):
         coulomb: NumbersLike | None = None,
         turn_over: ScalarLike = 1.0,
     ):
-        count = base.count_of(axes, "axes", "wheel")
+        count = base.row_count(axes, "axes", "wheel")
         self.axes = base.unit_rows(axes, "axes", count)
-        inertia = _checks.finite_floating(inertia, (count,), "inertia")
-        self.inertia = _checks.if_known(_checks.sign, inertia, "inertia", "> 0")
-        self.speeds = _checks.finite_floating(speeds, (count,), "speeds")
+        inertia = _checks.finite_array(inertia, (count,), "inertia")
+        self.inertia = _checks.check_if_known(_checks.require_sign, inertia, "inertia", "> 0")
+        self.speeds = _checks.finite_array(speeds, (count,), "speeds")
         self.motor = None if motor is None else base.constant_or_callable(motor, "motor", count)
         words = "(t, state, speeds) → torques (R,), N m"
-        self.feedback = None if feedback is None else _checks.function(feedback, "feedback", words)
-        self.max_torque = _one_or_each(max_torque, count, "max_torque", "> 0")
-        self.max_speed = _one_or_each(max_speed, count, "max_speed", "> 0")
-        self.viscous = _one_or_each(viscous, count, "viscous", "≥ 0")
-        self.coulomb = _one_or_each(coulomb, count, "coulomb", "≥ 0")
-        turn_over = _checks.finite_floating(turn_over, (), "turn_over")
-        self.turn_over = _checks.if_known(_checks.sign, turn_over, "turn_over", "> 0")
+        self.feedback = (
+            None if feedback is None else _checks.require_function(feedback, "feedback", words)
+        )
+        self.max_torque = _checked_one_or_each(max_torque, count, "max_torque", "> 0")
+        self.max_speed = _checked_one_or_each(max_speed, count, "max_speed", "> 0")
+        self.viscous = _checked_one_or_each(viscous, count, "viscous", "≥ 0")
+        self.coulomb = _checked_one_or_each(coulomb, count, "coulomb", "≥ 0")
+        turn_over = _checks.finite_array(turn_over, (), "turn_over")
+        self.turn_over = _checks.check_if_known(_checks.require_sign, turn_over, "turn_over", "> 0")
 
     @property
     def steady(self) -> bool:
@@ -164,7 +166,7 @@ class ReactionWheels(base.AbstractTorque):
         """Return the `body`, an `Inertia` or `MassProperties` with locked wheels, minus `Σ J a
         aᵀ`.
         """
-        body = validation.single(body, (Inertia, MassProperties), "body")
+        body = validation.require_single_body(body, (Inertia, MassProperties), "body")
         rows = (j * outer(a, a) for j, a in zip(self.inertia, self.axes, strict=True))
         taken = sum(rows, jnp.zeros((3, 3), self.axes.dtype))
         return with_tensor(body, tensor_of(body) - taken)
@@ -173,26 +175,28 @@ class ReactionWheels(base.AbstractTorque):
         """Return the speeds (R,) relative to the body, rad/s, from the momenta `own` and the
         state.
         """
-        own = _checks.floating(own, self.inertia.shape, "own")
-        omega = _checks.single(state, HasSpin, "state", wanted="a Spin, Attitude or Rigid").omega
+        own = _checks.array_of_shape(own, self.inertia.shape, "own")
+        omega = _checks.require_single(
+            state, HasSpin, "state", requirement="a Spin, Attitude or Rigid"
+        ).omega
         along = jnp.stack([a[0] * omega[0] + a[1] * omega[1] + a[2] * omega[2] for a in self.axes])
         return own / self.inertia - along
 
     def torques_of(self, t: ScalarLike, own: Array, state: HasSpin) -> Float[Array, " wheels"]:
         """Return the torque of motor and bearing on each wheel about its axis, (R,), N m."""
-        speeds, t = self.speeds_of(own, state), _checks.floating(t, (), "t")
+        speeds, t = self.speeds_of(own, state), _checks.array_of_shape(t, (), "t")
         count, total = self.inertia.shape[0], jnp.zeros_like(speeds)
         if self.motor is not None:
             total = total + base.vector_at(self.motor, t, "motor", count).astype(total.dtype)
         if self.feedback is not None:
-            found = self.feedback(t, state, speeds)
-            total = total + _checks.floating(found, (count,), "feedback(t, state, speeds)")
+            feedback = self.feedback(t, state, speeds)
+            total = total + _checks.array_of_shape(feedback, (count,), "feedback(t, state, speeds)")
         if self.max_torque is not None:
             total = jnp.clip(total, -self.max_torque, self.max_torque)
         if self.max_speed is not None:
             top = self.max_speed
             room = jnp.where(total > 0, top - speeds, top + speeds)
-            total = total * _smooth(jnp.clip(room / (_FADE * top), 0, 1))
+            total = total * _smooth_step(jnp.clip(room / (_FADE * top), 0, 1))
         if self.viscous is not None:
             total = total - self.viscous * speeds
         if self.coulomb is not None:
@@ -227,18 +231,22 @@ class ReactionWheels(base.AbstractTorque):
         return total
 
 
-def _smooth(x: Array) -> Array:
+def _smooth_step(x: Array) -> Array:
     """Return a smooth step from 0 at x = 0 to 1 at x = 1, whose first two derivatives vanish at
     both.
     """
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))
 
 
-def _one_or_each(value: NumbersLike | None, count: int, name: str, wanted: str) -> Array | None:
+def _checked_one_or_each(
+    value: NumbersLike | None, count: int, name: str, requirement: str
+) -> Array | None:
     """Return one number for all wheels, or one number for each, checked to be "> 0" or "≥ 0";
     `None` for `None`.
     """
     if value is None:
         return None
-    found = base.one_or_each(value, count, name)
-    return _checks.if_known(_checks.sign, found, name, wanted, zero=wanted == "≥ 0")
+    numbers = base.broadcast_to_each(value, count, name)
+    return _checks.check_if_known(
+        _checks.require_sign, numbers, name, requirement, zero=requirement == "≥ 0"
+    )

@@ -121,7 +121,7 @@ def test_time_and_rates_are_found_in_si(tmp_path, kind):
     name, write, exact = FILES[kind]
     write(tmp_path / name)
     layout = imu_columns_of(tmp_path / name)
-    rates = spec.channel(f"gyro={','.join(layout.columns[1:])}:{layout.unit}")
+    rates = spec.parse_channel(f"gyro={','.join(layout.columns[1:])}:{layout.unit}")
     record = spec.read_log(
         tmp_path / name, [rates], time=layout.columns[0], time_unit=layout.time_unit
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rigidjax.cli.logs.errors import LogError, LogWarning
-from rigidjax.cli.logs.times import kept_rows, mask_of_increasing, remark_on_step
+from rigidjax.cli.logs.times import mask_of_increasing, remark_on_step, rows_to_use
 
 NAN = np.nan
 
@@ -59,7 +59,7 @@ def test_a_bad_stamp_costs_its_own_row_and_is_named(case):
     shown = ", ".join(str(row + 1) for row in bad)
     words = f"log: column 'time': {len(bad)} of 60 rows are left out.*rows? {shown}\\)"
     with pytest.warns(LogWarning, match=words):
-        rows = kept_rows("log", t, "time", None)
+        rows = rows_to_use("log", t, "time", None)
     assert sorted({*range(60)} - {*rows.tolist()}) == bad
 
 
@@ -67,21 +67,21 @@ def test_many_bad_rows_are_counted_and_the_first_five_named():
     t = T.copy()
     t[2::3] = t[1::3]
     with pytest.warns(LogWarning, match=r"20 of 60 rows .*rows 3, 6, 9, 12, 15, …\)"):
-        assert kept_rows("log", t, "time", None).size == 40
+        assert rows_to_use("log", t, "time", None).size == 40
 
 
 @pytest.mark.parametrize("case", [name for name in ONE_BAD if name != "missing"])
 def test_a_bad_stamp_outside_the_window_is_no_matter(case):
     t, bad = ONE_BAD[case]
     low = T[max(bad) + 1]
-    rows = kept_rows("log", t, "time", (low, 14.0))
+    rows = rows_to_use("log", t, "time", (low, 14.0))
     np.testing.assert_array_equal(rows, np.flatnonzero((low <= T) & (T <= 14.0)))
 
 
 def test_a_missing_stamp_inside_the_window_is_told_and_one_outside_is_not():
     t = changed(r5=NAN, r30=NAN)
     with pytest.warns(LogWarning, match=r"1 of 17 rows .*row 31\)"):
-        rows = kept_rows("log", t, "time", (6.0, 10.0))
+        rows = rows_to_use("log", t, "time", (6.0, 10.0))
     assert rows.tolist() == [k for k in range(24, 41) if k != 30]
 
 
@@ -89,10 +89,10 @@ def test_an_empty_window_is_told_with_the_range_there_is():
     for window in ((15.0, 20.0), (-5.0, -1.0)):
         words = r"wanted at least 4 samples between .* from the first stamp, got .; the log goes from 0 to 14.75 s"
         with pytest.raises(LogError, match=words):
-            kept_rows("log", T, "time", window)
+            rows_to_use("log", T, "time", window)
     for window in ((3.0, 3.0), (4.0, 1.0), (NAN, 1.0)):
         with pytest.raises(LogError, match="window: wanted FROM below TO"):
-            kept_rows("log", T, "time", window)
+            rows_to_use("log", T, "time", window)
 
 
 @pytest.mark.parametrize("second", [T, T[:20], T + 0.01, T[:20] + 0.01, 3.0 + T])
@@ -101,18 +101,18 @@ def test_two_logs_in_one_file_are_not_mixed(second, order):
     t = np.concatenate([T, second][::order])
     row = (T if order == 1 else second).size
     with pytest.raises(LogError, match=f"the clock was set back at row {row + 1}, from .*--window"):
-        kept_rows("log", t, "time", None)
+        rows_to_use("log", t, "time", None)
 
 
 def test_a_part_before_the_clock_is_set_back_can_be_chosen():
     t = np.concatenate([T, 10.0 + T])
-    np.testing.assert_array_equal(kept_rows("log", t, "time", (0.0, 9.9)), np.arange(40))
+    np.testing.assert_array_equal(rows_to_use("log", t, "time", (0.0, 9.9)), np.arange(40))
 
 
 def test_a_log_without_times_is_refused():
     for t in (np.full(20, NAN), np.full(20, 3.0), T[:3], np.zeros(0)):
         with pytest.raises(LogError, match=r"are repeated, backward or missing|at least 4 samples"):
-            kept_rows("log", t, "time", None)
+            rows_to_use("log", t, "time", None)
 
 
 @pytest.mark.parametrize(

@@ -180,7 +180,7 @@ def test_steps_take_readings_of_one_number():
     record = identify.Recording([0.0, 0.1], (Speed(), [1.0, 1.0]))
     model = records.known(record)
     first = identify.first_belief(model, state=rj.Spin([0.0, 0.0, 1.1]), rate=0.1)
-    seen, gap = (identify.step(model, first, 0.0, 1.0, seen=[seen]) for seen in (True, False))
+    seen, gap = (identify.step(model, first, 0.0, 1.0, mask=[seen]) for seen in (True, False))
     np.testing.assert_allclose(gap.state.omega, first.state.omega, rtol=1e-15)
     np.testing.assert_allclose(seen.state.omega, [0.0, 0.0, 1.05], rtol=1e-14)
     np.testing.assert_allclose(seen.deviation, [0.1, 0.1, 0.1 / 2**0.5], rtol=1e-14)
@@ -237,7 +237,7 @@ def test_a_gap_is_followed_in_steps_that_the_rate_asks_for():
     for k in range(0, 92):
         readings = (reading.values[k] for reading in record.readings)
         flags = [bool(reading.mask[k] & seen[k]) for reading in record.readings]
-        belief = identify.step(model, belief, record.t[k], *readings, seen=flags)
+        belief = identify.step(model, belief, record.t[k], *readings, mask=flags)
     np.testing.assert_allclose(found.states.q[21], belief.state.q, atol=1e-7)
     np.testing.assert_allclose(found.belief.deviation[21], belief.deviation, rtol=1e-5)
 
@@ -264,7 +264,7 @@ def test_a_channel_at_its_full_scale_is_left_out(tumbling):
     rest = [(r.sensor, r.values) for r in record.readings[1:]]
     limited = identify.Recording(record.t, (gyro, clipped), *rest)
     found = identify.filter(records.known(limited, model.process), first)
-    np.testing.assert_array_equal(found.readings[0].seen, ~full)
+    np.testing.assert_array_equal(found.readings[0].mask, ~full)
     assert found.words == "followed"
     told = identify.Recording(record.t, (identify.Gyro(1e-4), clipped), *rest)
     with pytest.raises(ValueError, match=r"lost|broken"):
@@ -470,8 +470,8 @@ class TestBadInput:
             ValueError, match=r"readings: wanted one for each sensor \(Gyro\), got 0"
         ):
             identify.step(self.model, self.start(), 0.1)
-        with pytest.raises(ValueError, match=r"seen: wanted one for each sensor \(Gyro\), got 2"):
-            identify.step(self.model, self.start(), 0.1, jnp.zeros(3), seen=[True, False])
+        with pytest.raises(ValueError, match=r"mask: wanted one for each sensor \(Gyro\), got 2"):
+            identify.step(self.model, self.start(), 0.1, jnp.zeros(3), mask=[True, False])
 
     def test_several_recordings(self):
         model = records.known([self.record, self.record])

@@ -10,7 +10,7 @@ from once import once
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.filtering.steps import Extended, dynamics_of
+from rigidjax.identify.filtering.steps import ExtendedState, dynamics_of
 from rigidjax.motion.manifold import minus, plus
 
 COUNT = 5
@@ -84,7 +84,7 @@ def test_it_knows_more_than_the_filter(short):
     sizes = [np.linalg.slogdet(run.belief.root[0])[1] for run in (found, passed)]
     assert sizes[0] < sizes[1] - 1
     assert found.change < 1e-9 and found.words == "followed"
-    assert isinstance(found.belief.x, Extended)
+    assert isinstance(found.belief.x, ExtendedState)
 
 
 def test_a_torque_that_is_not_in_the_equations_is_seen():

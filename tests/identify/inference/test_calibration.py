@@ -99,7 +99,7 @@ def test_the_truth_lies_anywhere_among_the_draws_and_in_as_many_intervals_as_sai
         # too full in each, and so in the histogram of the ranks.
         found = identify.refit(density(ts, read, law, directions), key=jax.random.fold_in(key, 1))
         ranks.append(rank(found, start, real))
-        effective.append(float(found.effective))
+        effective.append(float(found.effective_count))
     whole = np.asarray(effective) > 100
     print(
         f"{scene}: {whole.mean():.3f} with 100 independent draws, median {np.median(effective):.0f}"

@@ -16,7 +16,7 @@ import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.answer.answers import Answer
 from rigidjax.identify.filtering.terms import curvature
-from rigidjax.identify.model.terms import blocks
+from rigidjax.identify.model.terms import errors_and_jacobians
 from rigidjax.identify.uncertainty.covariance import linearise
 
 # The places of the initial rate among the free numbers of `model`.
@@ -43,7 +43,7 @@ def fitted():
         model(), at, covariance, covariance, "", noises, (), 0.0, 1, 1.0, 1.0,
         jnp.ones(5), nothing, (), Answer("found"),
         Answer("explains the readings"), (),
-        linear=linearise(model(), at, noises, blocks(model(), at)),
+        linear=linearise(model(), at, noises, errors_and_jacobians(model(), at)),
     )  # fmt: skip
 
 
@@ -213,7 +213,7 @@ def test_a_noise_that_is_unknown_moves_no_other_number(fitted):
         at = at.at[other.slots[0].shared[0]].set(jnp.array([1.0, -1.0, 0.5]))
         covariance = 1e-4 * jnp.eye(8)
         found = dataclasses.replace(
-            fitted, model=other, x=at, covariance=covariance, seen=covariance,
+            fitted, model=other, x=at, covariance=covariance, determined_covariance=covariance,
             singular_values=jnp.ones(8), null_directions=jnp.zeros((0, 8)),
         )  # fmt: skip
         with_one = identify.LogDensity(found, rj.torques.RandomTorque(1e-4), deviation=None)
@@ -236,7 +236,7 @@ def test_the_gradient_with_a_process_is_right_recording_by_recording(fitted):
     size = at.size
     covariance = 1e-4 * jnp.eye(size)
     found = dataclasses.replace(
-        fitted, model=both, x=at, covariance=covariance, seen=covariance,
+        fitted, model=both, x=at, covariance=covariance, determined_covariance=covariance,
         noises=(jnp.full((2, 3), 0.02),), singular_values=jnp.ones(size),
         null_directions=jnp.zeros((0, size)),
     )  # fmt: skip
@@ -267,7 +267,7 @@ def test_any_sampler_will_do(fitted):
     assert (drawn.rhat < 1.01).all() and (np.abs(drawn.ess / 2000 - 1) < 0.3).all()
     assert drawn.points.body.tensor.shape == (4, 500, 3, 3)
     # A draw's moments are roots of its own tensor, which those of a batch of bodies are not.
-    moments = drawn.of(lambda point: point.body.moments)
+    moments = drawn.map(lambda point: point.body.moments)
     one = np.linalg.eigvalsh(drawn.points.body.tensor[2, 7])
     np.testing.assert_allclose(moments[2, 7], one, rtol=1e-9)
 
@@ -277,7 +277,7 @@ def test_chains_of_many_recordings_are_those_of_their_keys_too(fitted):
     at = many.start(records.BODY)
     covariance = jnp.diag(jnp.linspace(1e-4, 1e-2, 26))
     found = dataclasses.replace(
-        fitted, model=many, x=at, covariance=covariance, seen=covariance,
+        fitted, model=many, x=at, covariance=covariance, determined_covariance=covariance,
         noises=(jnp.full((8, 3), 0.02),), singular_values=jnp.ones(26),
         null_directions=jnp.zeros((0, 26)),
     )  # fmt: skip
@@ -343,7 +343,7 @@ def test_several_bodies_go_to_arviz_by_name(fitted):
     covariance = 1e-4 * jnp.eye(size)
     noises = (jnp.full((2, 3), 0.02),)
     found = dataclasses.replace(
-        fitted, model=both, x=at, covariance=covariance, seen=covariance, noises=noises,
+        fitted, model=both, x=at, covariance=covariance, determined_covariance=covariance, noises=noises,
         singular_values=jnp.ones(size), null_directions=jnp.zeros((0, size)),
     )  # fmt: skip
     density = identify.LogDensity(found)
@@ -432,7 +432,7 @@ def test_weighted_draws_stand_for_the_density(fitted):
     # Nearly normal here: the draws have the mean and the covariance of the curvature.
     density = identify.LogDensity(fitted)
     found = identify.refit(density, draws=4000, key=jax.random.key(1))
-    assert found.draws.shape == (4000, density.size) and found.effective > 1500
+    assert found.draws.shape == (4000, density.size) and found.effective_count > 1500
     np.testing.assert_allclose(found.weights.sum(), 1.0)
     # Each weight is as large as the density over that of the t, whose logarithm is written out.
     root = 1.2 * np.linalg.cholesky(found.covariance)

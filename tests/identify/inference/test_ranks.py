@@ -39,7 +39,7 @@ def drawn_body(key):
     line = cell * jnp.arange(-150.0, 150.0)
     centre = identify.Model(record(np.ones((TS.size, 3))), CHART).start(PRIOR.guess)
     points = centre[:2][None] + jnp.stack(jnp.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    log = jax.vmap(lambda x: -0.5 * jnp.sum(PRIOR.residuals(CHART.body(x), scaled=False) ** 2))
+    log = jax.vmap(lambda x: -0.5 * jnp.sum(PRIOR.residuals(CHART.body(x), to_scale=False) ** 2))
     # Of the numbers of a body those whose root has no negative eigenvalue: a flat body, which the
     # prior forbids, is between these and the others.
     inside = (points > -1.0).all(axis=1) & (points.sum(axis=1) < 1.0)
@@ -109,7 +109,7 @@ def test_the_truth_has_any_rank_among_draws_by_nuts(process):
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
             found = identify.posterior(density, mine[2], sampler=SAMPLER, chains=2)
         effective.append(float(jnp.min(found.ess)))
-        draws = found.of(numbers)
+        draws = found.map(numbers)
         # 99 draws: 100 ranks.
         few = {name: np.concatenate(np.asarray(d)[:, ::THIN])[1:] for name, d in draws.items()}
         ranks.append({name: np.sum(d < np.asarray(truth[name]), axis=0) for name, d in few.items()})
