@@ -215,7 +215,7 @@ def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
 
     def refuse(i: int) -> None:
         try:
-            Inertia(np.asarray(tensors)[i]).invertible()
+            Inertia(np.asarray(tensors)[i]).require_invertible()
         except ValueError as error:
             raise ValueError(f"bodies: {error}; this is body {i}") from None
 

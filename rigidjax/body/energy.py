@@ -161,7 +161,7 @@ def ellipsoid(
         second_moments, q = principal(solid.second_moment)
         return jnp.sqrt(5.0 * second_moments / solid.mass), q
     one = _checks.require_single(body, (Inertia, MassProperties), "body", hint=_HINT)
-    moments, q = Inertia(tensor_of(one)).invertible().principal()
+    moments, q = Inertia(tensor_of(one)).require_invertible().principal()
     wanted = "a number ≥ 0, J" if kind == "energy" else "a number ≥ 0, kg m²/s"
     size = _checks.require_sign(_checks.array_of_shape(size, (), "size"), "size", wanted, zero=True)
     return (jnp.sqrt(2.0 * size / moments) if kind == "energy" else size / moments), q

@@ -43,7 +43,7 @@ class Inertia(eqx.Module):
     **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor checks shape and dtype only;
     `from_tensor`, `from_principal`, `from_second_moment`, and every function that takes a body,
     check that some mass has this inertia. `scale` "arbitrary" if only the ratios of the components
-    are known, as after a fit of free motion: `simulate` then warns of torques, and `shifted` raises
+    are known, as after a fit of free motion: `simulate` then warns of torques, and `shift` raises
     `ValueError`.
 
     The object stores I, not 𝔖: `from_tensor` changes no digit, and the small moment of a rod keeps
@@ -129,14 +129,14 @@ class Inertia(eqx.Module):
         """
         return principal(self.tensor)
 
-    def shifted(self, r: Vector, mass: ScalarLike) -> "Inertia":
+    def shift(self, r: Vector, mass: ScalarLike) -> "Inertia":
         """Return the inertia about a point away from the centre of mass: `I + m (|r|² 1 − r rᵀ)`.
 
         **Arguments:** `self` is about the centre of mass; `r` (3,) from the centre of mass to the
         new point, or back, m, body frame; `mass` kg; a negative mass undoes a shift. Source:
         Steiner; Landau and Lifshitz, eq 32.12.
 
-        >>> Inertia.from_principal(1.0, 1.0, 1.0).shifted([0.0, 0.0, 2.0], 3.0).moments
+        >>> Inertia.from_principal(1.0, 1.0, 1.0).shift([0.0, 0.0, 2.0], 3.0).moments
         Array([ 1., 13., 13.], dtype=float64)
         """
         r, m = (
@@ -144,23 +144,23 @@ class Inertia(eqx.Module):
             _checks.array_of_shape(mass, (), "mass"),
         )
         if self.scale is not None:
-            raise ValueError("shifted: wanted an inertia in kg m², got one of arbitrary scale")
+            raise ValueError("shift: wanted an inertia in kg m², got one of arbitrary scale")
         return Inertia(self.tensor + swap_trace(m * outer(r, r)))
 
-    def rotated(self, q: Quaternion) -> "Inertia":
+    def rotate(self, q: Quaternion) -> "Inertia":
         """Return the inertia of the turned body, or of the body in other axes: `R(q) I R(q)ᵀ`.
 
         **Arguments:** `q` (4,) unit quaternion (w, x, y, z), active: the mass at `r` moves to `R(q)
         r`. With q body → world the result is the inertia in world axes.
 
         >>> half = 0.5**0.5
-        >>> Inertia.from_principal(1.0, 2.0, 2.5).rotated([half, 0, 0, half]).tensor[0, 0]
+        >>> Inertia.from_principal(1.0, 2.0, 2.5).rotate([half, 0, 0, half]).tensor[0, 0]
         Array(2., dtype=float64)
         """
         m = quaternion.to_matrix(validation.attitude_quaternion(q))
         return Inertia(product(m, product(self.tensor, m.T)), self.scale)
 
-    def invertible(self) -> "Inertia":
+    def require_invertible(self) -> "Inertia":
         """Return `self`. **Raises:** `ValueError` if a moment is zero: Euler's equations divide by
         the moments.
         """
@@ -219,7 +219,7 @@ class MassProperties(eqx.Module):
         """Return the inertia about the centre of mass, body axes."""
         return Inertia(swap_trace(self.second_moment))
 
-    def checked(self) -> "MassProperties":
+    def check(self) -> "MassProperties":
         """Return an equal body whose values are checked, also under `jit`. **Raises:** as the
         constructor.
         """
@@ -229,7 +229,7 @@ class MassProperties(eqx.Module):
             validation.require_real_second_moment(self.second_moment),
         )
 
-    def invertible(self) -> "MassProperties":
+    def require_invertible(self) -> "MassProperties":
         """Return `self`. **Raises:** `ValueError` if a moment about the centre of mass is zero."""
         return validation.check_body(self, self.inertia.tensor, self.mass, throw=True)
 
@@ -256,22 +256,22 @@ class MassProperties(eqx.Module):
         """
         return Inertia(swap_trace(self.second_moment_about(point)))
 
-    def shifted(self, r: Vector) -> "MassProperties":
+    def shift(self, r: Vector) -> "MassProperties":
         """Return the body shifted by `r` (3,), m, in its own axes: only its centre of mass changes.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
-        >>> body.shifted([0.0, 1.0, 0.0]).com
+        >>> body.shift([0.0, 1.0, 0.0]).com
         Array([1., 1., 0.], dtype=float64)
         """
         com = self.com + _checks.array_of_shape(r, (3,), "r")
         return MassProperties(self.mass, com, self.second_moment)
 
-    def rotated(self, q: Quaternion) -> "MassProperties":
+    def rotate(self, q: Quaternion) -> "MassProperties":
         """Return the body turned about its origin by `q` (4,), unit, active: `c → R c`, `𝔖 → R 𝔖
         Rᵀ`.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
-        >>> body.rotated([0.0, 0, 0, 1]).com
+        >>> body.rotate([0.0, 0, 0, 1]).com
         Array([-1.,  0.,  0.], dtype=float64)
         """
         m = quaternion.to_matrix(validation.attitude_quaternion(q))
@@ -283,7 +283,7 @@ class MassProperties(eqx.Module):
         ca`.
 
         >>> part = MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
-        >>> (part + part.shifted([2.0, 0, 0])).second_moment[0, 0]
+        >>> (part + part.shift([2.0, 0, 0])).second_moment[0, 0]
         Array(4., dtype=float64)
         """
         if not isinstance(other, MassProperties):
@@ -300,7 +300,7 @@ class MassProperties(eqx.Module):
         **Raises:** `ValueError` if the part has more mass than the body.
 
         >>> part = MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
-        >>> ((part + part.shifted([2.0, 0, 0])) - part).com
+        >>> ((part + part.shift([2.0, 0, 0])) - part).com
         Array([2., 0., 0.], dtype=float64)
         """
         if not isinstance(other, MassProperties):

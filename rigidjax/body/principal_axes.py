@@ -164,20 +164,20 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     unit = times_power_of_two(jnp.ones((), a.dtype), exponent_of(a) - 1)
     a = 0.5 * (a + a.T) / unit
 
-    def scaled(value):
+    def scaled_function(value):
         return _checks.array_of_shape(function(unit * value), (), "function(λ)", hint="one number")
 
     values, axes = eigensystem(jax.lax.stop_gradient(a))
     change = product(axes.T, product(a - jax.lax.stop_gradient(a), axes))
     close = _CLOSE * jnp.max(jnp.abs(values))
     x, y = values[np.array(_PAIRS)].T
-    first = jax.vmap(lambda x, y: _divided_difference(scaled, x, y, close))(x, y)[_PAIR]
+    first = jax.vmap(lambda x, y: _divided_difference(scaled_function, x, y, close))(x, y)[_PAIR]
     x, y, z = values[np.array(_TRIPLES)].T
-    second = jax.vmap(lambda x, y, z: _second_divided_difference(scaled, x, y, z, close))(x, y, z)[
-        _TRIPLE
-    ]
+    second = jax.vmap(lambda x, y, z: _second_divided_difference(scaled_function, x, y, z, close))(
+        x, y, z
+    )[_TRIPLE]
     bent = second * change[:, :, None] * change[None, :, :]
-    inner = jnp.diag(jax.vmap(scaled)(values)) + first * change + bent.sum(axis=1)
+    inner = jnp.diag(jax.vmap(scaled_function)(values)) + first * change + bent.sum(axis=1)
     return product(axes, product(inner, axes.T))
 
 

@@ -2,7 +2,7 @@
 
 Each function takes the mass and then the dimensions, and is differentiable in all of them. It
 raises `ValueError` for a mass ≤ 0 or a negative length. Every shape has its **centre of mass at the
-origin** and its axis of symmetry, if it has one, along z. Place it with `.rotated` and `.shifted`,
+origin** and its axis of symmetry, if it has one, along z. Place it with `.rotate` and `.shift`,
 join bodies with `+`, cut away with `-`. For a density use `rigidjax.volumes`:
 `box(density * volumes.box(size), size)`.
 

@@ -62,16 +62,16 @@ def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
 def swap_trace(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Return `Tr(A) 1 − A` without the cancellation: `[A22 + A33, −A12, …]` (notes, eqs 76–78)."""
     x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
-    return _negative(a, jnp.stack([y + z, z + x, x + y], axis=-1))
+    return _negate(a, jnp.stack([y + z, z + x, x + y], axis=-1))
 
 
 def swap_trace_back(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Return `½ Tr(A) 1 − A`, the inverse of `swap_trace`."""
     x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
-    return _negative(a, 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1))
+    return _negate(a, 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1))
 
 
-def _negative(a: Array, diagonal: Array) -> Array:
+def _negate(a: Array, diagonal: Array) -> Array:
     """Return −A with this `diagonal` instead of its own."""
     eye = jnp.broadcast_to(jnp.eye(3, dtype=bool), a.shape)
     return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)

@@ -422,7 +422,7 @@ def _write(
     if options.demo and figure is None and _matplotlib():
         figure = Path("toutatis.png")
 
-    def page() -> None:
+    def write_page() -> None:
         figures = _figures(fit, names, units) if figure is not None or _matplotlib() else []
         page: dict[str, Any] = {
             "title": title,
@@ -432,13 +432,13 @@ def _write(
         }
         report.write_html(fit, options.report, rate_unit=units["rate_unit"], **page)
 
-    def picture() -> None:
+    def write_picture() -> None:
         rj.plot.fit(fit, index=0, title=names[0], **units).savefig(figure, dpi=130)
 
     numbers = functools.partial(report.write_json, fit, options.json, files_read, more_rows)
     wanted = (
-        ("figure", figure, picture), ("numbers", options.json, numbers),
-        ("report", options.report, page),
+        ("figure", figure, write_picture), ("numbers", options.json, numbers),
+        ("report", options.report, write_page),
     )  # fmt: skip
     all_written = True
     for what, path, make in wanted:

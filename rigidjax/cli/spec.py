@@ -343,7 +343,7 @@ def model_of(
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {chart!r}")
     if loss not in LOSSES:
         raise LogError(f"loss: wanted one of {', '.join(LOSSES)}, got {loss!r}")
-    moving = _free_numbers(recordings[0].sensors, input_names(wheels), typical, free)
+    moving = _declared_free_numbers(recordings[0].sensors, input_names(wheels), typical, free)
     return Model(
         list(recordings),
         MODELS[chart](typical),
@@ -353,7 +353,7 @@ def model_of(
     )
 
 
-def _free_numbers(
+def _declared_free_numbers(
     sensors: Sequence[AbstractSensor], wheels: Sequence[str], typical: float, free: Sequence[str]
 ) -> list[Free]:
     """Return the `Free`s of the sensors and of the torque of `_torque_of_wheels`.

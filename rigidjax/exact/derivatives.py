@@ -81,13 +81,18 @@ def _flow_jvp(primals, tangents):
 
 
 def _variables(primals, tangents):
-    """Return `reciprocal` and `inputs_of`, each with its change along `tangents`."""
+    """Return `reciprocal` and `derivative_variables`, each with its change along `tangents`."""
     parts, changes = jax.jvp(reciprocal, primals[:2], tangents[:2])
-    return parts, changes, inputs_of(parts, *primals[1:]), inputs_of(changes, *tangents[1:])
+    return (
+        parts,
+        changes,
+        derivative_variables(parts, *primals[1:]),
+        derivative_variables(changes, *tangents[1:]),
+    )
 
 
 def _change_along(motion, rows, change):
-    """Return the change of Π, the turn and Ω (`motion`) as `inputs_of` move by `change`."""
+    """Return the change of Π, the turn and Ω (`motion`) by a `change` of the variables."""
     out, theta, rate = (tuple(jnp.sum(row * change) for row in three) for three in rows)
     return out, half_product(motion[1], theta), rate
 
@@ -169,7 +174,10 @@ def _moments_and_momentum(tensor: Mat3, omega: Vec3, s: MotionConstants) -> tupl
 
 @one_kernel
 def _input_derivatives(body: Float[Array, "12"], s: MotionConstants) -> Float[Array, "9 12"]:
-    """Return the derivatives of `inputs_of` by `body`: nine entries of the tensor, then Ω(0)."""
+    """Return the derivatives of `derivative_variables` by `body`.
+
+    `body` holds the nine entries of the tensor, then Ω(0).
+    """
     tensor, omega, axes = body[:9].reshape(3, 3), body[9:], s.axes
     moments, momentum = _moments_and_momentum(tensor, omega, s)
     # δK = −K δI K in principal axes: −BᵀδI B with B = A K. A batch of sums, not of products of
@@ -188,7 +196,7 @@ def _input_derivatives(body: Float[Array, "12"], s: MotionConstants) -> Float[Ar
 
 @one_kernel
 def _body_motion_and_derivatives(tensor: Mat3, omega: Vec3, s: MotionConstants, t: Scalar):
-    """Return Ω(t) and the turn in body axes, and their derivatives by `inputs_of`."""
+    """Return Ω(t) and the turn in body axes, and their derivatives by `derivative_variables`."""
     moments, momentum = _moments_and_momentum(tensor, omega, s)
     (_, (w, *axis), rate), rows, _ = motion_and_derivatives(moments, momentum, t)
     rate = combine_columns(s.axes, rate)
@@ -199,7 +207,7 @@ def _body_motion_and_derivatives(tensor: Mat3, omega: Vec3, s: MotionConstants, 
 
 
 class MotionDerivatives(NamedTuple):
-    """Hold the derivatives of Π(t), θ and Ω(t) by `inputs_of`, three rows of ten each."""
+    """Hold the derivatives of Π(t), θ, Ω(t) by `derivative_variables`: three rows of ten each."""
 
     momentum: Triple
     theta: Triple
@@ -276,7 +284,7 @@ def _derivative_columns(
     return MotionDerivatives(*jax.vmap(column)(jnp.eye(10, dtype=t.dtype), rows))
 
 
-def inputs_of(parts, momentum: Triple, t: Scalar) -> Float[Array, "10"]:
+def derivative_variables(parts, momentum: Triple, t: Scalar) -> Float[Array, "10"]:
     """Return d12, d23, k12, k13, k23, Π(0), k33, t, the variables of all derivatives.
 
     `parts`: of `reciprocal`, or their change. k33 is the least of K: a rod's thickness moves d12
@@ -288,7 +296,7 @@ def inputs_of(parts, momentum: Triple, t: Scalar) -> Float[Array, "10"]:
 
 @one_kernel
 def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
-    """Return the result of `flow`, d(Π(t) − Π(0)) by `inputs_of`, and G = ∫ Π Πᵀ dt.
+    """Return the result of `flow`, d(Π(t) − Π(0)) by `derivative_variables`, and G = ∫ Π Πᵀ dt.
 
     `o`: the constants of the motion.
     """

@@ -77,7 +77,7 @@ class InFrame(AbstractScene):
         return {"jacobi": frame.jacobi_integral(state, t, v)}
 
 
-def scene_of(force: object) -> AbstractScene:
+def scene_of_force(force: object) -> AbstractScene:
     """Return the scene that `simulate` solves, made from a scene, a moving frame or a plain
     force.
     """

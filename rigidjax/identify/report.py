@@ -104,9 +104,9 @@ def _place(number: float) -> int:
     return int(np.floor(np.log10(abs(number)))) if number else 0
 
 
-def _interval_as_text(shown: list[str]) -> str:
+def _interval_as_text(texts: list[str]) -> str:
     """Return the interval as text from the result of `numbers`: "not determined" for NaN."""
-    return "not determined" if "nan" in shown[1:] else f"{shown[1]} … {shown[2]}"
+    return "not determined" if "nan" in texts[1:] else f"{texts[1]} … {texts[2]}"
 
 
 def verdict(fit: Fit) -> str:

@@ -110,7 +110,7 @@ class EulerEquations(eqx.Module):
             require_law(torque)
         # Traced numbers are checked when a motion is computed: on its way a fit may reach numbers
         # that no body has.
-        self.inertia = inertia.invertible() if _checks.is_known(inertia.tensor) else inertia
+        self.inertia = inertia.require_invertible() if _checks.is_known(inertia.tensor) else inertia
         # The inverse is computed once per solve: a division inside the field costs 25 times as much
         # as the rest of it.
         self.inverse = inverse(inertia.tensor)

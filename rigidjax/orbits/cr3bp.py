@@ -120,7 +120,7 @@ class ThreeBody(AbstractReversible):
     @property
     def lagrange_points(self) -> Float[Array, "5 3"]:
         """Return L1 … L5 (5, 3), rotating axes (Szebehely 1967, sec. 4.4), differentiable by μ."""
-        return richardson.points(self.mu)
+        return richardson.lagrange_points(self.mu)
 
     def hessian(self, x: Vector) -> Mat3:
         """Return the second derivatives of U (3, 3) at a place."""

@@ -14,7 +14,7 @@ from rigidjax.frames.point import Point
 from rigidjax.orbits.differential_correction import PeriodicOrbit
 
 
-def points(mu: Scalar) -> Float[Array, "5 3"]:
+def lagrange_points(mu: Scalar) -> Float[Array, "5 3"]:
     """Return L1 … L5 (5, 3) of 0 < μ ≤ ½ by Euler's quintics (Szebehely 1967, sec. 4.4), rotating
     axes.
     """
@@ -114,7 +114,7 @@ def orbit_guess(
     y_rate = k * ax + 2 * (b21 * x2 - b22 * z2) + 3 * ax * (b31 * x2 - b32 * z2)
     y_rate = y_rate + ax * (b33 * x2 + b34 * z2)
     z = az - 2 * d21 * ax * az + az * (d32 * x2 - d31 * z2)
-    centre, zero = points(mu)[point - 1, 0], jnp.zeros_like(x)
+    centre, zero = lagrange_points(mu)[point - 1, 0], jnp.zeros_like(x)
     place, speed = jnp.stack([centre + unit * x, zero, unit * z]), unit * sweep * y_rate
     return PeriodicOrbit(Point(place, jnp.stack([zero, speed, zero])), 2 * math.pi / sweep)
 

@@ -76,8 +76,8 @@ def _fill_between_samples(
 
 
 def _draw_sensor(
-    upper: Any,
-    lower: Any,
+    upper_axes: Any,
+    lower_axes: Any,
     ts: ArrayLike,
     reading: Any,
     errors: np.ndarray,
@@ -95,7 +95,7 @@ def _draw_sensor(
         back = jax.vmap(lambda q, e: quaternion.multiply(q, quaternion.exp(-e)))
         line = _long_axis(back(jnp.asarray(values), jnp.asarray(errors)))
         names = tuple(f"{axis} of body z" for axis in "xyz")
-        upper.set_ylabel("body z axis in world axes")
+        upper_axes.set_ylabel("body z axis in world axes")
         unit = "deg (body axes)"
         if dense_states is not None:
             line_t, line = dense_states[0] / seconds, _long_axis(dense_states[1].q)
@@ -105,20 +105,22 @@ def _draw_sensor(
         whole = errors.shape == values.shape
         read = values * scale if sensor.unit != "rad" else values
         line = (values - errors) * scale if whole else None
-        upper.set_ylabel("body rate, " + unit if sensor.unit == "rad/s" else f"reading, {unit}")
+        upper_axes.set_ylabel(
+            "body rate, " + unit if sensor.unit == "rad/s" else f"reading, {unit}"
+        )
         bare = getattr(sensor, "bias", None) is None and getattr(sensor, "scale", None) is None
         if dense_states is not None and sensor.unit == "rad/s" and bare:
             line_t, line = dense_states[0] / seconds, np.asarray(dense_states[1].omega) * scale
-    lower.set_ylabel(f"error, {unit}")
+    lower_axes.set_ylabel(f"error, {unit}")
     many = seen.sum() > 100
     mark: dict[str, Any] = {"marker": "." if many else "o", "ls": "", "ms": 2 if many else 5}
     for axis, (name, colour) in enumerate(zip(names, COLOURS, strict=False)):
         if line is not None:
             whole = slice(None) if line_t is not t else seen
-            upper.plot(line_t[whole], line[whole, axis], color=colour, lw=1.2, label=name)
-        upper.plot(t[seen], read[seen, axis], color=colour, alpha=0.6, **mark)
+            upper_axes.plot(line_t[whole], line[whole, axis], color=colour, lw=1.2, label=name)
+        upper_axes.plot(t[seen], read[seen, axis], color=colour, alpha=0.6, **mark)
         if axis < errors.shape[1]:
-            lower.plot(t[seen], errors[seen, axis] * scale, color=colour, alpha=0.7, **mark)
+            lower_axes.plot(t[seen], errors[seen, axis] * scale, color=colour, alpha=0.7, **mark)
 
 
 def _long_axis(q: ArrayLike) -> np.ndarray:

@@ -75,7 +75,7 @@ def polhode(
         states, HasSpin, "states", requirement="a Spin, an Attitude or a Rigid"
     )
     energies = _checks.integer(energies, "energies", 0)
-    moments, q = inertia.invertible().principal()
+    moments, q = inertia.require_invertible().principal()
     i = np.asarray(moments, dtype=float)
     turn = style.rotation_matrices(np.asarray(q, dtype=float)[None])[0]
     omega = rows_on_host(states.omega, 3, "states.omega")

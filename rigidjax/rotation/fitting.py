@@ -85,7 +85,7 @@ def wahba(
     """
     body = _checks.array_of_rows(body, (3,), "body")
     world = _checks.array_of_shape(world, body.shape, "world")
-    w = weights_of(weights, body[:, 0], "body")
+    w = checked_weights(weights, body[:, 0], "body")
     for name, rows in (("body", body), ("world", world)):
         require_direction(rows.reshape(-1), name)
     w, world, body = (scale_to_order_one(x) for x in (w, world, body))
@@ -181,7 +181,7 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
     """
     matrices = _checks.array_of_rows(matrices, (3, 3), "matrices")
     _checks.check_if_known(require_rotation_matrix, matrices, "matrices")
-    weights_of(weights, matrices[:, 0, 0], "matrices")
+    checked_weights(weights, matrices[:, 0, 0], "matrices")
     return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
 
 
@@ -198,7 +198,7 @@ def mean_quaternion(
     """
     q = _checks.array_of_rows(quaternions, (4,), "quaternions")
     _checks.check_if_known(require_unit_quaternion, q, "quaternions")
-    return _karcher(q, scale_to_order_one(weights_of(weights, q[:, 0], "quaternions")))
+    return _karcher(q, scale_to_order_one(checked_weights(weights, q[:, 0], "quaternions")))
 
 
 # Compiled once: outside of `jit` the loop would be compiled again at each call.
@@ -230,7 +230,7 @@ def scale_to_order_one(x: Array) -> Array:
     return power_of_two_scale(jnp.max(jnp.abs(x))) * x
 
 
-def weights_of(weights: ArrayLike | None, rows: Array, description: str) -> Array:
+def checked_weights(weights: ArrayLike | None, rows: Array, description: str) -> Array:
     """Return one weight for each row of `rows`, 1 where `weights` is `None`; known weights must
     have a positive sum.
     """

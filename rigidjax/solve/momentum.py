@@ -19,7 +19,7 @@ from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of
 from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
 from rigidjax.motion.torques import ChangingInertia, Sum
 from rigidjax.motion.torques.base import in_precision
-from rigidjax.motion.torques.composite import parts_of, real_or_nan
+from rigidjax.motion.torques.composite import parts_of, tensor_or_nan
 from rigidjax.motion.torques.states import freeze
 from rigidjax.rotation.linalg3 import apply, solve
 
@@ -33,7 +33,7 @@ class _Changing(eqx.Module):
     def __call__(self, t: ScalarLike, y: Any, args: object = None) -> Any:
         dtype = y.omega.dtype
         body, law = in_precision(self.body, dtype), in_precision(self.law, dtype)
-        now = real_or_nan(law.tensor(jnp.asarray(t, dtype)).astype(dtype))
+        now = tensor_or_nan(law.tensor(jnp.asarray(t, dtype)).astype(dtype))
         kind: Any = AttitudeEquations if isinstance(y, Attitude) else EulerEquations
         kind = NewtonEuler if isinstance(body, MassProperties) else kind
         slope = kind(with_tensor(body, now), law.torque)(t, y)

@@ -18,7 +18,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import AbstractScene, MovingFrame, Point
-from rigidjax.frames.frame_dynamics import scene_of
+from rigidjax.frames.frame_dynamics import scene_of_force
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of, with_own_states
 from rigidjax.motion.equations import (
@@ -121,7 +121,7 @@ def equations_of_motion(
         return CoupledEquations(equations_of_motion(body, state0.motion, torque), body)
     validation.require_fit(body, state0, torque)
     if isinstance(state0, Point):
-        return scene_of(torque).field
+        return scene_of_force(torque).field
     kind: Any = EulerEquations
     if isinstance(body, MassProperties):
         kind = NewtonEuler
@@ -169,7 +169,7 @@ def solve(
     else:
         # With the states of the torque, where it has some.
         state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
-        scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
+        scene: Any = scene_of_force(setup.torque) if isinstance(state0, Point) else None
         watch = Ends(scene) if hasattr(scene, "ends") else None
         ys, stats, result, end = _integrated(setup, watch, state0, ts)
         if setup.throw:

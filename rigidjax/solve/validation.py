@@ -14,7 +14,7 @@ from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.validation import check_body
 from rigidjax.frames import AbstractScene, BodyInFrame, MovingFrame, Point
-from rigidjax.frames.frame_dynamics import scene_of
+from rigidjax.frames.frame_dynamics import scene_of_force
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.torques import ChangingInertia, GravityGradient
 from rigidjax.motion.torques.base import require_state_type
@@ -50,7 +50,7 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
             f"{type(state0).__name__}; frames.BodyInFrame is for a body in a moving frame"
         )
     if isinstance(state0, Point):
-        scene_of(torque)
+        scene_of_force(torque)
     if torque is not None and not isinstance(torque, AbstractScene | MovingFrame):
         require_state_type(torque, state0)
         _require_one_frame(torque)

@@ -54,7 +54,7 @@ def sum_table(light: tuple[Array, ...], highest: float) -> Sums:
 def _table(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
     """Return the sums `window` and `data` at the frequencies `grid`."""
 
-    def one(f: Array) -> tuple[Array, Array]:
+    def sums_at(f: Array) -> tuple[Array, Array]:
         angle = 2.0 * math.pi * f * (x - 0.5)
         cos, sin = jnp.cos(angle), jnp.sin(angle)
         squares, values = w * w, w * z
@@ -63,7 +63,7 @@ def _table(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
             jax.lax.complex(jnp.sum(values * cos), jnp.sum(values * sin)),
         )
 
-    return jax.lax.map(one, grid, batch_size=BATCH)
+    return jax.lax.map(sums_at, grid, batch_size=BATCH)
 
 
 def _interpolate(table: Array, f: Array) -> Array:
@@ -102,7 +102,7 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
         half = _interpolate(values, f)
         return jnp.concatenate([jnp.conj(half[:0:-1, ::-1]), half])
 
-    def one(pair: Array) -> Array:
+    def misfit_of_pair(pair: Array) -> Array:
         window = rows(table.window, pair, 2 * FIRST, 2 * order)
         side = jnp.conj(rows(table.data, pair, FIRST, order).ravel())
         gram = window[dj, dk]
@@ -112,7 +112,7 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
         c = jax.scipy.linalg.cho_solve(factor, side)
         return table.total - jnp.real(jnp.conj(side) @ c)
 
-    return jax.lax.map(one, pairs, batch_size=BATCH)
+    return jax.lax.map(misfit_of_pair, pairs, batch_size=BATCH)
 
 
 def least_squares_remainder(rows: Array, z: Array) -> tuple[Float[Array, ""], Float[Array, " k"]]:

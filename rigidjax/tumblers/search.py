@@ -87,10 +87,12 @@ def starts_of(
     # The columns of this rotation are the body's axes in the order of ascending moments.
     turn = np.eye(3)[:, order]
     turn = turn * np.array([1.0, 1.0, np.linalg.det(turn)])
-    return [_free_numbers(model, one, turn) for one in chosen]
+    return [_free_numbers_of_candidate(model, one, turn) for one in chosen]
 
 
-def _free_numbers(model: Model, candidate: starts.Candidate, turn: np.ndarray) -> Array:
+def _free_numbers_of_candidate(
+    model: Model, candidate: starts.Candidate, turn: np.ndarray
+) -> Array:
     """Return the free numbers (n,) of a candidate; `turn` leads from principal to body axes."""
     moments = turn @ np.diag(candidate.moments) @ turn.T
     start = model.start(Inertia(jnp.asarray(moments)))
@@ -130,7 +132,7 @@ def search_from(model: Model, starts: list[Array], noise: Noise, tolerance: floa
         chunk = [starts[first + k % len(starts[first:])] for k in range(FIRST)]
         stacked = _with_best_level(jnp.stack(chunk), model)
         settings = Settings(tolerance, CAREFUL, STEPS)
-        ends = _search_from_each(stacked, model, noise, settings, np.int32(FIRST))
+        ends = _search_from_starts(stacked, model, noise, settings, np.int32(FIRST))
         points.append(ends.x)
         costs.append(np.asarray(ends.cost))
     all_points = jnp.concatenate(points)
@@ -143,12 +145,12 @@ def search_from(model: Model, starts: list[Array], noise: Noise, tolerance: floa
     best = best[:SECOND]
     rows = jnp.asarray(np.resize(best, FIRST))
     settings = Settings(tolerance, 1e-2, MORE)
-    last = _search_from_each(all_points[rows], model, noise, settings, np.int32(len(best)))
+    last = _search_from_starts(all_points[rows], model, noise, settings, np.int32(len(best)))
     return [jax.tree.map(lambda leaf, k=k: leaf[k], last) for k in range(len(best))]
 
 
 @eqx.filter_jit
-def _search_from_each(
+def _search_from_starts(
     starts: Array,
     model: Model,
     noise: Noise,
@@ -160,7 +162,7 @@ def _search_from_each(
     The slopes are finite differences: derivatives of the closed form take a hundred times as long.
     """
 
-    def one(numbered_start: tuple[Array, Array]) -> Attempt:
+    def search_from_start(numbered_start: tuple[Array, Array]) -> Attempt:
         start, number = numbered_start
 
         def errors(point: Array) -> Array:
@@ -178,7 +180,7 @@ def _search_from_each(
         end = minimise(evaluate, start, jnp.ones_like(start), mine, ())
         return Attempt(end.point, end.cost, end.converged)
 
-    return jax.lax.map(one, (starts, jnp.arange(FIRST, dtype=jnp.int32)))
+    return jax.lax.map(search_from_start, (starts, jnp.arange(FIRST, dtype=jnp.int32)))
 
 
 @eqx.filter_jit
@@ -193,7 +195,7 @@ def _with_best_level(starts: Float[Array, "starts n"], model: Model) -> Float[Ar
     sensor: Any = reading.sensor
     level = sensor.level[0]
 
-    def one(start: Array) -> Array:
+    def level_of_start(start: Array) -> Array:
         error = model.errors(start)[0][:, 0]
         mask = reading.mask[0]
         if sensor.unit == "mag":
@@ -204,4 +206,4 @@ def _with_best_level(starts: Float[Array, "starts n"], model: Model) -> Float[Ar
         step = slot.step(level, better)
         return start.at[slot.shared].set(step.reshape(jnp.asarray(slot.shared).shape))
 
-    return jax.vmap(one)(starts)
+    return jax.vmap(level_of_start)(starts)

@@ -14,7 +14,7 @@ from jaxtyping import Array, PyTree
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia
-from rigidjax.frames.frame_dynamics import scene_of
+from rigidjax.frames.frame_dynamics import scene_of_force
 from rigidjax.motion import Attitude
 from rigidjax.motion.conserved import drift
 from rigidjax.motion.equations import AttitudeEquations
@@ -143,10 +143,10 @@ def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
     """
 
     def cast(scene: BenchmarkScene, dtype: DTypeLike) -> BenchmarkScene:
-        def one(a: PyTree) -> Any:
+        def cast_leaf(a: PyTree) -> Any:
             return jnp.asarray(a, dtype) if eqx.is_inexact_array(a) else a
 
-        parts = {name: jax.tree.map(one, getattr(scene, name)) for name in _PARTS}
+        parts = {name: jax.tree.map(cast_leaf, getattr(scene, name)) for name in _PARTS}
         return dataclasses.replace(scene, **parts)
 
     low = cast(scene, jnp.float32)
@@ -162,8 +162,8 @@ def _turn(scene: BenchmarkScene) -> float:
     return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
 
 
-def _settings(scene: BenchmarkScene, method: TimedMethod, thin: int) -> list[float]:
-    settings = list(method.settings)[::-1][::thin][::-1]
+def _settings(scene: BenchmarkScene, method: TimedMethod, stride: int) -> list[float]:
+    settings = list(method.settings)[::-1][::stride][::-1]
     if method.equal:
         return [float(round(s * _turn(scene) / 50)) for s in settings]
     # A tolerance below ten units of round-off rejects every step.
@@ -219,7 +219,7 @@ def drifts(scene: BenchmarkScene, end: np.ndarray | Array) -> tuple[float, float
     NaN).
     """
     if scene.body is None:
-        law: Any = scene_of(scene.torque)
+        law: Any = scene_of_force(scene.torque)
         state: Any = scene.state0
         last = type(state)(end[:3], end[3:])
         kept = law.conserved(0.0, state), law.conserved(scene.end, last)

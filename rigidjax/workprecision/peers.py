@@ -54,8 +54,8 @@ def _peer_decorator(
     The time to import `module` is not counted.
     """
 
-    def wrapped(make: Callable[[BenchmarkScene, np.ndarray, np.ndarray, Any], Any]) -> Any:
-        def ready(scene: BenchmarkScene) -> PreparedMethod | None:
+    def decorate(make: Callable[[BenchmarkScene, np.ndarray, np.ndarray, Any], Any]) -> Any:
+        def prepare(scene: BenchmarkScene) -> PreparedMethod | None:
             if not can(scene):
                 return None
             numbers, start = (np.asarray(v) for v in (scene.numbers, scene.flatten(scene.state0)))
@@ -64,9 +64,9 @@ def _peer_decorator(
             run = make(scene, numbers, start.astype(float), loaded)
             return PreparedMethod(run, time.perf_counter() - begin)
 
-        return ready
+        return prepare
 
-    return wrapped
+    return decorate
 
 
 def _run_of_stepper(

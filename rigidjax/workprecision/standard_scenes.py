@@ -69,7 +69,7 @@ class Circle(eqx.Module):
         return self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), zero])
 
 
-def _unchanged(x: Any) -> Any:
+def _return_unchanged(x: Any) -> Any:
     return x
 
 
@@ -100,8 +100,8 @@ def _body_scene(
         sin: Callable[..., Any],
         cos: Callable[..., Any],
         sqrt: Callable[..., Any],
-        wrap: Callable[..., Any] = _unchanged,
-        number: Callable[..., Any] = _unchanged,
+        wrap: Callable[..., Any] = _return_unchanged,
+        number: Callable[..., Any] = _return_unchanged,
     ) -> Any:
         exact = tuple(number(c) for c in constants)
         torque = None
@@ -135,8 +135,8 @@ def _point_scene(
         sin: Callable[..., Any],
         cos: Callable[..., Any],
         sqrt: Callable[..., Any],
-        wrap: Callable[..., Any] = _unchanged,
-        number: Callable[..., Any] = _unchanged,
+        wrap: Callable[..., Any] = _return_unchanged,
+        number: Callable[..., Any] = _return_unchanged,
     ) -> Any:
         return wrap(kind(tuple(number(c) for c in constants), sqrt))
 

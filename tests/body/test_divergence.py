@@ -40,8 +40,8 @@ def test_it_is_the_log_determinant_divergence_of_the_four_by_four_matrix(seed):
 def test_long_thin_bodies(radius):
     """𝔖 is known to ε of its largest entry, its smallest eigenvalue to ε 𝔖₁/𝔖₃."""
     q = quaternion.exp(jnp.array([0.3, 0.5, -0.7]))
-    a = shapes.cylinder(1.1, 1.1 * radius, 1.05).rotated(q)
-    b = shapes.cylinder(1.0, radius, 1.0).rotated(q)
+    a = shapes.cylinder(1.1, 1.1 * radius, 1.05).rotate(q)
+    b = shapes.cylinder(1.0, radius, 1.0).rotate(q)
     lost = 8 * 2.2e-16 * 4 / 12 / (radius / 2) ** 2
     # From a body like it, and from a ball.
     for reference in (b, shapes.sphere(1.0, 1.0)):
@@ -74,7 +74,7 @@ def test_no_frame_and_no_unit_changes_it():
     before = divergence(a, b)
     q = np.array([0.5, 0.5, -0.5, 0.5])
     r = np.array([3.0, -2.0, 7.0])
-    moved = divergence(a.rotated(q).shifted(r), b.rotated(q).shifted(r))
+    moved = divergence(a.rotate(q).shift(r), b.rotate(q).shift(r))
     np.testing.assert_allclose(moved, before, rtol=1e-9)
 
     def in_grams_and_millimetres(x):

@@ -9,7 +9,7 @@ import rigidjax as rj
 from rigidjax.body import shapes
 from rigidjax.body.energy import ellipsoid
 
-INERTIA = rj.Inertia.from_principal(1.0, 2.0, 2.5).rotated(np.array([0.8, 0.0, 0.6, 0.0]))
+INERTIA = rj.Inertia.from_principal(1.0, 2.0, 2.5).rotate(np.array([0.8, 0.0, 0.6, 0.0]))
 
 
 def surface(semi_axes, q):
@@ -29,9 +29,9 @@ def test_every_rate_on_it_has_that_energy_or_momentum():
 
 
 def test_the_equal_ellipsoid_has_the_same_mass_properties():
-    body = shapes.box(2.0, [1.0, 2.0, 3.0]).rotated(np.array([0.8, 0.0, 0.6, 0.0]))
+    body = shapes.box(2.0, [1.0, 2.0, 3.0]).rotate(np.array([0.8, 0.0, 0.6, 0.0]))
     semi_axes, q = ellipsoid(body, "mass")
-    again = shapes.ellipsoid(2.0, semi_axes).rotated(q)
+    again = shapes.ellipsoid(2.0, semi_axes).rotate(q)
     np.testing.assert_allclose(again.second_moment, body.second_moment, rtol=1e-13, atol=1e-14)
 
 

@@ -60,7 +60,7 @@ def test_mujoco_is_read_in_the_frame_of_its_body(tmp_path):
 @pytest.mark.parametrize(("text", "name"), [(URDF, "base"), (MUJOCO, "hand")])
 def test_what_is_written_is_read_and_the_rest_stays(tmp_path, text, name):
     source, path = written(tmp_path, text), tmp_path / "new.xml"
-    body = rj.shapes.box(1.5, [0.1, 0.2, 0.3]).shifted([0.01, 0.02, 0.03])
+    body = rj.shapes.box(1.5, [0.1, 0.2, 0.3]).shift([0.01, 0.02, 0.03])
     rj.body.write_inertials(path, {name: body, "upper": body}, source)
     before, after = rj.body.read_inertials(source), rj.body.read_inertials(path)
     assert set(after) == {*before, name}

@@ -48,7 +48,7 @@ def test_a_box_anywhere_is_a_box(dtype, offsets, tolerance):
         size = float(jnp.max(box.second_moment))
         np.testing.assert_allclose(body.second_moment, box.second_moment, atol=tolerance * size)
         assert body.second_moment.dtype == dtype
-        body.checked()
+        body.check()
 
 
 def exact_mesh(corners, faces):

@@ -171,7 +171,7 @@ def test_joining_and_cutting_simple_solids_gives_the_hollow_and_joined_ones():
     np.testing.assert_allclose(sum([cut, solid(r, h)]).mass, solid(R, h).mass, rtol=1e-14)
     with pytest.raises(TypeError, match="unsupported operand"):
         cut + 1
-    stacked = solid(R, h) + solid(R, L).shifted([0.0, 0.0, (h + L) / 2])
+    stacked = solid(R, h) + solid(R, L).shift([0.0, 0.0, (h + L) / 2])
     np.testing.assert_allclose(stacked.second_moment, solid(R, h + L).second_moment, rtol=1e-13)
     np.testing.assert_allclose(stacked.com, [0, 0, L / 2], rtol=1e-13)
 

@@ -25,7 +25,7 @@ TURN = rj.quaternion.exp(jnp.array([0.3, -0.5, 0.2]))
 
 @pytest.fixture(scope="module")
 def tumble():
-    body = rj.Inertia.from_principal(*MOMENTS).rotated(TURN)
+    body = rj.Inertia.from_principal(*MOMENTS).rotate(TURN)
     ts = jnp.linspace(0.0, 12.0, 80)
     return body, ts, rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], [0.4, 1.2, -0.3]), ts).ys
 

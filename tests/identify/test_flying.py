@@ -11,7 +11,7 @@ from rigidjax import identify
 TS = jnp.linspace(0.0, 1.2, 40)
 SIGMA = 1e-3
 # The frame of the markers is not at the centre of mass: a corner load.
-TRUTH = rj.shapes.box(2.0, [0.3, 0.2, 0.1]) + rj.shapes.sphere(0.3, 0.02).shifted([0.15, 0.1, 0.0])
+TRUTH = rj.shapes.box(2.0, [0.3, 0.2, 0.1]) + rj.shapes.sphere(0.3, 0.02).shift([0.15, 0.1, 0.0])
 PLACES = ([0.15, 0.1, 0.05], [-0.15, 0.1, -0.05], [0.15, -0.1, 0.05], [-0.15, -0.1, 0.05])
 START = rj.Rigid([0.0, 1.0, 2.0], [3.0, 0.5, 4.0], [1.0, 0.0, 0.0, 0.0], [2.0, 6.0, 1.0])
 FREE_FALL = rj.torques.UniformGravity([0.0, 0.0, -9.81])

@@ -112,7 +112,7 @@ TURN = rj.quaternion.exp(jnp.array([0.15, -0.2, 0.1]))
 FEW_WRONG = {
     "one scale 5 % off": lambda: both(tumble()[0] * [1.05, 1, 1], tumble()[1]),
     "skew of 3 degrees": lambda: gyro(unlike(tumble()[0])),
-    "axes that are not principal": lambda: gyro(tumble(BODY.rotated(TURN))[0]),
+    "axes that are not principal": lambda: gyro(tumble(BODY.rotate(TURN))[0]),
     "a hit in the middle": lambda: gyro(hit()),
     "a bias left out": lambda: gyro(tumble()[0] + BIAS),
     "deg/s, a gyro alone": lambda: gyro(np.degrees(tumble(sigma=1e-3)[0]), noise=0.1),

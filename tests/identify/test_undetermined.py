@@ -81,7 +81,7 @@ def test_axes_that_turn_are_named_by_the_tensor():
 
     def tilted(model):
         def vector(angle):
-            turned = BODY.rotated(rj.quaternion.exp(angle * jnp.array([0.0, 0.0, 1.0])))
+            turned = BODY.rotate(rj.quaternion.exp(angle * jnp.array([0.0, 0.0, 1.0])))
             return chart.vector(turned)
 
         return moved(model, range(6), (vector(1e-6) - vector(0.0)) / 1e-6)

@@ -91,7 +91,7 @@ def test_the_polhode_lies_on_the_sphere_and_on_the_ellipsoid(flip):
     # Axes in another order and turned: the picture is along the ascending principal axes.
     turn = rj.quaternion.exp(jnp.array([0.3, -0.5, 0.2]))
     turned = rj.Spin(jax.vmap(lambda w: rj.quaternion.rotate(turn, w))(flip.ys.omega))
-    ax = rj.plot.polhode(BODY.rotated(turn), turned)
+    ax = rj.plot.polhode(BODY.rotate(turn), turned)
     path = np.stack(line(ax, "this motion").get_data_3d(), axis=-1)
     hidden = np.isnan(path[:, 0])
     assert 0 < hidden.sum() < len(path)

@@ -38,7 +38,7 @@ def test_bodies_take_one():
     body = rj.shapes.box(1.0, [0.3, 0.2, 0.1])
     m = ONE.as_matrix()
     wanted = m @ np.asarray(body.inertia.tensor) @ m.T
-    np.testing.assert_allclose(body.rotated(ONE).inertia.tensor, wanted, atol=1e-17)
+    np.testing.assert_allclose(body.rotate(ONE).inertia.tensor, wanted, atol=1e-17)
 
 
 def test_readings_of_an_attitude_sensor_may_be_many():

@@ -356,27 +356,27 @@ def bodies() -> list[Case]:
         ),
         Case("body.ellipsoid of mass", lambda x: rj.body.ellipsoid(body_of(x), "mass")[0], {"ordinary": TEN}, step=0.01),
         Case(
-            "Inertia.shifted",
+            "Inertia.shift",
             lambda x: (
-                rj.Inertia(symmetric(x[:6])).shifted(x[6:9], x[9]), rj.Inertia(symmetric(x[:6])).rotated(unit(x[10:])),
+                rj.Inertia(symmetric(x[:6])).shift(x[6:9], x[9]), rj.Inertia(symmetric(x[:6])).rotate(unit(x[10:])),
                 rj.Inertia(symmetric(x[:6])).second_moment,
                 rj.Inertia.from_tensor(symmetric(x[:6])).tensor,
                 rj.Inertia.from_second_moment(symmetric(x[:6])).tensor,
             ),
             # No further than what is left to a plate.
             {k: join(t, V, 1.5, Q) for k, t in TENSORS.items()}, step=2e-4,
-            covers=("Inertia.rotated", "Inertia.from_tensor", "Inertia.from_second_moment"),
+            covers=("Inertia.rotate", "Inertia.from_tensor", "Inertia.from_second_moment"),
         ),
         # The last moment is as large as a body's may be at 0, and less on both sides.
         Case("Inertia.from_principal", lambda x: rj.Inertia.from_principal(x[0], x[1], x[0] + x[1] - x[2] * x[2]), {"ordinary": [1.0, 2.0, 0.7], "plate": [1.0, 2.0, 0.0]}, step=0.01),
         Case(
             "MassProperties",
             lambda x: (
-                body_of(x[:10]).shifted(x[10:13]), body_of(x[:10]).rotated(unit(x[13:])),
-                body_of(x[:10]).inertia_about(x[10:13]), body_of(x[:10]) + body_of(x[:10]).shifted(x[10:13]),
+                body_of(x[:10]).shift(x[10:13]), body_of(x[:10]).rotate(unit(x[13:])),
+                body_of(x[:10]).inertia_about(x[10:13]), body_of(x[:10]) + body_of(x[:10]).shift(x[10:13]),
             ),
             {"ordinary": join(TEN, V, Q), "ball": join(TEN_BALL, np.zeros(3), ONE)}, step=0.01,
-            covers=("MassProperties.shifted", "MassProperties.rotated", "MassProperties.inertia_about"),
+            covers=("MassProperties.shift", "MassProperties.rotate", "MassProperties.inertia_about"),
         ),
         Case(
             "energies and momenta",

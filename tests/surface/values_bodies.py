@@ -31,11 +31,11 @@ def props(m, c, s):
 # Inertia and mass properties. A second moment that is near a plate's says what digits I has lost.
 way(
     "Inertia Inertia.second_moment Inertia.from_tensor Inertia.from_second_moment "
-    "Inertia.invertible Inertia.rotated Inertia.shifted",
+    "Inertia.require_invertible Inertia.rotate Inertia.shift",
     lambda i, s, q, r, m: (
         rj.Inertia(i), rj.Inertia(i).second_moment, rj.Inertia.from_tensor(i),
-        rj.Inertia.from_second_moment(s), rj.Inertia(i).invertible(), rj.Inertia(i).rotated(q),
-        rj.Inertia(i).shifted(r, m),
+        rj.Inertia.from_second_moment(s), rj.Inertia(i).require_invertible(), rj.Inertia(i).rotate(q),
+        rj.Inertia(i).shift(r, m),
     ),
     (v.inertia, v.second_moment, v.quaternion, v.vector, MASS),
     lambda i, s, q, r, m: (
@@ -78,12 +78,12 @@ way("body.matrix_function (exp)", lambda a: bodies.matrix_function(jnp.exp, a),
     norm=True, ulps=EIGEN)  # fmt: skip
 BODY = (MASS, v.vector, v.second_moment)
 way(
-    "MassProperties MassProperties.inertia MassProperties.checked MassProperties.invertible "
-    "MassProperties.rotated MassProperties.shifted MassProperties.inertia_about "
+    "MassProperties MassProperties.inertia MassProperties.check MassProperties.require_invertible "
+    "MassProperties.rotate MassProperties.shift MassProperties.inertia_about "
     "MassProperties.second_moment_about",
     lambda m, c, s, q, r: (
-        props(m, c, s), props(m, c, s).inertia, props(m, c, s).checked(),
-        props(m, c, s).invertible(), props(m, c, s).rotated(q), props(m, c, s).shifted(r),
+        props(m, c, s), props(m, c, s).inertia, props(m, c, s).check(),
+        props(m, c, s).require_invertible(), props(m, c, s).rotate(q), props(m, c, s).shift(r),
         props(m, c, s).inertia_about(r), props(m, c, s).second_moment_about(r),
     ),
     (*BODY, v.quaternion, v.vector),

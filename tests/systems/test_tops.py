@@ -25,7 +25,7 @@ def cosine(q):
 def test_bruels_cardona():
     # Géradin & Cardona 2001; Brüls, Cardona, Arnold 2012, Mech. Mach. Theory 48:121, at t = 1.
     com = np.array([0.0, 1.0, 0.0])
-    body = rj.Inertia.from_principal(0.234375, 0.46875, 0.234375).shifted(com, 15.0)
+    body = rj.Inertia.from_principal(0.234375, 0.46875, 0.234375).shift(com, 15.0)
     start = rj.Attitude([1.0, 0, 0, 0], [0.0, 150.0, -4.61538])
     top = torques.HeavyTop(15.0, com, DOWN)
     out = spin(body, start, top, [0.0, 0.5, 1.0])

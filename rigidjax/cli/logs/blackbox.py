@@ -66,7 +66,7 @@ def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None)
             "that is missing, or on a frame that is damaged"
         )
     return log.names, {
-        name: log.wrapped(name, np.frombuffer(numbers, float)[keep])
+        name: log.wrap_to_32_bits(name, np.frombuffer(numbers, float)[keep])
         * scales.get(name.partition("[")[0], 1.0)
         for name, numbers in rows.items()
     }
@@ -106,7 +106,7 @@ class _Flight:
         self.others = [field.name for kind in others for field in kind]
         self.names = list(dict.fromkeys([*self.main, *self.others]))
 
-    def wrapped(self, name: str, values: np.ndarray) -> np.ndarray:
+    def wrap_to_32_bits(self, name: str, values: np.ndarray) -> np.ndarray:
         """Return the values of a field as the 32-bit numbers that the flight controller had."""
         if name not in self.main or name == "time":
             return values
@@ -137,7 +137,7 @@ class _Flight:
                 lost = 0
             try:
                 if kind == self.kind.EVENT:
-                    event, numbers = self._event(stream)
+                    event, numbers = self._pass_event(stream)
                     if event == _LOG_END:
                         return
                     if event == _RESUME:
@@ -204,7 +204,7 @@ class _Flight:
                 context.field_index += 1
         return values
 
-    def _event(self, stream: _Bytes) -> tuple[int, list[int]]:
+    def _pass_event(self, stream: _Bytes) -> tuple[int, list[int]]:
         """Pass one event; return its kind (-1 for an unknown one) and its numbers."""
         event = next(stream)
         if event == _LOG_END:

@@ -42,7 +42,7 @@ from rigidjax.identify.uncertainty.quantities import (
 )
 from rigidjax.identify.uncertainty.stretches import (
     jackknife,
-    remarks as remarks_on,
+    remarks_on_stretches as remarks_on,
     stretches_of,
 )
 

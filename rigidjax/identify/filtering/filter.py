@@ -27,7 +27,7 @@ from rigidjax.identify.filtering.steps import (
 )
 from rigidjax.identify.model.model import Model, require_numbers, require_one
 from rigidjax.identify.model.scene import Process, Scene
-from rigidjax.identify.model.terms import scene_of, torque_of_scene
+from rigidjax.identify.model.terms import scene_from_row, torque_of_scene
 from rigidjax.identify.model.walks import Drift, broadcast_to_shape, drifting_values
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.equations import project_to_group
@@ -197,7 +197,7 @@ def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
     record, reference, body_index = stacking.pick_records(
         (model.records, model.reference, model.body_indices), 0
     )
-    scene = scene_of(model, row, record, reference, body_index)
+    scene = scene_from_row(model, row, record, reference, body_index)
     return dataclasses.replace(scene, torque=torque_of_scene(scene, record))
 
 

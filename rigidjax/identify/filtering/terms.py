@@ -24,7 +24,7 @@ from rigidjax.identify.model.terms import (
     errors_and_jacobians,
     errors_of_scene,
     prior_residuals,
-    scene_of,
+    scene_from_row,
     standardised_errors,
     torque_of_scene,
     with_jacobian,
@@ -43,7 +43,7 @@ def terms_of_recording(
     **Arguments:** `row` the free numbers of the recording; `record`, `reference` and `body_index`
     its readings, its reference state and the index of its body.
     """
-    scene = scene_of(model, row, record, reference, body_index)
+    scene = scene_from_row(model, row, record, reference, body_index)
     if scene.process is None and not model.walks:
         return _terms_of_motion(model, scene, record)
     require_sensors(scene.sensors)

@@ -43,7 +43,7 @@ from rigidjax.identify.model.terms import (
     all_errors,
     motion_of_scene,
     over_records,
-    scene_of,
+    scene_from_row,
     scene_template,
     with_jacobian,
 )
@@ -350,7 +350,7 @@ class Model(eqx.Module):
         x = require_numbers(self, x)
 
         def motion_of_recording(row: Array, record: Recording, *others: PyTree) -> Any:
-            scene = scene_of(self, row, record, *others)
+            scene = scene_from_row(self, row, record, *others)
             return motion_of(motion_of_scene(self, scene, record)[0])
 
         states = over_records(motion_of_recording, self, self.index.rows(x))
@@ -488,7 +488,7 @@ def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
     """Return the result of `Model.scenes`, without a check of x."""
 
     def scene_of_recording(row: Array, *rest: PyTree) -> Scene:
-        return scene_of(model, row, *rest)
+        return scene_from_row(model, row, *rest)
 
     rows = model.index.rows(x)
     return eqx.filter_vmap(scene_of_recording)(

@@ -44,7 +44,7 @@ def scene_template(model: "Model", record: Recording) -> Scene:
     return Scene(None, model.torque, model.process, record.sensors, None)
 
 
-def scene_of(
+def scene_from_row(
     model: "Model", row: Row, record: Recording, reference: ReferenceStates, body_index: BodyIndex
 ) -> Scene:
     """Return the scene of one recording from the row of its free numbers."""
@@ -91,7 +91,7 @@ def errors_of_recording(
     - `body_index`: the index of its body.
     - `delay`: s, by which all clocks are behind, in addition to their offsets.
     """
-    scene = scene_of(model, row, record, reference, body_index)
+    scene = scene_from_row(model, row, record, reference, body_index)
     return errors_of_scene(model, scene, record, delay)
 
 
@@ -355,7 +355,7 @@ def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]
     return jnp.concatenate([prior_weights(model) * x, extra_residuals(model, x)])
 
 
-def weights_of(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
+def reading_weights(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
     """Return the weight (R, T) of each reading in the normal equations.
 
     The robust loss gives the weight; it is zero for a masked reading.

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rigidjax.identify.model.model import Model
-from rigidjax.identify.model.terms import Blocks, Noise, delay_derivatives, weights_of
+from rigidjax.identify.model.terms import Blocks, Noise, delay_derivatives, reading_weights
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
 
@@ -32,7 +32,7 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
     - `noise`: the present estimate.
     """
     errors = blocks[0]
-    weights = weights_of(model, errors, noise)
+    weights = reading_weights(model, errors, noise)
     groups, out = np.asarray(model.noise_groups), []
     shares = _shares_left(model, x, blocks, noise)
     readings = list(model.records.readings)

@@ -142,7 +142,7 @@ def descend_from(
         for first in range(0, descent.steps, STRIDE):
             key, own = jax.random.split(key)
             keys = jax.random.split(own, min(STRIDE, descent.steps - first))
-            after, memory, costs = _take_steps(x, memory, model, noise, descent, keys)
+            after, memory, costs = _descent_steps(x, memory, model, noise, descent, keys)
             if not np.isfinite(np.asarray(costs)).all():
                 break
             x = after
@@ -155,7 +155,7 @@ def descend_from(
 
 
 @eqx.filter_jit
-def _take_steps(
+def _descent_steps(
     x: Float[Array, " n"], memory: PyTree, model: Model, noise: Noise, descent: Descent, keys: Array
 ) -> tuple[Float[Array, " n"], PyTree, Float[Array, " steps"]]:
     """Return point, memory of the optimiser and misfits after one step for each of the `keys`."""

@@ -62,7 +62,7 @@ class AttitudeSensor(ClockedSensor):
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         """Return the rows that are no unit quaternions, (T,) true where wrong, and why."""
         wanted = "wanted (w, x, y, z) with the scalar first"
-        return _is_not_unit(values), f"the quaternion at index {{index}} is not unit; {wanted}"
+        return _has_wrong_length(values), f"the quaternion at index {{index}} is not unit; {wanted}"
 
 
 def _quaternions(matrices: np.ndarray) -> np.ndarray:
@@ -151,10 +151,10 @@ class Direction(ClockedSensor):
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         """Return the rows that are no unit vectors, (T,) true where wrong, and why."""
-        return _is_not_unit(values), "the direction at index {index} is not of length 1"
+        return _has_wrong_length(values), "the direction at index {index} is not of length 1"
 
 
-def _is_not_unit(rows: np.ndarray) -> np.ndarray:
+def _has_wrong_length(rows: np.ndarray) -> np.ndarray:
     """Return whether each row is longer or shorter than 1."""
     return np.abs(np.linalg.norm(rows, axis=1) - 1) > 1e-6
 

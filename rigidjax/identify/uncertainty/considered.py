@@ -127,12 +127,12 @@ def _directions(
 
 
 def slope_in_time(
-    model: Model, shown: Float[np.ndarray, "records times k"]
+    model: Model, prediction: Float[np.ndarray, "records times k"]
 ) -> Float[np.ndarray, "records times k"]:
     """Return the time derivative of the predictions of a sensor, zero beyond each recording."""
     t, counts = np.asarray(model.records.t)[..., None], np.asarray(model.counts)
     gap = np.diff(t, axis=1)
-    slope = np.diff(shown, axis=1) / np.where(gap > 0, gap, 1.0)
+    slope = np.diff(prediction, axis=1) / np.where(gap > 0, gap, 1.0)
     # The slope of the parabola through three samples, as in numpy.gradient: each difference is
     # weighted by the other gap.
     before, after = gap[:, :-1], gap[:, 1:]

@@ -15,8 +15,8 @@ from rigidjax.identify.model.terms import (
     Noise,
     extra_residuals,
     prior_weights,
+    reading_weights,
     residuals_and_jacobians,
-    weights_of,
     whiten,
     with_jacobian,
 )
@@ -137,7 +137,7 @@ def _linearise_parts(model: Model, x: Array, noise: Noise, blocks: Blocks) -> Py
     errors, slopes = blocks
     out, slopes = residuals_and_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
     extra_slopes, extra = with_jacobian(lambda x: extra_residuals(model, x), x)
-    weights, prior = weights_of(model, errors, noise), prior_weights(model)
+    weights, prior = reading_weights(model, errors, noise), prior_weights(model)
     return (out, slopes, weights), model.index.places, (prior * x, prior, extra, extra_slopes)
 
 

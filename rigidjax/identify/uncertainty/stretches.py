@@ -113,7 +113,7 @@ def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
     return dataclasses.replace(white, covariance=shown, determined=covariance, kind=kind)
 
 
-def remarks(
+def remarks_on_stretches(
     stretches: Stretches,
     model: Model,
     numbers: tuple[np.ndarray, np.ndarray],

@@ -144,7 +144,7 @@ class ChangingInertia(eqx.Module):
         def momentum(t: Array, q: Array, omega: Array) -> tuple[Vec3, Mat3]:
             here = eqx.tree_at(lambda s: s.omega, state, omega)
             here = here if q is None else eqx.tree_at(lambda s: s.q, here, q)
-            now = real_or_nan(self.tensor(t, here, body).astype(omega.dtype))
+            now = tensor_or_nan(self.tensor(t, here, body).astype(omega.dtype))
             return apply(now, omega), now
 
         # Ω̇ is not known yet, but d(IΩ)/dt is linear in it: one linearisation, evaluated along four
@@ -166,7 +166,7 @@ class ChangingInertia(eqx.Module):
         return torque if force is None else base.Wrench(force, torque)
 
 
-def real_or_nan(tensor: Mat3) -> Mat3:
+def tensor_or_nan(tensor: Mat3) -> Mat3:
     """Return the inertia tensor (3, 3) of a body, kg m²; return NaN for any other numbers, which
     end a run.
     """

@@ -24,7 +24,7 @@ class HeavyTop(base.AbstractTorque):
 
     **Arguments:** `mass` m, kg; `com` (3,) c, from the fixed point to the centre of mass, m, body
     frame; `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81]. The body's `Inertia` is the
-    one **about the fixed point** (`MassProperties.inertia_about`, `Inertia.shifted`). Any top is
+    one **about the fixed point** (`MassProperties.inertia_about`, `Inertia.shift`). Any top is
     allowed: Lagrange's, Kovalevskaya's, Goryachev–Chaplygin's, a general one, the physical
     pendulum.
 

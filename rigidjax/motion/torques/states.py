@@ -47,7 +47,7 @@ def has_own_states(node: object) -> bool:
 
 def has_states(law: PyTree) -> bool:
     """Return whether a torque, or any part of it, has states of its own."""
-    return any(map(has_own_states, jax.tree.leaves(law, is_leaf=_stop)))
+    return any(map(has_own_states, jax.tree.leaves(law, is_leaf=_holds_states)))
 
 
 def require_stateless(law: PyTree, user: str) -> None:
@@ -84,7 +84,7 @@ def initial_states(law: PyTree, t: ScalarLike, state: PyTree, body: Body) -> tup
     """Return the initial states of a torque, in the precision of the body's state: see `freeze`."""
     states: list[Any] = []
 
-    def begin(node: PyTree) -> Any:
+    def initial_state_of(node: PyTree) -> Any:
         here = node.state0(t, state, body) if callable(node.state0) else node.state0
         own = _checked_numbers(here, f"state0 of {type(node).__name__}", state.omega.dtype)
         if not jax.tree.leaves(own):
@@ -92,7 +92,7 @@ def initial_states(law: PyTree, t: ScalarLike, state: PyTree, body: Body) -> tup
         states.append(own)
         return own
 
-    _insert_states(law, begin)
+    _insert_states(law, initial_state_of)
     return tuple(states)
 
 
@@ -104,7 +104,7 @@ def rates_of_own_states(
     """
     queue, rates = list(own), []
 
-    def one(node: PyTree) -> Any:
+    def rate_of_node(node: PyTree) -> Any:
         here = queue.pop(0)
         name = f"rate of {type(node).__name__}"
         rate = _checked_numbers(node.rate(t, here, state, body), name, state.omega.dtype)
@@ -114,7 +114,7 @@ def rates_of_own_states(
         rates.append(rate)
         return here
 
-    _insert_states(law, one)
+    _insert_states(law, rate_of_node)
     return tuple(rates)
 
 
@@ -129,17 +129,17 @@ def require_frozen(law: PyTree) -> None:
 def _insert_states(tree: PyTree, own_of: Callable[[Any], Any]) -> Any:
     """Return the tree with all states inserted; `own_of(node)` gives them, inner parts first."""
 
-    def stop(node: PyTree) -> bool:
-        return node is not tree and _stop(node)
+    def is_leaf(node: PyTree) -> bool:
+        return node is not tree and _holds_states(node)
 
-    def inside(node: PyTree) -> Any:
+    def insert_in_node(node: PyTree) -> Any:
         return _insert_states(node, own_of) if node is not tree and has_own_states(node) else node
 
-    within = jax.tree.map(inside, tree, is_leaf=stop)
-    return FrozenLaw(within, (own_of(within),)) if has_own_states(tree) else within
+    inserted = jax.tree.map(insert_in_node, tree, is_leaf=is_leaf)
+    return FrozenLaw(inserted, (own_of(inserted),)) if has_own_states(tree) else inserted
 
 
-def _stop(node: PyTree) -> bool:
+def _holds_states(node: PyTree) -> bool:
     return isinstance(node, FrozenLaw) or has_own_states(node)
 
 
