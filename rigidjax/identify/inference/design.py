@@ -36,7 +36,7 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
 
     >>> model = rj.datasets.toutatis.model()
     >>> plan = model.start(rj.Inertia.from_principal(3.1, 3.2, 1.0))
-    >>> bool(expected(model, plan)[0].deviation < 1.0)
+    >>> bool(expected_quantities(model, plan)[0].deviation < 1.0)
     True
     """
     _require_known(model, x)
