@@ -45,8 +45,8 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
     information = np.asarray(_fisher(model, x if near is None else near))
     if not np.isfinite(information).all():
         raise ValueError(
-            "expected_quantities: wanted a finite Fisher information, got NaN or infinity; the recordings of "
-            "model hold NaN, or the motion of x overflows"
+            "expected_quantities: wanted a finite Fisher information, got NaN or infinity; the "
+            "recordings of model hold NaN, or the motion of x overflows"
         )
     half, null = covariance_root(information)
     return quantities(model, values_and_slopes(model, x, near), half @ half.T, null)
