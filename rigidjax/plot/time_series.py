@@ -62,11 +62,11 @@ def motion(
     return ax
 
 
-def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, form: str) -> None:
-    _checks.require_option(form, ("quaternion", "axes", "angles"), "attitude")
-    if form == "quaternion":
+def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, kind: str) -> None:
+    _checks.require_option(kind, ("quaternion", "axes", "angles"), "attitude")
+    if kind == "quaternion":
         names, lines, label = [f"q{n}" for n in "wxyz"], q.T, "attitude q"
-    elif form == "axes":
+    elif kind == "axes":
         names = [f"{n}' · z" for n in "xyz"]
         lines, label = style.rotation_matrices(q)[:, 2, :].T, "body axes along world z"
     else:

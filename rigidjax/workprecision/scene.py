@@ -180,8 +180,8 @@ class PreparedMethod(NamedTuple):
     complete when it returns; `compile` s that making it took, `memory` bytes of temporaries, each
     NaN where unknown.
 
-    >>> ready = Ready(lambda setting: ([0.0, 1.0], 1 / setting))
-    >>> ready.run(1e-2)[1], ready.compile
+    >>> prepared = PreparedMethod(lambda setting: ([0.0, 1.0], 1 / setting))
+    >>> prepared.run(1e-2)[1], prepared.compile
     (100.0, nan)
     """
 
@@ -200,8 +200,8 @@ class TimedMethod(NamedTuple):
     numbers of steps for a run of 50 rad, to be scaled to the scene.
 
     >>> import numpy as np
-    >>> ready = Ready(lambda setting: (np.ones(7), 0))
-    >>> guess = TimedMethod("a guess", "peer", (1e-3,), lambda scene: ready)
+    >>> prepared = PreparedMethod(lambda setting: (np.ones(7), 0))
+    >>> guess = TimedMethod("a guess", "peer", (1e-3,), lambda scene: prepared)
     >>> guess.gradients
     {}
     """

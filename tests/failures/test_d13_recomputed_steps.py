@@ -33,7 +33,7 @@ def away(name, rtol, mode=jax.grad, **how):
     scene = scenes()[name]()
 
     def loss(numbers):
-        body, start = scene.assembled(numbers)
+        body, start = scene.assemble(numbers)
         ts = jnp.array([0.0, scene.end])
         ys = rj.simulate(body, start, ts, scene.torque, rtol=rtol, atol=1e-3 * rtol, **how).ys
         return scene.loss(jnp.concatenate([ys.q[-1], ys.omega[-1]]))

@@ -88,7 +88,7 @@ class Compass(identify.AbstractSensor):
     unit: ClassVar[str] = "rad"
     noise: Any = None
 
-    def error(self, now, reading):
+    def error(self, motion, reading):
         return jnp.stack([reading, reading])
 
 

@@ -41,8 +41,8 @@ class Tachometer(identify.AbstractSensor):
     feels, noise = rj.motion.HasSpin, None
     wheels: torques.ReactionWheels
 
-    def error(self, now, reading):
-        return reading - self.wheels.speeds_of(now.own[0], now.state)
+    def error(self, motion, reading):
+        return reading - self.wheels.speeds_of(motion.own[0], motion.state)
 
 
 def of_scipy(times):

@@ -155,8 +155,8 @@ for name, given in {
     "coriolis": dict(v=V),
     "euler_acceleration": dict(x=Y),
     "fictitious": dict(x=Y, v=V),
-    "inward": dict(y=Y),
-    "outward": dict(y=Y),
+    "from_inertial_axes": dict(y=Y),
+    "to_inertial_axes": dict(y=Y),
 }.items():
     row(
         f"frames.Instant.{name}",

@@ -127,9 +127,9 @@ row("Inertia.from_principal", dict(i1=1.1, i2=2.2, i3=2.7), says=("principal mom
 row("Inertia.from_second_moment", dict(second_moment=SECOND))
 row("Inertia.shift", lambda: dict(self=s.inertia(), r=V, mass=1.5))
 row("Inertia.rotate", lambda: dict(self=s.inertia(), q=Q))
-for name in ("principal", "invertible"):
+for name in ("principal", "require_invertible"):
     row(f"Inertia.{name}", lambda: dict(self=s.inertia()), arguments=())
-for name in ("checked", "invertible"):
+for name in ("check", "require_invertible"):
     row(f"MassProperties.{name}", lambda: dict(self=s.body()), arguments=())
 for name in ("inertia_about", "second_moment_about"):
     row(f"MassProperties.{name}", lambda: dict(self=s.body(), point=Y), arguments=("point",))

@@ -36,7 +36,7 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
 
     >>> model = rj.datasets.toutatis.model()
     >>> plan = model.start(rj.Inertia.from_principal(3.1, 3.2, 1.0))
-    >>> bool(expected(model, plan)[0].deviation < 1.0)
+    >>> bool(expected_quantities(model, plan)[0].deviation < 1.0)
     True
     """
     _require_known(model, x)
@@ -45,8 +45,8 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
     information = np.asarray(_fisher(model, x if near is None else near))
     if not np.isfinite(information).all():
         raise ValueError(
-            "expected: wanted a finite Fisher information, got NaN or infinity; the recordings of "
-            "model hold NaN, or the motion of x overflows"
+            "expected_quantities: wanted a finite Fisher information, got NaN or infinity; the "
+            "recordings of model hold NaN, or the motion of x overflows"
         )
     half, null = covariance_root(information)
     return quantities(model, values_and_slopes(model, x, near), half @ half.T, null)

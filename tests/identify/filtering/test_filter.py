@@ -172,8 +172,8 @@ class Speed(identify.AbstractSensor):
     reading_shape, components, unit = (), 1, "rad/s"
     feels, noise = rj.motion.HasSpin, jnp.array([0.1])
 
-    def error(self, now, reading):
-        return (reading - jnp.linalg.norm(now.state.omega))[None]
+    def error(self, motion, reading):
+        return (reading - jnp.linalg.norm(motion.state.omega))[None]
 
 
 def test_steps_take_readings_of_one_number():
