@@ -1,4 +1,4 @@
-"""A fit as a table for the terminal, as JSON, and as a self-contained page of HTML."""
+"""Write a fit as a table for the terminal, as JSON, and as a self-contained page of HTML."""
 
 import base64
 import dataclasses
@@ -20,7 +20,7 @@ Row = tuple[str, float, float, float, str]
 
 
 def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
-    """Return all results as rows (name, value, low, high, unit) with their 95 % intervals.
+    """Return all results of a fit as rows (name, value, low, high, unit) with 95 % intervals.
 
     **Arguments:**
 
@@ -48,9 +48,10 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
 
 
 def table(lines: list[Row]) -> str:
-    """Return rows as a table of text, each number rounded by its interval.
+    """Return `lines` as a table of text, in which each number is rounded by its interval.
 
-    **Arguments:** `lines` one or more rows (name, value, low, high, unit), such as `rows` returns.
+    **Arguments:** `lines` one or more rows (name, value, low, high, unit), such as those that
+    `rows` returns.
 
     >>> print(table([("I1", 1.23456, 1.2, 1.27, "kg m²")]))
                  value  95 % interval
@@ -72,9 +73,9 @@ def table(lines: list[Row]) -> str:
 
 
 def numbers(value: float, low: float, high: float) -> list[str]:
-    """Return value, low and high as text, rounded by the interval.
+    """Return `value`, `low` and `high` as text, rounded by the width of the interval.
 
-    **Arguments:** `value`; `low` and `high`, the ends of its interval, in the same unit.
+    **Arguments:** `value`; `low` and `high`, the ends of its interval, in the unit of `value`.
 
     >>> numbers(1.23456, 1.2, 1.27)
     ['1.2346', '1.2000', '1.2700']
@@ -100,17 +101,17 @@ def numbers(value: float, low: float, high: float) -> list[str]:
 
 
 def _place(number: float) -> int:
-    """Return the power of ten of the first digit."""
+    """Return the power of ten of the first digit of `number`; 0 for zero."""
     return int(np.floor(np.log10(abs(number)))) if number else 0
 
 
 def _interval_as_text(texts: list[str]) -> str:
-    """Return the interval as text from the result of `numbers`: "not determined" for NaN."""
+    """Return as text the interval that `numbers` wrote in `texts`; "not determined" for NaN."""
     return "not determined" if "nan" in texts[1:] else f"{texts[1]} … {texts[2]}"
 
 
 def verdict(fit: Fit) -> str:
-    """Return the answers, the advice, and how well the data determine each quantity, in words.
+    """Return in words a fit's answers and advice, and how well the data determine each quantity.
 
     **Arguments:** `fit` a result of `rigidjax.identify.fit`.
 
@@ -136,7 +137,8 @@ def verdict(fit: Fit) -> str:
 
 
 def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> dict[str, Any]:
-    """Return all results as plain numbers and text, for JSON; infinity and NaN become `null`.
+    """Return all results of a fit as plain numbers and text, for JSON; infinity and NaN become
+    `null`.
 
     **Arguments:**
 
@@ -201,7 +203,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
 
 
 def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
-    """Return name, rms error of each component, and unit of each sensor.
+    """Return the name of each sensor, the rms error of each of its components, and its unit.
 
     Readings at full scale are left out.
     """
@@ -218,10 +220,10 @@ def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
 def write_json(
     fit: Fit, path: str | Path, files: Sequence[str] = (), more: Sequence[Row] = ()
 ) -> None:
-    """Write all results as JSON to a file: those of `as_dict`.
+    """Write all results of a fit to a file as JSON, in the form that `as_dict` returns.
 
-    **Arguments:** `fit`; `path` of the file, which is overwritten; `files` and `more` as for
-    `as_dict`.
+    **Arguments:** `fit`; `path`, the place of the file, which is overwritten; `files` and `more` as
+    for `as_dict`.
 
     >>> import json, tempfile
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
@@ -231,7 +233,7 @@ def write_json(
     'ok'
     """
     text = json.dumps(as_dict(fit, files, more), indent=2, ensure_ascii=False, allow_nan=False)
-    # A file name may hold bytes that are no character: write them as escapes, do not fail.
+    # A file name may hold bytes that are no character: such bytes are written as escapes.
     Path(path).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
@@ -245,13 +247,13 @@ def write_html(
     files: Sequence[str] = (),
     more: Sequence[Row] = (),
 ) -> None:
-    """Write a page of HTML without other files: status, table, words, errors, starts, figures.
+    """Write a fit as one page of HTML: status, table, words, errors, starts and figures.
 
     **Arguments:**
 
     - `fit`: a result of `rigidjax.identify.fit`.
-    - `path`: of the file, which is overwritten.
-    - `title`: of the page.
+    - `path`: the place of the file, which is overwritten.
+    - `title`: the title of the page.
     - `figures`: figures of matplotlib, such as those of `rigidjax.plot.fit`.
     - `rate_unit`: as for `rows`.
     - `files`: the names of the files that were read.
@@ -304,9 +306,10 @@ img {{ max-width: 100%; margin: 1rem 0 }}
 
 
 def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str:
-    """Return status, table and words as HTML, for a page or a notebook.
+    """Return the status, the table and the words of a fit as HTML, for a page or a notebook.
 
-    **Arguments:** `fit`; `rate_unit` as for `rows`; `more` rows of further quantities.
+    **Arguments:** `fit`; `rate_unit` as for `rows`; `more` rows of further quantities, in the form
+    of `rows`.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> as_html(result).startswith("<p") and "Ix/Iz" in as_html(result)
@@ -326,7 +329,7 @@ def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str
 
 
 def _cells(lines: Iterable[tuple[str, ...]]) -> str:
-    """Return the lines of a table as HTML."""
+    """Return the `lines` of a table, each a tuple of cells, as rows of HTML."""
     cells = ("".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in lines)
     return "".join(f"<tr>{line}</tr>" for line in cells)
 

@@ -1,1 +1,1 @@
-"""The search for the least misfit."""
+"""Find the free numbers of a model with the least misfit."""

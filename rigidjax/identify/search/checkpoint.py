@@ -1,4 +1,4 @@
-"""The checkpoint file of a fit, from which a killed search can continue."""
+"""Write the finished starts of a fit to a file, from which a killed search can continue."""
 
 import contextlib
 import dataclasses
@@ -20,7 +20,7 @@ from rigidjax.identify.search.stages import Attempt
 
 
 def without_arrays(attempt: Attempt) -> Attempt:
-    """Return the attempt without its errors and derivatives, which take memory."""
+    """Return the attempt without its errors and their derivatives, which take much memory."""
     return attempt if attempt.blocks is None else dataclasses.replace(attempt, blocks=None)
 
 
@@ -38,9 +38,9 @@ def report_progress(progress: Callable[[str], Any] | None, line: str) -> None:
 
 
 def require_folder(path: str | Path) -> None:
-    """Raise `ValueError` unless a file can be written at `path`.
+    """Raise `ValueError` if the folder of the file `path` does not exist, or if `path` is a folder.
 
-    It is called before a search, which would otherwise fail after its first start.
+    The check runs before a search, which would otherwise fail after its first start.
     """
     path = Path(path)
     if not path.parent.is_dir():
@@ -50,9 +50,9 @@ def require_folder(path: str | Path) -> None:
 
 
 def fingerprint(*trees: PyTree) -> str:
-    """Return a hash of the numbers and the structure of trees, the same in every process.
+    """Return a hash of the numbers and the structure of `trees`, equal in every process.
 
-    A function counts by its name.
+    A function counts by its name alone.
     """
     leaves, structure = jax.tree.flatten(trees)
     words, digest = [repr(structure)], hashlib.sha256()
@@ -69,16 +69,17 @@ def fingerprint(*trees: PyTree) -> str:
 
 
 class Checkpoint:
-    """The ends of the starts of a search so far, saved to a file after every start.
+    """Hold the end of the search from each finished start, and save these ends to a file.
 
     **Arguments:**
 
-    - `path`: of the file, `None` for no file.
-    - `example`: an `Attempt` with the shapes of those in the file.
+    - `path`: the place of the file; `None` for no file.
+    - `example`: an `Attempt` whose arrays have the shapes of the arrays in the file.
     - `print_of`: the `fingerprint` of everything that the search depends on.
 
-    The file of another model raises `ValueError`, and is not overwritten. A file that cannot be
-    written makes a warning.
+    The file is written after every start; if it exists already, it is read first. **Raises**
+    `ValueError` if an existing file belongs to another search; such a file is not overwritten. A
+    file that cannot be written causes a warning.
     """
 
     def __init__(self, path: str | Path | None, example: Attempt, print_of: str):
@@ -89,7 +90,7 @@ class Checkpoint:
             self._read(self.path)
 
     def save(self, attempts: Sequence[Attempt]) -> None:
-        """Save the finished `attempts`, replacing the file in one step."""
+        """Write the finished `attempts` to the file, which is replaced in one step."""
         if self.path is None:
             return
         head = dict(print_of=self.print_of, done=len(attempts))
@@ -111,7 +112,7 @@ class Checkpoint:
                 part.unlink(missing_ok=True)
 
     def _read(self, path: Path) -> None:
-        """Read the finished starts; raise `ValueError` for a file that is not of this search."""
+        """Read the finished starts of a file; raise `ValueError` for a file of another search."""
         try:
             with path.open("rb") as file:
                 head = json.loads(file.readline())

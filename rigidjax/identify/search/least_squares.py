@@ -1,4 +1,4 @@
-"""The search of Levenberg and Marquardt, on any normal equations."""
+"""Minimise a cost by the method of Levenberg and Marquardt, for any kind of normal equations."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,30 +12,31 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from rigidjax.identify.model.normal import NormalMatrix
 
-# The damping of the first step, in units of the diagonal of the normal equations (Marquardt's): a
-# damping of one makes a step half as long as a Gauss–Newton step.
+# The damping of a first step is in units of the diagonal of the normal equations (Marquardt 1963):
+# a damping of one makes a step half as long as a Gauss–Newton step.
 CAREFUL, BOLD = 1.0, 1e-3
-# The largest change in a step of a number that is scaled to order one.
+# One step changes a number that is scaled to order one by no more than this.
 LONGEST = 2.0
-# A step with less damping counts as a Gauss–Newton step.
+# A step with at most this damping counts as a Gauss–Newton step.
 FREE = 1e-2
-# The least ratio of actual to predicted gain of a step that supports the quadratic model.
+# A step supports the quadratic model of the cost if its actual gain is more than this part of its
+# predicted gain.
 FAIR = 0.25
 # The problem counts as linear if the ratio of actual to predicted gain is as near to one as this.
 LINEAR = 0.05
-# A search ends if at its pace it needs more than PATIENCE steps to the cost at which another search
-# ended. The pace is the fall of the logarithm of the misfit in a step: an average over the steps in
-# which each counts half as much as the next one.
+# A search ends if it would need more than PATIENCE steps, at its present pace, to reach the cost at
+# which another search ended. The pace is the fall of the logarithm of the misfit in a step,
+# averaged over all steps; in this average each step counts half as much as the next one.
 PATIENCE, FIRST_PACE = 25.0, 4.0
-# With more damping than this nothing moves.
+# A search with more damping than this is stuck: no step moves it any more.
 STUCK = 1e12
-# The cost is taken as noisy, like that of adaptive integration, if two steps in succession are
-# refused, the second one raises the cost by NOISY times its predicted gain or more, and by a larger
-# multiple than the first one, and this gain is less than LITTLE of the cost. Of a smooth cost
-# shorter steps raise it by smaller and smaller multiples.
+# A cost counts as noisy, like the cost by adaptive integration, if three things are true. Two steps
+# in succession are refused. The second step raises the cost by more than NOISY times its predicted
+# gain, and by a larger multiple of it than the first step does. The predicted gain is less than
+# LITTLE of the cost. A smooth cost is raised by smaller and smaller multiples as steps get shorter.
 NOISY, LITTLE = 10.0, 1e-4
-# The errors of sensors of unknown noise count as at least this part of their unit: below it they
-# are round-off.
+# Errors of sensors of unknown noise are taken to be at least this part of their unit: smaller
+# errors are round-off.
 EXACT = 1e-6
 
 
@@ -48,21 +49,21 @@ def _setting_as_array(value: ArrayLike) -> np.ndarray:
 
 
 class Settings(eqx.Module):
-    """The settings of a search, as arrays, so that another value does not compile again.
+    """Hold the settings of a search as arrays: another value does not compile the search again.
 
     **Arguments**; zero switches each of the last four off:
 
-    - `tolerance`: the search has converged at a step shorter than this, in standard deviations of
-      each number with all others fixed.
-    - `damping`: of the first step.
+    - `tolerance`: the search has converged if the next step changes each number by less than this
+      many of its standard deviations with all other numbers fixed.
+    - `damping`: the damping of the first step.
     - `steps`: the largest number of steps.
-    - `aim`: a cost that another search reached; this search ends if at its pace it would need more
-      than `PATIENCE` steps to it.
+    - `aim`: a cost that another search reached; this search ends if it would need more than
+      `PATIENCE` steps to reach it at its present pace.
     - `near`: the search ends at this cost.
-    - `count`: for errors of unknown size their number; their mean square then gives the standard
-      deviation, which is one otherwise.
-    - `level`: the search ends if a step of about the predicted gain gains less than this part of
-      what a fit gains from noise alone.
+    - `count`: the number of errors, if their size is unknown; the standard deviation of an error is
+      then the root of their mean square. It is one otherwise.
+    - `level`: the search ends after a step that gains about what was predicted, but less than this
+      part of what a fit gains from noise alone.
     """
 
     tolerance: Any = eqx.field(converter=_setting_as_array)
@@ -75,20 +76,20 @@ class Settings(eqx.Module):
 
 
 class LMState(eqx.Module):
-    """The state of a search by Levenberg and Marquardt.
+    """Hold the state of a search by the method of Levenberg and Marquardt.
 
     **Fields:**
 
     - `first`: the cost at the start.
     - `point`: the best point so far.
-    - `cost`, `normal`, `slope`: cost, normal matrix and gradient at the best point.
+    - `cost`, `normal`, `slope`: the cost, its normal matrix and its gradient at the best point.
     - `trial`, `hoped`: the next point, and its predicted gain.
-    - `damping`: of the step to the next point.
+    - `damping`: the damping of the step to the next point.
     - `pace`: the mean fall of the logarithm of the cost in a step.
     - `taken`: the number of evaluations.
     - `done`, `converged`: whether the search has ended, and whether it converged.
-    - `evaluation`, `evaluated_at_best`: the values kept from the last evaluation, and whether it
-      was at the best point.
+    - `evaluation`, `evaluated_at_best`: the values kept from the last evaluation, and whether this
+      evaluation was at the best point.
     - `rise`: the rise of the cost at the last trial over its predicted gain; zero if the trial was
       better.
     """
@@ -119,7 +120,7 @@ def minimise(
     zero_normal: NormalMatrix | None = None,
     gain_of_noise: Callable[[Any, NormalMatrix], Array] | None = None,
 ) -> LMState:
-    """Minimise a cost from `start`, and return the last state of the search.
+    """Minimise a cost by the method of Levenberg and Marquardt, and return the last state.
 
     Source: Marquardt 1963, doi:10.1137/0111030; the damping follows the ratio of actual to
     predicted gain as in Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares
@@ -127,16 +128,18 @@ def minimise(
 
     **Arguments:**
 
-    - `evaluate`: a function from a point to values to keep, cost, normal matrix and gradient. The
-      cost is half a sum of squares, or minus a log-density with Fisher's information as the normal
-      matrix (scoring).
-    - `start`: (n,) the first point; with no steps it alone is evaluated.
-    - `order_one`: (n,) one for numbers of order one, which no step moves far, else zero.
-    - `settings`: the settings.
-    - `zeros`: zeros of the shapes of the kept values.
+    - `evaluate`: a function that returns, at a point, values to keep, the cost, the normal matrix
+      and the gradient. The cost is half a sum of squares, or minus a log-density with Fisher's
+      information as the normal matrix (scoring).
+    - `start`: (n,) the point at which the search begins; if no steps are allowed, only this point
+      is evaluated.
+    - `order_one`: (n,) one for numbers of order one, which no step moves far; zero for other
+      numbers.
+    - `settings`: the settings of the search.
+    - `zeros`: a tree of zeros with the shapes of the values to keep.
     - `zero_normal`: zeros of the shapes of the normal matrix, if it has more than a core.
     - `gain_of_noise`: a function from the kept values and the normal matrix to the gain of a fit
-      from noise alone (see `Settings`), or `None`.
+      from noise alone (see `Settings.level`), or `None`.
     """
     number, kind = start.size, start.dtype
     begun = LMState(
@@ -170,7 +173,11 @@ def _next_state(
     settings: Settings,
     gain_of_noise: Callable[[Any, NormalMatrix], Array] | None,
 ) -> LMState:
-    """Return the state after an evaluation of the trial point, with the next trial."""
+    """Return the state of a search after an evaluation of its trial point.
+
+    The state holds the next trial point. **Arguments:** `state` the state before the evaluation;
+    `evaluation` the result of `evaluate` at its trial point; the others as for `minimise`.
+    """
     values, cost, normal, slope = evaluation
     parts = jax.tree.leaves((cost, normal, slope))
     finite = jnp.stack([jnp.isfinite(part).all() for part in parts]).all()
@@ -206,7 +213,7 @@ def _next_state(
     size = jnp.sqrt(2.0 * jnp.maximum(cost, 0.0) / jnp.maximum(settings.count, 1.0))
     unit = jnp.where(settings.count > 0, jnp.maximum(size, EXACT), 1.0)
     small = (jnp.max(jnp.abs(move) * root) < settings.tolerance * unit) & (damping <= FREE)
-    # At the minimum itself every step is refused, by round-off: stop if nothing can be gained.
+    # Round-off refuses every step at the minimum itself: stop if nothing can be gained.
     bottom = hoped <= 1e-14 * jnp.abs(cost)
     ended = small if gain_of_noise is None else small | flat
     converged = sound & (ended | noisy | (bottom & ~better & ~first))
@@ -237,7 +244,12 @@ def _next_state(
 def _damped_step(
     normal: NormalMatrix, slope: Array, order_one: Array, damping: Array
 ) -> tuple[Array, Array]:
-    """Return the damped step (n,), and the root (n,) of the diagonal of the normal matrix."""
+    """Return the damped step (n,) from a point, and the root (n,) of the normal matrix's diagonal.
+
+    **Arguments:** `normal` and `slope` the normal matrix and the gradient at the point; `order_one`
+    as for `minimise`; `damping` in units of the diagonal of the normal matrix. The step is
+    shortened so that no number of order one changes by more than `LONGEST`.
+    """
     diagonal = normal.diagonal
     diagonal = jnp.maximum(diagonal, jnp.maximum(1e-12 * jnp.max(diagonal), 1e-300))
     # Scale columns to length one, so that Cholesky's factor loses no digits to units.

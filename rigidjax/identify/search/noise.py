@@ -1,4 +1,4 @@
-"""The noise of sensors and the jitter of their clocks, estimated from the errors of a fit."""
+"""Estimate the noise of sensors and the jitter of their clocks from the errors of a fit."""
 
 from typing import Any, cast
 
@@ -13,17 +13,18 @@ from rigidjax.identify.model.terms import Blocks, Noise, delay_derivatives, read
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
 
-# The largest number of rounds in the estimate of noise and jitter together.
+# The estimate of noise and jitter together takes at most this many rounds.
 ROUNDS = 500
 
 
 def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tuple[Model, Noise]:
-    """Return the model with the estimated jitter of its sensors, and their estimated noise.
+    """Return the model with the estimated jitter of its sensors, and the noise of its sensors.
 
-    The noise (R, k) of each sensor is as given, or else the scatter of its errors: one number for
-    all channels and all recordings of a group. Fitted numbers take a part of the errors away, a
-    large one of few readings. This part is the leverage of the sensor at the present `noise`, as in
-    restricted maximum likelihood.
+    The noise (R, k) of a sensor with k channels in R recordings is the given one. If none is given
+    it is the scatter of the sensor's errors: one number for all channels and for all recordings of
+    a group. Fitted numbers make the errors smaller, by a large part if readings are few. The
+    estimate is corrected for this part, which is the leverage of the sensor at the present `noise`,
+    as in restricted maximum likelihood.
 
     **Arguments:**
 
@@ -39,7 +40,7 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
     for index, (reading, error, sigma, weight, share) in enumerate(
         zip(readings, errors, noise, weights, shares, strict=True)
     ):
-        # A reading at full scale has an error that is no noise.
+        # The mask leaves out readings at full scale, whose errors are not noise.
         sensor, mask = cast(Any, reading.sensor), reading.channel_mask
         known = sensor.noise is not None
         if known:
@@ -51,7 +52,7 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
                 variance = parts / np.maximum(np.bincount(groups, mask.sum(axis=(1, 2))), 1)
             else:
                 variance = _variance_by_median(squares, mask, groups)
-            # Noise is at least round-off: errors of perfect data are divided by it.
+            # Noise is at least round-off, since even the errors of perfect data are divided by it.
             floor = 1e-15 * float(np.abs(np.asarray(reading.values)).max() + 1e-300)
             each = np.maximum(np.sqrt(variance / share), floor)[groups]
             each = np.broadcast_to(each[:, None], sigma.shape)
@@ -73,14 +74,14 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
 
 
 def initial_noise(model: Model) -> Noise:
-    """Return the noise of each sensor, a tenth of its signal if the noise is to be estimated."""
+    """Return the noise of each sensor, or a tenth of its signal if its noise is to be estimated."""
     out = []
     for reading in model.records.readings:
         sensor = reading.sensor
         if reading.known_noise:
             out.append(sensor.noise)
         else:
-            # The size matters little, as long as no sensor outweighs another.
+            # The size of this noise matters little, as long as no sensor outweighs another.
             values = reading.values.reshape(*reading.mask.shape, -1)
             size = jnp.sqrt(jnp.mean(jnp.sum(values**2, axis=-1)) + 1e-300)
             out.append(jnp.full((model.count, sensor.components), 0.1) * size)
@@ -88,11 +89,12 @@ def initial_noise(model: Model) -> Noise:
 
 
 def _variance_by_median(squares: np.ndarray, mask: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Return the variance of each group by the median over readings, which outliers do not change.
+    """Return the variance of each group's errors, by a median that outliers hardly change.
 
-    An estimate with the weights of the loss would be too small without outliers, and too large with
-    many. **Arguments:** `squares` (R, T) the squared lengths of errors; `mask` (R, T, k) the
-    channels that count; `groups` (R,) of the recordings.
+    The median is taken over the readings of a group. An estimate with the weights of the robust
+    loss would be too small without outliers, and too large with many of them. **Arguments:**
+    `squares` (R, T) the squared lengths of the errors; `mask` (R, T, k) the channels that count;
+    `groups` (R,) the group of each recording.
     """
     half, _ = median_of_chi2(mask.shape[-1])
     whole = mask.all(axis=-1)
@@ -111,12 +113,15 @@ def median_of_chi2(size: int) -> tuple[float, float]:
 
 
 def _shares_left(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[np.ndarray]:
-    """Return for each sensor and group the share of squared errors that fitted numbers leave."""
+    """Return the share of the squared errors that fitted numbers leave, for each sensor and group.
+
+    A share is 0.1 at least.
+    """
     groups, readings = np.asarray(model.noise_groups), model.records.readings
     sizes = [np.bincount(groups, one.channel_mask.sum(axis=(1, 2))) for one in readings]
     held = model.prior, model.pull, *((slot.prior, slot.spread) for slot in model.slots)
     if len(readings) * sizes[0].size == 1 and not jax.tree.leaves(held):
-        # Without priors, and with one noise, all numbers are taken from these readings.
+        # Without priors, and with a single noise, these readings alone determine all numbers.
         taken = [np.array([x.size])]
     else:
         linear = linearise(model, x, noise, blocks)
@@ -133,18 +138,18 @@ def _noise_and_jitter(
     known_noise: bool,
     tau: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the most likely σ and τ (R,) of errors of covariance `σ² + τ² u uᵀ`.
+    """Return the most likely σ (R,) and τ (R,) of errors whose covariance is `σ² + τ² u uᵀ`.
 
-    They are found in turn: τ² by Fisher's scoring of the squares along u, whose mean is
-    `σ² + τ² |u|²`, and σ² by expectation and maximisation.
+    The two are found in turn: τ² by Fisher's scoring of the squares along u, whose mean is `σ² + τ²
+    |u|²`, and σ² by expectation and maximisation.
 
     **Arguments:**
 
     - `e`: (R, T, k) the errors; `u`: (R, T, k) the change of the prediction in time.
     - `count`: (R, T) the number of channels that were read.
-    - `groups`: (R,) the groups of recordings, which share σ and τ.
+    - `groups`: (R,) the group of each recording; the recordings of a group share σ and τ.
     - `known_noise`: whether σ is known; it is then 1.
-    - `tau`: a known τ, else `None`.
+    - `tau`: (R,) a known τ; `None` to estimate τ.
     """
     size, total = np.sum(u**2, axis=-1), np.sum(e**2, axis=-1)
     is_read = total > 0

@@ -1,4 +1,4 @@
-"""The least misfit from one start: a Levenberg–Marquardt search over growing parts of records."""
+"""Find the least misfit from one start: Levenberg–Marquardt over growing parts of records."""
 
 import dataclasses
 from collections.abc import Callable
@@ -21,34 +21,36 @@ from rigidjax.identify.model.predict import FixedSteps, HeldSteps
 from rigidjax.identify.model.terms import Blocks, Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
 
-# The parts of a record that are fitted one after the other. A long record has many wrong minima, in
-# which the phase slips by whole turns; a short one has none.
+# These parts of a record are fitted one after the other. A long record has many wrong minima, in
+# which the phase slips by whole turns; a short record has none.
 HORIZONS = (0.25, 0.5, 1.0)
-# From this many recordings on the numbers of one recording alone are eliminated.
+# If there are at least this many recordings, the normal equations eliminate the numbers that belong
+# to one recording alone.
 MANY = 16
-# The number of steps in one program. An interrupt is noticed between two programs.
+# One run of the compiled search takes this many steps. An interrupt is noticed between two runs.
 STRIDE = 25
-# The search is at the minimum if a stride lowers the misfit by less than this share.
+# A search has reached the minimum if a stride lowers the misfit by less than this share of it.
 SETTLED = 1e-7
-# A fit to a part of the record may raise the misfit of the whole by at most this factor.
+# A fit to a part of the record may raise the misfit of the whole record by at most this factor.
 WILD = 100.0
-# A search over windows ends about so many tolerances from the least misfit (0.05 deviations by
-# default): if a step gains less than the square of it, as a part of the gain of a fit from noise
-# alone. A rough search ends at ROUGH of that gain.
+# A search over windows ends about TOLERANCES tolerances from the least misfit (0.05 standard
+# deviations by default). It ends when a step gains less than the square of this distance, counted
+# as a part of the gain of a fit from noise alone. A rough search ends at the part ROUGH.
 TOLERANCES, ROUGH = 500.0, 1.0
-# The first searches over windows use a ninth and a third of their length, if this is SHORTEST steps
-# or longer, and make FEW steps of the search.
+# The first searches over windows use a ninth and a third of each window, if such a part has at
+# least SHORTEST steps of time; each of these searches takes at most FEW steps.
 PARTS, SHORTEST, FEW = (9, 3), 5, 10
-# The motion is followed for this many samples after the last one with weight, since a low-pass
+# The motion is followed for this many samples after the last sample with a weight, since a low-pass
 # filter takes its slopes from later samples.
 _BEYOND = 2
 
 
 class Evaluation(NamedTuple):
-    """The values that a search keeps of the last evaluation.
+    """Hold the values that a search keeps of its last evaluation.
 
     **Fields:** `blocks` the errors of all readings and their derivatives
-    (`terms.errors_and_jacobians`); `pulls` (R, m) the part of each of R recordings in the gradient.
+    (`terms.errors_and_jacobians`); `pulls` (R, m) the part of each of R recordings in the gradient,
+    by the m numbers of the recording.
     """
 
     blocks: Blocks
@@ -56,7 +58,7 @@ class Evaluation(NamedTuple):
 
 
 class Attempt(eqx.Module):
-    """The end of the search from one start.
+    """Hold the end of the search from one start.
 
     **Fields:**
 
@@ -74,7 +76,7 @@ class Attempt(eqx.Module):
 
 
 class Task(NamedTuple):
-    """The task of a search.
+    """Hold what a search has to fit, and how precisely.
 
     **Fields:** `model` to be fitted; `noise` of its sensors; `tolerance`, in standard deviations;
     `max_steps` of the search.
@@ -87,7 +89,7 @@ class Task(NamedTuple):
 
     @property
     def stride(self) -> int:
-        """Return the number of steps before the next look at the keyboard."""
+        """Return the number of steps of the search before it next notices an interrupt (Ctrl-C)."""
         return min(STRIDE, self.max_steps)
 
 
@@ -103,8 +105,13 @@ def least_squares_from(
 
     The normal equations are added up recording by recording.
 
-    **Arguments:** `x` (n,) the start; `noise` of the sensors; `weights` (R, T) of the readings,
-    zero for those that are not fitted; `settings` of the search.
+    **Arguments:**
+
+    - `model`: the readings and the free numbers.
+    - `x`: (n,) the start.
+    - `noise`: the noise of the sensors.
+    - `weights`: (R, T) the weights of the readings, zero for readings that are not fitted.
+    - `settings`: the settings of the search.
     """
     number, kind, places = model.size, x.dtype, model.index.places
     model = _until_last_weight(model, weights)
@@ -140,7 +147,7 @@ def least_squares_from(
     by_noise = partial(_gain_of_noise, model) if windows else None
     order_one = is_order_one(model, kind)
     end = minimise(evaluate, x, order_one, settings, zeros, zero_normal, by_noise)
-    # A cost that is never finite, not even at the start, leaves the start as the best point.
+    # If the cost is finite at no point, not even at the start, the start stays the best point.
     lost = ~jnp.isfinite(end.cost)
     return dataclasses.replace(
         end,
@@ -151,15 +158,18 @@ def least_squares_from(
 
 
 def _gain_of_noise(model: Model, evaluation: Evaluation, normal: NormalMatrix) -> Float[Array, ""]:
-    """Return ½ tr(K G⁻¹), the mean excess of the cost at the true numbers, of windows.
+    """Return `½ tr(K G⁻¹)`, the mean gain in the cost of windows by a fit to noise alone.
 
-    G is the normal matrix of the shared numbers, without the starts of the windows; K adds up
-    g gᵀ of the gradient g of each stretch of windows, whose errors may be alike: Takeuchi 1976;
-    Burnham and Anderson 2002, doi:10.1007/b97636, section 7.2. A start is at its own optimum near
-    the least cost, so that its gradient is left out.
+    It is the mean excess of the cost at the true numbers over the least cost. G is the normal
+    matrix of the shared numbers, from which the initial states of the windows are eliminated. K is
+    the sum of g gᵀ over stretches of windows, with g the gradient of the cost of a stretch, within
+    which errors may be alike: Takeuchi 1976; Burnham and Anderson 2002, doi:10.1007/b97636, section
+    7.2. The gradient by the initial states is left out: near the least cost each initial state is
+    at its own optimum.
     """
     assert model.clusters is not None
-    # Make a row for each window: the number of stretches, which is smaller, is not known here.
+    # There is a row for each window, although there are fewer stretches: the number of stretches is
+    # not known when this function is compiled.
     slopes = jnp.zeros((model.count, model.size), normal.core.dtype)
     slopes = slopes.at[model.clusters[:, None], model.index.places].add(
         evaluation.pulls, mode="drop"
@@ -174,18 +184,19 @@ def _gain_of_noise(model: Model, evaluation: Evaluation, normal: NormalMatrix) -
 
 
 def is_order_one(model: Model, kind: DTypeLike) -> Float[Array, " n"]:
-    """Return one for free numbers that are of order one, and zero for those of a `Free`.
+    """Return one for each free number that is of order one, and zero for each number of a `Free`.
 
-    The unit of a `Free` is chosen by a user.
+    The user chooses the unit of a `Free`, so that its numbers may have any size. **Arguments:**
+    `kind` the type of the result.
     """
     ones = jnp.zeros(model.size, kind).at[: model.index.bodies].set(1.0)
     return ones.at[model.index.start].set(1.0)
 
 
 def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
-    """Return the rows (m, n) that the curvature of the bodies' charts adds to the Jacobian.
+    """Return the rows (m, n) that the curvature of the bodies' charts adds to the Jacobian at x.
 
-    `slope` (n,) is the gradient of the cost (`AbstractBodyChart.bend`).
+    The `slope` (n,) is the gradient of the cost at x; see `AbstractBodyChart.bend`.
     """
     count = model.index.bodies
     parts = (chart_list(model.chart), *(numbers_of(model.chart, y[:count]) for y in (x, slope)))
@@ -194,7 +205,11 @@ def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
 
 
 def _until_last_weight(model: Model, weights: Float[Array, "records times"]) -> Model:
-    """Return the model with its motion followed only to the last time that has a weight."""
+    """Return the model with its motion followed only to the last time that has a weight.
+
+    The motion goes on for `_BEYOND` more samples, if the record has them. An adaptive integration
+    is not changed.
+    """
     steps = model.integrator
     if not isinstance(steps, FixedSteps | HeldSteps):
         return model
@@ -206,9 +221,10 @@ def _until_last_weight(model: Model, weights: Float[Array, "records times"]) -> 
 
 
 def _zeros_of_evaluation(model: Model, kind: DTypeLike) -> Evaluation:
-    """Return zeros of the shapes of an `Evaluation`.
+    """Return an `Evaluation` of zeros, of the type `kind`.
 
-    They are made from the shapes alone: to trace `terms.errors_and_jacobians` takes seconds.
+    Its shapes are computed from the model alone, because to trace `terms.errors_and_jacobians`
+    takes seconds.
     """
     count, times = model.records.t.shape
     columns = model.index.places.shape[1]
@@ -219,19 +235,22 @@ def _zeros_of_evaluation(model: Model, kind: DTypeLike) -> Evaluation:
 
 
 def whole_record(model: Model) -> Float[Array, "records times"]:
-    """Return the weights (R, T) of a fit to the whole of each record: ones."""
+    """Return the weights (R, T) for a fit to the whole of each record: ones."""
     # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
     return jnp.asarray(np.ones(model.records.t.shape, model.records.t.dtype))
 
 
 def weights_of_beginning(model: Model, part: float) -> Float[Array, "records times"]:
-    """Return the weights (R, T) of a fit to the first `part` of each record: one, else zero."""
+    """Return the weights (R, T) for a fit to the first `part` of each record: first ones, then
+    zeros.
+    """
     t = np.asarray(model.records.t)
     since, length = t - t[:, :1], t[:, -1:] - t[:, :1]
     return jnp.asarray((since <= part * length).astype(t.dtype))
 
 
 def _attempt_of(state: LMState) -> Attempt:
+    """Return the best point of a search as an attempt, with its errors if they were kept."""
     blocks = state.evaluation.blocks if bool(state.evaluated_at_best) else None
     return Attempt(state.point, state.cost, state.converged, blocks)
 
@@ -246,7 +265,17 @@ def _search_stride(
     steps: int | None = None,
     level: float | None = None,
 ) -> LMState:
-    """Return the last state after a stride of `steps` from x; `Settings` names the arguments."""
+    """Return the last state of a search after one stride from x.
+
+    **Arguments:**
+
+    - `x`: (n,) the start.
+    - `task`: the model, its noise, and the tolerance.
+    - `weights`: (R, T) the weights of the readings.
+    - `damping`, `aim`, `level`: as for `Settings`; `margin` is `Settings.near`.
+    - `steps`: the largest number of steps, `task.stride` unless given. Without a `level` the search
+      ends about `TOLERANCES` tolerances from the least misfit.
+    """
     steps, count = task.stride if steps is None else steps, nominal_count(task.model)
     level = (TOLERANCES * task.tolerance) ** 2 if level is None else level
     settings = Settings(task.tolerance, damping, steps, aim, margin, count, level)
@@ -254,19 +283,26 @@ def _search_stride(
 
 
 def _evaluate_at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
-    """Return the state of a search at x without a step, by the program of the search."""
+    """Return the state of a search that evaluates x and takes no step.
+
+    It is computed by the compiled program of the search, so that nothing else is compiled.
+    """
     return least_squares_from(model, x, noise, whole_record(model), Settings(0.0, 1.0, 0))
 
 
 def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Blocks:
-    """Return `terms.errors_and_jacobians` at x, by the program of the search."""
+    """Return the errors of all readings at x and their derivatives.
+
+    They are those of `terms.errors_and_jacobians`, computed by the compiled program of the search,
+    so that nothing else is compiled.
+    """
     kind, sensors = model.records.t.dtype, model.records.sensors
     ones = (np.ones((model.count, sensor.components), kind) for sensor in sensors)
     return _evaluate_at(model, x, tuple(map(jnp.asarray, ones))).evaluation.blocks
 
 
 def cost_of(model: Model, x: Float[Array, " n"], noise: Noise) -> float:
-    """Return the misfit at x over the whole of the records."""
+    """Return the misfit of a model at x over the whole of its records, for this `noise`."""
     return float(_evaluate_at(model, x, noise).cost)
 
 
@@ -278,18 +314,18 @@ def polish(
     aim: float = 0.0,
     watch: Callable[[Attempt], None] = lambda attempt: None,
 ) -> Attempt:
-    """Search over the whole of the records, stride by stride, until a stride changes nothing.
+    """Return the end of a search over the whole of the records, which goes on stride by stride.
 
-    Large damping alone can look like convergence: each stride after the first one therefore begins
-    with little.
+    It ends when a stride changes nothing. Large damping alone can look like convergence: each
+    stride after the first one therefore begins with little damping.
 
     **Arguments:**
 
-    - `begin`: the first point.
-    - `task`: the task.
-    - `damping`: that of the first stride.
+    - `begin`: the attempt at the first point.
+    - `task`: the task of the search.
+    - `damping`: the damping of the first stride.
     - `aim`: the cost that another start reached; a search that does not lead to it ends early.
-    - `watch`: a function that is called after each stride.
+    - `watch`: a function that is called with the attempt after each stride.
     """
     attempt, weights = begin, whole_record(task.model)
     for first in range(0, task.max_steps, STRIDE):
@@ -301,12 +337,14 @@ def polish(
             watch(attempt)
             break
         attempt = _attempt_of(end)
-        # At the minimum every step is refused, by round-off: test whether the misfit still falls.
-        # One or two steps alone, of a small `max_steps`, are also refused where they are too long.
+        # Round-off refuses every step at the minimum, so the search also ends if the misfit does
+        # not fall any more. This test needs a whole stride: with a small `max_steps`, one or two
+        # steps may all be refused only because they are too long.
         stands = before - float(attempt.cost) < SETTLED * (1.0 + abs(before))
         stands = stands and task.stride == STRIDE
         settled = bool(attempt.converged) or stands
-        # The search is hopeless if the misfit would not reach the aim by falling as much again.
+        # The search is hopeless if the misfit would still be above the aim after another fall by
+        # the factor of this stride.
         hopeless = aim > 0 and not settled and float(attempt.cost) ** 2 > aim * before
         attempt = dataclasses.replace(attempt, converged=settled)
         watch(attempt)
@@ -322,15 +360,15 @@ def fit_in_stages(
     aim: float = 0.0,
     watch: Callable[[Attempt], None] = lambda attempt: None,
 ) -> Attempt:
-    """Return the end of the search from one start.
+    """Return the end of the search from one start, over growing parts of each record.
 
-    The whole record is fitted first. If that does not explain it, its beginning is fitted, then
-    more of it, and then all of it (`HORIZONS`).
+    The whole record is fitted first. If this fit does not explain the record, its beginning is
+    fitted, then more of it, and then all of it (`HORIZONS`).
 
     **Arguments:**
 
     - `x`: (n,) the start.
-    - `task`: the task.
+    - `task`: the task of the search.
     - `aim`: the cost that another start reached; a search that does not lead to it ends early.
     - `watch`: a function that is called with each point reached over the whole of the records.
     """
@@ -347,29 +385,30 @@ def fit_in_stages(
         # A part of the record need not be fitted to convergence.
         weights = weights_of_beginning(model, part)
         end = _search_stride(x, task, weights, CAREFUL, aim * part, aim * part)
-        # A point that explains only a part may be far off later: a drag of the wrong sign, say.
+        # A point that explains only a part of the record may be far off later, for instance if its
+        # drag has the wrong sign.
         after = cost_of(model, end.point, noise)
         if after < WILD * max(level, 1e-300):
             x, level = end.point, after
         if aim * part > 0 and not bool(end.converged) and float(end.cost) > WILD * aim * part:
-            # This start does not even explain the part, which another start explains: give it up.
+            # Another start explains this part of the record, and this start does not: give it up.
             attempt = Attempt(x, level)
             watch(attempt)
             return attempt
     attempt = polish(Attempt(x), task, damping=CAREFUL, aim=aim, watch=watch)
     if not float(at_once.cost) < (1.0 - SETTLED) * float(attempt.cost):
         return attempt
-    # The fit to the beginning may have led away from the least misfit of the whole.
+    # The fit to the beginning may have led away from the least misfit of the whole record.
     return at_once if bool(at_once.converged) else polish(at_once, task, aim=aim, watch=watch)
 
 
 def _fit_windows(
     x: Float[Array, " n"], task: Task, aim: float, watch: Callable[[Attempt], None]
 ) -> Attempt:
-    """Return the end of the search over windows.
+    """Return the end of the search from one start over windows; arguments as for `fit_in_stages`.
 
-    The first searches are over a ninth and a third of each window: with poor numbers a long run
-    diverges.
+    The first searches are over a ninth and a third of each window, because a long run with poor
+    numbers diverges.
     """
     model, begin = task.model, x
     length = model.records.t.shape[1] - 1
@@ -386,12 +425,12 @@ def _fit_windows(
 
 
 def has_unit_noise(reading: Reading) -> bool:
-    """Return whether the noise of a reading is no more than the unit of its errors."""
+    """Return whether the noise of a reading is only the unit of its errors, and not their size."""
     return getattr(reading.sensor, "nominal", False)
 
 
 def nominal_count(model: Model) -> int:
-    """Return the number of errors if the size of none is known by a noise, else 0."""
+    """Return the number of errors if the noise of every reading is only a unit, else 0."""
     readings = model.records.readings
     return sum(map(count_of, readings)) if all(map(has_unit_noise, readings)) else 0
 
@@ -399,7 +438,8 @@ def nominal_count(model: Model) -> int:
 def sufficient_misfit(model: Model) -> float:
     """Return a misfit that only the true motion reaches.
 
-    It is twice the mean of half χ² for sensors of known noise, and 1 % of the signal for others.
+    For a sensor of known noise it is twice the mean of half χ²; for others it allows errors of
+    about 1 % of the signal.
     """
     return sum(
         (1.0 if reading.known_noise and not has_unit_noise(reading) else 0.01) * count_of(reading)

@@ -1,4 +1,4 @@
-"""The starting points of a fit: a linear regression if the data allow it, and scattered points."""
+"""Find the starting points of a fit: by a regression if the data allow it, then by scatter."""
 
 import equinox as eqx
 import jax
@@ -20,10 +20,12 @@ from rigidjax.motion.torques.states import has_states
 
 
 def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[Float[Array, " n"]]:
-    """Return `count` starting points (n,) of a fit: the regression first, then scattered ones.
+    """Return `count` starting points (n,) of a fit: the regression first, then scattered points.
 
-    The others scatter about the regression or over the whole chart of the body, and their initial
-    rates by a tenth. A `Free` starts at its given value.
+    The scattered points lie about the regression or all over the chart of the body, and their
+    initial rates differ by about a tenth. A `Free` starts at its given value. There is only one
+    point if neither a body nor initial rates are free. **Arguments:** `key` the random key of the
+    scatter; without a key the points are the same at each call.
     """
     recordings = (
         stacking.recordings_on_host(model.records, model.counts) if model.index.bodies else ()
@@ -42,7 +44,7 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
     # Use NumPy's generator: that of JAX takes seconds to compile.
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)
     out = []
-    # Without a free body and free initial rates there is nothing to scatter.
+    # If neither a body nor initial rates are free, there is nothing to scatter.
     for index in range(count if model.index.bodies or spins.size else 1):
         wide = 0.0 if index == 0 else (0.5 if regressed is not None and index % 2 else 1.5)
         x = np.array(start)
@@ -54,12 +56,13 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
 
 
 def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) -> Inertia | None:
-    """Return the inertia by a regression on Euler's equations in integral form.
+    """Return the inertia of a body by a regression on Euler's equations in integral form.
 
-    `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. With a torque τ they are
-    found by least squares; without one they are the right singular vector of the smallest singular
-    value, up to scale. The result is moved to the nearest real body. It is `None` if samples are
-    too far apart, or if the torque depends on more than time and rate.
+    The equation `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. With a torque τ
+    the components are found by least squares; without a torque they are, up to scale, the right
+    singular vector of the smallest singular value. The result is moved to the nearest real body. It
+    is `None` if samples are too few or too far apart, if the torque depends on more than time and
+    rate, or if the tensor has no positive trace.
     """
     balances = []
     for recording in recordings:
@@ -81,10 +84,11 @@ def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) ->
 
 
 def tensor_and_margin(matrix: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the components (6,) of a tensor by least squares, and its margin of being real.
+    """Return the components (6,) of a tensor by least squares, and the margin by which it is real.
 
-    If all sides are zero, the tensor has the trace one. The margin is the smallest eigenvalue of
-    the second moment over the largest: it is positive for a real body.
+    The components solve `matrix @ components = rhs`, with `matrix` (n, 6) and `rhs` (n,). If `rhs`
+    is zero, the tensor has the trace one. The margin is the smallest eigenvalue of the second
+    moment over the largest: it is positive for a real body.
     """
     if np.abs(rhs).max() > 0:
         components = np.linalg.lstsq(matrix, rhs, rcond=None)[0]
@@ -98,17 +102,18 @@ def tensor_and_margin(matrix: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, 
 
 
 def depends_on_rate_only(torque: Torque | None) -> bool:
-    """Return whether a torque depends on time and rate alone; true for no torque."""
+    """Return whether a torque depends on time and body rate alone; true for no torque."""
     return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
 
 
 def balance_of_momentum(
     recording: Recording, torque: Torque | None, turn: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Euler's equations integrated over a recording, of rates times the matrix `turn`.
+    """Return Euler's equations integrated over a recording, as linear equations for the inertia.
 
-    They are linear equations for the six components of the inertia: rows (n, 6) and right sides
-    (n,). The third result are the rows of the momentum alone.
+    The equations are those for the recorded rates multiplied by the matrix `turn`. They have rows
+    (n, 6), for the six components of the inertia, and right sides (n,). The third result is the
+    rows (n, 6) of the angular momentum alone.
     """
     t, w = rates(recording)
     w, pushed = w @ turn.T, np.zeros((t.size, 3))
@@ -121,7 +126,7 @@ def balance_of_momentum(
     total, impulse = momenta + integral[:, :-1], integral[:, -1:]
 
     def less_mean(x: np.ndarray) -> np.ndarray:
-        # The integral of the equations is a constant: compare each sample with the mean over the
+        # The integrated equations are constant in time: compare each sample with the mean over the
         # record. Sixty samples are enough.
         samples = (x - x.mean(axis=0))[:: max(1, t.size // 60)]
         return samples.transpose(0, 2, 1).reshape(-1, x.shape[1])
@@ -131,6 +136,6 @@ def balance_of_momentum(
 
 @eqx.filter_jit
 def _torques(torque: Torque, t: ArrayLike, w: ArrayLike) -> Array:
-    """Return the torques (n, 3) at times t (n,) and rates w (n, 3)."""
+    """Return the torques (n, 3) at the times t (n,) and the body rates w (n, 3)."""
     body = Inertia(jnp.eye(3))
     return jax.vmap(lambda time, omega: evaluate(torque, time, Spin(omega), body))(t, w)

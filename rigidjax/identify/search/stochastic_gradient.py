@@ -1,4 +1,4 @@
-"""Stochastic gradient descent by optax, for more recordings than a least-squares step can use."""
+"""Fit by stochastic gradient descent with optax, for more recordings than `fit` can use."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -25,18 +25,18 @@ from rigidjax.identify.search.noise import initial_noise
 if TYPE_CHECKING:
     import optax
 
-# The number of steps in one program. An interrupt, or a misfit that is NaN, is noticed between two
-# programs.
+# One run of the compiled program takes this many steps. An interrupt, or a misfit that is NaN, is
+# noticed between two runs.
 STRIDE = 50
 
 
 class Descent(eqx.Module):
-    """The options of a stochastic gradient descent, which takes a few recordings at a time.
+    """Hold the options of a stochastic gradient descent, which uses a few recordings in each step.
 
-    Each step draws `batch` recordings without replacement, and gives the gradient of their misfit
-    by all free numbers to the optimiser (Robbins and Monro 1951, doi:10.1214/aoms/1177729586). The
-    free numbers are unconstrained and of order one, so that a learning rate of 0.01 moves each by
-    about a hundredth of its size.
+    Each step draws `batch` recordings without replacement, and gives the optimiser the gradient of
+    their misfit by all free numbers (Robbins and Monro 1951, doi:10.1214/aoms/1177729586). The free
+    numbers are unconstrained and of order one, so that a learning rate of 0.01 moves each number by
+    about a hundredth of its size in a step.
 
     **Arguments:**
 
@@ -79,22 +79,22 @@ def descend(
 ) -> Float[Array, " n"]:
     """Fit the free numbers of a model by stochastic gradient descent alone.
 
-    It is for many numbers, such as the weights of a network in the torque, for which the dense
-    matrices of `fit` are too large. It gives no intervals.
+    It is for models with many free numbers, such as the weights of a network in the torque, for
+    which the dense matrices of `fit` are too large. It gives no intervals.
 
     **Arguments:**
 
-    - `model`: the readings and the free numbers. A sensor without noise counts with a noise of a
-      tenth of its signal.
-    - `descent`: optimiser, steps and batch.
+    - `model`: the readings and the free numbers. A sensor without a given noise counts with a noise
+      of a tenth of its signal.
+    - `descent`: the optimiser, the number of steps and the size of a batch.
     - `initial`: (n,) the free numbers to begin with, `model.start()` unless given.
-    - `key`: random key of the batches; without a key they are the same at each call.
+    - `key`: random key of the batches; without a key the batches are the same at each call.
     - `progress`: a function such as `print`, called with a line of text after every 50 steps.
 
-    **Returns** the free numbers x (n,) after the last step, or before the first step whose misfit
-    is not finite; `model.unpack(x)` returns the body and the values, `model.scenes(x)` the scenes.
-    After an interrupt (Ctrl-C) the numbers reached so far are returned. **Raises:** `ValueError`
-    for a batch of more recordings than there are.
+    **Returns** the free numbers x (n,) after the last step. If a misfit is not finite, they are
+    those before the 50 steps in which this happens; after an interrupt (Ctrl-C) they are those
+    reached so far. `model.unpack(x)` returns the body and the values, `model.scenes(x)` the scenes.
+    **Raises:** `ValueError` for a batch of more recordings than there are.
 
     >>> import optax
     >>> ts = jnp.linspace(0.0, 3.0, 31)
@@ -130,7 +130,9 @@ def descend_from(
 ) -> tuple[Float[Array, " n"], bool]:
     """Return the last point of a descent, and whether it ended without an interrupt (Ctrl-C).
 
-    The point is the last one before a misfit that is not finite.
+    If a misfit is not finite, the point is the one before the `STRIDE` steps in which this happens.
+    **Arguments:** `start` (n,) the free numbers to begin with; `noise` the noise of the sensors;
+    the others as for `descend`.
     """
     if descent.batch > model.count:
         raise ValueError(
@@ -158,7 +160,9 @@ def descend_from(
 def _descent_steps(
     x: Float[Array, " n"], memory: PyTree, model: Model, noise: Noise, descent: Descent, keys: Array
 ) -> tuple[Float[Array, " n"], PyTree, Float[Array, " steps"]]:
-    """Return point, memory of the optimiser and misfits after one step for each of the `keys`."""
+    """Return free numbers, the optimiser's memory and misfits after a step for each of the
+    `keys`.
+    """
 
     def step(carry: tuple, key: Array) -> tuple[tuple, Array]:
         x, memory = carry
@@ -175,9 +179,10 @@ def _descent_steps(
 
 
 def misfit_of(x: Float[Array, " n"], model: Model, noise: Noise, rows: Array) -> Float[Array, ""]:
-    """Return the misfit of the recordings `rows`, scaled up to all recordings, and of the priors.
+    """Return the misfit of some recordings, scaled up to all recordings, and of the priors.
 
-    Its mean over batches is the misfit of the whole model.
+    The recordings have the indices `rows`. The mean of this misfit over batches is the misfit of
+    the whole model.
     """
     few, sizes = chosen_recordings(model, rows), stacking.pick_records(noise, rows)
     weights = jnp.ones_like(few.records.t)
@@ -187,7 +192,7 @@ def misfit_of(x: Float[Array, " n"], model: Model, noise: Noise, rows: Array) ->
 
 
 def chosen_recordings(model: Model, rows: Array) -> Model:
-    """Return the model of the recordings `rows` alone, with all free numbers.
+    """Return the model with only the recordings of indices `rows`, and with all free numbers.
 
     The indices may be traced; the recordings keep their padding.
     """

@@ -1,4 +1,4 @@
-"""The sensors of a recording: each predicts its readings from a motion."""
+"""Provide the sensors of a recording, each of which predicts its readings from a motion."""
 
 from rigidjax._names import show
 from rigidjax.identify.sensors.attitude import (

@@ -1,4 +1,4 @@
-"""Sensors of the attitude, of directions, and of the positions of points of the body."""
+"""Provide sensors of the attitude, of directions, and of the positions of points of the body."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -18,22 +18,23 @@ from rigidjax.rotation.linalg3 import cross, dot
 
 
 class AttitudeSensor(ClockedSensor):
-    """A sensor of the attitude as a quaternion (w, x, y, z), body → world; q and −q are the same.
+    """Measure the attitude as a quaternion (w, x, y, z), body → world; q and −q are equal.
 
     The error is the rotation vector, in the sensor's axes, from the predicted attitude to the
-    reading, `log((q exp(mounting))⁻¹ q_read)`: its length is the angle between them. Readings are
-    quaternions (T, 4) or rotation matrices (T, 3, 3). Euler angles (T, 3) in degrees become
-    quaternions by `jax.vmap(lambda a: rj.euler.to_quaternion(a, "ZYX"))(jnp.deg2rad(angles))`.
+    reading, `log((q exp(mounting))⁻¹ q_read)`: its length is the angle between the two attitudes.
+    Readings are quaternions (T, 4) or rotation matrices (T, 3, 3). Euler angles (T, 3) in degrees
+    become quaternions by
+    `jax.vmap(lambda a: rj.euler.to_quaternion(a, "ZYX"))(jnp.deg2rad(angles))`.
 
     **Arguments:**
 
     - `noise`: the standard deviation of each component of the rotation vector, rad, one number or
-      (3,); `None` estimates it.
+      (3,); `None` estimates the noise.
     - `mounting`: (3,) the rotation vector from the body's axes to the sensor's, rad, or `None`.
     - `offset`, `jitter`: s, as for `Gyro`.
 
     **Raises** `ValueError` for a noise that is not positive, a wrong shape, NaN; a `Recording`
-    raises it for a matrix that is no rotation.
+    raises `ValueError` for a matrix that is no rotation.
 
     >>> AttitudeSensor(noise=0.01).reading_shape
     (4,)
@@ -51,22 +52,25 @@ class AttitudeSensor(ClockedSensor):
         return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
 
     def reading_of(self, motion: SensorInput, error: Vec3) -> Float[Array, "4"]:
-        """Return the reading (4,) that has the `error` (3,), rad."""
+        """Return the reading (4,) whose error is `error` (3,), rad, for this motion."""
         q = _mounted_attitude(motion.state.q, self.mounting)
         return quaternion.multiply(q, quaternion.exp(error))
 
     def readings(self, values: np.ndarray) -> np.ndarray:
-        """Return readings (T, 4), from quaternions (T, 4) or matrices (T, 3, 3)."""
+        """Return `values`, quaternions (T, 4) or matrices (T, 3, 3), as readings (T, 4)."""
         return _quaternions(values) if values.shape[1:] == (3, 3) else values
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return the rows that are no unit quaternions, (T,) true where wrong, and why."""
+        """Return which rows of `values` are no unit quaternions, (T,) true where wrong, and why."""
         wanted = "wanted (w, x, y, z) with the scalar first"
         return _has_wrong_length(values), f"the quaternion at index {{index}} is not unit; {wanted}"
 
 
 def _quaternions(matrices: np.ndarray) -> np.ndarray:
-    """Return the quaternions (T, 4) of rotation matrices (T, 3, 3); NaN for a matrix with NaN."""
+    """Return the quaternions (T, 4) of rotation matrices (T, 3, 3); NaN for a matrix with NaN.
+
+    **Raises** `ValueError` for a matrix that is no rotation.
+    """
     finite = np.isfinite(matrices).all(axis=(1, 2))
     filled = np.where(finite[:, None, None], matrices, np.eye(3))
     off = np.abs(filled @ filled.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
@@ -82,12 +86,15 @@ def _quaternions(matrices: np.ndarray) -> np.ndarray:
 
 
 def _mounted_attitude(q: Array, mounting: Vec3 | None) -> Array:
-    """Return the attitude of a sensor's axes on a body of attitude q."""
+    """Return the attitude of a sensor's axes on a body of attitude q.
+
+    The rotation vector `mounting` leads from the body's axes to the sensor's axes.
+    """
     return q if mounting is None else quaternion.multiply(q, quaternion.exp(mounting))
 
 
 def _unit_vector(world: NumbersLike) -> Vec3:
-    """Return the unit vector along `world`; raise `ValueError` for a length of zero."""
+    """Return the unit vector along `world` (3,); raise `ValueError` for a length of zero."""
     vector = base.array_field("world")(world)
     length = jnp.sqrt(dot(vector, vector))
     words = "world: wanted a direction, got a vector of length zero"
@@ -95,7 +102,7 @@ def _unit_vector(world: NumbersLike) -> Vec3:
 
 
 class Direction(ClockedSensor):
-    """A sensor of the direction, in its own axes, of an object with a known direction in the world.
+    """Measure the direction, in the sensor's axes, of an object of known direction in the world.
 
     Examples are a sun sensor, a tracker of one star, a sensor of the vertical. The error is the
     chord from the prediction to the reading, in the plane across the reading: two numbers, rad for
@@ -104,7 +111,8 @@ class Direction(ClockedSensor):
     **Arguments:**
 
     - `world`: (3,) the direction in the world frame, of any length.
-    - `noise`: rad across the line of sight, one number or (2,), `None` to estimate it.
+    - `noise`: the standard deviation across the line of sight, rad, one number or (2,); `None` to
+      estimate it.
     - `mounting`, `offset`, `jitter`: as for `AttitudeSensor`.
 
     **Raises** `ValueError` for a direction of length zero, a noise that is not positive, NaN.
@@ -126,19 +134,21 @@ class Direction(ClockedSensor):
         # The axes across the reading are data: no derivative passes through them. Axes across the
         # prediction would jump as the motion changes.
         first, second = _orthogonal_pair(reading)
-        # The chord is sin θ / cos ½θ = 2 sin ½θ; the bound guards opposite directions.
+        # The chord is sin θ / cos ½θ = 2 sin ½θ; the bound prevents a division by zero for opposite
+        # directions.
         half = jnp.sqrt(jnp.maximum(0.5 * (1.0 + dot(predicted, reading)), 1e-12))
         return -jnp.stack([dot(first, predicted), dot(second, predicted)]) / half
 
     def reading_of(self, motion: SensorInput, error: Float[Array, "2"]) -> Vec3:
         """Return a reading (3,) whose error has the length of `error` (2,).
 
-        The components are the same to first order: here they are taken along axes across the
-        prediction, which are turned from those across the reading by the angle between the two.
+        The components of the two errors are equal to first order. Here they are taken along axes
+        across the prediction, which are turned from the axes across the reading by the angle
+        between the prediction and the reading.
         """
         predicted = self._predict(motion)
         first, second = _orthogonal_pair(predicted)
-        # |error| is a chord: cos θ = 1 − ½ |error|², sin θ = |error| cos ½θ.
+        # The length of `error` is a chord: cos θ = 1 − ½ |error|², sin θ = |error| cos ½θ.
         square = jnp.minimum(error[0] * error[0] + error[1] * error[1], 4.0)
         half = jnp.sqrt(1.0 - 0.25 * square)
         return (1.0 - 0.5 * square) * predicted + half * (error[0] * first + error[1] * second)
@@ -150,12 +160,12 @@ class Direction(ClockedSensor):
         )
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return the rows that are no unit vectors, (T,) true where wrong, and why."""
+        """Return which rows of `values` are no unit vectors, (T,) true where wrong, and why."""
         return _has_wrong_length(values), "the direction at index {index} is not of length 1"
 
 
 def _has_wrong_length(rows: np.ndarray) -> np.ndarray:
-    """Return whether each row is longer or shorter than 1."""
+    """Return (T,) whether the length of each row of `rows` (T, k) differs from 1."""
     return np.abs(np.linalg.norm(rows, axis=1) - 1) > 1e-6
 
 
@@ -168,11 +178,12 @@ def _orthogonal_pair(line: Vec3) -> tuple[Vec3, Vec3]:
 
 
 class Marker(ClockedSensor):
-    """A marker: its position in the world is read, `x + R r`, m; the point is fixed in the body.
+    """Measure the position in the world of a point fixed in the body: `x + R r`, m.
 
     **Arguments:**
 
-    - `place`: (3,) r, the point, m, body frame; that of the `MassProperties` if the body moves.
+    - `place`: (3,) r, the point, m, body frame; for a body that moves, in the frame of its
+      `MassProperties`.
     - `noise`: m, one number or (3,), `None` to estimate it.
     - `origin`: (3,) m, world frame, the fixed point of a body on a pivot; `None` for a body that
       moves (`Rigid`, with `MassProperties`).
@@ -187,7 +198,7 @@ class Marker(ClockedSensor):
     [0.25, 0.0, 0.0]
     """
 
-    # The place of a body on a pivot is known: only its attitude is needed.
+    # The position of a body on a pivot is known: the sensor needs only the attitude.
     feels: ClassVar[Any] = property(lambda self: HasPose if self.origin is None else HasAttitude)
     unit: ClassVar[str] = "m"
     place: Vec3 = eqx.field(converter=base.array_field("place"), default=None)
@@ -202,7 +213,7 @@ class Marker(ClockedSensor):
 
 
 class Position(ClockedSensor):
-    """A sensor of the centre of mass of a `Rigid`, in the world: `x + bias`, m.
+    """Measure the position of the centre of mass of a `Rigid`, in the world: `x + bias`, m.
 
     Use `Marker` for another point.
 
@@ -230,15 +241,15 @@ class Position(ClockedSensor):
 
 
 class Velocity(ClockedSensor):
-    """A sensor of the velocity of a point of a `Rigid`: `v + R (Ω × r)`, in world or sensor axes.
+    """Measure the velocity of a point of a `Rigid`, `v + R (Ω × r)`, in world or sensor axes.
 
     Source: Landau and Lifshitz, Mechanics, eq 31.2.
 
     **Arguments:**
 
     - `noise`: m/s, one number or (3,), `None` to estimate it.
-    - `place`: (3,) the point, m, in the frame of the `MassProperties`; r is the vector to it from
-      the centre of mass. `None` for the centre of mass.
+    - `place`: (3,) the point, m, in the frame of the `MassProperties`; r is the vector from the
+      centre of mass to this point. `None` for the centre of mass.
     - `mounting`: (3,) the rotation vector from the body's axes to the sensor's, rad, for a sensor
       on the body, such as a Doppler log; zeros for the body's axes. `None` for the world's axes, as
       in satellite navigation.
@@ -273,9 +284,9 @@ class Velocity(ClockedSensor):
 
 
 class Range(ClockedSensor):
-    """A sensor of the distance of a point of a `Rigid` from a station: `|x + R r − s| + bias`, m.
+    """Measure the distance of a point of a `Rigid` from a station: `|x + R r − s| + bias`, m.
 
-    Readings are (T,).
+    Readings are (T,). The vector r leads from the centre of mass to the point.
 
     **Arguments:**
 
@@ -307,14 +318,17 @@ class Range(ClockedSensor):
         line = state.x - self.station
         if self.place is not None:
             line = line + quaternion.rotate(state.q, motion.lever(self.place))
-        # At the station itself the distance has no derivative; it is set to 0.
+        # At the station itself the distance has no derivative; the derivative is set to 0.
         square = dot(line, line)
         length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
         predicted = length if self.bias is None else length + self.bias
         return (reading - predicted)[None]
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return the distances below zero, (T,) true where wrong, and why; none with a bias."""
+        """Return which of the distances `values` are below zero, (T,) true where wrong, and why.
+
+        A sensor with a bias may read such distances.
+        """
         if self.bias is not None:
             return np.zeros(values.shape, bool), ""
         return values < 0, "the distance at index {index} is below zero"

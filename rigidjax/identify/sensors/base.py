@@ -1,4 +1,4 @@
-"""The base class of sensors, and the motion at one time from which a sensor predicts."""
+"""Define the base class of sensors, and the motion at one time from which a sensor predicts."""
 
 import abc
 import dataclasses
@@ -15,16 +15,17 @@ from rigidjax.body.inertia import MassProperties
 
 
 class SensorInput(eqx.Module):
-    """The input of a sensor: a motion at one time.
+    """Hold the motion at one time, from which a sensor predicts its reading.
 
     **Fields:**
 
-    - `t`: s.
+    - `t`: the time, s.
     - `state`: a `Spin`, `Attitude` or `Rigid`.
     - `body`: the `Inertia` or `MassProperties`.
-    - `field`: the equations of motion `f(t, state, args)`. Torques with states of their own, such
-      as wheels, are held at their states at `t`.
-    - `own`: these states, in the order of `Solution.own`, for a sensor of a wheel or a motor.
+    - `field`: the equations of motion `f(t, state, args)`. In them torques with states of their
+      own, such as wheels, have the states that they have at `t`.
+    - `own`: the states of these torques at `t`, in the order of `Solution.own`, for a sensor of a
+      wheel or a motor.
 
     >>> body, state = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
     >>> field = rj.equations_of_motion(body, state, None)
@@ -47,19 +48,19 @@ class SensorInput(eqx.Module):
     def lever(self, place: Vec3) -> Vec3:
         """Return the vector (3,), m, from the reference point of the state to a `place`.
 
-        The `place` (3,) is in the body frame.
+        The vector and the `place` (3,), m, are in the body frame.
         """
         return place - self.body.com if isinstance(self.body, MassProperties) else place
 
 
 class AbstractSensor(eqx.Module):
-    """A sensor: the shape of its readings, the state it needs, and the error of a reading.
+    """Define a sensor: the shape of its readings, the state it needs, and the error of a reading.
 
     To make a sensor of your own, write a subclass with the method `error` and these members:
 
     - `reading_shape`: the shape of one reading.
-    - `feels`: the state that it needs, `HasSpin`, `HasAttitude` or `HasPose`.
-    - `components`, `unit`: the number of components k of an error, and its unit.
+    - `feels`: the state that the sensor needs, `HasSpin`, `HasAttitude` or `HasPose`.
+    - `components`, `unit`: the number k of components of an error, and the unit of an error.
     - `noise`: (k,) the standard deviation of each component, or `None` to estimate it.
 
     Optional members:
@@ -67,14 +68,14 @@ class AbstractSensor(eqx.Module):
     - `offset`: s, if the sensor's clock is behind: the reading at t belongs to t + offset.
     - `limit`: (k,) the full scale of each channel, in the unit of the error.
     - `lowpass`: a `LowPass`, if the error is reading minus prediction.
-    - `refusal(values)`: a method that returns the rows that cannot be readings, (T,) true where
-      wrong, and why.
+    - `refusal(values)`: a method that returns which rows cannot be readings, (T,) true where wrong,
+      and why.
     - `typical_rate(t, values)`: a method that returns the rough rate of the body, rad/s, from the
       unmasked readings, if no other sensor shows it.
     - `reading_of(motion, error)`: a method that returns the reading with this error, for
       `simulate_readings`, if the error is not reading minus prediction.
-    - `suspect`: name, words and remedy of the cause that a fit names for the errors of this sensor
-      if it finds no other cause.
+    - `suspect`: the name, the words and the remedy of a cause for large errors of this sensor,
+      which a fit names if it finds no other cause.
 
     >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s
     ...     reading_shape, components, unit = (), 1, "rad/s"
@@ -93,13 +94,15 @@ class AbstractSensor(eqx.Module):
 
     @abc.abstractmethod
     def error(self, motion: SensorInput, reading: Array) -> Float[Array, " k"]:
-        """Return reading minus prediction (k,), in the sensor's unit."""
+        """Return the error (k,) of a `reading`, such as reading − prediction, in the sensor's
+        unit.
+        """
 
 
 def array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]:
-    """Return a converter of a field to finite numbers of this shape, for `eqx.field`.
+    """Return a converter, for `eqx.field`, of a field to finite numbers of this `shape`.
 
-    The numbers are an array, so that a fit may move them.
+    The numbers are an array, so that a fit may move them; `name` names the field in error messages.
     """
 
     def convert(value: NumbersLike) -> Array:
@@ -111,15 +114,15 @@ def array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Arr
 
 
 def optional_array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array | None]:
-    """Return the converter of `array_field` for a field that may be `None`."""
+    """Return the converter of `array_field`, for a field that may be `None`."""
     converted = array_field(name, shape)
     return lambda value: None if value is None else converted(value)
 
 
 def deviations_field(size: int = 3) -> Callable[[Any], Array | None]:
-    """Return a converter of one number, or `size` numbers, to standard deviations (size,).
+    """Return a converter of one number, or of `size` numbers, to standard deviations (size,).
 
-    `None` stays `None`.
+    It leaves `None` unchanged.
     """
     return lambda value: positive_numbers(value, "noise", "a positive standard deviation", size)
 
@@ -129,7 +132,8 @@ def positive_numbers(
 ) -> Array | None:
     """Return one number, or `size` numbers, as an array (size,) of positive numbers.
 
-    `None` stays `None`; `name` and `requirement` are words of the error that is raised for others.
+    `None` stays `None`. **Raises** `ValueError` for other values; `name` and `requirement` are
+    words of its message.
     """
     if value is None:
         return None
@@ -142,9 +146,10 @@ def positive_numbers(
 
 
 class Jitter(eqx.Module):
-    """The scatter of time stamps.
+    """Hold the scatter of time stamps.
 
-    **Fields:** `deviation` the standard deviation, s; `estimated` whether the fit estimates it.
+    **Fields:** `deviation` the standard deviation of a time stamp, s; `estimated` whether the fit
+    estimates this deviation.
     """
 
     deviation: Scalar
@@ -164,7 +169,7 @@ def jitter_of(jitter: object) -> Jitter | None:
 
 
 class ClockedSensor(AbstractSensor):
-    """A sensor whose clock may be behind by an `offset`, and whose time stamps may have `jitter`.
+    """Define a sensor whose clock may be behind by an `offset`, and its time stamps have `jitter`.
 
     It reads a vector (3,), unless a subclass sets another shape.
     """

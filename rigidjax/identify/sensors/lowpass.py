@@ -1,4 +1,4 @@
-"""The low-pass filter that readings passed before they were logged."""
+"""Apply the low-pass filter that readings passed before they were logged."""
 
 import math
 from collections.abc import Callable
@@ -14,24 +14,25 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 
-# An interval of more than _GAP usual ones is a gap, after which the filter starts anew.
+# An interval longer than _GAP usual intervals is a gap, after which the filter starts anew.
 _GAP = 3.0
-# The third powers of numbers and intervals must be finite in float32, too.
+# The third powers of numbers and of intervals must be finite in float32, too.
 _LARGEST = 1e12
 _ROOT = math.sqrt(2.0)
 
 
 class LowPass(eqx.Module):
-    """A low-pass filter of first or second order (Butterworth), as in the chips of gyros.
+    """Apply a low-pass filter of first or second order (Butterworth), as in the chips of gyros.
 
-    Give it to a sensor (`Gyro(0.01, lowpass=LowPass(40.0))`), and the predictions pass the same
-    filter as the readings; without it a fit mistakes the lag of the filter for an offset of the
-    clock.
+    Give the filter to a sensor (`Gyro(0.01, lowpass=LowPass(40.0))`): the predictions then pass the
+    same filter as the readings. Without it a fit mistakes the lag of the filter for an offset of
+    the clock.
 
-    The filter is `ẏ = w(u − y)`, or `ÿ + √2 w ẏ + w² y = w² u`, with w = 2π · cutoff. It is solved
-    exactly from sample to sample, for an input u that is a cubic between samples. Before the first
-    sample u is the cubic through the first four samples; before the first sample after a gap of
-    more than three intervals it is a straight line.
+    The filter is `ẏ = w(u − y)` for order 1, and `ÿ + √2 w ẏ + w² y = w² u` for order 2, with the
+    input u, the output y and w = 2π · cutoff. It is solved exactly from sample to sample, for an
+    input u that is a cubic between samples. Before the first sample u is the cubic through the
+    first four samples; before the first sample after a gap of more than three intervals u is a
+    straight line.
 
     **Arguments:** `cutoff` Hz, the frequency of gain 1/√2 (a `Free` may move it); `order` 1 or 2.
     **Raises** `ValueError` for a cutoff that is not positive, and for another order. Source:
@@ -56,11 +57,11 @@ class LowPass(eqx.Module):
     def __call__(
         self, t: Float[Array, " times"], values: Float[Array, "times k"]
     ) -> Float[Array, "times k"]:
-        """Return the filtered samples.
+        """Return the filtered samples (T, k).
 
         **Arguments:** `t` (T,) increasing times, s; `values` (T, k), of any unit. **Raises**
-        `ValueError` for times that do not increase, NaN, and numbers whose cubes overflow, if they
-        are known.
+        `ValueError`, for known times and values, if times do not increase, if a number is NaN, or
+        if its cube overflows.
         """
         values = _checks.numeric_array(values, "values")
         if values.ndim != 2:
@@ -73,14 +74,14 @@ class LowPass(eqx.Module):
             return values
         w = 2 * math.pi * self.cutoff.astype(values.dtype)
         gaps = jnp.diff(t)
-        # The padding of a shorter record repeats its last time: give it usual intervals. Its
-        # samples are masked, so that their values do not matter.
+        # The padding of a shorter record repeats the last time of the record: give the padding
+        # usual intervals. Its samples are masked, so that their values do not matter.
         is_last = gaps <= 0
         usual = jnp.nanmedian(jnp.where(is_last, jnp.nan, gaps))
         gaps = jnp.where(is_last, usual, gaps)
         after_gap = gaps > _GAP * usual
         before, after = _end_slopes(gaps, jnp.diff(values, axis=0), after_gap, is_last)
-        # On each interval u = u₀ + b s + c s² + d s³, s from its begin.
+        # On each interval u = u₀ + b s + c s² + d s³, with s the time since its begin.
         h = gaps[:, None]
         chord = jnp.diff(values, axis=0) / h
         c, d = (3 * chord - 2 * before - after) / h, (before + after - 2 * chord) / h**2
@@ -95,7 +96,7 @@ class LowPass(eqx.Module):
 
 
 def lowpass_of(lowpass: object) -> LowPass | None:
-    """Return `lowpass` if it is a `LowPass` or `None`; raise `TypeError` for others."""
+    """Return `lowpass` if it is a `LowPass` or `None`; raise `TypeError` for anything else."""
     wanted = "LowPass(cutoff in Hz) or None"
     return _checks.require_instance(lowpass, (LowPass, NoneType), "lowpass", requirement=wanted)
 
@@ -111,14 +112,17 @@ def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
 
 
 def _end_slopes(gaps: Array, steps: Array, after_gap: Array, is_last: Array) -> tuple[Array, Array]:
-    """Return du/dt at the begin and at the end of each interval.
+    """Return du/dt, of the input u, at the begin and at the end of each interval between samples.
 
-    They are those of the parabola through three samples, and of a straight line next to a gap.
+    The slopes are those of the parabola through three samples, and of a straight line next to a
+    gap. **Arguments:** `gaps` (n,) the lengths of the intervals; `steps` (n, k) the changes of u
+    over them; `after_gap` (n,) true for a gap; `is_last` (n,) true for the padding after the last
+    sample.
     """
     h, chord = gaps[:, None], steps / gaps[:, None]
     apart = (after_gap[1:] | after_gap[:-1])[:, None]
     bend = jnp.where(apart, 0.0, jnp.diff(chord, axis=0) / (h[1:] + h[:-1]))
-    # The last interval of a record has no next one: take the parabola before it.
+    # The last interval of a record has no next interval: take the parabola before it.
     bend = jnp.where(is_last[1:, None], jnp.roll(bend, 1, axis=0), bend)
     begin = jnp.concatenate([bend[:1] * h[:1], bend * h[1:]]) if bend.shape[0] else 0.0 * chord
     end = jnp.concatenate([bend * h[:-1], bend[-1:] * h[-1:]]) if bend.shape[0] else 0.0 * chord
@@ -126,7 +130,11 @@ def _end_slopes(gaps: Array, steps: Array, after_gap: Array, is_last: Array) -> 
 
 
 def _first_derivatives(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
-    """Return three derivatives at the first sample, of the cubic through the first four samples."""
+    """Return three derivatives, at the first sample, of the cubic through the first four samples.
+
+    **Arguments:** `gaps` (n,) the lengths of the intervals; `chord` (n, k) the mean slope in each
+    interval.
+    """
     a, b = gaps[0], gaps[0] + gaps[1]
     one = (chord[1] - chord[0]) / b
     two = ((chord[2] - chord[1]) / (gaps[1] + gaps[2]) - one) / (b + gaps[2])
@@ -137,9 +145,9 @@ def _first_derivatives(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
 def _particular_solution(
     order: int, w: Array, u: Array, du: tuple[ArrayLike, ArrayLike, ArrayLike]
 ) -> Array:
-    """Return the cubic that solves the filter's equation: y, and ẏ/w of a filter of order 2.
+    """Return the cubic that solves the filter's equation: y, and ẏ/w for a filter of order 2.
 
-    The input is a cubic of value u and derivatives `du`.
+    The input is a cubic with the value u and the three derivatives `du` at the time of the result.
     """
     # With x = (d/dt)/w: 1/(1 + x) = 1 − x + x² − x³ …, 1/(1 + √2 x + x²) = 1 − √2 x + x² + 0 x³ …
     if order == 1:
@@ -149,7 +157,10 @@ def _particular_solution(
 
 
 def _propagator(order: int, w: Array, h: Array) -> Array:
-    """Return the matrix that carries a difference from the particular solution over a time h."""
+    """Return the matrix that carries a difference from the particular solution over a time h.
+
+    **Arguments:** `order` of the filter; `w` its angular frequency, rad/s; `h` s.
+    """
     if order == 1:
         return jnp.exp(-w * h)[None, None]
     a = w * h / _ROOT
@@ -167,9 +178,10 @@ def _filter_samples(
 ) -> Array:
     """Return the filtered samples, solved from interval to interval.
 
-    **Arguments:** `begin` the first state; `y0`, `y1` the particular solutions at begin and end of
-    each interval; `propagator` a function of its length; `gaps` the lengths; `after_gap` true for a
-    gap, after which the state is the particular solution of the next interval.
+    **Arguments:** `begin` the first state; `y0`, `y1` the particular solutions at the begin and at
+    the end of each interval; `propagator` a function from the length of an interval to the matrix
+    of `_propagator`; `gaps` the lengths of the intervals; `after_gap` true for an interval that is
+    a gap, after which the state is the particular solution of the next interval.
     """
 
     def step(state: Array, row: tuple[Array, ...]) -> tuple[Array, Array]:

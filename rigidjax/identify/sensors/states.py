@@ -1,4 +1,4 @@
-"""The sensor of a whole state, for windows of measured states."""
+"""Provide the sensor of a whole state, for windows of measured states."""
 
 from typing import ClassVar
 
@@ -13,21 +13,22 @@ from rigidjax.motion.manifold import minus_small
 
 _FEELS = {Spin: HasSpin, Attitude: HasAttitude, Rigid: HasPose}
 _SIZES = {Spin: (3, 3), Attitude: (7, 6), Rigid: (13, 12)}
-# The index in a reading at which each part of the state but the first begins.
+# Each part of the state but the first begins at this index of a reading.
 _CUTS = {Spin: (), Attitude: (4,), Rigid: (3, 6, 10)}
 
 
 class StateSensor(AbstractSensor):
-    """A sensor that reads a whole state as a row of numbers: (3,) Ω, (7,) q, Ω, (13,) x, v, q, Ω.
+    """Measure a whole state as a row of numbers: (3,) Ω, (7,) q, Ω, or (13,) x, v, q, Ω.
 
-    The error is the change from the predicted state to the one that was read, as `motion.manifold`
-    counts it: three numbers for each part, for q a rotation vector (body frame, rad).
+    The error is the change from the predicted state to the measured state, as `motion.manifold`
+    counts it: three numbers for each part of the state; for q they are a rotation vector (body
+    frame, rad).
 
     **Arguments:**
 
     - `kind`: the class of the state, `Spin`, `Attitude` or `Rigid`.
     - `noise`: (k,) the standard deviations of the k numbers of the error.
-    - `nominal`: whether these are no more than units, and the errors are estimated.
+    - `nominal`: whether `noise` holds no more than units, and the size of the errors is estimated.
 
     >>> StateSensor(rj.Attitude, jnp.ones(6), False).reading_shape
     (7,)
@@ -50,7 +51,7 @@ class StateSensor(AbstractSensor):
 
     @property
     def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Return the protocol of the smallest state that has the parts that are read."""
+        """Return the protocol of the smallest state with all the parts that the sensor reads."""
         return _FEELS[self.kind]
 
     def error(self, motion: SensorInput, reading: Array) -> Float[Array, " k"]:

@@ -1,4 +1,4 @@
-"""Tolerances of a sensor: how far its scale, axes, bias and clock may be off."""
+"""Describe how far the scale, axes, bias and clock of a sensor may be off."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,20 +17,21 @@ def _tolerance_value(value: NumbersLike | None) -> Scalar | None:
 
 
 class Tolerance(eqx.Module):
-    """The errors that a sensor of vectors may have, as its data sheet or a calibration says.
+    """Hold the errors that a sensor of vectors may have, as its data sheet or a calibration says.
 
     The residuals of a free motion do not show such an error: the readings look like the motion of
-    another body. A fit does not estimate the errors but considers them: it adds their effect on
-    each fitted number to its covariance (Schmidt 1966; Bierman, Factorization Methods for Discrete
-    Sequential Estimation (1977), ch. VIII). A `Free` that moves the same number estimates it; the
-    tolerance is then its prior, unless the `Free` has a prior of its own.
+    another body. A fit does not estimate these errors but considers them: it adds their effect on
+    each fitted number to the covariance of the number (Schmidt 1966; Bierman, Factorization Methods
+    for Discrete Sequential Estimation (1977), ch. VIII). If a `Free` moves one of these numbers of
+    the sensor, the fit estimates the error; the tolerance is then its prior, unless the `Free` has
+    a prior of its own.
 
     **Arguments**, each a standard deviation, or `None` for an error that is not considered:
 
-    - `scale`: of each channel, relative.
-    - `cross_axis`: the share of each channel that another one reads, rad for a small angle.
-    - `bias`: of each channel, in the sensor's unit.
-    - `clock`: the offset of its clock, s.
+    - `scale`: the relative error of the scale of each channel.
+    - `cross_axis`: the share of each channel that another channel reads, rad for a small angle.
+    - `bias`: the bias of each channel, in the sensor's unit.
+    - `clock`: the offset of the sensor's clock, s.
 
     **Raises** `ValueError` for a number that is not positive.
 

@@ -1,4 +1,4 @@
-"""Sensors that read a vector in their own axes: rate gyro, accelerometer, magnetometer."""
+"""Provide sensors that read a vector in their own axes: rate gyro, accelerometer, magnetometer."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -17,7 +17,7 @@ from rigidjax.rotation.linalg3 import apply, cross
 
 
 class VectorSensor(ClockedSensor):
-    """A sensor that reads a vector in its own axes: `scale · S exp(−mounting) v + bias`."""
+    """Define a sensor that reads a vector v in its axes: `scale · S exp(−mounting) v + bias`."""
 
     noise: Vec3 | None = eqx.field(converter=base.deviations_field(), default=None)
     _: dataclasses.KW_ONLY
@@ -33,9 +33,9 @@ class VectorSensor(ClockedSensor):
     tolerance: Tolerance | None = None
 
     def _predict(self, vector: Vec3) -> Vec3:
-        """Return the prediction of a reading of a `vector` v (3,), body frame.
+        """Return the predicted reading (3,) of a `vector` v (3,), body frame.
 
-        S is `[[1, a, b], [0, 1, c], [0, 0, 1]]` for the skew (a, b, c).
+        The matrix S is `[[1, a, b], [0, 1, c], [0, 0, 1]]` for the `skew` (a, b, c).
         """
         reading = vector
         if self.mounting is not None:
@@ -49,7 +49,7 @@ class VectorSensor(ClockedSensor):
 
 
 class Gyro(VectorSensor):
-    """A rate gyro: it reads the body rate, `scale · S exp(−mounting) Ω + bias + G f`, rad/s.
+    """Measure the body rate with a rate gyro: `scale · S exp(−mounting) Ω + bias + G f`, rad/s.
 
     **Arguments**, `None` unless the sensor has them; a `Free` can move a number that is given:
 
@@ -63,15 +63,16 @@ class Gyro(VectorSensor):
     - `limit`: the full scale, rad/s, one number or (3,). A reading at full scale counts as "at
       least that much". `None` finds the full scale from the readings.
     - `offset`: s; the reading at t belongs to t + offset.
-    - `jitter`: the standard deviation of the time stamps, s, or `"estimated"`. Time stamps err
-      independently. A reading is then wrong along the change of the prediction in time; this is
-      taken to first order, for motions that turn little within the jitter.
-    - `lowpass`: the `LowPass` of the readings.
+    - `jitter`: the standard deviation of the time stamps, s, or `"estimated"`. The errors of time
+      stamps are independent. An error of a time stamp changes the reading along the time derivative
+      of the prediction; this is taken to first order, for motions that turn little within the
+      jitter.
+    - `lowpass`: the `LowPass` that the readings passed.
     - `tolerance`: a `Tolerance` for scale, axes, bias and clock.
     - `g_sensitivity`: G (3, 3), rad/s per m/s², the effect on each channel of the specific force f
       at the gyro, in the body's axes.
-    - `place`, `gravity`: for G, (3,) m and (3,) m/s² as for `Accelerometer`; `place` is the centre
-      of mass unless given.
+    - `place`, `gravity`: for G, (3,) m and (3,) m/s² as for `Accelerometer`; `place` is zero, the
+      origin of its frame, unless given.
 
     **Raises** `ValueError` for a noise, limit or jitter that is not positive, a wrong shape, NaN.
 
@@ -86,7 +87,7 @@ class Gyro(VectorSensor):
     )
     place: Vec3 | None = eqx.field(converter=base.optional_array_field("place"), default=None)
     gravity: Vec3 | None = eqx.field(converter=base.optional_array_field("gravity"), default=None)
-    # The attitude is needed only to turn gravity into the body frame.
+    # The gyro needs the attitude only to turn gravity into the body frame.
     feels: type = eqx.field(static=True, init=False, default=HasSpin)
 
     def __post_init__(self) -> None:
@@ -107,10 +108,11 @@ class Gyro(VectorSensor):
 
 
 def specific_force(motion: SensorInput, place: Vec3, gravity: Vec3 | None) -> Vec3:
-    """Return the specific force at a place of the body, m/s², body frame.
+    """Return the specific force (3,) at a place of the body, m/s², body frame.
 
-    It is `Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)`, with r the vector to the `place` and g the
-    `gravity`; without gravity only the terms of r.
+    It is `Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)`, with r the vector to the `place` from the reference
+    point of the state, a the acceleration of this point, and g the `gravity`; without gravity it is
+    the terms of r alone.
     """
     state, rate = motion.state, motion.rate
     r = motion.lever(place)
@@ -122,11 +124,11 @@ def specific_force(motion: SensorInput, place: Vec3, gravity: Vec3 | None) -> Ve
 
 
 class Accelerometer(VectorSensor):
-    """An accelerometer: it reads the specific force, `scale · S exp(−mounting) f + bias`, m/s².
+    """Measure the specific force with an accelerometer: `scale · S exp(−mounting) f + bias`, m/s².
 
     `f = Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)` in the body frame (notes, eq 88, seen from the body),
-    with r the lever arm from the centre of mass, or from the fixed point of a body on a pivot. A
-    body in free fall has a = g, and only the terms of r remain.
+    with r the lever arm from the centre of mass, or from the fixed point of a body on a pivot, and
+    a the acceleration of this point. A body in free fall has a = g, and only the terms of r remain.
 
     **Arguments:**
 
@@ -144,7 +146,7 @@ class Accelerometer(VectorSensor):
     'm/s²'
     """
 
-    # The attitude is needed only to turn gravity into the body frame.
+    # The sensor needs the attitude only to turn gravity into the body frame.
     feels: ClassVar[Any] = property(lambda self: HasSpin if self.gravity is None else HasAttitude)
     unit: ClassVar[str] = "m/s²"
     _: dataclasses.KW_ONLY
@@ -156,7 +158,7 @@ class Accelerometer(VectorSensor):
 
 
 class Magnetometer(VectorSensor):
-    """A magnetometer: it reads a known field, `scale · S exp(−mounting) Rᵀ b + bias`.
+    """Measure a known magnetic field with a magnetometer: `scale · S exp(−mounting) Rᵀ b + bias`.
 
     For a direction without a strength use `Direction`.
 

@@ -1,1 +1,1 @@
-"""Covariances of a fit, flat bodies, and intervals of named quantities."""
+"""Compute covariances of a fit, allow for flat bodies, and give intervals of named quantities."""

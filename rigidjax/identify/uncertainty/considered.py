@@ -1,6 +1,7 @@
-"""Considered errors: errors of a sensor that the covariance allows for, and no fit estimates.
+"""Compute the effect of considered errors on a fit.
 
-Schmidt 1966, Application of state-space methods to navigation problems; Bierman 1977,
+A considered error of a sensor is one that the covariance allows for, and that no fit estimates.
+Sources: Schmidt 1966, Application of state-space methods to navigation problems; Bierman 1977,
 Factorization Methods for Discrete Sequential Estimation, ch. VIII; Tapley, Schutz and Born 2004,
 Statistical Orbit Determination, ch. 6.
 """
@@ -18,22 +19,22 @@ from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.identify.sensors.vectors import VectorSensor
 from rigidjax.identify.uncertainty.covariance import Linearisation
 
-# The errors whose effect a report states for a sensor of unknown tolerance: 1 % of scale, 1°
+# A report states the effect of these errors for a sensor of unknown tolerance: 1 % of scale, and 1°
 # between axes.
 USUAL = {"scale": 0.01, "cross_axis": float(np.radians(1.0))}
-# The member of a sensor that each tolerance belongs to.
+# Each tolerance belongs to a member of a sensor, which this table gives.
 MEMBERS = {tolerance: member for member, tolerance in TOLERANCES.items()}
 _OFF_DIAGONAL = [(i, j) for i in range(3) for j in range(3) if i != j]
 
 
 class Consideration(eqx.Module):
-    """An error that a sensor may have, and its effect on a fit.
+    """Hold an error that a sensor may have, and its effect on a fit.
 
     **Fields:**
 
     - `sensor`: the number of the sensor.
     - `kind`: the name of the error, a field of `Tolerance`.
-    - `deviation`: its standard deviation.
+    - `deviation`: the standard deviation of the error.
     - `shifts`: (n, c) the changes of the n free numbers by an error of one standard deviation in
       each of its c independent components: three scales, six pairs of axes, three biases, or one
       clock.
@@ -57,9 +58,10 @@ class Consideration(eqx.Module):
 def considerations(
     model: Model, linear: Linearisation, noise: Noise, covariance: np.ndarray
 ) -> tuple[Consideration, ...]:
-    """Return the considered errors of all sensors: those with a tolerance that no `Free` moves.
+    """Return the considered errors of all sensors: errors with a tolerance that no `Free` moves.
 
-    `covariance` (n, n) is the one for white errors, within the determined directions.
+    **Arguments:** `model`, `linear` and `noise`, the model, its linearisation and the noise of its
+    sensors; `covariance` (n, n) the covariance for white errors, within the determined directions.
     """
     out = []
     for index, sensor in enumerate(model.records.sensors):
@@ -68,7 +70,7 @@ def considerations(
             width = getattr(tolerance, kind, None)
             if width is None or slot_of(model, index, member) is not None:
                 continue
-            # Recordings may give one sensor several tolerances: the largest counts.
+            # Recordings may give one sensor several tolerances: the largest of them counts.
             deviation = float(np.max(np.asarray(width)))
             shifts = deviation * shifts_of(model, linear, noise, covariance, index, kind)
             out.append(Consideration(index, kind, deviation, shifts))
@@ -76,7 +78,7 @@ def considerations(
 
 
 def slot_of(model: Model, index: int, member: str) -> Slot | None:
-    """Return the slot that moves the `member` of the sensor number `index`, `None` if none does."""
+    """Return the slot that moves the `member` of the sensor number `index`; `None` if none does."""
     for slot in model.slots:
         path = tuple(getattr(key, "name", getattr(key, "idx", None)) for key in slot.path)
         if path == ("sensors", index, member):
@@ -92,14 +94,15 @@ def shifts_of(
     index: int,
     kind: str,
 ) -> Float[np.ndarray, "n ways"]:
-    """Return the changes (n, c) of the free numbers by unit errors of a sensor, of one kind.
+    """Return the changes (n, c) of the n free numbers by unit errors of a sensor, of one `kind`.
 
-    An error of c components moves the readings by D, (R, T, k, c), and thereby the least squares
-    by `−H⁻¹ Jᵀ W D`, with `H⁻¹` the `covariance`.
+    An error of c components moves the readings of the sensor number `index` by D, (R, T, k, c), and
+    thereby the least-squares answer by `−H⁻¹ Jᵀ W D`, with H⁻¹ the `covariance`, J the derivatives
+    and W the weights of the readings.
     """
     direction = _directions(model, linear, index, kind)
     jitter_error = model.records.readings[index].jitter_error
-    # In NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
+    # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
     scaled = np.asarray(in_deviations(direction, np.asarray(noise[index]), jitter_error))
     pulls = np.einsum(
         "rtkm,rt,rtkc->rmc", linear.slopes[index], linear.weights[index], scaled, optimize=True
@@ -112,7 +115,10 @@ def shifts_of(
 def _directions(
     model: Model, linear: Linearisation, index: int, kind: str
 ) -> Float[np.ndarray, "records times 3 ways"]:
-    """Return the changes of the readings of a sensor by unit errors of one kind."""
+    """Return the changes (R, T, 3, c) of the readings of a sensor by unit errors of one `kind`.
+
+    The sensor has the number `index`; c is the number of components of the error.
+    """
     reading = model.records.readings[index]
     shown = np.asarray(reading.values) - linear.raw[index]
     eye = np.eye(3)
@@ -129,12 +135,12 @@ def _directions(
 def slope_in_time(
     model: Model, prediction: Float[np.ndarray, "records times k"]
 ) -> Float[np.ndarray, "records times k"]:
-    """Return the time derivative of the predictions of a sensor, zero beyond each recording."""
+    """Return the time derivative of the predictions of a sensor, zero after a recording's end."""
     t, counts = np.asarray(model.records.t)[..., None], np.asarray(model.counts)
     gap = np.diff(t, axis=1)
     slope = np.diff(prediction, axis=1) / np.where(gap > 0, gap, 1.0)
-    # The slope of the parabola through three samples, as in numpy.gradient: each difference is
-    # weighted by the other gap.
+    # Take the slope of the parabola through three samples, as in numpy.gradient: the mean slope in
+    # each gap is weighted by the length of the other gap.
     before, after = gap[:, :-1], gap[:, 1:]
     whole = np.where(before + after > 0, before + after, 1.0)
     middle = (after * slope[:, :-1] + before * slope[:, 1:]) / whole
@@ -154,7 +160,7 @@ def stacked_shifts(parts: tuple[Consideration, ...], size: int) -> Float[np.ndar
 
 
 def describe_considered(parts: tuple[Consideration, ...], sensors: Sequence[AbstractSensor]) -> str:
-    """Describe the considered errors: "a Gyro off by 1 % of scale, 0.5° between axes"."""
+    """Describe the considered errors in words: "a Gyro off by 1 % of scale, 0.5° between axes"."""
     units = {"scale": "{:.3g} % of scale", "cross_axis": "{:.3g}° between axes",
              "bias": "a bias of {:.3g} {unit}", "clock": "a clock offset of {:.3g} s"}  # fmt: skip
     sizes = {"scale": 100.0, "cross_axis": float(np.degrees(1.0)), "bias": 1.0, "clock": 1.0}
@@ -180,8 +186,9 @@ def unit_moves(
 ) -> list[tuple[int, dict[str, Float[np.ndarray, " quantities"]]]]:
     """Return how far `USUAL` errors of each sensor without a tolerance would move quantities.
 
-    The quantities have the derivatives `slopes`. For each such sensor the result holds its number,
-    and by kind of error the largest change of each quantity by one component of the error.
+    The quantities have the derivatives `slopes`. For each sensor without a tolerance the result
+    holds the number of the sensor and, by kind of error, the largest change of each quantity by one
+    component of the error.
     """
     out = []
     for index, sensor in enumerate(model.records.sensors):

@@ -1,4 +1,4 @@
-"""The covariance of a fit, for white and for autocorrelated errors, and undetermined directions."""
+"""Compute the covariance of a fit, for white and for autocorrelated errors."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -23,26 +23,27 @@ from rigidjax.identify.model.terms import (
 
 # A direction is undetermined if its singular value is below this share of the largest one.
 BLIND = 1e-8
-# Columns of the Jacobian are scaled to length one, but not those shorter than this share of the
-# longest: they may be round-off.
+# Columns of the Jacobian are scaled to length one, except columns shorter than this share of the
+# longest column, which may be round-off.
 WEAKEST = 1e-6
 
 
 class Linearisation(eqx.Module):
-    """The errors of a model at one point, and their derivatives by its n free numbers.
+    """Hold the errors of a model at one point, and their derivatives by its n free numbers.
 
-    **Fields**, the first six for each sensor:
+    **Fields**, the first six for each sensor, of R recordings, T times and k components:
 
     - `raw`: (R, T, k) the errors in the unit of the sensor.
-    - `raw_slopes`: (R, T, k, m) their derivatives by the m numbers of each recording.
-    - `errors`, `slopes`: the same, whitened.
+    - `raw_slopes`: (R, T, k, m) the derivatives of `raw` by the m numbers of each recording.
+    - `errors`, `slopes`: the errors and their derivatives, whitened.
     - `weights`: (R, T) the weights of the robust loss.
     - `mask`: (R, T, k) true if an error has a weight and its reading is below full scale.
     - `places`: (R, m) the places of each recording's numbers among all n.
     - `prior_residuals`: (n,) the free numbers over the deviations of their priors.
-    - `prior_weights`: (n,) one over these deviations, zero without a prior.
-    - `extra`, `extra_slopes`: (j,) other residuals than those of readings and of these priors, and
-      (j, n) their derivatives.
+    - `prior_weights`: (n,) one over the deviations of the priors, zero for a number without a
+      prior.
+    - `extra`, `extra_slopes`: (j,) all residuals but those of readings and of these priors, and (j,
+      n) their derivatives.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model(), starts=1, max_steps=2)
     >>> [slopes.shape for slopes in result.linear.slopes]  # 17 times, 3 components, 8 free numbers
@@ -63,30 +64,30 @@ class Linearisation(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return the number of free numbers."""
+        """Return the number n of free numbers."""
         return int(self.extra_slopes.shape[-1])
 
     def first_times(self, count: int) -> "Linearisation":
-        """Return the part of the first `count` times, without the padding of a fit."""
+        """Return the linearisation at the first `count` times, without the padding of a fit."""
         long = ("raw", "raw_slopes", "errors", "slopes", "weights", "mask")
         parts = {name: tuple(a[:, :count] for a in getattr(self, name)) for name in long}
         return dataclasses.replace(self, **parts)
 
     @property
     def slope(self) -> np.ndarray:
-        """Return the gradient (n,) of the misfit."""
+        """Return the gradient (n,) of the misfit by the free numbers."""
         readings = self.to_all_numbers(self.scores).sum(axis=0)
         priors = self.prior_weights * self.prior_residuals
         return readings + priors + self.extra @ self.extra_slopes
 
     @property
     def dense(self) -> np.ndarray:
-        """Return the weighted slopes (R, N, m) of all N errors of each recording."""
+        """Return the weighted derivatives (R, N, m) of all N errors of each recording."""
         return np.concatenate(self.rows, axis=1)
 
     @property
     def rows(self) -> list[np.ndarray]:
-        """Return the weighted slopes (R, T k, m) of each sensor, a row for each error."""
+        """Return the weighted derivatives (R, T k, m) for each sensor, a row for each error."""
         return [
             _flatten_rows(slope * np.sqrt(weight)[..., None, None])
             for slope, weight in zip(self.slopes, self.weights, strict=True)
@@ -98,20 +99,22 @@ class Linearisation(eqx.Module):
         return tuple(rows.swapaxes(1, 2) @ rows for rows in self.rows)
 
     def squared_change(self, step: np.ndarray) -> float:
-        """Return the sum of squares of the changes of all residuals by a `step` (n,)."""
+        """Return the sum of the squared changes of all residuals by a `step` (n,)."""
         moved = np.append(step, 0.0)[self.places]
         readings = np.einsum("rim,rm->ri", self.dense, moved)
         rest = self.prior_weights * step, self.extra_slopes @ step
         return float(sum(np.sum(part**2) for part in (readings, *rest)))
 
     def to_all_numbers(self, blocks: np.ndarray) -> np.ndarray:
-        """Return rows (R, n) of all numbers from rows (R, m) of each recording's numbers."""
+        """Return rows (R, n) for all numbers, from `blocks` (R, m) for each recording's numbers."""
         wide = np.zeros((len(blocks), self.size + 1))
         np.add.at(wide, (np.arange(len(blocks))[:, None], self.places), blocks)
         return wide[:, :-1]
 
     def blocks(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the covariance (R, m, m) of each recording's numbers; zero if it is not finite."""
+        """Return the `covariance` (R, m, m) of each recording's numbers; zero unless it is
+        finite.
+        """
         known = covariance if np.isfinite(covariance).all() else np.zeros_like(covariance)
         wide = np.pad(known, (0, 1))
         return wide[self.places[:, :, None], self.places[:, None, :]]
@@ -127,13 +130,17 @@ class Linearisation(eqx.Module):
 
 
 def _flatten_rows(slopes: np.ndarray) -> np.ndarray:
-    """Return slopes (R, T, k, m) as rows (R, T k, m), one for each error."""
+    """Return derivatives `slopes` (R, T, k, m) as rows (R, T k, m), one row for each error."""
     return slopes.reshape(len(slopes), -1, slopes.shape[-1])
 
 
 @eqx.filter_jit
 def _linearise_parts(model: Model, x: Array, noise: Noise, blocks: Blocks) -> PyTree[Array]:
-    """Return the parts of `linearise` as one program: of readings, places, of other residuals."""
+    """Return the parts of `linearise`, computed by one compiled program.
+
+    They are those of the readings, the places of the recordings' numbers, and those of the other
+    residuals.
+    """
     errors, slopes = blocks
     out, slopes = residuals_and_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
     extra_slopes, extra = with_jacobian(lambda x: extra_residuals(model, x), x)
@@ -148,7 +155,7 @@ def linearise(
     blocks: Blocks,
     thickened: tuple[Array, Blocks] | None = None,
 ) -> Linearisation:
-    """Return errors, derivatives and weights at x as NumPy arrays.
+    """Return errors, derivatives and weights at x as NumPy arrays, in a `Linearisation`.
 
     **Arguments:**
 
@@ -156,7 +163,7 @@ def linearise(
     - `x`: (n,) the free numbers.
     - `blocks`: the errors and derivatives at x, as `terms.errors_and_jacobians` returns them.
     - `thickened`: if a body is flat at x, the point with a thicker body at which derivatives are
-      taken, and the `blocks` there.
+      taken, and the `blocks` at that point.
     """
     (errors, slopes, weights), places, others = jax.tree.map(
         np.asarray, _linearise_parts(model, x, noise, blocks)
@@ -171,15 +178,18 @@ def linearise(
 
 
 class Root(eqx.Module):
-    """A root of the covariance of n numbers for white errors, recording by recording.
+    """Hold a root of the covariance of n numbers for white errors, recording by recording.
+
+    A root of a matrix A is a matrix B with B Bᵀ = A.
 
     **Fields:**
 
-    - `size`: (n,) the unit of each number; the other fields are in these units.
+    - `size`: (n,) the factor by which each number is multiplied for the other fields.
     - `lift`: (n, s) the change of all numbers with the s numbers that recordings share.
     - `core`: (s, r) a root of the covariance of the shared numbers.
     - `own`: for each recording the places (k,) of the numbers that it alone has, a root (k, j) of
-      their covariance for known shared numbers, and the rows (p, k + s) of priors of both.
+      the covariance of these numbers for known shared numbers, and the rows (p, k + s) of the
+      priors of both.
     - `ties`: (q, s) the rows of priors of shared numbers alone.
     - `null`: (i, n) orthonormal directions that are not determined.
     """
@@ -194,13 +204,14 @@ class Root(eqx.Module):
     def sandwich(self, rows: np.ndarray, places: np.ndarray, middle: np.ndarray) -> np.ndarray:
         """Return the sandwich covariance `H⁻¹ M H⁻¹` (n, n).
 
-        M is the information of priors plus the sum over recordings of `rowsᵀ middle rows`.
+        H⁻¹ is the covariance for white errors. M is the information of priors plus the sum over
+        recordings of `rowsᵀ middle rows`.
 
         **Arguments:**
 
         - `rows`: (R, q, m) rows for the m numbers of each recording.
         - `places`: (R, m) the places of these numbers among all n.
-        - `middle`: (R, q, q).
+        - `middle`: (R, q, q) the matrix between the rows of each recording.
         """
         wide, lift = (np.concatenate([x, 0 * x[:1]]) for x in (1.0 / self.size, self.lift))
         rows, inverse = rows * wide[places][:, None, :], self.core @ self.core.T
@@ -223,7 +234,7 @@ class Root(eqx.Module):
 
     @property
     def covariance(self) -> np.ndarray:
-        """Return `H⁻¹` (n, n) within the directions that are determined."""
+        """Return the covariance `H⁻¹` (n, n) within the directions that are determined."""
         half = self.lift @ self.core
         out = half @ half.T
         for mine, root, _ in self.own:
@@ -245,13 +256,13 @@ def _indices_in(columns: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 
 
 class Covariance(eqx.Module):
-    """A covariance of the n free numbers.
+    """Hold a covariance of the n free numbers, and the directions that the data do not determine.
 
     **Fields:**
 
-    - `covariance`: (n, n), infinite for a number that the data do not determine.
+    - `covariance`: (n, n), with an infinite variance for a number that the data do not determine.
     - `determined`: (n, n) the covariance within the determined directions.
-    - `kind`: its method, in words.
+    - `kind`: the method of the covariance, in words.
     - `singular_values`: (n,) of the weighted Jacobian with columns of length one.
     - `null_directions`: (k, n) the directions that are not determined.
     - `root`: a root of the covariance for white errors; `None` if the motion is not finite.
@@ -268,9 +279,10 @@ class Covariance(eqx.Module):
 def white_covariance(linear: Linearisation) -> Covariance:
     """Return the covariance for white errors, `(JᵀWJ)⁻¹`.
 
-    Directions of singular values below 1e-8 of the largest are not determined. The numbers of one
-    recording alone are eliminated first, recording by recording (Schur complement); the singular
-    values are those of these blocks and of the rest.
+    J holds the derivatives of all residuals, W their weights. Directions with singular values below
+    1e-8 of the largest one are not determined. The numbers that one recording alone has are
+    eliminated first, recording by recording (Schur complement); the singular values are those of
+    these blocks and of the rest.
     """
     n, dense = linear.size, linear.dense
     if not (np.isfinite(dense).all() and np.isfinite(linear.extra_slopes).all()):
@@ -278,8 +290,8 @@ def white_covariance(linear: Linearisation) -> Covariance:
         return Covariance(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)), None)
     triangles, owner = np.linalg.qr(dense, mode="r"), _owners(linear)
     shared = np.flatnonzero(owner < 0)
-    # Scale columns to order one: a bias in rad/s must not look undetermined next to a moment; but
-    # do not scale round-off up.
+    # Scale columns to order one: a bias in rad/s must not look undetermined next to a moment. The
+    # least size keeps round-off from being scaled up.
     squares = np.bincount(linear.places.ravel(), np.sum(triangles**2, axis=1).ravel(), n + 1)[:n]
     size = np.sqrt(squares + linear.prior_weights**2 + np.sum(linear.extra_slopes**2, axis=0))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-150))
@@ -343,8 +355,8 @@ def _rows_of_shared(
     **Arguments:**
 
     - `linear`: the linearisation of all recordings.
-    - `triangles`: (R, q, m) the triangular factors of their weighted derivatives.
-    - `size`: (n,) the unit of each number.
+    - `triangles`: (R, q, m) for each recording the triangular factor of its weighted derivatives.
+    - `size`: (n,) the factor by which each number is multiplied.
     - `selected`: (R,) true for recordings whose errors change with shared numbers alone.
     - `shared`: (s,) the places of the shared numbers.
     """
@@ -356,9 +368,10 @@ def _rows_of_shared(
 
 
 def _owners(linear: Linearisation) -> np.ndarray:
-    """Return for each number the recording (n,) that alone changes with it, −1 if several do.
+    """Return for each number (n,) the recording that alone changes with it, −1 if several do.
 
-    It is −1, too, for numbers of several recordings that one of the other residuals ties together.
+    The result is −1, too, for numbers of several recordings that one of the other residuals ties
+    together.
     """
     records, n = len(linear.places), linear.size
     owner, used = np.full(n + 1, -1), np.zeros((records, n + 1), bool)
@@ -373,10 +386,11 @@ def _owners(linear: Linearisation) -> np.ndarray:
 
 
 def _decompose(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Decompose `rows` (q, k), whose columns are of order one, by their singular values.
+    """Compute the range of `rows` (q, k), whose columns are of order one, by singular values.
 
-    Returns an orthonormal basis (q, r) of their range, a root (k, r) of the inverse of their Gram
-    matrix, the directions (j, k) that they do not determine, and the singular values.
+    Returns an orthonormal basis (q, r) of the range, a root (k, r) of the inverse of the Gram
+    matrix `rowsᵀ rows`, the directions (j, k) that the rows do not determine, and the singular
+    values.
     """
     u, singular, directions = np.linalg.svd(rows, full_matrices=False)
     determined = singular > BLIND * singular.max(initial=1.0)
@@ -387,15 +401,18 @@ def _decompose(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
 def covariance_of(
     linear: Linearisation, times: "CorrelationTimes", white: Covariance | None = None
 ) -> Covariance:
-    """Return the covariance for white errors, or the sandwich `H⁻¹ M H⁻¹` for correlated ones.
+    """Return the covariance for white errors, or the sandwich `H⁻¹ M H⁻¹` for correlated errors.
 
-    M is `Jᵀ C J` plus the information of priors, C the covariance of the errors in time. In each
-    channel the part of the variance that second differences show is white, the rest decays
+    M is `Jᵀ C J` plus the information of priors, with C the covariance of the errors in time. In
+    each channel, the part of the variance that second differences show is white; the rest decays
     exponentially. Fitted errors do not show the decay time well: each number gets the largest
     variance over all times from two samples to half a record. Fitted errors are too small: `Jᵀ C J`
-    is multiplied by n/(n − p) for n independent errors and p free numbers. Of many recordings the
-    variance between recordings is taken if it is larger. Source: White 1980, doi:10.2307/1912934;
-    Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
+    is multiplied by n/(n − p) for n independent errors and p free numbers. If there are many
+    recordings, the variance between recordings is taken where it is larger. Source: White 1980,
+    doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
+
+    **Arguments:** `linear` the linearisation of the model; `times` the correlation times of its
+    errors; `white` the covariance for white errors, computed unless given.
     """
     white = white_covariance(linear) if white is None else white
     if times.longest <= 1.5 or not np.isfinite(white.determined).all():
@@ -415,7 +432,7 @@ def with_infinite_variance(null: np.ndarray, covariance: np.ndarray) -> np.ndarr
 
 
 def covariance_root(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a root (n, m) of the inverse of an information (n, n), and its null directions.
+    """Return a root (n, m) of the inverse of the `information` (n, n), and its null directions.
 
     The null directions (k, n) are those that the information does not determine.
     """
@@ -433,9 +450,9 @@ def distance_to_minimum(
 ) -> float:
     """Return the distance to the least misfit in standard deviations, `√(gᵀ(JᵀWJ)⁻¹g)`.
 
-    g is the gradient of the misfit; MINUIT ends a search by this distance (James and Roos 1975,
-    doi:10.1016/0010-4655(75)90039-9). Functions whose derivatives (n,) are in `directions` stay
-    constant.
+    Here g is the gradient of the misfit, and (JᵀWJ)⁻¹ the covariance `white`; MINUIT ends a search
+    by this distance (James and Roos 1975, doi:10.1016/0010-4655(75)90039-9). Functions whose
+    derivatives (n,) are in `directions` stay constant.
     """
     covariance = white.determined
     for row in directions:
@@ -445,7 +462,7 @@ def distance_to_minimum(
 
 
 def _sandwich(linear: Linearisation, white: Covariance, times: "CorrelationTimes") -> np.ndarray:
-    """Return the sandwich covariance of `covariance_of`, of errors that are not independent.
+    """Return the sandwich covariance of `covariance_of`, for errors that are not independent.
 
     Products of derivatives are taken in orthonormal columns: otherwise round-off could make
     variances negative.
@@ -463,7 +480,7 @@ def _sandwich(linear: Linearisation, white: Covariance, times: "CorrelationTimes
         # The variance between many recordings needs no model of their errors.
         between = np.full((records, 1, 1), records / (records - 1))
         estimates.append(root.sandwich(linear.scores[:, None], linear.places, between))
-    # Scale the widest estimate up where another one is wider, be it that for white errors.
+    # Scale the widest estimate up where another estimate, or the one for white errors, is wider.
     all_ = np.stack([np.diag(white.determined), *(np.diag(c) for c in estimates)])
     least = np.maximum(all_[0], 1e-300)
     out = estimates[int(np.argmax((all_[1:] / least).mean(axis=1)))]
@@ -476,7 +493,8 @@ def _spectra(linear: Linearisation, columns: np.ndarray) -> tuple[np.ndarray, np
     """Return the spectra of the `columns` of all k channels, and the smooth shares of the errors.
 
     The spectra are real and imaginary parts (R, k, 2, T + 1, m) by frequency, multiplied by the
-    standard deviation of the errors of the channel; the shares are (k, 1, 1).
+    standard deviation of the errors of the channel. The smooth share (k, 1, 1) of a channel is the
+    result of `smooth_share`.
     """
     first, slopes, shares = 0, [], []
     for error, weight in zip(linear.errors, linear.weights, strict=True):
@@ -498,9 +516,9 @@ def _spectra(linear: Linearisation, columns: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _meat(spectra: np.ndarray, share: np.ndarray, time: float) -> np.ndarray:
-    """Return `Jᵀ C J` for errors of which the part `share` decays over `time` samples.
+    """Return `Jᵀ C J` (R, m, m) for errors of which the part `share` decays over `time` samples.
 
-    The rest of the errors is white; `spectra` and `share` are those of `_spectra`.
+    The rest of the errors is white; `spectra` and `share` are the results of `_spectra`.
     """
     size = 2 * spectra.shape[3] - 2
     lags = np.arange(size)
@@ -512,27 +530,30 @@ def _meat(spectra: np.ndarray, share: np.ndarray, time: float) -> np.ndarray:
 
 
 def smooth_share(e: np.ndarray, mask: np.ndarray) -> float:
-    """Return the share of the variance of errors e (R, T) that second differences do not show."""
+    """Return the share of the variance of errors e (R, T) that second differences do not show.
+
+    Only the errors where `mask` (R, T) is true are used.
+    """
     rows = [x[kept] for x, kept in zip(e, mask, strict=True)]
     total = sum(float(row @ row) for row in rows) / max(sum(row.size for row in rows), 1)
     return float(np.clip(1.0 - scatter(rows) / total, 0.0, 1.0)) if total > 0 else 1.0
 
 
 def scatter(rows: list[np.ndarray]) -> float:
-    """Return the variance of white noise that has the second differences of these rows."""
+    """Return the variance of white noise with second differences as large as those of `rows`."""
     bends = np.concatenate([row[2:] - 2.0 * row[1:-1] + row[:-2] for row in rows])
     # The second difference of white noise has six times the variance of the noise.
     return float(np.mean(bends**2)) / 6.0 if bends.size else 0.0
 
 
 class CorrelationTimes(eqx.Module):
-    """The autocorrelation of the errors of a fit.
+    """Hold the autocorrelation of the errors of a fit.
 
     **Fields:**
 
-    - `spans`: for each channel of each sensor the samples over which errors are autocorrelated; 1
-      for white errors.
-    - `closeness`: the correlation of neighbours in the channel of the longest span.
+    - `spans`: for each channel of each sensor the number of samples over which errors are
+      autocorrelated; 1 for white errors.
+    - `closeness`: the correlation of neighbouring errors in the channel of the longest span.
     - `independent`: the number of independent errors.
     """
 
@@ -549,8 +570,8 @@ class CorrelationTimes(eqx.Module):
 def correlation_times(linear: Linearisation) -> CorrelationTimes:
     """Return the autocorrelation time of each channel, `1 + 2 Σ ρ_l` over lags l.
 
-    The sum ends at the first correlation ρ below twice its standard deviation. Readings at full
-    scale take no part.
+    The sum ends at the first correlation ρ that is below twice its standard deviation, or that has
+    fewer than ten pairs of errors. Readings at full scale are left out.
     """
     spans, longest, closest, independent = [], 1.0, 0.0, 0.0
     for error, weight, kept in zip(linear.errors, linear.weights, linear.mask, strict=True):
@@ -567,9 +588,10 @@ def correlation_times(linear: Linearisation) -> CorrelationTimes:
 
 
 def _channel_time(e: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
-    """Return the autocorrelation time of errors e (R, T) in samples, and that of neighbours.
+    """Return the autocorrelation time of errors e (R, T) in samples, and their first correlation.
 
-    The second number is the correlation of neighbouring errors.
+    The first correlation is the one of neighbouring errors. Only the errors where `mask` (R, T) is
+    true are used.
     """
     counts = mask.sum(axis=1, keepdims=True)
     mean = e.sum(axis=1, keepdims=True) / np.maximum(counts, 1)
@@ -588,6 +610,9 @@ def _channel_time(e: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
 
 
 def _lagged_products(x: np.ndarray) -> np.ndarray:
-    """Return the sums (T,) of products of rows x (R, T) with themselves, by lag, by FFT."""
+    """Return for each lag the sum over rows of x (R, T) of the products with the shifted row.
+
+    The sums (T,) are computed by FFT.
+    """
     size = x.shape[1]
     return np.fft.irfft(np.sum(np.abs(np.fft.rfft(x, 2 * size)) ** 2, axis=0), 2 * size)[:size]

@@ -1,4 +1,4 @@
-"""The degrees of freedom of the variances of a fit, where noise or widths are estimated."""
+"""Compute the degrees of freedom of the variances of a fit that estimates noise or widths."""
 
 from typing import Any, cast
 
@@ -9,24 +9,28 @@ from rigidjax import _checks
 from rigidjax.identify.model.model import Model
 from rigidjax.identify.uncertainty.covariance import CorrelationTimes, Linearisation
 
-# With more degrees of freedom a 95 % interval is at most 1.3 % wider than with infinitely many.
+# With more degrees of freedom than this, a 95 % interval is at most 1.3 % wider than with
+# infinitely many.
 PLENTY = 100.0
 
 
 class Freedom(eqx.Module):
-    """The numbers from which the degrees of freedom of any variance of a fit are computed.
+    """Hold the numbers from which the degrees of freedom of any variance of a fit are computed.
+
+    A width is the `spread` of a `Free`, by which recordings deviate from the shared value.
 
     **Fields:**
 
-    - `covariance`: (n, n) of the free numbers, for white errors.
-    - `places`: (R, m) the places among them of the numbers of each recording.
+    - `covariance`: (n, n) the covariance of the n free numbers, for white errors.
+    - `places`: (R, m) the places, among the free numbers, of the m numbers of each recording.
     - `groups`: (R,) the group of each recording; the recordings of a group share their noise.
-    - `blocks`: of each sensor, (R, m, m), the information in its readings.
-    - `left`: of each sensor, (G,), its independent errors less those that the fit takes; infinite
-      for a given noise.
-    - `widths`: of each estimated width the places of its deviations, its square, and its degrees of
-      freedom.
-    - `considered`: (n, c) the shifts of the numbers by considered errors, of known variances.
+    - `blocks`: for each sensor, (R, m, m), the information in its readings.
+    - `left`: for each sensor, (G,), the number of its independent errors in each group, less the
+      free numbers that they determine; infinite for a given noise.
+    - `widths`: for each estimated width, the places of the deviations of recordings, the square of
+      the width, and its degrees of freedom.
+    - `considered`: (n, c) the shifts of the free numbers by considered errors, which have known
+      variances.
     """
 
     covariance: np.ndarray
@@ -40,8 +44,9 @@ class Freedom(eqx.Module):
     def degrees(self, slope: np.ndarray) -> np.ndarray:
         """Return the degrees of freedom of the variances of functions with derivative `slope`.
 
-        The `slope` (…, n) is taken with respect to the free numbers. Considered errors add a known
-        variance: the degrees grow with the square of the whole variance over its estimated part.
+        The `slope` (…, n) is the derivative by the n free numbers. Considered errors add a known
+        variance: the degrees of freedom grow with the square of the whole variance over its
+        estimated part.
         """
         estimated = np.sum((slope @ self.covariance) * slope, axis=-1)
         known = np.sum((slope @ self.considered) ** 2, axis=-1)
@@ -49,11 +54,12 @@ class Freedom(eqx.Module):
         return np.asarray(self.estimated_degrees(slope) * grown)
 
     def estimated_degrees(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom of the part of each variance that noise and widths make.
+        """Return the degrees of freedom of the part of each variance that is estimated.
 
-        They follow from the share of each noise and each width in the variance (Satterthwaite
+        They follow from the share of each noise and of each width in the variance (Satterthwaite
         1946, doi:10.2307/3002019). If every noise has more than `PLENTY` degrees of freedom, the
-        shares of the noises are not computed: the smallest degrees are used for all of them.
+        shares of the noises are not computed: the smallest number of degrees is used for all
+        noises. The `slope` (…, n) is the derivative of the functions by the n free numbers.
         """
         along = slope @ self.covariance
         variance = np.maximum(np.sum(along * slope, axis=-1), 1e-300)
@@ -86,8 +92,9 @@ def freedom_of(
 
     **Arguments:**
 
-    - `model`, `linear`, `times`: the model, its linearisation, the correlation times of its errors.
-    - `covariance`: (n, n) of the free numbers, for white errors.
+    - `model`, `linear`, `times`: the model, its linearisation, and the correlation times of its
+      errors.
+    - `covariance`: (n, n) the covariance of the free numbers, for white errors.
     - `considered`: (n, c) the shifts of these numbers by considered errors.
     """
     groups, left, blocks = np.asarray(model.noise_groups), [], linear.information
@@ -117,7 +124,11 @@ def freedom_of(
 def leverages(
     linear: Linearisation, information: tuple[np.ndarray, ...], covariance: np.ndarray
 ) -> list[np.ndarray]:
-    """Return how many free numbers the readings of each sensor determine, (R,) by recording."""
+    """Return how many free numbers the readings of each sensor determine, (R,) by recording.
+
+    **Arguments:** `linear` the linearisation of the model; `information` (R, m, m) for each sensor,
+    on the m numbers of each recording; `covariance` (n, n) of all free numbers.
+    """
     known = linear.blocks(covariance)
     return [np.sum(block * known, axis=(1, 2)) for block in information]
 
@@ -125,8 +136,8 @@ def leverages(
 def quantile(level: float, freedom: np.ndarray | float) -> np.ndarray:
     """Return the half-width of an interval of probability `level`, in standard deviations.
 
-    It is the quantile of Student's distribution with `freedom` degrees, the normal one for infinite
-    degrees. **Raises** `ValueError` for a `level` outside (0, 1).
+    It is the quantile of Student's distribution with `freedom` degrees of freedom, and of the
+    normal distribution for infinitely many. **Raises** `ValueError` for a `level` outside (0, 1).
     """
     level = _checks.fraction(level, "level", "a level between 0 and 1")
     from scipy.special import ndtri, stdtrit

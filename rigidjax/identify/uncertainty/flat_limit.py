@@ -1,4 +1,4 @@
-"""Flat bodies, I1 + I2 = I3: derivatives and intervals at this limit of real bodies."""
+"""Compute derivatives and intervals at the limit of real bodies: flat bodies, I1 + I2 = I3."""
 
 from typing import Any
 
@@ -12,21 +12,23 @@ from rigidjax.body.symmetric3 import swap_trace
 from rigidjax.identify.model.charts import AbstractBodyChart, as_list, chart_list, numbers_of
 from rigidjax.identify.model.model import Model, without_samples
 
-# Derivatives are taken at a body whose least second moment is at least this share of the trace.
+# Derivatives are taken at a body whose least second moment is at least this share of the sum of its
+# three second moments.
 THIN = 1e-4
-# The quantile of a one-sided bound of 95 %.
+# A one-sided bound of 95 % lies this many standard deviations away.
 ONE_SIDED = 1.645
 
 
 class Limit(eqx.Module):
-    """The distance of a body from a flat one, `(I1 + I2 − I3) / I3`, called its flatness.
+    """Hold the distance of a body from a flat body, `(I1 + I2 − I3) / I3`, called its flatness.
 
     **Fields:**
 
     - `where`: the suffix of the names of the body's quantities.
-    - `flatness`: its value at the best point.
-    - `free`: its value at the minimum of the linear model, which may be negative.
-    - `slope`: (n,) its derivative.
+    - `flatness`: the flatness at the best point.
+    - `free`: the flatness at the minimum of the linear model, if it is smaller there; it may be
+      negative.
+    - `slope`: (n,) the derivative of the flatness by the n free numbers.
     """
 
     where: str
@@ -35,32 +37,42 @@ class Limit(eqx.Module):
     slope: np.ndarray
 
     def deviation(self, covariance: np.ndarray) -> float:
-        """Return the standard deviation of the flatness; NaN if its variance is negative."""
+        """Return the standard deviation of the flatness; NaN if its variance is negative.
+
+        The `covariance` (n, n) is that of the n free numbers.
+        """
         with np.errstate(invalid="ignore"):
             return float(np.sqrt(self.slope @ covariance @ self.slope))
 
     def bound(self, covariance: np.ndarray) -> float:
-        """Return the one-sided 95 % upper bound of the flatness."""
+        """Return the one-sided 95 % upper bound of the flatness.
+
+        The `covariance` (n, n) is that of the n free numbers.
+        """
         wide = self.deviation(covariance)
         return self.free + float(np.hypot(ONE_SIDED * wide, min(self.free, 0.0)))
 
     def is_near(self, covariance: np.ndarray, reach: float) -> bool:
-        """Return whether a flat body is within `reach` standard deviations."""
+        """Return whether a flat body lies within `reach` standard deviations.
+
+        The `covariance` (n, n) is that of the n free numbers.
+        """
         return bool(self.free < reach * self.deviation(covariance))
 
 
 def interval_ends(
     reach: np.ndarray | float, correlation: np.ndarray | float, flatness: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends of an interval that ends at a flat body, in standard deviations.
+    """Return the ends (low, high) of an interval that stops at a flat body, in standard deviations.
 
-    They are counted from the best value. They follow from the likelihood ratio of two normal
-    numbers, of which the flatness z is not negative: `m²(y) = min over z ≥ 0 of m²(y, z)`.
+    The ends are counted from the best value of a number y. They follow from the likelihood ratio of
+    two normal numbers, y and the flatness z, which is not negative: `m²(y) = min over z ≥ 0 of
+    m²(y, z)`.
 
     **Arguments:**
 
     - `reach`: the quantile of the interval.
-    - `correlation`: of the number y with the flatness z.
+    - `correlation`: the correlation of the number y with the flatness z.
     - `flatness`: the flatness at the minimum of the linear model, over its standard deviation.
     """
     rho = np.clip(np.asarray(correlation), -1.0, 1.0)
@@ -80,7 +92,7 @@ def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     """Return the free numbers x with each flat body made thicker; `None` if no body is flat.
 
     The derivative of a chart is zero at a flat body. The information on the tensor itself is
-    regular there, and hardly differs between a flat body and one of so small a thickness.
+    regular there, and hardly differs between a flat body and a body as thin as this one.
     """
     thick = list(map(_thicken_chart, chart_list(model.chart), bodies_of(model, x)))
     if all(one is None for one in thick):
@@ -91,21 +103,22 @@ def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
 
 
 def bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
-    """Return the bodies of a fit, in the order of their charts."""
+    """Return the bodies of a fit with the free numbers x, in the order of their charts."""
     return _bodies_of(without_samples(model), x)
 
 
 @eqx.filter_jit
 def _bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
-    """Return the result of `bodies_of`, as one program."""
-    # Compile one program: outside of a trace each operation of JAX takes as long as 100 steps.
+    """Return the result of `bodies_of`, computed by one compiled program."""
+    # Compile one program: outside of a trace each operation of JAX takes as long as a run of 100
+    # steps.
     return as_list(model.bodies(x))
 
 
 def _thicken_chart(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
-    """Return the numbers of a thicker body in the chart; `None` for a body that is not flat.
+    """Return the numbers, in the `chart`, of a thicker body; `None` for a body that is not flat.
 
-    It is `None` for a chart by a user, too, of which the limit is not known.
+    The result is `None`, too, for a chart by a user, whose limit is not known.
     """
     # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
     if isinstance(body, MassProperties):
@@ -126,7 +139,7 @@ def _thicken_chart(chart: AbstractBodyChart, body: Inertia | MassProperties) -> 
 
 
 def _has_limit(chart: AbstractBodyChart) -> bool:
-    """Return whether the chart is one of ours that moves moments of inertia."""
+    """Return whether the chart is one of this package, and moves moments of inertia."""
     return type(chart).__module__ == AbstractBodyChart.__module__ and any(
         name != "mass" for name in chart.log_names
     )
@@ -140,7 +153,7 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
         if not _has_limit(chart):
             out.append(jnp.ones((), x.dtype))
             continue
-        # The last logarithms are three moments, or two ratios to the third.
+        # The last logarithms are those of three moments, or of the ratios of two to the third.
         logs = chart.logs(body)[-3:]
         logs = logs if logs.size == 3 else jnp.append(logs, 0.0)
         low, middle, high = jnp.sort(jnp.exp(logs - jnp.max(logs)))
@@ -152,15 +165,16 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
 def flat_limits(
     model: Model, numbers: tuple[np.ndarray, np.ndarray], step: np.ndarray, names: list[str]
 ) -> tuple[Limit, ...]:
-    """Return the limit of each body whose moments are free.
+    """Return the `Limit` of each body whose moments are free.
 
     **Arguments:**
 
     - `model`: the model.
     - `numbers`: the reported numbers and their derivatives, the flatness of each body last, as
       `quantities.values_and_slopes` returns them.
-    - `step`: (n,) the step of the free numbers to the minimum of the linear model.
-    - `names`: the suffix of the names of each body's quantities.
+    - `step`: (n,) the step of the free numbers from the best point to the minimum of the linear
+      model.
+    - `names`: for each body the suffix of the names of its quantities.
     """
     rows = zip(names, *(part[-len(names) :] for part in numbers), strict=True)
     have_limits = [_has_limit(chart) for chart in chart_list(model.chart)]
@@ -172,7 +186,7 @@ def flat_limits(
 
 
 def why_unreal(body: PyTree) -> str | None:
-    """Say why no real body has the numbers of `body`; return `None` for a real body."""
+    """Return in words why no real body has the numbers of `body`; `None` for a real body."""
     try:
         if isinstance(body, MassProperties):
             MassProperties(body.mass, body.com, body.second_moment)
@@ -184,7 +198,12 @@ def why_unreal(body: PyTree) -> str | None:
 
 
 def unreal_bodies(charts: list[tuple[str, AbstractBodyChart]], bodies: list[Any]) -> list[str]:
-    """List why bodies are not real; only charts by users can have points that are no real body."""
+    """Return in words why bodies are not real, one line for each body that is not.
+
+    Only bodies in charts by users are checked: no other chart has points that are no real body.
+    **Arguments:** `charts` the name and the chart of each body; `bodies` the bodies in the same
+    order.
+    """
     ours = AbstractBodyChart.__module__
     theirs = [
         (n, b) for (n, c), b in zip(charts, bodies, strict=True) if type(c).__module__ != ours

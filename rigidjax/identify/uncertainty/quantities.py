@@ -1,4 +1,4 @@
-"""The quantities that a fit reports by name, their values, standard deviations and intervals."""
+"""Compute the values, standard deviations and intervals of the quantities that a fit reports."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,22 +16,22 @@ from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
 # A positive number that is not known to this factor gets the interval from 0 to infinity.
 FARTHEST = 1e3
-# A correlation nearer to one than this is one.
+# A correlation that is nearer to one than this counts as one.
 ROUND_OFF = 1e-13
 
 
 class Quantity(eqx.Module):
-    """A reported quantity: a number with a name, a standard deviation and a unit.
+    """Hold a reported quantity: a number with a name, a standard deviation and a unit.
 
     **Fields:**
 
-    - `name`, `value`, `unit`: of the number.
+    - `name`, `value`, `unit`: the name, the value and the unit of the number.
     - `deviation`: its standard deviation, in the same unit.
     - `positive`: whether it is positive. Its errors are then those of its logarithm: `deviation` is
       the value times the standard deviation of the logarithm, and an interval reaches farther up
       than down.
-    - `cuts`: for each body its correlation with the body's flatness, and the flatness in standard
-      deviations, at which intervals end.
+    - `cuts`: for each body the correlation of the number with the body's flatness, and the flatness
+      in standard deviations; intervals end where a body would be flat.
     - `most`: the largest value that any body can have.
     - `freedom`: the degrees of freedom of its variance; infinite if all noise is given.
 
@@ -51,11 +51,12 @@ class Quantity(eqx.Module):
     freedom: float = np.inf
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Return the low and the high end of the interval, by the logarithm of a positive number.
+        """Return the low and the high end of the interval of a probability `level`.
 
-        An interval ends where the body would be flat. The ends are 0 and infinity for a positive
-        number that is not known to a factor of 1e3. **Arguments:** `level` the probability that the
-        interval holds the true value. **Raises** `ValueError` for a level outside (0, 1).
+        The interval of a positive number is that of its logarithm. An interval ends where the body
+        would be flat. The ends are 0 and `most`, infinity by default, for a positive number that is
+        not known to a factor of 1e3. **Arguments:** `level` the probability that the interval holds
+        the true value. **Raises** `ValueError` for a level outside (0, 1).
         """
         reach = float(quantile(level, self.freedom))
         wide = reported_deviation(self)
@@ -68,17 +69,17 @@ class Quantity(eqx.Module):
 
 
 def reported_deviation(quantity: Quantity) -> float:
-    """Return the standard deviation of a quantity, of the logarithm of a positive one."""
+    """Return the standard deviation of a quantity; for a positive one, that of its logarithm."""
     if not quantity.positive:
         return quantity.deviation
     return quantity.deviation / quantity.value if quantity.value else np.inf
 
 
 def cut_ends(reach: np.ndarray | float, cuts: Sequence[tuple[Any, float]]) -> tuple[Any, Any]:
-    """Return the ends of an interval in standard deviations, cut at each limit.
+    """Return the ends (low, high) of an interval in standard deviations, cut at each limit.
 
-    **Arguments:** `reach` its half-width without limits; `cuts` for each limit the correlation with
-    it and the distance to it.
+    **Arguments:** `reach` the half-width of the interval without limits; `cuts` for each limit the
+    correlation with its flatness, and the flatness in standard deviations.
     """
     low: Any = -reach
     high: Any = reach
@@ -89,7 +90,7 @@ def cut_ends(reach: np.ndarray | float, cuts: Sequence[tuple[Any, float]]) -> tu
 
 
 def labels(model: Model) -> list[tuple[str, str, bool]]:
-    """Return name, unit and whether positive, of the quantities of `quantity_vector`, in order."""
+    """Return name, unit and whether positive of each quantity of `quantity_vector`, in order."""
     out = []
     for name, chart in charts_by_suffix(model):
         out += [(f"{log}{name}", chart.unit, True) for log in chart.log_names]
@@ -113,16 +114,17 @@ def reports_starts(model: Model) -> bool:
 
 
 def charts_by_suffix(model: Model) -> list[tuple[str, AbstractBodyChart]]:
-    """Return the chart of each body, after the suffix of the names of its quantities."""
+    """Return for each body the suffix of the names of its quantities, and its chart."""
     if not isinstance(model.chart, Bodies):
         return [("", model.chart)]
     return [(f" [{n}]", c) for n, c in zip(model.chart.names, model.chart.charts, strict=True)]
 
 
 def recording_names(model: Model) -> list[str]:
-    """Return the suffix of the names of each recording's quantities.
+    """Return for each recording the suffix of the names of its quantities.
 
-    It is empty for one recording, else the number of the recording among those of its body.
+    The suffix is empty for a single recording; otherwise it has the number of the recording among
+    the recordings of its body.
     """
     if model.count == 1:
         return [""]
@@ -134,12 +136,12 @@ def recording_names(model: Model) -> list[str]:
 
 
 def _component(index: tuple[int, ...]) -> str:
-    """Return the name of a component of an array: x, y or z of a vector, else its index."""
+    """Return the name of a component of an array: x, y or z for a vector, else its index."""
     return "xyz"[index[0]] if len(index) == 1 and index[0] < 3 else str(index)
 
 
 def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
-    """Return the reported quantities as a vector, with the logarithms of positive ones."""
+    """Return the reported quantities as a vector, with the logarithms of positive quantities."""
     parts, bodies = [jnp.zeros(0, x.dtype)], as_list(model.bodies(x))
     for (_, chart), body in zip(charts_by_suffix(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
@@ -155,13 +157,13 @@ def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
 
 
 def value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Return the reported quantities and the flatness of each body, and their derivatives."""
+    """Return the reported quantities with the flatness of each body, and all their derivatives."""
     return _value_and_slope(without_samples(model), x)
 
 
 @eqx.filter_jit
 def _value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Return the result of `value_and_slope`, as one program."""
+    """Return the result of `value_and_slope`, computed by one compiled program."""
 
     def value(x: Array) -> Array:
         return jnp.concatenate([quantity_vector(model, x), flat_limit.flatness(model, x)])
@@ -173,9 +175,9 @@ def _value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]
 def values_and_slopes(
     model: Model, x: Float[Array, " n"], derivative_point: Float[Array, " n"] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the reported quantities and the flatness of each body, with their derivatives.
+    """Return the reported quantities with the flatness of each body, and all their derivatives.
 
-    Derivatives are taken at x or, if a body is flat at x, at the point `derivative_point`.
+    The derivatives are taken at x or, if a body is flat at x, at the point `derivative_point`.
     """
     values, slopes = (np.asarray(part) for part in value_and_slope(model, x))
     if derivative_point is not None:
@@ -196,9 +198,9 @@ def quantities(
     **Arguments:**
 
     - `model`: the model.
-    - `numbers`: values and derivatives, as `values_and_slopes` returns them.
-    - `covariance`: (n, n) of the free numbers within the determined directions.
-    - `null`: (k, n) the other directions.
+    - `numbers`: the values and the derivatives, as `values_and_slopes` returns them.
+    - `covariance`: (n, n) the covariance of the free numbers within the determined directions.
+    - `null`: (k, n) the directions that are not determined.
     - `limits`: the flat bodies at which intervals end.
     - `freedom`: the degrees of freedom of the variances.
     """
@@ -247,10 +249,11 @@ def cuts_of(
     deviations: np.ndarray,
     limits: tuple[flat_limit.Limit, ...],
 ) -> list[tuple[np.ndarray, float]]:
-    """Return the correlations of functions with the flatness of each body, and the flatness.
+    """Return the correlation of functions with the flatness of each body, and this flatness.
 
-    The flatness is in standard deviations. The functions have the derivative `slope` and the
-    standard deviations `deviations`.
+    There is a pair for each of the `limits`, with the flatness in standard deviations. The
+    functions have the derivative `slope` and the standard deviations `deviations`; `covariance` and
+    `limits` are as for `quantities`.
     """
     out = []
     for limit in limits:
@@ -258,8 +261,8 @@ def cuts_of(
         if np.isfinite(wide) and wide > 0:
             with np.errstate(invalid="ignore", divide="ignore"):
                 rho = slope @ (covariance @ limit.slope) / (deviations * wide)
-            # The flatness itself has a correlation of one but for round-off, of which the square
-            # root √(1 − ρ²) would be 1e-8.
+            # The flatness itself has a correlation ρ of one but for round-off, which the square
+            # root √(1 − ρ²) would raise to 1e-8.
             rho = np.where(np.abs(rho) > 1.0 - ROUND_OFF, np.sign(rho), rho)
             out.append((np.where(np.isfinite(rho), rho, 0.0), limit.free / wide))
     return out
@@ -269,8 +272,8 @@ def standard_deviations(slope: np.ndarray, covariance: np.ndarray, null: np.ndar
     """Return the standard deviations of functions with derivative `slope` (…, n).
 
     A deviation is infinite if the function changes along a direction of `null` (k, n). It is NaN if
-    its variance is negative or round-off, or if it depends on a number whose correlation with
-    another one is beyond one. All intervals use these deviations.
+    its variance is negative or round-off, or if the function depends on a number whose correlation
+    with another number is beyond one. All intervals use these deviations.
     """
     if not np.isfinite(covariance).all():
         return np.full(slope.shape[:-1], np.nan)
@@ -280,8 +283,8 @@ def standard_deviations(slope: np.ndarray, covariance: np.ndarray, null: np.ndar
     unit = np.where(unit > 0, unit, 1.0)
     rows, scaled = (slope * unit).reshape(-1, unit.size), covariance / np.outer(unit, unit)
     beyond, out = np.abs(scaled).max(axis=0, initial=0.0) > 1.0 + 1e-6, np.zeros(len(rows))
-    # Take functions of the same few numbers together, such as those of one recording's state: an
-    # eigendecomposition of the whole covariance for each function would be slow.
+    # Take functions of the same few numbers together, such as the functions of one recording's
+    # state: an eigendecomposition of the whole covariance for each function would be slow.
     alike: dict[bytes, list[int]] = {}
     for index, row in enumerate(rows):
         alike.setdefault((row != 0).tobytes(), []).append(index)
@@ -295,7 +298,7 @@ def standard_deviations(slope: np.ndarray, covariance: np.ndarray, null: np.ndar
 def _deviations(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return the standard deviations (m,) of functions with derivative `slope` (m, n).
 
-    They are NaN as in `standard_deviations`.
+    A deviation is NaN if its variance is negative or round-off.
     """
     values, axes = np.linalg.eigh(covariance)
     along = slope @ axes

@@ -1,9 +1,9 @@
-"""The covariance of a fit of windows, by leaving out one stretch of windows at a time (jackknife).
+"""Compute the covariance of a fit of windows, leaving out one stretch at a time (jackknife).
 
-Windows are no independent draws: the errors of a model last longer than a window, and windows may
-overlap. Neighbours therefore form stretches, which are left out as a whole (Künsch 1989,
-doi:10.1214/aos/1176347265); the fit without a stretch is one Gauss–Newton step from the best point
-(Miller 1974, doi:10.1093/biomet/61.1.1).
+A stretch is a run of neighbouring windows. Windows are no independent draws: the errors of a model
+last longer than a window, and windows may overlap. Therefore a whole stretch is left out (Künsch
+1989, doi:10.1214/aos/1176347265). The fit without a stretch is one Gauss–Newton step from the best
+point (Miller 1974, doi:10.1093/biomet/61.1.1).
 """
 
 import dataclasses
@@ -21,20 +21,20 @@ from rigidjax.identify.uncertainty.covariance import (
 )
 from rigidjax.identify.uncertainty.quantities import labels
 
-# A number hangs on one stretch, of FEWEST or more, if this stretch makes the part HANGS of its
-# variance.
+# A number hangs on one stretch if this stretch makes more than the part HANGS of its variance. With
+# fewer stretches than FEWEST this is not tested.
 HANGS, FEWEST = 0.85, 6
 
 
 class Stretches(eqx.Module):
-    """The changes of a fit if one of its C stretches of windows is left out.
+    """Hold the changes of a fit if one of its C stretches of windows is left out.
 
     **Fields:**
 
-    - `steps`: (C, s) the changes of the s shared numbers without each stretch.
+    - `steps`: (C, s) the changes of the s shared numbers if each stretch is left out.
     - `places`: (s,) the places of the shared numbers among all n.
-    - `null`: for each stretch the directions (k, n) that the other stretches do not show; all
-      directions if there is one stretch.
+    - `null`: for each stretch, (k, n), the directions of the n numbers that the other stretches do
+      not show; these are all directions if there is only one stretch.
     """
 
     steps: Float[np.ndarray, "stretches s"]
@@ -43,14 +43,15 @@ class Stretches(eqx.Module):
 
     @property
     def hidden_directions(self) -> Float[np.ndarray, "k n"]:
-        """Return the directions whose scatter between stretches is not known."""
+        """Return the directions (k, n) whose scatter between stretches is not known."""
         return np.concatenate(self.null)
 
 
 def stretches_of(model: Model, linear: Linearisation) -> Stretches | None:
     """Return the `Stretches` of a fit of windows; `None` for other recordings.
 
-    The numbers of one window alone are eliminated window by window (Schur complement).
+    It is `None`, too, if the motion is not finite. The numbers that one window alone has are
+    eliminated window by window (Schur complement).
     """
     if model.clusters is None:
         return None
@@ -74,7 +75,7 @@ def stretches_of(model: Model, linear: Linearisation) -> Stretches | None:
         both = np.linalg.solve(inner, np.concatenate([sides, pull[..., None]], axis=2))
         gram = gram - sides.swapaxes(1, 2) @ both[..., :-1]
         slope = slope - np.einsum("rks,rk->rs", sides, both[..., -1])
-    # A number may differ between groups of windows: its column then has a place for each group.
+    # A number may differ between groups of windows; its column then has a place for each group.
     places, columns = np.unique(linear.places[:, shared], return_inverse=True)
     columns = columns.reshape(len(gram), shared.size)
     grams, slopes = np.zeros((count, places.size, places.size)), np.zeros((count, places.size))
@@ -83,8 +84,8 @@ def stretches_of(model: Model, linear: Linearisation) -> Stretches | None:
     known = np.diag(linear.prior_weights[places] ** 2)
     steps, null = np.zeros_like(slopes), []
     for k in range(count):
-        # Add up the other stretches. To subtract one from the whole would leave round-off in the
-        # directions that the others do not show.
+        # Add up the other stretches. To subtract this stretch from the sum of all would leave
+        # round-off in the directions that the others do not show.
         rest = np.delete(grams, k, axis=0).sum(axis=0) + known
         blind = np.eye(places.size)
         if rest.any():
@@ -96,10 +97,9 @@ def stretches_of(model: Model, linear: Linearisation) -> Stretches | None:
 
 
 def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
-    """Return the covariance of the shared numbers by the scatter of the steps.
+    """Return the covariance of the shared numbers by the scatter of their steps between stretches.
 
-    `white` is the covariance for white errors, which is kept for the numbers of
-    one window alone.
+    The covariance `white`, for white errors, is kept for the numbers that one window alone has.
     """
     count, places = len(stretches.steps), stretches.places
     covariance = np.array(white.determined)
@@ -119,7 +119,7 @@ def remarks_on_stretches(
     numbers: tuple[np.ndarray, np.ndarray],
     white: Covariance,
 ) -> list[str]:
-    """Return a remark on each reported quantity that one stretch decides.
+    """Return a remark on each reported quantity that a single stretch decides.
 
     **Arguments:**
 
@@ -155,6 +155,9 @@ def remarks_on_stretches(
 def _changes_along(
     null: Float[np.ndarray, "k n"], slopes: Float[np.ndarray, "q n"]
 ) -> Bool[np.ndarray, " q"]:
-    """Return whether each quantity, of derivative `slopes`, changes along a direction of `null`."""
+    """Return whether each of q quantities changes along a direction of `null` (k, n).
+
+    The quantities have the derivatives `slopes` (q, n) by the n free numbers.
+    """
     size = np.abs(slopes).max(axis=-1, initial=1e-300)
     return np.abs(slopes @ null.T).max(axis=-1, initial=0.0) > 1e-6 * size
