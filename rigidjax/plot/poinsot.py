@@ -100,7 +100,7 @@ def polhode(
     # All energies are equal if all moments are equal: there are no lines to draw.
     if i[2] - i[0] > 1e-9 * i[2]:
         _draw_other_energies(ax, i, energies)
-    how = dict(behind={"ls": (0, (1, 1)), "lw": 1.8}, label="this motion", zorder=5)
+    how = dict(hidden_style={"ls": (0, (1, 1)), "lw": 1.8}, label="this motion", zorder=5)
     style.draw_around_ball(ax, pi, color=COLOURS[1], lw=2.6, **how)
     ax.plot(*pi[:1].T, color=COLOURS[1], marker="o", ms=6, ls="", label="start", zorder=6)
     style.set_equal_scales(ax, max(1.0, float(semi_axes.max())), ("Π₁ / h", "Π₂ / h", "Π₃ / h"))
