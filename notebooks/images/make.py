@@ -23,7 +23,7 @@ def save(figure, name):
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=90)
     plt.close(figure)
-    Image.open(drawn).convert("RGB").quantize(96).save(HERE / name, optimize=True)
+    Image.open(drawn).convert("RGB").quantize(192).save(HERE / name, optimize=True)
 
 
 def frames():
@@ -61,8 +61,9 @@ def draw_flip(inertia, sol, name):
     # Below the label of the axis, which reaches into the corner of a picture in three dimensions.
     ax.get_legend().set_bbox_to_anchor((0.5, -0.12))
     ax = figure.add_subplot(1, 2, 2)
-    for index, colour in enumerate(rj.plot.COLOURS[:3]):
-        ax.plot(sol.ts, sol.ys.omega[:, index], color=colour, label=f"$\\Omega_{'xyz'[index]}$")
+    for index, style in enumerate(("-", "--", ":")):
+        rate, label = sol.ys.omega[:, index], f"$\\Omega_{'xyz'[index]}$"
+        ax.plot(sol.ts, rate, style, lw=1.8, color=rj.plot.COLOURS[index], label=label)
     ax.set(xlabel="time, s", ylabel="body rate, rad/s", title="the flip about the middle axis")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize=9, frameon=False)
     ax.grid(alpha=0.3)

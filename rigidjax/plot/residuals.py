@@ -38,7 +38,7 @@ def residuals(
     seconds = unit_factor(time_unit, TIMES, "time_unit")
     record, left, noises = readings_of_fit(fit_result, index)
     count = len(record.readings)
-    ax = axes_of_shape(ax, (count, 4), nrows=count, ncols=4, figsize=(14, 3.1 * count))
+    ax = axes_of_shape(ax, (count, 4), nrows=count, ncols=4, figsize=(10.5, 2.8 * count))
     t = np.asarray(record.t) / seconds
     for row, reading, errors, noise in zip(ax, record.readings, left, noises, strict=True):
         _draw_sensor_residuals(row, t, errors / noise, np.asarray(reading.host_mask))
@@ -73,8 +73,10 @@ def _draw_sensor_residuals(
         name = f"beyond ±{reach:.0f}"
         over_time.plot([], [], color="0.4", marker="^", ms=2.5, ls="", label=name)
     over_time.axhspan(-2, 2, color="0.9", zorder=0)
-    over_time.legend(loc="upper right", ncols=4, fontsize=8, markerscale=2, columnspacing=1)
-    over_time.set_ylim(-reach, 1.35 * reach)
+    # Four names in a row are wider than the axes: two rows then, and room for them.
+    columns, room = (2, 1.65) if beyond else (3, 1.35)
+    over_time.legend(loc="upper right", ncols=columns, fontsize=8, markerscale=2, columnspacing=1)
+    over_time.set_ylim(-reach, room * reach)
     # The histogram is as wide as the data: errors far smaller than their noise would otherwise all
     # lie in two or three bins.
     inside = everything[np.abs(everything) <= reach]
@@ -88,7 +90,7 @@ def _draw_sensor_residuals(
     spread.hist(everything, bins=bins, weights=weights, color=COLOURS[5], alpha=0.8, label=label)
     x = np.linspace(-reach, reach, 200)
     spread.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi), color="0.2", lw=1.4, label="normal")
-    spread.set(xlabel="error / noise", ylabel="density")
+    spread.set(xlabel="error / noise", ylabel="density", ylim=(0, 1.3 * spread.get_ylim()[1]))
     spread.legend(loc="upper right", fontsize=8)
 
     number = int(mask.sum())
