@@ -19,6 +19,8 @@ ROOMS = (
     "workprecision",
     "batch",
     "exact",
+    "elliptic",
+    "tumblers",
 )
 FILES = [
     *PACKAGE.glob("*.py"),

@@ -1,6 +1,7 @@
-"""Legendre's elliptic integrals, complete and incomplete, with the parameter m = k².
+"""Compute Legendre's elliptic integrals, complete and incomplete, with the parameter m = k².
 
-All of them, and all their derivatives, belong to one family that is closed under differentiation:
+All of these integrals, and all their derivatives, belong to one family that is closed under
+differentiation:
 
     I_jkl(φ, m, n) = ∫₀^φ sin^{2j}θ Δ^{−(2k+1)} (1 − n sin²θ)^{−l} dθ,      Δ = √(1 − m sin²θ)
     dI_jkl = [integrand at φ] dφ + (k + ½) I_{j+1,k+1,l} dm + l I_{j+1,k,l+1} dn
@@ -24,7 +25,8 @@ from rigidjax.elliptic.carlson import rd, rf
 from rigidjax.elliptic.carlson_r import r_integral
 from rigidjax.rotation.stumpff import half_turns
 
-# Steps after which a and b agree to √eps for b/a down to the square root of the least number.
+# After this number of steps the means a and b agree to √eps, for b/a down to the square root of the
+# least number of the dtype.
 _MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
 
 
@@ -119,9 +121,10 @@ def ellippiinc(
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def integral(orders: tuple[int, int, int], sine: Array, cosine: Array, m1: Array, n1: Array) -> Any:
-    """Return I_jkl for `orders` (j, k, l) from the sine and cosine of φ, |φ| ≤ π/2.
+    """Return I_jkl for `orders` = (j, k, l), from the sine and cosine of φ with |φ| ≤ π/2.
 
-    From both, not from φ, so that no digit is lost near π/2.
+    It is computed from sine and cosine, not from φ, so that no digit is lost near π/2. `m1` is 1 −
+    m and `n1` is 1 − n.
     """
     j, k, last = orders
     s, c2 = sine, cosine * cosine
@@ -165,13 +168,13 @@ def _integral_jvp(
 
 
 def complete_integral(orders: tuple[int, int, int], m1: Array, n1: Array | None = None) -> Any:
-    """Return I_jkl, `orders` (j, k, l), at φ = π/2."""
+    """Return I_jkl for `orders` = (j, k, l) at φ = π/2."""
     one = jnp.ones_like(m1)
     return integral(orders, one, jnp.zeros_like(m1), m1, one if n1 is None else n1)
 
 
 def mean_iterates(m1: Array) -> list[tuple[Any, Any]]:
-    """Return the pairs of arithmetic and geometric means from (1, √m1) to their common value."""
+    """Return the pairs of arithmetic and geometric means, from (1, √m1) to their common value."""
     rows = [(jnp.ones_like(m1), jnp.sqrt(m1))]
     for _ in range(_MEAN_STEPS[np.dtype(m1.dtype)]):
         a, b = rows[-1]
@@ -181,7 +184,7 @@ def mean_iterates(m1: Array) -> list[tuple[Any, Any]]:
 
 @jax.custom_jvp
 def _complete_first_kind(m1: Array) -> Any:
-    """Return K = π/(2 agm(1, √m1)); infinity for m1 = 0."""
+    """Return K = π/(2 agm(1, √m1)), which is infinite for m1 = 0."""
     a, b = mean_iterates(m1)[-1]
     return jnp.where(m1 == 0, jnp.inf, math.pi / (a + b))
 
@@ -195,12 +198,12 @@ def _complete_first_kind_jvp(
 
 
 def _second_kind(s: Array, c2: Array, delta2: Array, m1: Array) -> Any:
-    """Return E(φ|m) for |φ| ≤ π/2 from s = sin φ, c2 = cos²φ and delta2 = 1 − m s².
+    """Return E(φ|m) for |φ| ≤ π/2, from s = sin φ, c2 = cos²φ and delta2 = 1 − m s².
 
-    By DLMF 19.25.10 for 0 ≤ m ≤ 1 and by 19.25.9 for m < 0, where every term is positive.
+    It follows DLMF 19.25.10 for 0 ≤ m ≤ 1 and DLMF 19.25.9 for m < 0: every term is then positive.
     """
     m, one = 1 - m1, jnp.ones_like(s)
-    # E(φ|1) = sin φ: at φ = π/2 the terms below have no values of their own.
+    # E(φ|1) is sin φ; at φ = π/2 the terms below have no values of their own.
     end = delta2 == 0
     c2, delta2 = jnp.where(end, one, c2), jnp.where(end, one, delta2)
     above = m >= 0
@@ -215,14 +218,15 @@ def _second_kind(s: Array, c2: Array, delta2: Array, m1: Array) -> Any:
 def _integral_at_any_amplitude(
     orders: tuple[int, int, int], phi: Array, m1: Array, n1: Array | None = None
 ) -> Any:
-    """Return I_jkl, `orders` (j, k, l), at any amplitude φ.
+    """Return I_jkl for `orders` = (j, k, l) at any amplitude φ = `phi`.
 
-    Whole half turns come from the complete integral, the rest from its sine and cosine.
+    The complete integral gives the part of the whole half turns; the sine and cosine of the
+    remainder give the rest.
     """
     turns, remainder = half_turns(phi)
     n1 = jnp.ones_like(m1) if n1 is None else n1
     part = integral(orders, jnp.sin(remainder), jnp.cos(remainder), m1, n1)
-    # Within the first half turn the complete integral may be infinite, and is not wanted.
+    # Within the first half turn the complete integral is not needed, and it may be infinite.
     near = turns == 0
     one = jnp.ones_like(m1)
     safe_m1, safe_n1 = jnp.where(near, one, m1), jnp.where(near, one, n1)
