@@ -21,6 +21,7 @@ ROOMS = (
     "exact",
     "elliptic",
     "tumblers",
+    "cli",
 )
 FILES = [
     *PACKAGE.glob("*.py"),

@@ -1,4 +1,4 @@
-"""The units of columns: their factors to SI, and their spellings in the names of columns."""
+"""Convert units of columns to SI, and find units in the names of columns."""
 
 import math
 import re
@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 from rigidjax.cli.logs.errors import LogError, warn
 
-# The factor of each unit to SI.
+# A value in a unit is multiplied by this factor to give SI.
 UNITS = {
     "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "mm": 1e-3, "m/s2": 1.0, "g": 9.80665,
     "1": 1.0, "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180,
     "rpm": math.pi / 30,
 }  # fmt: skip
 TIME_UNITS = ("s", "ms", "us", "ns")
-# The spellings of each unit, in small letters; powers without `^`, `**` or raised digits.
+# Each unit has these spellings, in small letters; powers are without `^`, `**` or raised digits.
 _SPELLINGS = {
     "s": "s sec secs second seconds",
     "ms": "ms msec millisecond milliseconds",
