@@ -1,10 +1,10 @@
-"""Identification: from recordings to a body, with its uncertainty.
+"""Identify a body from recordings, with the uncertainty of all numbers.
 
 `fit` finds the body and all other free numbers of a `Model`. `filter`, `step` and `smooth` follow a
-model with an unknown torque: states, torques and sensor errors with their standard deviations.
-`log_likelihood` is the density of the readings, unknown torques integrated out; `sample` draws a
-motion under random torques. `LogDensity` is the posterior density of a fit: `posterior` draws from
-it, `refit` finds its maximum.
+model with an unknown torque, and estimate states, torques and sensor errors with their standard
+deviations. `log_likelihood` is the density of the readings, with the unknown torques integrated
+out; `sample` draws a motion under random torques. `LogDensity` is the posterior density of a fit:
+`posterior` draws from it, `refit` finds its maximum.
 """
 
 from rigidjax._names import show

@@ -1,3 +1,3 @@
-"""The former place of `read_table`, kept for programs that import `identify.csv_io.read_table`."""
+"""Import `read_table` under its former name, for programs that use `identify.csv_io.read_table`."""
 
 from rigidjax.cli.logs.table import read_table as read_table
