@@ -173,7 +173,9 @@ class _Parser(argparse.ArgumentParser):
     """Read the command line, with error messages that contain no control characters from names."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the message, made printable, and end the program with exit code 2."""
+        """Print the message with its control characters escaped, and end the program with exit code
+        2.
+        """
         super().error(_checks.escape_controls(message))
 
 

@@ -1,5 +1,4 @@
-"""Compute elliptic functions and integrals: Jacobi's functions, Legendre's and Carlson's
-integrals.
+"""Compute elliptic functions and integrals: Jacobi's functions, Legendre's and Carlson's integrals.
 
 The parameter is m = k², as in SciPy and mpmath. Its complement m1 = 1 − m is an optional argument,
 because the difference 1 − m loses its digits as m → 1 and finally rounds to 0. Results have the

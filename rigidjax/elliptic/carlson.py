@@ -24,13 +24,13 @@ _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}
 
 
 def rf(x: Real, y: Real, z: Real) -> Result:
-    """Return Carlson's integral of the first kind, R_F(x, y, z) = ½ ∫₀^∞ dt /
-    √((t+x)(t+y)(t+z)).
+    """Return Carlson's integral of the first kind, R_F(x, y, z) = ½ ∫₀^∞ dt / √((t+x)(t+y)(t+z)).
 
-    **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, in one unit; the result has the power
-    −½ of this unit. Two zeros give infinity, a negative argument gives NaN. **Returns:** R_F (DLMF
-    19.16.1), symmetric in all three arguments. Its derivative ∂R_F/∂z = −R_D(x, y, z)/6 (DLMF
-    19.18.1) is −∞ at z = 0.
+    **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, all in one unit. Two zeros give
+    infinity, a negative argument gives NaN.
+
+    **Returns** R_F (DLMF 19.16.1), symmetric in all three arguments, in the power −½ of their unit.
+    Its derivative ∂R_F/∂z = −R_D(x, y, z)/6 (DLMF 19.18.1) is −∞ at z = 0.
 
     >>> float(rf(4.0, 4.0, 4.0))
     0.5
@@ -42,9 +42,10 @@ def rd(x: Real, y: Real, z: Real) -> Result:
     """Return Carlson's R_D(x, y, z) = (3/2) ∫₀^∞ dt / ((t+z) √((t+x)(t+y)(t+z))), of the second
     kind.
 
-    **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, in one unit. The result is
-    infinite for z = 0 or x = y = 0, and NaN for negative arguments. **Returns:** R_D (DLMF
-    19.16.5), symmetric in x and y.
+    **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, all in one unit. The result is
+    infinite for z = 0 or x = y = 0, and NaN for negative arguments.
+
+    **Returns** R_D (DLMF 19.16.5), symmetric in x and y.
 
     >>> float(rd(4.0, 4.0, 4.0))
     0.125
@@ -56,10 +57,12 @@ def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
     """Return Carlson's R_J(x, y, z, p) = (3/2) ∫₀^∞ dt / ((t+p) √((t+x)(t+y)(t+z))), of the third
     kind.
 
-    The underscore distinguishes the name from `import rigidjax as rj`. **Arguments:** `x`, `y`, `z`
-    ≥ 0, at most one of them 0, and `p` > 0, in one unit. p = 0 gives infinity, p < 0 gives NaN (not
-    the principal value). **Returns:** R_J (DLMF 19.16.2) by the trapezoidal rule in ln t, exact to
-    round-off.
+    The underscore distinguishes the name from `import rigidjax as rj`.
+
+    **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, and `p` > 0, all in one unit. p = 0
+    gives infinity, p < 0 gives NaN (not the principal value).
+
+    **Returns** R_J (DLMF 19.16.2) by the trapezoidal rule in ln t, exact to round-off.
 
     >>> round(float(rj_(4.0, 4.0, 4.0, 4.0)), 14)
     0.125

@@ -41,11 +41,14 @@ _FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
 def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Result]:
     """Return Jacobi's elliptic functions sn(u|m), cn(u|m) and dn(u|m).
 
-    **Arguments:** `u` real; the error grows as |u| eps. `m` the parameter k² (not the modulus k),
-    any real number. `m1` = 1 − m: give it if m is so near 1 that 1 − m loses digits. Values and
-    derivatives then belong to m1, and m is used only where it is small.
+    **Arguments:**
 
-    **Returns:** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech, sech
+    - `u`: real; the error grows as |u| eps.
+    - `m`: the parameter k² (not the modulus k), any real number.
+    - `m1`: 1 − m. Give it if m is so near 1 that 1 − m loses digits: values and derivatives then
+      belong to m1, and m is used only where it is small.
+
+    **Returns** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech, sech
     (DLMF 22.5.3–4); m < 0 and m > 1 follow from DLMF 22.17. Derivatives of every order by u (DLMF
     22.13(i)), m and m1 are exact.
 
@@ -58,8 +61,7 @@ def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Re
 
 
 def am(u: Real, m: Real, m1: Real | None = None) -> Result:
-    """Return Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad, which is the inverse of F(φ|m) for m ≤
-    1.
+    """Return Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad, which is the inverse of F(φ|m) for m ≤ 1.
 
     **Arguments:** as `sncndn`. **Returns:** φ (DLMF 22.16.1–3). For m ≤ 1 it grows by π in each
     half period 2K, without jumps; for m > 1 it oscillates within |φ| ≤ arcsin(1/√m).

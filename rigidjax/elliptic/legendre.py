@@ -33,9 +33,14 @@ _MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
 def ellipk(m: Real, m1: Real | None = None) -> Result:
     """Return the complete elliptic integral of the first kind, K(m) = ∫₀^{π/2} dθ/√(1 − m sin²θ).
 
-    **Arguments:** `m` < 1 the parameter k² (not the modulus k), also negative; 1 gives infinity, a
-    larger m NaN. `m1` = 1 − m: give it if m is so near 1 that 1 − m loses digits. Value and
-    derivative then depend on m1 alone. **Returns:** π/(2 agm(1, √m1)) (DLMF 19.8.5).
+    **Arguments:**
+
+    - `m`: the parameter k² (not the modulus k), below 1 and possibly negative; 1 gives infinity, a
+      larger m NaN.
+    - `m1`: 1 − m. Give it if m is so near 1 that 1 − m loses digits: value and derivative then
+      depend on m1 alone.
+
+    **Returns** π/(2 agm(1, √m1)), with agm the arithmetic–geometric mean (DLMF 19.8.5).
 
     >>> round(float(ellipk(1.0, 1e-30)), 12)
     35.925070756031
@@ -48,7 +53,8 @@ def ellipe(m: Real, m1: Real | None = None) -> Result:
     """Return the complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
 
     **Arguments:** `m` ≤ 1 the parameter k² (a larger one gives NaN); `m1` as for `ellipk`.
-    **Returns:** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms.
+
+    **Returns** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms.
 
     >>> float(ellipe(1.0))
     1.0
@@ -60,10 +66,15 @@ def ellipe(m: Real, m1: Real | None = None) -> Result:
 def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) -> Result:
     """Return the complete integral of the third kind, ∫₀^{π/2} dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
-    **Arguments:** `n` < 1 the characteristic (DLMF's α²): 1 gives infinity, a larger n NaN (not the
-    principal value); `m` < 1 the parameter k²; `m1` = 1 − m and `n1` = 1 − n as for `ellipk`. The
-    order is Wolfram's and mpmath's. **Returns:** DLMF 19.2.8 as one integral with a positive
-    integrand, accurate to round-off for any n < 1.
+    **Arguments**, in the order of Wolfram and mpmath:
+
+    - `n`: the characteristic (DLMF's α²), below 1; 1 gives infinity, a larger n NaN (not the
+      principal value).
+    - `m`: the parameter k², below 1.
+    - `m1`, `n1`: 1 − m and 1 − n, as for `ellipk`.
+
+    **Returns** DLMF 19.2.8 as one integral with a positive integrand, accurate to round-off for any
+    n < 1.
 
     >>> round(float(ellippi(0.5, 0.5)), 12)
     2.701287762095
@@ -75,9 +86,10 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
 def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
     """Return the incomplete elliptic integral of the first kind, F(φ|m) = ∫₀^φ dθ/√(1 − m sin²θ).
 
-    **Arguments:** `phi` the amplitude, rad, any size; `m` the parameter k² with m sin²φ < 1 (else
-    NaN); `m1` as for `ellipk`. **Returns:** DLMF 19.25.5 in Carlson's R_F after reduction to |φ| ≤
-    π/2 (DLMF 19.2.10).
+    **Arguments:** `phi` the amplitude, rad, of any size; `m` the parameter k² with m sin²φ < 1
+    (else NaN); `m1` as for `ellipk`.
+
+    **Returns** DLMF 19.25.5 in Carlson's R_F, after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
 
     >>> round(float(ellipf(1.0, 0.5)), 12)
     1.083216772845
@@ -89,9 +101,11 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
 def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
     """Return the incomplete elliptic integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ.
 
-    **Arguments:** `phi` the amplitude, rad, any size; `m` ≤ 1 the parameter k² (a larger one gives
-    NaN); `m1` as for `ellipk`. **Returns:** DLMF 19.25.9 or 19.25.10 in Carlson's integrals,
-    whichever has positive terms, after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
+    **Arguments:** `phi` the amplitude, rad, of any size; `m` ≤ 1 the parameter k² (a larger one
+    gives NaN); `m1` as for `ellipk`.
+
+    **Returns** DLMF 19.25.9 or 19.25.10 in Carlson's integrals, whichever has positive terms, after
+    reduction to |φ| ≤ π/2 (DLMF 19.2.10).
 
     >>> round(float(ellipeinc(1.0, 0.5)), 12)
     0.927329883624
@@ -105,10 +119,14 @@ def ellippiinc(
 ) -> Result:
     """Return the incomplete integral of the third kind, ∫₀^φ dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
-    **Arguments:** `n` the characteristic with n sin²φ < 1; `phi` the amplitude, rad, any size; `m`
-    the parameter k² with m sin²φ < 1 (beyond either bound: NaN); `m1` = 1 − m and `n1` = 1 − n as
-    for `ellipk`. The order is Wolfram's and mpmath's. **Returns:** DLMF 19.2.7 as one integral
-    after reduction to |φ| ≤ π/2 (19.2.10).
+    **Arguments**, in the order of Wolfram and mpmath:
+
+    - `n`: the characteristic, with n sin²φ < 1 (else NaN).
+    - `phi`: the amplitude, rad, of any size.
+    - `m`: the parameter k², with m sin²φ < 1 (else NaN).
+    - `m1`, `n1`: 1 − m and 1 − n, as for `ellipk`.
+
+    **Returns** DLMF 19.2.7 as one integral, after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
 
     >>> round(float(ellippiinc(0.5, 1.0, 0.5)), 12)
     1.288978174245

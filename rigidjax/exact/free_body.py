@@ -103,9 +103,13 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     """Return the state of a torque-free body at any time t in closed form, without a solver or
     steps.
 
-    **Arguments:** `inertia` about the centre of mass, any tensor with positive moments, kg m², body
-    frame; `state0` a `Spin` (Ω) or `Attitude` (q, Ω): Ω rad/s in the body frame, q unit quaternion
-    (w, x, y, z) body → world; `t` scalar time since `state0`, s, of either sign.
+    **Arguments:**
+
+    - `inertia`: about the centre of mass, any tensor with positive moments, kg m², body frame.
+    - `state0`: the initial state, a `Spin` (Ω) or an `Attitude` (q, Ω): Ω rad/s in the body frame,
+      q a unit quaternion (w, x, y, z), body → world.
+    - `t`: scalar time since `state0`, s, of either sign.
+
     **Returns** the state at `t`, of the type and dtype of `state0`. Use `jax.vmap` for many times
     or bodies; `FreeBody(inertia, state0)` keeps the constants of the motion.
 

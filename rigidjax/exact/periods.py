@@ -25,8 +25,12 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     the body frame (5.41 days about the long axis for 4179 Toutatis). For a spin about a stable axis
     it is the period of small wobbles. It is infinite on the separatrix, for a sphere and at rest.
 
-    **Arguments:** `inertia` of the body about its centre of mass (kg m²); `omega0` (3,) Ω at any
-    moment, rad/s, body frame. **Returns** a scalar, s.
+    **Arguments:**
+
+    - `inertia`: of the body about its centre of mass, kg m².
+    - `omega0`: (3,) Ω at any moment, rad/s, body frame.
+
+    **Returns** the period, a scalar, s.
 
     `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, eᵢ the roots in `rigidjax.exact.sigma_form` (DLMF
     19.8.5; Landau and Lifshitz, Mechanics, eq 37.11).

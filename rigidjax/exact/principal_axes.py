@@ -66,7 +66,8 @@ def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     Jacobi's method.
     """
     one, zero = jnp.ones_like(m[0, 0]), jnp.zeros_like(m[0, 0])
-    # Nearly equal moments keep their differences: a shift that is exact by Sterbenz' lemma.
+    # Subtract a shift from nearly equal moments: it is exact by Sterbenz' lemma, and so the moments
+    # keep their differences.
     least = jnp.minimum(jnp.minimum(m[0, 0], m[1, 1]), m[2, 2])
     most = jnp.maximum(jnp.maximum(m[0, 0], m[1, 1]), m[2, 2])
     shift = jnp.where(2.0 * least >= most, least, zero)

@@ -27,8 +27,7 @@ from rigidjax.tumblers.scattering import (
 def ellipsoid(
     semi_axes: Vector, sun: Vector, observer: Vector, scattering: AbstractScattering | None = None
 ) -> Scalar:
-    """Return the brightness of a triaxial ellipsoid, m², which is π r² for a sphere at zero
-    phase.
+    """Return the brightness of a triaxial ellipsoid, m², which is π r² for a sphere at zero phase.
 
     It is differentiable in all numbers, also at zero phase and for a sphere. For many directions
     use `jax.vmap`.
@@ -71,12 +70,15 @@ def mesh(
     visible faces.
 
     For a body that is not convex it is the brightness without shadows. It is differentiable in the
-    vertices and directions; a face at the edge of the light has the derivative of a dark one.
+    vertices and directions; a face at the edge of the light has the derivative of a dark face.
     Source: Kaasalainen and Torppa 2001, Icarus 153:24, doi:10.1006/icar.2001.6673.
 
-    **Arguments:** `vertices`, `faces` as for `rigidjax.shapes.mesh`; `sun`, `observer` and
-    `scattering` as for `ellipsoid`. **Raises:** as `ellipsoid`, and as `rigidjax.shapes.mesh` for
-    faces.
+    **Arguments:**
+
+    - `vertices`, `faces`: as for `rigidjax.shapes.mesh`.
+    - `sun`, `observer`, `scattering`: as for `ellipsoid`.
+
+    **Raises:** the errors of `ellipsoid`, and those of `rigidjax.shapes.mesh` for faces.
 
     >>> corners = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     >>> sides = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]

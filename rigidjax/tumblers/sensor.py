@@ -24,8 +24,7 @@ UNITS = ("flux", "mag")
 
 
 class Brightness(AbstractSensor):
-    """Measure the brightness of an ellipsoid that the sun lights; the readings are a light
-    curve.
+    """Measure the brightness of an ellipsoid that the sun lights; the readings are a light curve.
 
     A flux is `level · B/(π (abc)^⅔)`, a magnitude `level − 2.5 log₁₀(B/(π (abc)^⅔))`, with B the
     result of `rj.tumblers.brightness.ellipsoid` for the semi-axes a, b, c. The level is therefore

@@ -162,8 +162,7 @@ def pad_light(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array
 
 
 def strongest_lines(light: tuple[Array, Array, Array], highest: float, count: int) -> np.ndarray:
-    """Return the `count` strongest lines of the spectrum up to the frequency `highest`, in
-    1/span.
+    """Return the `count` strongest lines of the spectrum up to the frequency `highest`, in 1/span.
 
     Each line is subtracted from the `light` before the next one is sought.
     """

@@ -66,8 +66,7 @@ class Header(NamedTuple):
 
 
 def read_header(file: io.TextIOBase) -> Header:
-    """Read the header of a text from its beginning, which is the first line after comments
-    (`#`).
+    """Read the header of a text from its beginning, which is the first line after comments (`#`).
 
     If numbers follow the last comment, this comment is the header, as in files of `numpy.savetxt`.
     """

@@ -29,9 +29,10 @@ _SPELLINGS = {
 }
 _UNIT_OF = {word: unit for unit, words in _SPELLINGS.items() for word in words.split()}
 _IN_BRACKETS = re.compile(r"[(\[]([^()\[\]]*)[)\]]\s*$")
-# Words in brackets that are meant as a unit: others are an axis or an index.
+# This pattern finds words in brackets that are meant as a unit; other words in brackets are an axis
+# or an index.
 _UNKNOWN = re.compile(r"[/°]|dps|lsb|count|raw", re.IGNORECASE)
-# Characters that have several spellings.
+# These characters have several spellings.
 _SIGNS = str.maketrans({
     "²": "2", "⁻": "-", "−": "-", "¹": "1", "µ": "u", "μ": "u", "º": "°", "^": None, "*": None,
     "·": None, "⋅": None, ".": None, " ": None,
@@ -56,7 +57,9 @@ def unit_in(name: str, allowed: Sequence[str]) -> str | None:
 
 
 def _usual_spelling(word: str) -> str:
-    """Return a unit in the spelling of `_SPELLINGS`; a capital G, which is gauss, stays."""
+    """Return a unit in the spelling of `_SPELLINGS`, except a capital G, which means gauss and
+    stays unchanged.
+    """
     return word.translate(_SIGNS).lower() if word.strip() != "G" else word
 
 
@@ -67,7 +70,8 @@ def unit_of(
     allowed: Sequence[str],
     place: str,
 ) -> str:
-    """Return the unit of columns: the one that their names or the user state, else the usual one.
+    """Return the unit of columns, which is the one that their names or the user state, else the
+    usual one.
 
     **Arguments:**
 

@@ -9,7 +9,7 @@ FOUND, NOT_ALONE, NOT_ENDED = "found", "not alone", "not ended"
 # These are the answers on the model.
 EXPLAINS, LEAVES, FAILS = "explains the readings", "leaves a part", "does not explain the readings"
 
-# Errors larger than the given noise by more than this factor are no errors of a sensor.
+# Errors that are larger than the given noise by more than this factor are not those of a sensor.
 FAR = 3.0
 
 

@@ -128,7 +128,8 @@ class Fit(eqx.Module):
 
     @property
     def causes(self) -> tuple[Cause, ...]:
-        """Return what most likely makes the errors that the model leaves, if the readings show it.
+        """Return the most likely causes of the errors that the model does not explain, if the
+        readings show them.
 
         Each cause has `name`, `sensor`, `share`, `words` and `remedy`.
         """
@@ -291,8 +292,7 @@ class Fit(eqx.Module):
         return interval_about(middle, slope, determined, null, reach, self.limits)
 
     def degrees_of_freedom(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom of the variances of functions whose derivative is
-        `slope`.
+        """Return the degrees of freedom of the variances of functions whose derivative is `slope`.
 
         The `slope` (…, n) is taken with respect to the free numbers.
         """

@@ -148,8 +148,7 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
 
 
 def _readings_change(fit: "Fit", direction: np.ndarray) -> bool:
-    """Return whether readings change along a `direction` (n,) although their derivatives are
-    zero.
+    """Return whether readings change along a `direction` (n,) although their derivatives are zero.
 
     This happens where a torque switches at a time or a state that the direction moves. Only the
     part of the change that is odd in the step counts: a number that enters by its square has a

@@ -16,8 +16,7 @@ MOST = 0.7
 
 
 def full_scale_of(values: np.ndarray) -> float | None:
-    """Return the full scale of one channel (T,), or `None` unless its largest readings are cut
-    off.
+    """Return the full scale of one channel (T,), or `None` unless its largest readings are cut off.
 
     They are cut off if more readings in a row are equal than at the top of a smooth wave. At such a
     top 2 √(2d/a) readings are equal, where d is the last digit of the readings and a their second

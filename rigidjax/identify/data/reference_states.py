@@ -99,8 +99,7 @@ def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (m,) and body rates (m, 3) between the attitudes q (n, 4) at the times t
-    (n,).
+    """Return times (m,) and body rates (m, 3) between the attitudes q (n, 4) at the times t (n,).
 
     Each rate is the mean one over about `_TURN`, at the middle of its interval of time.
     """

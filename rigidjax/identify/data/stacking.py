@@ -15,8 +15,7 @@ from rigidjax.motion.torques import Linear, Series
 
 
 def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
-    """Return the recordings as one recording with a leading axis, and the number of times of
-    each.
+    """Return the recordings as one recording with a leading axis, and the number of times of each.
 
     Shorter recordings are padded with masked readings at their last time, and their tables of time
     with the last value.
@@ -144,8 +143,7 @@ def _is_table(node: PyTree) -> bool:
 
 
 def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0) -> Recording:
-    """Return the recording padded to `count` times, with its tables of time padded to `rows`
-    rows.
+    """Return the recording padded to `count` times, with its tables of time padded to `rows` rows.
 
     The padding is masked readings at the last time, and the last value of tables. Times are along
     `axis`: 0 for one recording, 1 for several with a leading axis.

@@ -118,7 +118,8 @@ class Windows(eqx.Module):
         return jnp.asarray(np.repeat(np.where(each == 0, 1.0, each), 3))
 
     def records(self) -> Recording:
-        """Return the windows as recordings, with a leading axis, of a sensor of the whole state.
+        """Return the windows as recordings with a leading axis, read by one sensor of the whole
+        state.
 
         The first time of each window is its start, at which nothing is read.
         """

@@ -35,8 +35,7 @@ from rigidjax.motion.manifold import names, plus
 
 
 class Belief(eqx.Module):
-    """Hold an estimate of the state at a time, and a root S of the covariance `S Sᵀ` of its
-    errors.
+    """Hold an estimate of the state at a time, and a root S of the covariance `S Sᵀ` of its errors.
 
     `first_belief` makes the first one; in the result of `filter` all fields have a leading time
     axis.
@@ -382,8 +381,7 @@ def log_likelihood(
     *,
     substeps: int | None = None,
 ) -> Scalar:
-    """Return the logarithm of the density of all readings, with the unknown torques integrated
-    out.
+    """Return the logarithm of the density of all readings, with the unknown torques integrated out.
 
     It is `Σ log N(ν; 0, s)` over innovations ν of variance s (Schweppe 1965,
     doi:10.1109/TIT.1965.1053737). Maximise it over moments, the density of a torque, a noise, or an

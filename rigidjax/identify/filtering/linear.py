@@ -299,8 +299,7 @@ def joint_roots(transition: Array, noise: Array, root: Array) -> Joint:
 def backward_pass(
     joint: Joint, mean: Array, predicted: Array, noise: Array, last: tuple[Array, Array]
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the smoothed means and roots, and the means and covariances of the noise of all
-    steps.
+    """Return the smoothed means and roots, and the means and covariances of the noise of all steps.
 
     It is the backward pass of Rauch, Tung and Striebel (1965). The covariance (m, m) of the unit
     noise of a step is `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ` with `Z = L⁻¹ G`, where L is the predicted

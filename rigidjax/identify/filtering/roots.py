@@ -106,8 +106,7 @@ def update(
 
 
 class Terms(NamedTuple):
-    """Hold the terms of a log-density in which each number read is normal, given the earlier
-    ones.
+    """Hold the terms of a log-density in which each number read is normal, given the earlier ones.
 
     **Fields:** `error` of each number in standard deviations; `log_variance` the logarithm of 2π
     times its variance; both are zero for masked numbers.

@@ -58,7 +58,9 @@ class ExtendedState(eqx.Module):
 
 
 def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
-    """Raise `ValueError` for a sensor whose errors the filter cannot weigh."""
+    """Raise `ValueError` for a sensor that the filter cannot use: one without noise, with a
+    low-pass filter, or with jitter.
+    """
     for sensor in sensors:
         name = type(sensor).__name__
         if sensor.noise is None:
@@ -79,8 +81,7 @@ def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
 
 
 class Dynamics(eqx.Module):
-    """Hold the equations of a filter, for one dtype and type of state, which `dynamics_of`
-    makes.
+    """Hold the equations of a filter, for one dtype and type of state, which `dynamics_of` makes.
 
     **Fields:**
 
@@ -212,7 +213,8 @@ def coloured_parts(process: Process | None) -> tuple[CorrelatedTorque, ...]:
 def moved_root(
     x: ExtendedState, e: Float[Array, " n"], root: Float[Array, "n m"], *, inverse: bool = False
 ) -> Float[Array, "n m"]:
-    """Return the root of the errors about `x ⊕ e`, from the `root` of the errors about x.
+    """Return the root of the errors about the state `x ⊕ e`, which is x changed by e, from the
+    `root` of the errors about x.
 
     Errors δ of a turn e become `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, here to second order in e
     (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848). With `inverse` the root is multiplied

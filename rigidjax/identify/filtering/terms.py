@@ -80,7 +80,8 @@ def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
 
 
 def reading_terms(model: Model, x: Float[Array, " n"]) -> Terms:
-    """Return the terms (R, N) of all readings of a model at the free numbers x.
+    """Return the terms (R, N) of the log-density of all readings of a model, for R recordings at
+    the free numbers x.
 
     Derivatives by x are computed recording by recording, in forward mode.
     """
@@ -88,7 +89,9 @@ def reading_terms(model: Model, x: Float[Array, " n"]) -> Terms:
 
 
 def log_density(model: Model, x: Float[Array, " n"]) -> Scalar:
-    """Return the logarithm of the density of all readings and of the priors of x."""
+    """Return the logarithm of the density of all readings, with the priors, at the free numbers x
+    of a model.
+    """
     return reading_terms(model, x).log_density - 0.5 * jnp.sum(prior_residuals(model, x) ** 2)
 
 

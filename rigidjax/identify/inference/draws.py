@@ -310,9 +310,9 @@ class Refit(eqx.Module):
         """Return the interval (low, high), with equal tails, of a function of the posterior.
 
         It is computed from the weighted draws. If these are worth fewer than 100 independent ones
-        (`effective_count`), it is computed from the covariance and the derivative of the function, which
-        must then be differentiable: take the logarithm of a positive quantity. Such an interval is
-        too narrow on short records.
+        (`effective_count`), it is computed from the covariance and the derivative of the function,
+        which must then be differentiable: take the logarithm of a positive quantity. Such an
+        interval is too narrow on short records.
 
         **Arguments:** `function` from `Unpacked` to an array; `level` the probability
         that the interval holds the true value. **Raises** `ValueError` for a level outside (0, 1),
@@ -361,8 +361,8 @@ def refit(
     The draws come from a wide Student's t distribution about the maximum; their weight is the
     density over that of the t distribution (importance sampling: Geweke 1989,
     doi:10.2307/1913710). For more than some dozen numbers such draws are worth little
-    (`effective_count`). Intervals then come from the information, which is good enough if each recording
-    is long; or draw by `identify.posterior`, from any density.
+    (`effective_count`). Intervals then come from the information, which is good enough if each
+    recording is long; or draw by `identify.posterior`, from any density.
 
     **Arguments:**
 

@@ -107,7 +107,8 @@ _value = eqx.filter_jit(quantities.quantity_vector)
 def _interval_end(
     pull_to: Callable[[float], tuple[float, float]], reach: float, largest: float, side: float
 ) -> float:
-    """Return the value of the quantity at which the misfit has grown enough.
+    """Return the value of the quantity at which the misfit has grown by the amount that ends the
+    interval.
 
     **Arguments:** `pull_to` a function from the distance of the target to the excess of the misfit
     and the value; `reach` the first distance; `largest` the last one; `side` the sign of infinity.

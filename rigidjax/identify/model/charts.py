@@ -160,8 +160,7 @@ def _typical_moments(value: object) -> Array:
 
 
 class Tensor(AbstractBodyChart):
-    """Map six numbers to the inertia tensor with its scale, which a known torque or momentum
-    shows.
+    """Map six numbers to the inertia tensor with its scale, which a known torque or momentum shows.
 
     Its six numbers are the logarithm of the size of 𝔖 in units of `typical`, and the five numbers
     of `Ratios`.

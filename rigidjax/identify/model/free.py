@@ -138,7 +138,7 @@ class Slot(eqx.Module):
 
     @property
     def columns(self) -> slice:
-        """Return the columns of the steps in the row of a recording."""
+        """Return the columns that hold the steps of this slot in the row of a recording."""
         return slice(self.column, self.column + int(np.prod(self.shape, dtype=int)))
 
     def move(self, start: Array, step: Array) -> Array:
@@ -226,8 +226,7 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
 def leaf_at(
     where: Callable[[Any], Any], tree: PyTree, name: str, role: str
 ) -> tuple[tuple[Any, ...], Any]:
-    """Return the path of the leaf of a tree that `where` picks, and the leaf, an array of
-    numbers.
+    """Return the path of the leaf of a tree that `where` picks, and the leaf, an array of numbers.
 
     `name` and `role` are words for error messages: the object that has `where`, and the object that
     needs a starting value.

@@ -253,7 +253,7 @@ class Model(eqx.Module):
 
     @property
     def recordings(self) -> tuple[Recording, ...]:
-        """Return the recordings, one by one."""
+        """Return the recordings as a tuple, one by one."""
         return tuple(
             stacking.take_rows(stacking.pick_records(self.records, index), count)
             for index, count in enumerate(np.asarray(self.counts).tolist())
@@ -530,7 +530,7 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
 
 
 def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
-    """Return the starting value of each slot in each recording."""
+    """Return the starting value that each slot has in each recording."""
     leaves, out = dict(jax.tree.leaves_with_path(scene_template(model, model.records))), []
     for slot in model.slots:
         leaf = jnp.asarray(leaves[slot.path])
@@ -540,7 +540,9 @@ def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
 
 
 def filter_steps_of(model: Model) -> int:
-    """Return the number of steps of a filter in the widest gap between two times."""
+    """Return the number of steps that a filter needs in the widest gap between two times of a
+    model.
+    """
     widest = np.max(np.diff(np.asarray(model.records.t), axis=1), initial=0.0)
     turn = 1.5 * float(widest) * float(np.max(np.asarray(model.reference.rate)))
     # A NaN in a recording gives no number of steps: take one step, and let later checks refuse the
@@ -599,7 +601,9 @@ def with_parts(model: Model, **parts: Any) -> Model:
 
 
 def _require_states(windows: Windows, kind: type) -> None:
-    """Raise `TypeError` if the torque needs more than the measured states have."""
+    """Raise `TypeError` if the torque needs a state with more parts than the measured states
+    have.
+    """
     if not isinstance(windows.starts, kind):
         raise TypeError(
             f"windows: wanted measured states of type {kind.__name__}, which the torque needs, got "
@@ -658,7 +662,7 @@ def _samples_read(torque: Torque | None, recording: Recording) -> list[str]:
 
 
 def _require_even_times(torque: Torque | None, recording: Recording, number: int) -> None:
-    """Raise `ValueError` for inputs that are samples at uneven times."""
+    """Raise `ValueError` if the torque reads inputs that are samples at uneven times."""
     names, steps = _samples_read(torque, recording), np.diff(np.asarray(recording.t, float))
     if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
         raise ValueError(

@@ -158,7 +158,7 @@ def by_recording(
 
 @by_recording.def_jvp
 def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
-    """Return value and tangent of `by_recording`."""
+    """Return the value and the tangent of `by_recording`."""
     (rows, model, function), (step, *rest) = primals, tangents
     if jax.tree.leaves(rest):
         raise TypeError(
@@ -337,8 +337,7 @@ def residuals_and_jacobians(
 
 
 def prior_weights(model: "Model") -> Float[Array, " n"]:
-    """Return one over the standard deviation of the prior of each free number, a prior about
-    zero.
+    """Return one over the standard deviation of the prior of each free number, a prior about zero.
 
     It is zero for a number without a prior.
     """

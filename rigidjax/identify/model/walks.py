@@ -59,7 +59,7 @@ class Drift(eqx.Module):
 
 
 def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]:
-    """Return the drift of each `Walk` in a scene."""
+    """Return the `Drift` of each `Walk` in a scene."""
     wanted = "a sequence of Walk(where, deviation)"
     _checks.require_instance(walks, (Walk, Sequence), "walks", requirement=wanted)
     drifts: list[Drift] = []
