@@ -98,8 +98,8 @@ def duplicate(f: Elliptic, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
 
 
 def taylor_series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
-    """Compute S, C, D and ξ at a time h by Taylor series, exact to round-off for `√max(p, q) |h| ≤
-    0.15`.
+    """Compute S, C, D and ξ at a time h by Taylor series, exact to round-off for
+    `√max(p, q) |h| ≤ 0.15`.
 
     In float32 the bound is 0.31. For `mu` and `turn` see `elliptic`.
     """
@@ -167,10 +167,10 @@ def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
     """Return the least T > 0 with S(T) = 0, and the phase at T and the mean of S² from 0 to T.
 
     With λ² = max(p, q), a₀ = 1 and b₀ = √|p − q|/λ, the time is `T = π/(λ agm(a₀, b₀))` (DLMF
-    19.8.5). With `c₁ = (a₀ − b₀)/2` and `c_{n+1} = c_n²/(4 a_{n+1})`, the mean is `⟨S²⟩ = (½ + Σ
-    2^{n−1} c_n²/w)/λ²`, where w = min(p, q)/λ² (DLMF 19.8.6 divided by w, so that w = 0 is an
-    ordinary value). The phase is the complete integral of the third kind, DLMF 19.8.7–19.8.9, with
-    μ instead of −α².
+    19.8.5). With `c₁ = (a₀ − b₀)/2` and `c_{n+1} = c_n²/(4 a_{n+1})`, the mean is
+    `⟨S²⟩ = (½ + Σ 2^{n−1} c_n²/w)/λ²`, where w = min(p, q)/λ² (DLMF 19.8.6 divided by w, so that w
+    = 0 is an ordinary value). The phase is the complete integral of the third kind, DLMF
+    19.8.7–19.8.9, with μ instead of −α².
     """
     big, small = jnp.maximum(m.p, m.q), jnp.minimum(m.p, m.q)
     at_rest = big <= 0

@@ -171,8 +171,9 @@ class Divisor(NamedTuple):
     """Hold the parts of W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²) that do not depend on Π.
 
     The index i is 1 if `first` is true, else 3; for these two, W is a sum of positive terms. The
-    number `square` is (T²)ᵢᵢ. The factor of σ² is `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13 Π₁ Π₃ +
-    |KΠ|² − less`, where K in KΠ is taken without its diagonal.
+    number `square` is (T²)ᵢᵢ. The factor of σ² is
+    `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13 Π₁ Π₃ + |KΠ|² − less`, where K in KΠ is taken without its
+    diagonal.
     """
 
     first: Array

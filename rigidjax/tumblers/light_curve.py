@@ -152,8 +152,8 @@ def fit_light_curve(
       `level` of the sensor unless it is known.
     - `shortest`: the shortest period of a line in the spectrum, s; `None` for four times the median
       distance of the samples.
-    - `count`: the largest number of pairs of frequencies. If more pairs fit, the search has `not
-      ended`.
+    - `count`: the largest number of pairs of frequencies. If more pairs fit, the search has
+      `not ended`.
     - `tolerance`: as for `rigidjax.identify.fit`.
     - `progress`: a function such as `print`, called with lines of text.
 

@@ -184,10 +184,10 @@ def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
     `shape`.
 
     It is an integral over normals n, with dA = det E/(n·En)² dn. Over the whole lit part, with μ <
-    0 on its hidden part, the integral is `sun·T observer`, where `T = π det E ∫ (E + τ²)⁻¹ det(E +
-    τ²)^(−½) dτ` from 0 to ∞ (both are one Gaussian integral). Therefore `B(sun, observer) = sun·T
-    observer + B(sun, −observer)`, where B is the integral over the lit and visible part, and only
-    the integral over the smaller of the two lunes is computed.
+    0 on its hidden part, the integral is `sun·T observer`, where
+    `T = π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 to ∞ (both are one Gaussian integral).
+    Therefore `B(sun, observer) = sun·T observer + B(sun, −observer)`, where B is the integral over
+    the lit and visible part, and only the integral over the smaller of the two lunes is computed.
     """
     minors = cofactors(shape)
     total, of_sun = shape[0, 0] + shape[1, 1] + shape[2, 2], apply(minors, sun)

@@ -1,11 +1,11 @@
 """Find possible motions that have two given frequencies of a light curve, on a grid of bodies.
 
 The squared brightness F² of an ellipsoid is nearly a quadratic form of the direction n half way
-between sun and observer: `F² ∝ Σ_k M_k (n·r_k)²`, with r_k the body's axes in the world and `M =
-(bc)², (ca)², (ab)²` for the semi-axes a, b, c (exactly at zero phase, for projected areas). For a
-given body, energy and phase F² is therefore linear in the six numbers of n nᵀ in a frame along the
-angular momentum. Least squares finds the direction of the momentum, the initial angle and the level
-at once; the grid covers the shape of the body and the phase of its rotation.
+between sun and observer: `F² ∝ Σ_k M_k (n·r_k)²`, with r_k the body's axes in the world and
+`M = (bc)², (ca)², (ab)²` for the semi-axes a, b, c (exactly at zero phase, for projected areas).
+For a given body, energy and phase F² is therefore linear in the six numbers of n nᵀ in a frame
+along the angular momentum. Least squares finds the direction of the momentum, the initial angle and
+the level at once; the grid covers the shape of the body and the phase of its rotation.
 """
 
 import math

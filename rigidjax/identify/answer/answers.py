@@ -14,8 +14,8 @@ FAR = 3.0
 
 
 class Answer(eqx.Module):
-    """Hold an answer in one `word` with its `reasons` in words; it is printed as `word (reason;
-    reason)`.
+    """Hold an answer in one `word` with its `reasons` in words; it is printed as
+    `word (reason; reason)`.
 
     >>> print(Answer("not ended", ("max_steps reached",)))
     not ended (max_steps reached)

@@ -83,10 +83,10 @@ def update(
     """Return the mean and the root of errors e after k numbers `error = h · e + noise`, taken one
     after the other.
 
-    Potter's formula holds for a row h of `matrix` and the `variance` r of its noise: `s = |Sᵀh|² +
-    r`, `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh` (Battin, Astronautical Guidance (1964), §9.6;
-    Bierman, Factorization Methods (1977), §II.4). `step` is the mean of e and `root` the S before
-    the update. Numbers for which `mask` is false do not count.
+    Potter's formula holds for a row h of `matrix` and the `variance` r of its noise:
+    `s = |Sᵀh|² + r`, `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh` (Battin, Astronautical Guidance
+    (1964), §9.6; Bierman, Factorization Methods (1977), §II.4). `step` is the mean of e and `root`
+    the S before the update. Numbers for which `mask` is false do not count.
     """
 
     def absorb(state: tuple[Array, Array], number: tuple) -> tuple[Any, Any]:

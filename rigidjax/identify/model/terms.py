@@ -238,8 +238,8 @@ def whiten(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, ".
 def decorrelate(
     e: Float[Array, "*rows k"], v: Float[Array, "*rows k"]
 ) -> tuple[Float[Array, "*rows k"], Float[Array, "*rows k"]]:
-    """Return errors that are independent and of variance one, from errors e (…, k) of covariance `1
-    + v vᵀ`.
+    """Return errors that are independent and of variance one, from errors e (…, k) of covariance
+    `1 + v vᵀ`.
 
     They are `L⁻¹ e`, with L the Cholesky factor of the covariance. The second result is the
     logarithms of the squared diagonal of L, which are those of the variance of each error given the
@@ -278,8 +278,8 @@ def standardised_errors(
     effect of jitter.
 
     The effect of jitter is the logarithm of the factor by which it multiplies each variance, or
-    `None` without jitter. A saturated channel says "at least that much", and counts as `√(−2 log
-    Φ(z))`, where z is the excess of the prediction over the limit (Tobin 1958,
+    `None` without jitter. A saturated channel says "at least that much", and counts as
+    `√(−2 log Φ(z))`, where z is the excess of the prediction over the limit (Tobin 1958,
     doi:10.2307/1907382).
 
     **Arguments:**
