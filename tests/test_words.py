@@ -18,6 +18,10 @@ ROOMS = (
     "datasets",
     "workprecision",
     "batch",
+    "exact",
+    "elliptic",
+    "tumblers",
+    "cli",
 )
 FILES = [
     *PACKAGE.glob("*.py"),
@@ -29,6 +33,7 @@ VERBS = frozenset(
     Handle Hold Import Integrate Interpolate Make Map Measure Name Normalise Prepare Present Print Provide Raise Read Refuse Return
     Reverse Run Scale Set Share Show Simulate Solve Sort Store Sum Take Turn Wrap Write Yield
     Estimate Fit Minimise
+    Estimate Fit Identify Join Predict Warn
     """.split()
 )
 

@@ -1,1 +1,3 @@
-"""The command line: `command` runs it, `spec` makes a model of its options, `logs` reads logs."""
+"""Run the command line: `command` runs it, `spec` makes a model of its options, `logs` reads
+logs.
+"""

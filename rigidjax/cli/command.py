@@ -1,4 +1,4 @@
-"""The command `python -m rigidjax`, which identifies a body from logs, or compares methods."""
+"""Run the command `python -m rigidjax`, which identifies a body from logs, or compares methods."""
 
 import _thread
 import argparse
@@ -24,9 +24,10 @@ from rigidjax.cli.logs.layouts import imu_columns_of
 from rigidjax.cli.logs.units import TIME_UNITS, unit_in
 from rigidjax.workprecision import command as workprecision
 
-# The options that the demo takes as well; the others describe how to read logs.
+# The demo takes these options as well; the others describe how to read logs.
 _OF_DEMO = ("starts", "checkpoint", "figure", "report", "json", "no_cache")
-# The options that name a file to write: no two may be the same file, nor one of the logs.
+# Each of these options names a file to write: no two may be the same file, nor may one be a log
+# that is read.
 _OUTPUTS = ("checkpoint", "figure", "report", "json", "csv", "keep")
 
 
@@ -34,11 +35,11 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
     The code is 0 for success, 1 for a fit that cannot be trusted, 2 for bad input or a file that
-    could not be written, 130 for an interrupt.
+    could not be written, and 130 for an interrupt.
 
-    **Arguments:** `arguments` those of the command line; `None` for the ones of this process. Only
-    with `None` does the process belong to this command: its compiled programs are then kept for the
-    next run, unless `--no-cache` is given.
+    **Arguments:** `arguments` of the command line; `None` takes those of this process. Only with
+    `None` does the process belong to this command: its compiled programs are then kept for the next
+    run, unless `--no-cache` is given.
     """
     parser = _parser()
     options = parser.parse_args(arguments)
@@ -63,9 +64,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _raise_interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
-    """Raise a Ctrl-C again that Python dropped, as in JAX's callback of the garbage collector.
+    """Raise a Ctrl-C again that Python dropped, as it does in JAX's callback of the garbage
+    collector.
 
-    `dropped` holds the exception, as `sys.unraisablehook` gets it.
+    `dropped` holds the exception as `sys.unraisablehook` gets it.
     """
     if dropped.exc_type is KeyboardInterrupt:
         # Raise it from another thread, a moment later: within this hook it would be dropped again.
@@ -75,9 +77,9 @@ def _raise_interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
 
 
 def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, owns_process: bool) -> int:
-    """Run the command of the options and return its exit code.
+    """Run the command that the options name, and return its exit code.
 
-    `owns_process` says whether the process is its own.
+    `owns_process` says whether the process belongs to this command.
     """
     if options.command == "workprecision":
         return workprecision.run_subcommand(options)
@@ -96,10 +98,13 @@ def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, owns_proc
 
 
 def _check_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """End the program with a message if a file could not be written after the fit."""
+    """Check the files that the options name, and end the program with a message if one could not be
+    written after the fit.
+    """
     figure = options.figure
     if figure is not None and figure.name and not figure.suffix.strip("."):
-        # Matplotlib adds this ending: add it here, so that the message names the right file.
+        # Matplotlib adds this ending to a name without one: add it here, so that the message names
+        # the right file.
         options.figure = figure.with_name(figure.name.rstrip(".") + ".png")
     if figure is not None and not _matplotlib():
         parser.error("--figure: needs matplotlib: pip install 'rigidjax[view]'")
@@ -123,12 +128,14 @@ def _check_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -
 
 
 def _keep_compiled_programs() -> None:
-    """Keep compiled programs in the user's cache folder, so that the next start takes seconds.
+    """Set JAX to store compiled programs in the user's cache folder, so that the next start takes
+    seconds.
 
     Programs of `workprecision` are not kept: it measures how long they take to compile.
     """
     if jax.__version_info__ < (0, 12):
-        # XLA reports two of its own flags as errors for each program that it loads, 2.6 kB a line.
+        # Hide the messages of XLA, which reports two of its own flags as errors for each program
+        # that it loads, in a line of 2.6 kB.
         jax.config.update("jax_logging_level", "CRITICAL")
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
@@ -137,7 +144,7 @@ def _keep_compiled_programs() -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         held = folder.stat()
         # Programs in the folder are run: make sure that nobody else can have put them there. On
-        # Windows a user's folder is the user's own already.
+        # Windows the folder of a user belongs to the user already.
         if hasattr(os, "getuid"):
             if held.st_uid != os.getuid() or held.st_mode & 0o022:
                 words = "is not yours alone: it is not used, and starts are slower; delete it"
@@ -152,7 +159,7 @@ def _keep_compiled_programs() -> None:
 
 
 def _cache_folder() -> Path:
-    """Return the cache folder of a user on this platform: XDG, macOS or Windows."""
+    """Return the cache folder of the user on this platform: XDG, macOS or Windows."""
     xdg_folder = os.environ.get("XDG_CACHE_HOME")
     if xdg_folder:
         return Path(xdg_folder) / "rigidjax"
@@ -163,15 +170,17 @@ def _cache_folder() -> Path:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose messages hold no control characters out of names."""
+    """Read the command line, with error messages that contain no control characters from names."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the message, made printable, and end the program with exit code 2."""
+        """Print the message with its control characters escaped, and end the program with exit code
+        2.
+        """
         super().error(_checks.escape_controls(message))
 
 
 _FLAG: dict[str, Any] = {"action": "store_true"}
-# The options of `identify`, as `argparse` takes them.
+# These are the options of `identify`, as `argparse` takes them.
 OPTIONS: dict[str, dict[str, Any]] = {
     "logs": dict(metavar="FILE", nargs="*", help="logs of one body"),
     "--demo": _FLAG | dict(help="the tumbling of 4179 Toutatis"),
@@ -258,7 +267,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run_demo(options: argparse.Namespace) -> int:
-    """Run the demo, the fit of asteroid Toutatis; return the exit code."""
+    """Run the demo, the fit of asteroid Toutatis, and return the exit code."""
     from rigidjax.datasets import toutatis
 
     print("4179 Toutatis, 17 radar observations, 2 to 18 December 1992")
@@ -278,7 +287,9 @@ def _run_demo(options: argparse.Namespace) -> int:
 
 
 def _channels_of_options(options: argparse.Namespace, rates: Sequence[str]) -> list[spec.Channel]:
-    """Return the sensors that the options describe; `rates` are the names of the rate columns."""
+    """Return the sensors that the options describe, where `rates` are the names of the rate
+    columns.
+    """
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
         if alone:
@@ -296,7 +307,9 @@ def _channels_of_options(options: argparse.Namespace, rates: Sequence[str]) -> l
 def _read_logs(
     options: argparse.Namespace,
 ) -> tuple[list[spec.Channel], list[rj.identify.Recording], rj.identify.Model]:
-    """Return the sensors, the recordings, and the model that the options describe."""
+    """Return the sensors of the first log, the recordings of all logs, and the model that the
+    options describe.
+    """
     if options.columns and options.time:
         raise LogError("--time: not together with --columns, whose first name is the time column")
     wheels = [spec.parse_wheel(text) for text in options.wheel]
@@ -324,7 +337,7 @@ def _read_logs(
 
 
 def _say_units(path: str, time: str, time_unit: str, channels: Sequence[spec.Channel]) -> None:
-    """Print the units that were read from the names of columns."""
+    """Print the units that were taken from the names of the columns of a log."""
     units = [("time", (time,), time_unit)] + [(one.kind, one.columns, one.unit) for one in channels]
     words = [f"{what} in {unit}" for what, names, unit in units if unit_in(names[0], [unit or ""])]
     if words:
@@ -333,7 +346,7 @@ def _say_units(path: str, time: str, time_unit: str, channels: Sequence[spec.Cha
 
 @contextlib.contextmanager
 def _log_warnings(strict: bool) -> Iterator[None]:
-    """Print each warning of a log in one line or, if `strict`, raise the first one."""
+    """Print each warning of a log in one line or, if `strict`, raise the first warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error" if strict else "always", LogWarning)
         usual = warnings.showwarning
@@ -351,7 +364,7 @@ def _log_warnings(strict: bool) -> Iterator[None]:
 
 
 def _run_logs(options: argparse.Namespace) -> int:
-    """Fit the logs that the options name, and print the report; return the exit code."""
+    """Run the fit of the logs that the options name, print the report, and return the exit code."""
     try:
         with _log_warnings(options.strict):
             channels, records, model = _read_logs(options)
@@ -386,9 +399,10 @@ def _run_logs(options: argparse.Namespace) -> int:
 def _fit(
     model: rj.identify.Model, options: argparse.Namespace, starts: int
 ) -> rj.identify.Fit | None:
-    """Return the fit from `starts` starts unless the options say another number.
+    """Return the fit of the model from `starts` starts, or from the number of starts in the
+    options.
 
-    Return `None` after an error, which is printed.
+    After an error the message is printed, and the result is `None`.
     """
     try:
         return rj.identify.fit(
@@ -447,7 +461,7 @@ def _write(
                 make()
                 _print_line(f"{what}: {path}")
         except Exception as error:
-            # A fit of an hour must not be lost to one output.
+            # A fit of an hour must not be lost because one output fails.
             _print_error(f"no {what}: {path}: {type(error).__name__}: {error}")
             all_written = False
     if "interrupted" in fit.status:
@@ -457,7 +471,7 @@ def _write(
 
 
 def _figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str]) -> list[Any]:
-    """Return the figures of a report, without those that cannot be drawn."""
+    """Return the figures of a report, without those whose drawing fails."""
     figures, plot = [], functools.partial(rj.plot.fit, fit, **units)
     logs = [functools.partial(plot, index=i, title=name) for i, name in enumerate(names[:12])]
     time_unit = units.get("time_unit", "s")
@@ -472,7 +486,7 @@ def _figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str]) -> l
 
 
 def _matplotlib() -> bool:
-    """Return whether figures can be drawn, and choose a backend without windows."""
+    """Return whether matplotlib can draw figures, and choose its backend without windows."""
     try:
         import matplotlib
     except ModuleNotFoundError:
@@ -483,12 +497,12 @@ def _matplotlib() -> bool:
 
 
 def _print_line(line: str) -> None:
-    """Print a line, made printable."""
+    """Print a line, with its control characters escaped."""
     try:
         print(_checks.escape_controls(line), flush=True)
     except OSError:
-        # The reader has stopped, as `head` does, or a disk is full. Go on without output: the files
-        # are still to be written.
+        # The reader of the output has stopped, as `head` does, or a disk is full. Go on without
+        # output: the files are still to be written.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -1,4 +1,4 @@
-"""The recordings and the model that the words of the command line describe."""
+"""Make the recordings and the model that the words of the command line describe."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ from rigidjax.motion.torques import Damping, Flywheel, Input, Series, Sum, Wheel
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation import euler
 
-# The charts of the body by their words; each is made from the typical size of a moment, kg m².
+# Each word names a chart of the body, which is made from the typical size of a moment, kg m².
 MODELS: dict[str, Callable[[float], charts.AbstractBodyChart]] = {
     "ratios": lambda _: charts.Ratios(),
     "principal-ratios": lambda _: charts.PrincipalRatios(),
@@ -35,7 +35,8 @@ MODELS: dict[str, Callable[[float], charts.AbstractBodyChart]] = {
     "principal": charts.Principal,
 }
 LOSSES = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}
-# The units of each kind of sensor, the usual one first; "euler" stands for all its sequences.
+# These are the units of each kind of sensor, the usual one first; "euler" stands for all sequences
+# of angles.
 SENSOR_UNITS = {
     "gyro": ("rad/s", "deg/s", "rpm"),
     "accelerometer": ("m/s2", "g"),
@@ -47,11 +48,11 @@ _WHEEL_UNITS = ("rad/s", "rpm")
 
 
 class Channel(eqx.Module):
-    """One sensor of a log.
+    """Hold one sensor of a log.
 
-    **Fields:** `kind` of the sensor; `columns` their names; `unit` of the readings, `None` if the
-    names of the columns decide, or else the usual unit; `noise` of each axis and full scale
-    `limit`, in this unit, or `None`.
+    **Fields:** `kind` of the sensor; `columns` the names of its columns; `unit` of the readings,
+    where `None` takes the unit in the names of the columns, or else the usual unit; `noise` of each
+    axis and full scale `limit`, both in this unit, or `None`.
     """
 
     kind: str
@@ -62,7 +63,7 @@ class Channel(eqx.Module):
 
 
 class WheelColumn(eqx.Module):
-    """A wheel whose speed was logged.
+    """Hold the description of a wheel whose speed was logged.
 
     **Fields:** `column` of the speed; `unit` as in `Channel`; `inertia`, kg m²; `axis` (3,).
     """
@@ -74,7 +75,7 @@ class WheelColumn(eqx.Module):
 
 
 def parse_channel(text: str) -> Channel:
-    """Return the sensor that is written `KIND=COLUMNS[:UNIT[:NOISE]]`.
+    """Return the sensor that is written as `KIND=COLUMNS[:UNIT[:NOISE]]`.
 
     An example is `gyro=wx,wy,wz:deg/s:0.1`. KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y,
     z) or `euler-ZXZ` (any sequence; body → world); NOISE is one number or three, one for each axis,
@@ -105,15 +106,15 @@ def parse_channel(text: str) -> Channel:
 
 
 def _units_of_kind(kind: str) -> tuple[str, ...]:
-    """Return the units of a kind of sensor; none for a word that is no kind."""
+    """Return the units of a kind of sensor, or an empty tuple for a word that is no kind."""
     key = "euler" if kind.startswith("euler-") else kind
     return () if kind == "euler" else SENSOR_UNITS.get(key, ())
 
 
 def broadcast_noise(noise: Sequence[float], place: str) -> tuple[float, ...]:
-    """Return the noise of three axes, from one positive number or three.
+    """Return the noise of three axes, made from one positive number or from three.
 
-    Raise `LogError` for others; the message begins with `place`.
+    It raises `LogError` for other numbers; the message begins with `place`.
     """
     if len(noise) not in (1, 3):
         raise LogError(f"{place}: wanted one noise or three, got {len(noise)}")
@@ -123,7 +124,7 @@ def broadcast_noise(noise: Sequence[float], place: str) -> tuple[float, ...]:
 
 
 def parse_wheel(text: str) -> WheelColumn:
-    """Return the wheel that is written `COLUMN:INERTIA[:AXIS[:UNIT]]`.
+    """Return the wheel that is written as `COLUMN:INERTIA[:AXIS[:UNIT]]`.
 
     An example is `flywheel:5.2e-7:z:rad/s`. INERTIA is in kg m² about its axis, AXIS `x`, `y` or
     `z` of the body. **Raises** `LogError`.
@@ -152,7 +153,7 @@ def read_log(
     free: Sequence[str] = (),
     flight: int | None = None,
 ) -> Recording:
-    """Return the recording in a file, with the described sensors.
+    """Return the recording in a file, with the sensors that `channels` describe.
 
     Its times are counted from the first time stamp of the log. An empty cell is a gap.
 
@@ -173,14 +174,15 @@ def read_log(
     that are all zero.
     """
     unit = unit_of_time(path, time, time_unit)
-    # Two wheels may have their speed in the same column.
+    # Read each column once: two wheels may have their speeds in the same column.
     turning = dict.fromkeys(w.column for w in wheels)
     names = [time, *(c for one in channels for c in one.columns), *turning]
     table = read_table(path, names, flight=flight)
-    # Count from the first stamp: seconds since 1970, or nanoseconds, leave few digits for a step.
+    # Count from the first stamp: as seconds since 1970, or nanoseconds, times have few digits left
+    # for a step.
     t = (table[time] - _first_time(table[time])) * UNITS[unit]
     kept = rows_to_use(path, t, time, window)
-    # A slice makes no copy of a large log.
+    # If all rows are kept use a slice, which makes no copy of a large log.
     kept = slice(None) if kept.size == t.size else kept
     readings, rate = [], 0.0
     for one in channels:
@@ -203,26 +205,32 @@ def read_log(
 
 
 def _first_time(t: np.ndarray) -> float:
-    """Return the first time that is not missing, or zero."""
+    """Return the first time that is not missing, or zero if all are missing."""
     finite = np.isfinite(t)
     return float(t[np.argmax(finite)]) if finite.any() else 0.0
 
 
 def unit_of_channel(path: str | Path, channel: Channel) -> str:
-    """Return the unit of a channel: its own, that in the names of its columns, or the usual one."""
+    """Return the unit of a channel: its own unit, else the one in the names of its columns, else
+    the usual one.
+    """
     allowed = _units_of_kind(channel.kind)
     usual = usual_unit(path, channel.columns[0]) or allowed[0]
     return unit_of(channel.columns, channel.unit, usual, allowed, str(path))
 
 
 def unit_of_time(path: str | Path, column: str, stated_unit: str | None) -> str:
-    """Return the unit of times: the `stated_unit`, that in the column's name, or the usual one."""
+    """Return the unit of times: the `stated_unit`, else the one in the name of the `column`, else
+    the usual one.
+    """
     usual = usual_unit(path, column) or "s"
     return unit_of([column], stated_unit, usual, TIME_UNITS, str(path))
 
 
 def _typical_rate(path: str | Path, channel: Channel, rates: np.ndarray) -> float:
-    """Return the median length of rates (n, 3), rad/s; raise `LogError` if all are zero."""
+    """Return the median length of the rates (n, 3), rad/s, and raise `LogError` if all rates are
+    zero.
+    """
     names = ", ".join(channel.columns)
     if not rates.size:
         raise LogError(f"{path}: no row has a rate in each of the columns {names}")
@@ -238,10 +246,10 @@ def _typical_rate(path: str | Path, channel: Channel, rates: np.ndarray) -> floa
 def _sensor_and_readings(
     channel: Channel, values: np.ndarray, factor: float, bias: bool
 ) -> tuple[AbstractSensor, np.ndarray]:
-    """Return the sensor of a channel, and its readings.
+    """Return the sensor that a channel describes, and its readings.
 
-    **Arguments:** `values` in SI; `factor` from the unit of the channel to SI; `bias` whether the
-    sensor gets one.
+    **Arguments:** `channel`; `values` of its columns, in SI; `factor` from the unit of the channel
+    to SI; `bias` whether the sensor gets a bias.
     """
     zero = [0.0, 0.0, 0.0] if bias else None
     noise = None if channel.noise is None else factor * np.array(channel.noise)
@@ -267,7 +275,7 @@ def input_names(wheels: Sequence[WheelColumn]) -> list[str]:
 
 
 def _evenly_spaced(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return an even series of samples (n,), in which missing rows are interpolated.
+    """Return an evenly spaced series of samples (n,), in which missing rows are interpolated.
 
     Times that are not even to a thousandth of a step are returned unchanged.
     """
@@ -287,9 +295,9 @@ def _evenly_spaced(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
 def _logged_speeds(
     path: str | Path, t: np.ndarray, table: dict[str, np.ndarray], wheels: Sequence[WheelColumn]
 ) -> dict[str, Series]:
-    """Return the logged speed of each wheel by the name of its input, rad/s."""
+    """Return the logged speed of each wheel, rad/s, by the name of its input."""
     speeds = {}
-    # Keep speeds outside of the window, too: a delayed speed is from before a reading.
+    # Keep speeds outside of the window as well: a delayed speed is from before a reading.
     kept = mask_of_increasing(t) if wheels else slice(None)
     for name, one in zip(input_names(wheels), wheels, strict=True):
         unit = unit_of([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
@@ -302,9 +310,9 @@ def _logged_speeds(
 
 
 def _torque_of_wheels(wheels: Sequence[WheelColumn], free: Sequence[str]) -> Torque | None:
-    """Return the torque of the wheels and, if `free` holds "drag", of a linear drag.
+    """Return the torque of the wheels and, if `free` contains "drag", of a linear drag.
 
-    Return `None` without either.
+    Without wheels and drag it returns `None`.
     """
     delay = 0.0 if "delay" in free else None
     parts: list[Torque] = [
@@ -325,7 +333,7 @@ def model_of(
     free: Sequence[str] = (),
     loss: str = "soft-l1",
 ) -> Model:
-    """Return the model of recordings from `read_log`.
+    """Return the model of recordings that were read by `read_log`.
 
     All recordings share one drag; each has its own bias and delay.
 
@@ -356,7 +364,7 @@ def model_of(
 def _declared_free_numbers(
     sensors: Sequence[AbstractSensor], wheels: Sequence[str], typical: float, free: Sequence[str]
 ) -> list[Free]:
-    """Return the `Free`s of the sensors and of the torque of `_torque_of_wheels`.
+    """Return the `Free`s of the sensors and of the torque that `_torque_of_wheels` returns.
 
     `wheels` are the names of the inputs of the wheels.
     """

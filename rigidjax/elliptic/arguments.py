@@ -1,4 +1,4 @@
-"""Checks and conversions of the arguments of elliptic functions."""
+"""Check and convert the arguments of elliptic functions."""
 
 from typing import Any
 
@@ -10,13 +10,15 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from rigidjax import _checks
 from rigidjax.rotation.barrier import batch_as
 
-# Arguments and results of all functions: real numbers of shapes that broadcast.
+# The arguments and results of all functions are real numbers, of shapes that broadcast.
 Real = Float[ArrayLike, "..."]
 Result = Float[Array, "..."]
 
 
 def to_common_dtype(**named: Real) -> tuple[Result, ...]:
-    """Convert the arguments to arrays of one dtype and shape; Python numbers take the dtype."""
+    """Convert the arguments to arrays of one dtype and shape; Python numbers take the dtype of the
+    arrays.
+    """
     arrays = {
         name: _checks.array_of_shape(value, (), name, batched=True) for name, value in named.items()
     }
@@ -30,7 +32,11 @@ def to_common_dtype(**named: Real) -> tuple[Result, ...]:
 
 
 def complement_pair(name: str, value: Real, complement: Real | None) -> dict[str, Any]:
-    """Return `value` and 1 − `value` by name; a `complement` that is given must fit `value`."""
+    """Return `value` and 1 − `value` as a dictionary with the keys `name` and `name` + "1".
+
+    If a `complement` is given it is the second number, and an error is raised unless it is 1 −
+    `value`.
+    """
     value = _checks.array_of_shape(value, (), name, batched=True)
     if complement is None:
         return {name: value, name + "1": 1 - value}
@@ -49,7 +55,9 @@ def complement_pair(name: str, value: Real, complement: Real | None) -> dict[str
 
 @jax.custom_jvp
 def exact_complement(value: Result, complement: Result) -> Any:
-    """Return `value` with the derivative −1 by its `complement` (1 − `value`) and 0 by itself."""
+    """Return `value`, with the derivative −1 by its `complement` (1 − `value`) and the derivative 0
+    by itself.
+    """
     return batch_as(value, complement)
 
 

@@ -1,10 +1,10 @@
-"""Carlson's symmetric elliptic integrals R_F, R_D, R_J, R_C.
+"""Compute Carlson's symmetric elliptic integrals R_F, R_D, R_J and R_C.
 
-R_F and R_D by duplication (Carlson 1995, doi 10.1007/BF02198293; DLMF 19.36(i)). Each step replaces
-every argument a by (a + λ)/4: this first halves the logarithm of the arguments' ratio, then divides
-their distance by four. In the end a Taylor series about their mean is exact to round-off. R_J is
-computed from its definition as an integral. Derivatives are integrals of the same kind (DLMF
-19.18).
+R_F and R_D are computed by duplication (Carlson 1995, doi 10.1007/BF02198293; DLMF 19.36(i)). Each
+step replaces every argument a by (a + λ)/4: this first halves the logarithm of the arguments'
+ratio, then divides their distance by four. In the end a Taylor series about their mean is exact to
+round-off. R_J is computed from its definition as an integral. The derivatives are integrals of the
+same kind (DLMF 19.18).
 """
 
 from functools import partial
@@ -19,17 +19,18 @@ from jaxtyping import Array, PyTree
 from rigidjax.elliptic.arguments import Real, Result, to_common_dtype
 from rigidjax.elliptic.carlson_r import directional_derivative, nan_below_zero, r_integral, scale_of
 
-# Steps after which the series is exact for ratios over the whole range of the dtype.
+# After this number of steps the series is exact for ratios over the whole range of the dtype.
 _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}
 
 
 def rf(x: Real, y: Real, z: Real) -> Result:
-    """Return R_F(x, y, z) = ½ ∫₀^∞ dt / √((t+x)(t+y)(t+z)), Carlson's integral of the first kind.
+    """Return Carlson's integral of the first kind, R_F(x, y, z) = ½ ∫₀^∞ dt / √((t+x)(t+y)(t+z)).
 
-    **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, in one unit; the result has the power
-    −½ of this unit. Two zeros give infinity, a negative argument gives NaN. **Returns:** R_F (DLMF
-    19.16.1), symmetric in all three arguments. Its derivative ∂R_F/∂z = −R_D(x, y, z)/6 (DLMF
-    19.18.1) is −∞ at z = 0.
+    **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, all in one unit. Two zeros give
+    infinity, a negative argument gives NaN.
+
+    **Returns** R_F (DLMF 19.16.1), symmetric in all three arguments, in the power −½ of their unit.
+    Its derivative ∂R_F/∂z = −R_D(x, y, z)/6 (DLMF 19.18.1) is −∞ at z = 0.
 
     >>> float(rf(4.0, 4.0, 4.0))
     0.5
@@ -38,11 +39,13 @@ def rf(x: Real, y: Real, z: Real) -> Result:
 
 
 def rd(x: Real, y: Real, z: Real) -> Result:
-    """Return R_D(x, y, z) = (3/2) ∫₀^∞ dt / ((t+z) √((t+x)(t+y)(t+z))), of the second kind.
+    """Return Carlson's R_D(x, y, z) = (3/2) ∫₀^∞ dt / ((t+z) √((t+x)(t+y)(t+z))), of the second
+    kind.
 
-    **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, in one unit. The result is
-    infinite for z = 0 or x = y = 0, and NaN for negative arguments. **Returns:** R_D (DLMF
-    19.16.5), symmetric in x and y.
+    **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, all in one unit. The result is
+    infinite for z = 0 or x = y = 0, and NaN for negative arguments.
+
+    **Returns** R_D (DLMF 19.16.5), symmetric in x and y.
 
     >>> float(rd(4.0, 4.0, 4.0))
     0.125
@@ -51,12 +54,15 @@ def rd(x: Real, y: Real, z: Real) -> Result:
 
 
 def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
-    """Return R_J(x, y, z, p) = (3/2) ∫₀^∞ dt / ((t+p) √((t+x)(t+y)(t+z))), of the third kind.
+    """Return Carlson's R_J(x, y, z, p) = (3/2) ∫₀^∞ dt / ((t+p) √((t+x)(t+y)(t+z))), of the third
+    kind.
 
-    The underscore distinguishes the name from `import rigidjax as rj`. **Arguments:** `x`, `y`, `z`
-    ≥ 0, at most one of them 0, and `p` > 0, in one unit. p = 0 gives infinity, p < 0 gives NaN (not
-    the principal value). **Returns:** R_J (DLMF 19.16.2) by the trapezoidal rule in ln t, exact to
-    round-off.
+    The underscore distinguishes the name from `import rigidjax as rj`.
+
+    **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, and `p` > 0, all in one unit. p = 0
+    gives infinity, p < 0 gives NaN (not the principal value).
+
+    **Returns** R_J (DLMF 19.16.2) by the trapezoidal rule in ln t, exact to round-off.
 
     >>> round(float(rj_(4.0, 4.0, 4.0, 4.0)), 14)
     0.125
@@ -65,7 +71,8 @@ def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
 
 
 def rc(x: Real, y: Real) -> Result:
-    """Return R_C(x, y) = ½ ∫₀^∞ dt / ((t+y) √(t+x)) = R_F(x, y, y): arctangents and logarithms.
+    """Return Carlson's R_C(x, y) = R_F(x, y, y) = ½ ∫₀^∞ dt / ((t+y) √(t+x)), made of arctangents
+    and logarithms.
 
     **Arguments:** `x` ≥ 0 and `y` ≠ 0 in one unit. y = 0 gives infinity, x < 0 gives NaN.
     **Returns:** R_C (DLMF 19.2.17); for y < 0 the Cauchy principal value (DLMF 19.2.20).
@@ -76,7 +83,7 @@ def rc(x: Real, y: Real) -> Result:
     x, y = to_common_dtype(x=x, y=y)
     below = y < 0
     length = jnp.where(below, x - y, 1)
-    # √0 has no derivative: keep it out of the branch that is not taken.
+    # The root √0 has no derivative: keep it out of the branch that is not taken.
     factor = jnp.sqrt(jnp.where(below, x / length, 1))
     positive = jnp.where(below, -y, y)
     return factor * _rf((jnp.where(below, x - y, x), positive, positive))
@@ -93,7 +100,7 @@ def _rf(arguments: tuple[Array, ...]) -> Any:
     X, Y = 1 - x / mean, 1 - y / mean
     Z = -X - Y
     e2, e3 = X * Y - Z * Z, X * Y * Z
-    # DLMF 19.36.1.
+    # The series is DLMF 19.36.1.
     series = 1 - e2 / 10 + e3 / 14 + e2**2 / 24 - 3 * e2 * e3 / 44
     series = series - 5 * e2**3 / 208 + 3 * e3**2 / 104 + e2**2 * e3 / 16
     return _value_in_domain(series / jnp.sqrt(mean * scale), arguments)
@@ -122,7 +129,7 @@ def _rd(arguments: tuple[Array, ...]) -> Any:
     mean = (x + y + 3 * z) / 5
     X, Y = 1 - x / mean, 1 - y / mean
     Z = -(X + Y) / 3
-    # DLMF 19.36.2.
+    # The series is DLMF 19.36.2.
     e2 = X * Y - 6 * Z**2
     e3 = (3 * X * Y - 8 * Z**2) * Z
     e4 = 3 * (X * Y - Z**2) * Z**2
@@ -142,12 +149,14 @@ def _rd_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[
 
 
 def _lambda(x: Array, y: Array, z: Array) -> Any:
-    """Return λ = √x√y + √x√z + √y√z of the duplication theorem (DLMF 19.26.18)."""
+    """Return λ = √x√y + √x√z + √y√z, the shift of the duplication theorem (DLMF 19.26.18)."""
     a, b, c = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
     return a * b + b * c + c * a
 
 
 def _value_in_domain(value: Array, arguments: tuple[Array, ...]) -> Any:
-    """Return infinity if two arguments are 0, NaN if one is negative or NaN, else `value`."""
+    """Return `value`, but infinity if two of the `arguments` are 0, and NaN if one is negative or
+    NaN.
+    """
     x, y, z = (a == 0 for a in arguments)
     return nan_below_zero(jnp.where((x & y) | (y & z) | (z & x), jnp.inf, value), arguments)

@@ -1,12 +1,14 @@
-"""Carlson's multivariate R without its factor: elliptic integrals and all their derivatives.
+"""Compute Carlson's multivariate R without its factor, which gives elliptic integrals and all their
+derivatives.
 
     H(b; a) = ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt = R_{1−Σb}(b; a) / (Σb − 1)        (DLMF 19.16.9)
 
-R_F, R_D, R_J have this form (DLMF 19.16.1, 19.16.2, 19.16.5), and so have their derivatives: ∂H/∂aᵢ
-= −bᵢ H(b + eᵢ; a). The integrand is positive: nothing cancels at any order. As a function of s = ln
-t it is analytic for |Im s| < π and decays exponentially. The trapezoidal rule therefore converges
-like exp(−2π²/h) (Trefethen & Weideman 2014, doi 10.1137/130932132), and a fixed number of nodes
-reaches round-off, also for arguments of very different sizes.
+R_F, R_D and R_J have this form (DLMF 19.16.1, 19.16.2, 19.16.5), and so have their derivatives:
+∂H/∂aᵢ = −bᵢ H(b + eᵢ; a), where eᵢ is the i-th unit vector. The integrand is positive, so that
+nothing cancels at any order. As a function of s = ln t it is analytic for |Im s| < π and decays
+exponentially. The trapezoidal rule therefore converges like exp(−2π²/h), h the step in s (Trefethen
+& Weideman 2014, doi 10.1137/130932132), and a fixed number of nodes reaches round-off, also for
+arguments of very different sizes.
 """
 
 import functools
@@ -22,20 +24,22 @@ from jaxtyping import Array, PyTree
 
 from rigidjax.elliptic.arguments import Result
 
-# Enough that h < 0.5 (float64) or 0.9 (float32) for arguments in ratios of 1e35.
+# With these numbers of nodes the step is h < 0.5 (float64) or h < 0.9 (float32) for arguments in
+# ratios of 1e35.
 _NODES = {np.dtype("float64"): 512, np.dtype("float32"): 160}
-# What the largest argument is scaled to: float32 has no room below 1e-30 for the tail at t → 0.
+# The largest argument is scaled to this number: float32 has no room below 1e-30 for the tail at t →
+# 0.
 _UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def r_integral(powers: tuple[float, ...], arguments: tuple[Result, ...]) -> Result:
-    """Return ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt, aᵢ the `arguments`, bᵢ the `powers`.
+    """Return ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt, where aᵢ are the `arguments` and bᵢ the `powers`.
 
-    The aᵢ must be ≥ 0, the bᵢ multiples of ½, and their sum above 1.
+    The aᵢ must be ≥ 0, the bᵢ multiples of ½, and the sum of the bᵢ must be above 1.
 
-    It is infinite if the integral diverges at 0, NaN for a negative argument, and accurate to
-    round-off for ratios of the aᵢ up to 1e35 (to 1e-13 at 1e60).
+    The result is infinite if the integral diverges at 0, NaN for a negative argument, and accurate
+    to round-off for ratios of the aᵢ up to 1e35 (to 1e-13 at 1e60).
     """
     scale = scale_of(arguments)
     dtype = np.dtype(arguments[0].dtype)
@@ -55,7 +59,7 @@ def r_integral(powers: tuple[float, ...], arguments: tuple[Result, ...]) -> Resu
     count = (jnp.arange(nodes, dtype=dtype) + 0.5).reshape((nodes,) + (1,) * scale.ndim)
     t = jnp.exp(low[None] + step[None] * count)
 
-    # t first: then the running product stays between the sizes of its neighbours.
+    # Begin the product with t: it then stays between the sizes of its factors.
     product = t
     for a, power in zip(scaled, powers, strict=True):
         product = _divide(product, t + a[None], power)
@@ -79,7 +83,7 @@ def directional_derivative(
     arguments: tuple[Array, ...],
     directions: tuple[Array | SymbolicZero, ...],
 ) -> Any:
-    """Return the derivative of `r_integral` as its `arguments` move along `directions`."""
+    """Return the derivative of `r_integral` if its `arguments` move along `directions`."""
     tangent = jnp.zeros_like(arguments[0])
     for i, direction in enumerate(directions):
         if powers[i] and not isinstance(direction, SymbolicZero):
@@ -89,13 +93,15 @@ def directional_derivative(
 
 
 def nan_below_zero(value: Array, arguments: tuple[Array, ...]) -> Any:
-    """Return NaN if one of `arguments` is negative or NaN, else `value`."""
+    """Return `value`, but NaN if one of the `arguments` is negative or NaN."""
     good = functools.reduce(jnp.logical_and, (a >= 0 for a in arguments))
     return jnp.where(good, value, jnp.nan)
 
 
 def scale_of(arguments: tuple[Array, ...]) -> Any:
-    """Return the largest argument, or 1 if all are 0.
+    """Return the largest of the `arguments`, or 1 if all are 0.
+
+    The integrals are homogeneous: if the arguments are divided by this number, no square overflows.
 
     The integrals are homogeneous: with arguments divided by it no square overflows.
     """
@@ -104,7 +110,10 @@ def scale_of(arguments: tuple[Array, ...]) -> Any:
 
 
 def _divide(value: Array, x: Array, power: float) -> Any:
-    """Divide `value` by x^power, `power` a multiple of ½, one factor after the other."""
+    """Return `value` divided by x^power, where `power` is a multiple of ½.
+
+    It divides by one factor x or √x after the other.
+    """
     whole = math.floor(power)
     if power > whole:
         factor = jax.lax.rsqrt(x)

@@ -1,15 +1,15 @@
-"""Jacobi's elliptic functions sn, cn, dn and the amplitude, for every real parameter.
+"""Compute Jacobi's elliptic functions sn, cn, dn and the amplitude, for every real parameter.
 
-Values: the argument is reduced by the half period 2K. Bulirsch's descending transformation (1965,
-doi 10.1007/BF01397975) then works with 1 − m, and no digit is lost as m → 1.
+For the values, the argument is reduced by the half period 2K. Bulirsch's descending transformation
+(1965, doi 10.1007/BF01397975) then works with 1 − m, and no digit is lost as m → 1.
 
-Derivatives: with φ = am(u|m) and u = F(φ|m), the derivative at fixed u is ∂φ/∂m = dn X with
+For the derivatives, let φ = am(u|m) and u = F(φ|m). The derivative at fixed u is ∂φ/∂m = dn X with
 
     X = −∂F/∂m = −½ ∫₀^u sd²(v) dv.
 
 The integrand is positive: X has all its digits at m = 0 and as m → 1, where the textbook formulas
 (Byrd & Friedman 1971, 710.51–53) divide a small difference by m m1. The second derivative in m also
-comes from X for m ≤ 0.9 or |u| ≤ 1, and else from a sum over images (`jacobi_near_one.py`).
+comes from X for m ≤ 0.9 or |u| ≤ 1, and otherwise from a sum over images (`jacobi_near_one.py`).
 """
 
 import math
@@ -33,18 +33,22 @@ from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, sncndn_near_one
 from rigidjax.elliptic.legendre import complete_integral, integral, mean_iterates
 from rigidjax.rotation.stumpff import half_turns, parity
 
-# Below this cn and dn, integrals over sd² depend on their ratio only (to the floor squared).
+# If cn and dn are below this number, integrals over sd² depend on the ratio of cn and dn only (to
+# the square of the number).
 _FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
 
 
 def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Result]:
-    """Return Jacobi's sn(u|m), cn(u|m), dn(u|m).
+    """Return Jacobi's elliptic functions sn(u|m), cn(u|m) and dn(u|m).
 
-    **Arguments:** `u` real; the error grows as |u| eps. `m` the parameter k² (not the modulus k),
-    any real number. `m1` = 1 − m: give it if m is so near 1 that 1 − m loses digits. Values and
-    derivatives then belong to m1, and m is used only where it is small.
+    **Arguments:**
 
-    **Returns:** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech, sech
+    - `u`: real; the error grows as |u| eps.
+    - `m`: the parameter k² (not the modulus k), any real number.
+    - `m1`: 1 − m. Give it if m is so near 1 that 1 − m loses digits: values and derivatives then
+      belong to m1, and m is used only where it is small.
+
+    **Returns** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech, sech
     (DLMF 22.5.3–4); m < 0 and m > 1 follow from DLMF 22.17. Derivatives of every order by u (DLMF
     22.13(i)), m and m1 are exact.
 
@@ -57,7 +61,7 @@ def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Re
 
 
 def am(u: Real, m: Real, m1: Real | None = None) -> Result:
-    """Return Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad: the inverse of F(φ|m) for m ≤ 1.
+    """Return Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad, which is the inverse of F(φ|m) for m ≤ 1.
 
     **Arguments:** as `sncndn`. **Returns:** φ (DLMF 22.16.1–3). For m ≤ 1 it grows by π in each
     half period 2K, without jumps; for m > 1 it oscillates within |φ| ≤ arcsin(1/√m).
@@ -72,8 +76,8 @@ def am(u: Real, m: Real, m1: Real | None = None) -> Result:
 
 
 def _functions_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any, Any]:
-    """Return sn, cn, dn for any real m, and the number of half turns in the amplitude."""
-    # DLMF 22.17.2–4: m > 1 becomes 1/m, and cn and dn change places.
+    """Return sn, cn and dn for any real m, and the number of half turns in the amplitude."""
+    # By DLMF 22.17.2–4, m > 1 becomes 1/m, and cn and dn change places.
     above = m1 < 0
     divisor = jnp.where(above, m, 1)
     root = jnp.sqrt(divisor)
@@ -88,11 +92,11 @@ def _functions_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Any, Any, 
 
 @jax.custom_jvp
 def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
-    """Return sn, cn, dn for m ≤ 1, as functions of u and m1; m must be 1 − m1."""
+    """Return sn, cn and dn for m ≤ 1 as functions of u and m1, where m must be 1 − m1."""
     turns, angle, rows = _reduce_argument(u, m1)
     sign = parity(turns)
     theta = jnp.abs(angle)
-    # Bulirsch's recursion carries cot²φ: let it not overflow, neither at 0 nor at a half period.
+    # Bulirsch's recursion carries cot²φ, which must not overflow near 0 or near a half period.
     tiny = jnp.abs(u) * jnp.maximum(1, jnp.sqrt(m1)) < float(jnp.finfo(u.dtype).eps) ** (1 / 3)
     safe = jnp.maximum(theta, float(jnp.finfo(u.dtype).tiny) ** 0.4)
     a = jnp.cos(safe) / jnp.sin(safe)
@@ -110,7 +114,7 @@ def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
     c = jnp.where(tiny, 1 - square / 2, c)
     d = jnp.where(tiny, 1 - m * square / 2, d)
 
-    # m = 1. Beyond the clip sech would underflow, and its quotients with it.
+    # This is the case m = 1. Beyond the clip sech would underflow, and its quotients with it.
     largest = 0.97 * math.log(float(jnp.finfo(u.dtype).max))
     e = jnp.exp(-jnp.minimum(jnp.abs(u), largest))
     sech = 2 * e / (1 + e * e)
@@ -125,7 +129,7 @@ def _sncndn_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tu
     s, c, d = _sncndn(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
-        # DLMF 22.13.1–3.
+        # The derivatives by u are DLMF 22.13.1–3.
         ds, dc, dd = c * d * du, -s * d * du, -m * s * c * du
     if not isinstance(dm1, SymbolicZero):
         sm, cm, dm = _derivatives_by_m(u, m, m1)
@@ -135,7 +139,7 @@ def _sncndn_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tu
 
 @jax.custom_jvp
 def _derivatives_by_m(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
-    """Return the derivatives of sn, cn, dn with respect to m at a fixed u."""
+    """Return the derivatives of sn, cn and dn with respect to m at a fixed u."""
     return _derivatives_from_integral(u, m, m1)
 
 
@@ -151,7 +155,8 @@ def _derivatives_by_m_jvp(
         ds, dc = (cm * d + c * dm) * du, -(sm * d + s * dm) * du
         dd = -(s * c + m * (sm * c + s * cm)) * du
     if not isinstance(dm1, SymbolicZero):
-        # For small u the images cancel to leave u³, and the integral has no large terms.
+        # Use the images for large u only: for small u they cancel to leave u³, while the integral
+        # then has no large terms.
         near = (m1 < LARGEST_M1) & (jnp.abs(u) > 1)
         middle, one = jnp.full_like(m1, 0.5), jnp.ones_like(m1)
         far_m, far_m1 = jnp.where(near, middle, m), jnp.where(near, middle, m1)
@@ -169,15 +174,17 @@ def _derivatives_by_m_jvp(
 
 
 def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
-    """Return the derivatives of sn, cn, dn by m: those by the amplitude φ times dn X.
+    """Return the derivatives of sn, cn and dn with respect to m, as their derivatives by the
+    amplitude φ times dn X.
 
-    X is the integral in the head of this file: Carlson's R_D of u reduced by half periods.
+    X is the integral in the docstring of this module; Carlson's R_D gives it for u reduced by half
+    periods.
     """
     s, c, d = _sncndn(u, m, m1)
     turns = _reduce_argument(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = parity(turns)
-    # X ~ 1/dn² must not overflow. If cn and dn are minute it depends, but for that factor, on
-    # their ratio only (to the floor squared): raise both.
+    # X ~ 1/dn² must not overflow. If cn and dn are minute, X depends on their ratio only, except
+    # for a factor (to the square of the floor): multiply both by the same large number.
     up = jnp.maximum(1, _FLOOR[np.dtype(u.dtype)] / jax.lax.stop_gradient(d))
     c, d, raised = c * up, d * up, m1 * up * up
     near = turns == 0
@@ -188,9 +195,10 @@ def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Any, Any,
 
 
 def _reduce_argument(u: Array, m1: Array) -> tuple[Any, Any, list[tuple[Any, Any]]]:
-    """Reduce the argument, u = 2Kn + r.
+    """Return the parts of the reduced argument, u = 2Kn + r.
 
-    Returns n, the angle πr/2K and the arithmetic and geometric means of 1 and √m1.
+    They are n, the angle πr/2K, and the iterates of the arithmetic and geometric means of 1 and
+    √m1.
     """
     rows = mean_iterates(jnp.where(m1 == 0, 1, m1))
     turns, angle = half_turns(u * rows[-1][0])

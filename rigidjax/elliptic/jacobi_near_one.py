@@ -1,4 +1,5 @@
-"""sn, cn, dn near m = 1 as sums over images: one hyperbolic function per half period.
+"""Compute sn, cn and dn near m = 1 as sums over images, with one hyperbolic function for each half
+period.
 
 With p = exp(−πK/K') ≈ m1/16 the complementary nome and B = π/2K' (DLMF §22.12, after Jacobi's
 imaginary transformation, §22.6(iv)),
@@ -6,9 +7,9 @@ imaginary transformation, §22.6(iv)),
     dn u = B Σᵢ sech(B(u − 2iK))            cn u = (B/k) Σᵢ (−1)ⁱ sech(B(u − 2iK))
     sn u = (B/k) Σᵢ (−1)ⁱ tanh(B(u − 2iK)),     i = −∞ … ∞,     e^(−2BK) = p.
 
-B, k and p are analytic in m1 at 0, so every derivative in m, at m = 1 and near it, is the
-derivative of an explicit sum. The sums give the second derivatives, which lose all digits through
-∂F/∂m as m1 → 0.
+B, k and p are analytic in m1 at 0. Every derivative in m, at m = 1 and near it, is therefore the
+derivative of an explicit sum. The sums give the second derivatives; ∂F/∂m would lose all digits of
+them as m1 → 0.
 """
 
 from typing import Any
@@ -21,23 +22,24 @@ from jaxtyping import Array, PyTree
 from rigidjax.elliptic.arguments import Result
 from rigidjax.rotation.stumpff import parity
 
-# The nome is below 0.0066 there: a few images, and two terms of its own series, are enough.
+# For m1 up to this number the nome is below 0.0066: a few images, and two terms of the nome's own
+# series, are enough.
 LARGEST_M1 = 0.1
 _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 
 
 def sncndn_near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
-    """Return sn, cn, dn for 0 ≤ m1 ≤ 0.1, to round-off of 1.
+    """Return sn, cn and dn for 0 ≤ m1 ≤ 0.1, with an absolute error of the round-off of 1.
 
-    Tangents of m must be minus those of m1 = 1 − m.
+    The tangents of m must be minus the tangents of m1 = 1 − m.
     """
     root = jnp.sqrt(m)
     fourth = jnp.sqrt(root)
-    # DLMF 19.5.5–6, the difference 1 − m^(1/4) written as a quotient.
+    # The nome is DLMF 19.5.5–6, with the difference 1 − m^(1/4) written as a quotient.
     x = 0.5 * m1 / ((1 + fourth) * (1 + fourth) * (1 + root))
     x4 = (x * x) * (x * x)
     nome = x * (1 + x4 * (2 + 15 * x4))
-    # DLMF 20.9.2: K' = (π/2) θ₃².
+    # By DLMF 20.9.2, K' = (π/2) θ₃².
     theta3 = 1 + 2 * nome * (1 + nome * nome * nome)
     rate = 1 / (theta3 * theta3)
 
@@ -47,14 +49,14 @@ def sncndn_near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, R
     reach = _IMAGES[np.dtype(u.dtype)]
     offset = jnp.arange(-reach, reach + 1, dtype=u.dtype).reshape((1,) * u.ndim + (-1,))
     image = turns[..., None] + offset
-    # e^(−distance to the image) as a power of the nome times e^(±y).
+    # Compute e^(−distance to the image) as a power of the nome times e^(±y).
     beyond = jax.lax.stop_gradient(y) >= jnp.where(turns == 0, 0, turns * length)
     side = jnp.where(
         jnp.where(offset == 0, beyond[..., None], jnp.broadcast_to(offset < 0, image.shape)), -1, 1
     ).astype(u.dtype)
     z = _power_exp(nome[..., None], side * y[..., None], side * image)
     hyperbolic = 2 * z / (1 + z * z)
-    # tanh, less its limits ±1 on either side, which cancel in pairs.
+    # Take tanh without its limits ±1 on either side, which cancel in pairs.
     tangent = jnp.where(offset == 0, -side * (1 - z * z), side * 2 * z * z) / (1 + z * z)
 
     sine = rate / root * (parity(image) * tangent).sum(-1)
@@ -64,9 +66,9 @@ def sncndn_near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, R
 
 @jax.custom_jvp
 def _power_exp(p: Array, y: Array, n: Array) -> Any:
-    """Return pⁿ e^y.
+    """Return pⁿ e^y, with exact derivatives by p.
 
-    For n = 1 its second derivative by p is exactly 0; that of exp(y + n ln p) is not.
+    For n = 1 the second derivative by p is exactly 0; that of exp(y + n ln p) is not.
     """
     return jnp.exp(y + jnp.where(n == 0, 0, n * jnp.log(p)))
 

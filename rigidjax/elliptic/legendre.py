@@ -1,6 +1,7 @@
-"""Legendre's elliptic integrals, complete and incomplete, with the parameter m = k².
+"""Compute Legendre's elliptic integrals, complete and incomplete, with the parameter m = k².
 
-All of them, and all their derivatives, belong to one family that is closed under differentiation:
+All of these integrals, and all their derivatives, belong to one family that is closed under
+differentiation:
 
     I_jkl(φ, m, n) = ∫₀^φ sin^{2j}θ Δ^{−(2k+1)} (1 − n sin²θ)^{−l} dθ,      Δ = √(1 − m sin²θ)
     dI_jkl = [integrand at φ] dφ + (k + ½) I_{j+1,k+1,l} dm + l I_{j+1,k,l+1} dn
@@ -24,16 +25,22 @@ from rigidjax.elliptic.carlson import rd, rf
 from rigidjax.elliptic.carlson_r import r_integral
 from rigidjax.rotation.stumpff import half_turns
 
-# Steps after which a and b agree to √eps for b/a down to the square root of the least number.
+# After this number of steps the means a and b agree to √eps, for b/a down to the square root of the
+# least number of the dtype.
 _MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
 
 
 def ellipk(m: Real, m1: Real | None = None) -> Result:
     """Return the complete elliptic integral of the first kind, K(m) = ∫₀^{π/2} dθ/√(1 − m sin²θ).
 
-    **Arguments:** `m` < 1 the parameter k² (not the modulus k), also negative; 1 gives infinity, a
-    larger m NaN. `m1` = 1 − m: give it if m is so near 1 that 1 − m loses digits. Value and
-    derivative then depend on m1 alone. **Returns:** π/(2 agm(1, √m1)) (DLMF 19.8.5).
+    **Arguments:**
+
+    - `m`: the parameter k² (not the modulus k), below 1 and possibly negative; 1 gives infinity, a
+      larger m NaN.
+    - `m1`: 1 − m. Give it if m is so near 1 that 1 − m loses digits: value and derivative then
+      depend on m1 alone.
+
+    **Returns** π/(2 agm(1, √m1)), with agm the arithmetic–geometric mean (DLMF 19.8.5).
 
     >>> round(float(ellipk(1.0, 1e-30)), 12)
     35.925070756031
@@ -46,7 +53,8 @@ def ellipe(m: Real, m1: Real | None = None) -> Result:
     """Return the complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
 
     **Arguments:** `m` ≤ 1 the parameter k² (a larger one gives NaN); `m1` as for `ellipk`.
-    **Returns:** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms.
+
+    **Returns** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms.
 
     >>> float(ellipe(1.0))
     1.0
@@ -58,10 +66,15 @@ def ellipe(m: Real, m1: Real | None = None) -> Result:
 def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) -> Result:
     """Return the complete integral of the third kind, ∫₀^{π/2} dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
-    **Arguments:** `n` < 1 the characteristic (DLMF's α²): 1 gives infinity, a larger n NaN (not the
-    principal value); `m` < 1 the parameter k²; `m1` = 1 − m and `n1` = 1 − n as for `ellipk`. The
-    order is Wolfram's and mpmath's. **Returns:** DLMF 19.2.8 as one integral with a positive
-    integrand, accurate to round-off for any n < 1.
+    **Arguments**, in the order of Wolfram and mpmath:
+
+    - `n`: the characteristic (DLMF's α²), below 1; 1 gives infinity, a larger n NaN (not the
+      principal value).
+    - `m`: the parameter k², below 1.
+    - `m1`, `n1`: 1 − m and 1 − n, as for `ellipk`.
+
+    **Returns** DLMF 19.2.8 as one integral with a positive integrand, accurate to round-off for any
+    n < 1.
 
     >>> round(float(ellippi(0.5, 0.5)), 12)
     2.701287762095
@@ -73,9 +86,10 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
 def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
     """Return the incomplete elliptic integral of the first kind, F(φ|m) = ∫₀^φ dθ/√(1 − m sin²θ).
 
-    **Arguments:** `phi` the amplitude, rad, any size; `m` the parameter k² with m sin²φ < 1 (else
-    NaN); `m1` as for `ellipk`. **Returns:** DLMF 19.25.5 in Carlson's R_F after reduction to |φ| ≤
-    π/2 (DLMF 19.2.10).
+    **Arguments:** `phi` the amplitude, rad, of any size; `m` the parameter k² with m sin²φ < 1
+    (else NaN); `m1` as for `ellipk`.
+
+    **Returns** DLMF 19.25.5 in Carlson's R_F, after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
 
     >>> round(float(ellipf(1.0, 0.5)), 12)
     1.083216772845
@@ -87,9 +101,11 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
 def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
     """Return the incomplete elliptic integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ.
 
-    **Arguments:** `phi` the amplitude, rad, any size; `m` ≤ 1 the parameter k² (a larger one gives
-    NaN); `m1` as for `ellipk`. **Returns:** DLMF 19.25.9 or 19.25.10 in Carlson's integrals,
-    whichever has positive terms, after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
+    **Arguments:** `phi` the amplitude, rad, of any size; `m` ≤ 1 the parameter k² (a larger one
+    gives NaN); `m1` as for `ellipk`.
+
+    **Returns** DLMF 19.25.9 or 19.25.10 in Carlson's integrals, whichever has positive terms, after
+    reduction to |φ| ≤ π/2 (DLMF 19.2.10).
 
     >>> round(float(ellipeinc(1.0, 0.5)), 12)
     0.927329883624
@@ -103,10 +119,14 @@ def ellippiinc(
 ) -> Result:
     """Return the incomplete integral of the third kind, ∫₀^φ dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
-    **Arguments:** `n` the characteristic with n sin²φ < 1; `phi` the amplitude, rad, any size; `m`
-    the parameter k² with m sin²φ < 1 (beyond either bound: NaN); `m1` = 1 − m and `n1` = 1 − n as
-    for `ellipk`. The order is Wolfram's and mpmath's. **Returns:** DLMF 19.2.7 as one integral
-    after reduction to |φ| ≤ π/2 (19.2.10).
+    **Arguments**, in the order of Wolfram and mpmath:
+
+    - `n`: the characteristic, with n sin²φ < 1 (else NaN).
+    - `phi`: the amplitude, rad, of any size.
+    - `m`: the parameter k², with m sin²φ < 1 (else NaN).
+    - `m1`, `n1`: 1 − m and 1 − n, as for `ellipk`.
+
+    **Returns** DLMF 19.2.7 as one integral, after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
 
     >>> round(float(ellippiinc(0.5, 1.0, 0.5)), 12)
     1.288978174245
@@ -119,9 +139,10 @@ def ellippiinc(
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def integral(orders: tuple[int, int, int], sine: Array, cosine: Array, m1: Array, n1: Array) -> Any:
-    """Return I_jkl for `orders` (j, k, l) from the sine and cosine of φ, |φ| ≤ π/2.
+    """Return I_jkl for `orders` = (j, k, l), from the sine and cosine of φ with |φ| ≤ π/2.
 
-    From both, not from φ, so that no digit is lost near π/2.
+    It is computed from sine and cosine, not from φ, so that no digit is lost near π/2. `m1` is 1 −
+    m and `n1` is 1 − n.
     """
     j, k, last = orders
     s, c2 = sine, cosine * cosine
@@ -165,13 +186,13 @@ def _integral_jvp(
 
 
 def complete_integral(orders: tuple[int, int, int], m1: Array, n1: Array | None = None) -> Any:
-    """Return I_jkl, `orders` (j, k, l), at φ = π/2."""
+    """Return I_jkl for `orders` = (j, k, l) at φ = π/2."""
     one = jnp.ones_like(m1)
     return integral(orders, one, jnp.zeros_like(m1), m1, one if n1 is None else n1)
 
 
 def mean_iterates(m1: Array) -> list[tuple[Any, Any]]:
-    """Return the pairs of arithmetic and geometric means from (1, √m1) to their common value."""
+    """Return the pairs of arithmetic and geometric means, from (1, √m1) to their common value."""
     rows = [(jnp.ones_like(m1), jnp.sqrt(m1))]
     for _ in range(_MEAN_STEPS[np.dtype(m1.dtype)]):
         a, b = rows[-1]
@@ -181,7 +202,7 @@ def mean_iterates(m1: Array) -> list[tuple[Any, Any]]:
 
 @jax.custom_jvp
 def _complete_first_kind(m1: Array) -> Any:
-    """Return K = π/(2 agm(1, √m1)); infinity for m1 = 0."""
+    """Return K = π/(2 agm(1, √m1)), which is infinite for m1 = 0."""
     a, b = mean_iterates(m1)[-1]
     return jnp.where(m1 == 0, jnp.inf, math.pi / (a + b))
 
@@ -195,12 +216,12 @@ def _complete_first_kind_jvp(
 
 
 def _second_kind(s: Array, c2: Array, delta2: Array, m1: Array) -> Any:
-    """Return E(φ|m) for |φ| ≤ π/2 from s = sin φ, c2 = cos²φ and delta2 = 1 − m s².
+    """Return E(φ|m) for |φ| ≤ π/2, from s = sin φ, c2 = cos²φ and delta2 = 1 − m s².
 
-    By DLMF 19.25.10 for 0 ≤ m ≤ 1 and by 19.25.9 for m < 0, where every term is positive.
+    It follows DLMF 19.25.10 for 0 ≤ m ≤ 1 and DLMF 19.25.9 for m < 0: every term is then positive.
     """
     m, one = 1 - m1, jnp.ones_like(s)
-    # E(φ|1) = sin φ: at φ = π/2 the terms below have no values of their own.
+    # E(φ|1) is sin φ; at φ = π/2 the terms below have no values of their own.
     end = delta2 == 0
     c2, delta2 = jnp.where(end, one, c2), jnp.where(end, one, delta2)
     above = m >= 0
@@ -215,14 +236,15 @@ def _second_kind(s: Array, c2: Array, delta2: Array, m1: Array) -> Any:
 def _integral_at_any_amplitude(
     orders: tuple[int, int, int], phi: Array, m1: Array, n1: Array | None = None
 ) -> Any:
-    """Return I_jkl, `orders` (j, k, l), at any amplitude φ.
+    """Return I_jkl for `orders` = (j, k, l) at any amplitude φ = `phi`.
 
-    Whole half turns come from the complete integral, the rest from its sine and cosine.
+    The complete integral gives the part of the whole half turns; the sine and cosine of the
+    remainder give the rest.
     """
     turns, remainder = half_turns(phi)
     n1 = jnp.ones_like(m1) if n1 is None else n1
     part = integral(orders, jnp.sin(remainder), jnp.cos(remainder), m1, n1)
-    # Within the first half turn the complete integral may be infinite, and is not wanted.
+    # Within the first half turn the complete integral is not needed, and it may be infinite.
     near = turns == 0
     one = jnp.ones_like(m1)
     safe_m1, safe_n1 = jnp.where(near, one, m1), jnp.where(near, one, n1)

@@ -1,4 +1,4 @@
-"""Motions in closed form, without a solver."""
+"""Solve the motion of a torque-free body in closed form, without a solver."""
 
 from rigidjax._names import show
 from rigidjax.exact.free_body import FreeBody as FreeBody, free_body as free_body

@@ -1,4 +1,7 @@
-"""The free motion in principal axes: values only, in components (`derivatives` has the rest)."""
+"""Compute the values of the free motion in principal axes, as tuples of components.
+
+The module `rigidjax.exact.derivatives` has the derivatives of these values.
+"""
 
 from typing import NamedTuple
 
@@ -20,24 +23,28 @@ from rigidjax.rotation.barrier import barrier, one_kernel
 
 
 class Orbit(NamedTuple):
-    """Hold the constants of a free motion, in principal axes labelled 1, 2, 3 in order."""
+    """Hold the constants of a free motion, in principal axes that are labelled 1, 2, 3 in ascending
+    or descending order of their moments.
+    """
 
-    a: Scalar  # the largest or smallest reciprocal moment
-    d12: Scalar  # differences of reciprocal moments
+    a: Scalar  # the reciprocal of the moment of axis 1
+    d12: Scalar  # 1/I₁ − 1/I₂; below 1/I₁ − 1/I₃ and 1/I₂ − 1/I₃
     d13: Scalar
     d23: Scalar
     P: Triple  # the initial momentum
-    h: Scalar  # its length
+    h: Scalar  # the length of the momentum
     modulus: Modulus
     mu: Scalar
     turn: Scalar
     half: HalfPeriod
-    swapped: Float[Array, ""]  # which of the two monotone labellings is used
+    swapped: Float[Array, ""]  # whether axis 1 has the largest moment
 
 
 @one_kernel
 def orbit(moments: Triple, momentum: Triple) -> Orbit:
-    """Set up the motion of a body with principal moments I1 ≤ I2 ≤ I3 (any of them equal)."""
+    """Return the constants of the motion of a body with the principal moments I₁ ≤ I₂ ≤ I₃, any of
+    which may be equal.
+    """
     (i1, i2, i3), (p1, p2, p3) = moments, momentum
     r1, r2, r3 = 1.0 / i1, 1.0 / i2, 1.0 / i3
     d12, d13, d23 = (i2 - i1) * (r1 * r2), (i3 - i1) * (r1 * r3), (i3 - i2) * (r2 * r3)
@@ -45,7 +52,7 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
     A3 = d13 * p1 * p1 + d23 * p2 * p2
     A2 = d23 * p3 * p3 - d12 * p1 * p1
     p, q, gap = d23 * A1, d12 * A3, d13 * A2
-    # Label so that the phase ξ, a correction to the turning about axis 1, stays small.
+    # Label the axes such that the phase ξ, a correction to the turn about axis 1, stays small.
     swap = d12 * A1 > d23 * A3
     p, q, gap = jnp.where(swap, q, p), jnp.where(swap, p, q), jnp.where(swap, -gap, gap)
     a = jnp.where(swap, r3, r1)
@@ -61,25 +68,30 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
 
 
 class ReducedTime(NamedTuple):
-    """Hold a time that was reduced by whole half periods."""
+    """Hold a time from which a whole number of half periods was subtracted."""
 
-    halves: Scalar  # their number
+    halves: Scalar  # the number of half periods that were subtracted
     rest: Scalar
-    near: Scalar  # the rest, on the separatrix cut at the time to come to rest
+    near: Scalar  # `rest`; on the separatrix clipped to the time to come to rest
 
 
 def reduce_time(u: Scalar, half_period: Scalar, m: Modulus) -> ReducedTime:
-    """Reduce the time u by whole half periods `half_period`."""
+    """Return the time u reduced by a whole number of half periods of length `half_period`."""
     count = jnp.round(u / half_period)
     rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half_period)
     return ReducedTime(count, rest, clip_at_rest(rest, m))
 
 
 def restore_periods(o: Orbit, f: Elliptic, u: ReducedTime) -> tuple[Elliptic, Scalar]:
-    """Return S, C, D at the whole time from `f`, those at `u.near`; and the phase left out."""
+    """Return S, C, D and the phase at the whole time, from the functions `f` at the reduced time
+    `u.near`.
+
+    The phase is the part of ξ that `f` does not contain.
+    """
     big = jnp.maximum(o.modulus.p, o.modulus.q)
     whole = jnp.where(u.halves == 0, 0.0, u.halves)
-    # From then on the momentum rests on the middle axis, S² = 1/max(p, q): a steady spin.
+    # After the time `u.near` on the separatrix the momentum rests on the middle axis, where S² =
+    # 1/max(p, q): the body spins steadily.
     spin = (u.rest - u.near) * o.turn / jnp.where(big > 0, big + o.mu, 1.0)
     odd = jnp.abs(whole - 2.0 * jnp.round(0.5 * whole)) > 0.5
     sign = jnp.where(odd, -1.0, 1.0)
@@ -95,9 +107,11 @@ def restore_periods(o: Orbit, f: Elliptic, u: ReducedTime) -> tuple[Elliptic, Sc
 
 
 def restore_identity(f: Elliptic, m: Modulus) -> Elliptic:
-    """Compute the larger of C² and D² again from the smaller: D² − C² = (p − q)S².
+    """Compute the larger one of C² and D² in `f` again from the smaller one, by D² − C² = (p −
+    q)S².
 
-    C and SD cancel near the middle axis, and of the doublings' errors only a common one does, too.
+    Near the middle axis C and SD cancel. An error that the doublings made in both of them alike
+    cancels as well; an error in one of them alone does not, and this identity removes it.
     """
     gs = m.gap * f.S * f.S
     other = jnp.sqrt(jnp.where(gs > 0, f.C * f.C + gs, f.D * f.D - gs))
@@ -108,7 +122,9 @@ def restore_identity(f: Elliptic, m: Modulus) -> Elliptic:
 
 
 def momentum_at(o: Orbit, f: Elliptic) -> Triple:
-    """Return the body momentum from S, C, D (`f`) at the same time, in the labelling of `o`."""
+    """Return the body momentum from S, C, D in `f` at one time, in the labelling of the axes in
+    `o`.
+    """
     p1, p2, p3 = o.P
     f = restore_identity(f, o.modulus)
     y1 = p1 * f.C - o.d23 * p2 * p3 * f.S * f.D
@@ -117,7 +133,8 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
     size = jnp.maximum(jnp.maximum(jnp.abs(y1), jnp.abs(y2)), jnp.abs(y3))
     still = size <= 0
     size = jnp.where(still, 1.0, size)
-    # Quotients: of a steady spin ±1 exactly, and its momentum stays to the last digit.
+    # The quotients of a steady spin are exactly ±1, and so its momentum stays the same to the last
+    # digit.
     y1, y2, y3 = y1 / size, y2 / size, y3 / size
     r = o.h / jnp.sqrt(jnp.where(still, 1.0, y1 * y1 + y2 * y2 + y3 * y3))
     return y1 * r, y2 * r, y3 * r
@@ -125,19 +142,24 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
 
 @one_kernel
 def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
-    """Return the body momentum at t and the quaternion of the turn since 0, in principal axes."""
+    """Return the body momentum at the time t, and the quaternion of the turn from time 0 to t, in
+    principal axes.
+    """
     u = reduce_time(0.5 * t, o.half.time, o.modulus)
     return motion_from_functions(o, elliptic(u.near, o.modulus, o.mu, o.turn), u, t)
 
 
 def motion_from_functions(o: Orbit, f: Elliptic, u: ReducedTime, t: Scalar) -> tuple[Triple, Four]:
-    """Return momentum and turn at time t from `f`, the elliptic functions at `u.near`."""
+    """Return the body momentum at the time t and the turn from time 0 to t, from the elliptic
+    functions `f` at `u.near`.
+    """
     f, phase = barrier(restore_periods(o, f, u))
     full = barrier(duplicate(f, o.modulus, o.mu, o.turn))
     _, k2, k3 = barrier(momentum_at(o, f))
     m1, m2, m3 = barrier(momentum_at(o, full))
 
-    # b turns about (half way) momentum's partner axes, the rest is a turn about the momentum.
+    # The quaternion b turns about an axis across the momentum at half the time; the rest of the
+    # turn is one about the momentum.
     b0, b2, b3 = f.C, -o.d12 * f.S * k2 * f.C, -o.d13 * f.S * k3
     size = jnp.maximum(jnp.maximum(jnp.abs(b0), jnp.abs(b2)), jnp.abs(b3))
     b0, b2, b3 = barrier((b0 / size, b2 / size, b3 / size))

@@ -1,6 +1,7 @@
-"""Vectors, quaternions and symmetric matrices (11, 22, 33, 12, 13, 23) as tuples of scalars.
+"""Compute with vectors, quaternions and symmetric matrices that are tuples of scalars.
 
-XLA makes one kernel of a batch of them (stacked arrays cost ten times it).
+A symmetric matrix is the tuple of its entries (11, 22, 33, 12, 13, 23). XLA compiles a batch of
+such tuples to one kernel; stacked arrays take ten times as long.
 """
 
 import jax.numpy as jnp
@@ -9,21 +10,23 @@ from jaxtyping import Array
 from rigidjax._types import Scalar
 from rigidjax.rotation.linalg3 import cross_components as cross
 
-# Of 3, 4 and 6 entries; generators do not carry their length for a type checker.
+# The tuples have 3, 4 and 6 entries. Their types do not state the length, since a type checker
+# cannot derive it from a generator.
 Triple = tuple[Scalar, ...]
 Four = tuple[Scalar, ...]
 Six = tuple[Scalar, ...]
-# ½ a : b of two symmetric matrices is the sum of these times the products of their entries.
+# For two symmetric matrices a and b, ½ a : b is the sum of the products of their entries, weighted
+# by these numbers.
 HALF = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
 
 
 def add(a: Triple, b: Triple) -> Triple:
-    """Add two vectors."""
+    """Return the sum of two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def matvec(m: Six, v: Triple) -> Triple:
-    """Multiply a symmetric matrix by a vector."""
+    """Return the product of a symmetric matrix m and a vector v."""
     a, b, c, x, y, z = m
     return (
         a * v[0] + x * v[1] + y * v[2],
@@ -33,7 +36,7 @@ def matvec(m: Six, v: Triple) -> Triple:
 
 
 def commuting_product(m: Six, n: Six) -> Six:
-    """Multiply two symmetric matrices that commute; their product is symmetric."""
+    """Return the product of two symmetric matrices that commute, which is symmetric."""
     a, b, c, x, y, z = m
     d, e, f, u, v, w = n
     return (
@@ -72,7 +75,7 @@ def adjugate(m: Six) -> Six:
 
 
 def half_product(q: Four, v: Triple) -> Four:
-    """Return ½ q ⊗ (0, v), ⊗ the product of quaternions."""
+    """Return ½ q ⊗ (0, v), where ⊗ is the product of quaternions."""
     w, x, y, z = q
     a, b, c = 0.5 * v[0], 0.5 * v[1], 0.5 * v[2]
     return (
@@ -84,7 +87,7 @@ def half_product(q: Four, v: Triple) -> Four:
 
 
 def change_by_inverse_rotation(q: Four, v: Triple) -> Triple:
-    """Return R(q)ᵀ v − v, without a difference of large numbers."""
+    """Return R(q)ᵀ v − v, computed without a difference of large numbers."""
     w, *axis = q
     first = cross(v, tuple(axis))
     second = cross(first, tuple(axis))

@@ -1,13 +1,18 @@
-"""The free flow in principal axes, with its derivatives: (inertia, Π, t) → (Π(t), turn).
+"""Compute the free flow in principal axes and its derivatives: (inertia, Π(0), t) → (Π(t), turn).
 
-The turn's derivative needs no elliptic integral of the third kind. Let `δR = R hat(θ)`. Momentum is
-constant in space, `R Π(t) = Π(0)` (R since t = 0), which gives θ across Π(t):
+The derivative of the turn needs no elliptic integral of the third kind. Let R be the rotation from
+time 0 to t, and `δR = R hat(θ)` its change. The momentum is constant in space, `R Π(t) = Π(0)`, and
+this gives the part of θ across Π(t):
 
     Π(t) × (Rᵀ δΠ(0) − δΠ(t)) = h² θ − Π (Π·θ)
 
-and along it `d(Π·θ)/dt = Π·δΩ = ½ δE₂ + ½ Π·δK Π`, E₂ = Π·KΠ constant, so
+The part along Π(t) follows from `d(Π·θ)/dt = Π·δΩ = ½ δE₂ + ½ Π·δK Π`, where K = I⁻¹ and E₂ = Π·KΠ
+is constant:
 
     Π(t)·θ = ½ t δE₂ + ½ δK : ∫₀ᵗ Π Πᵀ dt + E₂ δt.
+
+Both δΠ(t) − δΠ(0) and R − 1 are proportional to the angle of the turn. The quotient by h² therefore
+loses no digits, except near rest, where the derivative comes from a Taylor series.
 
 δΠ(t) − δΠ(0) and R − 1 are proportional to the turn, so that the quotient by h² loses no digits
 except at rest, where the derivative comes from a Taylor series.
@@ -54,21 +59,23 @@ from rigidjax.exact.sigma_form import Differences
 from rigidjax.rotation.barrier import one_kernel
 from rigidjax.rotation.linalg3 import components
 
-# Below this turn, rad, a series of third order in time is used. Its second derivatives are off by
-# the square of the turn, those of the other form by round-off over the turn.
+# Below this angle of the turn, rad, a series of third order in time is used. The second derivatives
+# of the series have an error of the square of the angle; those of the other form have an error of
+# the round-off over the angle.
 _STILL = {jnp.dtype("float32"): 5e-3, jnp.dtype("float64"): 5e-6}
 
 
-# Up to so many times a loop over them compiles sooner than one batch, and is as fast but for the
-# values of one body.
+# Up to this number of times, a loop over the times compiles sooner than one batch. The loop is as
+# fast as the batch, except for the values (without derivatives) of one body.
 _LOOPED = 1000
 
 
 @jax.custom_jvp
 def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
-    """Return Π(t) and the quaternion of the turn since 0.
+    """Return Π(t) and the quaternion of the turn from time 0 to t.
 
-    `moments`: I11 ≤ I22 ≤ I33, I12, I13, I23, the last three zero in value; `momentum` Π(0).
+    `moments` are the entries I11 ≤ I22 ≤ I33, I12, I13, I23 of the inertia tensor, the last three
+    zero in value; `momentum` is Π(0).
     """
     return momentum_and_turn(orbit(moments[:3], momentum), t)
 
@@ -81,7 +88,9 @@ def _flow_jvp(primals, tangents):
 
 
 def _variables(primals, tangents):
-    """Return `reciprocal` and `derivative_variables`, each with its change along `tangents`."""
+    """Return the results of `reciprocal` and `derivative_variables`, each with its change along
+    `tangents`.
+    """
     parts, changes = jax.jvp(reciprocal, primals[:2], tangents[:2])
     return (
         parts,
@@ -92,13 +101,17 @@ def _variables(primals, tangents):
 
 
 def _change_along(motion, rows, change):
-    """Return the change of Π, the turn and Ω (`motion`) by a `change` of the variables."""
+    """Return the changes of Π, the turn and Ω in `motion` for a `change` of the derivative
+    variables.
+
+    `rows` holds the derivatives of Π, θ and Ω, where θ is the small rotation that changes the turn.
+    """
     out, theta, rate = (tuple(jnp.sum(row * change) for row in three) for three in rows)
     return out, half_product(motion[1], theta), rate
 
 
 class MotionConstants(NamedTuple):
-    """Hold the constants of a free motion: by value, never differentiated."""
+    """Hold the constants of a free motion, which are values and never differentiated."""
 
     axes: Mat3
     moments: Triple
@@ -108,7 +121,9 @@ class MotionConstants(NamedTuple):
 
 @one_kernel
 def set_up(tensor: Mat3, omega: Vec3) -> MotionConstants:
-    """Find the principal axes, and the orbit of the momentum in them."""
+    """Return the principal axes of the inertia `tensor`, and the constants of the motion in these
+    axes.
+    """
     moments, axes = principal_frame(tensor)
     momentum = matvec(moments, components_along(axes, omega))
     return MotionConstants(axes, moments[:3], momentum, orbit(moments[:3], momentum))
@@ -118,7 +133,9 @@ def set_up(tensor: Mat3, omega: Vec3) -> MotionConstants:
 def body_motion(
     tensor: Mat3, omega: Vec3, setting: MotionConstants, t: Float[Array, "*n"]
 ) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 4"]]:
-    """Return Ω(t) and the quaternion of the turn since 0, in body axes, at one time or many."""
+    """Return Ω(t) and the quaternion of the turn from time 0 to t, in body axes, at one time or at
+    many times t.
+    """
     del tensor, omega
     return _at_each_time(lambda time: _body_motion_at(setting, time), t)
 
@@ -127,12 +144,13 @@ def body_motion(
 def _body_motion_jvp(primals, tangents):
     tensor, omega, setting, t = primals
     d_tensor, d_omega, _, d_t = tangents
-    # Two matrices, so that the transposed part is short: the rest is compiled once.
+    # The derivative is a product of two matrices. Only one of them depends on time, so that the
+    # transposed part is short and the rest is compiled once.
     first = _input_derivatives(jnp.concatenate([tensor.ravel(), omega]), setting)
     out, (rates, thetas) = _at_each_time(
         lambda time: _body_motion_and_derivatives(tensor, omega, setting, time), t
     )
-    # Summed, not a product of matrices: on a GPU that is rounded to ten bits in float32.
+    # Sum products of entries: on a GPU a product of matrices is rounded to ten bits in float32.
     change = jnp.sum(first * jnp.concatenate([d_tensor.ravel(), d_omega])[None], axis=-1)
     change = jnp.broadcast_to(change, (*t.shape, 9))
     change = jnp.concatenate([change, d_t[..., None]], axis=-1)
@@ -150,7 +168,7 @@ def _quaternion_change(turn: Quat, theta: Vec3) -> Quat:
 
 
 def _at_each_time(function, t):
-    """Evaluate `function` at the time or at each of the times t."""
+    """Return the values of `function` at the time t, or at each of the times t."""
     if t.ndim == 0:
         return function(t)
     return jax.lax.map(function, t) if t.size <= _LOOPED else jax.vmap(function)(t)
@@ -158,7 +176,7 @@ def _at_each_time(function, t):
 
 @one_kernel
 def _body_motion_at(s: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
-    """Return Ω(t) and the turn since 0 in body axes."""
+    """Return Ω(t) and the quaternion of the turn from time 0 to t, in body axes."""
     momentum, (w, *axis) = momentum_and_turn(s.orbit, t)
     rate = tuple(p / i for p, i in zip(momentum, s.moments, strict=True))
     return jnp.stack(combine_columns(s.axes, rate)), jnp.stack(
@@ -167,21 +185,24 @@ def _body_motion_at(s: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
 
 
 def _moments_and_momentum(tensor: Mat3, omega: Vec3, s: MotionConstants) -> tuple[Six, Triple]:
-    """Return moments and momentum as functions of `tensor` and Ω(0); the axes are held fixed."""
+    """Return the moments and the momentum as functions of `tensor` and Ω(0) = `omega`.
+
+    The principal axes in `s` are held fixed.
+    """
     moments = tensor_in_axes(tensor, s.axes, s.moments)
     return moments, matvec(moments, components_along(s.axes, omega))
 
 
 @one_kernel
 def _input_derivatives(body: Float[Array, "12"], s: MotionConstants) -> Float[Array, "9 12"]:
-    """Return the derivatives of `derivative_variables` by `body`.
+    """Return the derivatives of `derivative_variables` with respect to `body`.
 
-    `body` holds the nine entries of the tensor, then Ω(0).
+    `body` holds the nine entries of the inertia tensor, then Ω(0).
     """
     tensor, omega, axes = body[:9].reshape(3, 3), body[9:], s.axes
     moments, momentum = _moments_and_momentum(tensor, omega, s)
-    # δK = −K δI K in principal axes: −BᵀδI B with B = A K. A batch of sums, not of products of
-    # matrices: see `_body_motion_jvp`.
+    # In principal axes, δK = −K δI K is −BᵀδI B with B = A K, where A holds the axes. This is a
+    # batch of sums, not of products of matrices, for the reason given in `_body_motion_jvp`.
     k = jnp.stack(symmetric_rows(reciprocal(moments, momentum)[1]))
     b = jnp.sum(axes[:, :, None] * k[None], axis=1)
     d_k = lambda i, j: -(b[:, None, i] * b[None, :, j]).ravel()  # noqa: E731
@@ -196,18 +217,23 @@ def _input_derivatives(body: Float[Array, "12"], s: MotionConstants) -> Float[Ar
 
 @one_kernel
 def _body_motion_and_derivatives(tensor: Mat3, omega: Vec3, s: MotionConstants, t: Scalar):
-    """Return Ω(t) and the turn in body axes, and their derivatives by `derivative_variables`."""
+    """Return Ω(t) and the turn in body axes, and their derivatives with respect to
+    `derivative_variables`.
+    """
     moments, momentum = _moments_and_momentum(tensor, omega, s)
     (_, (w, *axis), rate), rows, _ = motion_and_derivatives(moments, momentum, t)
     rate = combine_columns(s.axes, rate)
     turn = jnp.stack([w, *combine_columns(s.axes, tuple(axis))])
-    # Rows, not matrices: to stack them costs a batch five times what they are.
+    # Return rows, not matrices: stacking them takes five times as long for a batch as computing
+    # them.
     in_body = jax.vmap(lambda *v: combine_columns(s.axes, v))
     return (jnp.stack(rate), turn), (in_body(*rows.rate), in_body(*rows.theta))
 
 
 class MotionDerivatives(NamedTuple):
-    """Hold the derivatives of Π(t), θ, Ω(t) by `derivative_variables`: three rows of ten each."""
+    """Hold the derivatives of Π(t), θ and Ω(t) with respect to `derivative_variables`: three rows
+    of ten for each.
+    """
 
     momentum: Triple
     theta: Triple
@@ -217,7 +243,8 @@ class MotionDerivatives(NamedTuple):
 @jax.custom_jvp
 @one_kernel
 def motion_and_derivatives(moments: Six, momentum: Triple, t: Scalar):
-    """Return Π(t), the quaternion of the turn and Ω(t); their derivatives; the parts of these.
+    """Return Π(t), the quaternion of the turn and Ω(t), the derivatives of all three, and the parts
+    of these derivatives.
 
     The parts, which `_first_order` returns, are the derivatives of Π(t) − Π(0), and G = ∫ Π Πᵀ dt.
     """
@@ -227,7 +254,8 @@ def motion_and_derivatives(moments: Six, momentum: Triple, t: Scalar):
     return motion, _derivative_columns(k, energy2, momentum, t, motion, rows, g), (rows, g)
 
 
-# The jvp of a closed first derivative is taken from the tensor form, which is smooth to any order.
+# The second derivatives come from the form of the motion in the whole tensor (`sigma_form`), which
+# is smooth to any order.
 @motion_and_derivatives.defjvp
 def _motion_and_derivatives_jvp(primals, tangents):
     motion, rows, parts = motion_and_derivatives(*primals)
@@ -241,9 +269,9 @@ def _motion_and_derivatives_jvp(primals, tangents):
 def _derivative_columns(
     k: Six, energy2: Scalar, momentum: Triple, t: Scalar, motion, rows, g: Six
 ) -> MotionDerivatives:
-    """Return the derivatives of `motion`, the result of `motion_and_derivatives`.
+    """Return the derivatives of `motion`, the first result of `motion_and_derivatives`.
 
-    `k`, `energy2`: of `reciprocal`; `rows`, `g`: of `_first_order`.
+    `k` and `energy2` come from `reciprocal`; `rows` and `g` come from `_first_order`.
     """
     out, turn, _ = motion
     p1, p2, p3 = momentum
@@ -267,7 +295,8 @@ def _derivative_columns(
         along = sum(a * b for a, b in zip(weights, d_k, strict=True))
         along = along + t * sum(a * b for a, b in zip(rate, start, strict=True)) + energy2 * et
         theta = tuple(r * (a + b * along) for a, b in zip(across, out, strict=True))
-        # Near rest by a series: θ' = δΩ − Ω × θ, with Ω = KΠ and Π' = Π × Ω.
+        # Near rest the derivative is a series in t, from θ' = δΩ − Ω × θ with Ω = KΠ and Π' = Π ×
+        # Ω.
         faster = add(matvec(d_k, momentum), matvec(k, start))
         d_pull = add(cross(start, rate), cross(momentum, faster))
         gained = add(matvec(d_k, pull), matvec(k, d_pull))
@@ -285,10 +314,12 @@ def _derivative_columns(
 
 
 def derivative_variables(parts, momentum: Triple, t: Scalar) -> Float[Array, "10"]:
-    """Return d12, d23, k12, k13, k23, Π(0), k33, t, the variables of all derivatives.
+    """Return d12, d23, k12, k13, k23, Π(0), k33 and t, the variables of all derivatives of this
+    module.
 
-    `parts`: of `reciprocal`, or their change. k33 is the least of K: a rod's thickness moves d12
-    alone (k11 and d12 by 1/I₁², which cancel).
+    `parts` is the result of `reciprocal`, or the change of this result. k33 is the least diagonal
+    entry of K = I⁻¹. It is taken since the thickness of a rod then changes d12 alone; with k11 it
+    would change both k11 and d12 by 1/I₁², and the two would cancel.
     """
     body, k, _ = parts
     return jnp.stack([body.d12, body.d23, body.k12, body.k13, body.k23, *momentum, k[2], t])
@@ -296,9 +327,10 @@ def derivative_variables(parts, momentum: Triple, t: Scalar) -> Float[Array, "10
 
 @one_kernel
 def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
-    """Return the result of `flow`, d(Π(t) − Π(0)) by `derivative_variables`, and G = ∫ Π Πᵀ dt.
+    """Return the result of `flow`, the derivatives of Π(t) − Π(0) by `derivative_variables`, and G
+    = ∫ Π Πᵀ dt.
 
-    `o`: the constants of the motion.
+    The argument `o` holds the constants of the motion.
     """
     u = reduce_time(0.5 * t, o.half.time, o.modulus)
     at = integrals(u.near, o.modulus, o.mu, o.turn)
@@ -314,7 +346,11 @@ def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
 
 
 def _second_order(body: Differences, inputs, change):
-    """Return the changes of the derivatives and of G in `_first_order`, from the tensor form."""
+    """Return the changes of the derivatives and of G, which `_first_order` returns, from the form
+    of the motion in the whole tensor.
+
+    `inputs` are the `derivative_variables`, and `change` is the change of these variables.
+    """
 
     def of_inputs(x):
         d12, d23, k12, k13, k23, p1, p2, p3, _, time = x
@@ -324,7 +360,7 @@ def _second_order(body: Differences, inputs, change):
         )
 
     def columns(x):
-        # One after the other: a batch of them takes longer to compile.
+        # Compute one column after the other: a batch of columns takes longer to compile.
         column = lambda e: jax.jvp(of_inputs, (x,), (e,))[1]  # noqa: E731
         return jax.lax.map(column, jnp.eye(10, dtype=x.dtype))
 
@@ -333,7 +369,9 @@ def _second_order(body: Differences, inputs, change):
 
 
 def reciprocal(moments: Six, momentum: Triple):
-    """Return the differences of K = I⁻¹, K itself and E₂ = Π·KΠ, twice the energy."""
+    """Return the differences of the diagonal of K = I⁻¹, K itself, and E₂ = Π·KΠ, which is twice
+    the energy.
+    """
     i1, i2, i3, i12, i13, i23 = moments
     r = 1.0 / determinant(moments)
     k = tuple(c * r for c in adjugate(moments))

@@ -1,4 +1,4 @@
-"""The closed form as a diffrax solver: exact at any step size, dense output included."""
+"""Solve a free motion in diffrax by the closed form, exact at any step size, with dense output."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -34,7 +34,7 @@ class FreeInterpolation(dfx.AbstractLocalInterpolation):
 
 
 class FreeSolver(dfx.AbstractSolver):
-    """Solve torque-free spins and attitudes in diffrax; a step is the closed form.
+    """Solve torque-free spins and attitudes in diffrax, where each step evaluates the closed form.
 
     Use it with `diffrax.ODETerm(rigidjax.equations_of_motion(inertia, y0))` of a `Spin` or an
     `Attitude`, with no torque. One step over the whole interval does. Events, dense output and
@@ -55,7 +55,7 @@ class FreeSolver(dfx.AbstractSolver):
     interpolation_cls: ClassVar[Callable[..., FreeInterpolation]] = FreeInterpolation
 
     def order(self, terms: PyTree[dfx.AbstractTerm]) -> int | None:
-        # An exact step does not need it; some controllers do.
+        # An exact step needs no order, but some step size controllers ask for it.
         return 1
 
     def error_order(self, terms: PyTree[dfx.AbstractTerm]) -> float | None:
@@ -82,7 +82,7 @@ class FreeSolver(dfx.AbstractSolver):
         solver_state: None,
         made_jump: Bool[ArrayLike, ""],
     ) -> tuple[Any, Any, dict[str, Any], None, dfx.RESULTS]:
-        # −1 where diffrax integrates backwards, its times running as −t.
+        # The direction is −1 if diffrax integrates backwards, in which case its times are −t.
         inertia, direction = (
             _field(terms).inertia,
             jnp.asarray(field_of(terms)[1], jnp.result_type(t0)),
@@ -97,14 +97,19 @@ class FreeSolver(dfx.AbstractSolver):
 
 
 def field_of(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
-    """Return the vector field inside a term, and the direction of time diffrax wraps around it."""
-    # `vf` and `contr`, all that diffrax promises of a wrapped term, give numbers, not the inertia.
+    """Return the vector field inside a term, and the direction of time that diffrax wraps around
+    the term.
+    """
+    # Read attributes of the wrapped term: its methods `vf` and `contr`, the only ones that diffrax
+    # promises, return numbers and not the inertia.
     term = getattr(terms, "term", terms)
     return getattr(term, "vector_field", None), getattr(terms, "direction", 1)
 
 
 def _field(terms: PyTree[dfx.AbstractTerm]) -> EulerEquations:
-    """Return Euler's equations from inside a term."""
+    """Return Euler's equations from inside a term, or raise an error if they are not those of a
+    free body.
+    """
     field, _ = field_of(terms)
     euler = field.euler if isinstance(field, AttitudeEquations) else field
     term = getattr(terms, "term", terms)

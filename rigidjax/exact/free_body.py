@@ -1,4 +1,4 @@
-"""A torque-free body at any time, in closed form."""
+"""Solve the motion of a torque-free body at any time in closed form."""
 
 import functools
 from typing import Any, TypeVar
@@ -24,9 +24,9 @@ State = TypeVar("State", bound=HasSpin)
 
 
 class FreeBody(eqx.Module):
-    """Hold the whole motion of a free body; call it with a time, or `at` with many.
+    """Hold the whole motion of a free body: call it with one time, or call `at` with many times.
 
-    Its constants are computed once. **Arguments:** as for `free_body`.
+    The constants of the motion are computed once. **Arguments:** as for `free_body`.
 
     >>> motion = FreeBody(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([0.0, 0.0, 1.0]))
     >>> motion(10.0).omega
@@ -41,7 +41,7 @@ class FreeBody(eqx.Module):
 
     def __init__(self, inertia: Inertia, state0: HasSpin):
         inertia = _checked_inertia(inertia, state0)
-        # Powers of two, so that scaling loses no digit and no body is too large or small.
+        # Scale by powers of two: this loses no digit, and then no body is too large or too small.
         self.exponent = exponent_of(state0.omega)
         self.tensor = times_power_of_two(inertia.tensor, -exponent_of(inertia.tensor))
         self.omega = times_power_of_two(state0.omega, -self.exponent)
@@ -52,7 +52,8 @@ class FreeBody(eqx.Module):
         return self.at(_checked_time(t, self.state0.omega))
 
     def at(self, ts: Float[Array, "*n"]) -> HasSpin:
-        """Return the states at `ts` (n,), s since `state0`: as `jax.vmap` does, compiled sooner.
+        """Return the states at the times `ts` (n,), s since `state0`, as `jax.vmap` does but
+        compiled sooner.
 
         >>> motion = FreeBody(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([0.0, 0.0, 1.0]))
         >>> motion.at(jnp.array([0.0, 10.0])).omega
@@ -60,7 +61,7 @@ class FreeBody(eqx.Module):
                [0., 0., 1.]], dtype=float64)
         """
         t = ts.astype(self.tensor.dtype)
-        # After so many turns the dtype has no digit within one turn: then there is no state.
+        # Beyond this angle the dtype has no digit within one turn, and the state is unknown.
         turned = jnp.abs(t) * jnp.max(jnp.abs(self.state0.omega))
         t = jnp.where(turned <= 1 / jnp.finfo(t.dtype).eps, t, jnp.nan)
         since = times_power_of_two(t, self.exponent)
@@ -74,7 +75,8 @@ class FreeBody(eqx.Module):
 
 
 class FreeMotion(eqx.Module):
-    """Hold the motion of a free body of any kind: `FreeBody`, and x + v t of a `Rigid`.
+    """Hold the motion of a free body of any kind: a `FreeBody`, and for a `Rigid` also its path x +
+    v t.
 
     Call it with a time, or with times (n,), s since `state0`. Times that are too long give NaN.
     """
@@ -98,11 +100,16 @@ class FreeMotion(eqx.Module):
 
 
 def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
-    """Return the state of a torque-free body at any time, in closed form: no solver, no steps.
+    """Return the state of a torque-free body at any time t in closed form, without a solver or
+    steps.
 
-    **Arguments:** `inertia` about the centre of mass, any tensor with positive moments, kg m², body
-    frame; `state0` a `Spin` (Ω) or `Attitude` (q, Ω): Ω rad/s in the body frame, q unit quaternion
-    (w, x, y, z) body → world; `t` scalar time since `state0`, s, of either sign.
+    **Arguments:**
+
+    - `inertia`: about the centre of mass, any tensor with positive moments, kg m², body frame.
+    - `state0`: the initial state, a `Spin` (Ω) or an `Attitude` (q, Ω): Ω rad/s in the body frame,
+      q a unit quaternion (w, x, y, z), body → world.
+    - `t`: scalar time since `state0`, s, of either sign.
+
     **Returns** the state at `t`, of the type and dtype of `state0`. Use `jax.vmap` for many times
     or bodies; `FreeBody(inertia, state0)` keeps the constants of the motion.
 
@@ -138,7 +145,9 @@ _jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0).at(t))
 
 
 def _checked_time(t: ScalarLike, omega: Array) -> Scalar:
-    """Check the time: a number in whose dtype the turn of the body has digits."""
+    """Return the time t, and raise an error if the dtype has no digit within one turn of the body
+    at t.
+    """
     t = _checks.checked_time(t)
     if not _checks.is_known((t, omega)):
         return t
@@ -154,7 +163,9 @@ def _checked_time(t: ScalarLike, omega: Array) -> Scalar:
 
 
 def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
-    """Check body and state, and return the body; one that is traced and impossible is NaN."""
+    """Return the inertia after checks of body and state; an impossible body that is traced becomes
+    NaN.
+    """
     if isinstance(state0, HasPose) or not isinstance(state0, HasSpin):
         raise TypeError(
             f"state0: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
@@ -182,6 +193,6 @@ def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
 
 @functools.partial(jnp.vectorize, signature="(n),(n)->(n)")
 def _unit_product(q: Quat, other: Quat) -> Quat:
-    """Multiply two quaternions, and give the product unit length."""
+    """Return the product of two quaternions, scaled to unit length."""
     out = jnp.stack(product4(components(q), components(other)))
     return out / jnp.sqrt(jnp.sum(out * out))

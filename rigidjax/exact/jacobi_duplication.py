@@ -1,14 +1,16 @@
-"""The three elliptic functions of a free body, by scaling and doubling; half their period.
+"""Compute the three elliptic functions of a free body by scaling and doubling, and half their
+period.
 
 A free body needs only the solution of
 
     S' = C D,   C' = −p S D,   D' = −q S C,   S(0) = 0, C(0) = D(0) = 1,
 
-with `C² = 1 − p S²`, `D² = 1 − q S²`: sn, cn, dn in a scaling that needs neither `p > q` nor
-`p, q ≠ 0`. p = q = 0 is a sphere, or rest; p = q the separatrix; q = 0 a symmetric top or a spin
-about an axis. Start from the Taylor series at `u/2^N` and apply the duplication formula N times
-(DLMF 22.6(ii)). Three things keep the digits: p − q is a separate number; while S is small, `1 − C`
-is doubled instead, `1 − C(2u) = 2pS²D²/(C² + pS²D²)`; denominators are sums of positive terms.
+with `C² = 1 − p S²` and `D² = 1 − q S²`. These functions are sn, cn, dn in a scaling that needs
+neither `p > q` nor `p, q ≠ 0`. For p = q = 0 the body is a sphere, or at rest; p = q is the
+separatrix; q = 0 is a symmetric top, or a spin about an axis. The computation starts from the
+Taylor series at `u/2^N` and applies the duplication formula N times (DLMF 22.6(ii)). Three measures
+keep the digits. The difference p − q is a separate number. While S is small, `1 − C` is doubled
+instead of C, by `1 − C(2u) = 2pS²D²/(C² + pS²D²)`. All denominators are sums of positive terms.
 """
 
 import functools
@@ -34,7 +36,7 @@ class Elliptic(NamedTuple):
 
 
 class Modulus(NamedTuple):
-    """Hold p, q and `gap` = p − q, computed without subtracting them; 1/s²."""
+    """Hold p, q and `gap` = p − q, which is computed without subtracting q from p; all in 1/s²."""
 
     p: Scalar
     q: Scalar
@@ -42,37 +44,43 @@ class Modulus(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Hold the range and the number of doublings for a dtype."""
+    """Hold the number of doublings and the limits of the motion for one dtype."""
 
-    doublings: int  # from u/2^doublings to u
+    doublings: int  # the number of doublings from u/2^doublings to u
     agm: int  # steps of the arithmetic–geometric mean
     floor: float  # |p − q|/max(p, q) at and below which the motion is the separatrix's
-    rest: float  # √max(p, q) |u| beyond which the separatrix is at rest
+    rest: float  # √max(p, q) |u| beyond which a motion on the separatrix rests
 
 
 def dtype_limits(dtype) -> Limits:
-    """Return the limits of a dtype.
+    """Return the limits of a dtype, float32 or float64.
 
-    The doublings reach the longest quarter period, `ln(4/√floor)`; C⁴ must not underflow.
+    The doublings reach the longest quarter period, `ln(4/√floor)`, and at this time C⁴ must not
+    underflow.
     """
     wide = dtype == jnp.float64
     return Limits(9, 11, 1e-64, 75.0) if wide else Limits(7, 9, 1e-33, 20.0)
 
 
 def is_endless(m: Modulus) -> Bool[Array, ""]:
-    """Say whether the motion has no period: the separatrix, a sphere, rest."""
+    """Return whether the motion has no period: on the separatrix, for a sphere, and at rest."""
     return jnp.abs(m.gap) <= dtype_limits(m.p.dtype).floor * jnp.maximum(m.p, m.q)
 
 
 def clip_at_rest(u: Scalar, m: Modulus) -> Scalar:
-    """Return the reduced time u; on the separatrix clip it to the time the motion takes to rest."""
+    """Return the reduced time u, on the separatrix clipped to the time after which the motion is at
+    rest.
+    """
     big = jnp.maximum(m.p, m.q)
     rest = dtype_limits(u.dtype).rest / jnp.sqrt(jnp.where(big > 0, big, 1.0))
     return jnp.where(is_endless(m) & (big > 0), jnp.clip(u, -rest, rest), u)
 
 
 def duplicate(f: Elliptic, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
-    """Return S, C, D and ξ at 2u from `f` at u; ξ(2u) = 2ξ + arctan(B/A), a complex product."""
+    """Return S, C, D and ξ at 2u from `f`, their values at u.
+
+    The phase is ξ(2u) = 2ξ + arctan(B/A), computed as a product of complex numbers.
+    """
     S, C, D, x, y = f
     s, cc, dd = S * S, C * C, D * D
     ps, qs = m.p * s, m.q * s
@@ -90,14 +98,15 @@ def duplicate(f: Elliptic, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
 
 
 def taylor_series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
-    """Sum the Taylor series at a time h, to round-off for `√max(p, q) |h| ≤ 0.15`.
+    """Compute S, C, D and ξ at a time h by Taylor series, exact to round-off for
+    `√max(p, q) |h| ≤ 0.15`.
 
-    In float32 the bound is 0.31.
+    In float32 the bound is 0.31. For `mu` and `turn` see `elliptic`.
     """
     hh = h * h
     p, q = m.p * hh, m.q * hh
     e, f = p + q, p * q
-    # The smallest first, which is summed first.
+    # The smallest term comes first, because it must be summed first.
     terms = [
         -e * f * f * (e * e * (258821 / 3027024000) + f * (13511 / 36036000)),
         e * e * (e * e * f * (8303 / 518918400) + f * f * (9481 / 14414400))
@@ -120,8 +129,8 @@ def taylor_series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
 def growth_integral(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
     """Return ∫ S²/(1 + μS²) du = ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)) for a small S.
 
-    It is a power series in S, by the recurrence of Legendre's polynomials for the roots and another
-    for 1 + μS².
+    It is a power series in S. The recurrence of Legendre's polynomials gives the terms of the
+    roots, and a second recurrence those of 1/(1 + μS²).
     """
     s = S * S
     e, f, w = (m.p + m.q) * s, (m.p * m.q) * (s * s), mu * s
@@ -135,57 +144,63 @@ def growth_integral(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
 
 
 def elliptic(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
-    """Return S, C, D at u and the phase `ξ = turn ∫₀ᵘ S²/(1 + μS²) du`.
+    """Return S, C, D at u, and the phase `ξ = turn ∫₀ᵘ S²/(1 + μS²) du` with μ = `mu`.
 
-    `0 ≤ mu ≤ √(pq)`; `turn` = κμ times a rate. `u` is reduced: |u| at most a quarter period.
+    `mu` lies between 0 and √(pq), and `turn` is κμ times a rate. `u` is reduced: |u| is at most a
+    quarter period.
     """
     n = dtype_limits(u.dtype).doublings
     f = taylor_series(u * 2.0**-n, m, mu, turn)
-    # A loop, not nine copies: compiles eight times sooner.
+    # A loop compiles eight times sooner than nine copies of its body.
     return jax.lax.fori_loop(0, n, lambda _, g: duplicate(g, m, mu, turn), f)
 
 
 class HalfPeriod(NamedTuple):
-    """Hold what the motion gathers in half a period."""
+    """Hold the time, the phase and the mean of S² of half a period."""
 
     time: Scalar  # infinite on the separatrix
-    phase: Scalar  # ξ
-    mean: Scalar  # of S²
+    phase: Scalar  # the phase ξ at the end of the half period
+    mean: Scalar  # the mean of S²
 
 
 def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
-    """Return the least T > 0 with S(T) = 0, and the phase and the mean of S² until then.
+    """Return the least T > 0 with S(T) = 0, and the phase at T and the mean of S² from 0 to T.
 
-    With λ² = max(p, q), a₀ = 1, b₀ = √|p − q|/λ: `T = π/(λ agm(a₀, b₀))` (DLMF 19.8.5), and with
-    `c₁ = (a₀ − b₀)/2, c_{n+1} = c_n²/(4 a_{n+1})` the mean `⟨S²⟩ = (½ + Σ 2^{n−1} c_n²/w)/λ²`,
-    w = min(p, q)/λ² (19.8.6 divided through by w, so that w = 0 is an ordinary value). The phase is
-    the complete integral of the third kind, 19.8.7–19.8.9, with μ instead of −α².
+    With λ² = max(p, q), a₀ = 1 and b₀ = √|p − q|/λ, the time is `T = π/(λ agm(a₀, b₀))` (DLMF
+    19.8.5). With `c₁ = (a₀ − b₀)/2` and `c_{n+1} = c_n²/(4 a_{n+1})`, the mean is
+    `⟨S²⟩ = (½ + Σ 2^{n−1} c_n²/w)/λ²`, where w = min(p, q)/λ² (DLMF 19.8.6 divided by w, so that w
+    = 0 is an ordinary value). The phase is the complete integral of the third kind, DLMF
+    19.8.7–19.8.9, with μ instead of −α².
     """
     big, small = jnp.maximum(m.p, m.q), jnp.minimum(m.p, m.q)
     at_rest = big <= 0
     big = jnp.where(at_rest, 1.0, big)
     gap = jnp.abs(m.gap)
     endless = is_endless(m)
-    # In units of λ: XLA may gather the divisors below into one product, which must not underflow.
+    # Compute in units of λ: XLA may multiply the divisors below into one product, which must not
+    # underflow.
     w = small / big
     a, b = jnp.ones_like(big), jnp.sqrt(jnp.where(endless, 1.0, gap / big))
-    # c₁ = w/(2(a₀ + b₀)) exactly; `ratio` is c_n²/w and `c` is c_n.
+    # The equality c₁ = w/(2(a₀ + b₀)) is exact; `ratio` is c_n²/w and `c` is c_n.
     c = w / (2.0 * (a + b))
     ratio = w / (4.0 * (a + b) ** 2)
-    # A loop: written out, eleven steps take as long to compile as the rest of the motion.
+    # Use a loop: eleven steps written out take as long to compile as the rest of the motion.
     point, half, one = jnp.sqrt(1.0 + mu / big), jnp.full_like(a, 0.5), jnp.ones_like(a)
     start = (a, b, c, ratio, half, point, one, one)
     a, *_, total, _, _, sum_parts = jax.lax.fori_loop(
         0, dtype_limits(a.dtype).agm, _mean_step, start
     )
     time = math.pi / (a * jnp.sqrt(big))
-    # turn = κμ h; over a quarter ξ = κ h (π/2a) ½ μ/(λ² + μ) Σ.
+    # With turn = κμ h, the phase of a quarter period is ξ = κ h (π/2a) ½ μ/(λ² + μ) Σ.
     phase = turn * time * 0.5 / (big + mu) * sum_parts
     return HalfPeriod(jnp.where(endless, jnp.inf, time), phase, total / big)
 
 
 def _mean_step(_: Array, state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-    """Take a step of the arithmetic–geometric mean and of its sums; `ratio` carries 2^{n−1}."""
+    """Return the state after one step of the arithmetic–geometric mean and of its sums.
+
+    In the state, `ratio` contains the factor 2^{n−1} of step n.
+    """
     a, b, c, ratio, total, point, part, sum_parts = state
     square, product = point * point, a * b
     part = 0.5 * part * (square - product) / (square + product)

@@ -1,14 +1,15 @@
-"""First derivatives of the free momentum in closed form, in principal axes.
+"""Compute the first derivatives of the free momentum in closed form, in principal axes.
 
-With f = S/E (E = D or C, whichever has no zero) and `Y₂ = ∫ S²`, `Y = ∫ f²`, at fixed initial data
-δS, δC, δD follow from `∂τ/∂p = ½ ∫ S²/C² …` without any division by p, q or p − q:
+Let E be that one of D and C which has no zero, f = S/E, `Y₂ = ∫ S²` and `Y = ∫ f²`. At fixed
+initial data the changes δS, δC, δD follow from `∂τ/∂p = ½ ∫ S²/C² …`, without any division by p, q
+or p − q:
 
     θ = δt + ½ δ|p−q| Y + ½ δmax(p,q) Y₂
     δS = C D θ − ½ S³ δmax,   δC = −p S D θ − ½ S² C δmax (+ ½ S² δ|p−q|/C if q > p),   …
 
-Both integrals double: `Y(2u) = 2Y(u) + f(u)² f(2u)`, and grow by their means over whole periods.
-Off-diagonal entries of K enter through the divided differences of T = diag(D, 1, C), which the last
-doubling gives without a quotient. These are the derivatives of `sigma_form`.
+Both integrals double, as in `Y(2u) = 2Y(u) + f(u)² f(2u)`, and grow by their means in each whole
+period. Off-diagonal entries of K enter through the divided differences of T = diag(D, 1, C), which
+the last doubling gives without a quotient. These derivatives are equal to those of `sigma_form`.
 """
 
 from typing import NamedTuple
@@ -30,7 +31,7 @@ from rigidjax.exact.sigma_form import Differences, invariants
 
 
 class Integrals(NamedTuple):
-    """Hold the elliptic functions at some time, and the integrals Y₂ and Y until then."""
+    """Hold the elliptic functions at some time u, and the integrals Y₂ and Y from 0 to u."""
 
     f: Elliptic
     y2: Scalar
@@ -48,10 +49,11 @@ def jacobian_and_integral(
 ) -> tuple[tuple, Six]:
     """Return the derivatives of Π(t) − Π(0) as three rows, and G = ∫ Π Πᵀ dt.
 
-    The columns are the derivatives by d12, d23, k12, k13, k23, Π(0), k33 and t.
+    The columns are the derivatives with respect to d12, d23, k12, k13, k23, Π(0), k33 and t.
 
-    Off-diagonal entries must be zero. `half_time_integrals` at half of a time that was reduced by
-    `halves` half periods, `whole_periods` in all, its C and D as in `body`; `mean` of S².
+    The off-diagonal entries in `body` must be zero. `half_time_integrals` are taken at half of the
+    reduced time, with C and D in the labelling of `body`. The time was reduced by `halves` half
+    periods, together of the length `whole_periods`. `mean` is the mean of S².
     """
     d12, d13, d23 = body[:3]
     p1, p2, p3 = momentum
@@ -64,7 +66,7 @@ def jacobian_and_integral(
     grown2 = after.y2 + whole_periods * mean
     grown = after.y + whole_periods * (1.0 - top * mean) / jnp.where(halves == 0, 1.0, jnp.abs(gap))
 
-    # Divided differences of T = diag(D, 1, C) by k12, k13, k23.
+    # These are the divided differences of T = diag(D, 1, C) by k12, k13, k23.
     s = half_time_integrals.f.S * half_time_integrals.f.S
     cc, dd = (
         half_time_integrals.f.C * half_time_integrals.f.C,
@@ -79,7 +81,8 @@ def jacobian_and_integral(
     ss, tt = S * S, jnp.where(three, D, C)
     rw = 1.0 / (tt * tt + ss * z)
     m1, m2, m3 = y1 * rw, y2 * rw, y3 * rw
-    # For short times the values minus 1, without subtraction: only the small parts of C, D and W.
+    # For short times take the values minus 1, without a subtraction: only the small parts of C, D
+    # and W.
     w1 = ss * (z - jnp.where(three, q, p))
     short = jnp.abs(w1) < 0.5
     c1 = jnp.where(C > 0, -p * ss / (1.0 + jnp.abs(C)), C - 1.0)
@@ -131,7 +134,8 @@ def jacobian_and_integral(
 
     rows = jax.vmap(lambda e: tangent(*e))(jnp.eye(10, dtype=t.dtype))
 
-    # G: its 22 entry, the other two by ∫A₁ and ∫A₃, and the off-diagonal ones.
+    # The 22 entry of G comes first, then the other two diagonal entries by ∫A₁ and ∫A₃, then the
+    # off-diagonal entries.
     g22 = A1 * A3 * grown2 + (S * C * D * p2 * p2 + ss * p2 * u2) * rw
     still = d13 == 0
     rest = (g22 - p2 * p2 * t) / jnp.where(still, 1.0, d13)
@@ -144,10 +148,12 @@ def jacobian_and_integral(
 
 
 def integrals(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
-    """Return what `elliptic` does, and the integrals Y₂ and Y from 0 to u."""
+    """Return the elliptic functions at u as `elliptic` does, and the integrals Y₂ and Y from 0 to
+    u.
+    """
     n = dtype_limits(u.dtype).doublings
     f = taylor_series(u * 2.0**-n, m, mu, turn)
-    # S²/D² and S²/C² are S²/(1 + μS²) for μ = −q and −p.
+    # The functions S²/D² and S²/C² are S²/(1 + μS²) with μ = −q and μ = −p.
     low = jnp.where(m.gap > 0, -m.q, -m.p)
     first = Integrals(f, growth_integral(f.S, m, jnp.zeros_like(u)), growth_integral(f.S, m, low))
     return jax.lax.fori_loop(0, n, lambda _, g: double_argument(g, m, mu, turn), first)

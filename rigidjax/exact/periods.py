@@ -1,4 +1,4 @@
-"""The two periods of a free body."""
+"""Compute the two periods of a free body: of its body rates, and of its precession."""
 
 import math
 
@@ -18,14 +18,19 @@ from rigidjax.exact.principal_axes import components_along, principal_frame
 
 
 def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
-    """Return the time after which the body rates repeat: a rotation about the circulated axis.
+    """Return the time after which the body rates repeat, one rotation about the axis that the
+    momentum circles.
 
-    This is the time in which the angular momentum circles the axis of the smallest or largest
-    moment in the body frame (5.41 days about the long axis for 4179 Toutatis); for a spin about a
-    stable axis the period of small wobbles; infinite on the separatrix, for a sphere and at rest.
+    In this time the angular momentum goes once round the axis of the smallest or largest moment in
+    the body frame (5.41 days about the long axis for 4179 Toutatis). For a spin about a stable axis
+    it is the period of small wobbles. It is infinite on the separatrix, for a sphere and at rest.
 
-    **Arguments:** `inertia` of the body about its centre of mass (kg m²); `omega0` (3,) Ω at any
-    moment, rad/s, body frame. **Returns** a scalar, s.
+    **Arguments:**
+
+    - `inertia`: of the body about its centre of mass, kg m².
+    - `omega0`: (3,) Ω at any moment, rad/s, body frame.
+
+    **Returns** the period, a scalar, s.
 
     `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, eᵢ the roots in `rigidjax.exact.sigma_form` (DLMF
     19.8.5; Landau and Lifshitz, Mechanics, eq 37.11).
@@ -40,11 +45,13 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
 
 def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
-    """Return the mean time in which the circulated axis turns once about the angular momentum.
+    """Return the mean time in which the axis that the momentum circles turns once about the angular
+    momentum.
 
-    The axis that the momentum circles in the body turns about the fixed angular momentum; this is
-    2π over its mean rate (7.35 days for the long axis of 4179 Toutatis). If no axis is circulated
-    (separatrix, sphere) it is the limit, `2π I₂/|L|`. It is infinite at rest.
+    This axis of the body turns about the angular momentum, which is fixed in space; the result is
+    2π over the mean rate of this turn (7.35 days for the long axis of 4179 Toutatis). If the
+    momentum circles no axis (separatrix, sphere) the result is the limit, `2π I₂/|L|`. It is
+    infinite at rest.
 
     **Arguments:** as for `body_period`. **Returns** a scalar, s.
 
@@ -61,7 +68,7 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
 
 def _checked_tensor_and_rate(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
-    """Check body and rate; return the tensor and Ω in its dtype."""
+    """Return the inertia tensor, and Ω in the dtype of the tensor, after checks of both."""
     _checks.require_single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     tensor = validation.check_body(inertia, inertia.tensor, None, throw=False).tensor
     return tensor, _checks.array_of_shape(omega0, (3,), "omega0").astype(tensor.dtype)
@@ -69,7 +76,7 @@ def _checked_tensor_and_rate(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, 
 
 @jax.jit
 def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
-    """Return the body period and the precession period, from one program."""
+    """Return the body period and the precession period, both computed in one program."""
     exponent = exponent_of(omega)
     moments, axes = principal_frame(times_power_of_two(tensor, -exponent_of(tensor)))
     momentum = matvec(moments, components_along(axes, times_power_of_two(omega, -exponent)))
@@ -77,7 +84,8 @@ def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
     v = sigma_form.invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
     endless = is_endless(jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap)))
-    # The branch not taken gets other inputs if there is no period, so that no derivative is NaN.
+    # If there is no period, the branch that is not taken gets other inputs, so that no derivative
+    # is NaN.
     one, zero = jnp.ones_like(h), jnp.zeros_like(h)
     other = (one, 2 * one, 3 * one, zero, zero, zero), (one, zero, zero)
     safe_moments, safe_momentum = jax.tree.map(
@@ -95,7 +103,9 @@ def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
 
 @jax.custom_jvp
 def _precession(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
-    """Return the angle of the circulated axis about the momentum in one period of body rates."""
+    """Return the angle by which the circled axis turns about the momentum in one `period` of the
+    body rates.
+    """
     body, k, _ = reciprocal(moments, momentum)
     v = sigma_form.invariants(body, momentum)
     about_three, h = v.a2 > 0, jnp.sqrt(v.h2)

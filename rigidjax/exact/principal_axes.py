@@ -1,4 +1,4 @@
-"""Principal axes as a fixed frame: chosen once by value, never differentiated.
+"""Compute principal axes as a fixed frame, which is chosen by value and never differentiated.
 
 In this frame the off-diagonal entries of the inertia are exact zeros that carry the tangents.
 """
@@ -10,14 +10,17 @@ from rigidjax._types import Mat3, Scalar, Vec3
 from rigidjax.exact.components3 import Six, Triple
 from rigidjax.rotation.barrier import batch_as, one_kernel
 
-# Cyclic Jacobi converges quadratically; 3×3 needs four or five sweeps from anywhere.
+# Jacobi's cyclic method converges quadratically; a 3×3 matrix needs four or five sweeps from
+# anywhere.
 _SWEEPS = 6
 
 
 def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
-    """Return the inertia in its principal axes, ascending, and these axes as columns (a rotation).
+    """Return the inertia in its principal axes, in ascending order, and the matrix A of these axes
+    as columns (a rotation).
 
-    By Jacobi's method, in which small moments keep their digits; A is held fixed in derivatives.
+    The method is Jacobi's, in which small moments keep their digits. A is held fixed in
+    derivatives.
     """
     columns, moments = _jacobi(jax.lax.stop_gradient(tensor))
     axes = jnp.stack([jnp.stack(row) for row in columns])
@@ -26,16 +29,19 @@ def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
 
 @jax.custom_jvp
 def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
-    """Return `AᵀIA`, A the principal `axes` of I: diagonal in value, full in its derivative."""
+    """Return `AᵀIA`, where A = `axes` are principal axes of I = `tensor`.
+
+    Its value is the diagonal matrix of `moments`; its derivative is a full symmetric matrix.
+    """
     zero = jnp.zeros_like(tensor[0, 0])
     return batch_as((*moments, zero, zero, zero), (tensor, axes, moments))
 
 
 @tensor_in_axes.defjvp
 def _tensor_in_axes_jvp(primals, tangents):
-    # The change of a symmetric matrix, so that a gradient is symmetric.
+    # Take the change of a symmetric matrix, so that a gradient is symmetric.
     axes, change = primals[1], 0.5 * (tangents[0] + tangents[0].T)
-    # Summed, not a product of matrices: on a GPU that is rounded to ten bits in float32.
+    # Sum products of entries: on a GPU a product of matrices is rounded to ten bits in float32.
     turned = jnp.sum(axes[:, :, None] * change[:, None], axis=0)
     m = jnp.sum(turned[:, None] * axes.T[None], axis=2)
     return tensor_in_axes(*primals), (m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2])
@@ -56,9 +62,12 @@ def combine_columns(axes: Mat3, v: Triple) -> Triple:
 
 @one_kernel
 def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
-    """Return the rows of the matrix whose columns are principal axes, and the moments (Jacobi)."""
+    """Return the rows of the matrix whose columns are principal axes of m, and the moments, by
+    Jacobi's method.
+    """
     one, zero = jnp.ones_like(m[0, 0]), jnp.zeros_like(m[0, 0])
-    # Nearly equal moments keep their differences: a shift that is exact by Sterbenz' lemma.
+    # Subtract a shift from nearly equal moments: it is exact by Sterbenz' lemma, and so the moments
+    # keep their differences.
     least = jnp.minimum(jnp.minimum(m[0, 0], m[1, 1]), m[2, 2])
     most = jnp.maximum(jnp.maximum(m[0, 0], m[1, 1]), m[2, 2])
     shift = jnp.where(2.0 * least >= most, least, zero)
@@ -67,11 +76,12 @@ def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     axes = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
 
     def rotate(_, state):
-        # Always the last two; then the axes are counted on by one: one rotation to compile.
+        # Rotate always the last two axes, then move each axis on by one place: so only one rotation
+        # is compiled.
         d, o, axes = _rotate(*state)
         return tuple((x[1], x[2], x[0]) for x in (d, o, axes))
 
-    # `axes` are columns: axes[i] is the i-th axis.
+    # Each entry axes[i] is the i-th axis, a column of the matrix.
     d, _, axes = jax.lax.fori_loop(0, 3 * _SWEEPS, rotate, (d, o, axes))
     for i, j in ((0, 1), (1, 2), (0, 1)):
         d, axes = _exchange_to_ascending(d, axes, i, j)
@@ -80,7 +90,9 @@ def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
 
 
 def _orthonormalise(a):
-    """Make a product of many rotations one to round-off again: A(3 − AᵀA)/2 (Higham 1986)."""
+    """Return the matrix A(3 − AᵀA)/2, which makes a product A of many rotations orthonormal to
+    round-off again (Higham 1986).
+    """
     excess = [
         [
             a[0][i] * a[0][j] + a[1][i] * a[1][j] + a[2][i] * a[2][j] - float(i == j)
@@ -95,12 +107,17 @@ def _orthonormalise(a):
 
 
 def _rotate(d, o, axes):
-    """Annihilate the entry of the last two axes; o[k] is the one that does not touch axis k."""
+    """Return the state after a rotation of the last two axes that makes their off-diagonal entry
+    zero.
+
+    `d` holds the diagonal entries, `o[k]` the off-diagonal entry that does not belong to axis k,
+    and `axes` the axes.
+    """
     (first, second, third), (x, y, z), (u, v, w) = d, o, axes
     none = x == 0
     cot = 0.5 * (third - second) / jnp.where(none, 1.0, x)
     size = jnp.abs(cot)
-    # √(1 + cot²) overflows in float32 for tiny x: there t = 1/(2 cot).
+    # For a tiny x, √(1 + cot²) overflows in float32; then t = 1/(2 cot).
     t = 1.0 / (size + jnp.where(size > 1e15, size, jnp.sqrt(1.0 + jnp.minimum(size, 1e15) ** 2)))
     t = jnp.where(none, 0.0, jnp.where(cot < 0, -t, t))
     c = 1.0 / jnp.sqrt(1.0 + t * t)
@@ -108,12 +125,14 @@ def _rotate(d, o, axes):
     turned = [tuple(c * p - s * q for p, q in zip(v, w, strict=True))]
     turned.append(tuple(s * p + c * q for p, q in zip(v, w, strict=True)))
     d = (first, second - t * x, third + t * x)
-    # Entry (first, second) is z, entry (first, third) is y.
+    # The off-diagonal entry (first, second) is z, and the entry (first, third) is y.
     return d, (jnp.zeros_like(x), s * z + c * y, c * z - s * y), (u, *turned)
 
 
 def _exchange_to_ascending(d, axes, i, j):
-    """Exchange axes i and j (turning one round) unless d[i] ≤ d[j]."""
+    """Return the diagonal and the axes with axes i and j exchanged, one of them reversed, unless
+    d[i] ≤ d[j].
+    """
     wrong = d[i] > d[j]
     d, axes = list(d), list(axes)
     d[i], d[j] = jnp.where(wrong, d[j], d[i]), jnp.where(wrong, d[i], d[j])

@@ -1,15 +1,16 @@
-"""The free motion as a smooth function of the whole inertia tensor, for its derivatives.
+"""Compute the free motion as a smooth function of the whole inertia tensor, for its derivatives.
 
-Principal axes are not a smooth function of a tensor; the motion is. With `K = I⁻¹`, Π the body
+Principal axes are not a smooth function of a tensor, but the motion is. With `K = I⁻¹`, Π the body
 momentum, `E₂ = Π·KΠ` and `h = |Π|`, let
 
     E = E₂ K + h² adj(K)      (symmetric; commutes with K)
 
-and let σ(u) be a scalar, T(u) a matrix that commutes with K, both fixed up to a common factor, with
+Let σ(u) be a scalar and T(u) a matrix that commutes with K, both fixed up to a common factor, with
 
     T² = w 1 − σ² E,   T(2u) = T⁴ − σ⁴ χ'(E),   σ(2u) = 2 σ det T,   χ the characteristic polynomial
 
-(Weierstrass's sigma functions: T has eigenvalues σ₁, σ₂, σ₃). Then the addition theorem reads
+These are Weierstrass's sigma functions: T has the eigenvalues σ₁, σ₂, σ₃. The addition theorem then
+reads
 
     Π(t) ∝ adj(T) Π + σ T (Π × KΠ),   T and σ at t,   |Π(t)| = h
 
@@ -41,7 +42,9 @@ from rigidjax.rotation.barrier import barrier
 
 
 class Differences(NamedTuple):
-    """Hold K = I⁻¹ without its trace: differences of its diagonal, and off-diagonal entries."""
+    """Hold K = I⁻¹ without its trace, as differences of its diagonal entries and as off-diagonal
+    entries.
+    """
 
     d12: Scalar
     d13: Scalar
@@ -52,7 +55,11 @@ class Differences(NamedTuple):
 
 
 class Invariants(NamedTuple):
-    """Hold the parts of E − E₂₂ 1; `a1, a2, a3` are a₁h² − E₂, a₂h² − E₂, E₂ − a₃h²."""
+    """Hold the entries of E − E₂₂ 1 and the numbers that they are made of.
+
+    The numbers `a1`, `a2`, `a3` are a₁h² − E₂, a₂h² − E₂ and E₂ − a₃h², where aᵢ are the diagonal
+    entries of K.
+    """
 
     h2: Scalar
     a1: Scalar
@@ -67,7 +74,7 @@ class Invariants(NamedTuple):
 
 
 class Sigma(NamedTuple):
-    """Hold σ, T, adj T, det T and Y at some time; T is scaled so that T₂₂ = 1."""
+    """Hold σ, T, adj T, det T and Y at some time, where T is scaled so that T₂₂ = 1."""
 
     s: Scalar
     t: Six
@@ -77,7 +84,7 @@ class Sigma(NamedTuple):
 
 
 def invariants(body: Differences, momentum: Triple) -> Invariants:
-    """Return the invariants of a motion from K and Π(0)."""
+    """Return the invariants of a motion from K in `body` and Π(0) = `momentum`."""
     d12, d13, d23, k12, k13, k23 = body
     p1, p2, p3 = momentum
     x1, x2, x3 = p1 * p1, p2 * p2, p3 * p3
@@ -103,30 +110,31 @@ def invariants(body: Differences, momentum: Triple) -> Invariants:
     )
 
 
-# Doublings beyond `dtype_limits`, so that the series of `sigma_near_zero` have two terms.
+# These doublings are added to those of `dtype_limits`, so that the series of `sigma_near_zero` need
+# only two terms.
 _MORE = 10
 
 
 def sigma_near_zero(u: Scalar, v: Invariants) -> Sigma:
-    """Return σ, T, Y at a minute u: T = √(1 − x), x = σ²E, to second order in x."""
+    """Return σ, T and Y at a minute u, from T = √(1 − x) with x = σ²E, to second order in x."""
     uu, zero = u * u, jnp.zeros_like(u)
     c1 = (v.p + v.q) * uu
     s = barrier(u * (1.0 - c1 / 6))
     x = barrier(_scale((v.q, zero, v.p, v.e12, v.e13, v.e23), s * s))
     t = tuple(-0.5 * (a + 0.25 * b) for a, b in zip(x, commuting_product(x, x), strict=True))
-    # Y = ⅓u³ (1 − c₁/5 + 3x/5).
+    # The integral is Y = ⅓u³ (1 − c₁/5 + 3x/5).
     y = _scale(_add_scalar(_scale(x, 0.6), 1.0 - 0.2 * c1), u * uu / 3)
     return _scaled_sigma(s, _add_scalar(t, 1.0), y)
 
 
 def double_sigma(f: Sigma, v: Invariants) -> Sigma:
-    """Return σ, T, Y at 2u from `f`, their values at u."""
+    """Return σ, T and Y at 2u from `f`, their values at u."""
     t1, t2, t3, t12, t13, t23 = f.t
     s = f.s
     ss = s * s
     q, p, gap, e12, e13, e23 = v.q, v.p, v.gap, v.e12, v.e13, v.e23
     s12, s13, s23 = t12 * t12, t13 * t13, t23 * t23
-    # M = T²: its off-diagonal entries are −σ²E exactly.
+    # The off-diagonal entries of M = T² are exactly −σ²E.
     m11, m22, m33 = t1 * t1 + s12 + s13, t2 * t2 + s12 + s23, t3 * t3 + s13 + s23
     m12, m13, m23 = -ss * e12, -ss * e13, -ss * e23
     m11, m22, m33, m12, m13, m23 = barrier((m11, m22, m33, m12, m13, m23))
@@ -151,7 +159,7 @@ def double_sigma(f: Sigma, v: Invariants) -> Sigma:
     n13 = 2.0 * (m13 * m22 - m12 * m23)
     n23 = 2.0 * (m23 * m11 - m12 * m13)
     after = _scaled_sigma(2.0 * s * f.det, (n11, n22, n33, n12, n13, n23), f.y)
-    # Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u).
+    # The integral doubles as Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u).
     before = barrier(_scale(f.adjugate, s / f.det))
     more = commuting_product(
         barrier(commuting_product(before, before)), _scale(after.adjugate, after.s / after.det)
@@ -162,9 +170,10 @@ def double_sigma(f: Sigma, v: Invariants) -> Sigma:
 class Divisor(NamedTuple):
     """Hold the parts of W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²) that do not depend on Π.
 
-    `first` says whether i is 1; else it is 3. For these two i, W is a sum of positive terms. The
-    second factor is, with K without its diagonal in KΠ,
-    `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13 Π₁ Π₃ + |KΠ|² − less`, and `square` is (T²)ᵢᵢ.
+    The index i is 1 if `first` is true, else 3; for these two, W is a sum of positive terms. The
+    number `square` is (T²)ᵢᵢ. The factor of σ² is
+    `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13 Π₁ Π₃ + |KΠ|² − less`, where K in KΠ is taken without its
+    diagonal.
     """
 
     first: Array
@@ -176,7 +185,7 @@ class Divisor(NamedTuple):
 
 
 def divisor(body: Differences, v: Invariants, f: Sigma) -> Divisor:
-    """Return the parts of W that do not depend on Π."""
+    """Return the parts of W (see `Divisor`) that do not depend on Π."""
     one, three = (body.d12, body.d12, body.k12), (body.d23, -body.d23, -body.k23)
     first, (t1, _, t3, t12, t13, t23) = v.gap > 0, f.t
     d, slant, k = (jnp.where(first, a, b) for a, b in zip(one, three, strict=True))
@@ -189,10 +198,12 @@ def divisor(body: Differences, v: Invariants, f: Sigma) -> Divisor:
 def momentum_and_part(
     body: Differences, w: Divisor, f: Sigma, momentum: Triple
 ) -> tuple[Triple, Six]:
-    """Return Π after the time of `f`, and 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ, W that of `w`."""
+    """Return Π after the time of `f`, and 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ with W from the divisor
+    `w`.
+    """
     p1, p2, p3 = momentum
     d12, d13, d23, k12, k13, k23 = body
-    # K without its diagonal, times Π.
+    # This is K without its diagonal, times Π.
     r1, r2, r3 = barrier((k12 * p2 + k13 * p3, k12 * p1 + k23 * p3, k13 * p1 + k23 * p2))
     u1 = -d23 * p2 * p3 + p2 * r3 - p3 * r2
     u2 = d13 * p1 * p3 + p3 * r1 - p1 * r3
@@ -210,7 +221,9 @@ def momentum_and_part(
 def momentum_and_integral_by_quarters(
     body: Differences, momentum: Triple, v: Invariants, span: Scalar
 ) -> tuple[Triple, Six]:
-    """Return Π after `span`, and ∫ Π Πᵀ dt in four parts: T has no inverse at a quarter period."""
+    """Return Π after the time `span`, and ∫ Π Πᵀ dt, computed in four parts because T has no
+    inverse at a quarter period.
+    """
     f, hh = sigma_at(0.125 * span, v), v.h2
     w = barrier(divisor(body, v, f))
     k12, k13, k23 = (hh * c for c in body[3:])
@@ -224,7 +237,7 @@ def momentum_and_integral_by_quarters(
     )
 
     def take_eighth(i, state):
-        # Each part about its middle.
+        # Each part of the integral is taken about its middle.
         point, total = state
         point, part = momentum_and_part(body, w, f, point)
         odd = i % 2 == 1
@@ -234,26 +247,25 @@ def momentum_and_integral_by_quarters(
 
 
 def sigma_at(u: Scalar, v: Invariants) -> Sigma:
-    """Return σ, T, Y at u: the Taylor series of a small part of u, then doublings."""
+    """Return σ, T and Y at u, from the Taylor series at a small part of u and repeated doubling."""
     n = dtype_limits(u.dtype).doublings + _MORE
     f = sigma_near_zero(u * 2.0**-n, v)
     return jax.lax.fori_loop(0, n, lambda _, g: double_sigma(g, v), f)
 
 
 def period(v: Invariants) -> Scalar:
-    """Return the period of Π: `2π/agm(√(z − x), √(z − y))`, x, y, z the eigenvalues of E.
+    """Return the period of Π, `2π/agm(√(z − x), √(z − y))`, where x, y, z are the eigenvalues of E
+    and z is the largest.
 
-    z is the largest.
-
-    One step of Newton's from the diagonal entry has the derivatives of z to third order; the other
-    two enter through symmetric functions, the first step of the mean.
+    One step of Newton's method from the diagonal entry gives the derivatives of z to third order.
+    The other two eigenvalues enter only through symmetric functions, by the first step of the mean.
     """
     three = v.gap > 0
     top = jnp.where(three, v.p, v.q)
     off = v.e12 * v.e12, v.e13 * v.e13, v.e23 * v.e23
 
     def differences(z):
-        # z − E₁₁ and z − E₃₃ without subtraction where z is one of them.
+        # Compute z − E₁₁ and z − E₃₃ without a subtraction if z is one of these two entries.
         extra = z - top
         return jnp.where(three, v.gap, 0.0) + extra, z, jnp.where(three, 0.0, -v.gap) + extra
 
@@ -271,11 +283,11 @@ def period(v: Invariants) -> Scalar:
 
 
 def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tuple[Triple, Six]:
-    """Return Π(t) and G = ∫₀ᵗ Π Πᵀ dt."""
+    """Return Π(t) and G = ∫₀ᵗ Π Πᵀ dt, from K in `body` and Π(0) = `momentum`."""
     v = barrier(invariants(body, momentum))
     m = jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap))
     endless = is_endless(m)
-    # Dummy invariants keep NaN out of the derivatives if there is no period.
+    # If there is no period, dummy invariants keep NaN out of the derivatives.
     one, zero = jnp.ones_like(t), jnp.zeros_like(t)
     tame = Invariants(one, one, one, one, zero, one, one, zero, zero, zero)
     usual = jax.tree.map(lambda a, b: jnp.where(endless, b, a), v, tame)
@@ -285,7 +297,7 @@ def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
     whole = barrier(period(usual))
     r = 2.0 * clip_at_rest(0.5 * (t - jnp.where(several, count * whole, 0.0)), m)
 
-    # The rest and a whole period.
+    # Compute the reduced time and one whole period in one loop.
     both = jax.tree.map(lambda *a: jnp.stack(a), (v, r), (usual, whole))
     out, g = jax.lax.map(lambda a: momentum_and_integral_by_quarters(body, momentum, *a), both)
     g = tuple(c[0] + jnp.where(several, count * c[1], 0.0) for c in g)
@@ -293,17 +305,17 @@ def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
 
 
 def _scaled_sigma(s: Scalar, t: Six, y: Six) -> Sigma:
-    """Return `Sigma`, with σ and T scaled by one factor so that T₂₂ = 1 in value."""
+    """Return a `Sigma` with σ and T scaled by one factor, so that T₂₂ = 1 in value."""
     r = barrier(1.0 / jax.lax.stop_gradient(t[1]))
     s, t = barrier((s * r, _scale(t, r)))
     return Sigma(s, t, *barrier((adjugate(t), determinant(t))), y)
 
 
 def _scale(m: Six, r) -> Six:
-    """Multiply a symmetric matrix by a number."""
+    """Return the symmetric matrix m times the number r."""
     return tuple(c * r for c in m)
 
 
 def _add_scalar(m: Six, r) -> Six:
-    """Add a number to the diagonal of a symmetric matrix."""
+    """Return the symmetric matrix m with the number r added to its diagonal."""
     return (m[0] + r, m[1] + r, m[2] + r, *m[3:])

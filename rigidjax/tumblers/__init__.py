@@ -1,4 +1,4 @@
-"""Tumbling bodies as points of light: their brightness, and a body from one light curve."""
+"""Compute the brightness of tumbling bodies, and fit the motion of a body to one light curve."""
 
 from rigidjax._names import show
 from rigidjax.tumblers import brightness as brightness, plot as plot

@@ -1,8 +1,9 @@
-"""The brightness of a lit body: ellipsoids in closed form, convex meshes by their faces.
+"""Compute the brightness of a lit body: ellipsoids in closed form, convex meshes by their faces.
 
 The brightness is the light to the observer from all lit and visible surface, `∫ f(μ₀, μ) dA`, where
-μ₀ and μ are the cosines of incidence and emission. Its unit is an area: each scattering law f is
-scaled so that a sphere of radius r at zero phase has π r².
+μ₀ and μ are the cosines of the angles of incidence and emission, and f is the scattering law. Its
+unit is an area: each law f is scaled so that a sphere of radius r at zero phase has the brightness
+π r².
 """
 
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ from rigidjax.tumblers.scattering import (
 def ellipsoid(
     semi_axes: Vector, sun: Vector, observer: Vector, scattering: AbstractScattering | None = None
 ) -> Scalar:
-    """Return the brightness of a triaxial ellipsoid, m²; π r² for a sphere at zero phase.
+    """Return the brightness of a triaxial ellipsoid, m², which is π r² for a sphere at zero phase.
 
     It is differentiable in all numbers, also at zero phase and for a sphere. For many directions
     use `jax.vmap`.
@@ -52,7 +53,7 @@ def ellipsoid(
         unit_direction(sun, "sun").astype(a.dtype),
         unit_direction(observer, "observer").astype(a.dtype),
     )
-    # The fourth power of the axes would overflow: scale them by a power of two.
+    # Scale the axes by a power of two: their fourth power could overflow.
     size = exponent_of(a)
     a = times_power_of_two(a, -size)
     return times_power_of_two(law.of_ellipsoid(jnp.diag(a * a), s, o), 2 * size)
@@ -65,15 +66,19 @@ def mesh(
     observer: Vector,
     scattering: AbstractScattering | None = None,
 ) -> Scalar:
-    """Return the brightness of a convex body, m²: `Σ f(μ₀, μ) area` over lit and visible faces.
+    """Return the brightness of a convex body, m², as the sum `Σ f(μ₀, μ) area` over its lit and
+    visible faces.
 
     For a body that is not convex it is the brightness without shadows. It is differentiable in the
-    vertices and directions; a face at the edge of the light has the derivative of a dark one.
+    vertices and directions; a face at the edge of the light has the derivative of a dark face.
     Source: Kaasalainen and Torppa 2001, Icarus 153:24, doi:10.1006/icar.2001.6673.
 
-    **Arguments:** `vertices`, `faces` as for `rigidjax.shapes.mesh`; `sun`, `observer` and
-    `scattering` as for `ellipsoid`. **Raises:** as `ellipsoid`, and as `rigidjax.shapes.mesh` for
-    faces.
+    **Arguments:**
+
+    - `vertices`, `faces`: as for `rigidjax.shapes.mesh`.
+    - `sun`, `observer`, `scattering`: as for `ellipsoid`.
+
+    **Raises:** the errors of `ellipsoid`, and those of `rigidjax.shapes.mesh` for faces.
 
     >>> corners = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     >>> sides = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]

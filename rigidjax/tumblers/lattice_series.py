@@ -1,7 +1,8 @@
-"""χ² of Fourier series in two frequencies, for very many pairs, from a table of sums.
+"""Compute χ² of Fourier series in two frequencies for very many pairs of frequencies, from a table
+of sums.
 
-The normal equations of a series contain nothing but sums over times at multiples of the two
-frequencies. These are interpolated in a table: a pair then costs no loop over the readings.
+The normal equations of a series contain nothing but sums over the times, at multiples of the two
+frequencies. These sums are interpolated in a table: a pair then costs no loop over the readings.
 """
 
 import functools
@@ -13,21 +14,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-# The highest multiple of the first frequency: a squared brightness is of second order in
-# directions.
+# The highest multiple of the first frequency is two, since a squared brightness is of second order
+# in directions.
 FIRST = 2
-# The table has DENSE entries in 1/span, of which NEAR are used in an interpolation. Times are in an
-# interval of length one: the error is below 1e-8 of the sum of the weights.
+# The table has DENSE entries in a frequency of 1/span, of which NEAR are used in an interpolation.
+# Times are scaled to an interval of length one, and the error is below 1e-8 of the sum of the
+# weights.
 DENSE, NEAR = 16, 8
-# Tables have a multiple of ROWS entries, and pairs come FEW or MANY at a time: few programs to
-# compile. A program takes BATCH pairs at once.
+# Tables have a multiple of ROWS entries, and pairs come FEW or MANY at a time, so that few programs
+# are compiled. A program computes BATCH pairs at once.
 ROWS, BATCH, FEW, MANY = 4096, 32, 256, 2048
-# The largest number of side peaks of the spectral window, and their least height over the main one.
+# At most SIDES side peaks of the spectral window are used, of at least HIGH times the height of the
+# main peak.
 SIDES, HIGH = 2, 0.3
 
 
 class Sums(NamedTuple):
-    """The table of sums over times at the frequencies f = −4/DENSE, −3/DENSE, … in 1/span.
+    """Hold the table of sums over times at the frequencies f = −4/DENSE, −3/DENSE, … in 1/span.
 
     **Fields:** `window` Σ w² exp 2πi f x; `data` Σ w z exp 2πi f x; `total` Σ z². Here x are times
     over the span, less ½, z are values over their noise, and w is one over the noise.
@@ -39,7 +42,7 @@ class Sums(NamedTuple):
 
 
 def sum_table(light: tuple[Array, ...], highest: float) -> Sums:
-    """Return the table up to the frequency `highest`, 1/span.
+    """Return the table of sums up to the frequency `highest`, 1/span.
 
     `light` holds the times over the span, the values over their noise, and one over the noise.
     """
@@ -52,7 +55,7 @@ def sum_table(light: tuple[Array, ...], highest: float) -> Sums:
 
 @jax.jit
 def _table(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
-    """Return the sums `window` and `data` at the frequencies `grid`."""
+    """Return the sums `window` and `data` of `Sums` at the frequencies `grid`."""
 
     def sums_at(f: Array) -> tuple[Array, Array]:
         angle = 2.0 * math.pi * f * (x - 0.5)
@@ -67,7 +70,9 @@ def _table(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
 
 
 def _interpolate(table: Array, f: Array) -> Array:
-    """Return the sums at frequencies f by Lagrange's polynomial through the nearest entries."""
+    """Return the sums at the frequencies f, by Lagrange's polynomial through the nearest entries of
+    `table`.
+    """
     place = jnp.abs(f) * DENSE
     first = jnp.floor(place)
     part = place - first
@@ -86,17 +91,19 @@ def _interpolate(table: Array, f: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnums=2)
 def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pairs"]:
-    """Return χ² of the best series `Σ c_jk exp 2πi (j f₁ + k f₂) t` of each pair (f₁, f₂).
+    """Return χ² of the best series `Σ c_jk exp 2πi (j f₁ + k f₂) t` for each pair (f₁, f₂).
 
-    The pairs (P, 2) are in 1/span; |j| ≤ 2 and |k| ≤ `order`.
+    The `pairs` (P, 2) are in 1/span. The sum has |j| ≤ 2 and |k| ≤ `order`.
     """
     js, ks = np.meshgrid(np.arange(-FIRST, FIRST + 1), np.arange(-order, order + 1), indexing="ij")
     js, ks = js.ravel(), ks.ravel()
     dj, dk = js[None, :] - js[:, None] + 2 * FIRST, ks[None, :] - ks[:, None] + 2 * order
 
     def rows(values: Array, pair: Array, first: int, second: int) -> Array:
-        """Return the sums (2 first + 1, 2 second + 1) at all multiples of both frequencies."""
-        # Sums at opposite frequencies are conjugates: interpolate half of them.
+        """Return the sums (2 first + 1, 2 second + 1) at all multiples of both frequencies of a
+        pair.
+        """
+        # Interpolate half of the sums: those at opposite frequencies are conjugates.
         m, n = np.arange(first + 1.0), np.arange(-second, second + 1.0)
         f = jnp.asarray(m[:, None]) * pair[0] + jnp.asarray(n[None, :]) * pair[1]
         half = _interpolate(values, f)
@@ -116,7 +123,9 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
 
 
 def least_squares_remainder(rows: Array, z: Array) -> tuple[Float[Array, ""], Float[Array, " k"]]:
-    """Return the least `|z − cᵀ rows|²` for rows (k, T), and the coefficients c (k,)."""
+    """Return the least value of `|z − cᵀ rows|²` for rows (k, T), and the coefficients c (k,) of
+    this value.
+    """
     gram, side = rows @ rows.T, rows @ z
     gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(side.size, dtype=z.dtype)
     c = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(gram), side)
@@ -124,13 +133,15 @@ def least_squares_remainder(rows: Array, z: Array) -> tuple[Float[Array, ""], Fl
 
 
 def pad_rows(rows: np.ndarray) -> np.ndarray:
-    """Repeat the first of `rows` up to one of few lengths, so that few programs are compiled."""
+    """Return `rows` followed by copies of the first row, up to one of few lengths, so that few
+    programs are compiled.
+    """
     size = FEW if len(rows) <= FEW else -(-len(rows) // MANY) * MANY
     return np.concatenate([rows, np.repeat(rows[:1], size - len(rows), axis=0)])
 
 
 def lattice_chi2(table: Sums, pairs: np.ndarray, order: int) -> np.ndarray:
-    """Return `lattice_misfits` of any number of pairs (P, 2), as a NumPy array."""
+    """Return `lattice_misfits` for any number of pairs (P, 2), as a NumPy array."""
     out = [np.zeros(0)]
     for first in range(0, len(pairs), MANY):
         chunk = pairs[first : first + MANY]
@@ -140,13 +151,13 @@ def lattice_chi2(table: Sums, pairs: np.ndarray, order: int) -> np.ndarray:
 
 
 def side_peaks(table: Sums, highest: float) -> np.ndarray:
-    """Return the highest side peaks of the spectral window, in 1/span.
+    """Return the positions of the highest side peaks of the spectral window, in 1/span.
 
-    A line that is moved by a side peak gives nearly the same readings.
+    A line that is moved by such a position gives nearly the same readings.
     """
     size = math.ceil(highest * DENSE)
     window = np.abs(np.asarray(table.window))[NEAR // 2 : NEAR // 2 + size]
-    # A peak is away from the main one, and the highest within 1/span on both sides.
+    # A side peak is away from the main one, and is the highest entry within 1/span on both sides.
     inner = range(2 * DENSE, size - DENSE)
     peaks = [k for k in inner if window[k] == window[k - DENSE : k + DENSE + 1].max()]
     peaks = sorted((k for k in peaks if window[k] > HIGH * window[0]), key=lambda k: -window[k])

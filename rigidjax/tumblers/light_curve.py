@@ -1,4 +1,6 @@
-"""The fit of a tumbling body to its light curve alone: all motions that explain it."""
+"""Fit a tumbling body to its light curve alone, and list all motions that explain the light
+curve.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -33,23 +35,24 @@ from rigidjax.tumblers.search import MAGNITUDE, noise_of, relative_flux, search_
 from rigidjax.tumblers.sensor import Brightness, bisector
 from rigidjax.tumblers.two_frequencies import TwoFrequencies, two_frequencies
 
-# Two motions are the same if both periods and both ratios of moments differ relatively by less than
-# SAME, or by less than REACH standard deviations.
+# Two motions count as the same if both periods and both ratios of moments differ relatively by less
+# than SAME, or by less than REACH standard deviations.
 SAME, REACH = np.array([1e-3, 1e-3, 0.05, 0.05]), 5.0
-# A rival explains the data nearly as well if its log-likelihood is lower by less than this.
+# A rival motion explains the data nearly as well if its log-likelihood is lower by less than this
+# number.
 MARGIN = 10.0
-# The standard deviation by which a real body is brighter or fainter than its ellipsoid.
+# A real body is brighter or fainter than its ellipsoid by this standard deviation.
 SHAPE = 0.04
-# A χ² is rejected if it is above its mean by this many standard deviations. A fit alone accepts
-# five, but the errors of a wrong alias may be hardly larger than the noise.
+# A χ² is rejected if it is above its mean by this number of standard deviations. A fit alone
+# accepts five, but the errors of a wrong alias may be hardly larger than the noise.
 CONTENT = 3.0
-# LEAST pairs of frequencies are always tried; others only if their χ² is less than ABOVE over the
-# best one.
+# At least LEAST pairs of frequencies are tried. Further pairs are tried only if their χ² exceeds
+# that of the best pair by less than ABOVE.
 LEAST, ABOVE = 12, 40.0
 
 
 class Alias(eqx.Module):
-    """A motion that a search found.
+    """Hold a motion that a search found.
 
     **Fields:**
 
@@ -79,7 +82,7 @@ class Alias(eqx.Module):
 
 
 class LightCurve(eqx.Module):
-    """The result of `fit_light_curve`.
+    """Hold the result of `fit_light_curve`: the fit of the best motion, and all other motions.
 
     **Fields:**
 
@@ -102,12 +105,12 @@ class LightCurve(eqx.Module):
 
     @property
     def status(self) -> str:
-        """Return both answers in one line; `ok` if both are good and have no reasons."""
+        """Return both answers in one line, which is `ok` if both are good and have no reasons."""
         return answers.status(self.search, self.explanation)
 
     @property
     def ok(self) -> bool:
-        """Return whether the fit is ok, and no other motion explains the data nearly as well."""
+        """Return whether the fit is ok and no other motion explains the data nearly as well."""
         return self.status == "ok"
 
     @property
@@ -128,18 +131,18 @@ def fit_light_curve(
     tolerance: float = 1e-4,
     progress: Callable[[str], Any] | None = None,
 ) -> LightCurve:
-    """Fit the motion of a free tumbler to one light curve, without a guess.
+    """Fit the motion of a free tumbler to one light curve, without an initial guess.
 
     `two_frequencies` finds pairs of frequencies in the squared flux. Each pair is taken as the
-    frequencies of precession and of twice the rotation, in long- and short-axis mode (Kaasalainen
-    2001), over a grid of bodies and phases. A few steps of a fit with the sensor itself follow from
-    the best of these starts; the best ends are then continued to convergence. The result lists all
-    motions found. Motions that differ by a symmetry of the brightness (half turns of the world, see
-    `Brightness`, or of the body about its axes) have the same periods, moments and mode, and count
-    as one.
+    frequency of precession and twice the frequency of rotation, in long- and short-axis mode
+    (Kaasalainen 2001), over a grid of bodies and phases. From the best of these starts a few steps
+    of a fit with the sensor itself follow; the best ends are then continued to convergence. The
+    result lists all motions found. The brightness has symmetries: half turns of the world (see
+    `Brightness`), and half turns of the body about its axes. Motions that differ by one of them
+    have the same periods, moments and mode, and count as one.
 
-    Intervals allow for a real shape by consider parameters (Tapley, Schutz and Born 2004,
-    Statistical Orbit Determination, ch. 6): the brightness has a factor 1 + n·S n, where n is the
+    The intervals allow for a real shape by consider parameters (Tapley, Schutz and Born 2004,
+    Statistical Orbit Determination, ch. 6). The brightness has a factor 1 + n·S n, where n is the
     direction half way between sun and observer, body frame, and the entries of S are independent
     with a standard deviation of 4 %.
 
@@ -149,8 +152,8 @@ def fit_light_curve(
       `level` of the sensor unless it is known.
     - `shortest`: the shortest period of a line in the spectrum, s; `None` for four times the median
       distance of the samples.
-    - `count`: the largest number of pairs of frequencies. If more pairs fit, the search has `not
-      ended`.
+    - `count`: the largest number of pairs of frequencies. If more pairs fit, the search has
+      `not ended`.
     - `tolerance`: as for `rigidjax.identify.fit`.
     - `progress`: a function such as `print`, called with lines of text.
 
@@ -185,7 +188,9 @@ def fit_light_curve(
 
 
 def _only_reading(model: Model) -> Reading:
-    """Return the reading of the model's only sensor; raise an error for another kind of model."""
+    """Return the reading of the model's only sensor, and raise an error for another kind of
+    model.
+    """
     require_one(model)
     if not _checks.is_known(model):
         words = "got traced ones; call it outside of jax.jit, jax.grad and jax.vmap"
@@ -208,9 +213,11 @@ def _only_reading(model: Model) -> Reading:
 
 @eqx.filter_jit
 def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Array]:
-    """Return the logarithms (4,) of both periods and both ratios, and h²/2T over the middle moment.
+    """Return the logarithms (4,) of both periods and both ratios of moments, and the number h²/2T
+    over the middle moment.
 
-    h is the momentum and T the kinetic energy: below 1 the motion is in the long-axis mode.
+    Here h is the momentum and T the kinetic energy. If the last number is below 1, the motion is in
+    the long-axis mode.
     """
     body: Any = model.bodies(x)
     inertia = Inertia(tensor_of(body))
@@ -223,12 +230,14 @@ def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Arr
 
 @eqx.filter_jit
 def _period_derivatives(x: Float[Array, " n"], model: Model) -> Float[Array, "4 n"]:
-    """Return the derivatives of the logarithms of both periods and both ratios."""
+    """Return the derivatives of the logarithms of both periods and both ratios with respect to the
+    free numbers x.
+    """
     return jax.jacfwd(lambda x: _periods_and_ratios(x, model)[0])(x)
 
 
 def _alias(model: Model, x: Array, cost: float) -> Alias:
-    """Return the motion of the free numbers x as an `Alias`."""
+    """Return the motion of the free numbers x, with half of its χ² = `cost`, as an `Alias`."""
     numbers, middle = (np.asarray(v) for v in _periods_and_ratios(x, model))
     rotation, precession, *ratios = np.exp(numbers)
     mode = "long" if middle < 1 else "short"
@@ -237,7 +246,7 @@ def _alias(model: Model, x: Array, cost: float) -> Alias:
 
 
 def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
-    """Return the different motions among the `ends` of a search, the best first."""
+    """Return the different motions among the `ends` of a search, in the order of their misfits."""
     out: list[Alias] = []
     for end in sorted(ends, key=lambda one: float(one.cost)):
         if not np.isfinite(float(end.cost)):
@@ -254,14 +263,16 @@ def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
 
 
 def _is_same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
-    """Return whether two motions have one mode, and logarithms within `tolerance`."""
+    """Return whether two motions have the same mode, and logarithms that differ by less than
+    `tolerance`.
+    """
     one, other = (np.log([m.rotation, m.precession, *m.ratios]) for m in (a, b))
     return a.mode == b.mode and bool((np.abs(one - other) < tolerance).all())
 
 
 @eqx.filter_jit
 def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
-    """Return the directions half way between sun and observer at each time, body frame."""
+    """Return the directions half way between sun and observer at each time, in the body frame."""
     point = model.unpack(x)
     body, state0 = point.body, point.state0
     motion, t = exact.FreeBody(Inertia(tensor_of(body)), state0), model.records.t[0]
@@ -275,7 +286,7 @@ def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
 
 
 def _allow_for_shape(best: Fit) -> Fit:
-    """Return the fit with a covariance that allows for a body that is no ellipsoid."""
+    """Return the fit `best` with a covariance that allows for a body that is no ellipsoid."""
     linear: Any = best.linear
     reading, weight = stacking.pick_records(best.model.records.readings[0], 0), linear.weights[0][0]
     flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
@@ -304,9 +315,9 @@ def _allow_for_shape(best: Fit) -> Fit:
 def _result(
     best: Fit, aliases: list[Alias], pairs: TwoFrequencies, is_incomplete: bool
 ) -> LightCurve:
-    """Return the result from the `best` fit and all motions.
+    """Return the `LightCurve` of the `best` fit and all motions.
 
-    It `is_incomplete` if not all pairs were tried.
+    `is_incomplete` says that not all pairs of frequencies were tried.
     """
     slopes, wider = (
         np.asarray(_period_derivatives(best.derivative_point, best.model)),
@@ -318,12 +329,14 @@ def _result(
         )
         for one in (best, wider)
     )
-    # A search that stopped on its way to the best motion is no rival.
+    # A search that stopped on its way to the best motion does not count as a rival.
     near = np.fmax(SAME, REACH * own)
-    # Compare the costs of the search, which have one noise: the fit may have estimated another.
+    # Compare the costs of the search, which all have the same noise; the fit may have estimated
+    # another.
     first = _alias(best.model, best.x, aliases[0].cost)
     others = [alias for alias in aliases if not _is_same_motion(alias, first, near)]
-    # Misfits count for less if the errors are larger than the noise, or autocorrelated.
+    # A difference of misfits counts for less if the errors are larger than the noise, or
+    # autocorrelated.
     count = int(best.model.records.readings[0].host_mask.sum())
     margin = MARGIN * max(1.0, 2.0 * first.cost / count) * max(best.correlation, 1.0)
     marked = tuple(
@@ -337,7 +350,7 @@ def _result(
         search = Answer(NOT_ALONE, (f"{who} the light curve nearly as well",))
     elif is_incomplete and best.ok:
         search = Answer(NOT_ENDED, ("more pairs of frequencies fit than were tried",))
-    # Outliers dominate χ² under a robust loss.
+    # Do not test χ² under a robust loss, where outliers dominate it.
     above = best.chi2 - best.dof if best.model.loss is None else 0.0
     if search == Answer(FOUND) and best.ok and above > CONTENT * np.sqrt(2.0 * best.dof):
         why = "another motion that was not found, or more noise than given"

@@ -1,4 +1,4 @@
-"""Pictures of light curves: against time, and folded with a period."""
+"""Draw light curves against time, and folded with a period."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +10,7 @@ from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax.plot.style import COLOURS, TIMES, axes_of_shape, escape_formulas, unit_factor
 
-# The colour map of the cycles, from the first to the last.
+# The colour map runs from the first cycle to the last.
 _MAP = "viridis"
 
 
@@ -25,11 +25,12 @@ def light_curve(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """Draw a light curve against time, and below it folded with each of the periods.
+    """Draw a light curve against time, and below it one picture for each period with which it is
+    folded.
 
-    The light curve of a body that turns about a principal axis, folded with its period, is one
-    curve. That of a tumbler is a band, since a second period moves the curve from cycle to cycle;
-    the colour shows the cycle.
+    The light curve of a body that turns about a principal axis is one curve if it is folded with
+    its period. That of a tumbler is a band, since a second period moves the curve from cycle to
+    cycle; the colour shows the cycle.
 
     **Arguments:**
 

@@ -1,9 +1,9 @@
-"""Scattering laws: the light from a piece of surface, and from a whole ellipsoid.
+"""Compute how a surface scatters light, for a piece of surface and for a whole ellipsoid.
 
-`r = A u` with |u| = 1 maps the unit sphere to an ellipsoid. With s and o the directions to sun and
-observer, `p = A⁻¹ s` and `q = A⁻¹ o`, this gives `μ₀ dA = det A (p·u) du`, and the lit and visible
-part becomes the lune between p and q. The result depends only on |p|, |q| and p·q, that is on the
-tensor A² and not on its axes: a sphere is not singular.
+The map `r = A u` with |u| = 1 turns the unit sphere into an ellipsoid. Let s and o be the
+directions to sun and observer, `p = A⁻¹ s` and `q = A⁻¹ o`. Then `μ₀ dA = det A (p·u) du`, and the
+lit and visible part becomes the lune between p and q. The result depends only on |p|, |q| and p·q,
+that is on the tensor A² and not on its axes: a sphere is not singular.
 """
 
 import abc
@@ -20,16 +20,16 @@ from rigidjax._types import Mat3, Numbers, Scalar, Vec3, Vec3Like
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.rotation.linalg3 import apply, cofactors, cross, determinant, dot
 
-# The function of Lommel and Seeliger's law is a series of _TERMS terms for arguments below _SMALL.
+# For arguments below _SMALL the function of Lommel and Seeliger's law is a series of _TERMS terms.
 _SMALL, _TERMS = 0.1, 16
-# The number of Gauss–Legendre points of each of the two integrals of Lambert's law.
+# Each of the two integrals of Lambert's law has this number of Gauss–Legendre points.
 _POINTS = 32
 
 Faces = Float[Array, "*faces"]
 
 
 class AbstractScattering(eqx.Module):
-    """A scattering law: the light from a piece of surface, and from a whole ellipsoid.
+    """Describe a scattering law by the light from a piece of surface and from a whole ellipsoid.
 
     >>> class Flat(AbstractScattering):  # all that is lit and seen is equally bright
     ...     def per_area(self, incidence, emission):
@@ -42,7 +42,8 @@ class AbstractScattering(eqx.Module):
 
     @abc.abstractmethod
     def per_area(self, incidence: Faces, emission: Faces) -> Faces:
-        """Return the brightness over the area, from the cosines of `incidence` and `emission`.
+        """Return the brightness over the area of a piece of surface, from the cosines of its angles
+        of `incidence` and `emission`.
 
         Both cosines are positive.
         """
@@ -56,7 +57,7 @@ class AbstractScattering(eqx.Module):
 
 
 class Geometric(AbstractScattering):
-    """The law of a surface whose lit pieces are equally bright.
+    """Describe the scattering of a surface whose lit pieces are all equally bright.
 
     The brightness is the projected area of the lit and visible part, m².
 
@@ -75,7 +76,7 @@ class Geometric(AbstractScattering):
 
 
 class LommelSeeliger(AbstractScattering):
-    """The law of single scattering, `2 μ₀ μ/(μ₀ + μ)`, of dark surfaces such as asteroids.
+    """Describe single scattering, `2 μ₀ μ/(μ₀ + μ)`, as by the dark surfaces of asteroids.
 
     An ellipsoid has `π (|p||q| + p·q)/(|p| + |q|) [1 − (1 − z²) artanh(z)/z]/z²` with
     `z = |p + q|/(|p| + |q|)`, p and q (see the module) times the product of the semi-axes. It is a
@@ -97,7 +98,7 @@ class LommelSeeliger(AbstractScattering):
 
 
 class Lambert(AbstractScattering):
-    """The law of bright, rough surfaces, `3/2 μ₀ μ`.
+    """Describe the scattering of bright, rough surfaces, `3/2 μ₀ μ`.
 
     For a triaxial ellipsoid it has no elementary form: it needs two integrals of one variable, with
     32 points each. The relative error is below 1e-9 for axes up to 30 : 1 and phases up to 170°;
@@ -115,7 +116,9 @@ class Lambert(AbstractScattering):
 
 
 def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
-    """Return the law `scattering`, Lommel and Seeliger's for `None`; `TypeError` for others."""
+    """Return the law `scattering`, or Lommel and Seeliger's for `None`; raise `TypeError` for other
+    objects.
+    """
     if scattering is None:
         return LommelSeeliger()
     wanted = "LommelSeeliger(), Geometric() or Lambert()"
@@ -127,27 +130,27 @@ def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
 def unit_direction(value: Vec3Like | Numbers, name: str) -> Vec3:
     """Return the unit vector along `value` (3,).
 
-    Raise `ValueError` for a length of zero, NaN or a wrong shape.
+    It raises `ValueError` for a length of zero, NaN or a wrong shape; `name` stands in the message.
     """
     v = _checks.require_finite(_checks.array_of_shape(value, (3,), name), name)
     words = f"{name}: wanted a direction, got a vector of length zero"
     v = _checks.error_if(v, ~(jnp.abs(v) > 0).any(), words)
-    # The square of a distance of 1e200 m would overflow: scale it by a power of two.
+    # Scale the vector by a power of two: the square of a distance of 1e200 m would overflow.
     v = times_power_of_two(v, -exponent_of(v))
     return v / jnp.sqrt(dot(v, v))
 
 
 def _side_products(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
-    """Return |p|, |q|, |p||q| + p·q, z² and 1 − z² of `LommelSeeliger`.
+    """Return |p|, |q|, |p||q| + p·q, z² and 1 − z², the numbers of `LommelSeeliger`.
 
-    p and q are multiplied by the product of the semi-axes.
+    Here p and q are multiplied by the product of the semi-axes.
     """
     minors = cofactors(shape)
     of_sun, turned = apply(minors, sun), cross(sun, observer)
     pq = dot(observer, of_sun)
     p, q = _root_or_zero(dot(sun, of_sun)), _root_or_zero(dot(observer, apply(minors, observer)))
-    # Of |p||q| ± p·q take the smaller one from |p × q|², which is computed without subtraction: it
-    # keeps its digits at zero phase, and opposite to it.
+    # The smaller one of |p||q| ± p·q comes from |p × q|², which is computed without a subtraction:
+    # it keeps its digits at zero phase, and opposite to it.
     across = dot(turned, apply(shape, turned)) * determinant(shape)
     same_side = pq > 0
     large = p * q + jnp.where(same_side, pq, -pq)
@@ -158,9 +161,9 @@ def _side_products(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]
 
 
 def _excess(w: Array, complement: Array) -> Array:
-    """Return `(artanh(√w)/√w − 1)/w`, with `complement` = 1 − w; 1/3 at w = 0.
+    """Return `(artanh(√w)/√w − 1)/w`, which is 1/3 at w = 0; `complement` is 1 − w.
 
-    The numbers may be complex.
+    Both numbers may be complex.
     """
     near = jnp.abs(w) < _SMALL
     few = jnp.where(near, w, 0.0)
@@ -170,20 +173,21 @@ def _excess(w: Array, complement: Array) -> Array:
     far = jnp.where(near, 0.5, w)
     z = jnp.sqrt(far)
     lone = jnp.abs(complement) > 0
-    # At rest = 0, zero phase, the result is multiplied by rest: take 0 for the limit of x ln x. Its
-    # derivative is right as well, since rest has a minimum there.
+    # At zero phase `complement` is 0, and the result is multiplied by it: take 0 for the limit of x
+    # ln x. The derivative is right as well, since `complement` has a minimum there.
     logarithm = jnp.where(lone, jnp.log(jnp.where(lone, complement, 1.0)), 0.0)
     return jnp.where(near, series, ((jnp.log1p(z) - 0.5 * logarithm) / z - 1.0) / far)
 
 
 def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """Return `∫ μ₀ μ dA` over the lit and visible part of the ellipsoid of tensor E = `shape`.
+    """Return `∫ μ₀ μ dA` over the lit and visible part of the ellipsoid with the tensor E =
+    `shape`.
 
-    It is an integral over normals n, dA = det E/(n·En)² dn. Over the whole lit part, with μ < 0 on
-    its hidden part, the integral is `sun·T observer`, where
+    It is an integral over normals n, with dA = det E/(n·En)² dn. Over the whole lit part, with μ <
+    0 on its hidden part, the integral is `sun·T observer`, where
     `T = π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 to ∞ (both are one Gaussian integral).
-    Therefore `B(sun, observer) = sun·T observer + B(sun, −observer)`, and only the integral over
-    the smaller of the two lunes is computed.
+    Therefore `B(sun, observer) = sun·T observer + B(sun, −observer)`, where B is the integral over
+    the lit and visible part, and only the integral over the smaller of the two lunes is computed.
     """
     minors = cofactors(shape)
     total, of_sun = shape[0, 0] + shape[1, 1] + shape[2, 2], apply(minors, sun)
@@ -191,7 +195,8 @@ def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
     x, w = np.polynomial.legendre.leggauss(_POINTS)
     tangent, w = np.tan(0.25 * np.pi * (1.0 + x)), 0.25 * np.pi * w
     tangent, w = (jnp.asarray(v, size.dtype) for v in (tangent, w * (1.0 + tangent**2)))
-    # The middle point has a τ² between the squares of the least and the largest semi-axis.
+    # The middle point of the integration has a τ² between the squares of the least and the largest
+    # semi-axis.
     middle = jax.lax.stop_gradient(jnp.sqrt(total * size / second))
     square, both = middle * tangent * tangent, dot(sun, observer)
     top = total * both - dot(observer, apply(shape, sun)) + square * both
@@ -204,7 +209,9 @@ def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
 
 
 def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """Return `∫ (n·sun)(n·observer)/(n·En)² dn` over normals n with two positive factors."""
+    """Return `∫ (n·sun)(n·observer)/(n·En)² dn` over the normals n for which both factors are
+    positive, with E = `shape`.
+    """
     pole = cross(sun, observer)
     sine, apart = _root_or_zero(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
     # If sun and observer are nearly in line, any pole across them will do.
@@ -216,7 +223,7 @@ def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scal
     e_edge, e_pole, turned = apply(shape, edge), apply(shape, pole), apply(minors, edge)
     d0, d1, d2 = dot(sun, apply(minors, sun)), -dot(sun, turned), dot(edge, turned)
     # The integrand has a peak at the minimum of d, like that of an elliptic integral. In the
-    # variable after two of Landen's transformations the peak is gone.
+    # variable after two of Landen's transformations this peak is gone.
     m0, m1, m2 = (jax.lax.stop_gradient(d) for d in (d0, d1, d2))
     mean, far = 0.5 * (m0 + m2), jnp.sqrt(0.25 * (m0 - m2) ** 2 + m1 * m1)
     first = 0.5 * jnp.arctan2(2.0 * m1, m0 - m2)
@@ -236,8 +243,8 @@ def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scal
         angle = 0.5 * (angle + jnp.arcsin(s))
     angle = angle + first
     c, s = jnp.cos(angle), jnp.sin(angle)
-    # For a = c edge + s sun: along = a·Ea, tilt = a·E pole, and d the determinant of E on the plane
-    # of a and the pole.
+    # With a = c edge + s sun, `along` is a·Ea, `tilt` is a·E pole, and d is the determinant of E on
+    # the plane of a and the pole.
     mixed = 2.0 * c * dot(sun, e_edge) + s * dot(sun, apply(shape, sun))
     along = c * c * dot(edge, e_edge) + s * mixed
     tilt = c * dot(edge, e_pole) + s * dot(sun, e_pole)
@@ -252,12 +259,14 @@ def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scal
 
 
 def _root_or_zero(x: Scalar) -> Scalar:
-    """Return √x, with the derivative 0 at zero: an ellipsoid without thickness, seen edge on."""
+    """Return √x, with the derivative 0 at x = 0, where an ellipsoid without thickness is seen edge
+    on.
+    """
     is_positive = x > 0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
 def _ratio_or_zero(x: Scalar, y: Scalar) -> Scalar:
-    """Return x/y, and 0 if y is 0."""
+    """Return x/y, or 0 if y is 0."""
     is_positive = y > 0
     return jnp.where(is_positive, x / jnp.where(is_positive, y, 1.0), 0.0)

@@ -1,4 +1,6 @@
-"""The motions of a tumbler that have given pairs of frequencies: starts on a grid, and a search."""
+"""Find the motions of a tumbler that have given pairs of frequencies, by starts on a grid and a
+search.
+"""
 
 from typing import Any
 
@@ -21,19 +23,20 @@ from rigidjax.tumblers import starts
 from rigidjax.tumblers.sensor import bisector
 from rigidjax.tumblers.two_frequencies import pad_light
 
-# The search makes STEPS from all starts, FIRST of which are in one program; then MORE steps from
-# the SECOND best ones.
+# The search makes STEPS steps from all starts, FIRST of which are in one program; then it makes
+# MORE steps from the SECOND best ones.
 FIRST, STEPS, SECOND, MORE = 96, 12, 24, 60
-# The step of finite differences by the free numbers, which are of order one.
+# Finite differences by the free numbers, which are of order one, have this step.
 DIFFERENCE = 1e-6
-# The change of the logarithm of a flux with a magnitude.
+# A flux whose magnitude changes by one changes its logarithm by this number.
 MAGNITUDE = 0.4 * np.log(10.0)
 
 
 def relative_flux(
     model: Model, reading: Reading
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return times since the first one, s, fluxes relative to their median, and their noise.
+    """Return the times since the first one, s, the fluxes relative to their median, and the noise
+    of these fluxes.
 
     The noise is `None` if it is not known.
     """
@@ -59,10 +62,11 @@ def starts_of(
     noise: np.ndarray | None,
     pairs: np.ndarray,
 ) -> list[Array]:
-    """Return the best starting points (n,) over all pairs of frequencies.
+    """Return the best starting points, each of the free numbers (n,), over all pairs of
+    frequencies.
 
-    **Arguments:** `model` and its only `reading`; `t` (T,) s, `squares` the squared fluxes, `noise`
-    their standard deviations or `None`; `pairs` (P, 2), 1/s.
+    **Arguments:** `model` and its only `reading`; `t` (T,) s; `squares` (T,) the squared fluxes;
+    `noise` their standard deviations or `None`; `pairs` (P, 2), 1/s.
     """
     sensor: Any = reading.sensor
     sigma = np.ones(t.shape) if noise is None else noise
@@ -77,14 +81,14 @@ def starts_of(
     for pair in pairs:
         for mode in starts.MODES:
             candidates = starts.candidates(pair, mode, light, middle, areas, 3)
-            # Take the best body of each mode of each pair first: a grid alone cannot decide
-            # between modes and pairs.
+            # Take the best body of each mode of each pair first: a grid alone cannot decide between
+            # modes and pairs.
             best_of += candidates[: len(starts.ABOUT)]
             others += candidates[len(starts.ABOUT) :]
     chunks = max(1, -(-len(best_of) // FIRST))
     in_order = [one for group in (best_of, others) for one in sorted(group, key=lambda c: c.misfit)]
     chosen = in_order[: chunks * FIRST]
-    # The columns of this rotation are the body's axes in the order of ascending moments.
+    # The columns of this rotation are the axes of the body in the order of ascending moments.
     turn = np.eye(3)[:, order]
     turn = turn * np.array([1.0, 1.0, np.linalg.det(turn)])
     return [_free_numbers_of_candidate(model, one, turn) for one in chosen]
@@ -93,28 +97,35 @@ def starts_of(
 def _free_numbers_of_candidate(
     model: Model, candidate: starts.Candidate, turn: np.ndarray
 ) -> Array:
-    """Return the free numbers (n,) of a candidate; `turn` leads from principal to body axes."""
+    """Return the free numbers (n,) of a candidate; the rotation `turn` leads from principal to body
+    axes.
+    """
     moments = turn @ np.diag(candidate.moments) @ turn.T
     start = model.start(Inertia(jnp.asarray(moments)))
     reference = model.reference
     step = _rotation_vector(jnp.asarray(candidate.q), jnp.asarray(turn), reference.state.q[0])
     spin = jnp.asarray(turn @ candidate.omega) / reference.rate[0]
-    # The free numbers of an initial `Attitude`: the turn from the reference, and the rate.
+    # The free numbers of an initial `Attitude` are the turn from the reference, and the rate.
     return start.at[model.index.start[0]].set(jnp.concatenate([step, spin]))
 
 
 @jax.jit
 def _rotation_vector(q: Array, turn: Array, reference: Array) -> Array:
-    """Return the rotation vector (3,) from the `reference` to the attitude q of principal axes."""
+    """Return the rotation vector (3,) from the attitude `reference` to a body whose principal axes
+    have the attitude q.
+
+    `turn` is the rotation matrix from principal to body axes.
+    """
     back = quaternion.conjugate(quaternion.from_matrix(turn))
     q = quaternion.multiply(q, back)
     return quaternion.log(quaternion.multiply(quaternion.conjugate(reference), q))
 
 
 def noise_of(reading: Reading, flux: np.ndarray, scatter: float) -> tuple[Float[Array, "1 1"], ...]:
-    """Return the noise (1, 1) in the sensor's unit.
+    """Return the noise (1, 1) of the readings in the unit of the sensor.
 
-    If it is not known, it follows from the `scatter` of the squared `flux` about a Fourier series.
+    If the noise is not known, it follows from the `scatter` of the squared `flux` about a Fourier
+    series.
     """
     sensor: Any = reading.sensor
     if sensor.noise is not None:
@@ -125,7 +136,9 @@ def noise_of(reading: Reading, flux: np.ndarray, scatter: float) -> tuple[Float[
 
 
 def search_from(model: Model, starts: list[Array], noise: Noise, tolerance: float) -> list[Attempt]:
-    """Return the ends of searches from the best starts, after a few steps from all of them."""
+    """Return the ends of the searches that go on from the best starts, after a few steps from all
+    starts.
+    """
     points, costs = [], []
     for first in range(0, len(starts), FIRST):
         # Repeat starts up to a whole chunk: all chunks then use one program.
@@ -157,9 +170,10 @@ def _search_from_starts(
     settings: Settings,
     count: np.ndarray | np.generic | Array,
 ) -> Attempt:
-    """Return the ends of the searches from the first `count` starts, one after another.
+    """Return the ends of the searches from the first `count` starts, computed one after another.
 
-    The slopes are finite differences: derivatives of the closed form take a hundred times as long.
+    The slopes are finite differences, because derivatives of the closed form take a hundred times
+    as long.
     """
 
     def search_from_start(numbered_start: tuple[Array, Array]) -> Attempt:
@@ -185,7 +199,9 @@ def _search_from_starts(
 
 @eqx.filter_jit
 def _with_best_level(starts: Float[Array, "starts n"], model: Model) -> Float[Array, "starts n"]:
-    """Return the starts, each with the level of brightness that fits it best, if that is free."""
+    """Return the `starts`, each with the level of brightness that fits it best; unchanged if the
+    level is not free.
+    """
     scene = scene_template(model, model.records)
     path = leaf_at(lambda s: s.sensors[0].level, scene, "level", "the sensor")[0]
     mine = [slot for slot in model.slots if slot.path == path and slot.shared is not None]

@@ -1,4 +1,4 @@
-"""The sensor of a body's brightness, whose readings are a light curve."""
+"""Predict the brightness of a body, whose readings are a light curve, as a sensor of a fit."""
 
 import math
 from collections.abc import Callable
@@ -24,7 +24,7 @@ UNITS = ("flux", "mag")
 
 
 class Brightness(AbstractSensor):
-    """A sensor of the brightness of an ellipsoid lit by the sun: its readings are a light curve.
+    """Measure the brightness of an ellipsoid that the sun lights; the readings are a light curve.
 
     A flux is `level · B/(π (abc)^⅔)`, a magnitude `level − 2.5 log₁₀(B/(π (abc)^⅔))`, with B the
     result of `rj.tumblers.brightness.ellipsoid` for the semi-axes a, b, c. The level is therefore
@@ -110,7 +110,7 @@ class Brightness(AbstractSensor):
         return (reading - self.predict(motion))[None]
 
     def predict(self, motion: SensorInput) -> Scalar:
-        """Return the reading of a state without noise."""
+        """Return the reading without noise that belongs to a state."""
         shape = motion.body.second_moment
         if self.semi_axes is not None:
             shape = jnp.diag(self.semi_axes * self.semi_axes)
@@ -123,15 +123,16 @@ class Brightness(AbstractSensor):
         relative = area / (math.pi * jnp.cbrt(determinant(shape)))
         if self.unit == "flux":
             return self.level * relative
-        # A body that hides its lit side has an infinite magnitude: bound it, as fainter than any
-        # reading.
+        # A body that hides its lit side has an infinite magnitude: bound it by one that is fainter
+        # than any reading.
         visible = relative > 1e-12
         return self.level - 2.5 / math.log(10.0) * jnp.log(jnp.where(visible, relative, 1e-12))
 
     def typical_rate(self, t: np.ndarray, values: np.ndarray) -> float:
-        """Return the rough rate of the body, rad/s: half the strongest frequency of 1000 readings.
+        """Return a rough rate of the body, rad/s, which is half the strongest frequency of the
+        first 1000 readings.
 
-        An ellipsoid shows two maxima in a turn.
+        It is half, because an ellipsoid shows two maxima in a turn.
         """
         t, values = t[:1000], values[:1000]
         if t.size < 10 or np.ptp(values) == 0:
@@ -144,7 +145,9 @@ class Brightness(AbstractSensor):
         return 0.5 * float(turns[np.argmax(power)])
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return the fluxes that are far below zero, (T,) true where wrong, and why."""
+        """Return which of the `values` are fluxes far below zero, a mask (T,), and a message that
+        says why they are wrong.
+        """
         noise = np.std(values) if self.noise is None else np.asarray(self.noise)[0]
         wrong = values < 0 if self.unit == "flux" else np.zeros(values.shape, bool)
         wrong = wrong & (np.abs(values) > 10 * noise)
@@ -153,24 +156,28 @@ class Brightness(AbstractSensor):
 
 
 def directions(sensor: Brightness, t: ScalarLike, dtype: DTypeLike | None = None) -> list[Vec3]:
-    """Return the unit vectors to sun and observer at the time `t`, world frame."""
+    """Return the unit vectors to sun and observer at the time `t`, in the world frame."""
     vectors = vector_at(sensor.sun, t, "sun"), vector_at(sensor.observer, t, "observer")
     return [_unit_vector(v if dtype is None else v.astype(dtype)) for v in vectors]
 
 
 def bisector(sensor: Brightness, t: ScalarLike) -> Vec3:
-    """Return the unit vector half way between sun and observer at the time `t`, world frame."""
+    """Return the unit vector half way between sun and observer at the time `t`, in the world
+    frame.
+    """
     sun, observer = directions(sensor, t)
     return _unit_vector(sun + observer)
 
 
 def _unit_vector(v: Vec3) -> Vec3:
-    """Return the unit vector along v."""
+    """Return the unit vector along the vector v."""
     return v / jnp.sqrt(dot(v, v))
 
 
 def _direction_source(source: NumbersLike | Callable[..., Any], name: str) -> Any:
-    """Return a direction as a unit vector, or a function of time as it is; else raise an error."""
+    """Return a direction as a unit vector, or a function of time unchanged; raise an error for
+    other objects.
+    """
     if callable(source):
         return _checks.require_function(source, name, "of time to (3,)")
     shape = _checks.numeric_array(source, name).shape

@@ -1,11 +1,11 @@
-"""Possible motions with two given frequencies of a light curve, on a grid of bodies.
+"""Find possible motions that have two given frequencies of a light curve, on a grid of bodies.
 
-The squared brightness of an ellipsoid is nearly a quadratic form of the direction n half way
+The squared brightness F² of an ellipsoid is nearly a quadratic form of the direction n half way
 between sun and observer: `F² ∝ Σ_k M_k (n·r_k)²`, with r_k the body's axes in the world and
-`M = (bc)², (ca)², (ab)²` (exactly at zero phase, for projected areas). For a given body, energy and
-phase F² is therefore linear in the six numbers of n nᵀ in a frame along the angular momentum. Least
-squares finds the direction of the momentum, the initial angle and the level at once; the grid
-covers the shape of the body and the phase of its rotation.
+`M = (bc)², (ca)², (ab)²` for the semi-axes a, b, c (exactly at zero phase, for projected areas).
+For a given body, energy and phase F² is therefore linear in the six numbers of n nᵀ in a frame
+along the angular momentum. Least squares finds the direction of the momentum, the initial angle and
+the level at once; the grid covers the shape of the body and the phase of its rotation.
 """
 
 import math
@@ -24,18 +24,19 @@ from rigidjax.rotation import quaternion
 from rigidjax.rotation.kernels import product4
 from rigidjax.tumblers.lattice_series import least_squares_remainder
 
-# The grid: ratios b/a and c/b of the semi-axes, and the number of phases in half a rotation.
+# The grid has these ratios b/a and c/b of the semi-axes, and PHASES phases in half a rotation.
 MIDDLE, SHORT, PHASES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9), (0.5, 0.65, 0.8, 0.93), 12
-# Turns about the direction n that are tried with each start: they hardly change the brightness.
+# These turns about the direction n are tried with each start, because they hardly change the
+# brightness.
 ABOUT = (0.0, math.pi / 3, 2 * math.pi / 3)
 MODES = ("long", "short")
 
 
 class Candidate(NamedTuple):
-    """A starting motion.
+    """Hold a starting motion of the search.
 
-    **Fields:** `moments` (3,) over the largest; `q` and `omega` the initial attitude and rate of
-    the principal axes; `misfit` χ².
+    **Fields:** `moments` (3,) over the largest one; `q` and `omega` the initial attitude and rate
+    of the principal axes; `misfit` χ² of the motion.
     """
 
     moments: np.ndarray
@@ -52,7 +53,8 @@ def candidates(
     areas: np.ndarray | None,
     count: int,
 ) -> list[Candidate]:
-    """Return the best motions of the grid that have a pair of frequencies, the best first.
+    """Return the best motions of the grid that have a given pair of frequencies, in the order of
+    their misfits.
 
     **Arguments:**
 
@@ -75,7 +77,7 @@ def candidates(
     arrays = jnp.asarray(moments), jnp.asarray(forms), jnp.asarray(pair), *light
     motions = _grid(jnp.asarray(mode == "long"), *arrays)
     misfits, sides, q, omega = (np.asarray(v) for v in motions)
-    # The best phase of each body.
+    # Take the best phase of each body.
     phase, least = misfits.argmin(axis=1), misfits.min(axis=1)
     out = []
     for k in np.argsort(least)[:count]:
@@ -88,10 +90,10 @@ def candidates(
 
 
 def _turns_to_world(side: np.ndarray, bisector: np.ndarray) -> list[tuple[Any, ...]]:
-    """Return the quaternions that turn the frame of the momentum to the world.
+    """Return the quaternions that turn the frame of the momentum to the world frame.
 
-    n in the frame of the momentum is the leading eigenvector of the matrix with the six numbers
-    `side`; in the world it is the `bisector`.
+    In the frame of the momentum, n is the leading eigenvector of the matrix with the six numbers
+    `side`; in the world frame it is the `bisector`.
     """
     xx, yy, zz, xy, xz, yz = side
     _, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
@@ -103,7 +105,8 @@ def _turns_to_world(side: np.ndarray, bisector: np.ndarray) -> list[tuple[Any, .
 
 
 def _shortest_turn(u: Any, v: Any, xp: ModuleType) -> Any:
-    """Return the shortest turn (4,) from the unit vector u to v, which is not opposite to u.
+    """Return the shortest turn, a quaternion (4,), from the unit vector u to the unit vector v,
+    which is not opposite to u.
 
     `xp` is the module of the arrays, `numpy` or `jax.numpy`.
     """
@@ -112,9 +115,11 @@ def _shortest_turn(u: Any, v: Any, xp: ModuleType) -> Any:
 
 
 def _rate_from_energy(moments: Array, d: Array) -> Float[Array, "3"]:
-    """Return the rate of momentum h = 1 and `h²/2T = d` without a part along the middle axis.
+    """Return the rate (3,) with the momentum h = 1 and `h²/2T = d`, without a part along the middle
+    axis.
 
-    T is the kinetic energy; the first and the last of the ascending `moments` have the other axes.
+    T is the kinetic energy. The `moments` are ascending, and the rate has parts along the first and
+    the last axis.
     """
     a, _, c = (1.0 / moments[k] for k in range(3))
     x = jnp.clip((1.0 / d - c) / (a - c), 0.0, 1.0)
@@ -122,10 +127,11 @@ def _rate_from_energy(moments: Array, d: Array) -> Float[Array, "3"]:
 
 
 def _rate_of_ratio(moments: Array, ratio: Array, long_axis: Array) -> tuple[Array, Array, Array]:
-    """Return a rate whose precession and rotation period have this `ratio`.
+    """Return a rate whose precession period over its rotation period is `ratio`, its precession
+    period, and whether there is such a rate.
 
-    Its precession period is returned, too, and whether there is such a rate in the mode
-    (`long_axis` for the long axis). The energy is found by bisection.
+    The rate is sought in the mode of the long axis if `long_axis` is true, else of the short axis.
+    Bisection finds the energy.
     """
     body, pure = Inertia(jnp.diag(moments)), jnp.where(long_axis, moments[0], moments[2])
 
@@ -141,7 +147,8 @@ def _rate_of_ratio(moments: Array, ratio: Array, long_axis: Array) -> tuple[Arra
     kind = moments.dtype
     zero = jnp.zeros((), kind)
     ends = jnp.asarray(1e-4, kind), jnp.asarray(1.0 - 1e-7, kind)
-    # Carry the results of the last trial along: after the loop they would be compiled again.
+    # Carry the results of the last trial along: computed after the loop, they would be compiled
+    # again.
     state = (*ends, jnp.zeros_like(moments), zero, zero)
     _, _, omega, precession, quotient = jax.lax.fori_loop(0, 33, bisect, state)
     return omega, precession, jnp.abs(quotient - 1.0) < 1e-3
@@ -157,9 +164,11 @@ def _grid(
     squares: Array,
     weights: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Return misfits (S, phases), n nᵀ times the level (…, 6), attitudes and rates of S bodies.
+    """Return the misfits (S, phases), n nᵀ times the level (S, phases, 6), the attitudes and the
+    rates of S bodies.
 
-    `moments` and `forms` (S, 3) are those of the bodies; `t`, `squares` and `weights` the light.
+    `moments` and `forms` (S, 3) are those of the bodies; `t`, `squares` and `weights` are the light
+    curve.
     """
     ratio = 0.5 * pair[1] / pair[0]
 
@@ -168,7 +177,8 @@ def _grid(
         omega, precession, exists = _rate_of_ratio(body, ratio, long_axis)
         omega = omega * (precession * pair[0])
         h = body * omega
-        # Turn the momentum to z of the world. It is not opposite to z: no part of it is negative.
+        # Turn the momentum to the z axis of the world. It is not opposite to z, because no part of
+        # it is negative.
         q = _shortest_turn(h / jnp.sqrt(jnp.sum(h * h)), jnp.eye(3, dtype=h.dtype)[2], jnp)
         motion = exact.FreeBody(Inertia(jnp.diag(body)), Attitude(q, omega))
 
@@ -181,11 +191,12 @@ def _grid(
                 def entry(i: int, j: int) -> Any:
                     return sum(form[k] * m[i, k] * m[j, k] for k in range(3))
 
-                # The entries of Σ M_k r_k r_kᵀ, r_k the body axes in the world.
+                # These are the entries of Σ M_k r_k r_kᵀ, with r_k the body axes in the world.
                 twice = (2 * entry(0, 1), 2 * entry(0, 2), 2 * entry(1, 2))
                 return jnp.stack([entry(0, 0), entry(1, 1), entry(2, 2), *twice])
 
-            # Compute the first state together with the others: alone it would compile once more.
+            # Compute the first state together with the others: alone it would be compiled once
+            # more.
             states: Any = jax.vmap(motion)(since + jnp.concatenate([jnp.zeros(1, t.dtype), t]))
             rows = jax.vmap(row)(states.q[1:]).T * weights[None, :]
             misfit, n = least_squares_remainder(rows, squares * weights)

@@ -1,4 +1,4 @@
-"""The two frequencies of a light curve: those whose Fourier series fits best."""
+"""Find the two frequencies of a light curve, those whose Fourier series fits best."""
 
 import math
 
@@ -20,27 +20,27 @@ from rigidjax.tumblers.lattice_series import (
     sum_table,
 )
 
-# A pair must explain one of the LINES strongest lines; the first frequency is on a grid of this
-# STEP, 1/span.
+# A pair must explain one of the LINES strongest lines; the first frequency is on a grid with the
+# step STEP, 1/span.
 LINES, STEP = 3, 0.1
-# The largest second frequency of the search, over the highest of these lines.
+# The largest second frequency of the search is SECOND times the highest of these lines.
 SECOND = 1.5
-# The number of pairs that are refined for each one that is returned.
+# For each pair that is returned, TRIED pairs are refined.
 TRIED = 2
-# Squares of numbers above LARGEST may overflow; a spectrum of more than MOST lines takes hours.
+# Squares of numbers above LARGEST may overflow; the spectrum of more than MOST lines takes hours.
 LARGEST, MOST = 1e100, 1e5
 # Times are padded to a multiple of BLOCK, so that few programs are compiled.
 BLOCK = 256
-# Pairs nearer than this, in 1/span, count as one.
+# Pairs nearer than this distance, in 1/span, count as one.
 NEAR = 0.25
-# The aliases of the SEEDS best pairs are tried, in ROUNDS or fewer.
+# The aliases of the SEEDS best pairs are tried, in at most ROUNDS rounds.
 SEEDS, ROUNDS = 16, 3
-# A pair (0, 0) and its eight neighbours, in steps.
+# These are the pair (0, 0) and its eight neighbours, in steps.
 AROUND = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
 
 
 class TwoFrequencies(eqx.Module):
-    """The result of `two_frequencies`, in the order of the misfits.
+    """Hold the result of `two_frequencies`, in the order of the misfits.
 
     **Fields:**
 
@@ -77,10 +77,11 @@ def two_frequencies(
 
     The multiples j go from −2 to 2, k from −`order` to `order`. One of the three strongest lines of
     the spectrum must be j f₁ + k f₂: all pairs with this property are tried on a grid, and the best
-    ones are refined. Then their aliases are tried: one frequency or both moved by a side peak of
-    the spectral window (readings at night have side peaks at one and two a day) or by half of it;
-    halved, doubled; or f₂ moved by f₁. Several pairs give the same set of lines. All pairs that fit
-    are returned: only a fit of the motion decides between them.
+    ones are refined. Then the aliases of the best pairs are tried. In an alias, one frequency or
+    both are moved by a side peak of the spectral window (readings at night have side peaks at one
+    and two a day) or by half of it; or one frequency is halved or doubled; or f₂ is moved by f₁.
+    Several pairs give the same set of lines. All pairs that fit are returned: only a fit of the
+    motion decides between them.
 
     **Arguments:**
 
@@ -138,7 +139,8 @@ def two_frequencies(
     light = pad_light((t - t[0]) / span, y / sigma, 1.0 / sigma)
     lines = strongest_lines(light, span / least, 2 * LINES)
     highest = SECOND * float(lines[:LINES].max())
-    # The table holds all multiples of a pair, and the steps of the refinement beyond the highest.
+    # The table holds all multiples of a pair, and the steps of the refinement beyond the highest
+    # frequency.
     table = sum_table(light, 2 * (FIRST + order) * (highest + 1.0))
     pairs, misfits = _scan_pairs(table, lines, order)
     pairs, misfits = refine_pairs(
@@ -154,15 +156,15 @@ def two_frequencies(
 
 
 def pad_light(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array, Array]:
-    """Return times x, values z and weights w, padded with zeros to a multiple of `BLOCK`."""
+    """Return the times x, values z and weights w, padded with zeros to a multiple of `BLOCK`."""
     more = -x.size % BLOCK
     return tuple(jnp.asarray(np.pad(v, (0, more))) for v in (x, z, w))  # pyright: ignore
 
 
 def strongest_lines(light: tuple[Array, Array, Array], highest: float, count: int) -> np.ndarray:
-    """Return the strongest lines up to the frequency `highest`, in 1/span.
+    """Return the `count` strongest lines of the spectrum up to the frequency `highest`, in 1/span.
 
-    Each line is subtracted from the `light` before the next one is searched.
+    Each line is subtracted from the `light` before the next one is sought.
     """
     grid = np.arange(0.5, max(highest, 2.0), 0.2)
     x, z, w = (np.asarray(v) for v in light)
@@ -176,7 +178,9 @@ def strongest_lines(light: tuple[Array, Array, Array], highest: float, count: in
 
 @jax.jit
 def _strongest_line(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Array, Array]:
-    """Return the frequency of the strongest line of a `grid`, and its curve with a constant."""
+    """Return the frequency of the strongest line of a `grid`, and the curve of this line with a
+    constant.
+    """
     x, z, w = jnp.asarray(x), jnp.asarray(z), jnp.asarray(w)
 
     def rows(f: Array) -> Array:
@@ -191,7 +195,7 @@ def _strongest_line(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tu
 
 
 def _scan_pairs(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return all pairs on a grid that give one of the `lines`, and their misfits."""
+    """Return all pairs on a grid that give one of the `lines`, and the misfits of these pairs."""
     highest = float(lines[:LINES].max())
     grid = np.arange(0.5, 0.8 * highest + 0.5, STEP)
     whole = np.arange(0.5, SECOND * highest, STEP)
@@ -208,9 +212,9 @@ def _scan_pairs(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray,
 
 
 def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
-    """Return the pairs (M, 2) that may fit the same readings as `pairs` (P, 2).
+    """Return the pairs (M, 2) that may fit the same readings as the `pairs` (P, 2) do.
 
-    Their frequencies are moved by the side peaks `peaks` or half of them, halved, doubled, or
+    Their frequencies are moved by the side peaks `peaks` or by half of them, or halved, doubled or
     combined.
     """
     moves = np.unique(np.concatenate([[0.0], *((p, -p, p / 2, -p / 2) for p in peaks)]))
@@ -228,7 +232,9 @@ def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
 def with_aliases(
     table: Sums, pairs: np.ndarray, misfits: np.ndarray, highest: float, order: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pairs with aliases of the best of them, in rounds until none is better."""
+    """Return the `pairs` together with aliases of the best of them, found in rounds until none is
+    better.
+    """
     peaks = side_peaks(table, highest)
     for _ in range(ROUNDS):
         seeds = pairs[distinct_pairs(pairs, misfits, SEEDS)]
@@ -246,7 +252,9 @@ def with_aliases(
 
 
 def distinct_pairs(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
-    """Return the indices of `count` pairs that differ, in the order of their misfits."""
+    """Return the indices of `count` pairs that differ from each other, in the order of their
+    misfits.
+    """
     chosen: list[int] = []
     for index in np.argsort(misfits)[:20_000]:
         if not chosen or np.abs(pairs[chosen] - pairs[index]).max(axis=1).min() > NEAR:
@@ -257,7 +265,8 @@ def distinct_pairs(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[i
 
 
 def refine_pairs(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Move each pair from neighbour to neighbour down to a minimum; return pairs and misfits.
+    """Return the pairs and their misfits after each pair moved from neighbour to neighbour down to
+    a minimum.
 
     The steps become shorter whenever no neighbour is lower.
     """

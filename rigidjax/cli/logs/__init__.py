@@ -1,1 +1,1 @@
-"""Readers of logs, one module for each format; `table.read_table` chooses among them."""
+"""Read logs, by one module for each format; `table.read_table` chooses among the modules."""

@@ -1,8 +1,9 @@
-"""The reader of Blackbox logs of flight controllers; orangebox (an extra) decodes their fields.
+"""Read Blackbox logs of flight controllers; orangebox (an extra) decodes the fields of their
+frames.
 
 A P frame holds differences from the frames before it, down to an I frame, which stands alone. The
-library returns P frames even if their I frame is missing. The order of frames is therefore checked
-here, as the flight controllers' own decoder does.
+library orangebox returns P frames even if their I frame is missing. The order of frames is
+therefore checked here, as the flight controllers' own decoder does.
 """
 
 import math
@@ -19,10 +20,10 @@ from rigidjax import _checks
 from rigidjax.cli.logs.columns import Columns
 from rigidjax.cli.logs.errors import LogError, warn
 
-# The bounds of the flight controllers' own decoder: a frame in bytes, jumps of the iteration and of
-# the time, µs. Both counters have 32 bits.
+# These are the bounds of the flight controllers' own decoder: of a frame in bytes, and of jumps of
+# the iteration and of the time, µs. Both counters have 32 bits.
 _LONGEST_FRAME, _ITERATION_JUMP, _TIME_JUMP, _WRAP = 256, 5_000, 10_000_000, 2**32
-# The number of numbers of variable length that follow each kind of event.
+# Each kind of event is followed by this number of integers of variable length.
 _EVENT_NUMBERS = {0: 1, 14: 2, 15: 1, 30: 2}
 _RESUME, _ADJUSTMENT, _LOG_END = 14, 13, 255
 _END_MARK = b"End of log\0"
@@ -30,7 +31,8 @@ _ERASED = re.compile(rb"[\xff\0]*\Z")
 
 
 def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
-    """Return the names of all fields, and the wanted ones, of one flight in a Blackbox log.
+    """Return the names of all fields in one flight of a Blackbox log, and the fields that `columns`
+    name.
 
     Rates are in deg/s and accelerations in g, by the scales in the header, as in the flight
     controllers' own viewer; other fields are as logged. A log without its end mark is read to the
@@ -73,7 +75,9 @@ def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None)
 
 
 class _Bytes:
-    """An iterator over bytes, for the library's decoders; `place` is the index of the next byte."""
+    """Provide bytes one by one to the decoders of the library; `place` is the index of the next
+    byte.
+    """
 
     def __init__(self, data: bytes, place: int):
         self.data, self.place = data, place
@@ -85,7 +89,7 @@ class _Bytes:
 
 
 class _Flight:
-    """One flight: its header, and its frames in the order of the log.
+    """Hold one flight: its header, and its frames in the order of the log.
 
     **Fields**, among others: `names` of all fields; `count` the number of I and P frames met so
     far; `left_out` the number of those that were left out.
@@ -107,7 +111,7 @@ class _Flight:
         self.names = list(dict.fromkeys([*self.main, *self.others]))
 
     def wrap_to_32_bits(self, name: str, values: np.ndarray) -> np.ndarray:
-        """Return the values of a field as the 32-bit numbers that the flight controller had."""
+        """Return the values of a field as the 32-bit integers that the flight controller had."""
         if name not in self.main or name == "time":
             return values
         if self.fields[self.kind.INTRA][self.main.index(name)].signed:
@@ -115,7 +119,7 @@ class _Flight:
         return values % _WRAP
 
     def frames(self) -> Iterator[tuple[int, Mapping[str, float]]]:
-        """Yield the group and the fields, by name, of each frame that can be decoded.
+        """Yield the group, and the fields by name, of each frame that can be decoded.
 
         The group counts the I frames; an I frame itself, which depends on no other frame, has the
         group -1. Fields of slow and GPS frames have the values of the last such frame, NaN before
@@ -128,7 +132,7 @@ class _Flight:
             begin = stream.place
             if kind is None or (kind != self.kind.EVENT and kind not in self.fields):
                 # These bytes are a frame that lost its letter. Erased memory at the end of a log
-                # does not count as one.
+                # does not count as a frame.
                 lost, order.is_valid = lost + order.is_valid, False
                 continue
             is_main = kind in (self.kind.INTRA, self.kind.INTER)
@@ -148,8 +152,8 @@ class _Flight:
                 values = ()
             size = stream.place - begin
             if not values or size > _LONGEST_FRAME or not self._is_frame_next(stream.place):
-                # The decoder may have read the letter of the next frame: begin again after this
-                # frame's letter.
+                # The decoder may have read the letter of the next frame: begin again after the
+                # letter of this frame.
                 stream.place, order.is_valid = begin, False
                 self.left_out += is_main
             elif not is_main:
@@ -169,10 +173,11 @@ class _Flight:
         return self.context.last_iter + 1 + self.context.count_skipped_frames()
 
     def _is_frame_next(self, place: int) -> bool:
-        """Return whether at `place` there is a frame, a P frame without its letter, or the end.
+        """Return whether there is a frame at `place`, a P frame without its letter, or the end of
+        the data.
 
-        If there is none, the frame before is probably damaged: it has too few bytes or too many.
-        Erased memory is an end.
+        If there is none of these, the frame before is probably damaged: it has too few bytes or too
+        many. Erased memory counts as an end.
         """
         if place == len(self.data) or self.data[place] in self.kinds:
             return True
@@ -193,7 +198,7 @@ class _Flight:
         return place
 
     def _values(self, stream: _Bytes, kind: Any) -> tuple[Any, ...]:
-        """Decode the fields of one frame."""
+        """Return the decoded fields of one frame."""
         context, fields, values = self.context, self.fields[kind], ()
         context.frame_type, context.field_index = kind, 0
         while context.field_index < len(fields):
@@ -205,7 +210,7 @@ class _Flight:
         return values
 
     def _pass_event(self, stream: _Bytes) -> tuple[int, list[int]]:
-        """Pass one event; return its kind (-1 for an unknown one) and its numbers."""
+        """Read one event, and return its kind (-1 for an unknown one) and its integers."""
         event = next(stream)
         if event == _LOG_END:
             is_last = self.data.startswith(_END_MARK, stream.place)
@@ -221,7 +226,7 @@ class _Flight:
 
 
 class _Order:
-    """The order of I and P frames by their iterations and times.
+    """Check the order of I and P frames by their iterations and times.
 
     A group is an I frame and the P frames after it.
 
@@ -241,12 +246,12 @@ class _Order:
         self.groups, self.incomplete = 0, list[int]()
 
     def resume(self, numbers: Sequence[int]) -> None:
-        """Continue at the iteration and the time `numbers` of an event after a pause."""
+        """Set the iteration and the time to the `numbers` of an event that ends a pause."""
         self.last = self.last_key = tuple(numbers)
         self.is_resumed = True
 
     def accepts(self, values: Sequence[int], is_key: bool, expected: int) -> bool:
-        """Return whether a frame continues the last one, and make it the last one if so.
+        """Return whether a frame continues the last one, and make it the last one if it does.
 
         **Arguments:** `values` its iteration and time; `is_key` whether it is an I frame;
         `expected` the iteration that it must have.
@@ -266,15 +271,15 @@ class _Order:
             self.time = self.key_time + (values[1] - self.key_time) % _WRAP
             self.last = values
         if is_key:
-            # Of two I frames that do not continue each other either may be damaged: compare the
-            # next I frame with the later one.
+            # If two I frames do not continue each other, either may be damaged: compare the next I
+            # frame with the later one.
             self.last_key, self.is_resumed = values, False
         return self.is_valid
 
     def _lacks_frames(self, key: Sequence[int], expected: int) -> bool:
-        """Return whether frames are missing between the last frame and an I frame, `key`.
+        """Return whether frames are missing between the last frame and the I frame `key`.
 
-        A great jump of the iteration is a pause, in which none are missing.
+        A large jump of the iteration is a pause, in which no frames are missing.
         """
         is_earlier = (key[1] - self.last[1]) % _WRAP >= _WRAP // 2
         return is_earlier or 0 < (key[0] - expected) % _WRAP < _ITERATION_JUMP
@@ -282,14 +287,16 @@ class _Order:
     def incomplete_groups(self) -> list[int]:
         """Return the groups from which frames are missing.
 
-        If this is so for half of all groups, return none: then the interval of frames in the header
-        is not that of the log.
+        If frames are missing from half of all groups, it returns no group: the interval of frames
+        in the header is then not that of the log.
         """
         return self.incomplete if 2 * len(self.incomplete) < self.groups else []
 
 
 def _read_unsigned(stream: _Bytes) -> int:
-    """Read a number of variable length: seven bits a byte, the eighth is set if more follow."""
+    """Read an integer of variable length, with seven bits in each byte; the eighth bit is set if
+    more bytes follow.
+    """
     number, shift = 0, 0
     while shift < 35:
         byte = next(stream)
@@ -301,17 +308,19 @@ def _read_unsigned(stream: _Bytes) -> int:
 
 
 def _continues(last: Sequence[int], values: Sequence[int]) -> bool:
-    """Return whether iteration and time of a frame follow those of the `last` one closely."""
+    """Return whether the iteration and the time in `values` closely follow those of the `last`
+    frame.
+    """
     iteration, time = ((new - old) % _WRAP for old, new in zip(last, values, strict=True))
     return iteration < _ITERATION_JUMP and time < _TIME_JUMP
 
 
 def _scales(headers: Mapping[str, Any]) -> dict[str, float]:
-    """Return the factors from the raw numbers of rates and accelerations to deg/s and g."""
+    """Return the factors from the raw integers of rates and accelerations to deg/s and g."""
     factors = {}
     if "gyro_scale" in headers:
         value = headers["gyro_scale"]
-        # The header has the bits of a float, which the parser takes for a whole number.
+        # The header has the bits of a float, which the parser takes for an integer.
         scale = struct.unpack("f", struct.pack("I", value))[0] if isinstance(value, int) else value
         baseflight = "baseflight" in str(headers.get("Firmware type", "")).lower()
         factors["gyroADC"] = scale * (1e6 * 180 / math.pi if baseflight else 1.0)

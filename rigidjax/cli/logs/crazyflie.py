@@ -1,4 +1,4 @@
-"""The reader of the Crazyflie's µSD log: no library reads it, but its header describes it."""
+"""Read the Crazyflie's µSD log, which no library reads but whose header describes it."""
 
 import struct
 from array import array
@@ -13,11 +13,12 @@ FIRST_BYTE = 0xBC
 
 
 def read_crazyflie(path: Path, columns: Sequence[str]) -> Columns:
-    """Return the variables of a Crazyflie's µSD log by name (`gyro.x`), and their `timestamp`, µs.
+    """Return the names of all variables of a Crazyflie's µSD log (`gyro.x`) and the wanted ones,
+    with their `timestamp`, µs.
 
-    A log holds several events, each with variables of its own: the one with most of the wanted
-    names is read. Source: the description of the format in the documentation of the firmware,
-    "µSD card deck", versions 1 and 2.
+    A log holds several events, each with variables of its own: the event with most of the wanted
+    names is read. Source: the description of the format in the documentation of the firmware, "µSD
+    card deck", versions 1 and 2.
     """
     data = path.read_bytes()
     version, count = struct.unpack_from("<HH", data, 1)

@@ -1,4 +1,6 @@
-"""The error for a log that cannot be read, and the warning for one that is not read whole."""
+"""Define the error for a log that cannot be read, and the warning for a log that is not read
+whole.
+"""
 
 import warnings
 
@@ -6,20 +8,20 @@ from rigidjax import _checks
 
 
 class LogError(ValueError):
-    """The error for a log that cannot be read.
+    """Describe why a log cannot be read.
 
     The message names the file and, if they are known, the line and the column.
     """
 
     def __str__(self) -> str:
-        """Return the message without control characters: a name may hold those of a terminal."""
+        """Return the message without control characters: a name may contain those of a terminal."""
         return _checks.escape_controls(super().__str__())
 
 
 class LogWarning(UserWarning):
-    """The warning for a log of which a part is left out, or whose units are doubtful."""
+    """Describe which part of a log is left out, or why its units are doubtful."""
 
 
 def warn(words: str) -> None:
-    """Warn by a `LogWarning` with these words."""
+    """Warn with a `LogWarning` that says `words`."""
     warnings.warn(LogWarning(_checks.escape_controls(words)), stacklevel=3)

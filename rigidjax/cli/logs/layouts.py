@@ -1,4 +1,4 @@
-"""The columns of time and rates that a log is known to have."""
+"""Find the columns of time and rates that a log is known to have."""
 
 import contextlib
 import re
@@ -11,7 +11,7 @@ from rigidjax.cli.logs.units import TIME_UNITS, unit_in
 
 
 class ImuColumns(NamedTuple):
-    """The columns of time and rates of a log.
+    """Hold the columns of time and rates of a log.
 
     **Fields:** `columns` the names of the time and of the three rates; `unit` of the rates;
     `time_unit`.
@@ -25,7 +25,7 @@ class ImuColumns(NamedTuple):
 USUAL = ImuColumns(("t", "wx", "wy", "wz"), "rad/s", "s")
 
 
-# The units of fields in binary logs, whose names hold no units.
+# Fields in binary logs have these units; their names hold no units.
 _UNITS = {
     ".bbl": {"time": "us", "gyroADC": "deg/s", "accSmooth": "g"},
     ".ulg": {"timestamp": "us"},
@@ -41,9 +41,10 @@ def usual_unit(path: str | Path, name: str) -> str | None:
 
 
 def imu_columns_of(path: str | Path) -> ImuColumns:
-    """Return the columns of time and rates of a log, `USUAL` if they are not known.
+    """Return the columns of time and rates of a log, or `USUAL` if they are not known.
 
-    In a text they are known by the units in their names, as phyphox writes them in any language.
+    The columns of a text are known by the units in their names, as phyphox writes them in any
+    language.
     """
     path = Path(path)
     # Suppress errors here: the reader of the log raises them with better words.
@@ -58,7 +59,7 @@ def imu_columns_of(path: str | Path) -> ImuColumns:
 def _columns_by_name(names: list[str]) -> ImuColumns | None:
     """Return the one time and the three rates, about x, y and z, that have units in their names.
 
-    Return `None` unless there is exactly one of each.
+    It returns `None` unless there is exactly one time and one rate about each axis.
     """
     times = {name: unit for name in names if (unit := unit_in(name, ())) in TIME_UNITS}
     rates = {name: unit for name in names if (unit := unit_in(name, ())) in ("rad/s", "deg/s")}
@@ -71,7 +72,7 @@ def _columns_by_name(names: list[str]) -> ImuColumns | None:
 
 
 def _imu_columns_of_binary(path: Path) -> ImuColumns | None:
-    """Return the columns of a binary log, or `None` if it has no rates."""
+    """Return the columns of time and rates of a binary log, or `None` if it has no rates."""
     columns = _columns_of_binary(path)
     if columns is None:
         return None
@@ -80,7 +81,9 @@ def _imu_columns_of_binary(path: Path) -> ImuColumns | None:
 
 
 def _columns_of_binary(path: Path) -> tuple[str, str, str, str] | None:
-    """Return the names of the time and the rates in a binary log, `None` if it has no rates."""
+    """Return the names of the time and of the rates in a binary log, or `None` if it has no
+    rates.
+    """
     kind = kind_of(path)
     if kind in (".bbl", ".bfl"):
         return "time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]"

@@ -1,4 +1,4 @@
-"""The reader of MCAP files of JSON and ROS 2 messages, by the library mcap (an extra)."""
+"""Read MCAP files of JSON and ROS 2 messages, by the library mcap (an extra)."""
 
 import json
 from array import array
@@ -13,7 +13,8 @@ from rigidjax.cli.logs.columns import Columns
 
 
 def read_mcap(path: Path, columns: Sequence[str]) -> Columns:
-    """Return the fields of JSON and ROS 2 messages, such as `/imu.angular_velocity.x`.
+    """Return the names of all fields of JSON and ROS 2 messages, such as `/imu.angular_velocity.x`,
+    and the wanted fields.
 
     The times `topic.log_time` and `topic.stamp` (the latter of the header of a message) are in s
     from the first message of the file.
@@ -27,7 +28,7 @@ def read_mcap(path: Path, columns: Sequence[str]) -> Columns:
         reader = make_reader(file, decoder_factories=[_Json(), ros()])
         for number, (_, channel, message, content) in enumerate(reader.iter_decoded_messages()):
             if not columns and number == _ENOUGH:
-                # No columns are wanted, only names: every topic has been met by now.
+                # Only names are wanted, and every topic has been met by now.
                 break
             first = message.log_time if first is None else first
             fields = {"log_time": 1e-9 * (message.log_time - first)} | dict(_numbers_in(content))
@@ -42,15 +43,15 @@ def read_mcap(path: Path, columns: Sequence[str]) -> Columns:
     return list(names), {name: np.frombuffer(a, float) for name, a in arrays.items() if len(a)}
 
 
-# The number of messages among which every topic has at least one.
+# Among this number of messages every topic has at least one.
 _ENOUGH = 2000
 
 
 class _Json:
-    """The decoder of messages in JSON, by mcap's interface."""
+    """Provide the decoder of messages in JSON, by the interface of mcap."""
 
     def decoder_for(self, encoding: str, schema: object) -> Callable[[bytes], Any] | None:
-        """Return the decoder of an encoding, `None` for another one than JSON."""
+        """Return the decoder of an encoding, or `None` for another encoding than JSON."""
         return json.loads if encoding == "json" else None
 
 

@@ -1,4 +1,4 @@
-"""The columns of a log by name, whatever its format."""
+"""Read the columns of a log by name, whatever the format of the log."""
 
 import csv
 import functools
@@ -31,7 +31,7 @@ _READERS = {".npz": read_npz, ".mat": read_mat} | BINARY
 def read_table(
     path: str | Path, columns: Sequence[str], *, flight: int | None = None
 ) -> dict[str, np.ndarray]:
-    """Read columns of a log by name.
+    """Read columns of a log by name, from text or from one of several binary formats.
 
     A log is one of these:
 
@@ -83,7 +83,7 @@ def read_table(
     if path.suffix.lower() == ".gz" and kind_of(path.with_suffix("")) in _READERS:
         raise LogError(f"{path}: only text is read while it is packed; unpack it first: gunzip")
     try:
-        # Read line by line: only the numbers of a large file stay in memory.
+        # Read line by line: only the numbers of a large file then stay in memory.
         with text.open_text(path) as file:
             return text.read_columns(path, file, columns)
     except (OSError, EOFError, UnicodeError, zlib.error, csv.Error) as error:
@@ -92,7 +92,7 @@ def read_table(
 
 
 def kind_of(path: Path) -> str:
-    """Return the ending of a log in small letters; `.usd` for a Crazyflie's log without ending."""
+    """Return the ending of a log in small letters, `.usd` for a Crazyflie's log without ending."""
     if path.suffix or not path.is_file():
         return path.suffix.lower()
     with path.open("rb") as file:
@@ -100,13 +100,13 @@ def kind_of(path: Path) -> str:
 
 
 def _require_one_flight(path: Path, flight: int | None) -> None:
-    """Raise `LogError` if a flight is chosen in a log that is not of Blackbox."""
+    """Raise `LogError` if a `flight` is chosen in a log that is not one of Blackbox."""
     if flight is not None:
         raise LogError(f"{path}: flight {flight}: only a Blackbox log (.bbl, .bfl) has flights")
 
 
 def _arrays(path: Path, columns: Sequence[str], flight: int | None) -> dict[str, np.ndarray]:
-    """Read columns of a log that is not text."""
+    """Return the wanted columns of a log that is not text."""
     read: Any = _READERS[kind_of(path)]
     if read is read_blackbox:
         read = functools.partial(read_blackbox, flight=flight)

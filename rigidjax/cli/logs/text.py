@@ -1,4 +1,6 @@
-"""The reader of logs in text: a header line, then numbers. Errors name file, line and column."""
+"""Read logs in text, a header line and then numbers, with errors that name file, line and
+column.
+"""
 
 import codecs
 import csv
@@ -20,7 +22,9 @@ SEPARATORS = ",;\t"
 
 
 def open_text(path: Path) -> io.TextIOWrapper:
-    """Open a log in text, packed (`.gz`) or not, by the encoding that its first bytes show."""
+    """Return a log in text as an open file, packed (`.gz`) or not, with the encoding that its first
+    bytes show.
+    """
     packed = path.suffix.lower() == ".gz"
     raw: Any = gzip.open(path, "rb") if packed else path.open("rb")
     try:
@@ -31,10 +35,10 @@ def open_text(path: Path) -> io.TextIOWrapper:
 
 
 def _encoding(begin: bytes) -> str:
-    """Return the encoding of a text by its first bytes `begin`.
+    """Return the encoding of a text, found from its first bytes `begin`.
 
-    A byte-order mark, or zeros between the letters, show UTF-16. Else it is UTF-8 if the bytes are
-    valid in it, or Windows's code page 1252.
+    A byte-order mark, or zeros between the letters, show UTF-16. Otherwise it is UTF-8 if the bytes
+    are valid in UTF-8, else Windows's code page 1252.
     """
     if begin[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return "utf-16"
@@ -43,13 +47,13 @@ def _encoding(begin: bytes) -> str:
     try:
         codecs.getincrementaldecoder("utf-8")().decode(begin)
     except UnicodeDecodeError:
-        # Bytes that are no letter in this code page, either, raise an error when they are read.
+        # Bytes that are no letter in this code page either raise an error when they are read.
         return "cp1252"
     return "utf-8-sig"
 
 
 class Header(NamedTuple):
-    """The header of a text.
+    """Hold the header of a text.
 
     **Fields:** `names` of the columns; `separator` of cells; `line` the number of its line; `after`
     the lines that were read after it.
@@ -62,7 +66,7 @@ class Header(NamedTuple):
 
 
 def read_header(file: io.TextIOBase) -> Header:
-    """Read the header of a text from its begin: the first line after comments (`#`).
+    """Read the header of a text from its beginning, which is the first line after comments (`#`).
 
     If numbers follow the last comment, this comment is the header, as in files of `numpy.savetxt`.
     """
@@ -76,20 +80,20 @@ def read_header(file: io.TextIOBase) -> Header:
     return Header(names, separator, line, [])
 
 
-# The longest header that is read, the length that `csv` allows for a cell: a file may be one
+# The longest header that is read has the length that `csv` allows for a cell: a file may be one
 # endless line.
 _LONGEST = 131_072
 _NUMBER = re.compile(r"[-+.\d][-+.\deE]*")
 
 
 def _split_names(first: str) -> tuple[list[str], str]:
-    """Return the names in a line and their separator, the one that gives most names."""
+    """Return the names in a line, and their separator, which is the one that gives most names."""
     separator = max(SEPARATORS, key=first.count)
     return [name.strip() for name in next(csv.reader([first], delimiter=separator), [])], separator
 
 
 def read_columns(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read the wanted columns of a text, line by line; `path` is for messages."""
+    """Read the wanted columns of a text line by line, where `path` is for error messages."""
     header, separator, top, after = read_header(file)
     if not any(header):
         raise LogError(f"{path}: line 1: wanted a header with the columns {', '.join(columns)}")
@@ -131,14 +135,16 @@ def read_columns(path: Path, file: io.TextIOBase, columns: Sequence[str]) -> dic
 
 
 class _NumberReader:
-    """A reader of cells as numbers: the first decimal decides between a point and a comma."""
+    """Read cells as numbers, where the first decimal decides between a point and a comma."""
 
     def __init__(self, separator: str):
         self.separator = separator
         self.decimal: str | None = None
 
     def __call__(self, cell: str) -> float:
-        """Return the number in a cell, NaN for an empty one; raise `ValueError` for others."""
+        """Return the number in a cell, NaN for an empty cell; raise `ValueError` for other
+        cells.
+        """
         if not cell:
             return math.nan
         plain = cell
@@ -160,7 +166,7 @@ class _NumberReader:
         """Return the cell with a point in place of its decimal comma."""
         if "." in cell or self.decimal == ".":
             raise ValueError(f"{cell!r} is not a number; the decimals above have the other sign")
-        # Between tabs 1,200 may be a thousand and two hundred.
+        # Between tabs, 1,200 may mean a thousand and two hundred.
         if self.decimal is None and self.separator == "\t" and _THOUSANDS.fullmatch(cell):
             raise ValueError(f"{cell!r} is not a number; does its comma mark thousands?")
         if "," in cell:

@@ -1,4 +1,4 @@
-"""The time column of a log: the rows in a window whose times increase."""
+"""Check the time column of a log, and choose the rows in a window whose times increase."""
 
 import bisect
 from pathlib import Path
@@ -8,29 +8,31 @@ import numpy as np
 from rigidjax.cli.logs.errors import LogError, warn
 from rigidjax.cli.logs.units import TIME_UNITS, UNITS
 
-# This many rows in succession with bad times mean that the clock was set.
+# This number of rows in succession with bad times means that the clock was set.
 _RESTART = 5
-# The least number of rows of a log.
+# A log must have at least this number of rows.
 _FEWEST = 4
-# The steps, s, that loggers of moving bodies have, and those beyond which a step is doubtful.
+# The first range holds the steps, s, that loggers of moving bodies have; a step outside of the
+# second range is doubtful.
 _USUAL_STEPS = (1e-5, 1.0)
 _ODD_STEPS = (1e-7, 1e3)
-# A gap of more steps means that the clock was set, or that the logger was off.
+# A gap of more steps than this means that the clock was set, or that the logger was off.
 _GAP = 1e5
 
 
 def mask_of_increasing(t: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of times that increase, with as few left out as possible.
+    """Return a mask (T,) of times that increase, which leaves out as few times as possible.
 
-    They are a longest increasing subsequence, found by patience sorting. A time that is repeated,
-    backward, far too large or missing (NaN) therefore costs its own row only.
+    The chosen times are a longest increasing subsequence, found by patience sorting. A time that is
+    repeated, backward, far too large or missing (NaN) therefore costs its own row only.
 
     >>> mask_of_increasing(np.array([0.0, 1.0, 1.0, 90.0, 2.0, np.nan, 3.0])).tolist()
     [True, True, False, False, True, False, True]
     """
     if (np.diff(t) > 0).all() and np.isfinite(t).all():
         return np.ones(t.shape, bool)
-    # For each length: the least last time of an increasing subsequence of that length, and its row.
+    # For each length, `ends` has the least last time of an increasing subsequence of that length,
+    # and `rows` has the row of that time.
     ends: list[float] = []
     rows: list[int] = []
     before = np.full(t.shape, -1)
@@ -53,7 +55,7 @@ def mask_of_increasing(t: np.ndarray) -> np.ndarray:
 def rows_to_use(
     path: str | Path, t: np.ndarray, name: str, window: tuple[float, float] | None
 ) -> np.ndarray:
-    """Return the indices of the rows to use: those in the window whose times increase.
+    """Return the indices of the rows to use, those in the window whose times increase.
 
     **Arguments:**
 
@@ -104,11 +106,14 @@ def rows_to_use(
 def _require_one_clock(
     path: str | Path, t: np.ndarray, name: str, rows: np.ndarray, keep: np.ndarray
 ) -> None:
-    """Raise `LogError` if bad times are a second increasing series: the clock was set back."""
+    """Raise `LogError` if the bad times are a second increasing series, that is if the clock was
+    set back.
+    """
     bad = np.flatnonzero(~keep)
     for run in np.split(bad, np.flatnonzero(np.diff(bad) > 1) + 1):
         if run.size >= _RESTART and (np.diff(t[rows[run]]) > 0).all():
-            # The bad rows are either the end of the first series or the begin of the second one.
+            # The bad rows are either the end of the first series or the beginning of the second
+            # one.
             first, after = run[0], run[-1] + 1
             row = rows[first if first and t[rows[first]] <= t[rows[first - 1]] else after]
             raise LogError(
@@ -118,7 +123,7 @@ def _require_one_clock(
 
 
 def remark_on_step(path: str | Path, t: np.ndarray, unit: str, rate: float) -> None:
-    """Warn of a long gap in times, and of times that are plainly not in their unit.
+    """Warn of a long gap in the times, and of times that are plainly not in their unit.
 
     **Arguments:** `path` for the message; `t` (T,) s; `unit` in which the times were read; `rate` a
     typical body rate, rad/s, or zero without a gyro.

@@ -1,4 +1,4 @@
-"""The reader of PX4's ULog, by the library pyulog (an extra)."""
+"""Read PX4's ULog, by the library pyulog (an extra)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,7 +8,8 @@ from rigidjax.cli.logs.columns import Columns
 
 
 def read_ulog(path: Path, columns: Sequence[str]) -> Columns:
-    """Return the fields of a ULog of PX4 as `topic.field`, such as `sensor_combined.gyro_rad[0]`.
+    """Return the names of all fields of PX4's ULog as `topic.field`, such as
+    `sensor_combined.gyro_rad[0]`, and the wanted fields.
 
     The fields of a second instance of a topic are `topic#1.field`; times are in µs.
     """

@@ -1,4 +1,4 @@
-"""The units of columns: their factors to SI, and their spellings in the names of columns."""
+"""Convert units of columns to SI, and find units in the names of columns."""
 
 import math
 import re
@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 from rigidjax.cli.logs.errors import LogError, warn
 
-# The factor of each unit to SI.
+# A value in a unit is multiplied by this factor to give SI.
 UNITS = {
     "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "mm": 1e-3, "m/s2": 1.0, "g": 9.80665,
     "1": 1.0, "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180,
     "rpm": math.pi / 30,
 }  # fmt: skip
 TIME_UNITS = ("s", "ms", "us", "ns")
-# The spellings of each unit, in small letters; powers without `^`, `**` or raised digits.
+# Each unit has these spellings, in small letters; powers are without `^`, `**` or raised digits.
 _SPELLINGS = {
     "s": "s sec secs second seconds",
     "ms": "ms msec millisecond milliseconds",
@@ -29,9 +29,10 @@ _SPELLINGS = {
 }
 _UNIT_OF = {word: unit for unit, words in _SPELLINGS.items() for word in words.split()}
 _IN_BRACKETS = re.compile(r"[(\[]([^()\[\]]*)[)\]]\s*$")
-# Words in brackets that are meant as a unit: others are an axis or an index.
+# This pattern finds words in brackets that are meant as a unit; other words in brackets are an axis
+# or an index.
 _UNKNOWN = re.compile(r"[/°]|dps|lsb|count|raw", re.IGNORECASE)
-# Characters that have several spellings.
+# These characters have several spellings.
 _SIGNS = str.maketrans({
     "²": "2", "⁻": "-", "−": "-", "¹": "1", "µ": "u", "μ": "u", "º": "°", "^": None, "*": None,
     "·": None, "⋅": None, ".": None, " ": None,
@@ -56,7 +57,9 @@ def unit_in(name: str, allowed: Sequence[str]) -> str | None:
 
 
 def _usual_spelling(word: str) -> str:
-    """Return a unit in the spelling of `_SPELLINGS`; a capital G, which is gauss, stays."""
+    """Return a unit in the spelling of `_SPELLINGS`, except a capital G, which means gauss and
+    stays unchanged.
+    """
     return word.translate(_SIGNS).lower() if word.strip() != "G" else word
 
 
@@ -67,7 +70,8 @@ def unit_of(
     allowed: Sequence[str],
     place: str,
 ) -> str:
-    """Return the unit of columns: the one that their names or the user state, else the usual one.
+    """Return the unit of columns, which is the one that their names or the user state, else the
+    usual one.
 
     **Arguments:**
 

@@ -1,1 +1,1 @@
-"""The result of a fit, and what it says in words."""
+"""Describe the result of a fit, in numbers and in words."""

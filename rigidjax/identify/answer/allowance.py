@@ -1,4 +1,4 @@
-"""Words for the errors, besides random ones, that the intervals of a fit allow for."""
+"""Describe in words the errors, besides random ones, that the intervals of a fit allow for."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from rigidjax.identify.uncertainty.considered import (
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 from rigidjax.identify.uncertainty.quantities import Quantity
 
-# The largest number of quantities named in one sentence.
+# At most this number of quantities is named in one sentence.
 MOST = 3
 # A free bias is remarkable if it exceeds this share of the root mean square of the readings: the
 # bias of a gyro is a hundredth of the rates that are worth a fit.
@@ -33,7 +33,8 @@ def allowance(
     moves: Moves,
     named: Sequence[Quantity],
 ) -> str:
-    """Return sentences on the sensor errors that the intervals allow for, and that they do not.
+    """Return sentences on the sensor errors that the intervals allow for, and on those that they do
+    not.
 
     **Arguments:**
 
@@ -63,10 +64,11 @@ def allowance(
 
 
 def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
-    """Say which free biases without a prior are as large as readings; empty if none is.
+    """Describe the free biases without a prior that are as large as readings, in a text that is
+    empty if there is none.
 
-    Such a bias takes up what the model of the motion lacks: that of a pendulum's gyro came out as
-    1.6 rad/s. `quantities` are those of the fit.
+    Such a bias takes up what the model of the motion lacks: the bias of a pendulum's gyro came out
+    as 1.6 rad/s. `quantities` are those of the fit.
     """
     out = []
     for index, reading in enumerate(model.records.readings):
@@ -89,7 +91,9 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
 
 
 def _list_shifts(named: Sequence[Quantity], sizes: Float[np.ndarray, " quantities"]) -> str:
-    """List by how much each quantity would move, with the half-width of its interval."""
+    """Return the words that say by how much each quantity would move, with the half-width of its
+    interval.
+    """
     words = []
     for quantity, size in list(zip(named, sizes, strict=True))[:MOST]:
         unit = quantity.value if quantity.positive else 1.0

@@ -1,18 +1,21 @@
-"""The two answers of a fit, and the advice that follows from them."""
+"""Describe the two answers of a fit, on the search and on the model, and the advice that follows
+from them.
+"""
 
 import equinox as eqx
 
-# The answers on the search.
+# These are the answers on the search.
 FOUND, NOT_ALONE, NOT_ENDED = "found", "not alone", "not ended"
-# The answers on the model.
+# These are the answers on the model.
 EXPLAINS, LEAVES, FAILS = "explains the readings", "leaves a part", "does not explain the readings"
 
-# Errors larger than the given noise by more than this factor are no errors of a sensor.
+# Errors that are larger than the given noise by more than this factor are not those of a sensor.
 FAR = 3.0
 
 
 class Answer(eqx.Module):
-    """An answer in one `word`, with `reasons` in words; it is printed as `word (reason; reason)`.
+    """Hold an answer in one `word` with its `reasons` in words; it is printed as
+    `word (reason; reason)`.
 
     >>> print(Answer("not ended", ("max_steps reached",)))
     not ended (max_steps reached)
@@ -26,7 +29,7 @@ class Answer(eqx.Module):
 
 
 class Cause(eqx.Module):
-    """The most likely cause of the errors of a sensor; it is printed as its words.
+    """Hold the most likely cause of the errors of a sensor; it is printed as its words.
 
     **Fields:**
 
@@ -52,7 +55,7 @@ class Cause(eqx.Module):
 
 
 def status(search: Answer, model: Answer) -> str:
-    """Return both answers in one line: `ok` if both are good and have no reasons."""
+    """Return both answers in one line, which is `ok` if both are good and have no reasons."""
     if search == Answer(FOUND) and model == Answer(EXPLAINS):
         return "ok"
     return f"search: {search}; model: {model}"
@@ -66,7 +69,7 @@ def advice(
     above: float,
     allowed: str,
 ) -> str:
-    """Say whether the intervals can be trusted, and what to try.
+    """Return words that say whether the intervals can be trusted, and what to try.
 
     **Arguments:**
 

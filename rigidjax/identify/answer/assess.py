@@ -1,4 +1,6 @@
-"""The quality of a fit: its covariance, its two answers, and the starts that fit as well."""
+"""Measure the quality of a fit: its covariance, its two answers, and the starts that fit as
+well.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -46,12 +48,14 @@ from rigidjax.identify.uncertainty.stretches import (
     stretches_of,
 )
 
-# The false-alarm rate of the test for autocorrelated errors: a fit tests many sensors and channels.
+# The test for autocorrelated errors has this rate of false alarms: a fit tests many sensors and
+# channels.
 RARE = 1e-5
-# The number of lags in this test.
+# The test takes this number of lags.
 LAGS = 10
-# Shares of the variance of the readings. A model fails if its errors exceed HALF of it, or their
-# autocorrelated part a TENTH; errors below a QUARTER are small, if nothing else is wrong.
+# These are shares of the variance of the readings. A model fails if its errors exceed HALF of it,
+# or if their autocorrelated part exceeds a TENTH; errors below a QUARTER are small, if nothing else
+# is wrong.
 HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
@@ -62,7 +66,8 @@ def goodness(
     times: CorrelationTimes,
     covariance: np.ndarray,
 ) -> tuple[float, int, Answer, tuple[int, ...]]:
-    """Return χ², its degrees of freedom, the answer on the model, and the unexplained sensors.
+    """Return χ², its degrees of freedom, the answer on the model, and the sensors whose errors it
+    does not explain.
 
     χ² counts the sensors whose noise is given. The size of the errors is compared with this noise
     (by five standard deviations of χ², or of the median of the squares under a robust loss) and
@@ -91,7 +96,7 @@ def goodness(
         slope = linear.slopes[index] * root[..., None]
         white = left <= tiny or _is_white(e * root, mask, slope, own, has_noise)
         has_clock_error = left > tiny and clock_cause(model, noise, linear, index) is not None
-        # Errors below a given noise, or small ones, cannot hide a missing part of the model.
+        # Errors below a given noise, or small errors, cannot hide a missing part of the model.
         small = has_noise or left <= QUARTER * varies + tiny
         if factor == 1.0 and white and small and not has_clock_error:
             continue
@@ -101,7 +106,7 @@ def goodness(
             word = FAILS
         word = LEAVES if word == EXPLAINS else word
         sensors.append(index)
-        # Only an error with as many numbers as a reading has the unit of the reading.
+        # An error has the unit of the reading only if it has as many numbers as the reading.
         alike = int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
         share = left / varies if varies > tiny and alike else None
         span = None if white else times.longest
@@ -145,7 +150,7 @@ def _describe_errors(
 
 
 def _describe_interval(model: Model, error: np.ndarray, mask: np.ndarray) -> str:
-    """Describe the shortest interval of time that holds half of the sum of squared errors."""
+    """Describe the shortest interval of time that contains half of the sum of squared errors."""
     squares = np.sum(np.where(mask, error, 0.0) ** 2, axis=-1)
     row = int(np.argmax(squares.sum(axis=1)))
     count = int(model.counts[row])
@@ -163,23 +168,27 @@ def _describe_interval(model: Model, error: np.ndarray, mask: np.ndarray) -> str
 def _sums_of_squares(
     reading: Reading, error: np.ndarray, mask: np.ndarray
 ) -> tuple[float, float, float]:
-    """Return three sums of squares: of errors, of readings about their mean, and of round-off."""
+    """Return three sums of squares: of the errors, of the readings about their mean, and of the
+    round-off of the readings.
+    """
     values = np.asarray(reading.values)[reading.host_mask]
     varies = float(np.sum((values - values.mean(axis=0)) ** 2))
     return float(np.sum(error[mask] ** 2)), varies, 1e-12 * float(np.sum(values**2))
 
 
 def _excess_by_median(squares: np.ndarray, size: int) -> float:
-    """Return the size of whitened errors over that of noise, by the median of their `squares`.
+    """Return the size of whitened errors over the size of noise, computed from the median of their
+    `squares`.
 
-    It is 1 unless the difference is significant. Under a robust loss outliers are expected, and
-    they would dominate χ². `size` is the number of components of an error.
+    It is 1 unless the difference is significant. The median is taken because outliers are expected
+    under a robust loss, and they would dominate χ². `size` is the number of components of an error.
     """
     if not squares.size:
         return 1.0
     middle = float(np.median(squares))
     half, density = median_of_chi2(size)
-    # The deviation of the median of n samples is 1 / (2 f √n), f the density at the median.
+    # The standard deviation of the median of n samples is 1 / (2 f √n), with f the density at the
+    # median.
     wide = 0.5 / (density * np.sqrt(squares.size))
     return float(np.sqrt(middle / half)) if middle > half + 5 * wide else 1.0
 
@@ -187,7 +196,7 @@ def _excess_by_median(squares: np.ndarray, size: int) -> float:
 def _is_white(
     e: np.ndarray, used: np.ndarray, slope: np.ndarray, covariance: np.ndarray, has_noise: bool
 ) -> bool:
-    """Return whether whitened errors `e` (R, T, k) are white, by Ljung and Box's test.
+    """Return whether the whitened errors `e` (R, T, k) are white, by Ljung and Box's test.
 
     Fitted numbers take the part `slope covariance slopeᵀ` out of white errors and so correlate
     them, which shows in many short recordings (Box and Pierce 1970,
@@ -217,7 +226,9 @@ def _is_white(
 
 
 def _packed_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return the rows (R, T, m) under the `mask` (R, T), less their mean, first and zeros after."""
+    """Return the rows (R, T, m) without their mean, with the entries of the `mask` (R, T) first and
+    zeros after them.
+    """
     order = np.argsort(~mask, axis=1, kind="stable")
     valid = np.take_along_axis(mask, order, axis=1)[..., None]
     packed = np.where(valid, np.take_along_axis(rows, order[..., None], axis=1), 0.0)
@@ -225,14 +236,16 @@ def _packed_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return np.where(valid, packed - mean, 0.0)
 
 
-# A search has ended if the least misfit is nearer than this, in standard deviations.
+# A search has ended if the least misfit is nearer than this distance, in standard deviations.
 AT_THE_END = 0.05
 
 
 def _search_answer(
     best_cost: float, ended: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
 ) -> Answer:
-    """Return the answer on the search; `rivals` names the starts that fit as well elsewhere."""
+    """Return the answer on the search, where `rivals` describes the starts that fit as well
+    elsewhere.
+    """
     if not np.isfinite(best_cost):
         return Answer(NOT_ENDED, ("no start gave a finite misfit",))
     if not ended:
@@ -246,12 +259,15 @@ def _search_answer(
 def _count_rivals(
     starts: Sequence[Start], best_cost: float, margin: float, linear: Linearisation, x: Array
 ) -> int:
-    """Count the `starts` that ended far from the best point x, by more than a `margin`."""
+    """Return the number of `starts` that ended at a point far from the best point x, by more than a
+    `margin`.
+    """
     count = 0
     for item in starts:
         if item.converged and item.cost > best_cost + 0.01 * margin:
             away = item.x - x
-            # Two points of a flat valley differ, but give the same readings: they are no rivals.
+            # Two points of a flat valley differ, but give the same readings: such points are no
+            # rivals.
             count += linear.squared_change(np.asarray(away)) > 2 * margin
     return count
 
@@ -298,8 +314,8 @@ def assess(
     limits = flat_limit.flat_limits(
         model, numbers, -white.determined @ linear.slope, [n for n, _ in of]
     )
-    # In a long curved valley steps stay short, although there is hardly anything left to gain: the
-    # distance to the minimum of the linearised problem says that the search has ended.
+    # In a long curved valley steps stay short, although there is hardly anything left to gain: a
+    # small distance to the minimum of the linearised problem then says that the search has ended.
     held = [limit.slope for limit in limits if limit.free < 0]
     near_end = AT_THE_END
     if count := nominal_count(model):
@@ -307,8 +323,8 @@ def assess(
     done = bool(best.converged) or uncertainty.distance_to_minimum(linear, white, held) < near_end
     chi2, dof, explanation, left = goodness(model, noise, linear, times, white.determined)
     believable = explanation.word != FAILS
-    # A start fits as well within ten units of log-likelihood, measured in the estimated noise if
-    # some noise is estimated; autocorrelated errors count as fewer.
+    # A start fits as well if its log-likelihood is within ten units, measured in the estimated
+    # noise if some noise is estimated; autocorrelated errors count as fewer errors.
     guessed = not all(r.known_noise and not has_unit_noise(r) for r in model.records.readings)
     unit = 2 * best_cost / model.records.size if guessed else 1.0
     margin = 10.0 * unit * max(times.longest, 1.0)
@@ -370,7 +386,9 @@ def _allowance(
     quantities: Sequence[Quantity],
     slopes: np.ndarray,
 ) -> str:
-    """Say what the intervals of the moments and ratios allow for, or of the `Free`s without any."""
+    """Return what the intervals of the moments and ratios allow for, or of the `Free`s if there are
+    no moments.
+    """
     bodies = {log + name for name, chart in charts_by_suffix(model) for log in chart.log_names}
     free = {slot.name for slot in model.slots}
     rows = [i for i, one in enumerate(quantities) if one.name in bodies and one.name != "mass"]

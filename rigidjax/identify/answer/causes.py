@@ -1,4 +1,4 @@
-"""The most likely cause of the errors of a fit.
+"""Find the most likely cause of the errors of a fit.
 
 Each cause has a direction: the change of the readings that it would make along the fitted motion.
 The errors are regressed on this direction together with all free numbers (a score test: Rao 1948,
@@ -37,7 +37,7 @@ BETTER, LITTLE = 0.5, 0.3
 EQUAL = 1.1
 _SAME = np.eye(3)
 
-# Mistakes in rates, and the matrix that corrects each.
+# Each mistake in rates is corrected by a matrix.
 RATES = {
     "deg/s read as rad/s": _SAME * np.pi / 180,
     "rad/s read as deg/s": _SAME * 180 / np.pi,
@@ -58,7 +58,8 @@ ATTITUDES = {
 
 
 def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause | None:
-    """Return the mistake made when the rates of one body were read, `None` if there is none.
+    """Return the mistake that was made when the rates of one body were read, or `None` if there is
+    none.
 
     The rates are compared with the rates between attitudes or, without attitudes, with Euler's
     equations of the best body: there a correction counts only if this body is a real one. A
@@ -82,14 +83,14 @@ def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause 
             ratios[name] = _rate_difference(recordings, changed, _SAME)
     elif depends_on_rate_only(torque):
         bound, margin = _euler_residual(recordings, torque, _SAME)
-        # Sensor errors alone can make the best body slightly unreal, but not far from real ones.
+        # Sensor errors alone can make the best body slightly unreal, but not far from real bodies.
         bound *= BETTER if margin > -0.8 else EQUAL
         fits = {name: _euler_residual(recordings, torque, turn) for name, turn in RATES.items()}
         if torque is not None:
             fits["the torque with the other sign"] = _euler_residual(
                 recordings, torque, _SAME, -1.0
             )
-        # A margin near 1 is that of a ball, to which every constant rate is a free motion.
+        # A margin near 1 is that of a ball: every constant rate is a free motion of it.
         ratios = {name: left if -0.01 < m < 0.8 else np.inf for name, (left, m) in fits.items()}
     else:
         return None
@@ -103,7 +104,8 @@ def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause 
 def _euler_residual(
     recordings: Sequence[Recording], torque: Torque | None, turn: np.ndarray, sign: float = 1.0
 ) -> tuple[float, float]:
-    """Return the relative residual of Euler's equations and the best body's margin of being real.
+    """Return the relative residual of Euler's equations, and the margin by which the best body is
+    real.
 
     The rates are multiplied by the matrix `turn`, the torque by `sign`.
     """
@@ -119,7 +121,8 @@ def _rate_difference(
     attitudes: Sequence[tuple[np.ndarray, np.ndarray]],
     turn: np.ndarray,
 ) -> float:
-    """Return the relative difference between rates, times `turn`, and rates between attitudes.
+    """Return the relative difference between the read rates, multiplied by `turn`, and the rates
+    between attitudes.
 
     `attitudes` holds the times (n,) and the attitudes (n, 4) of each recording.
     """
@@ -140,11 +143,12 @@ def _rate_difference(
 # A cause is named if it explains more than the share ENOUGH of the squared errors, and at least
 # NEARLY of what the best cause explains.
 ENOUGH, NEARLY = 0.7, 0.95
-# A direction is dropped if the free numbers absorb it but for this part.
+# A direction is dropped if the part of it that the free numbers cannot absorb is below this share.
 APART = 0.05
-# The causes that are linear in their size only while it is SMALL.
+# These causes are linear in their size only while the size is below SMALL.
 LINEAR, SMALL = ("scale", "mounting", "skew"), 0.5
-# SKEW[i, j, k] = 1 if the axis j reads a part of the component i by the k-th angle of skew.
+# The entry SKEW[i, j, k] is 1 if the axis j reads a part of the component i by the k-th angle of
+# skew.
 SKEW = np.zeros((3, 3, 3))
 SKEW[1, 0, 0] = SKEW[2, 0, 1] = SKEW[2, 1, 2] = 1.0
 
@@ -183,7 +187,8 @@ def causes(
 
 
 def clock_cause(model: Model, noise: Noise, linear: Linearisation, index: int) -> Cause | None:
-    """Return the cause "clock" if time stamps scatter by more than the jitter of the sensor.
+    """Return the cause "clock" if time stamps scatter by more than the jitter of the sensor, else
+    `None`.
 
     A late time stamp makes an error along the change of the readings in time, dy/dt.
     """
@@ -201,7 +206,7 @@ def clock_cause(model: Model, noise: Noise, linear: Linearisation, index: int) -
         return None
     along = np.sum(np.sum(error * slope, axis=-1)[moving] ** 2 / moved[moving])
     channels = np.sum(error[kept] ** 2, axis=0)
-    # The share along this direction that random errors of the same sizes have by chance.
+    # Random errors of the same sizes have this share along the direction by chance.
     ways = np.mean(slope[moving] ** 2 / moved[moving][:, None], axis=0)
     chance, share = float(ways @ channels / channels.sum()), float(along / channels.sum())
     if not share > chance + 0.5 * (1.0 - chance) + 1.0 / np.sqrt(moving.sum()):
@@ -214,7 +219,7 @@ def clock_cause(model: Model, noise: Noise, linear: Linearisation, index: int) -
 
 
 def _cause(name: str, sensor: AbstractSensor, share: float, words: str, remedy: str) -> Cause:
-    """Return a `Cause` whose words say how much of the squared errors it explains."""
+    """Return a `Cause` whose words say which share of the squared errors it explains."""
     kind = type(sensor).__name__
     explained = f"{100 * share:.0f} % of the squared errors of the {kind}"
     return Cause(name, kind, share, f"most likely {words}: {explained}", remedy)
@@ -223,7 +228,8 @@ def _cause(name: str, sensor: AbstractSensor, share: float, words: str, remedy: 
 def _largest_cause(
     sensor: AbstractSensor, rows: Sequence[tuple], shares: Sequence[tuple]
 ) -> Cause | None:
-    """Return the cause that explains the most, joined with those that explain nearly as much.
+    """Return the cause that explains the most, joined with the causes that explain nearly as much,
+    or `None`.
 
     `rows` are those of `_candidate_causes`, `shares` the results of `_explained_share` for them.
     """
@@ -232,7 +238,8 @@ def _largest_cause(
         for (name, _, words, remedy), (share, size) in zip(rows, shares, strict=True)
         if name not in LINEAR
         or np.abs(size).max() < SMALL
-        # A wrong unit, such as g read as m/s², is a large scale error that all axes share.
+        # A wrong unit, such as g read as m/s², is a large scale error that is the same for all
+        # axes.
         or (name == "scale" and np.ptp(size) < 0.1 * abs(size.mean()))
     ]
     most = max((share for share, *_ in candidates), default=0.0)
@@ -244,14 +251,15 @@ def _largest_cause(
 
 
 def _is_vector_error(sensor: AbstractSensor) -> bool:
-    """Return whether errors of the sensor are readings minus predictions along three axes."""
+    """Return whether the errors of the sensor are readings minus predictions along three axes."""
     return sensor.reading_shape == (3,) and sensor.components == 3
 
 
 def _candidate_causes(
     model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearisation, index: int
 ) -> tuple[tuple[str, np.ndarray, str, str], ...]:
-    """Return name, direction (R, T, 3, c), words and remedy of each cause for one sensor.
+    """Return the name, direction (R, T, 3, c), words and remedy of each possible cause for one
+    sensor.
 
     A cause of c numbers, such as a bias of three, has c directions.
     """
@@ -287,10 +295,11 @@ def _candidate_causes(
 def _response(
     model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearisation, index: int
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function from torques τ (R, T, 3, c) to the changes of the body rate by them.
+    """Return the function that maps torques τ (R, T, 3, c) to the changes of the body rate that
+    they make.
 
-    The change is `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt` with Φ = dΩ/dΩ₀ along the fitted motion; zero for a sensor
-    that is no `Gyro`.
+    The change is `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt` with Φ = dΩ/dΩ₀ along the fitted motion. It is zero for a
+    sensor that is no `Gyro`.
     """
     if not isinstance(model.records.readings[index].sensor, Gyro):
         return np.zeros_like
@@ -319,7 +328,8 @@ def _explained_share(
     free_columns: np.ndarray,
     direction: np.ndarray,
 ) -> tuple[float, np.ndarray]:
-    """Return the share of a sensor's squared errors that a direction explains, and its size.
+    """Return the share of a sensor's squared errors that a `direction` explains, and the size of
+    the cause.
 
     The `direction` (R, T, k, c) counts only by its part outside of the orthonormal columns
     `free_columns` (R, N, m), which span what the free numbers can change. The size (c,) is the

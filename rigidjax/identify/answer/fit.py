@@ -1,4 +1,6 @@
-"""Least squares from several starts, with the noise, the widths and the steps that it needs."""
+"""Fit by least squares from several starts, with the noise, the widths and the steps that the fit
+needs.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -40,18 +42,19 @@ from rigidjax.identify.search.starts import starting_points
 from rigidjax.identify.search.stochastic_gradient import Descent, descend_from
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 
-# The largest number of free numbers that all recordings share: the normal equations are dense.
+# At most this number of free numbers may be shared by all recordings, because the normal equations
+# are dense.
 MOST_SHARED = 1000
-# On a GPU a model of fewer numbers takes ten times as long as on a CPU, which starts each program
+# A model with fewer numbers takes ten times as long on a GPU as on a CPU, which starts each program
 # sooner.
 _FEW = 100_000
 # Integration steps are short enough if shorter ones change predictions by less than this part of
 # the noise.
 _MATTERS = 0.05
-# The noise is estimated in rounds; so is the width of the deviations of the recordings from a
+# The noise is estimated in rounds. So is the width of the deviations of the recordings from a
 # shared number, by expectation and maximisation (Dempster, Laird and Rubin 1977; Laird and Ware
-# 1982, doi:10.2307/2529876). They end after _ROUNDS or at a relative change below _SETTLED. A width
-# that falls below _LEAST times its first value is zero.
+# 1982, doi:10.2307/2529876). The rounds end after _ROUNDS, or at a relative change below _SETTLED.
+# A width that falls below _LEAST times its first value counts as zero.
 _ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
 
 
@@ -67,7 +70,8 @@ def fit(
     checkpoint: str | Path | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> Fit:
-    """Fit the free numbers of a model to its recordings: the body, initial states, all `Free`s.
+    """Fit the free numbers of a model to its recordings: the body, the initial states and all
+    `Free`s.
 
     **Arguments:**
 
@@ -147,8 +151,8 @@ def fit(
         points += starting_points(model, starts - len(points), key)
     points, interrupts, rough = points[:starts], [], []
     if isinstance(padded.integrator, Adaptive):
-        # Choose the tolerance before the search: the errors of long steps would slow it down, and
-        # another tolerance compiles no other program.
+        # Choose the tolerance of the integrator before the search: the errors of long steps would
+        # slow the search down, and another tolerance compiles no other program.
         first = Attempt(points[0], blocks=errors_and_slopes(padded, points[0]))
         finer = _converged_integrator(first, task, rough)
         task = task if rough else task._replace(model=_with_integrator(padded, finer))
@@ -173,7 +177,8 @@ _ON_CPU = "computed on the CPU, which is faster than a GPU for so few readings"
 
 
 def _faster_device(model: Model) -> Any:
-    """Return the CPU for a small model on a machine with a GPU, unless a device was chosen.
+    """Return the CPU for a small model on a machine with a GPU, unless a device was chosen; else
+    `None`.
 
     A device is chosen by `jax.default_device`, or by arrays that were put on a device.
     """
@@ -187,7 +192,9 @@ def _faster_device(model: Model) -> Any:
 
 
 def _with_original_readings(original: Model, fitted: Model) -> Model:
-    """Return the `fitted` model with the unpadded readings of the `original`, and their jitter."""
+    """Return the `fitted` model with the unpadded readings of the `original` model, but with the
+    jitter of the `fitted` one.
+    """
     records = original.records
     for index, r in enumerate(fitted.records.readings):
         if r.jitter_error is not None:
@@ -198,13 +205,15 @@ def _with_original_readings(original: Model, fitted: Model) -> Model:
 
 
 def _cost(attempt: Attempt) -> float:
-    """Return the cost of an attempt, infinity for NaN, so that the least cost is a good one."""
+    """Return the cost of an attempt, or infinity for NaN, so that the least cost is a good one."""
     cost = float(attempt.cost)
     return cost if np.isfinite(cost) else np.inf
 
 
 def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
-    """Estimate the unknown noise and the best point in turn; return the point, and the new task."""
+    """Estimate the unknown noise and the best point in turn, and return the point and the task with
+    the new noise.
+    """
     if all(reading.known_noise for reading in task.model.records.readings):
         return best, task
 
@@ -213,8 +222,8 @@ def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
         model, noise = estimate_noise(task.model, best.x, blocks, task.noise)
         return task._replace(model=model, noise=noise)
 
-    # Repeat it: the weights, the robust loss and the degrees of freedom that the fit takes from few
-    # readings depend on the noise.
+    # Repeat the estimate: the weights, the robust loss and the degrees of freedom that the fit
+    # takes from few readings depend on the noise.
     for turn in range(_ROUNDS):
         before, task = task.noise, estimate(best, task)
         pairs = zip(before, task.noise, strict=True)
@@ -254,13 +263,14 @@ def _search_from_each(
     progress: Callable[[str], Any] | None,
     interrupts: list[str],
 ) -> list[Attempt]:
-    """Return the end of the search from each point, or of those in the file `checkpoint`.
+    """Return the end of the search from each point, continuing with the ends in the file
+    `checkpoint`.
 
     After an interrupt (Ctrl-C) a line is added to `interrupts`, and the rest is left out.
     """
     like, print_of = Attempt(points[0]), ""
     if checkpoint is not None:
-        # The misfits tell two torque functions of one name apart, which the fingerprint does not.
+        # The misfits distinguish two torque functions of one name, which the fingerprint does not.
         costs = [cost_of(task.model, point, task.noise) for point in points]
         print_of = fingerprint(points, task, costs)
     keep = Checkpoint(checkpoint, like, print_of)
@@ -274,7 +284,7 @@ def _search_from_each(
         for number, point in enumerate(points[len(keep.done) :], len(keep.done) + 1):
             latest = like
             # Once a start explains the record, the others only have to show whether another motion
-            # does so, too: they may end at this misfit.
+            # does so as well: they may end at this misfit.
             ended = [float(one.cost) for one in attempts if bool(one.converged)]
             aim = min(ended, default=np.inf)
             aim = aim if aim <= sufficient_misfit(task.model) else 0.0
@@ -296,7 +306,9 @@ def _search_from_each(
 
 
 def _with_blocks(best: Attempt, model: Model) -> Attempt:
-    """Return the attempt with errors and derivatives, unless the search ended with them."""
+    """Return the attempt with errors and derivatives, which are computed unless the search ended
+    with them.
+    """
     if best.blocks is not None:
         return best
     return dataclasses.replace(best, blocks=errors_and_slopes(model, best.x))
@@ -309,7 +321,7 @@ def _errors_alone(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..
 
 
 def _with_integrator(model: Model, integrator: AbstractIntegrator | None) -> Model:
-    """Return the model with this integrator; `None` keeps the integrator of the model."""
+    """Return the model with the `integrator`, or the unchanged model for `None`."""
     if integrator is None:
         return model
     return eqx.tree_at(lambda m: m.integrator, model, integrator)
@@ -318,9 +330,10 @@ def _with_integrator(model: Model, integrator: AbstractIntegrator | None) -> Mod
 def _converged_integrator(
     best: Attempt, task: Task, remarks: list[str]
 ) -> AbstractIntegrator | None:
-    """Return the integrator whose predictions shorter steps do not change, `None` for the present.
+    """Return the integrator whose predictions shorter steps do not change, or `None` if this is the
+    present integrator.
 
-    If even the shortest steps change them, a line is added to `remarks`.
+    If even the shortest steps change the predictions, a line is added to `remarks`.
     """
     model, (errors, _) = task.model, best.blocks
     steps, apart = model.integrator, 0.0
@@ -338,8 +351,8 @@ def _converged_integrator(
             break
         steps, errors = finer, exact
         if apart <= 8 * _MATTERS:
-            # The errors fall by more than 8 with twice as many steps of a method of order 4, or
-            # with a hundredth of the tolerance: no third comparison is needed.
+            # The errors fall by more than a factor of 8 with twice as many steps of a method of
+            # order 4, or with a hundredth of the tolerance: no third comparison is needed.
             break
     else:
         if apart > _MATTERS:
@@ -350,7 +363,8 @@ def _converged_integrator(
 
 
 def _estimate_widths_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
-    """Estimate the widths of deviations and the best point in turn; return the point and the task.
+    """Estimate the widths of deviations and the best point in turn, and return the point and the
+    task with the new widths.
 
     These are the widths of the `Free`s whose deviations between recordings are to be estimated.
     """

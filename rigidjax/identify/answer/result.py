@@ -1,4 +1,4 @@
-"""The result of a fit: the best point, its uncertainty, and the end of each start."""
+"""Hold the result of a fit: the best point, its uncertainty, and the end of each start."""
 
 import dataclasses
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from rigidjax.identify.uncertainty.quantities import Quantity, interval_about
 
 
 class Start(eqx.Module):
-    """The end of the search from one start.
+    """Hold the end of the search from one start.
 
     **Fields:**
 
@@ -47,7 +47,7 @@ class Start(eqx.Module):
 
 
 class Fit(eqx.Module):
-    """The result of `fit`: the best point and its uncertainty.
+    """Hold the result of `fit`: the best point and its uncertainty.
 
     **Fields:**
 
@@ -113,7 +113,7 @@ class Fit(eqx.Module):
 
     @property
     def status(self) -> str:
-        """Return both answers in one line; `ok` if both are good and have no reasons."""
+        """Return both answers in one line, which is `ok` if both are good and have no reasons."""
         return answers.status(self.search, self.explanation)
 
     @property
@@ -123,12 +123,13 @@ class Fit(eqx.Module):
 
     @property
     def derivative_point(self) -> Float[Array, " n"]:
-        """Return the free numbers at which derivatives are taken: x, or for a flat body `near`."""
+        """Return the free numbers at which derivatives are taken, x or for a flat body `near`."""
         return self.x if self.near is None else self.near
 
     @property
     def causes(self) -> tuple[Cause, ...]:
-        """Return what most likely makes the errors that the model leaves, if the readings show it.
+        """Return the most likely causes of the errors that the model does not explain, if the
+        readings show them.
 
         Each cause has `name`, `sensor`, `share`, `words` and `remedy`.
         """
@@ -138,8 +139,8 @@ class Fit(eqx.Module):
 
     @property
     def advice(self) -> str:
-        """Say whether the intervals can be trusted, and what to try."""
-        # Outliers dominate χ² under a robust loss.
+        """Return words that say whether the intervals can be trusted, and what to try."""
+        # Do not use χ² under a robust loss, where outliers dominate it.
         above = np.sqrt(self.chi2 / self.dof) if self.model.loss is None else 1.0
         return answers.advice(
             self.search,
@@ -162,7 +163,7 @@ class Fit(eqx.Module):
 
     @property
     def body(self) -> Any:
-        """Return the body; several bodies as a dict by name.
+        """Return the body, or several bodies as a dict by name.
 
         Its `scale` is "arbitrary" if the chart has no scale, such as one of ratios.
         """
@@ -170,7 +171,7 @@ class Fit(eqx.Module):
 
     @property
     def state0(self) -> Any:
-        """Return the state at the first time; of several recordings with a leading axis."""
+        """Return the state at the first time, for several recordings with a leading axis."""
         return self.model.unpack(self.x).state0
 
     @property
@@ -180,7 +181,9 @@ class Fit(eqx.Module):
 
     @property
     def spreads(self) -> dict[str, Array]:
-        """Return the `spread` of each `Free` with one, given or estimated, by name, in its unit."""
+        """Return the `spread` of each `Free` that has one, given or estimated, by name and in its
+        unit.
+        """
         slots = self.model.slots
         return {s.name: s.spread * s.scale for s in slots if s.spread is not None}
 
@@ -188,15 +191,15 @@ class Fit(eqx.Module):
     def noise(self) -> tuple[Float[Array, "*records _"], ...]:
         """Return the standard deviations (k,) of each sensor, given or estimated.
 
-        Of R recordings they are (R, k).
+        For R recordings their shape is (R, k).
         """
         return tuple(n[0] for n in self.noises) if self.model.count == 1 else self.noises
 
     @property
     def jitter(self) -> tuple[Float[Array, "*records"] | None, ...]:
-        """Return the deviation of each sensor's time stamps, s, given or estimated.
+        """Return the standard deviation of each sensor's time stamps, s, given or estimated.
 
-        It is `None` for a sensor without jitter, and (R,) of R recordings.
+        It is `None` for a sensor without jitter, and has the shape (R,) for R recordings.
         """
         index = 0 if self.model.count == 1 else slice(None)
         jitters = (getattr(sensor, "jitter", None) for sensor in self.model.records.sensors)
@@ -204,9 +207,10 @@ class Fit(eqx.Module):
 
     @property
     def residuals(self) -> tuple[Float[Array, "*records times _"], ...]:
-        """Return reading minus prediction for each sensor, in its unit; zero where masked.
+        """Return reading minus prediction for each sensor, in its unit, with zero for a masked
+        reading.
 
-        Of several recordings they have a leading axis.
+        For several recordings the residuals have a leading axis.
         """
         errors = self._errors
         return tuple(e[0] for e in errors) if self.model.count == 1 else errors
@@ -238,7 +242,7 @@ class Fit(eqx.Module):
         return tuple(out)
 
     def interval(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Return the intervals of all reported quantities, name → (low, high).
+        """Return the intervals of all reported quantities, as a dict of (low, high) by name.
 
         The interval of a positive quantity is that of its logarithm. **Arguments:** `level` the
         probability that an interval holds the true value. **Raises** `ValueError` for a level
@@ -288,7 +292,7 @@ class Fit(eqx.Module):
         return interval_about(middle, slope, determined, null, reach, self.limits)
 
     def degrees_of_freedom(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom of the variances of functions with derivative `slope`.
+        """Return the degrees of freedom of the variances of functions whose derivative is `slope`.
 
         The `slope` (…, n) is taken with respect to the free numbers.
         """
@@ -309,12 +313,14 @@ class Fit(eqx.Module):
 
     @property
     def identifiability(self) -> tuple[str, ...]:
-        """Say which quantities the data determine well, weakly, and not at all."""
+        """Describe which quantities the data determine well, weakly, and not at all."""
         return identifiability.identifiability(self)
 
 
 def require_one_fit(fit: PyTree, name: str = "fit") -> Fit:
-    """Return the `fit`; raise `TypeError` or `ValueError` unless it is one `Fit`, not a batch."""
+    """Return the `fit`, and raise `TypeError` or `ValueError` unless it is one `Fit` and not a
+    batch.
+    """
     _checks.require_instance(fit, Fit, name)
     if np.shape(fit.chi2) != ():
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The numbers that a fit determines, and those that it does not, in words."""
+"""Describe in words the numbers that a fit determines, and those that it does not."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -39,19 +39,20 @@ if TYPE_CHECKING:
 
 # A number belongs to a combination if it changes by more than this share of the largest change.
 PART = 1e-3
-# In the elimination a row is zero if less than this share of the largest entry is left of it.
+# In the elimination a row counts as zero if its largest entry is below this share of the largest of
+# all entries.
 ROUND_OFF = 1e-5
-# Two numbers change by the same factor if the factors differ by less than this share.
+# Two numbers change by the same factor if their factors differ by less than this share.
 EVEN = 0.01
-# Readings change along a direction if a hundredth of the numbers' sizes moves them by more than
-# this, in standard deviations of all readings.
+# Readings change along a direction if a hundredth of the sizes of the numbers moves the readings by
+# more than this number of standard deviations of all readings.
 CHANGED = 0.01
-# The largest number of names written for a combination, and of combinations.
+# At most MOST names are written for a combination, and at most SEVERAL combinations.
 MOST, SEVERAL = 6, 5
 
 
 class Combination(eqx.Module):
-    """Numbers that may change together without changing a reading.
+    """Hold numbers that may change together without changing a reading.
 
     **Fields:**
 
@@ -76,7 +77,7 @@ class Combination(eqx.Module):
 
     @property
     def in_words(self) -> str:
-        """Say in a sentence or two what the data do not determine."""
+        """Describe in a sentence or two what the data do not determine."""
         names, sizes = self.names, np.array(self.changes)
         if self.unseen_switch:
             return (
@@ -110,8 +111,8 @@ TENSOR = dict(zip(Tensor.plain_names, COMPONENTS, strict=True))
 def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
     """Return the combinations that the data do not determine at all, each of few numbers.
 
-    By the reduced echelon form each combination has a number that no other has. Initial attitudes
-    are counted about the axes of the world or of the body: those that need fewer numbers.
+    By the reduced echelon form each combination has a number that no other combination has. Initial
+    attitudes are counted about the axes of the world or of the body, whichever need fewer numbers.
     """
     null = np.asarray(fit.null_directions)
     if not null.size:
@@ -123,11 +124,11 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
     names, many = _names_and_units(fit.model), len(charts_by_suffix(fit.model))
     first, turns = len(labels(fit.model)), 3 * fit.model.count
     for other in (1, 0):
-        # Attitudes about the world's axes, or about the body's.
+        # Try attitudes about the axes of the world, then about those of the body.
         begin = first + 6 * many + other * turns
         rows = np.delete(np.arange(len(names)), slice(begin, begin + turns))
         here, slope = [names[row] for row in rows], slopes[rows]
-        # The free numbers are of order one, so the largest derivative of a number is its size.
+        # The free numbers are of order one, so that the largest derivative of a number is its size.
         size = np.abs(slope).max(axis=1)
         tensors = size[first : first + 6 * many].reshape(many, 6)
         tensors[:] = tensors.max(axis=1, keepdims=True)
@@ -171,12 +172,14 @@ def _combination_of_row(
     values: np.ndarray,
     switch: bool,
 ) -> Combination:
-    """Return the combination of a `row` (M,) of changes; `names`, `size` and `values` as of all."""
+    """Return the combination of a `row` (M,) of changes, with the `names`, `size` and `values` of
+    all M numbers.
+    """
     order = np.flatnonzero(row)
-    # The largest change is a hundredth of the number, or of its size; the first number rises.
+    # The largest change is a hundredth of the number, or of its size, and the first number rises.
     changes = 0.01 * np.sign(row[order[0]]) * row / np.abs(row).max() * size
     relative = np.array([name[2] for name in names])
-    # Numbers that change by one factor get a shorter sentence.
+    # Numbers that all change by one factor get a shorter sentence.
     shares = np.where(relative, changes, changes / np.where(values == 0, np.inf, values))[order]
     if np.ptp(np.abs(shares)) < EVEN * np.abs(shares).max():
         changes[order] = 0.01 * shares / np.abs(shares).max()
@@ -191,9 +194,8 @@ def _combination_of_row(
 
 
 def _names_and_units(model: Model) -> list[tuple[str, str, bool]]:
-    """Return name and unit of the numbers of `_values_and_slopes`.
-
-    The third part is whether the changes of a number are relative.
+    """Return the name and the unit of each number of `_values_and_slopes`, and whether its changes
+    are relative.
     """
     out = labels(model)
     for name, chart in charts_by_suffix(model):
@@ -243,14 +245,15 @@ def _values_and_slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, 
 
 
 def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
-    """Return the mask (M,) of the numbers in which `changes` (k, M) are to be reported.
+    """Return the mask (M,) of the numbers of which the `changes` (k, M) are to be reported.
 
     A body's tensor is reported by its moments, or by its components if changes turn its axes.
     """
     rows = bodies_of(fit.model, fit.derivative_point)
     mask = np.ones(len(names), bool)
     for (where, chart), body in zip(charts_by_suffix(fit.model), rows, strict=True):
-        # A chart may report the components itself; the last entries of the name are ours.
+        # A chart may report the components of the tensor itself; the last entries of this name are
+        # those of `_values_and_slopes`.
         every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]
         places = [some[-1] for some in every]
         mask[[i for some in every for i in some]] = False
@@ -261,7 +264,7 @@ def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.nda
 
 
 def _turn_axes(tensor: np.ndarray, changes: np.ndarray) -> bool:
-    """Return whether some of the `changes` (k, 6) of a tensor (3, 3) turn its principal axes."""
+    """Return whether some of the `changes` (k, 6) of a `tensor` (3, 3) turn its principal axes."""
     steps = np.einsum("mk,kij->mij", changes, BASIS)
     _, axes = np.linalg.eigh(tensor)
     along = np.einsum("ia,kij,jb->kab", axes, steps, axes)
@@ -270,7 +273,9 @@ def _turn_axes(tensor: np.ndarray, changes: np.ndarray) -> bool:
 
 
 def _reduced_echelon_form(rows: np.ndarray) -> np.ndarray:
-    """Return the reduced echelon form of `rows` (k, M) by complete pivoting, small parts zero."""
+    """Return the reduced echelon form of `rows` (k, M) by complete pivoting, with small entries set
+    to zero.
+    """
     rows = np.array(rows)
     size, done = np.abs(rows).max(), 0
     while done < len(rows):
@@ -287,7 +292,7 @@ def _reduced_echelon_form(rows: np.ndarray) -> np.ndarray:
 
 
 def identifiability(fit: "Fit") -> tuple[str, ...]:
-    """Say which quantities the data determine well, weakly, and not at all."""
+    """Describe which quantities the data determine well, weakly, and not at all."""
     lost = fit.explanation.word == FAILS
     if lost or fit.search.word == NOT_ENDED:
         why = "does not explain the data" if lost else "did not end in a minimum"
@@ -305,7 +310,8 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         first += len(chart.log_names) + len(chart.plain_names)
     for quantity in moments:
         wide = _half_width(quantity)
-        # The half-width of the logarithm is relative if narrow, and a factor if wide.
+        # The half-width of the logarithm is a relative one if it is narrow, and a factor if it is
+        # wide.
         if not np.isfinite(wide) or wide > 1.5:
             out.append(f"{quantity.name} is not determined by these data.")
         elif wide > 0.05:
@@ -342,12 +348,12 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
 
 
 def _half_width(quantity: Quantity) -> float:
-    """Return half the width of the 95 % interval, of the logarithm of a positive quantity."""
+    """Return half the width of the 95 % interval, for a positive quantity that of its logarithm."""
     return float(quantile(0.95, quantity.freedom)) * reported_deviation(quantity)
 
 
 def _describe_rates(rates: Sequence[Quantity], count: int) -> str:
-    """Say how well the initial body rates of `count` recordings are determined."""
+    """Describe how well the initial body rates of `count` recordings are determined."""
     shares = []
     for index in range(count):
         three = rates[3 * index : 3 * index + 3]
@@ -363,7 +369,7 @@ def _describe_rates(rates: Sequence[Quantity], count: int) -> str:
 
 
 def _list_undetermined(fit: "Fit") -> list[str]:
-    """List what the data do not determine, a sentence each."""
+    """Describe what the data do not determine, in one sentence each."""
     combinations = undetermined_combinations(fit)
     if not combinations:
         return []
@@ -393,7 +399,8 @@ def scale_is_unseen(fit: "Fit") -> bool:
 
 
 def correlations(fit: "Fit") -> list[str]:
-    """List the pairs of reported quantities whose errors correlate by |ρ| > 0.95, a sentence each.
+    """Describe the pairs of reported quantities whose errors correlate by |ρ| > 0.95, in one
+    sentence each.
 
     Components of the tensor are left out: they follow from the moments and axes.
     """

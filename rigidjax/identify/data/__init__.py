@@ -1,1 +1,1 @@
-"""Recordings: times, readings, inputs, and what the first readings show."""
+"""Hold recordings: their times, readings and inputs, and what the first readings show."""

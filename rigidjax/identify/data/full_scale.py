@@ -1,4 +1,4 @@
-"""Readings at full scale: their detection, and their words in a report."""
+"""Find readings at full scale, and describe them in a report."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,17 +9,18 @@ import numpy as np
 
 from rigidjax.identify.data.recording import Recording
 
-# A plateau has at least this many readings in a row at the largest value.
+# A plateau has at least this number of readings in a row at the largest value.
 RUN = 3
 # A record with a larger share of its readings at the largest value is constant, not cut off.
 MOST = 0.7
 
 
 def full_scale_of(values: np.ndarray) -> float | None:
-    """Return the full scale of one channel (T,), `None` unless its largest readings are cut off.
+    """Return the full scale of one channel (T,), or `None` unless its largest readings are cut off.
 
-    They are cut off if more readings in a row are equal than at the top of a smooth wave. There
-    2 √(2d/a) readings are equal: d is the last digit of the readings, a their second difference.
+    They are cut off if more readings in a row are equal than at the top of a smooth wave. At such a
+    top 2 √(2d/a) readings are equal, where d is the last digit of the readings and a their second
+    difference.
     """
     size = np.abs(values)
     top = float(size.max(initial=0.0))
@@ -38,7 +39,9 @@ def full_scale_of(values: np.ndarray) -> float | None:
 
 
 def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
-    """Return the recordings with the full scale as `limit` of the sensors that have none yet."""
+    """Return the recordings with the full scale as the `limit` of the sensors that have no limit
+    yet.
+    """
     out = list(recordings)
     for index in range(max(len(r.readings) for r in recordings)):
         limits_by_place = {}
@@ -65,7 +68,7 @@ def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def describe_full_scale(readings: Sequence[Any]) -> list[str]:
-    """List the readings at full scale, a sentence for each sensor that has some."""
+    """Describe the readings at full scale, in one sentence for each sensor that has some."""
     out = []
     for reading in readings:
         count = (reading.host_mask[..., None] & ~reading.channel_mask).sum(axis=(0, 1))

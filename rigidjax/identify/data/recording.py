@@ -1,4 +1,4 @@
-"""A recording: times, the readings of each sensor, and logged inputs."""
+"""Hold a recording: times, the readings of each sensor, and logged inputs."""
 
 import warnings
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from rigidjax.motion.torques import Held
 
 
 class Reading(eqx.Module):
-    """The readings of one sensor.
+    """Hold the readings of one sensor.
 
     **Fields:**
 
@@ -60,7 +60,8 @@ class Reading(eqx.Module):
         return mask & (np.abs(self.values) < np.asarray(limit)[..., None, :] * (1 - 1e-6))
 
     def with_jitter(self, jitter_error: Array, deviation: Array) -> "Reading":
-        """Return these readings with another `jitter_error`, and jitter of another `deviation`, s.
+        """Return these readings with another `jitter_error`, and with jitter of another
+        `deviation`, s.
 
         A search holds `jitter_error` constant. If it did not, errors would count less wherever a
         motion changes quickly, and the search would prefer such motions.
@@ -78,7 +79,7 @@ class Reading(eqx.Module):
 
 
 class Recording(eqx.Module):
-    """The times and readings of one motion.
+    """Hold the times and readings of one motion.
 
     **Arguments:**
 
@@ -136,14 +137,15 @@ class Recording(eqx.Module):
         read = np.any([mask for _, _, mask, _ in rows], axis=0)
         if read.sum() < 2:
             raise ValueError("Recording: wanted readings at two times at least; the rest is masked")
-        # The motion starts at the first reading: rows hidden before the first, or after the last
-        # one, do not keep their time.
+        # The motion starts at the first reading: rows that are hidden before the first reading, or
+        # after the last one, do not keep their time.
         within = np.maximum.accumulate(read) & np.maximum.accumulate(read[::-1])[::-1]
         used = read | (within & np.any([hidden for *_, hidden in rows], axis=0))
         if any(not callable(source) for source in self.inputs.values()):
-            # Each sample is held until the next one, so every time of a sampled input is needed.
+            # Each sample is held until the next one, so that every time of a sampled input is
+            # needed.
             used = np.ones(t.size, bool)
-        # Only reports use this number, a fit does not.
+        # This number is only for reports; a fit does not use it.
         self.dropped = int((~used).sum())
         # A slice makes no copy of a long recording.
         kept = used if self.dropped else slice(None)
@@ -170,7 +172,7 @@ class Recording(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return how many numbers were read."""
+        """Return how many numbers were read by all sensors."""
         return sum(count_of(reading) for reading in self.readings)
 
     @property
@@ -180,7 +182,7 @@ class Recording(eqx.Module):
 
 
 def recording_of(t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]) -> Recording:
-    """Return a recording with these fields, unchecked: `readings` may have a leading axis."""
+    """Return a recording with these fields, without checks; `readings` may have a leading axis."""
     record = object.__new__(Recording)
     parts = {"t": t, "readings": readings, "inputs": inputs, "dropped": 0}
     for name, part in parts.items():
@@ -194,7 +196,9 @@ def readings_of(recording: Recording, kind: type) -> list[Any]:
 
 
 def sources_of(recording: Recording) -> dict[str, Any]:
-    """Return the inputs as functions of time; samples are held, one for each of the even steps."""
+    """Return the inputs as functions of time, where samples are held, one for each of the even
+    steps.
+    """
     t, out = recording.t, {}
     for name, source in recording.inputs.items():
         if not callable(source):
@@ -207,12 +211,16 @@ def sources_of(recording: Recording) -> dict[str, Any]:
 
 
 def count_of(reading: Reading) -> int:
-    """Return how many numbers were read: unmasked readings times the components of an error."""
+    """Return how many numbers were read, which is the number of unmasked readings times the
+    components of an error.
+    """
     return reading.sensor.components * int(reading.host_mask.sum())
 
 
 def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
-    """Return the inputs by name: functions of time unchanged, checked samples (T, …) as arrays."""
+    """Return the inputs by name, functions of time unchanged and checked samples (T, …) as
+    arrays.
+    """
     _checks.require_instance(
         inputs, Mapping, "inputs", requirement="samples or functions of time by name"
     )
@@ -233,9 +241,9 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
 
 
 def _require_digits(t: np.ndarray, dtype: np.dtype) -> None:
-    """Raise `ValueError` if rounding the times `t` to this dtype makes two of them equal.
+    """Raise `ValueError` if rounding the times `t` to this `dtype` makes two of them equal.
 
-    Warn if it changes a step by more than a tenth.
+    It warns if rounding changes a step by more than a tenth.
     """
     # Use NumPy: within a trace the numbers of a new JAX array are not known.
     steps, held = np.diff(t), np.diff(t.astype(dtype).astype(float))

@@ -1,4 +1,4 @@
-"""The reference of the initial states of a fit: the first readings of each recording."""
+"""Find the reference of the initial states of a fit from the first readings of each recording."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -26,8 +26,8 @@ from rigidjax.motion.manifold import names, plus
 from rigidjax.rotation import quaternion, so3
 from rigidjax.rotation.fitting import nearest_rotation
 
-# The turn, rad, between two attitudes from which a rate is taken: large against noise, but so small
-# that the axis hardly moves.
+# A rate is taken between two attitudes that differ by this turn, rad: it is large against noise,
+# but so small that the axis hardly moves.
 _TURN = 0.3
 # Directions do not determine an attitude if two singular values of Σ world bodyᵀ are below this
 # share of the largest.
@@ -35,10 +35,10 @@ _DETERMINED = 1e-3
 
 
 def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (n,), s, and attitudes (n, 4), body → world, that the readings show.
+    """Return the times (n,), s, and the attitudes (n, 4), body → world, that the readings show.
 
     They are those of an attitude sensor or, as by `rigidjax.so3.wahba`, of three markers or two
-    directions. Without these n is 0.
+    directions. Without such sensors n is 0.
     """
     t = np.asarray(recording.t)
     for reading in readings_of(recording, AttitudeSensor):
@@ -76,7 +76,8 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 @jax.jit
 def _attitudes_of(sums: ArrayLike) -> Array:
-    """Return the attitudes (n, 4) that fit directions best, from Σ world bodyᵀ (n, 3, 3) of each.
+    """Return the attitudes (n, 4) that fit directions best, from the matrix Σ world bodyᵀ (3, 3) of
+    each of n times.
 
     This is `so3.wahba` without its check: `equinox.error_if` always raises in a compiled function
     that is called within `jax.ensure_compile_time_eval`, as the model calls this one.
@@ -85,7 +86,8 @@ def _attitudes_of(sums: ArrayLike) -> Array:
 
 
 def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (n,), s, and body rates (n, 3), rad/s, of a gyro, else between attitudes.
+    """Return the times (n,), s, and the body rates (n, 3), rad/s, of a gyro, or else of the turns
+    between attitudes.
 
     If the readings show neither, n is 0.
     """
@@ -97,7 +99,7 @@ def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (m,) and body rates (m, 3) between attitudes q (n, 4) at times t (n,).
+    """Return times (m,) and body rates (m, 3) between the attitudes q (n, 4) at the times t (n,).
 
     Each rate is the mean one over about `_TURN`, at the middle of its interval of time.
     """
@@ -115,7 +117,8 @@ def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarr
 
 @jax.jit
 def _rotation_vectors(p: ArrayLike, q: ArrayLike) -> Array:
-    """Return the shortest rotation vectors (n, 3), body axes, from quaternions p to q (n, 4).
+    """Return the shortest rotation vectors (n, 3), in body axes, from the quaternions p to the
+    quaternions q (n, 4).
 
     The signs of the quaternions do not matter.
     """
@@ -127,7 +130,7 @@ def _rotation_vectors(p: ArrayLike, q: ArrayLike) -> Array:
 
 
 class ReferenceStates(eqx.Module):
-    """The reference state of a recording, from which the initial state of a fit is counted.
+    """Hold the reference state of a recording, from which the initial state of a fit is counted.
 
     **Fields:**
 
@@ -149,7 +152,9 @@ class ReferenceStates(eqx.Module):
 
 
 def reference_of(recordings: Sequence[Recording], state_type: type) -> ReferenceStates:
-    """Return the reference states, of type `state_type`, from the first readings of recordings."""
+    """Return the reference states, of the type `state_type`, from the first readings of
+    recordings.
+    """
     turns = [[*attitudes(r)[1], np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
     places = [_first_position(r) for r in recordings]
     dtype = recordings[0].t.dtype
@@ -165,7 +170,7 @@ def reference_of(recordings: Sequence[Recording], state_type: type) -> Reference
 
 
 def _typical_rate(recording: Recording) -> float:
-    """Return a typical length of the body rate, rad/s; 1 if the readings show none."""
+    """Return a typical length of the body rate, rad/s, or 1 if the readings show none."""
     _, w = rates(recording)
     if readings_of(recording, Gyro):
         return float(np.sqrt(np.mean(np.sum(w**2, axis=1)))) or 1.0
@@ -181,7 +186,8 @@ def _typical_rate(recording: Recording) -> float:
 
 
 def _first_position(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the first position, m, the first velocity, m/s, and a typical length, m.
+    """Return the first position, m, the first velocity, m/s, and a typical length, m, of a
+    recording.
 
     They are those of the centre of mass, or of the origin of the body frame if only markers were
     read.
@@ -204,14 +210,14 @@ def _first_position(recording: Recording) -> tuple[np.ndarray, np.ndarray, float
     else:
         v = _first_velocity(when, x)
     x = x if when.size else np.zeros((1, 3))
-    # The length is the largest distance from the mean place, 1 if all places are the same.
+    # The length is the largest distance from the mean place, or 1 if all places are the same.
     return x[0], v, float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
 
 
 def _places_by_markers(
     recording: Recording, markers: Sequence[Any]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (n,) and the places (n, 3) of the body's origin by its markers.
+    """Return times (n,) and the places (n, 3) of the origin of the body, found from its markers.
 
     If the markers are never all read at once, the first one stands for all.
     """
@@ -229,7 +235,9 @@ def _places_by_markers(
 
 
 def _first_velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the slope (3,) of a line through the first places x (n, 3); zero for one place."""
+    """Return the slope (3,) of a line through the first of the places x (n, 3), or zero for one
+    place.
+    """
     few = slice(0, max(2, min(5, t.size)))
     return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
 
@@ -237,8 +245,9 @@ def _first_velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
 def _places_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Return the places x (n, 3) at the distances d = `lengths` (n, k) from k stations.
 
-    The equations `|x|² − 2 s·x + |s|² = d²`, less their mean over the stations s, are linear in x.
-    A component of x that they do not determine is that of the stations' centre.
+    The equations `|x|² − 2 s·x + |s|² = d²` are linear in x once their mean over the stations s is
+    subtracted. A component of x that they do not determine is taken from the centre of the
+    stations.
     """
     centre = stations.mean(axis=0)
     s = stations - centre
@@ -250,9 +259,10 @@ def _places_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 def first_rates(
     records: Recording, counts: Int[Array | np.ndarray, " records"]
 ) -> Float[Array, "records 3"]:
-    """Return `first_rate` of several recordings with a leading axis; zero if they are traced.
+    """Return the `first_rate` of each of several recordings with a leading axis, or zero if they
+    are traced.
 
-    The rates that a gyro reads are returned for traced recordings, too.
+    The rates that a gyro reads are returned for traced recordings as well.
     """
     for reading in readings_of(records, Gyro):
         xp: Any = np if _checks.is_known(reading) else jnp
@@ -265,6 +275,8 @@ def first_rates(
 
 
 def first_rate(recording: Recording) -> np.ndarray:
-    """Return the first body rate (3,), rad/s, of `rates`; zero if the readings show none."""
+    """Return the first body rate (3,), rad/s, that `rates` finds, or zero if the readings show
+    none.
+    """
     _, w = rates(recording)
     return w[0] if len(w) else np.zeros(3)

@@ -1,4 +1,4 @@
-"""Several recordings in one tree with a leading axis, so that one program fits them all."""
+"""Join several recordings in one tree with a leading axis, so that one program fits them all."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,15 +15,16 @@ from rigidjax.motion.torques import Linear, Series
 
 
 def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
-    """Return the recordings in one with a leading axis, and the number of times of each.
+    """Return the recordings as one recording with a leading axis, and the number of times of each.
 
-    Shorter recordings are padded: with masked readings at their last time, and their tables of time
+    Shorter recordings are padded with masked readings at their last time, and their tables of time
     with the last value.
     """
     counts = np.array([r.t.shape[0] for r in recordings], np.int32)
     rows = max(_count_rows(recording, 0) for recording in recordings)
     alike = [pad_recording(r, int(counts.max()), rows) for r in recordings]
-    # An input may hold things that are no numbers, such as functions: they must be the same.
+    # An input may contain objects that are no numbers, such as functions: they must be the same for
+    # all recordings.
     numbers, others = zip(*(eqx.partition(r, _is_number) for r in alike), strict=True)
     shapes = [[np.shape(x) for x in jax.tree.leaves(r)] for r in numbers]
     for index, other in enumerate(others):
@@ -37,15 +38,15 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
 
 
 def _is_number(leaf: PyTree) -> bool:
-    """Return whether a leaf is an array or a real number of Python, which may be stacked."""
+    """Return whether a leaf is an array or a Python float, which may be stacked."""
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | complex)
 
 
 def pad_to_few_lengths(model: PyTree) -> Any:
     """Return the model with its recordings padded by masked readings to one of few lengths.
 
-    There are four such lengths an octave, so that few programs are compiled. Windows are all of one
-    length already, and stay as they are.
+    There are four such lengths in an octave, so that few programs are compiled. Windows are all of
+    one length already, and stay unchanged.
     """
     records = model.records
     if model.clusters is not None:
@@ -57,14 +58,18 @@ def pad_to_few_lengths(model: PyTree) -> Any:
 
 
 def _count_rows(recording: Recording, axis: int) -> int:
-    """Count the rows of the longest table of time in the inputs and sensors; 0 without a table."""
+    """Return the number of rows of the longest table of time in the inputs and sensors, or 0
+    without a table.
+    """
     parts = recording.inputs, recording.sensors
     tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))
     return max((int(table.values.shape[axis]) for table in tables), default=0)
 
 
 def _padded_length(count: int) -> int:
-    """Return the least multiple of 16, of four an octave, that is not below `count`."""
+    """Return the least number that is not below `count` among multiples of 16, of which there are
+    about four in an octave.
+    """
     if not count:
         return 0
     octaves = np.array([-1, 0]) + np.ceil(4.0 * np.log2(count))
@@ -73,7 +78,7 @@ def _padded_length(count: int) -> int:
 
 
 def _stack_leaves(*leaves: PyTree) -> Any:
-    """Stack leaves along a new first axis."""
+    """Return the leaves stacked along a new first axis."""
     # Use NumPy if the numbers are known: JAX would compile a program for each shape.
     if _checks.is_known(leaves):
         return _constant_array(np.stack([np.asarray(leaf) for leaf in leaves]))
@@ -81,7 +86,7 @@ def _stack_leaves(*leaves: PyTree) -> Any:
 
 
 def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "*rows"]) -> PyTree:
-    """Return the tree of arrays at one index of their leading axis, or at several."""
+    """Return the tree of arrays at one `index` of their leading axis, or at several."""
 
     def pick(leaf: PyTree) -> Any:
         if not eqx.is_array(leaf):
@@ -93,7 +98,7 @@ def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "
 
 
 def _constant_array(array: np.ndarray | np.generic) -> Array:
-    """Return a JAX array whose numbers stay known also within a trace."""
+    """Return a JAX array whose numbers stay known within a trace as well."""
     with jax.ensure_compile_time_eval():
         return jnp.asarray(array)
 
@@ -138,13 +143,14 @@ def _is_table(node: PyTree) -> bool:
 
 
 def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0) -> Recording:
-    """Return the recording padded to `count` times, and its tables of time to `rows`.
+    """Return the recording padded to `count` times, with its tables of time padded to `rows` rows.
 
     The padding is masked readings at the last time, and the last value of tables. Times are along
     `axis`: 0 for one recording, 1 for several with a leading axis.
     """
     missing = count - recording.t.shape[axis]
-    # Not only inputs hold tables of time: so do sensors that read a moving object.
+    # Pad the sensors as well as the inputs: sensors that read a moving object hold tables of time,
+    # too.
     inputs, sensors = jax.tree.map(
         lambda node: _pad_table(node, rows, axis) if _is_table(node) else node,
         (recording.inputs, recording.sensors),
@@ -175,7 +181,7 @@ def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0
 
 
 def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
-    """Return a table of time with `rows`, its last value repeated after its last time."""
+    """Return a table of time with `rows` rows, its last value repeated after its last time."""
     missing = rows - table.values.shape[axis]
     if missing <= 0:
         return table
@@ -192,7 +198,9 @@ def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
 def _repeat_last(
     values: ArrayLike, count: int, axis: int, fill: float | bool | None = None
 ) -> Array:
-    """Append the last entry along `axis`, or the number `fill`, `count` times to `values`."""
+    """Return `values` with their last entry along `axis`, or the number `fill`, added `count` times
+    at the end.
+    """
     # Use NumPy where the numbers are known: JAX would compile a program for each shape.
     xp: Any = np if _checks.is_known(values) else jnp
     array = xp.asarray(values)

@@ -1,7 +1,7 @@
-"""Many short open-loop runs from measured starts, to identify driven machines.
+"""Make many short open-loop runs from measured starts, to identify driven machines.
 
-A record of measured states is cut into windows. The model runs open-loop from the start of each,
-driven by the recorded inputs, and is compared with the measured states at every step.
+A record of measured states is cut into windows. The model runs open-loop from the start of each
+window, driven by the recorded inputs, and is compared with the measured states at every step.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,7 +24,8 @@ from rigidjax.motion.torques.inputs import delays_of
 
 
 class Horizons(NamedTuple):
-    """The open-loop errors of a model by horizon, the number of steps that it predicts ahead.
+    """Hold the open-loop errors of a model by horizon, which is the number of steps that the model
+    predicts ahead.
 
     Errors are given by kind: `x` m, `v` m/s, `q` rad, `omega` rad/s.
 
@@ -48,7 +49,9 @@ class Horizons(NamedTuple):
 
 
 def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"]) -> Horizons:
-    """Average the `errors` of states over windows; `starts` has the type of the states."""
+    """Return the means over all windows of the `errors` of states, where `starts` has the type of
+    the states.
+    """
     by_kind = parts_by_name(jax.tree.map(lambda leaf: leaf[0], starts), errors)
     absolute = {k: np.asarray(jnp.mean(jnp.abs(v), (0, 2))) for k, v in by_kind.items()}
     squares = {k: jnp.sum(v * v, 2) for k, v in by_kind.items()}
@@ -59,12 +62,14 @@ def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"])
 
 @jax.jit
 def held_errors(starts: HasSpin, measured: HasSpin) -> Float[Array, "windows steps n"]:
-    """Return the errors of a prediction that holds each start, against the `measured` states."""
+    """Return the errors of a prediction that stays at each start, compared with the `measured`
+    states.
+    """
     return jax.vmap(jax.vmap(minus_small, (None, 0)))(starts, measured)
 
 
 class Windows(eqx.Module):
-    """Windows of a record: short runs of one length, each from a measured start.
+    """Hold the windows of a record: short runs of one length, each from a measured start.
 
     `windows` cuts a record into windows; `Windows.join` joins those of several records.
 
@@ -102,7 +107,7 @@ class Windows(eqx.Module):
 
     @property
     def scales(self) -> Float[Array, " m"]:
-        """Return the unit (m,) in which each number of an error counts.
+        """Return the unit (m,) in which each number of an error is counted.
 
         It is the `noise`, else the rms error of a prediction that holds the start.
         """
@@ -113,7 +118,8 @@ class Windows(eqx.Module):
         return jnp.asarray(np.repeat(np.where(each == 0, 1.0, each), 3))
 
     def records(self) -> Recording:
-        """Return the windows as recordings, with a leading axis, of a sensor of the whole state.
+        """Return the windows as recordings with a leading axis, read by one sensor of the whole
+        state.
 
         The first time of each window is its start, at which nothing is read.
         """
@@ -129,7 +135,7 @@ class Windows(eqx.Module):
         sensor = StateSensor(kind, noise, unknown)  # pyright: ignore[reportCallIssue]
         values = jnp.asarray(np.concatenate(rows, axis=-1))
         reading = Reading(sensor, values, jnp.asarray(mask))
-        # A recording has as many samples as times; the one at the last time is not used.
+        # A recording has as many samples as times; the sample at the last time is not used.
         inputs = {name: np.asarray(rows) for name, rows in self.inputs.items()}
         inputs = {
             name: jnp.asarray(np.concatenate([rows, rows[:, -1:]], axis=1))
@@ -138,12 +144,12 @@ class Windows(eqx.Module):
         return recording_of(jnp.asarray(t), (reading,), inputs)
 
     def held_horizons(self) -> Horizons:
-        """Return the errors of a prediction that holds each start: a model must beat them."""
+        """Return the errors of a prediction that stays at each start, which a model must beat."""
         return average_by_horizon(self.starts, held_errors(self.starts, self.wanted))
 
     @staticmethod
     def join(*parts: "Windows") -> "Windows":
-        """Join the windows of several records, all of one step and one length.
+        """Join the windows of several records, all of one step and one length, in one `Windows`.
 
         **Raises:** `ValueError` for none, or for steps, lengths or inputs that differ.
         """
@@ -187,7 +193,8 @@ def windows(
     noise: Mapping[str, float] | None = None,
     starts: Mapping[str, float] | None = None,
 ) -> Windows:
-    """Cut a record of measured states into windows of `length` steps, one every `stride` samples.
+    """Return the windows of `length` steps of a record of measured states, one at every `stride`
+    samples.
 
     **Arguments:**
 
@@ -264,7 +271,7 @@ def windows(
 def _checked_by_kind(
     numbers: object, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
 ) -> dict[str, float]:
-    """Return the numbers of a mapping whose keys are `kinds`, each one checked by `check`."""
+    """Return the numbers of a mapping whose keys are `kinds`, after `check` of each number."""
     by_kind = _checks.require_instance(numbers, Mapping, name, requirement="numbers by kind")
     if set(by_kind) != set(kinds):
         raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(by_kind)}")
@@ -272,7 +279,7 @@ def _checked_by_kind(
 
 
 def _start_deviation(value: object, name: str) -> float:
-    """Return the deviation of a start; raise `ValueError` unless it is positive, maybe infinite."""
+    """Return the deviation of a start, and raise `ValueError` unless it is positive or infinite."""
     number = _checks.known_float(value, name)
     if not number > 0:
         raise ValueError(
@@ -323,7 +330,7 @@ def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def require_windows(windows: PyTree) -> None:
-    """Raise `TypeError` or `ValueError` unless these are several windows of finite numbers."""
+    """Raise `TypeError` or `ValueError` unless `windows` are several windows of finite numbers."""
     _checks.require_instance(
         windows, Windows, "windows", requirement="what identify.windows returns"
     )
@@ -337,7 +344,8 @@ def require_windows(windows: PyTree) -> None:
 
 
 def mistakes_of_delays(law: PyTree, history: float, length: float) -> list[str]:
-    """Describe each delay of a torque that reads an input outside of the samples of a window.
+    """Describe each delay with which a torque `law` reads an input outside of the samples of a
+    window.
 
     **Arguments:**
 
@@ -364,10 +372,11 @@ def mistakes_of_delays(law: PyTree, history: float, length: float) -> list[str]:
 def starts_of_windows(
     windows: Windows, stretches: int
 ) -> tuple[ReferenceStates, Float[Array, "windows m"] | None, Int[Array, " windows"]]:
-    """Return the starts as reference states, their weights, and the stretch of each window.
+    """Return the starts as reference states, their weights, and the index of the stretch of each
+    window.
 
-    A weight is the unit of a start's free number over its deviation; `None` for known starts. The
-    windows are divided into as many as `stretches` stretches of neighbours.
+    A weight is the unit of a start's free number over its deviation, and `None` for known starts.
+    The windows are divided into at most `stretches` stretches of neighbours.
     """
     count, scales = windows.count, np.asarray(windows.scales)
     dtype = windows.wanted.omega.dtype

@@ -1,1 +1,1 @@
-"""Kalman filter and smoother for unknown torques."""
+"""Follow states and unknown torques by a Kalman filter and a smoother."""

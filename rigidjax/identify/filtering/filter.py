@@ -1,4 +1,4 @@
-"""The extended Kalman filter on the manifold, in square-root form, and its first belief."""
+"""Run the extended Kalman filter on the manifold, in square-root form, from a first belief."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -35,7 +35,7 @@ from rigidjax.motion.manifold import names, plus
 
 
 class Belief(eqx.Module):
-    """An estimate of the state at a time, and a root S of the covariance `S Sᵀ` of its errors.
+    """Hold an estimate of the state at a time, and a root S of the covariance `S Sᵀ` of its errors.
 
     `first_belief` makes the first one; in the result of `filter` all fields have a leading time
     axis.
@@ -55,7 +55,7 @@ class Belief(eqx.Module):
 
     @property
     def state(self) -> Any:
-        """Return the `Spin`, `Attitude` or `Rigid`."""
+        """Return the estimated `Spin`, `Attitude` or `Rigid`."""
         return self.x.motion
 
     @property
@@ -192,7 +192,7 @@ def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recordi
 
 @eqx.filter_jit
 def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
-    """Return the scene of the first recording, its inputs bound to the torque."""
+    """Return the scene of the first recording, with its inputs bound to the torque."""
     row = model.index.rows(x)[0]
     record, reference, body_index = stacking.pick_records(
         (model.records, model.reference, model.body_indices), 0
@@ -202,7 +202,7 @@ def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
 
 
 class Grid(NamedTuple):
-    """The times of the steps of a filter: those of the recording, and some between.
+    """Hold the times of the steps of a filter: those of the recording, and some between them.
 
     **Fields:**
 
@@ -218,8 +218,10 @@ class Grid(NamedTuple):
     rows: Int[Array, " t"]
 
     def at_rows(self, values: PyTree[Array]) -> PyTree[Array]:
-        """Return the `values` at the times of the recording, from those at all times."""
-        # If there are no other times, to pick all values would only copy them.
+        """Return the `values` at the times of the recording, picked from those at all times of the
+        grid.
+        """
+        # If there are no other times, picking all values would only copy them.
         same = self.rows.size == self.t.size
         return values if same else jax.tree.map(lambda leaf: leaf[self.rows], values)
 
@@ -227,7 +229,7 @@ class Grid(NamedTuple):
 def grid_of(
     process: Process | None, recording: Recording, belief: Belief, substeps: int | None
 ) -> Grid:
-    """Return the times of the steps from the `belief` belief through the recording."""
+    """Return the times of the steps from the time of the `belief` to the end of the recording."""
     xp = _checks.namespace((recording.t, belief.t))
     t, t0 = xp.asarray(recording.t), xp.asarray(belief.t)
     if xp is np:
@@ -247,7 +249,7 @@ def grid_of(
 
 
 class FilterInput(NamedTuple):
-    """The checked arguments of a filter: `checked_input` makes them.
+    """Hold the checked arguments of a filter, which `checked_input` makes.
 
     **Fields:** `scene` with its torque bound to inputs; `drifts` of the model; `recording`; `first`
     the belief before it; `grid` the times of the steps.
@@ -260,8 +262,8 @@ class FilterInput(NamedTuple):
     grid: Grid
 
 
-# A filter is lost if for LOST_AFTER seconds, and for LOST_READINGS in a row, no reading was within
-# LOST_BEYOND standard deviations of its prediction.
+# A filter is lost if, for LOST_AFTER seconds and for LOST_READINGS readings in a row, no reading
+# was within LOST_BEYOND standard deviations of its prediction.
 LOST_AFTER, LOST_READINGS, LOST_BEYOND = 1.0, 3, 6.0
 WORDS = (
     "followed",
@@ -271,7 +273,7 @@ WORDS = (
 
 
 class Filtered(eqx.Module):
-    """The result of `filter`.
+    """Hold the result of `filter`.
 
     **Fields:**
 
@@ -362,7 +364,7 @@ def filter(
 
 
 def raise_if_lost(run: Any) -> Any:
-    """Return the run of a filter; raise `ValueError` if it was lost or stopped."""
+    """Return the run of a filter, and raise `ValueError` if it was lost or stopped."""
     status = run.status
     at = f" (at {float(run.lost_at):g} s)" if _checks.is_known(run.lost_at) else ""
     advice = (
@@ -379,7 +381,7 @@ def log_likelihood(
     *,
     substeps: int | None = None,
 ) -> Scalar:
-    """Return the logarithm of the density of all readings, the unknown torques integrated out.
+    """Return the logarithm of the density of all readings, with the unknown torques integrated out.
 
     It is `Σ log N(ν; 0, s)` over innovations ν of variance s (Schweppe 1965,
     doi:10.1109/TIT.1965.1053737). Maximise it over moments, the density of a torque, a noise, or an
@@ -406,7 +408,8 @@ def step(
     mask: Sequence[Any] | None = None,
     x: Float[Array, " n"] | None = None,
 ) -> Belief:
-    """Return the belief at the time t, after the readings at t: a filter while the body moves.
+    """Return the belief at the time t after the readings at t, to run a filter while the body
+    moves.
 
     It makes one step of the classical method of order 4: the body may turn only little from one
     reading to the next.
@@ -461,7 +464,7 @@ def step(
 
 @eqx.filter_jit
 def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) -> Belief:
-    """Return the belief after one step, as one program."""
+    """Return the belief after one step, computed in one program."""
     # Replace missing readings by a unit vector: derivatives at a zero quaternion are NaN.
     units = (jnp.eye(1, v.size, dtype=v.dtype).reshape(v.shape) for v in stop.values)
     values = tuple(map(jnp.where, stop.masks, stop.values, units))
@@ -473,7 +476,7 @@ def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) 
 def _predict_and_update(
     dynamics: Dynamics, belief: Belief, stop: Stops
 ) -> tuple[Belief, ReadNumbers]:
-    """Return the belief at a stop, after its readings, and what was read."""
+    """Return the belief at a stop after its readings, and the numbers that were read."""
     dtype = belief.root.dtype
     # Subtract times before they are rounded to the dtype of the state: after a thousand seconds the
     # seven digits of float32 are too few.
@@ -493,7 +496,8 @@ def scan_filter(
 ) -> tuple[Dynamics, Stops, PyTree[Array]]:
     """Run the filter over all stops by `lax.scan`.
 
-    Returns its equations, its stops, and the results of `keep(belief, read)` at each stop.
+    It returns the equations of the filter, the stops, and the results of `keep(belief, read)` at
+    each stop.
     """
     scene, drifts, recording, first, grid = run
     dtype = first.root.dtype
@@ -513,7 +517,7 @@ def scan_filter(
 
 @eqx.filter_jit
 def _filter(run: FilterInput) -> Filtered:
-    """Return the result of `filter` from its checked arguments, as one program."""
+    """Return the result of `filter` from its checked arguments, computed in one program."""
     both = scan_filter(run, lambda belief, read: (belief, read))[2]
     beliefs, read = run.grid.at_rows(both)
     reads = steps.split_by_sensor(run.scene.sensors, read)
@@ -523,12 +527,14 @@ def _filter(run: FilterInput) -> Filtered:
 
 @eqx.filter_jit
 def _log_likelihood(run: FilterInput) -> Scalar:
-    """Return the result of `log_likelihood` from its checked arguments, as one program."""
+    """Return the result of `log_likelihood` from its checked arguments, computed in one program."""
     return roots.innovation_terms(*scan_filter(run, lambda _, read: read)[2]).log_density
 
 
 def status_of(beliefs: Belief, reads: tuple[ReadNumbers, ...], t0: Array) -> tuple[Array, Array]:
-    """Return the status of a run that starts at `t0`, and the time at which it was lost or NaN."""
+    """Return the status of a run that starts at `t0`, and the time at which it was lost, else
+    NaN.
+    """
     t, times = beliefs.t, jnp.arange(beliefs.t.shape[0])
     lost = jnp.zeros(t.shape, bool)
     for read in reads:
@@ -549,7 +555,7 @@ def status_of(beliefs: Belief, reads: tuple[ReadNumbers, ...], t0: Array) -> tup
 def checked_input(
     model: Model, belief: Belief, x: Float[Array, " n"] | None, substeps: int | None
 ) -> FilterInput:
-    """Return the checked arguments of `filter` and `smooth`."""
+    """Return the arguments of `filter` and `smooth` after checks."""
     scene, recording = scene_at(model, x)
     _checks.require_instance(belief, Belief, "first", hint="identify.first_belief makes it")
     for sensor in scene.sensors:

@@ -1,4 +1,6 @@
-"""The Kalman filter and smoother of any linear model with normal noise, in square-root form."""
+"""Compute the Kalman filter and smoother of any linear model with normal noise, in square-root
+form.
+"""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -13,14 +15,15 @@ from rigidjax import _checks
 from rigidjax._types import Numbers, Scalar
 from rigidjax.identify.filtering import roots
 
-# An array or nested lists of numbers, with a leading axis or without.
+# A parameter is an array or nested lists of numbers, with a leading axis or without.
 Parameter = Float[ArrayLike, "..."] | Numbers
 
 
 class LinearModel(eqx.Module):
-    """A linear model, `x' = F x + d + G u` and `y = H x + c + r v`.
+    """Hold a linear model, `x' = F x + d + G u` and `y = H x + c + r v`, where x' is the state
+    after a step.
 
-    u and v are normal, independent and of unit variance.
+    The vectors u and v are normal, with independent entries of unit variance.
 
     **Arguments:**
 
@@ -93,12 +96,12 @@ class LinearModel(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return the number of numbers in the state."""
+        """Return the number of entries of the state."""
         return self.transition.shape[-1]
 
 
 class LinearEstimate(eqx.Module):
-    """The means of a state at each time, and roots of its covariances.
+    """Hold the means of a state at each time, and roots of its covariances.
 
     **Fields:**
 
@@ -129,8 +132,8 @@ class LinearEstimate(eqx.Module):
         return jnp.sqrt(jnp.sum(self.root**2, -1))
 
 
-# The number of axes of each part of a model. A part that changes from step to step, or from time to
-# time, has one more.
+# Each part of a model has this number of axes. A part that changes from step to step, or from time
+# to time, has one more.
 _STEPS = {"transition": 2, "noise": 2, "push": 1}
 _AXES = _STEPS | {"matrix": 2, "deviation": 1, "offset": 1}
 Parts = dict[str, Any]
@@ -145,7 +148,8 @@ Mask = Bool[ArrayLike, "times k"] | Numbers | None
 def linear_filter(
     model: LinearModel, readings: Readings, mean: Mean, root: Root, mask: Mask = None
 ) -> LinearEstimate:
-    """Return the state of a `LinearModel` at each time from the readings so far (Kalman filter).
+    """Return the state of a `LinearModel` at each time from the readings up to this time (Kalman
+    filter).
 
     **Arguments:**
 
@@ -188,7 +192,7 @@ def linear_smooth(
 def _checked_parts(
     model: LinearModel, readings: Readings, mean: Mean, root: Root, mask: Mask
 ) -> tuple[Parts, Array, Array, Array, Array]:
-    """Return the parts of the model, and the other arguments as checked arrays."""
+    """Return the parts of the model, and the other arguments, as checked arrays."""
     _checks.require_instance(model, LinearModel, "model")
     n, k = model.size, model.deviation.shape[-1]
     readings = _checks.array_of_rows(readings, (k,), "readings")
@@ -266,7 +270,7 @@ def linear_estimate(
 
 
 class Joint(NamedTuple):
-    """The values of a forward step that the backward pass needs, made by `joint_roots`.
+    """Hold the values of a forward step that the backward pass needs, which `joint_roots` makes.
 
     **Fields:** `predicted` a root of the covariance of the predicted state; `gain` of the smoother;
     `rest` a root of the covariance before the step, given the state after it.
@@ -286,7 +290,7 @@ def joint_roots(transition: Array, noise: Array, root: Array) -> Joint:
     n, m = noise.shape
     upper = jnp.concatenate([roots.matrix_product(transition, root), noise], 1)
     whole = jnp.concatenate([upper, jnp.pad(root, ((0, 0), (0, m)))])
-    # A triangle of 2n rows needs as many columns.
+    # A triangular root of 2n rows needs as many columns.
     whole = roots.triangular_root(jnp.pad(whole, ((0, 0), (0, max(0, n - m)))))
     predicted, cross = whole[:n, :n], whole[n:, :n]
     return Joint(predicted, roots.divide_right(cross, predicted), whole[n:, n:])
@@ -295,11 +299,11 @@ def joint_roots(transition: Array, noise: Array, root: Array) -> Joint:
 def backward_pass(
     joint: Joint, mean: Array, predicted: Array, noise: Array, last: tuple[Array, Array]
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the smoothed means and roots, and means and covariances of the noise of all steps.
+    """Return the smoothed means and roots, and the means and covariances of the noise of all steps.
 
-    It is the pass back of Rauch, Tung and Striebel (1965). The covariance (m, m) of the unit noise
-    of a step is `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ` with `Z = L⁻¹ G`, L the predicted root and S the
-    smoothed root after the step.
+    It is the backward pass of Rauch, Tung and Striebel (1965). The covariance (m, m) of the unit
+    noise of a step is `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ` with `Z = L⁻¹ G`, where L is the predicted
+    root and S the smoothed root after the step.
 
     **Arguments:**
 

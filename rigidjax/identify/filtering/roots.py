@@ -1,4 +1,6 @@
-"""Covariances P by their roots S: round-off cannot make `P = S Sᵀ` indefinite."""
+"""Compute with covariances P by their roots S, because round-off cannot make `P = S Sᵀ`
+indefinite.
+"""
 
 import math
 from typing import Any, NamedTuple
@@ -11,7 +13,7 @@ from rigidjax._types import Scalar, ScalarLike
 
 
 def triangular_root(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
-    """Return the lower triangular root L of `a aᵀ` whose diagonal is not negative.
+    """Return the lower triangular root L of `a aᵀ` whose diagonal has no negative entry.
 
     It is computed by the modified Gram–Schmidt process on the rows, whose triangular factor is as
     good as Householder's (Björck 1967, doi:10.1007/BF01934122). A row that depends on earlier rows,
@@ -42,18 +44,18 @@ def predicted_root(
 
 
 def inverse_root(x: Array, threshold: ScalarLike = 0.0) -> Array:
-    """Return 1/√x where x is above `threshold`, else zero with zero derivatives."""
+    """Return 1/√x where x is above `threshold`, and zero with zero derivatives elsewhere."""
     there = x > threshold
     return jnp.where(there, 1 / jnp.sqrt(jnp.where(there, x, 1)), 0)
 
 
 def matrix_product(a: Float[Array, "n m"], b: Float[Array, "m k"]) -> Float[Array, "n k"]:
-    """Return the matrix product `a b`, in full precision, and cheap for a few rows."""
+    """Return the matrix product `a b` in full precision, in a way that is cheap for a few rows."""
     return jnp.sum(a[:, :, None] * b[None], 1)
 
 
 class Update(NamedTuple):
-    """The update of an estimate by the numbers read.
+    """Hold the update of an estimate by the numbers read.
 
     **Fields:**
 
@@ -78,12 +80,13 @@ def update(
     variance: Float[Array, " k"],
     mask: Bool[Array, " k"],
 ) -> Update:
-    """Update mean and root of errors e by k numbers `error = h · e + noise`, one after the other.
+    """Return the mean and the root of errors e after k numbers `error = h · e + noise`, taken one
+    after the other.
 
-    Potter's formula for a row h of `matrix` and the `variance` r of its noise: `s = |Sᵀh|² + r`,
-    `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh` (Battin, Astronautical Guidance (1964), §9.6;
-    Bierman, Factorization Methods (1977), §II.4). `step` is the mean of e, `root` the S before, and
-    numbers that are not `mask` do not count.
+    Potter's formula holds for a row h of `matrix` and the `variance` r of its noise:
+    `s = |Sᵀh|² + r`, `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh` (Battin, Astronautical Guidance
+    (1964), §9.6; Bierman, Factorization Methods (1977), §II.4). `step` is the mean of e and `root`
+    the S before the update. Numbers for which `mask` is false do not count.
     """
 
     def absorb(state: tuple[Array, Array], number: tuple) -> tuple[Any, Any]:
@@ -103,7 +106,7 @@ def update(
 
 
 class Terms(NamedTuple):
-    """The terms of a log-density: each number read is normal, given the earlier ones.
+    """Hold the terms of a log-density in which each number read is normal, given the earlier ones.
 
     **Fields:** `error` of each number in standard deviations; `log_variance` the logarithm of 2π
     times its variance; both are zero for masked numbers.
@@ -119,13 +122,17 @@ class Terms(NamedTuple):
 
 
 def innovation_terms(innovation: Array, variance: Array, mask: Array) -> Terms:
-    """Return the terms of innovations with these variances, zero where not `mask`."""
+    """Return the terms of innovations with these variances, which are zero where `mask` is
+    false.
+    """
     error = jnp.where(mask, innovation * lax.rsqrt(variance), 0)
     return Terms(error, jnp.where(mask, jnp.log(2 * math.pi * variance), 0))
 
 
 def divide(lower: Float[Array, "n n"], rhs: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """Return `lower⁻¹ right` by forward substitution; a row is zero where the diagonal is."""
+    """Return `lower⁻¹ rhs` by forward substitution, where a row is zero if the diagonal entry of
+    `lower` is.
+    """
 
     def forward_substitution_step(rhs: Array, k: Array) -> tuple[Array, Array]:
         column = lax.dynamic_index_in_dim(lower, k, 1, keepdims=False)
@@ -137,6 +144,6 @@ def divide(lower: Float[Array, "n n"], rhs: Float[Array, "n m"]) -> Float[Array,
 
 
 def divide_right(numerator: Float[Array, "m n"], lower: Float[Array, "n n"]) -> Float[Array, "m n"]:
-    """Return `left lower⁻¹`; a column is zero where the diagonal is."""
+    """Return `numerator lower⁻¹`, where a column is zero if the diagonal entry of `lower` is."""
     turned = divide(lower[::-1, ::-1].T, numerator[:, ::-1].T)
     return turned.T[:, ::-1]

@@ -1,4 +1,4 @@
-"""The iterated smoother: the most probable motion, given all readings."""
+"""Find the most probable motion, given all readings, by an iterated smoother."""
 
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from rigidjax.motion.manifold import minus, plus
 
 
 class Push(NamedTuple):
-    """The estimate of a white torque, averaged over the step that ends at each time.
+    """Hold the estimate of a white torque, averaged over the step that ends at each time.
 
     **Fields:** `mean` and `deviation` (N, 3) N m, body frame. The deviation is large for short
     steps, since white noise has no value at one time.
@@ -38,7 +38,7 @@ class Push(NamedTuple):
 
 
 class Smoothed(eqx.Module):
-    """The result of `smooth`.
+    """Hold the result of `smooth`.
 
     **Fields:**
 
@@ -129,7 +129,7 @@ def smooth(
 
 @eqx.filter_jit
 def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
-    """Return the result of `smooth` from its checked arguments, as one program."""
+    """Return the result of `smooth` from its checked arguments, computed in one program."""
     sensors, first, grid = run.scene.sensors, run.first, run.grid
     dynamics, stops, kept = scan_filter(run, lambda belief, read: (belief, read))
     beliefs, read = grid.at_rows(kept)
@@ -145,7 +145,8 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
         return *out, count + 1
 
     still = jnp.zeros((stops.t.shape[0], dynamics.kicks), first.root.dtype)
-    # Start the loop from a blank estimate: a first iteration before it would be compiled, too.
+    # Start the loop from a blank estimate: a first iteration before the loop would be compiled as
+    # well.
     blank = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
         jax.eval_shape(lambda: _iterate(dynamics, first, stops, path, still)[1]),
@@ -172,15 +173,16 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
 def _iterate(
     dynamics: Dynamics, belief: Belief, stops: Stops, path: ExtendedState, kicks: Array
 ) -> tuple[ExtendedState, LinearEstimate, Scalar]:
-    """Linearise about the states `path` and the `kicks` between them, and solve exactly.
+    """Return the states after one iteration, which linearises about the states `path` and the
+    `kicks` between them and solves exactly.
 
-    Returns the new states, the estimate of their changes, and the largest change in standard
+    It returns the new states, the estimate of their changes, and the largest change in standard
     deviations.
     """
     dtype = belief.root.dtype
 
     def linearise(row: tuple) -> tuple:
-        """Linearise the step to a stop, and its readings, about the path."""
+        """Return the step to a stop, and the readings at the stop, linearised about the path."""
         t0, stop, x, y, kick = row
         after, grown, noise = dynamics.predict(
             t0.astype(dtype), (stop.t - t0).astype(dtype), x, kick

@@ -1,4 +1,6 @@
-"""The equations of the state that a filter follows, and random motions under them."""
+"""Compute the equations of the state that a filter follows, and random motions under these
+equations.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -43,7 +45,7 @@ from rigidjax.solve.tableaus import KUTTA4
 
 
 class ExtendedState(eqx.Module):
-    """The state that a filter follows.
+    """Hold the state that a filter follows.
 
     **Fields:** `motion` a `Spin`, `Attitude` or `Rigid`; `torques` the value (3,) of each
     `CorrelatedTorque`, N m, body frame; `walks` the value of each `Walk`. Errors of the state are
@@ -56,7 +58,9 @@ class ExtendedState(eqx.Module):
 
 
 def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
-    """Raise `ValueError` for a sensor whose errors the filter cannot weigh."""
+    """Raise `ValueError` for a sensor that the filter cannot use: one without noise, with a
+    low-pass filter, or with jitter.
+    """
     for sensor in sensors:
         name = type(sensor).__name__
         if sensor.noise is None:
@@ -77,7 +81,7 @@ def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
 
 
 class Dynamics(eqx.Module):
-    """The equations of a filter, for one dtype and type of state: `dynamics_of` makes them.
+    """Hold the equations of a filter, for one dtype and type of state, which `dynamics_of` makes.
 
     **Fields:**
 
@@ -108,7 +112,9 @@ class Dynamics(eqx.Module):
         return 6 * (len(self.white) + len(self.coloured))
 
     def with_torques(self, change: PyTree, torques: Sequence[Array]) -> PyTree:
-        """Return the rate of change of a motion with these `torques` added to its equations'."""
+        """Return the rate of change of a motion, `change`, with the effect of these `torques`
+        added.
+        """
         if not torques:
             return change
         spin = change.omega + jnp.sum(self.inverse * sum(torques[1:], torques[0])[None], 1)
@@ -174,7 +180,7 @@ class Dynamics(eqx.Module):
 
 
 def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: ExtendedState) -> Dynamics:
-    """Return the equations of a filter from a scene whose torque reads no `Input`.
+    """Return the equations of a filter, from a scene whose torque reads no `Input`.
 
     The state `x` gives their dtype and the type of the state.
     """
@@ -207,7 +213,8 @@ def coloured_parts(process: Process | None) -> tuple[CorrelatedTorque, ...]:
 def moved_root(
     x: ExtendedState, e: Float[Array, " n"], root: Float[Array, "n m"], *, inverse: bool = False
 ) -> Float[Array, "n m"]:
-    """Return the root of the errors about `x ⊕ e`, from the `root` of the errors about x.
+    """Return the root of the errors about the state `x ⊕ e`, which is x changed by e, from the
+    `root` of the errors about x.
 
     Errors δ of a turn e become `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, here to second order in e
     (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848). With `inverse` the root is multiplied
@@ -224,7 +231,7 @@ def moved_root(
 
 
 class Stops(NamedTuple):
-    """The times of the steps of a filter, s, and the readings at these times.
+    """Hold the times of the steps of a filter, s, and the readings at these times.
 
     **Fields:** `t`; `values` and `masks` of each sensor. A step takes one row of each.
     """
@@ -237,10 +244,10 @@ class Stops(NamedTuple):
 def linearise_readings(
     dynamics: Dynamics, stop: Stops, x: ExtendedState
 ) -> tuple[Float[Array, "k n"], Float[Array, " k"], Float[Array, " k"], Bool[Array, " k"]]:
-    """Linearise all k numbers read at one time about the state x.
+    """Return all k numbers read at one time, linearised about the state x.
 
-    Returns the derivatives (k, n) of their predictions, their errors (k,), the standard deviations
-    of the errors, and a mask of those that were read.
+    It returns the derivatives (k, n) of their predictions, their errors (k,), the standard
+    deviations of the errors, and a mask of the numbers that were read.
     """
     dtype = x.motion.omega.dtype
     t = stop.t.astype(dtype)
@@ -274,7 +281,7 @@ def linearise_readings(
 
 
 class ReadNumbers(NamedTuple):
-    """The numbers that a filter read of one sensor.
+    """Hold the numbers that a filter read of one sensor.
 
     **Fields:** `innovation` each number minus its prediction from all numbers read before;
     `variance` of the innovation; `mask` whether the number was read.
@@ -288,14 +295,14 @@ class ReadNumbers(NamedTuple):
 def split_by_sensor(
     sensors: Sequence[AbstractSensor], numbers: ReadNumbers
 ) -> tuple[ReadNumbers, ...]:
-    """Split the `ReadNumbers` of all numbers in a row into one of each sensor."""
+    """Return one `ReadNumbers` for each sensor, from the `numbers` of all sensors in a row."""
     ends = np.cumsum([sensor.components for sensor in sensors])[:-1]
     return tuple(
         ReadNumbers(*own) for own in zip(*(jnp.split(a, ends, -1) for a in numbers), strict=True)
     )
 
 
-# The longest step, as a fraction of the correlation time of a torque.
+# A step is at most this fraction of the correlation time of a torque.
 MEMORY_A_STEP = 0.25
 
 
@@ -308,8 +315,8 @@ def steps_of(
 ) -> np.ndarray:
     """Return the number of fixed steps from each of the times `ts` to the next.
 
-    It is `substeps` if given. Else it is chosen by the body rate, of the `state` and of gyros, and
-    by the correlation times of the process; it is one if these are traced.
+    It is `substeps` if this is given. Otherwise it follows from the body rate, of the `state` and
+    of gyros, and from the correlation times of the process; it is one if these numbers are traced.
     """
     if substeps is not None:
         return np.full(ts.shape[0] - 1, _checks.integer(substeps, "substeps", 1))
@@ -327,7 +334,7 @@ def steps_of(
 
 
 class Sampled(eqx.Module):
-    """The result of `sample`.
+    """Hold the result of `sample`.
 
     **Fields:** `t` (T,) s; `states` with a leading time axis; `torques` the value (T, 3) of each
     `CorrelatedTorque`, N m, body frame.
@@ -398,7 +405,9 @@ def sample(
 def _sample(
     key: PRNGKeyArray | UInt32[Array, "2"], scene: Scene, ts: Array, pieces: int
 ) -> Sampled:
-    """Return the result of `sample` by `pieces` steps between two times, as one program."""
+    """Return the result of `sample` with `pieces` steps between two times, computed in one
+    program.
+    """
     state0: Any = scene.start
     dtype, coloured = state0.omega.dtype, coloured_parts(scene.process)
     first, later = jax.random.split(key)

@@ -1,4 +1,6 @@
-"""The terms of a log-density: every number read is normal, given the numbers read before it."""
+"""Compute the terms of a log-density in which every number read is normal, given the numbers read
+before it.
+"""
 
 import dataclasses
 import math
@@ -35,7 +37,7 @@ from rigidjax.motion.manifold import dimension
 def terms_of_recording(
     model: Model, row: Array, record: Recording, reference: ReferenceStates, body_index: BodyIndex
 ) -> Terms:
-    """Return the terms of the readings of one recording.
+    """Return the terms of the log-density of the readings of one recording.
 
     Readings are normal about the motion. If a torque or a sensor error is unknown, the filter
     integrates it out, and readings are normal about the predictions of the filter.
@@ -78,7 +80,8 @@ def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
 
 
 def reading_terms(model: Model, x: Float[Array, " n"]) -> Terms:
-    """Return the terms (R, N) of all readings of a model at the free numbers x.
+    """Return the terms (R, N) of the log-density of all readings of a model, for R recordings at
+    the free numbers x.
 
     Derivatives by x are computed recording by recording, in forward mode.
     """
@@ -86,12 +89,14 @@ def reading_terms(model: Model, x: Float[Array, " n"]) -> Terms:
 
 
 def log_density(model: Model, x: Float[Array, " n"]) -> Scalar:
-    """Return the logarithm of the density of all readings and of the priors of x."""
+    """Return the logarithm of the density of all readings, with the priors, at the free numbers x
+    of a model.
+    """
     return reading_terms(model, x).log_density - 0.5 * jnp.sum(prior_residuals(model, x) ** 2)
 
 
 class Curvature(NamedTuple):
-    """The second-order model of a posterior at a point.
+    """Hold the second-order model of a posterior at a point.
 
     **Fields:** `cost`, minus the logarithm of its density; `gram`, Fisher's information; `slope`,
     the gradient of the cost.
@@ -103,14 +108,14 @@ class Curvature(NamedTuple):
 
 
 def curvature(model: Model, x: Float[Array, " n"]) -> Curvature:
-    """Return cost, gradient and Fisher's information of the posterior at x.
+    """Return the cost, gradient and Fisher's information of the posterior at x.
 
     The free numbers move the variances of normal errors, too. The information is that of the priors
     plus `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta and Mehra 1974,
     doi:10.1109/TAC.1974.1100714, for the filter).
     """
     value, slopes = errors_and_jacobians(model, x, terms_of_recording)
-    # dν/√s from the derivative of ν/√s: d(ν/√s) = dν/√s − ½ ν/√s d(log s).
+    # The term dν/√s follows from the derivative of ν/√s, by d(ν/√s) = dν/√s − ½ ν/√s d(log s).
     moved = slopes.error + 0.5 * value.error[..., None] * slopes.log_variance
     both = jnp.concatenate([moved, 0.5**0.5 * slopes.log_variance], axis=1)
     places, size = model.index.places, model.size

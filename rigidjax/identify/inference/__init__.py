@@ -1,1 +1,1 @@
-"""Posterior densities, profiles, comparison of models, and design of experiments."""
+"""Compute posterior densities and profiles, compare models, and design experiments."""

@@ -1,4 +1,4 @@
-"""Comparison of models: by an information criterion, and by predicting recordings left out."""
+"""Compare models by an information criterion, and by predicting recordings that were left out."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +22,7 @@ from rigidjax.identify.search.stages import errors_and_slopes
 
 
 class Comparison(eqx.Module):
-    """One of several models of the same data, compared with the best of them.
+    """Hold the comparison of one of several models of the same data with the best of them.
 
     **Fields:**
 
@@ -42,7 +42,7 @@ class Comparison(eqx.Module):
 
 
 def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
-    """Compare models of the same data by Schwarz's criterion, the best model first.
+    """Compare models of the same data by Schwarz's criterion, and return the best model first.
 
     The criterion is `N log s² + p log N` for p free numbers (Schwarz 1978,
     doi:10.1214/aos/1176344136). s² is the mean square error of a sensor, and its first term is
@@ -89,7 +89,8 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 def _log_squares(fit: Fit) -> np.ndarray:
     """Return the logarithm of each sensor's mean square error.
 
-    For a sensor with jitter it is that of white errors which are as likely as the errors.
+    For a sensor with jitter it is the logarithm for white errors that are as likely as the errors
+    of the sensor.
     """
     out, model = 2.0 * np.log(np.maximum(fit.rms, 1e-300)), fit.model
     errors, _ = errors_and_slopes(model, fit.x)
@@ -145,7 +146,9 @@ def cross_validate(
 
 
 def _with_shared(model: Model, of_others: Fit) -> Model:
-    """Return the model with the body and the shared numbers of another fit, no longer free."""
+    """Return the model with the body and the shared numbers of the fit `of_others`, which are then
+    no longer free.
+    """
     x = model.start()
     for slot, fitted in zip(model.slots, of_others.model.slots, strict=True):
         if slot.shared is not None and fitted.shared is not None:

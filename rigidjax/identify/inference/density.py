@@ -1,4 +1,4 @@
-"""The posterior density of a fitted model in unconstrained numbers, for any sampler."""
+"""Compute the posterior density of a fitted model in unconstrained numbers, for any sampler."""
 
 import dataclasses
 import math
@@ -32,7 +32,8 @@ from rigidjax.identify.model.terms import Noise, scene_template
 from rigidjax.identify.uncertainty.covariance import white_covariance
 from rigidjax.motion.torques.composite import parts_of
 
-# The advice for a density with a process: a fit without this torque may end far from the body.
+# This is the advice for a density with a process: a fit without this torque may end far from the
+# body.
 _GUESS = (
     ", or begin from a first guess, fit(model, starts=1, max_steps=1): the torque may be too "
     "strong for a fit without it"
@@ -40,7 +41,8 @@ _GUESS = (
 
 
 class LogDensity(eqx.Module):
-    """The logarithm of the posterior density of a fitted model, a function of one vector x.
+    """Compute the logarithm of the posterior density of a fitted model, as a function of one vector
+    x.
 
     Call it with x (n,), real numbers without bounds. These are the free numbers of the fitted model
     and, as additional shared `Free`s, the logarithms of factors: of each noise that the fit
@@ -137,7 +139,7 @@ class LogDensity(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return the number of numbers in x."""
+        """Return the number of entries of x."""
         return self.x0.size
 
     def __call__(self, x: Float[Array, " n"]) -> Scalar:
@@ -160,12 +162,15 @@ class LogDensity(eqx.Module):
 def map_draws(
     function: Callable[[Unpacked], Any], density: LogDensity, x: Float[Array, "m n"]
 ) -> Any:
-    """Return `function(point)` of each draw x (m, n), as one program for densities of one form."""
+    """Return `function(point)` of each draw in x (m, n), in one program for all densities of one
+    form.
+    """
     return jax.vmap(lambda one: function(density.unpack(one)))(x)
 
 
 def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
-    """Return the slots of factors of unknown noises, and the variances of their logarithms.
+    """Return the slots of the factors of unknown noises, and the variances of the logarithms of
+    these factors.
 
     There is a slot for each sensor without noise, with a factor for each group of recordings.
     """
@@ -174,7 +179,7 @@ def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
         if reading.sensor.noise is not None:
             continue
         rows = np.bincount(groups, np.asarray(reading.host_mask.sum(axis=1)))
-        # The logarithm of a standard deviation has the variance 1/(2n) for n numbers read.
+        # The logarithm of a standard deviation has the variance 1/(2n) if n numbers were read.
         variances.append(0.5 / np.maximum(rows * reading.sensor.components, 1))
         path = _path_of(model, lambda s, index=index: s.sensors[index].noise)
         name = f"noise of {type(reading.sensor).__name__} {index}"
@@ -184,7 +189,7 @@ def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
 
 
 def _process_slots(process: Process | None, prior: Array) -> list[Slot]:
-    """Return the slots of factors of all numbers of a process.
+    """Return the slots of the factors of all numbers of a process.
 
     The prior of the logarithm of each factor has the standard deviation `prior`.
     """
@@ -207,13 +212,15 @@ def _factor(
     groups: Array | None,
     prior: Array | None = None,
 ) -> Slot:
-    """Return the slot of a factor of the leaf at `path`, whose step is the factor's logarithm."""
+    """Return the slot of a factor of the leaf at `path`, whose step is the logarithm of the
+    factor.
+    """
     one = jnp.ones(())
     return Slot(path, name, unit, False, True, shape, labels, groups, one, prior, None)
 
 
 def _path_of(model: Model, where: Callable[[Scene], Any]) -> tuple[Any, ...]:
-    """Return the path of the leaf of a scene that `where` picks, even if the leaf is `None`."""
+    """Return the path of the leaf of a scene that `where` picks, even if this leaf is `None`."""
     scene = scene_template(model, model.records)
     marked = eqx.tree_at(where, scene, 0.0, is_leaf=lambda node: node is None)
     pairs = jax.tree.leaves_with_path(eqx.tree_at(where, marked, _MARK))
@@ -226,9 +233,10 @@ _MARK = object()
 def _with_slots(
     model: Model, noises: Noise, process: Process | None, slots: list[Slot]
 ) -> tuple[Model, np.ndarray]:
-    """Return the model with these noises, this process and additional shared slots.
+    """Return the model with these noises, this process and additional shared slots, and the places
+    of its old numbers.
 
-    The second result (n,) holds the places of the old free numbers among the new ones.
+    The places (n,) are those of the old free numbers among the new ones.
     """
     bodies = places_of(model.chart, model.body_indices, model.count)
     kinds = model.index.start.shape[1] // 3
@@ -254,7 +262,7 @@ def _with_slots(
 
 
 def _covariance_of_white_errors(fit: Fit, follows_the_motion: bool) -> np.ndarray:
-    """Return the covariance of a fit for white errors, as far as the density assumes them.
+    """Return the covariance of a fit for white errors, where the density assumes white errors.
 
     Without a process (`follows_the_motion`) the density assumes white errors about the motion.
     """
@@ -262,8 +270,8 @@ def _covariance_of_white_errors(fit: Fit, follows_the_motion: bool) -> np.ndarra
     if fit.considered and fit.linear is not None:
         covariance = white_covariance(fit.linear).covariance
     elif fit.covariance_kind.startswith("sandwich"):
-        # The sandwich covariance of a fit is wider than a density of white errors. Of many
-        # recordings it may be singular, too: it then gives a search no scale.
+        # The sandwich covariance of a fit is wider than a density of white errors. For many
+        # recordings it may be singular as well: it then gives a search no scale.
         size = np.sqrt(np.diagonal(covariance))
         definite = np.linalg.eigvalsh(covariance / np.outer(size, size)).min() > 1e-10
         if (follows_the_motion or not definite) and fit.linear is not None:

@@ -1,4 +1,4 @@
-"""Experiment design: the uncertainty to expect of a planned motion, and the best motion."""
+"""Compute the uncertainty to expect of a planned motion, and find the best motion."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -21,7 +21,8 @@ from rigidjax.identify.uncertainty.quantities import Quantity, quantities, value
 
 
 def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, ...]:
-    """Return the quantities that a fit of planned recordings would report, with deviations.
+    """Return the quantities that a fit of planned recordings would report, with their standard
+    deviations.
 
     **Arguments:**
 
@@ -53,7 +54,8 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
 
 
 def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """Return Fisher's information (n, n) of the free numbers: `Jᵀ Σ⁻¹ J` of the predictions.
+    """Return Fisher's information (n, n) of the free numbers, which is `Jᵀ Σ⁻¹ J` of the
+    predictions.
 
     J are the derivatives of the predictions by x, Σ is the covariance of the noise. The result is
     differentiable in x, for a design by gradients.
@@ -71,7 +73,7 @@ def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
 
 @eqx.filter_jit
 def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """Return the result of `fisher` without its checks, as one program."""
+    """Return the result of `fisher` without its checks, computed in one program."""
     sensors = model.records.sensors
     noises: list[Any] = [sensor.noise for sensor in sensors]
     _, slopes = errors_and_jacobians(model, x)
@@ -97,7 +99,7 @@ def _require_noise(model: Model, x: Float[Array, " n"]) -> None:
 
 
 def _require_known(model: Model, motion: PyTree) -> None:
-    """Raise `TypeError` for a model or a motion of traced numbers."""
+    """Raise `TypeError` if the model or the motion has traced numbers."""
     if not _checks.is_known((model, motion)):
         raise TypeError(
             "model, x, body, omega: wanted known numbers, got traced ones; call it outside of "
@@ -112,11 +114,11 @@ def best_first_rate(
     *,
     max_steps: int = 60,
 ) -> tuple[Vec3, tuple[Quantity, ...]]:
-    """Return the initial rate, of the length of `omega`, that determines the body best.
+    """Return the initial rate, with the length of `omega`, that determines the body best.
 
-    Its direction minimises the mean logarithm of the standard deviations of the body's free numbers
-    (D-optimality; the other numbers are free as well). BFGS of optimistix finds a minimum near
-    `omega`: try several.
+    Its direction minimises the mean logarithm of the standard deviations of the free numbers of the
+    body (D-optimality; all other numbers are free as well). The method BFGS of optimistix finds a
+    minimum near `omega`: try several directions.
 
     **Arguments:**
 
@@ -141,7 +143,9 @@ def best_first_rate(
 
 @eqx.filter_jit
 def _best_direction(model: Model, body: PyTree, start: Array, size: Array, max_steps: int) -> Array:
-    """Return the direction (3,) near `start` of the least uncertainty, for a rate of `size`."""
+    """Return the direction (3,) near `start` with the least uncertainty, for a rate of length
+    `size`.
+    """
     minimise: Any = optx.minimise
     out = minimise(
         _log_uncertainty,
@@ -156,7 +160,8 @@ def _best_direction(model: Model, body: PyTree, start: Array, size: Array, max_s
 
 
 def _log_uncertainty(direction: Array, args: tuple[Model, PyTree, Array]) -> Scalar:
-    """Return the mean log standard deviation of the body's n numbers for a direction of the rate.
+    """Return the mean logarithm of the standard deviations of the body's n numbers for one
+    direction of the rate.
 
     It is ½ log det of their covariance over n. A penalty keeps the length of `direction` near 1.
     """
@@ -164,7 +169,7 @@ def _log_uncertainty(direction: Array, args: tuple[Model, PyTree, Array]) -> Sca
     length = jnp.sqrt(jnp.sum(direction**2))
     information = fisher(model, model.start(body, size * direction / length))
     n = model.index.bodies
-    # Schur's complement: the information on the body if the other numbers are free, too.
+    # Schur's complement is the information on the body if the other numbers are free as well.
     mine, across, rest = information[:n, :n], information[:n, n:], information[n:, n:]
     scale = jnp.sqrt(jnp.diagonal(rest))
     rest = rest / (scale[:, None] * scale[None, :]) + 1e-12 * jnp.eye(rest.shape[0])

@@ -1,7 +1,9 @@
-"""The maximum of a posterior density with weighted draws, and draws by samplers of other libraries.
+"""Find the maximum of a posterior density with weighted draws, and draw by samplers of other
+libraries.
 
 Draws are needed because intervals from the information at the maximum are too narrow on short
-records: they fix the density of a torque at its most probable value, which is below its mean.
+records: such intervals fix the density of a torque at its most probable value, which is below its
+mean.
 """
 
 from collections.abc import Callable
@@ -27,22 +29,24 @@ from rigidjax.identify.search.stages import is_order_one
 from rigidjax.identify.uncertainty.quantities import interval_about
 from rigidjax.motion.torques.composite import parts_of
 
-# A sampler: a function of a key, a log-density of z, and a first z (n,) to draws (samples, n).
+# A sampler is a function from a key, a log-density of z, and a first z (n,) to draws (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 
-# The arguments of `_checks.import_library`: the module, the extra that installs it, the function.
+# These are arguments of `_checks.import_library`: the module, the extra that installs it, the
+# function.
 _BLACKJAX = ("blackjax", "posterior", "posterior")
 
-# The weight of the first mass matrix, in draws. It counts, since Laplace's method made it.
+# The first mass matrix has this weight, in draws. It counts, because Laplace's method made it.
 _FIRST_WEIGHT = 50.0
 
-# From this many recordings on a gradient keeps a core busy: gradients of four chains at once then
-# take as long as one after another.
+# From this number of recordings on a gradient keeps a core busy: gradients of four chains at once
+# then take as long as one after another.
 _FULL = 8
 
 
 class Nuts(eqx.Module):
-    """The no-U-turn sampler of blackjax, with a warm-up that adapts its step and mass matrix.
+    """Draw by the no-U-turn sampler of blackjax, with a warm-up that adapts its step and its mass
+    matrix.
 
     It needs blackjax: `pip install rigidjax[posterior]`. Source: Hoffman and Gelman 2014, JMLR
     15:1593.
@@ -74,7 +78,7 @@ class Nuts(eqx.Module):
         blackjax = _checks.import_library(*_BLACKJAX)
         adaptation = blackjax.adaptation
         # Do the warm-up of `blackjax.window_adaptation` in one loop with the draws. In a loop of
-        # its own it compiles the density once more, which takes longer than the draws.
+        # its own it would compile the density once more, which takes longer than the draws.
         begin, tune, settle = adaptation.step_size.dual_averaging_adaptation(self.acceptance)
         metric = adaptation.mass_matrix.mass_matrix_adaptation(True, _FIRST_WEIGHT)
         metric_begin, metric_add, metric_end = metric
@@ -120,14 +124,14 @@ class Nuts(eqx.Module):
 
 
 class Posterior(eqx.Module):
-    """The result of `posterior`.
+    """Hold the result of `posterior`.
 
     **Fields:**
 
     - `density`: the `LogDensity`.
     - `x`: (chains, samples, n) the draws of its argument.
 
-    `points` are the bodies, states and values of the draws, `of(function)` any function of them.
+    `points` are the bodies, states and values of the draws, `map(function)` any function of them.
     `rhat` (n,) is below 1.01 if the chains agree, `ess` (n,) is the number of independent draws
     (Gelman et al., Bayesian Data Analysis (2013), §11.4, 11.5).
     """
@@ -137,7 +141,9 @@ class Posterior(eqx.Module):
 
     @property
     def rhat(self) -> Float[Array, " n"]:
-        """Return the potential scale reduction of the chains, near 1 if they agree (blackjax)."""
+        """Return the potential scale reduction of the chains, which is near 1 if they agree
+        (blackjax).
+        """
         return _checks.import_library(*_BLACKJAX).diagnostics.potential_scale_reduction(self.x)
 
     @property
@@ -147,14 +153,16 @@ class Posterior(eqx.Module):
 
     @property
     def points(self) -> Unpacked:
-        """Return bodies, states and values of the draws, with axes of chains and samples first."""
+        """Return the bodies, states and values of the draws, with the axes of chains and samples
+        first.
+        """
         return self.map(_identity)
 
     def map(self, function: Callable[[Unpacked], Any]) -> Any:
         """Return `function(point)` of each draw, with leading axes of chains and samples.
 
-        An example is `drawn.of(lambda point: point.body.moments)`. **Raises** `TypeError` for
-        anything but a `function`.
+        An example is `drawn.map(lambda point: point.body.moments)`. **Raises** `TypeError` if
+        `function` is not a function.
         """
         _checks.require_function(
             function, "function", "of `Unpacked`, such as lambda point: point.body"
@@ -163,7 +171,7 @@ class Posterior(eqx.Module):
         return jax.tree.map(lambda leaf: leaf.reshape(*self.x.shape[:2], *leaf.shape[1:]), rows)
 
     def to_arviz(self) -> Any:
-        """Return the draws for ArviZ: body, values, initial states and process.
+        """Return the draws as an object of ArviZ, with body, values, initial states and process.
 
         **Raises:** `ImportError` without arviz, which needs Python 3.12.
         """
@@ -182,14 +190,15 @@ class Posterior(eqx.Module):
 
 
 def _identity(point: Unpacked) -> Unpacked:
-    """Return the point: one function for all calls, so that none compiles again."""
+    """Return the point unchanged, by one function for all calls so that none compiles again."""
     return point
 
 
 def posterior(
     density: LogDensity, key: PRNGKeyArray, *, sampler: Sampler | None = None, chains: int = 4
 ) -> Posterior:
-    """Draw body, initial states, all `Free`s, noise and process, given all readings.
+    """Draw body, initial states, all `Free`s, noise and process from their density, given all
+    readings.
 
     **Arguments:**
 
@@ -227,9 +236,10 @@ def posterior(
 
 @eqx.filter_jit
 def _draw(density: LogDensity, root: Array, keys: Array, sampler: Sampler) -> Array:
-    """Return the draws (chains, samples, n) of one chain for each of the `keys`, as one program.
+    """Return the draws (chains, samples, n) of one chain for each of the `keys`, computed in one
+    program.
 
-    Chains are sampled in the vector z with `x = x0 + root z`.
+    A chain draws the vector z, with `x = x0 + root z`.
     """
 
     def to_numbers(z: Array) -> Array:
@@ -246,17 +256,18 @@ def _draw(density: LogDensity, root: Array, keys: Array, sampler: Sampler) -> Ar
     return jax.vmap(chain)(keys)
 
 
-# The search ends at a step of _SMALL standard deviations; _DAMPING is its damping at the start.
+# The search ends at a step of _SMALL standard deviations, and starts with the damping _DAMPING.
 _SMALL, _DAMPING = 1e-3, 1e-2
-# Draws come from Student's t with _FREEDOM degrees, _WIDER than Laplace's normal distribution: of a
-# narrow one a few draws in the tails would get all the weight.
+# Draws come from Student's t distribution with _FREEDOM degrees of freedom, _WIDER times as wide as
+# Laplace's normal distribution: of a narrow distribution a few draws in the tails would get all the
+# weight.
 _FREEDOM, _WIDER = 6.0, 1.2
-# The least number of independent draws that gives the ends of an interval.
+# At least this number of independent draws gives the ends of an interval.
 _LEAST = 100.0
 
 
 class Refit(eqx.Module):
-    """The result of `refit`.
+    """Hold the result of `refit`.
 
     **Fields:**
 
@@ -268,7 +279,7 @@ class Refit(eqx.Module):
     - `draws`, `weights`: (m, n) and (m,); together they represent the posterior density. The
       weights add up to 1.
 
-    `effective` is the number of independent draws that the weighted draws are worth.
+    `effective_count` is the number of independent draws that the weighted draws are worth.
     """
 
     density: LogDensity
@@ -286,7 +297,8 @@ class Refit(eqx.Module):
 
     @property
     def effective_count(self) -> Scalar:
-        """Return the number of independent draws that the weighted draws are worth, 1/Σw².
+        """Return the number of independent draws that the weighted draws are worth, 1/Σw² for
+        weights w.
 
         Source: Kish, Survey Sampling (1965).
         """
@@ -298,9 +310,9 @@ class Refit(eqx.Module):
         """Return the interval (low, high), with equal tails, of a function of the posterior.
 
         It is computed from the weighted draws. If these are worth fewer than 100 independent ones
-        (`effective`), it is computed from the covariance and the derivative of the function, which
-        must then be differentiable: take the logarithm of a positive quantity. Such an interval is
-        too narrow on short records.
+        (`effective_count`), it is computed from the covariance and the derivative of the function,
+        which must then be differentiable: take the logarithm of a positive quantity. Such an
+        interval is too narrow on short records.
 
         **Arguments:** `function` from `Unpacked` to an array; `level` the probability
         that the interval holds the true value. **Raises** `ValueError` for a level outside (0, 1),
@@ -349,8 +361,8 @@ def refit(
     The draws come from a wide Student's t distribution about the maximum; their weight is the
     density over that of the t distribution (importance sampling: Geweke 1989,
     doi:10.2307/1913710). For more than some dozen numbers such draws are worth little
-    (`effective`). Intervals then come from the information, which is good enough if each recording
-    is long; or draw by `identify.posterior`, from any density.
+    (`effective_count`). Intervals then come from the information, which is good enough if each
+    recording is long; or draw by `identify.posterior`, from any density.
 
     **Arguments:**
 
@@ -383,7 +395,7 @@ def refit(
 
 @eqx.filter_jit
 def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: int) -> Refit:
-    """Return the result of `refit` with `count` draws, as one program."""
+    """Return the result of `refit` with `count` draws, computed in one program."""
 
     def evaluate(x: Array) -> tuple[None, Array, NormalMatrix, Array]:
         cost, gram, slope = curvature(density.model, x)
@@ -400,7 +412,9 @@ def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: in
 def _weighted_draws(
     density: LogDensity, mode: Array, covariance: Array, key: PRNGKeyArray, count: int
 ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-    """Return `count` draws of Student's t about the maximum `mode`, and their weights."""
+    """Return `count` draws of Student's t distribution about the maximum `mode`, and their
+    weights.
+    """
     size, kind = mode.size, mode.dtype
     normal, square = jax.random.split(key)
     z = jax.random.normal(normal, (count, size), kind)
@@ -410,6 +424,6 @@ def _weighted_draws(
     draws = mode[None] + z @ root.T
     wanted = lax.map(density, draws)
     drawn_from = -0.5 * (_FREEDOM + size) * jnp.log1p(jnp.sum(z * z, 1) / _FREEDOM)
-    # A draw so far out that the density is NaN gets no weight.
+    # A draw that is so far out that the density is NaN gets no weight.
     logs = jnp.where(jnp.isfinite(wanted), wanted - drawn_from, -jnp.inf)
     return draws, jax.nn.softmax(logs)

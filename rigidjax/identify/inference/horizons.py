@@ -1,4 +1,6 @@
-"""The errors of a fitted model on windows, by the number of steps that it predicts ahead."""
+"""Compute the errors of a fitted model on windows, by the number of steps that it predicts
+ahead.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -61,7 +63,9 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
 def _on_windows(
     model: Model, x: Float[Array, " n"], windows: Windows
 ) -> tuple[Model, Float[Array, " m"]]:
-    """Return the model of these windows with known starts, and its shared free numbers."""
+    """Return the model of these windows with known starts, and the shared free numbers of this
+    model.
+    """
     reference, _, clusters = starts_of_windows(windows, 1)
     body_indices = None
     bodies = places_of(model.chart, body_indices, windows.count)
@@ -82,5 +86,5 @@ def _on_windows(
 
 @eqx.filter_jit
 def _errors(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors of all sensors, as one program."""
+    """Return the errors of all sensors, computed in one program."""
     return all_errors(model, x)

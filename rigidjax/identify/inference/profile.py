@@ -1,4 +1,4 @@
-"""Profile intervals: the range of a quantity in which the best misfit grows little."""
+"""Compute profile intervals: the range of a quantity in which the best misfit grows little."""
 
 import functools
 from collections.abc import Callable
@@ -16,12 +16,13 @@ from rigidjax.identify.search.stages import Attempt, Task, cost_of, polish
 from rigidjax.identify.uncertainty import quantities
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
-# The width of a pull, in standard deviations of the quantity: a narrower one slows the search down.
+# A pull has this width, in standard deviations of the quantity: a narrower one slows the search
+# down.
 PULL = 0.3
 
 
 class Pull(AbstractPull):
-    """A residual that pulls a reported quantity to a target.
+    """Hold a residual that pulls a reported quantity to a target.
 
     **Fields:** `index` the number of the quantity; `target`; `width` the standard deviation of the
     residual.
@@ -39,11 +40,11 @@ class Pull(AbstractPull):
 def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     """Return the profile interval (low, high) of one reported quantity.
 
-    The quantity is held at other values, and the other numbers are fitted again. At the ends of the
-    interval twice the misfit has grown by the squared quantile t², times the samples over which
-    errors are autocorrelated. This interval is better than that of `fit.interval()` if the misfit
-    is not quadratic: for a weakly determined quantity, or one near a boundary. Source: Raue et al.
-    2009, doi:10.1093/bioinformatics/btp358.
+    The quantity is held at other values, and all other numbers are fitted again. At the ends of the
+    interval, twice the misfit has grown by the squared quantile t², multiplied by the number of
+    samples over which errors are autocorrelated. This interval is better than that of
+    `fit.interval()` if the misfit is not quadratic, as for a weakly determined quantity or one near
+    a boundary. Source: Raue et al. 2009, doi:10.1093/bioinformatics/btp358.
 
     **Arguments:**
 
@@ -81,8 +82,9 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
 
         @functools.cache
         def pull_to(steps: float, side: float = side) -> tuple[float, float]:
-            # The pull is weak, so the quantity ends between the target and its best value. That is
-            # no error: the point has the least misfit of all points with its value.
+            # The pull is weak, and so the quantity ends between the target and its best value. That
+            # is no error: the point has the least misfit of all points with its value of the
+            # quantity.
             nonlocal point
             size = middle + side * steps * deviation, PULL * deviation
             target, width = (jnp.asarray(x, kind) for x in size)
@@ -105,7 +107,8 @@ _value = eqx.filter_jit(quantities.quantity_vector)
 def _interval_end(
     pull_to: Callable[[float], tuple[float, float]], reach: float, largest: float, side: float
 ) -> float:
-    """Return the value of the quantity at which the misfit has grown enough.
+    """Return the value of the quantity at which the misfit has grown by the amount that ends the
+    interval.
 
     **Arguments:** `pull_to` a function from the distance of the target to the excess of the misfit
     and the value; `reach` the first distance; `largest` the last one; `side` the sign of infinity.

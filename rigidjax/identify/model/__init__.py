@@ -1,1 +1,1 @@
-"""From free numbers to bodies, motions and the errors of all readings."""
+"""Compute bodies, motions and the errors of all readings from free numbers."""

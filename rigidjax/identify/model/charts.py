@@ -1,4 +1,4 @@
-"""Charts of the body for a fit: they map unconstrained numbers to bodies, all of them real ones."""
+"""Map unconstrained numbers to bodies, all of them physically possible, by charts for a fit."""
 
 import abc
 from collections.abc import Mapping, Sequence
@@ -15,20 +15,20 @@ from rigidjax.body import parameters as charts, validation
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of as tensor_of
 from rigidjax.body.symmetric3 import swap_trace
 
-# The parts of a `MassProperties` that may be free, and their places in `pack`.
+# These parts of a `MassProperties` may be free, at these places in `pack`.
 _PARTS = {"mass": (0,), "com": (7, 8, 9), "inertia": (1, 2, 3, 4, 5, 6)}
 Numbers = Float[Array, " chart"]
 Rows = Float[Array, "rows chart"]
-# Components of a tensor in the order of their names.
+# The components of a tensor are in the order of their names.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
-# The basis of symmetric tensors, in this order.
+# The basis of symmetric tensors is in this order.
 BASIS = np.zeros((6, 3, 3))
 for _k, (_i, _j) in enumerate(COMPONENTS):
     BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
 
 
 class AbstractBodyChart(eqx.Module):
-    """A chart of bodies: it maps `size` numbers to an `Inertia` or `MassProperties`, and back.
+    """Map `size` numbers to an `Inertia` or `MassProperties`, and back, as a chart of bodies.
 
     To make a chart of your own, write a subclass with the methods `body`, `vector` and `logs` and
     these members:
@@ -56,24 +56,25 @@ class AbstractBodyChart(eqx.Module):
     log_names: eqx.AbstractVar[tuple[str, ...]]
     plain_names: ClassVar[tuple[str, ...]] = ()
     unit: ClassVar[str] = ""
-    # The scale of the bodies that a user gets from `Model`. Within a fit bodies have none: a torque
-    # on a body of arbitrary scale would be refused there.
+    # This is the scale of the bodies that a user gets from `Model`. Within a fit bodies have no
+    # scale: a torque on a body of arbitrary scale would be refused there.
     scale: ClassVar[str | None] = None
 
     @abc.abstractmethod
     def body(self, vector: Numbers) -> Inertia | MassProperties:
-        """Return the body of the numbers `vector`."""
+        """Return the body that the numbers `vector` represent."""
 
     @abc.abstractmethod
     def vector(self, body: PyTree) -> Numbers:
-        """Return the numbers of a `body`, such as the initial guess of a fit."""
+        """Return the numbers that represent a `body`, such as the initial guess of a fit."""
 
     def bend(self, vector: Numbers, slope: Numbers) -> Rows:
-        """Return rows B whose BᵀB is the part of a misfit's second derivative from the curvature.
+        """Return rows B such that BᵀB is the part of a misfit's second derivative that comes from
+        the curvature of the chart.
 
-        The chart's curvature matters if a body may be flat (`rigidjax.body.parameters.flat_bend`);
-        without rows it is left out. **Arguments:** `vector` the numbers; `slope` the derivative of
-        the misfit by them.
+        The curvature matters if a body may be flat (`rigidjax.body.parameters.flat_bend`); without
+        rows it is left out. **Arguments:** `vector` the numbers; `slope` the derivative of the
+        misfit with respect to these numbers.
         """
         return jnp.zeros((0, self.size), vector.dtype)
 
@@ -87,7 +88,8 @@ class AbstractBodyChart(eqx.Module):
 
 
 class Ratios(AbstractBodyChart):
-    """The chart of the inertia tensor up to scale: two ratios of moments and the principal axes.
+    """Map five numbers to the inertia tensor up to scale: two ratios of moments and the principal
+    axes.
 
     It is for free motion, which cannot show the scale. Its five numbers are those of a root of the
     second moment 𝔖 of fixed scale (`rigidjax.body.parameters`), so that a flat body is an ordinary
@@ -116,7 +118,7 @@ class Ratios(AbstractBodyChart):
 
 
 class PrincipalRatios(AbstractBodyChart):
-    """The chart of two ratios of moments, if the body axes are known to be principal.
+    """Map two numbers to two ratios of moments, if the body axes are known to be principal.
 
     Its two numbers are those of the roots of the second moments λ1, λ2, λ3 along the axes, of fixed
     scale (notes, eqs 72, 76–78), so that every pair of numbers obeys the triangle inequalities.
@@ -144,7 +146,9 @@ class PrincipalRatios(AbstractBodyChart):
 
 
 def _typical_moments(value: object) -> Array:
-    """Return the rough size of the moments as an array; raise an error unless it is positive."""
+    """Return the rough size of the moments as an array, and raise an error unless it is
+    positive.
+    """
     if isinstance(value, Inertia | MassProperties):
         raise TypeError(
             "typical: wanted the rough size of the moments, one number, kg m², got "
@@ -156,7 +160,7 @@ def _typical_moments(value: object) -> Array:
 
 
 class Tensor(AbstractBodyChart):
-    """The chart of the inertia tensor with its scale, which a known torque or momentum shows.
+    """Map six numbers to the inertia tensor with its scale, which a known torque or momentum shows.
 
     Its six numbers are the logarithm of the size of 𝔖 in units of `typical`, and the five numbers
     of `Ratios`.
@@ -191,7 +195,8 @@ class Tensor(AbstractBodyChart):
 
 
 class Principal(AbstractBodyChart):
-    """The chart of three moments with their scale, if the body axes are known to be principal.
+    """Map three numbers to three moments with their scale, if the body axes are known to be
+    principal.
 
     Its three numbers are the logarithm of the size of 𝔖 in units of `typical`, and the two numbers
     of `PrincipalRatios`.
@@ -221,7 +226,7 @@ class Principal(AbstractBodyChart):
 
 
 class Mass(AbstractBodyChart):
-    """The chart of mass, centre of mass and inertia: all ten numbers, or some of them.
+    """Map numbers to mass, centre of mass and inertia, either all ten numbers or some of them.
 
     Forces must show them. The numbers are changes from the `guess` in the chart of
     `rigidjax.body.parameters.pack`.
@@ -266,12 +271,14 @@ class Mass(AbstractBodyChart):
 
     @property
     def _places(self) -> list[int]:
-        """Return the places of the free numbers among the ten of `pack`."""
+        """Return the places of the free numbers among the ten numbers of `pack`."""
         return sorted(place for name in self.free for place in _PARTS[name])
 
     @property
     def _length(self) -> Array:
-        """Return the size of the body, m: the centre counts in it, as a number of order one."""
+        """Return the size of the body, m, in which the centre is counted as a number of order
+        one.
+        """
         return jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
 
     def body(self, vector: Numbers) -> MassProperties:
@@ -307,7 +314,7 @@ class Mass(AbstractBodyChart):
 
 
 class Known(AbstractBodyChart):
-    """The chart of a known body: a fit moves only states, torques and sensors.
+    """Map no numbers to a known body: a fit then moves only states, torques and sensors.
 
     **Arguments:** `known` an `Inertia` or `MassProperties`.
 
@@ -333,12 +340,14 @@ class Known(AbstractBodyChart):
 
 
 def _pad(x: Float[Array, "*rows n"], leading: int, trailing: int) -> Float[Array, "*rows m"]:
-    """Return x with zeros `leading` and `trailing` it along the last axis."""
+    """Return x with `leading` zeros before it and `trailing` zeros after it, along the last
+    axis.
+    """
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(leading, trailing)])
 
 
 class Bodies(eqx.Module):
-    """The charts of several bodies; their numbers follow one another.
+    """Hold the charts of several bodies, whose numbers follow one another.
 
     Charts of one form are stacked, so that one program serves all recordings.
 
@@ -384,7 +393,9 @@ class Bodies(eqx.Module):
         return {name: scaled_body(chart, numbers) for name, chart, numbers in rows}
 
     def body(self, vector: Numbers, body_index: Int[Array, ""]) -> Inertia | MassProperties:
-        """Return the body number `body_index` from its numbers `vector`, padded with zeros."""
+        """Return the body with the index `body_index` from its numbers `vector`, which are padded
+        with zeros.
+        """
         kind, row = jnp.asarray(self.kind_of)[body_index], jnp.asarray(self.row_of)[body_index]
         chosen: Any = None
         for index, alike in enumerate(self.kinds):
@@ -412,10 +423,10 @@ def scaled_body(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProp
 def places_of(
     body: AbstractBodyChart | Bodies, body_indices: Int[Array, " records"] | None, count: int
 ) -> Int[np.ndarray, "records numbers"]:
-    """Return the places of the numbers of each recording's body among those of all bodies.
+    """Return the places of the numbers of each recording's body among the numbers of all bodies.
 
-    **Arguments:** `body` the chart or charts; `body_indices` (R,) the index of each
-    recording's body, `None` for one body; `count` R. The rows of smaller charts are filled with −1.
+    **Arguments:** `body` the chart or charts; `body_indices` (R,) the index of each recording's
+    body, or `None` for one body; `count` R. The rows of smaller charts are filled with −1.
     """
     if not isinstance(body, Bodies):
         return np.broadcast_to(np.arange(body.size), (count, body.size))
@@ -428,9 +439,10 @@ def places_of(
 def body_of_recording(
     body: AbstractBodyChart | Bodies, vector: Numbers, body_index: Int[Array, ""] | None
 ) -> Inertia | MassProperties:
-    """Return the body of one recording from a row `vector` that begins with its numbers.
+    """Return the body of one recording from a row `vector` that begins with the numbers of this
+    body.
 
-    `body_index` is its index among several bodies, `None` for one body.
+    `body_index` is the index of the body among several, or `None` for one body.
     """
     if not isinstance(body, Bodies):
         return body.body(vector[: body.size])
@@ -444,7 +456,7 @@ def chart_list(body: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...
 
 
 def numbers_of(body: AbstractBodyChart | Bodies, vector: Array | np.ndarray) -> list[Any]:
-    """Split the numbers `vector` of one body or of several into those of each chart."""
+    """Return the numbers `vector` of one body or of several, split into those of each chart."""
     sizes = [chart.size for chart in chart_list(body)]
     return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
 

@@ -1,4 +1,4 @@
-"""Free numbers inside a scene: the leaf that each one moves, and how it moves the leaf."""
+"""Find the free numbers inside a scene, the leaf that each one moves, and how it moves the leaf."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,7 +15,8 @@ from rigidjax.identify.model.scene import Scene
 
 
 class Free(eqx.Module):
-    """A free number: a number or array in the torque or the sensors of a scene that a fit moves.
+    """Define a free number: a number or array in the torque or the sensors of a scene that a fit
+    moves.
 
     **Arguments:**
 
@@ -87,7 +88,9 @@ class Free(eqx.Module):
 
 
 def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
-    """Return `each` of a `Free` if it is valid, labels as a tuple; else raise an error."""
+    """Return the argument `each` of a `Free` if it is valid, with labels as a tuple; else raise an
+    error.
+    """
     if isinstance(each, bool):
         return each
     if isinstance(each, str):
@@ -97,10 +100,10 @@ def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
 
 
 class Slot(eqx.Module):
-    """A `Free` whose leaf in the scene has been found.
+    """Hold a `Free` whose leaf in the scene has been found.
 
-    It holds no function, so that a second model does not compile again. A *step* is the change of
-    the leaf in units of `scale`.
+    It contains no function, so that a second model does not compile again. A *step* is the change
+    of the leaf in units of `scale`.
 
     **Fields:**
 
@@ -135,17 +138,19 @@ class Slot(eqx.Module):
 
     @property
     def columns(self) -> slice:
-        """Return the columns of the steps in the row of a recording."""
+        """Return the columns that hold the steps of this slot in the row of a recording."""
         return slice(self.column, self.column + int(np.prod(self.shape, dtype=int)))
 
     def move(self, start: Array, step: Array) -> Array:
-        """Return the value that lies `step` away from `start`, in units of the scale."""
+        """Return the value that lies `step` away from `start`, where `step` is in units of the
+        scale.
+        """
         if self.positive:
             return start * jnp.exp(step * self.scale)
         return start + step * self.scale
 
     def step(self, start: Array, value: Array) -> Array:
-        """Return the step that leads from `start` to `value`: the inverse of `move`."""
+        """Return the step that leads from `start` to `value`, which is the inverse of `move`."""
         if self.positive:
             return jnp.log(value / start) / self.scale
         return (value - start) / self.scale
@@ -170,7 +175,9 @@ def group_of_each(
 
 
 def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> list[Slot]:
-    """Return the slot of each `Free` in a scene; `bodies` (R,) names each recording's body."""
+    """Return the slot of each `Free` in a scene, where `bodies` (R,) names the body of each
+    recording.
+    """
     slots: list[Slot] = []
     for item in free:
         _checks.require_instance(item, Free, "free", requirement="Free(where, name)")
@@ -221,8 +228,8 @@ def leaf_at(
 ) -> tuple[tuple[Any, ...], Any]:
     """Return the path of the leaf of a tree that `where` picks, and the leaf, an array of numbers.
 
-    `name` and `role` are words for errors: the object that has `where`, and the one that needs a
-    starting value.
+    `name` and `role` are words for error messages: the object that has `where`, and the object that
+    needs a starting value.
     """
     pairs, structure = jax.tree.flatten_with_path(tree)
     paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
@@ -238,7 +245,8 @@ def leaf_at(
     if not isinstance(index, int):
         one = name.split()[0]
         raise ValueError(f"{name}: wanted one array, got {type(index).__name__}; one {one} each")
-    # Of a traced leaf `equinox.is_inexact_array_like` raises: it has a `__jax_array__` of `None`.
+    # For a traced leaf `equinox.is_inexact_array_like` raises an error, because the leaf has a
+    # `__jax_array__` of `None`.
     if not (eqx.is_inexact_array(leaves[index]) or isinstance(leaves[index], float)):
         raise ValueError(f"{name}: wanted numbers, got {type(leaves[index]).__name__}")
     return paths[index], leaves[index]
@@ -248,7 +256,7 @@ _UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place"
 
 
 def _implied_unit(scene: Scene, path: tuple[Any, ...]) -> str:
-    """Return the unit of a leaf of a scene, if its name implies one."""
+    """Return the unit of a leaf of a scene if its name implies one, else an empty text."""
     *way, last = path
     name = getattr(last, "name", "")
     if name != "bias":
@@ -259,12 +267,12 @@ def _implied_unit(scene: Scene, path: tuple[Any, ...]) -> str:
     return getattr(holder, "unit", "")
 
 
-# The tolerance that belongs to each member of a sensor.
+# Each member of a sensor belongs to this tolerance.
 TOLERANCES = {"scale": "scale", "skew": "cross_axis", "bias": "bias", "offset": "clock"}
 
 
 def _tolerance_at(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
-    """Return the tolerance of a sensor for its member at `path`; `None` without a tolerance."""
+    """Return the tolerance of a sensor for its member at `path`, or `None` without a tolerance."""
     if len(path) != 3 or getattr(path[0], "name", "") != "sensors":
         return None
     tolerance = getattr(scene.sensors[path[1].idx], "tolerance", None)
@@ -282,7 +290,7 @@ def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"
 
 
 def leaves_at(scene: Scene, paths: Sequence[tuple[Any, ...]]) -> tuple[Array, ...]:
-    """Return the leaves of a scene at these paths."""
+    """Return the leaves of a scene at the `paths`."""
     leaves = dict(jax.tree.leaves_with_path(scene))
     return tuple(jnp.asarray(leaves[path]) for path in paths)
 

@@ -1,4 +1,4 @@
-"""The index of a model: the place of each recording's numbers among all free numbers."""
+"""Find the place of each recording's numbers among all free numbers of a model."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,12 +12,12 @@ from rigidjax.identify.model.free import Slot
 
 
 class Index(eqx.Module):
-    """The places of each recording's numbers among the n free numbers x of a model.
+    """Hold the places of each recording's numbers among the n free numbers x of a model.
 
-    x holds the numbers of the bodies, then the shared steps of the slots, then the numbers that one
-    recording has alone: its initial state, part by part, and its own steps. The row of a recording
-    holds the numbers of its body, the step of each slot, and its initial state. A slot with
-    deviations has one step in the row, which is the sum of two numbers of x.
+    x holds the numbers of the bodies, then the shared steps of the slots, then the numbers that
+    belong to one recording alone: its initial state, part by part, and its own steps. The row of a
+    recording holds the numbers of its body, the step of each slot, and its initial state. A slot
+    with deviations has one step in the row, which is the sum of two numbers of x.
 
     **Fields:**
 

@@ -1,4 +1,4 @@
-"""The model of a fit: it maps free numbers to the scene of each recording."""
+"""Map the free numbers of a fit to the scene of each recording, by a model."""
 
 import abc
 import dataclasses
@@ -56,15 +56,17 @@ from rigidjax.motion.torques.base import AbstractForce, Torque, require_law
 from rigidjax.motion.torques.composite import parts_of
 from rigidjax.motion.torques.inputs import delays_of, inputs_of
 
-# The largest turn, rad, in a step of the filter: the classical method of order 4 then has an error
-# of 5e-8 of the turn.
+# In a step of the filter the body turns by at most this angle, rad: the classical method of order 4
+# then has an error of 5e-8 of the turn.
 TURN_OF_A_FILTER_STEP = 0.05
-# Times are even if their steps differ by no more than this part of the first one.
+# Times are even if their steps differ by no more than this part of the first step.
 EVEN = 1e-3
 
 
 class AbstractPull(eqx.Module):
-    """Residuals that pull the numbers of a fit, besides those of readings and priors."""
+    """Compute residuals that pull the numbers of a fit, in addition to those of readings and
+    priors.
+    """
 
     @abc.abstractmethod
     def __call__(self, model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
@@ -72,7 +74,7 @@ class AbstractPull(eqx.Module):
 
 
 class Unpacked(eqx.Module):
-    """The quantities that the free numbers of a model represent.
+    """Hold the quantities that the free numbers of a model represent.
 
     **Fields:**
 
@@ -98,7 +100,8 @@ class Unpacked(eqx.Module):
 
 
 class Model(eqx.Module):
-    """The recordings of one body or several, and the n numbers x that are free in their scenes.
+    """Hold the recordings of one body or several, and the description of the n numbers x that are
+    free in their scenes.
 
     **Arguments:**
 
@@ -233,7 +236,8 @@ class Model(eqx.Module):
         elif integrator is None and torque is not None:
             integrator = integrator_for(turn)
         self.integrator = integrator
-        # Without a filter the number would only make recordings of other gaps compile again.
+        # Without a filter the number is not needed, and it would only make recordings with other
+        # gaps compile again.
         filtered = process is not None or self.walks
         self.filter_steps = filter_steps_of(self) if filtered else 1
 
@@ -249,7 +253,7 @@ class Model(eqx.Module):
 
     @property
     def recordings(self) -> tuple[Recording, ...]:
-        """Return the recordings, one by one."""
+        """Return the recordings as a tuple, one by one."""
         return tuple(
             stacking.take_rows(stacking.pick_records(self.records, index), count)
             for index, count in enumerate(np.asarray(self.counts).tolist())
@@ -271,7 +275,7 @@ class Model(eqx.Module):
     def start(self, body: PyTree = None, omega: NumbersLike | None = None) -> Float[Array, " n"]:
         """Return free numbers with which a fit may start, or those of a planned motion.
 
-        Numbers of `Free`s have their starting values.
+        The numbers of `Free`s have their starting values.
 
         **Arguments:**
 
@@ -310,20 +314,23 @@ class Model(eqx.Module):
         rest = self.size - vector.size - spin.size
         own = sum(s.own.size for s in self.slots if s.own is not None)
         zeros = xp.zeros(rest - own, kind), xp.zeros(own, kind)
-        # The order is that of `Index`: bodies and shared steps, initial states with the rates last,
-        # own steps.
+        # The order is that of `Index`: bodies and shared steps, then initial states with the rates
+        # last, then own steps.
         parts = [xp.asarray(vector, kind), zeros[0], spin.reshape(-1), zeros[1]]
         return jnp.asarray(xp.concatenate(parts))
 
     def unpack(self, x: Float[Array, " n"]) -> Unpacked:
-        """Return what the free numbers x represent: body, initial state, values of the `Free`s.
+        """Return the quantities that the free numbers x represent: body, initial state, values of
+        the `Free`s.
 
-        With several recordings the states have a leading axis.
+        For several recordings the states have a leading axis.
         """
         return unpack_numbers(self, require_numbers(self, x))
 
     def bodies(self, x: Float[Array, " n"]) -> Any:
-        """Return the body that the free numbers x represent; for several bodies a dict by name."""
+        """Return the body that the free numbers x represent, or for several bodies a dict by
+        name.
+        """
         numbers = x[: self.index.bodies]
         if isinstance(self.chart, Bodies):
             return self.chart.all(numbers)
@@ -345,7 +352,7 @@ class Model(eqx.Module):
     def motion(self, x: Float[Array, " n"]) -> Any:
         """Return the states at the times of the recording, with a leading time axis.
 
-        Several recordings have an axis of their own before it.
+        For several recordings there is an axis of recordings before it.
         """
         x = require_numbers(self, x)
 
@@ -367,7 +374,7 @@ class Model(eqx.Module):
 
 
 class _Data(NamedTuple):
-    """The parts of a model that come from its recordings or windows.
+    """Hold the parts of a model that come from its recordings or windows.
 
     **Fields**, besides those of `Model`: `sensors` of one recording; `kinds` the number of parts,
     of three numbers each, of an initial state that is free; `widest` the longest time between two
@@ -397,7 +404,8 @@ def _data_of_recordings(
     records, counts = stacking.stack(recordings)
     sensors = recordings[0].sensors
     state_kind = _state_kind(sensors, torque, charts)
-    # The readings are known, even if the torque is traced: keep these numbers known, too.
+    # The readings are known even if the torque is traced: keep the numbers of the reference known
+    # as well.
     with jax.ensure_compile_time_eval():
         reference = reference_of(recordings, state_kind)
     kinds = dimension(stacking.pick_records(reference.state, 0)) // 3
@@ -408,7 +416,9 @@ def _data_of_recordings(
 def _data_of_windows(
     windows: Windows, torque: Torque | None, charts: AbstractBodyChart | Bodies, stretches: int
 ) -> _Data:
-    """Return the data of windows: each starts in its measured state, or in a free one about it."""
+    """Return the data of windows, each of which starts in its measured state, or in a free state
+    about it.
+    """
     require_inputs_of_windows(torque, windows)
     records = windows.records()
     counts = np.full(windows.count, windows.length + 1, np.int32)
@@ -429,7 +439,7 @@ def _require_parts(
     prior: object,
     integrator: object,
 ) -> None:
-    """Raise `TypeError` unless the parts of a model are of their types."""
+    """Raise `TypeError` unless the parts of a model have the right types."""
     for one in chart_list(charts):
         known = isinstance(one, Inertia | MassProperties)
         hint = "give a known body as Known(body)" if known else ""
@@ -463,22 +473,24 @@ def unpack_numbers(model: Model, x: Float[Array, " n"]) -> Unpacked:
 
 
 def unpack_with_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
-    """Return what x represents, and its derivatives by x along a new last axis of each array."""
+    """Return the quantities that x represents, and their derivatives by x along a new last axis of
+    each array.
+    """
     slopes, point = _unpack_with_jacobian(without_samples(model), x)
     return point, slopes
 
 
 @eqx.filter_jit
 def _unpack_with_jacobian(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
-    """Return the derivatives of `unpack_numbers` and its result, as one program."""
+    """Return the derivatives of `unpack_numbers` and its result, computed in one program."""
     return with_jacobian(lambda x: unpack_numbers(model, x), x)
 
 
 def without_samples(model: Model) -> Model:
-    """Return a model of known numbers with the first time of each recording alone.
+    """Return a model of known numbers that has only the first time of each recording.
 
-    What x represents depends on no reading. A program that computes it from this model is compiled
-    once, and not again for recordings of another length.
+    The quantities that x represents depend on no reading. A program that computes them from this
+    model is compiled once, and not again for recordings of another length.
     """
     records = jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, model.records)
     return with_parts(model, records=stacking.take_rows(records, 1, axis=1))
@@ -518,7 +530,7 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
 
 
 def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
-    """Return the starting value of each slot in each recording."""
+    """Return the starting value that each slot has in each recording."""
     leaves, out = dict(jax.tree.leaves_with_path(scene_template(model, model.records))), []
     for slot in model.slots:
         leaf = jnp.asarray(leaves[slot.path])
@@ -528,16 +540,21 @@ def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
 
 
 def filter_steps_of(model: Model) -> int:
-    """Return the number of steps of a filter in the widest gap between two times."""
+    """Return the number of steps that a filter needs in the widest gap between two times of a
+    model.
+    """
     widest = np.max(np.diff(np.asarray(model.records.t), axis=1), initial=0.0)
     turn = 1.5 * float(widest) * float(np.max(np.asarray(model.reference.rate)))
-    # A NaN in a recording gives no number of steps: take one, and let later checks refuse it.
+    # A NaN in a recording gives no number of steps: take one step, and let later checks refuse the
+    # NaN.
     steps = turn / TURN_OF_A_FILTER_STEP
     return math.ceil(steps) if 1.0 < steps < math.inf else 1
 
 
 def require_one(model: PyTree) -> Model:
-    """Return `model`; raise `TypeError` or `ValueError` unless it is one `Model`, not a batch."""
+    """Return `model`, and raise `TypeError` or `ValueError` unless it is one `Model` and not a
+    batch.
+    """
     _checks.require_instance(model, Model, "model")
     records, rate = model.records, model.reference.rate
     shapes = {records.t.shape, *(reading.mask.shape for reading in records.readings)}
@@ -553,7 +570,7 @@ def require_one(model: PyTree) -> Model:
 
 
 def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
-    """Return the free numbers x; raise an error unless they are numbers of this model."""
+    """Return the free numbers x, and raise an error unless they are numbers of this model."""
     require_one(model)
     hint = "model.start(body) makes them"
     numbers = _checks.numeric_array(x, "x")
@@ -572,7 +589,7 @@ def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
 
 
 def with_parts(model: Model, **parts: Any) -> Model:
-    """Return the model with the fields `parts` replaced, unchecked.
+    """Return the model with the fields `parts` replaced, without checks.
 
     `dataclasses.replace` would call `Model(…)`, and `equinox.tree_at` cannot replace a tuple
     without leaves.
@@ -584,7 +601,9 @@ def with_parts(model: Model, **parts: Any) -> Model:
 
 
 def _require_states(windows: Windows, kind: type) -> None:
-    """Raise `TypeError` if the torque needs more than the measured states have."""
+    """Raise `TypeError` if the torque needs a state with more parts than the measured states
+    have.
+    """
     if not isinstance(windows.starts, kind):
         raise TypeError(
             f"windows: wanted measured states of type {kind.__name__}, which the torque needs, got "
@@ -619,7 +638,7 @@ def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
 
 
 def describe_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
-    """Describe the delays that at the free numbers x read beyond their windows; none otherwise."""
+    """Describe the delays that, at the free numbers x, read inputs outside of their windows."""
     if model.clusters is None or not delays_of(model.torque):
         return []
     t, rows = np.asarray(model.records.t)[0], max(len(a[0]) for a in model.records.inputs.values())
@@ -630,7 +649,7 @@ def describe_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
 
 @eqx.filter_jit
 def _scenes_program(model: Model, x: Float[Array, " n"]) -> Scene:
-    """Return the result of `scenes_of` by one program.
+    """Return the result of `scenes_of`, computed in one program.
 
     Outside of a trace each operation of JAX takes as long as a run of 100 steps.
     """
@@ -643,7 +662,7 @@ def _samples_read(torque: Torque | None, recording: Recording) -> list[str]:
 
 
 def _require_even_times(torque: Torque | None, recording: Recording, number: int) -> None:
-    """Raise `ValueError` for inputs that are samples at uneven times."""
+    """Raise `ValueError` if the torque reads inputs that are samples at uneven times."""
     names, steps = _samples_read(torque, recording), np.diff(np.asarray(recording.t, float))
     if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
         raise ValueError(
@@ -696,7 +715,9 @@ def _charts_and_names(recording: Any, body: Any) -> tuple[list[Recording], Any, 
 
 
 def _require_recordings(recordings: Sequence[Any]) -> None:
-    """Raise an error unless these are known recordings, at least one, each without a batch."""
+    """Raise an error unless these are known recordings, at least one, each of them without a
+    batch.
+    """
     if not recordings:
         raise ValueError("Model: wanted at least one Recording, got an empty sequence")
     for item in recordings:
@@ -716,7 +737,7 @@ def _require_recordings(recordings: Sequence[Any]) -> None:
 
 
 def _numbers_in_chart(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " chart"]:
-    """Return the numbers of a body in a chart; zeros, the start of the chart, for `None`."""
+    """Return the numbers of a body in a chart, or zeros, the start of the chart, for `None`."""
     if body is None:
         return _host_zeros(chart.size)
     one = validation.require_single_body(body, (Inertia, MassProperties), "body")
@@ -734,7 +755,7 @@ def _numbers_in_chart(chart: AbstractBodyChart, body: Body | None) -> Float[Arra
 
 
 def _host_zeros(*shape: int) -> Array:
-    """Return zeros, made by NumPy: JAX would compile a program for each shape."""
+    """Return zeros made by NumPy, since JAX would compile a program for each shape."""
     return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
 
 
@@ -743,7 +764,7 @@ def _state_kind(
 ) -> type:
     """Return the smallest type of state that sensors and torque need.
 
-    Raise `ValueError` if the body needs a mass and has none.
+    It raises `ValueError` if they need a body with a mass and the chart has none.
     """
     needed = [sensor.feels for sensor in sensors]
     if torque is not None:

@@ -1,4 +1,4 @@
-"""Normal equations, from which the numbers of one recording alone are eliminated (Schur)."""
+"""Solve normal equations from which the numbers of one recording alone are eliminated (Schur)."""
 
 from collections.abc import Sequence
 
@@ -10,10 +10,10 @@ from jaxtyping import Array, Float, Int
 
 
 class OwnBlocks(eqx.Module):
-    """The part of a normal matrix that belongs to numbers which one recording has alone.
+    """Hold the part of a normal matrix for the numbers that belong to one recording alone.
 
-    **Fields:** `own` (R, k, k) the blocks of these numbers; `sides` (R, k, s) their blocks with the
-    numbers of the core; `at` (R, k) their places among all numbers.
+    **Fields:** `own` (R, k, k) the blocks of these numbers; `sides` (R, k, s) the blocks between
+    these numbers and those of the core; `at` (R, k) the places of these numbers among all numbers.
     """
 
     own: Float[Array, "records k k"]
@@ -22,7 +22,7 @@ class OwnBlocks(eqx.Module):
 
 
 class NormalMatrix(eqx.Module):
-    """A normal matrix of n numbers.
+    """Hold a normal matrix of n numbers.
 
     **Fields:** `core` (s, s) the block of the first s numbers, which recordings share; `own_blocks`
     the rest, or `None` if all n numbers are in the core.
@@ -33,7 +33,7 @@ class NormalMatrix(eqx.Module):
 
     @property
     def diagonal(self) -> Float[Array, " n"]:
-        """Return the diagonal."""
+        """Return the diagonal of the matrix."""
         own = self.own_blocks and jnp.diagonal(self.own_blocks.own, axis1=1, axis2=2)
         return self._join_rows(jnp.diagonal(self.core), own)
 
@@ -48,15 +48,15 @@ class NormalMatrix(eqx.Module):
         )
 
     def with_rows(self, rows: Float[Array, "m n"]) -> "NormalMatrix":
-        """Return the matrix with residuals of derivative `rows` added.
+        """Return the matrix with residuals added whose derivatives are `rows`.
 
-        These residuals may change only with numbers of the core.
+        These residuals may depend only on numbers of the core.
         """
         rows = rows[:, : self.core.shape[0]]
         return NormalMatrix(self.core + rows.T @ rows, self.own_blocks)
 
     def in_units(self, unit: Float[Array, " n"]) -> "NormalMatrix":
-        """Return the matrix of the numbers counted in the units `unit`."""
+        """Return the matrix of the numbers if they are counted in the units `unit`."""
         shared, own = self._split_rows(unit)
         core, alone = self.core * (shared[:, None] * shared[None, :]), self.own_blocks
         if alone is None:
@@ -75,7 +75,7 @@ class NormalMatrix(eqx.Module):
         return self._join_rows(first, jnp.einsum("rkl,rl->rk", alone.own, own) + from_core)
 
     def solve(self, rhs: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
-        """Return the x with `matrix @ x = side`; NaN unless the matrix is positive definite."""
+        """Return the x with `matrix @ x = rhs`, or NaN unless the matrix is positive definite."""
         alone, count = self.own_blocks, self.core.shape[0]
         if alone is None:
             return _solve_by_cholesky(self.core, rhs)
@@ -87,13 +87,15 @@ class NormalMatrix(eqx.Module):
         return self._join_rows(first, last).reshape(rhs.shape)
 
     def _split_rows(self, x: Array) -> tuple[Array, Array]:
-        """Return the rows of x (n, …) of the core, and those (R, k, …) of one recording alone."""
+        """Return the rows of x (n, …) that belong to the core, and those (R, k, …) that belong to
+        one recording alone.
+        """
         return (
             (x, x) if self.own_blocks is None else (x[: self.core.shape[0]], x[self.own_blocks.at])
         )
 
     def _join_rows(self, shared: Array, own: Array | None) -> Array:
-        """Return all rows (n, …) from those of the core and of one recording alone."""
+        """Return all rows (n, …), from those of the core and those of one recording alone."""
         if self.own_blocks is None:
             return shared
         first, at = shared.shape[0], self.own_blocks.at
@@ -102,7 +104,7 @@ class NormalMatrix(eqx.Module):
 
 
 def _solve_by_cholesky(matrix: Array, rhs: Array) -> Array:
-    """Solve `matrix x = side` by Cholesky's decomposition."""
+    """Solve `matrix x = rhs` by Cholesky's decomposition."""
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), rhs)
 
 
@@ -124,7 +126,7 @@ def normal_of(
     rest = np.setdiff1d(np.arange(columns), alone)
     squares = jnp.zeros((count, columns, columns), blocks[0].dtype)
     for rows in blocks:
-        # A product of matrices takes a fifth of the time of an `einsum` over two axes (on a CPU).
+        # On a CPU a product of matrices takes a fifth of the time of an `einsum` over two axes.
         flat = rows.reshape(count, -1, columns)
         squares = squares + flat.swapaxes(1, 2) @ flat
     # A column without a number goes to an additional last row, which is dropped.

@@ -1,4 +1,6 @@
-"""The states of a body at the times of a recording, and the readings of sensors along them."""
+"""Predict the states of a body at the times of a recording, and the readings of sensors along
+them.
+"""
 
 import abc
 import math
@@ -31,12 +33,13 @@ from rigidjax.solve.fixed_loop import first_row, first_rows, step
 from rigidjax.solve.steppers import cheapest, stepper_of
 from rigidjax.solve.tableaus import KUTTA4
 
-# The turn in a step, rad, at which a method of order 5 has an error of 1e-9 a radian, and the turn
-# at which a method of order 4 has this error, at two thirds of the cost a step.
+# With TURN_A_STEP rad in a step, a method of order 5 has an error of 1e-9 a radian. With
+# TURN_OF_ORDER_4 a method of order 4 has this error, at two thirds of the cost of a step.
 TURN_A_STEP, TURN_OF_ORDER_4 = 0.1, 0.02
-# More fixed steps than this between two samples cost more than adaptive steps.
+# More fixed steps than this number between two samples cost more than adaptive steps.
 FINEST = 32
-# The least relative tolerance to which adaptive steps are refined, and the factor of a refinement.
+# Adaptive steps are refined to the relative tolerance _LEAST at most; each refinement has the
+# factor _CLOSER.
 _LEAST, _CLOSER = 2.5e-14, 1e-2
 
 
@@ -44,10 +47,11 @@ State = Spin | Attitude | Rigid
 
 
 class AbstractIntegrator(eqx.Module):
-    """The integrator of a forced motion inside a fit, differentiable in forward mode.
+    """Integrate a forced motion inside a fit, with derivatives in forward mode.
 
-    At its end a fit compares its predictions with those of shorter steps (`finer`). If a prediction
-    changes by more than a twentieth of its noise, the fit goes on with the shorter steps.
+    At its end a fit compares its predictions with those of shorter steps (`refine`). If a
+    prediction changes by more than a twentieth of its noise, the fit goes on with the shorter
+    steps.
 
     >>> class Halves(AbstractIntegrator):  # two equal steps from one sample to the next
     ...     def states(self, body, state0, ts, torque):
@@ -62,16 +66,16 @@ class AbstractIntegrator(eqx.Module):
     ) -> PyTree:
         """Return the states at `ts` from `state0` at the first time, with a leading time axis.
 
-        They are a `motion.Coupled` if the torque has states of its own.
+        The states are a `motion.Coupled` if the torque has states of its own.
         """
 
     def refine(self) -> "AbstractIntegrator | None":
-        """Return an integrator of shorter steps, for comparison; `None` if there is none."""
+        """Return an integrator of shorter steps for comparison, or `None` if there is none."""
         return None
 
 
 class FixedSteps(AbstractIntegrator):
-    """The integrator that makes the same number of fixed steps between any two samples.
+    """Integrate with the same number of fixed steps between any two samples.
 
     It is the cheapest one if samples are close together, as in logs of 100 Hz and more.
 
@@ -109,12 +113,14 @@ class FixedSteps(AbstractIntegrator):
 
 
 def _tolerance_field(name: str) -> Callable[[ScalarLike], Array]:
-    """Return a converter of a field to an array, so that another value compiles no new program."""
+    """Return a function that converts a field to an array, so that another value compiles no new
+    program.
+    """
     return lambda value: jnp.asarray(_checks.known_float(value, name), jnp.result_type(float))
 
 
 class Adaptive(AbstractIntegrator):
-    """The integrator that chooses its steps by tolerances, through `rigidjax.simulate`.
+    """Integrate with steps that are chosen by tolerances, through `rigidjax.simulate`.
 
     **Arguments:** `rtol`, `atol` as for `rigidjax.simulate`. In float32 `rtol` is at least 1.2e-5.
     Another tolerance does not compile again.
@@ -133,8 +139,8 @@ class Adaptive(AbstractIntegrator):
     def states(
         self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
     ) -> PyTree:
-        # The padding of a shorter record repeats its last time, which a solver refuses: let these
-        # times grow a little.
+        # The padding of a shorter record repeats its last time, which a solver refuses: let the
+        # repeated times grow a little.
         first = jnp.zeros(1, bool)
         repeats = jnp.cumsum(jnp.concatenate([first, jnp.diff(ts) <= 0]).astype(ts.dtype))
         out = simulate(
@@ -171,7 +177,7 @@ def states_at(
     ts: Float[Array, " times"],
     torque: Torque | None,
 ) -> PyTree:
-    """Return the states at `ts` from `state0` at `ts[0]`: by the closed form for a free body."""
+    """Return the states at `ts` from `state0` at `ts[0]`, by the closed form for a free body."""
     if torque is not None:
         assert integrator is not None
         return integrator.states(body, state0, ts, torque)
@@ -179,7 +185,7 @@ def states_at(
 
 
 class HeldSteps(AbstractIntegrator):
-    """The integrator that makes a step of order 4 between samples, and holds the inputs in it.
+    """Integrate with one step of order 4 between samples, and hold the inputs in each step.
 
     Samples are evenly spaced. A delayed input changes inside a step, which is then split at the
     change.
@@ -221,7 +227,7 @@ class HeldSteps(AbstractIntegrator):
             return y, stepper.state(y)
 
         def warm_up(y: PyTree, i: Array) -> tuple[PyTree, None]:
-            # The torque's own states follow the inputs; the body keeps its initial state.
+            # The torque's own states follow the inputs, while the body keeps its initial state.
             y, _ = take_step(y, i)
             return split(Coupled(start.motion, stepper.state(y).own)), None
 
@@ -244,7 +250,7 @@ def shift_in_time(field: Callable[..., Any], t: Array, state: PyTree, offset: Ar
 def body_of_equations(body: Body, state_type: type) -> Body:
     """Return the body of the equations of motion of a state of this type.
 
-    Only the equations of a `Rigid` need the mass; the others take the inertia alone.
+    Only the equations of a `Rigid` need the mass; all others take the inertia alone.
     """
     return body.inertia if isinstance(body, MassProperties) and state_type is not Rigid else body
 
@@ -258,7 +264,8 @@ def sensor_inputs(
     states: PyTree,
     delay: Array | None = None,
 ) -> tuple[Array, PyTree, Callable[[Array, PyTree], SensorInput]]:
-    """Return the times and states that a sensor reads, and a function to its input at one time.
+    """Return the times and states that a sensor reads, and the function that makes its input at one
+    time.
 
     **Arguments:**
 
@@ -298,7 +305,9 @@ def errors_along(
     states: PyTree,
     input_at: Callable[[Array, PyTree], SensorInput],
 ) -> Float[Array, "times k"]:
-    """Return the errors of readings `values` (T, …); the other arguments are of `sensor_inputs`."""
+    """Return the errors of readings `values` (T, …) of a sensor, from the three results of
+    `sensor_inputs`.
+    """
 
     def error(t: Array, state: PyTree, value: Array) -> Array:
         return _error_of(sensor, input_at(t, state), value)
@@ -311,7 +320,9 @@ def errors_along(
 
 
 def _error_of(sensor: AbstractSensor, motion: SensorInput, value: Array) -> Array:
-    """Return the error of a reading, checked: a user may have written the method `error`."""
+    """Return the error of a reading after checks, since a user may have written the method
+    `error`.
+    """
     name = type(sensor).__name__
     try:
         error = sensor.error(motion, value)
@@ -340,7 +351,7 @@ def simulate_readings(
     *,
     key: PRNGKeyArray | None = None,
 ) -> Any:
-    """Return the readings of a sensor along a known motion, with noise: data to test a fit.
+    """Return the readings of a sensor along a known motion, with noise, as data to test a fit.
 
     `rigidjax.simulate` computes the motion. Bias, scale, mounting, clock offset, low-pass filter
     and full scale are those of the sensor. The function may be differentiated, jitted and batched.
@@ -396,7 +407,7 @@ def _readings(
     *,
     key: PRNGKeyArray | None,
 ) -> Float[Array, "times ..."]:
-    """Return the readings of one sensor along a motion, as one program."""
+    """Return the readings of one sensor along a motion, computed in one program."""
     jitter, late = getattr(sensor, "jitter", None), None
     if key is not None and jitter is not None:
         key, own = jax.random.split(key)
@@ -418,7 +429,9 @@ def _readings(
 
 
 def _require_sensor(sensor: PyTree, state0: State, key: object) -> None:
-    """Raise an error for anything but a sensor that can read this state, with noise for a key."""
+    """Raise an error unless this is a sensor that can read this state, with known noise if there is
+    a key.
+    """
     name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
     _checks.require_instance(sensor, AbstractSensor, "sensor", requirement=wanted)
     if not isinstance(state0, sensor.feels):

@@ -1,4 +1,4 @@
-"""Robust losses, which give outliers less weight, and a prior of the body."""
+"""Compute robust losses, which give outliers less weight, and a prior of the body."""
 
 import abc
 from functools import partial
@@ -14,7 +14,8 @@ from rigidjax.body.inertia import Inertia, MassProperties
 
 
 class AbstractLoss(eqx.Module):
-    """A robust loss ρ(s), a function of the squared length s of an error in units of its noise.
+    """Define a robust loss ρ(s), a function of the squared length s of an error in units of its
+    noise.
 
     A reading counts as a whole, so that the loss does not depend on the frame.
 
@@ -33,14 +34,16 @@ class AbstractLoss(eqx.Module):
 
     @abc.abstractmethod
     def weight(self, error: Float[Array, " k"]) -> Scalar:
-        """Return dρ/ds, the weight of the reading in the normal equations: 1 for a small error."""
+        """Return dρ/ds, the weight of the reading in the normal equations, which is 1 for a small
+        error.
+        """
 
 
 _scale = partial(_checks.positive_float, name="scale")
 
 
 class SoftL1(AbstractLoss):
-    """A loss that is quadratic for ordinary errors, linear for large ones.
+    """Define a loss that is quadratic for ordinary errors and linear for large ones.
 
     It is `ρ(s) = 2c²(√(1 + s/c²) − 1)`, SciPy's `soft_l1` (Charbonnier et al. 1997,
     doi:10.1109/83.551699).
@@ -63,7 +66,7 @@ class SoftL1(AbstractLoss):
 
 
 class Huber(AbstractLoss):
-    """A loss that is quadratic up to an error c and linear beyond it.
+    """Define a loss that is quadratic up to an error c and linear beyond it.
 
     It is `ρ(s) = s` for s ≤ c², else `2c√s − c²` (Huber 1964, doi:10.1214/aoms/1177703732).
 
@@ -88,12 +91,13 @@ class Huber(AbstractLoss):
 
 
 def _checked_weight(value: float) -> Scalar:
-    """Return the weight of a prior as an array; raise `ValueError` unless it is positive."""
+    """Return the weight of a prior as an array, and raise `ValueError` unless it is positive."""
     return jnp.asarray(_checks.positive_float(value, "weight"), jnp.result_type(float))
 
 
 class Entropic(eqx.Module):
-    """The entropic prior `w D(body, guess)`, D the log-determinant divergence of two bodies.
+    """Define the entropic prior `w D(body, guess)`, where D is the log-determinant divergence of
+    two bodies.
 
     For a `Mass` chart D is `rigidjax.body.divergence`, the divergence of the pseudo-inertias J. For
     other charts the second moments 𝔖 take the place of J; for a chart without a scale they are
@@ -118,7 +122,9 @@ class Entropic(eqx.Module):
     def residuals(
         self, body: Inertia | MassProperties, to_scale: bool = True
     ) -> Float[Array, " n"]:
-        """Return numbers whose squares add up to `2 w D`; shapes alone unless `to_scale`."""
+        """Return numbers whose squares add up to `2 w D`, from the shapes of the bodies alone
+        unless `to_scale`.
+        """
         if isinstance(body, MassProperties) and isinstance(self.guess, MassProperties):
             here, there = _pseudo_inertia(body), _pseudo_inertia(self.guess)
         else:
@@ -138,7 +144,7 @@ def _root_of_divergence(c: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return `√(c² − 1 − 2 log c)` with the sign of c − 1, which is smooth through c = 1."""
     x = c - 1.0
     near = jnp.abs(x) < 1e-2
-    # (x + 1)² − 1 − 2 log(1 + x) = 2 x² (1 − x/3 + x²/4 − x³/5 + …)
+    # The series is that of (x + 1)² − 1 − 2 log(1 + x) = 2 x² (1 − x/3 + x²/4 − x³/5 + …).
     series = 1.0 - x * (1 / 3 - x * (1 / 4 - x * (1 / 5 - x * (1 / 6 - x * (1 / 7 - x / 8)))))
     far = jnp.where(near, 2.0, c)
     exact = jnp.sign(far - 1.0) * jnp.sqrt(far * far - 1.0 - 2.0 * jnp.log(far))
@@ -146,7 +152,7 @@ def _root_of_divergence(c: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def _pseudo_inertia(body: MassProperties) -> Float[Array, "4 4"]:
-    """Return the pseudo-inertia J: the second moments ∫ r̃ r̃ᵀ dm of r̃ = (r, 1)."""
+    """Return the pseudo-inertia J, which holds the second moments ∫ r̃ r̃ᵀ dm of r̃ = (r, 1)."""
     m, c = body.mass, body.com
     upper = body.second_moment + m * c[:, None] * c[None, :]
     side = (m * c)[:, None]

@@ -1,4 +1,4 @@
-"""The scene of a recording: everything that its readings depend on."""
+"""Hold the scene of a recording, which is everything that its readings depend on."""
 
 import equinox as eqx
 from jaxtyping import PyTree
@@ -11,12 +11,12 @@ from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
 from rigidjax.motion.torques.base import Torque
 from rigidjax.motion.torques.composite import parts_of
 
-# An unknown torque: white, correlated in time, or several of these.
+# An unknown torque is white, correlated in time, or a sum of such torques.
 Process = RandomTorque | CorrelatedTorque | Sum
 
 
 class Scene(eqx.Module):
-    """The scene of a recording: everything that its readings depend on.
+    """Hold the scene of a recording, which is everything that its readings depend on.
 
     `Model.scenes(x)` makes the scenes of the free numbers x. A `Free(where, …)` picks a number of a
     scene, such as `lambda s: s.torque.coefficient` or `lambda s: s.sensors[0].bias`.
@@ -52,7 +52,7 @@ def require_process(process: PyTree) -> None:
 
 
 def require_known_torque(torque: Torque | None) -> None:
-    """Raise `TypeError` for a torque with unknown parts: these belong to the process."""
+    """Raise `TypeError` for a torque with unknown parts, which belong to the process."""
     for part in parts_of(torque):
         if isinstance(part, RandomTorque | CorrelatedTorque):
             raise TypeError(

@@ -1,4 +1,4 @@
-"""The errors of all readings, and their derivatives recording by recording."""
+"""Compute the errors of all readings, and their derivatives recording by recording."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -30,12 +30,14 @@ from rigidjax.rotation.barrier import batch_as, platform
 if TYPE_CHECKING:
     from rigidjax.identify.model.model import Model
 
-# The row of a recording's free numbers; the index of its body, `None` for one body.
+# A `Row` holds the free numbers of a recording; a `BodyIndex` is the index of its body, `None` for
+# one body.
 Row = Float[Array, " columns"]
 BodyIndex = Array | None
-# The errors (R, T, k) of each sensor, and their derivatives (R, T, k, m) by the m numbers of a row.
+# The blocks are the errors (R, T, k) of each sensor, and their derivatives (R, T, k, m) by the m
+# numbers of a row.
 Blocks = tuple[tuple[Array, ...], tuple[Array, ...]]
-# The standard deviations (R, k) of each sensor, of R recordings and k components.
+# The noise holds the standard deviations (R, k) of each sensor, for R recordings and k components.
 Noise = tuple[Float[Array, "records _"], ...]
 
 
@@ -82,7 +84,8 @@ def errors_of_recording(
     body_index: BodyIndex,
     delay: Array | None = None,
 ) -> tuple[Array, ...]:
-    """Return the errors (T, k) of each sensor in one recording, in its unit; zero where masked.
+    """Return the errors (T, k) of each sensor in one recording, in its unit, with zero for a masked
+    reading.
 
     **Arguments:**
 
@@ -109,7 +112,7 @@ def errors_of_scene(
 
 
 def over_records(function: Callable[..., PyTree], model: "Model", *rows: PyTree) -> Any:
-    """Return `function(*rows, record, reference, which)` of every recording.
+    """Return `function(*rows, record, reference, body_index)` of every recording.
 
     On a CPU the recordings follow one after another: XLA makes one kernel of a loop over a few
     dozen numbers, whereas batched scalars in the inner loop run at half the speed.
@@ -121,7 +124,7 @@ def over_records(function: Callable[..., PyTree], model: "Model", *rows: PyTree)
         return function(*eqx.combine(part, rest))
 
     if model.count == 1:
-        # One recording needs no loop: the program is smaller.
+        # One recording needs no loop, and the program is smaller without it.
         return jax.tree.map(
             lambda leaf: leaf[None], function_of_recording(stacking.pick_records(arrays, 0))
         )
@@ -142,7 +145,7 @@ def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
 def by_recording(
     rows: Float[Array, "records columns"], model: "Model", function: Callable[..., PyTree]
 ) -> Any:
-    """Return `function(model, row, record, reference, which)` of every recording.
+    """Return `function(model, row, record, reference, body_index)` of every recording.
 
     Only derivatives by the rows are defined; they are those of `errors_and_jacobians`.
     """
@@ -155,7 +158,7 @@ def by_recording(
 
 @by_recording.def_jvp
 def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
-    """Return value and tangent of `by_recording`."""
+    """Return the value and the tangent of `by_recording`."""
     (rows, model, function), (step, *rest) = primals, tangents
     if jax.tree.leaves(rest):
         raise TypeError(
@@ -172,8 +175,8 @@ def errors_and_jacobians(
 ) -> tuple[Any, Any]:
     """Return `function` of every recording, and its derivatives (R, …, m) by the free numbers.
 
-    The m derivatives are in the columns of `model.index`. No other place differentiates readings by
-    free numbers.
+    The m derivatives are in the columns of `model.index`. Readings are differentiated by free
+    numbers in this function and nowhere else.
     """
     out, slopes = _values_and_jacobians(model, model.index.rows(x), function)
     columns = jnp.asarray(model.index.columns, jnp.int32)
@@ -197,7 +200,9 @@ def _values_and_jacobians(
 
 @eqx.filter_jit
 def delay_derivatives(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
-    """Return the derivative (R, T, k) of the errors of each sensor by a delay of its clock."""
+    """Return the derivative (R, T, k) of the errors of each sensor with respect to a delay of its
+    clock.
+    """
 
     def derivative_of_recording(row: Row, *rest: PyTree) -> Any:
         now = jnp.zeros((), model.records.t.dtype)
@@ -209,7 +214,9 @@ def delay_derivatives(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Arra
 
 
 def with_jacobian(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tuple[Any, Any]:
-    """Return the derivative (…, n) of a function at x, in forward mode, and its value (…)."""
+    """Return the derivative (…, n) of a function at x, in forward mode, and the value (…) of the
+    function.
+    """
 
     def value_and_aux(x: Array) -> tuple[PyTree, PyTree]:
         value = function(x)
@@ -219,7 +226,7 @@ def with_jacobian(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tu
 
 
 def whiten(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors (R, T, k) of each sensor by `standardised_errors`."""
+    """Return the errors (R, T, k) of each sensor as `standardised_errors` scales them."""
     out = []
     for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
         limit = getattr(reading.sensor, "limit", None)
@@ -231,10 +238,12 @@ def whiten(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, ".
 def decorrelate(
     e: Float[Array, "*rows k"], v: Float[Array, "*rows k"]
 ) -> tuple[Float[Array, "*rows k"], Float[Array, "*rows k"]]:
-    """Make errors e (…, k) of covariance `1 + v vᵀ` independent and of variance one.
+    """Return errors that are independent and of variance one, from errors e (…, k) of covariance
+    `1 + v vᵀ`.
 
-    Returns `L⁻¹ e`, L the Cholesky factor of the covariance, and the logarithms of the squared
-    diagonal of L: the variances of each error, given those before it.
+    They are `L⁻¹ e`, with L the Cholesky factor of the covariance. The second result is the
+    logarithms of the squared diagonal of L, which are those of the variance of each error given the
+    errors before it.
     """
     along, total = jnp.cumsum(v * e, axis=-1), 1.0 + jnp.cumsum(v * v, axis=-1)
     none = jnp.zeros_like(total[..., :1])
@@ -246,7 +255,7 @@ def decorrelate(
 def in_deviations(
     x: Array | np.ndarray, sigma: Array | np.ndarray, jitter_error: Array | None
 ) -> Float[Array, "..."] | Float[np.ndarray, "..."]:
-    """Return changes x (R, T, k, n) of a sensor's errors in standard deviations.
+    """Return changes x (R, T, k, n) of a sensor's errors, in standard deviations.
 
     They are scaled as `standardised_errors` scales the errors, with the noise `sigma` (R, k) and
     the error `jitter_error` (R, T, k) by a time stamp.
@@ -265,11 +274,13 @@ def standardised_errors(
     limit: Float[Array, " k"] | None,
     jitter_error: Float[Array, "times k"] | None,
 ) -> tuple[Float[Array, "times k"], Bool[Array, "times k"], Float[Array, "times k"] | None]:
-    """Return errors of one sensor in standard deviations, and a mask of saturated channels.
+    """Return the errors of one sensor in standard deviations, a mask of saturated channels, and the
+    effect of jitter.
 
-    The third result is the logarithm of the factor by which jitter multiplies each variance; `None`
-    without jitter. A saturated channel says "at least that much", and counts as `√(−2 log Φ(z))`, z
-    the excess of the prediction over the limit (Tobin 1958, doi:10.2307/1907382).
+    The effect of jitter is the logarithm of the factor by which it multiplies each variance, or
+    `None` without jitter. A saturated channel says "at least that much", and counts as
+    `√(−2 log Φ(z))`, where z is the excess of the prediction over the limit (Tobin 1958,
+    doi:10.2307/1907382).
 
     **Arguments:**
 
@@ -293,7 +304,8 @@ def standardised_errors(
         return scaled, full, wider
     side = jnp.sign(values)
     z = jnp.where(full, -side * scaled, 0.0)
-    # Beyond five standard deviations the term is zero: its root has no derivative at zero.
+    # Beyond five standard deviations the term is set to zero, since its root has no derivative at
+    # zero.
     root = jnp.sqrt(-2.0 * jax.scipy.special.log_ndtr(jnp.minimum(z, 5.0)))
     return jnp.where(full, -side * jnp.where(z < 5.0, root, 0.0), scaled), full, wider
 
@@ -316,14 +328,16 @@ def reading_residuals(
 def residuals_and_jacobians(
     function: Callable[[tuple], tuple], errors: tuple, slopes: tuple
 ) -> tuple[tuple, tuple]:
-    """Return `of(errors)`, and its derivatives (R, T, k, n) from the `slopes` of the errors."""
-    # Each residual depends on the errors of its own reading alone, so this is cheap.
+    """Return `function(errors)`, and its derivatives (R, T, k, n) from the `slopes` of the
+    errors.
+    """
+    # Each residual depends on the errors of its own reading alone, so that this is cheap.
     value, push = jax.linearize(function, errors)
     return value, jax.vmap(push, in_axes=-1, out_axes=-1)(slopes)
 
 
 def prior_weights(model: "Model") -> Float[Array, " n"]:
-    """Return one over the standard deviation of the prior of each free number about zero.
+    """Return one over the standard deviation of the prior of each free number, a prior about zero.
 
     It is zero for a number without a prior.
     """
@@ -339,7 +353,9 @@ def prior_weights(model: "Model") -> Float[Array, " n"]:
 
 
 def extra_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-    """Return the residuals that depend on several numbers: of the body's prior, and of a pull."""
+    """Return the residuals that depend on several numbers, which are those of the prior of the body
+    and of a pull.
+    """
     out = [jnp.zeros(0, x.dtype)]
     if model.prior is not None:
         assert not isinstance(model.chart, Bodies)
@@ -351,7 +367,9 @@ def extra_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]
 
 
 def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """Return all residuals that are not of readings: n of the priors, then `extra_residuals`."""
+    """Return all residuals that do not belong to readings: n of the priors, then the
+    `extra_residuals`.
+    """
     return jnp.concatenate([prior_weights(model) * x, extra_residuals(model, x)])
 
 

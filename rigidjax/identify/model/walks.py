@@ -1,4 +1,4 @@
-"""Sensor errors that drift during a recording, which the filter follows."""
+"""Define sensor errors that drift during a recording, which the filter follows."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from rigidjax.identify.model.scene import Scene
 
 
 class Walk(eqx.Module):
-    """An unknown sensor error that drifts: `dx = √density dW`, a random walk.
+    """Define an unknown sensor error x that drifts as a random walk, `dx = √density dW`.
 
     **Arguments:**
 
@@ -45,9 +45,9 @@ class Walk(eqx.Module):
 
 
 class Drift(eqx.Module):
-    """A `Walk` whose leaf in the scene has been found.
+    """Hold a `Walk` whose leaf in the scene has been found.
 
-    It holds no function, so that a second model does not compile again.
+    It contains no function, so that a second model does not compile again.
 
     **Fields:** `path` of the leaf in the scene; `deviation` and `density` of the `Walk`, in the
     shape of the leaf.
@@ -59,7 +59,7 @@ class Drift(eqx.Module):
 
 
 def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]:
-    """Return the drift of each `Walk` in a scene."""
+    """Return the `Drift` of each `Walk` in a scene."""
     wanted = "a sequence of Walk(where, deviation)"
     _checks.require_instance(walks, (Walk, Sequence), "walks", requirement=wanted)
     drifts: list[Drift] = []
@@ -88,7 +88,9 @@ def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
 
 
 def require_nonnegative(value: NumbersLike, name: str) -> Array:
-    """Return finite numbers, if none is below zero; else raise `ValueError`."""
+    """Return the numbers `value` as an array, and raise `ValueError` unless they are finite and not
+    below zero.
+    """
     array, wanted = _checks.numeric_array(value, name), "a finite number that is not below zero"
     if not array.size:
         raise ValueError(f"{name}: wanted {wanted}, got none")
@@ -98,7 +100,7 @@ def require_nonnegative(value: NumbersLike, name: str) -> Array:
 def broadcast_to_shape(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
     """Return one number, or numbers of this `shape`, as an array of this shape.
 
-    Raise `ValueError` for another shape, or for a number below zero.
+    It raises `ValueError` for another shape, or for a number below zero.
     """
     numbers = require_nonnegative(value, name)
     if numbers.shape not in ((), shape):
