@@ -154,7 +154,8 @@ def adaptive(
       several parts of the field jump, give one array for each part: the field then gets as its
       `args` the times at which steps end, one array for each part. Times with which the field
       itself compares the time t are found without `jumps`.
-    - `halt`: a condition `halt(t, y)`, tested after each step; the run ends where it is true.
+    - `halt`: a condition `halt(t, y)`, tested after each accepted step; the run ends where the
+      condition is true.
 
     The result has derivatives with respect to all numbers of the field, `ts`, `jumps` and `y0`; the
     lengths of the steps are held constant for them.

@@ -33,7 +33,7 @@ class Method(NamedTuple):
 
     tableau: Tableau
     field: Field
-    project: Callable[[Array], Array]
+    project: Callable[[Array], Array]  # scales a quaternion to length 1
     sizes: list[int]  # how many numbers each array of the state has
 
 
@@ -67,7 +67,7 @@ class Motion(NamedTuple):
     condition: Callable[[Array, Array], tuple[Array, ...]]
     # counts(t, y, steps) returns whether a zero after so many steps is more than round-off.
     counts: Callable[[Array, Array, Array], Array]
-    project: Callable[[Array], Array]
+    project: Callable[[Array], Array]  # scales a quaternion to length 1
 
 
 class Search(NamedTuple):
@@ -242,9 +242,9 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
 def _newton(body: _Body, low: _End, high: _End, here: _End) -> tuple[Array, Array, Array, Array]:
     """Return where the zero between `low` and `high` is, seen from the last guess `here`.
 
-    **Returns** whether one move of Newton's method reaches the zero; whether the search has to stop
-    otherwise, since no time lies between the ends or the guesses are used up; the length of this
-    move, 0 if it does not reach the zero; and the offset of the next guess.
+    **Returns** whether one move of Newton's method reaches the zero; whether the search has to end
+    at `here` anyway, since no time lies between the ends or all guesses are used up; the length of
+    the move, 0 if it does not reach the zero; and the offset of the next guess.
     """
     rate, eps = here.rate, jnp.finfo(body.h.dtype).eps
     move = (-here.g / jnp.where(rate == 0, jnp.ones_like(rate), rate)).astype(here.x.dtype)

@@ -1,8 +1,8 @@
 """Compare a derivative with a difference of values, to show what the derivative does not see.
 
-The effect of a torque that switches at a time or at a state depends on that time or state; the
-derivative of `jnp.where`, `jnp.sign` and the like does not. Two values, one on each side of x, show
-this dependence.
+The effect of a torque that switches at a time or at a state depends on this time or state, but the
+derivatives of `jnp.where`, `jnp.sign` and the like leave this dependence out. Two values, one on
+each side of x, show it.
 """
 
 import warnings
@@ -106,11 +106,11 @@ def values_at(value: Callable[[Any, Any], Array], sides: Any, tolerances: Array)
 
 @jax.jit
 def slopes_of(x: Any, middle: Array, step: Array, sides: Any, values: Array, error: Any) -> Slopes:
-    """Return the slopes by the derivative in a `FunctionError`, and by the values on both sides of
-    x.
+    """Return the slope of a function by its derivative, and by its values on both sides of `x`.
 
-    `step` and `sides` are those of `sides_of`, and `values` are the values at the two `sides`.
-    `middle` is the value at `x` under the tolerances of `values`; `error` is the `FunctionError`.
+    The derivative, and the errors of value and derivative, are those of the `FunctionError` that
+    `error` is. `step` and `sides` are the results of `sides_of`, and `values` are the values at the
+    two `sides`. `middle` is the value at `x` under the tolerances of `values`.
     """
     # The numbers of the sides have been rounded: their change is no longer along the direction.
     moved = jax.tree.map(lambda side, leaf: side - leaf[None], sides, x)

@@ -1,4 +1,4 @@
-"""Take a step of an explicit Runge–Kutta method, whose length is known before.
+"""Take a step of an explicit Runge–Kutta method, whose length is known in advance.
 
 The stages of the step are either written out or a loop. With many tangents, as in a fit, the loop
 compiles two to three times faster and runs as fast. Values alone take a tenth longer in the loop,

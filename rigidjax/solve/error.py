@@ -117,8 +117,7 @@ class Error(eqx.Module):
     def lost(self) -> Bool[Array, " times"]:
         """Return at which times (T,) the state is unknown, as in chaos.
 
-        It is unknown from the first time on at which the error, as in `relative`, is above one
-        half.
+        It is unknown from the first time on at which the largest relative error is above one half.
         """
         return lax.associative_scan(jnp.logical_or, self._relative > _LOST)
 
@@ -137,10 +136,9 @@ class Error(eqx.Module):
 def error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None) -> Error:
     """Return the error of the states `ys`, which the run `setup` gave at `ts` in `count` steps.
 
-    The error of the steps is the distance to a second, closer run; a run in closed form has no
-    such error. If `tried`, the tolerance and
-    the states of an earlier and coarser run, is given, that run takes the place of the second run;
-    the error is then too large by a factor of up to ten.
+    The error of the steps is the distance to a second, closer run; a run in closed form has no such
+    error. `tried` has the tolerance and the states of an earlier, coarser run, if there is one: it
+    then takes the place of the second run, and the error is too large by a factor of up to ten.
     """
     setup, ts, ys, count, tried = _still((setup, ts, ys, count, tried))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
@@ -163,10 +161,10 @@ def _still(tree: Any) -> Any:
 def _with_round_off(
     setup: Any, ts: Array, ys: Any, count: Array, steps: dict[str, Array], rtol: Array
 ) -> Error:
-    """Return the error of a run, of which `steps` is the part of the steps and `rtol` the
-    tolerance.
+    """Return the error of a run from that of its `steps`, and measure that of round-off.
 
-    The part of round-off is measured by neighbouring runs here.
+    Neighbouring runs measure the error of round-off. `rtol` is the tolerance of the run, and
+    `count` its number of steps.
     """
     sizes, start = _sizes(ys), jax.tree.map(lambda leaf: leaf[0], ys)
     reached = jnp.isfinite(_largest(_apart(ys, ys), sizes))
@@ -328,11 +326,11 @@ def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
     traced = jax.make_jaxpr(lambda t: field(t, state0, None))(ts[0]).jaxpr
     if not any(var is traced.invars[0] for equation in traced.eqns for var in equation.invars):
         return ts[:0]
-    # The samples are at uneven times: on an even grid, the pulses of each second could all fall
-    # between the samples.
+    # The samples are at uneven times: on an even grid, pulses that come once a second could all
+    # fall between the samples.
     uneven = np.random.default_rng(1).uniform(-0.25, 0.25, (_PARTS, _SAMPLES_OF_PART + 2))
-    # The first and the last sample of a part serve only as neighbours of others: the next part has
-    # the same two times.
+    # The first and the last sample of a part serve only as neighbours of others. Two adjacent parts
+    # therefore have two times in common.
     uneven[1:, :2] = uneven[:-1, -2:]
     number = _SAMPLES_OF_PART * np.arange(_PARTS)[:, None] + np.arange(_SAMPLES_OF_PART + 2) - 0.5
     share = np.clip((number + uneven) / (_PARTS * _SAMPLES_OF_PART), 0.0, 1.0)

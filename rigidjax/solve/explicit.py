@@ -116,8 +116,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
 
 
 class RungeKutta4(AbstractExplicit):
-    """Solve by the classical Runge–Kutta method: order 4, four stages, an error estimate of order
-    3.
+    """Solve by the classical Runge–Kutta method: order 4, four stages, an estimate of order 3.
 
     It is for coarse tolerances (1e-3). A quaternion is scaled to |q| = 1 once per step, and in the
     dense output, which is cubic and as accurate as the steps.

@@ -25,8 +25,7 @@ _ZERO: Any = ad.Zero
 
 
 def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) -> Arrays:
-    """Return `function(*given, *tangents)`, which is linear in the tangents, with its own
-    transpose.
+    """Return `function(*given, *tangents)`, a map linear in `tangents` that has its own transpose.
 
     `transposed(*given, *bars)` returns the cotangents of `tangents` from those of the results.
     Neither function may close over tracers. Derivatives with respect to `given` exist in forward
