@@ -34,6 +34,9 @@ VERBS = frozenset(
     Reverse Run Scale Set Share Show Simulate Solve Sort Store Sum Take Turn Wrap Write Yield
     Estimate Fit Minimise
     Estimate Fit Identify Join Predict Warn
+    Add Apply Attract Broadcast Call Check Compare Compute Connect Convert Copy Define Delay Derive Describe Draw Evaluate Find Follow Give
+    Handle Hold Import Integrate Interpolate Locate Make Map Measure Name Normalise Prepare Present Print Provide Raise Read Refuse Return
+    Reverse Run Scale Set Share Show Simulate Solve Sort Store Sum Take Turn Warn Wrap Write Yield
     """.split()
 )
 

@@ -1,4 +1,4 @@
-"""Motions by a solver of diffrax, adaptive or with fixed steps."""
+"""Solve for the motion of a body: with adaptive steps, with equal steps, or in closed form."""
 
 from rigidjax._names import show
 from rigidjax.solve.adaptive import adaptive as adaptive

@@ -1,4 +1,4 @@
-"""A run of a vector field as one `diffrax.diffeqsolve`, whose steps end where the field jumps."""
+"""Solve a vector field in one call of `diffrax.diffeqsolve`; a step ends where the field jumps."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -21,13 +21,18 @@ REPLAY, NO_METER = ReplayAdjoint(), dfx.NoProgressMeter()
 
 
 class AdaptiveRun(NamedTuple):
-    """The result of `adaptive`.
+    """Hold the result of `adaptive`.
 
-    **Fields:** `ys` the states at `ts`, NaN where the run did not get; `num_steps` accepted and
-    rejected, `num_rejected` of these; `result` a `diffrax.RESULTS`; `last_time` at the end of the
-    run and `last` the state there; `next_step` the length of the step that would follow, NaN
-    under another adjoint than `ReplayAdjoint`; `missed` whether a part of the field switches by the
-    time more often than is looked for (`None`: nothing does).
+    **Fields:**
+
+    - `ys`: the states at `ts`; NaN at a time that the run did not reach.
+    - `num_steps`: the number of all steps; `num_rejected`: the number of rejected steps.
+    - `result`: a `diffrax.RESULTS`, which says how the run ended.
+    - `last_time`: the time at the end of the run, s; `last`: the state at `last_time`.
+    - `next_step`: the length of the step that would follow, s; NaN under any adjoint but
+      `ReplayAdjoint`.
+    - `missed`: whether a part of the field switches at more times than the search for switching
+      times has room for; `None` if no part of the field compares anything with the time.
     """
 
     ys: Any
@@ -41,7 +46,10 @@ class AdaptiveRun(NamedTuple):
 
 
 class _FieldOfNumbers(eqx.Module):
-    """A field of the numbers of a state as one of states, for diffrax."""
+    """Wrap a field that takes the numbers of a state as one vector, so that it takes the state.
+
+    diffrax calls it with the state; `tree` turns a vector of numbers back into a state.
+    """
 
     constants: Any
     field: Any = eqx.field(static=True)
@@ -52,7 +60,7 @@ class _FieldOfNumbers(eqx.Module):
 
 
 def _numbers(t: Any, y: Any, args: object) -> Array:
-    """Return the numbers of a state in a row."""
+    """Return the numbers of the state `y` as one vector."""
     return ravel_pytree(y)[0]
 
 
@@ -70,11 +78,12 @@ def integrated(
     adjoint: dfx.AbstractAdjoint = REPLAY,
     progress_meter: dfx.AbstractProgressMeter = NO_METER,
 ) -> AdaptiveRun:
-    """Return the states at `ts` (T,) s of a run of diffrax under any controller.
+    """Return the run of diffrax at the times `ts` (T,) s under any step size controller.
 
-    **Arguments:** those of `adaptive` and of `diffrax.diffeqsolve`. `jumps` are times at which the
-    field jumps, an array for each part of it; with them the `ts` increase, steps end at these times
-    and at those with which the field compares the time. With `None` they end at none.
+    **Arguments:** `controller`, `adjoint` and `progress_meter` are as for `diffrax.diffeqsolve`,
+    the others as for `adaptive`. `jumps` has one array of times, s, for each part of the field
+    that jumps. With `jumps`, `ts` has to increase, and steps end at the jumps and at the times with
+    which the field compares the time t. With `None`, no step is cut short for a jump.
     """
     missed = None
     if jumps is not None:
@@ -84,7 +93,7 @@ def integrated(
         field, missed = _FieldOfNumbers(program.constants, program.field, tree), program.over
         if program.stops.size:
             controller = Stopping(controller, program.stops)
-    # The last state needs no dense output.
+    # The last of `ts` is the end of the last step: its state needs no dense output.
     subs = [dfx.SubSaveAt(t1=True, fn=_numbers)]
     subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=_numbers)] if ts.shape[0] > 2 else []
     out = dfx.diffeqsolve(
@@ -98,14 +107,15 @@ def integrated(
     done = jnp.where(ts[0] > ts[-1], last_time <= ts[-1], last_time >= ts[-1])
     rows = [jnp.where(done, last, jnp.nan)][: ts.shape[0] - 1]
     if between:
-        # Where nothing was saved, diffrax says t = inf: not to be taken for a state.
+        # diffrax leaves t = inf in a row that the run did not reach: its state is no state.
         there = jnp.isfinite(times[0])[:, None]
         rows = [jnp.where(there, between[0], jnp.nan), *rows]
     numbers, tree = ravel_pytree(y0)
     ys = jax.vmap(tree)(jnp.concatenate([numbers[None], *rows]))
     ill = ~done
     if not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
-        # Equal steps look at no error, and would go on with NaN.
+        # A controller of equal steps looks at no error estimate: it continues with NaN to the end
+        # of the run and reports success.
         ill = ill | ~finite(ys)
     ill = ill & (out.result == dfx.RESULTS.successful)
     result = dfx.RESULTS.where(ill, NONFINITE, out.result)
@@ -128,20 +138,33 @@ def adaptive(
     jumps: Array | Sequence[Array] | None = None,
     halt: Callable[..., Any] | None = None,
 ) -> AdaptiveRun:
-    """Return the states at `ts` with adaptive steps.
+    """Solve a vector field with adaptive steps, and return its states at the times `ts`.
 
-    **Arguments:** `solver` an explicit method of this package; `field` a vector field
-    `f(t, y, args)` as of `equations_of_motion`; `ts` (T,) s; `y0` the state at `ts[0]`; `rtol`,
-    `atol` scalars; `dt0` the first step and `max_step` the longest, s, or `None`; `jumps` times,
-    s, in any order, at which the field jumps: steps end there (several arrays: one of each part of
-    the field, which gets the stops of each as its `args`); times with which the field compares the
-    time itself are found; `halt(t, y)` a condition, tested after each step, that ends the run.
-    Derivatives are by all numbers of the field, `ts`, `jumps` and `y0`, lengths of steps held.
+    **Arguments:**
 
-    **Returns** an `AdaptiveRun`. A run that needs more than `max_steps`, is halted, or meets a NaN
-    that no shorter step avoids, ends early: its `result` says so, and states not reached are NaN.
+    - `solver`: an explicit method of `rigidjax.solvers`.
+    - `field`: a vector field `f(t, y, args)`, such as `equations_of_motion` returns.
+    - `ts`: (T,) s, the times of the states, in increasing order.
+    - `y0`: the state at `ts[0]`.
+    - `rtol`, `atol`: scalars, the relative and the absolute tolerance of each step.
+    - `dt0`: the length of the first step, s; `None` chooses it from the field.
+    - `max_step`: the longest step, s; `None` sets no limit.
+    - `max_steps`: the largest number of steps, rejected steps included.
+    - `jumps`: times, s, in any order, at which the field jumps; a step ends at each of them. If
+      several parts of the field jump, give one array for each part: the field then gets as its
+      `args` the times at which steps end, one array for each part. Times with which the field
+      itself compares the time t are found without `jumps`.
+    - `halt`: a condition `halt(t, y)`, tested after each accepted step; the run ends where the
+      condition is true.
 
-    **Raises:** `TypeError` for a state of several dtypes, or of another than `ts`.
+    The result has derivatives with respect to all numbers of the field, `ts`, `jumps` and `y0`; the
+    lengths of the steps are held constant for them.
+
+    **Returns** an `AdaptiveRun`. A run ends early if it needs more than `max_steps`, if `halt` ends
+    it, or if it meets a NaN that no shorter step avoids: `result` says so, and the states that it
+    did not reach are NaN.
+
+    **Raises:** `TypeError` for a state of several dtypes, or of another dtype than `ts`.
 
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), start)

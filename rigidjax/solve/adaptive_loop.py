@@ -1,7 +1,8 @@
-"""Steps under any step controller of diffrax, for one body or many. Bodies are in the last axis.
+"""Run an explicit method under any step controller of diffrax, for one body or for many.
 
-For derivatives the steps are recorded in segments: the start of each segment is kept, and the steps
-of the last one; derivatives run the other segments once more.
+The bodies are in the last axis of every array. For derivatives the steps are recorded in segments:
+a record has the start of each segment, and the steps of the last segment alone. A derivative runs
+the other segments once more to get their steps.
 """
 
 from collections.abc import Callable
@@ -18,78 +19,87 @@ from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, nested, stages, weights
 from rigidjax.solve.tableaus import Tableau
 
-# diffrax inherits it from optimistix, where type checkers do not follow.
+# diffrax inherits this member from optimistix, and type checkers do not find it there.
 NONFINITE: Any = dfx.RESULTS.nonfinite
 
-# Steps in a segment, rejected ones included.
+# The number of steps in one segment of a record, rejected steps included.
 SEGMENT = 512
-# More rows for one that is run again: it may take a few steps more.
+# Additional rows for a segment that is run again: if the second program rounds differently, the
+# segment may take a few steps more.
 _MORE = 64
-# XLA on CPU makes one kernel of a loop whose state is smaller than a kilobyte: steps are written
-# into a block that small, and blocks into the record. (Written row by row, second derivatives of
-# several blocks of bodies with segments run again were wrong, on jaxlib 0.12.0.1.)
+# XLA on CPU makes one kernel of a loop whose state is smaller than a kilobyte. Steps are therefore
+# written into a block of at most `_BLOCK` bytes and `_MOST` rows, and full blocks into the record.
+# (When each row was written into the record directly, second derivatives were wrong for several
+# blocks of bodies whose segments were run again, on jaxlib 0.12.0.1.)
 _BLOCK, _MOST = 560, 8
+# The safety factor of the length of the next step, and the limits of its ratio to the last one.
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
-# Times of one body that are taken together.
+# The number of saved times of one body whose states are computed together.
 _TOGETHER = 16
 
 
 class Method(NamedTuple):
-    """The parts of a run besides its numbers."""
+    """Hold the parts of a run that are not arrays: its method, its functions and its limits."""
 
     tableau: Tableau
-    field: Field  # on (n, *bodies), as `project`
-    project: Callable[[Array], Array]
-    halt: Callable[..., Array] | None  # (t, y): whether the run ends here
-    # (again, (state, times), (left, right, error)): what the controller makes of a step, see there
+    field: Field  # on states (n, *bodies)
+    project: Callable[[Array], Array]  # on states (n, *bodies): scales a quaternion to length 1
+    halt: Callable[..., Array] | None  # halt(t, y): whether the run ends at the time t
+    # control(again, (state, times), (left, right, error)): the decision of the step controller on
+    # one step. `_Control` in `replay_adjoint` describes the arguments and the result.
     control: Callable[..., Any]
-    sizes: list[int]  # of the arrays of the state
+    sizes: list[int]  # how many numbers each array of the state has
     max_steps: int
 
 
 class Run(NamedTuple):
-    """The numbers of a run, a last axis of bodies in each."""
+    """Hold the numbers of a run, each with a last axis of bodies if there are many."""
 
-    t0: Array
-    stops: Array  # (J,) where the field jumps, and the last time
-    between: Array  # (K,) times asked for
-    y0: Array  # (n,)
-    end: Array  # of the first step
-    result: dfx.RESULTS | None  # at the start; `None`: successful
-    state: Any = None  # of controller and progress meter at the start
+    t0: Array  # the start of the run
+    stops: Array  # (J,) the times at which the field jumps, then the end of the run
+    between: Array  # (K,) the times whose states are saved
+    y0: Array  # (n,) the state at t0
+    end: Array  # the end of the first step
+    result: dfx.RESULTS | None  # the result at the start; `None` stands for successful
+    state: Any = None  # the states of the step controller and the progress meter at the start
 
     @property
     def before(self) -> Array:
-        """The last moment before each stop (J,): a stage there sees the field before the jump."""
+        """Return the last floating-point time before each jump, and the end of the run, (J,).
+
+        A stage at such a time evaluates the field as it is before the jump.
+        """
         jumps = lax.stop_gradient(self.stops[:-1])
         gap = before(jumps) - jumps
         return jnp.concatenate([self.stops[:-1] + gap, self.stops[-1:]])
 
 
 class LoopState(NamedTuple):
-    """The state of the loop, and the end of a run."""
+    """Hold the state of the loop over steps; after the last step it is the end of the run."""
 
-    y: Array  # (n, *bodies)
+    y: Array  # (n, *bodies) the state at the time t
     t: Array
-    end: Array  # of the next step
-    stop: Array  # index of the next one
-    steps: Array
-    rejected: Array
+    end: Array  # the time at which the next step is to end
+    stop: Array  # the index in `Run.stops` of the next stop
+    steps: Array  # the number of steps so far, rejected steps included
+    rejected: Array  # the number of rejected steps
     result: dfx.RESULTS  # anything but `successful` ends the run
-    state: Any  # of controller and progress meter
+    state: Any  # the states of the step controller and the progress meter
 
 
-# A recorded attempt is one row (4 + n, *bodies): start, length, kind, index of the next stop, and
-# the state at the start. Kinds: no step was taken; a step; a step that ends on the stop.
+# A recorded attempt at a step is one row (4 + n, *bodies). The first `HEAD` entries are the start
+# of the step, its length, its kind and the index of the next stop; the rest is the state at the
+# start. The kind is NONE if the step was rejected or not taken, STEP for a step, and LAST for a
+# step that ends at the stop.
 Rows = Array
 HEAD = 4
 NONE, STEP, LAST = range(3)
 
 
 def pack(loop: LoopState) -> Arrays:
-    """Return the numbers y (n, *bodies) of a loop, and the rest as one array of each dtype.
+    """Return a loop state as few arrays: its y (n, *bodies), and all the rest, one array per dtype.
 
-    A loop over blocks of bodies has a kernel for each array that goes in or comes out.
+    XLA makes a kernel for each array that goes into or comes out of a loop over blocks of bodies.
     """
     rest = _by_dtype(loop._replace(y=None))
     join = lambda leaves: jnp.concatenate([a.reshape(-1, *loop.t.shape) for a in leaves])  # noqa: E731
@@ -97,7 +107,10 @@ def pack(loop: LoopState) -> Arrays:
 
 
 def unpack(arrays: Arrays, like: LoopState) -> LoopState:
-    """Return the inverse of `pack`, of a loop with arrays `like` these."""
+    """Return the loop state from the `arrays` that `pack` returned for it.
+
+    `like` is a loop state of the wanted shapes and dtypes.
+    """
     rest, tree = jax.tree.flatten(like._replace(y=None))
     parts = {}
     for (kind, leaves), array in zip(_by_dtype(rest).items(), arrays[1:], strict=True):
@@ -108,10 +121,12 @@ def unpack(arrays: Arrays, like: LoopState) -> LoopState:
 
 
 def _kind(a: Array) -> Any:
+    """Return the dtype in which `pack` stores an array: int32 for a boolean one, else its own."""
     return jnp.dtype(jnp.int32) if a.dtype == bool else a.dtype
 
 
 def _by_dtype(tree: Any) -> dict[Any, Arrays]:
+    """Return the arrays of `tree` in lists, one list for each dtype that `_kind` returns."""
     parts: dict[Any, Arrays] = {}
     for a in jax.tree.leaves(tree):
         parts.setdefault(_kind(a), []).append(a)
@@ -119,31 +134,38 @@ def _by_dtype(tree: Any) -> dict[Any, Arrays]:
 
 
 class Record(NamedTuple):
-    """A recorded run."""
+    """Hold a recorded run: the start of each segment, and the steps of the last segment."""
 
-    starts: Arrays  # of each segment, as of `pack`, (S, …), and the end of the last
-    rows: Rows  # of the last segment
-    counts: Array  # (2,) of segments, and of these rows
+    starts: Arrays  # (S, …) the packed loop state at the start of each segment, then at the end
+    rows: Rows  # the rows of the last segment
+    counts: Array  # (2,) the number of segments, and the number of rows of the last segment
 
 
 class Segment(NamedTuple):
-    """A part of a run."""
+    """Hold the recorded steps of one segment of a run."""
 
     rows: Rows
-    times: Array  # at which each row begins, inf where there is none
-    end: Array
-    number: Array  # of rows
+    times: Array  # the time at which each row begins, inf after the last row
+    end: Array  # the time at which the segment ends
+    number: Array  # the number of rows that are filled
 
 
 def before(t: Array) -> Array:
-    """Return the number before `t`, as diffrax has it: XLA takes what is not normal for zero."""
+    """Return the largest floating-point number below the time `t`, as diffrax defines it.
+
+    For t = 0 it is the largest negative normal number: XLA treats subnormal numbers as zero.
+    """
     t = lax.stop_gradient(t)
     less = jnp.nextafter(t, jnp.full_like(t, -jnp.inf))
     return jnp.where(t == 0, -jnp.finfo(t.dtype).tiny, less).astype(t.dtype)
 
 
 def times_of(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
-    """Return start, length and end of the steps of rows (4 + n, *bodies), which move with stops."""
+    """Return the start, length and end of the steps recorded in `rows` (4 + n, *bodies).
+
+    All three have derivatives with respect to the stops. The start moves with the last stop before
+    it (with `run.t0` before the first stop). The end moves with the stop if the step ends at one.
+    """
     t, h, kind, stop = lax.stop_gradient(rows[:HEAD])
     stop, last = stop.astype(jnp.int32), kind == LAST
     t, h = t.astype(run.t0.dtype), h.astype(run.t0.dtype)
@@ -155,13 +177,13 @@ def times_of(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
 
 
 def take(a: Array, index: Array) -> Array:
-    """Return a[index] of each body; a (J, *bodies), index (*many, *bodies)."""
+    """Return `a[index]` of each body, where `a` is (J, *bodies) and `index` (*many, *bodies)."""
     count = a.shape[0]
     a = a.reshape(count, *[1] * (index.ndim + 1 - a.ndim), *a.shape[1:])
     if count == 1:
         return jnp.broadcast_to(a[0], index.shape)
     index = jnp.clip(index, 0, count - 1)
-    # Quicker than to look for one of so few rows, also in derivatives.
+    # For so few rows a sum over a mask is quicker than an indexed look-up, also in derivatives.
     if count <= 8:
         each = jnp.arange(count, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
         return jnp.sum(jnp.where(each == index[None], a, 0), 0).astype(a.dtype)
@@ -178,44 +200,52 @@ def finite(tree: Any) -> Bool[Array, ""]:
 
 
 def starting_step(size: Array, rate: Array, order: Any) -> Array:
-    """Return a first step from the norms, over the tolerance, of a state and of its derivative.
+    """Return the length of a first step from the norms of a state and of its derivative.
 
-    As Hairer, Nørsett and Wanner (1993), II.4, but that the second derivative is that of an
-    oscillation, rate²/size: to measure it the field would be compiled once more.
+    `size` is the norm of the state and `rate` that of its derivative, both divided by the
+    tolerance; `order` is the order of the error estimate. The formula is that of Hairer, Nørsett
+    and Wanner (1993), II.4, with one change: the second derivative is taken as that of an
+    oscillation, rate²/size. To measure it, the field would have to be compiled once more.
     """
-    # A state of zeros says nothing about the time in which it changes.
+    # A state of zeros says nothing about the time in which it changes: `size` has a lower limit.
     quickness = rate / jnp.maximum(size, 1e-4 * rate)
     guess = (0.01 / (rate * jnp.maximum(quickness, 1))) ** (1 / order)
     return jnp.where(rate < 1e-5, 1e-4, jnp.minimum(1 / quickness, guess)).astype(size.dtype)
 
 
 def next_step(norm: Array, order: Any, h: Any) -> tuple[Array, Array]:
-    """Return whether a step of length h is accepted, and the length of the next one.
+    """Return whether a step of length `h` is accepted, and the length of the next step.
 
-    `norm` is that of its error over the tolerance, `order` that of its error. The limits are the
-    defaults of `diffrax.PIDController`.
+    `norm` is the norm of the step's error divided by the tolerance, and `order` is the order of
+    this error. The limits of the next length are the defaults of `diffrax.PIDController`.
     """
     norm, h = lax.stop_gradient((norm, h))
-    # NaN in a step too long says as little as infinity: a shorter one is tried.
+    # In a step that is too long, NaN means no more than infinity does: a shorter step is tried.
     norm = jnp.where(jnp.isnan(norm), jnp.inf, norm)
     factor = jnp.clip(_SAFETY * norm ** (-1 / order), _SMALLEST, _LARGEST)
     return norm < 1, h * factor.astype(jnp.result_type(h))
 
 
 def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
-    """Return the result of a run; `nonfinite_input` where the body is NaN, as no body is."""
+    """Return the result of a run, or `nonfinite_input` if a number of the body is not finite.
+
+    In a batch, an inertia that no real body has is replaced by NaN instead of an error.
+    """
     return dfx.RESULTS.where(finite(body), result, dfx.RESULTS.nonfinite_input)  # pyright: ignore
 
 
 def per_body(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of one body's arrays as one of arrays with the bodies last, if any."""
+    """Return `function`, which takes the arrays of one body, as a function of the arrays of `run`.
+
+    If `run` has many bodies, they are in the last axis of its arrays.
+    """
     return jax.vmap(function, in_axes=-1, out_axes=-1) if run.t0.ndim else function
 
 
 def start(run: Run) -> LoopState:
-    """Return a loop about to begin."""
+    """Return the state of the loop before the first step of `run`."""
     zero = jnp.zeros(run.t0.shape, jnp.int32)
-    # Stops at the start or before it need no step.
+    # A stop at the start or before it needs no step.
     passed = jnp.sum(run.stops[:-1] <= run.t0[None], 0, dtype=jnp.int32)
     still = lax.stop_gradient((run.t0, run.end))
     result = run.result
@@ -225,7 +255,11 @@ def start(run: Run) -> LoopState:
 
 
 def is_running(method: Method, run: Run, loop: LoopState, until: Array | None) -> Array:
-    """Return whether a body has a step to take, until the time `until` at which a segment ends."""
+    """Return whether each body still has a step to take.
+
+    The run of a body lasts to the last of `run.stops`, or to the time `until`, the end of a
+    segment, if that is not `None`.
+    """
     well = per_body(run, lambda result: result == dfx.RESULTS.successful)(loop.result)
     last = lax.stop_gradient(run.stops[-1])
     last = last if until is None else jnp.minimum(last, until)
@@ -233,7 +267,7 @@ def is_running(method: Method, run: Run, loop: LoopState, until: Array | None) -
 
 
 def value(method: Method, constants: Arrays, run: Run) -> LoopState:
-    """Return the end of a run whose states between are not asked for."""
+    """Return the loop state at the end of a run, for which no other state is saved."""
     return lax.while_loop(
         lambda loop: jnp.any(is_running(method, run, loop, None)),
         lambda loop: _attempt(method, constants, run, loop, None)[0],
@@ -242,9 +276,10 @@ def value(method: Method, constants: Arrays, run: Run) -> LoopState:
 
 
 def states_of_one(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState]:
-    """Return the states between (K, n) of one body, NaN if not reached, and the end of its run.
+    """Return the states (K, n) of one body at `run.between`, and the loop state at the end.
 
-    The stages of dense output are taken in the steps alone that have one of the times in them.
+    A state that the run did not reach is NaN. The stages of dense output are evaluated only in the
+    steps that contain one of the times.
     """
     size = run.between.shape[0]
 
@@ -264,7 +299,7 @@ def states_of_one(method: Method, constants: Arrays, run: Run) -> tuple[Array, L
         ys, k = lax.while_loop(lambda state: next_time(state[1]) <= after.t, save, (ys, k))
         return after, ys, k
 
-    # A time at the start is in the first step, as far as it is accepted.
+    # A saved time at the start belongs to the first step, as far as that step is accepted.
     state = (start(run), _unreached(run), jnp.zeros((), jnp.int32))
     more = lambda state: is_running(method, run, state[0], None)  # noqa: E731
     loop, ys, _ = lax.while_loop(more, one, state)
@@ -272,14 +307,18 @@ def states_of_one(method: Method, constants: Arrays, run: Run) -> tuple[Array, L
 
 
 def _unreached(run: Run) -> Array:
-    """Return the states between (K, n, *bodies) at first: NaN, unless the run ends at t0."""
+    """Return the states (K, n, *bodies) before the first step: NaN, or y0 if the run ends at t0."""
     ended = run.stops[-1] <= run.t0
     still = jnp.where(lift(ended, run.y0), run.y0, jnp.nan)
     return jnp.broadcast_to(still[None], (run.between.shape[0], *run.y0.shape))
 
 
 def recording(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState, Record]:
-    """Return states between (K, n, *bodies), NaN if not reached; the end; what derivatives need."""
+    """Return the states at `run.between`, the loop state at the end, and the record of the run.
+
+    The states are (K, n, *bodies), and NaN if the run did not reach them. The record is what
+    derivatives need.
+    """
     loop, most = start(run), method.max_steps + run.stops.shape[0]
     count = -(-most // SEGMENT) + 1
     starts = [jnp.zeros((count, *a.shape), a.dtype) for a in pack(loop)]
@@ -310,17 +349,21 @@ def _attempt(
     method: Method, constants: Arrays, run: Run, loop: LoopState, until: Array | None,
     dense: Any = False,
 ) -> tuple[LoopState, Array, tuple[Step, Array]]:  # fmt: skip
-    """Return the loop after one attempt at a step of every body, its row, the step and its slopes.
+    """Return the loop state after one attempt at a step of every body, and the attempt itself.
 
-    Only a segment that is run again, `until` its end, has derivatives by the times.
+    **Returns** the loop state, the row of the attempt, and its step with the slopes of all stages.
+    `dense` says whether the stages of dense output are evaluated, too. `until` is the end of a
+    segment that is run again, else `None`: only steps that are run again have derivatives with
+    respect to the times of the run.
     """
-    # The loop around has asked whether one body is on its way; of many bodies some are not.
+    # The loop around this has found that some body has a step to take; other bodies may have none.
     on = is_running(method, run, loop, until) if run.t0.ndim else True
     stop, end = lax.stop_gradient((take(run.stops, loop.stop), take(run.before, loop.stop)))
-    # A stop that is passed already, such as the second of two at one time, needs no step.
+    # A stop that a body has already reached, such as the second of two at one time, needs no step.
     arrived = on & (loop.t >= stop) if run.stops.shape[0] > 1 else False
     moving = on if arrived is False else on & ~arrived
-    # No step goes over a stop, whatever its controller rounds: it would see both sides of a jump.
+    # No step goes over a stop, however the controller rounds: its stages would evaluate the field
+    # on both sides of the jump.
     last = loop.end >= end
     end = jnp.where(last, end, loop.end)
     if until is not None:
@@ -334,10 +377,10 @@ def _attempt(
         step = Step(begin, length, late, loop.y)
     there = stages(method.tableau, method.field, constants, step, dense)
     y = method.project(there.end)
-    # Derivatives hold the chosen steps constant.
+    # Derivatives hold the lengths of steps constant, so that the error has no derivative.
     left, right, slopes = lax.stop_gradient((loop.y, y, there.slopes))
     error = error_estimate(method.tableau, method.sizes, h, slopes)
-    # NaN in a step too long says as little as infinity: a shorter one is tried.
+    # In a step that is too long, NaN means no more than infinity does: a shorter step is tried.
     error = jnp.where(jnp.isfinite(error) & jnp.isfinite(right), error, jnp.inf)
     times = lax.stop_gradient((run.t0, run.stops[-1], loop.t, end))
     found = method.control(until is not None, (loop.state, times), (left, right, error))
@@ -364,7 +407,10 @@ def _attempt(
 
 
 def _where(which: Any, new: Any, old: Any) -> Any:
-    """Return the arrays (…, *bodies) of `new` where it is so, else of `old`; `True`: everywhere."""
+    """Return the arrays (…, *bodies) of `new` for the bodies where `which` is true, else of `old`.
+
+    If `which` is the constant `True`, all arrays are those of `new`, in the dtypes of `old`.
+    """
     if which is True:
         return jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), new, old)
     choose = lambda a, b: jnp.where(lift(which, a), a, b).astype(b.dtype)  # noqa: E731
@@ -374,7 +420,10 @@ def _where(which: Any, new: Any, old: Any) -> Any:
 def recorded(
     method: Method, constants: Arrays, run: Run, loop: LoopState, rows: Rows, until: Any
 ) -> tuple[LoopState, Rows, Array]:
-    """Return the loop from here until the rows are full, the rows, and their number."""
+    """Return the loop state after a segment of steps, the rows of these steps, and their number.
+
+    The segment ends where `rows` is full or the run ends, or, if it is run again, at `until`.
+    """
     many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))
     room = rows.shape[0] - (_MORE if until is None else 0) - _MOST
 
@@ -396,7 +445,7 @@ def recorded(
 
 
 def segment(rows: Rows, end: Array, count: Array) -> Segment:
-    """Return a part of a run from its rows, of which there are `count`."""
+    """Return the segment of the first `count` rows of `rows`, which ends at the time `end`."""
     there = jnp.arange(rows.shape[0], dtype=jnp.int32).reshape(-1, *[1] * end.ndim) < count
     times = jnp.where(there, lax.stop_gradient(rows[:, 0]).astype(end.dtype), jnp.inf)
     return Segment(rows, times, lax.stop_gradient(end), count)
@@ -405,20 +454,21 @@ def segment(rows: Rows, end: Array, count: Array) -> Segment:
 def states_at_saved_times(
     method: Method, constants: Arrays, run: Run, part: Segment, ys: Array
 ) -> Array:
-    """Return `ys` (K, n, *bodies) with the states in a part of a run."""
+    """Return `ys` (K, n, *bodies) with the states added whose times lie in the segment `part`."""
     size, many = run.between.shape[0], run.t0.ndim > 0
     width = 1 if many else min(size, _TOGETHER)
-    # All at once: in a loop each would be many small kernels.
+    # All times are searched for at once: in a loop, each search would be many small kernels.
     ts = lax.stop_gradient(run.between)
     search = per_body(run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1)
     index = search(part.times, ts)
     inside = (index >= 0) | (part.times[0] <= lax.stop_gradient(run.t0))[None]
     index, inside = jnp.maximum(index, 0), inside & (ts <= part.end[None])
-    # What is not inside stands still at the first state, where the field has a value.
+    # A time outside of the segment gets a step of length 0 at the segment's first state, where the
+    # field has a value; the result is not used.
     still = part.rows[0].at[1:3].set(0)
     pick = jax.vmap(lambda rows, i: rows[i], (-1 if many else None, -1), -1)
     if not many:
-        # Times of one body lie side by side as bodies do.
+        # The times of one body are in the last axis, where many bodies would be.
         field, project = (
             jax.vmap(method.field, (None, -1, -1), -1),
             jax.vmap(method.project, -1, -1),
@@ -426,7 +476,7 @@ def states_at_saved_times(
         method, still = method._replace(field=field, project=project), still[:, None]
 
     def window(i: Array, ys: Array) -> Array:
-        # A window beyond the last time is moved back: states that are there are worked out again.
+        # A window that reaches beyond the last time is moved back: some states are computed twice.
         number = jnp.minimum(first + i * width, size - width)
 
         def cut(a: Array) -> Array:
@@ -449,9 +499,10 @@ def states_at_saved_times(
 
 
 def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
-    """Return the state (n, *bodies) at the time t in a step, by the slopes of all its stages."""
+    """Return the state (n, *bodies) at the time `t` in a step from the slopes of all its stages."""
     theta = ((t - step.t) / jnp.where(step.h == 0, 1, step.h)).astype(slopes.dtype)
-    # Weights of the slopes are one number a stage; the rows F_r would be n.
+    # The polynomial is evaluated for the weights of the slopes, one number for each stage; for the
+    # rows F_r of dense output it would be n numbers each.
     rows = weights(method.tableau, slopes.dtype).dense
     shares = nested(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
     rise = jnp.sum(shares[None] * slopes, 1)

@@ -1,8 +1,9 @@
-"""A second pass over a recorded run: for tangents and cotangents.
+"""Compute tangents and cotangents of a recorded run by a second pass over its steps.
 
-The derivative is that of the steps taken, with fixed lengths; steps cut short at a stop follow it.
-All segments but the last are run once more. If another program rounds differently they may take
-other steps between the same ends: the derivative is then that of these, the same to the tolerance.
+The derivative is that of the steps taken, whose lengths are held constant; a step that was cut
+short at a stop moves with the stop. All segments but the last are run once more. If the second
+program rounds differently, a segment may have other steps between its two ends: the derivative is
+then that of these other steps, which is the same to within the tolerance.
 """
 
 from functools import partial
@@ -36,7 +37,10 @@ from rigidjax.solve.runge_kutta import Step, stages
 
 
 class Smooth(NamedTuple):
-    """The numbers of a run that have derivatives, or their tangents or cotangents."""
+    """Hold the numbers of a run that have derivatives, or the tangents or cotangents of them.
+
+    The fields have the names that they have in `Run`.
+    """
 
     t0: Array
     stops: Array
@@ -45,16 +49,19 @@ class Smooth(NamedTuple):
 
 
 def smooth_numbers(run: Run) -> Smooth:
-    """Return the numbers of a run that have derivatives."""
+    """Return the numbers of `run` that have derivatives."""
     return Smooth(run.t0, run.stops, run.between, run.y0)
 
 
 def passed(run: Run, part: Segment) -> Array:
-    """Return the number of saved times passed at the start of each row, and at the end."""
+    """Return how many of the saved times have passed at the start of each row of a segment.
+
+    The saved times are `run.between`. The last number is that at the end of the segment `part`.
+    """
     ends = jnp.concatenate([jnp.minimum(part.times, part.end[None]), part.end[None]])
     search = lambda ts, t: jnp.searchsorted(ts, t, side="right").astype(jnp.int32)  # noqa: E731
     count = per_body(run, search)(lax.stop_gradient(run.between), ends)
-    # A time at the start is in the first step.
+    # A saved time at the start of the run belongs to the first step: it has not passed before it.
     return jnp.where(ends <= lax.stop_gradient(run.t0)[None], 0, count)
 
 
@@ -62,15 +69,20 @@ def of_saved(
     method: Method, run: Run, step: Step, slopes: Array, first: Array, last: Array, bars: Array,
     between: Array | None,
 ) -> tuple[Array | None, Step, Array]:  # fmt: skip
-    """Transpose the states at the times in a step, from number `first` to before `last`.
+    """Return the cotangents of a step from those of the states that are saved within the step.
 
-    `bars` (K, n, *bodies) are the cotangents of all states. **Returns** `between`, if it is not
-    `None`, with the cotangents of the times added, and those of the step and its slopes.
+    This is the transpose of `state_in_step`, for all saved times in the step and all bodies.
+    `slopes` are those of all stages of the step. The saved times in it have the numbers from
+    `first` to `last` − 1. `bars` (K, n, *bodies) are the cotangents of all saved states, and
+    `between` are the cotangents of the saved times so far, or `None` if those are not wanted.
+    **Returns** `between` with the cotangents of the times in this step added (or `None`), the
+    cotangents of the step, and the cotangents of its slopes.
     """
     state_at, most = partial(state_in_step, method), run.between.shape[0] - 1
     pick = per_body(run, lambda a, index: a[index])
 
-    # One at a time: of many bodies few have as many in a step as one of them has.
+    # The times in a step are taken one after the other: of many bodies, only a few have as many
+    # times in one step as the body that has the most.
     def one(state: Any) -> Any:
         number, total, by = state
         inside, there = number < last, jnp.minimum(number, most)
@@ -89,7 +101,13 @@ def of_saved(
 def replay_steps(
     method: Method, constants: Arrays, run: Run, record: Record
 ) -> tuple[Array, Array, Array, Array]:
-    """Return states between, at the end, at starts, and rows, by the steps of the record, held."""
+    """Return the states of a recorded run, computed once more by its recorded steps.
+
+    The lengths of the steps are held constant for derivatives, except where a step was cut short
+    at a stop. **Returns** the states (K, n, *bodies) at `run.between`; the state at the end of the
+    run; the states at the starts of the segments, followed by the last state; and the rows of the
+    last segment with these states.
+    """
 
     def one(i: Array, state: tuple[Array, Array, Array, Array]) -> Any:
         y, ys, starts, _ = state
@@ -121,7 +139,8 @@ def cotangents(
 ) -> tuple[Arrays, Smooth]:
     """Return the cotangents of the constants and of the run: the transpose of `replay_steps`.
 
-    `bars` are those of the states between and at the end. Times have some only where `timed`.
+    `bars` are the cotangents of the states at `run.between` and of the state at the end. The
+    cotangents of the times of the run are computed only if `timed` is true; else they are 0.
     """
     number, size = jnp.max(record.counts[0]), run.between.shape[0]
 
@@ -151,7 +170,7 @@ def cotangents(
             )
             if seeds is not None:
                 rest = [a + b for a, b in zip(rest, (seeds.t, seeds.h, seeds.y), strict=True)]
-            # A body that has no step here may be NaN.
+            # The cotangents of a body that has no step in this row may be NaN: they are not used.
             on = row[2] >= STEP
             by_t, by_h, by_y = (_where(on, a) for a in rest)
             by_t0, by_stops = of_times((by_t, by_h, jnp.zeros_like(end)))
@@ -169,22 +188,23 @@ def cotangents(
 
 
 def _where(there: Array, a: Array) -> Array:
-    """Return `a` (…, *bodies), 0 where it is not `there`."""
+    """Return `a` (…, *bodies) for the bodies where `there` is true, and 0 for the others."""
     return jnp.where(lift(there, a), a, jnp.zeros_like(a))
 
 
 def _again(method: Method, constants: Arrays, run: Run, record: Record, number: Array) -> Segment:
-    """Return a segment of the record; any but the last is run once more."""
+    """Return the segment `number` of a record: recorded if it is the last, else run once more."""
     like = start(run)
     loop, after = (unpack([a[i] for a in record.starts], like) for i in (number, number + 1))
-    # The counts of steps and the result are those of the forward run.
+    # In the record, the count of steps and the result are those of the forward run: the segment
+    # starts with fresh ones, so that neither ends it.
     loop = loop._replace(steps=like.steps, result=like.result)
     count, filled = (jnp.max(a) for a in record.counts)
     again = number < count - 1
-    # Nothing is left to do of the last one.
+    # The last segment is in the record: it takes no step here.
     until = jnp.where(again, lax.stop_gradient(after.t), -jnp.inf)
     end, rows, count = recorded(method, constants, run, loop, record.rows, until)
-    # With too little room for its steps there would be wrong numbers: then there are none.
+    # If the rows had too little room for all steps, the derivative would be wrong: it becomes NaN.
     short = jnp.where(jnp.any(is_running(method, run, end, until)), jnp.nan, 0.0)
     rows = rows.at[:, HEAD:].add(short.astype(rows.dtype))
     count = jnp.where(again, count, filled)

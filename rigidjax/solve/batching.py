@@ -1,7 +1,8 @@
-"""Batches of a program: bodies in the last axis of every array, whatever `jax.vmap` is outside.
+"""Run a program on many bodies, which are in the last axis of every array under any `jax.vmap`.
 
-XLA on CPU makes vector instructions for arrays whose last axis is the batch. `jax.vmap` puts it
-first, which is many times slower in a loop over small states; `custom_vmap` moves it to the end.
+XLA on CPU makes vector instructions for arrays whose last axis is the batch. `jax.vmap` puts the
+batch first, which is many times slower in a loop over small states; `custom_vmap` moves the batch
+to the end.
 """
 
 from collections.abc import Callable
@@ -19,25 +20,30 @@ from rigidjax.rotation.barrier import platform
 
 Arrays = list[Any]
 
-# Bodies that go through a loop together on CPU: few, so that their numbers stay in the first cache.
+# The number of bodies that go through a loop together on CPU. They are few, so that their numbers
+# stay in the first-level cache.
 BLOCK = 16
 
 
 class Layout(NamedTuple):
-    """The axes of a program's arrays beyond one body's."""
+    """Describe which arrays of a program have a last axis of bodies."""
 
-    bodies: bool  # a last axis
-    shared: tuple[bool, ...]  # which constants have none all the same
+    bodies: bool  # whether the arrays of each body have this axis; without it there is one body
+    shared: tuple[bool, ...]  # for each constant, whether all bodies share it: it has no such axis
 
     def over(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """`function(constants, t, y)` of one body on the arrays of all."""
+        """Return `function(constants, t, y)`, which is for one body, as one for all bodies."""
         axes = [None if s else -1 for s in self.shared]
         return jax.vmap(function, (axes, -1, -1), -1) if self.bodies else function
 
     def broadcast_to_bodies(
         self, constants: Arrays, per_body: list[bool], like: Any
     ) -> tuple["Layout", Arrays]:
-        """Return the constants, those `per_body` one of each body, of which `like` has as many."""
+        """Broadcast the shared constants that `per_body` selects along a new last axis.
+
+        The new axis has one copy for each body, as many as the last axis of `like` has. `per_body`
+        has one truth value for each constant. **Returns** the new layout and the constants.
+        """
         if not self.bodies:
             return self, constants
         own = [s and w for s, w in zip(self.shared, per_body, strict=True)]
@@ -49,17 +55,20 @@ class Layout(NamedTuple):
         return self._replace(shared=shared), constants
 
 
-# `program(layout, constants, each)` returns a list of arrays of each body.
+# `program(layout, constants, each)` takes constants, which bodies may share, and arrays of which
+# each body has its own. It returns a list of arrays of which each body has its own.
 Program = Callable[[Layout, Arrays, Arrays], Arrays]
 
 
 def in_lanes(
     program: Program, constants: Arrays, each: Arrays, linear: int = 0, layout: Layout | None = None
 ) -> Arrays:
-    """The result of `program`; under `jax.vmap` its arrays get longer last axes (the bodies).
+    """Return the result of `program`, run with the bodies of any `jax.vmap` in the last axis.
 
-    Bodies may share `constants`. The program is linear in the last `linear` of `each`: many
-    directions of one motion are not counted as bodies.
+    Bodies may share an array of `constants`; of the arrays `each`, every body has its own. The
+    program is linear in the last `linear` of the arrays `each`: a `jax.vmap` over these alone gives
+    many directions of one motion, which are not counted as bodies. `layout` is the layout of the
+    arrays as they are given; `None` is one body.
     """
     was = Layout(False, (True,) * len(constants)) if layout is None else layout
     number = len(constants)
@@ -71,7 +80,7 @@ def in_lanes(
         own, rest = batched[:number], batched[number:]
         many = len(each) - linear
         if not any(batched):
-            # JAX asks for this where only tangents are batched.
+            # JAX calls this rule without a batched array where only tangents are batched.
             out = program(was, constants, each)
             return out, [False] * len(out)
         if not any(own) and not any(rest[:many]):
@@ -106,7 +115,8 @@ def in_lanes(
         return [first(a) for a in out], [True] * len(out)
 
     answer: Any = jax.custom_jvp(lambda *args: call(*args))
-    # The rule of `custom_vmap` itself gives wrong shapes in a batch of tangents.
+    # The derivative rule of `custom_vmap` itself gives wrong shapes in a batch of tangents: `_jvp`
+    # takes its place.
     answer.defjvp(partial(_jvp, program, was, number, linear), symbolic_zeros=True)
     return answer(*constants, *each)
 
@@ -119,10 +129,15 @@ def _jvp(
     primals: tuple[PyTree, ...],
     tangents: tuple[PyTree, ...],
 ) -> tuple[Arrays, Arrays]:
-    """The result of a program of `number` constants, and its tangent, as one program in lanes."""
+    """Return the result of a program and its tangent, which one call of `in_lanes` computes.
+
+    The first `number` of `primals` are constants. `was` is the layout of the arrays, and `linear`
+    is as for `in_lanes`.
+    """
     constants, each = list(primals[:number]), list(primals[number:])
     moving = [not isinstance(t, SymbolicZero) for t in tangents]
-    # Tangents of constants have a last axis of bodies, and so have then these.
+    # Tangents go among the arrays of each body, so that those of shared constants need a last axis
+    # of bodies; `with_tangents` adds the same axis to the constants themselves.
     _, along = was.broadcast_to_bodies(list(tangents[:number]), moving[:number], each[0])
     along = [t for t, m in zip([*along, *tangents[number:]], moving, strict=True) if m]
 
@@ -144,7 +159,10 @@ def _jvp(
 
 
 def _in_blocks(program: Program, layout: Layout, number: int, *args: Any) -> Arrays:
-    """A program of `number` constants and of bodies, so many of them at a time."""
+    """Return the result of a program, computed on CPU for at most `BLOCK` bodies at a time.
+
+    The first `number` of `args` are constants; of the other arrays each body has its own.
+    """
     constants, each = list(args[:number]), list(args[number:])
     count = each[0].shape[-1] if layout.bodies else 1
     if platform() != "cpu" or count <= BLOCK:
@@ -173,5 +191,8 @@ def _in_blocks(program: Program, layout: Layout, number: int, *args: Any) -> Arr
 
 
 def lift(a: Array, like: Array) -> Array:
-    """`a` with leading axes of length 1, as many axes as `like`: last axes are those they share."""
+    """Return `a` with leading axes of length 1 added, so that it has as many axes as `like`.
+
+    The last axes of `like` are the axes of `a`.
+    """
     return a.reshape((1,) * (like.ndim - a.ndim) + a.shape)

@@ -1,7 +1,8 @@
-"""A state as a tuple of scalars, and back.
+"""Convert a state to a tuple of scalars, and back.
 
-XLA on CPU runs a loop over a tuple of scalars as one kernel and, batched, over a tuple of (N,)
-arrays in vector instructions. A loop over (7,) or (N, 7) arrays becomes many small kernels.
+XLA on CPU makes one kernel of a loop over a tuple of scalars; in a batch, the loop is over a tuple
+of (N,) arrays and uses vector instructions. A loop over (7,) or (N, 7) arrays becomes many small
+kernels.
 """
 
 import math
@@ -13,12 +14,13 @@ from jax import lax
 from jaxtyping import Array
 
 Atoms = tuple[Array, ...]
-# Beyond this many numbers, writing each out costs more to compile than it gains.
+# An array of more numbers than this stays whole: to write out each of its numbers costs more time
+# to compile than it gains.
 FEW = 32
 
 
 def split(tree: Any) -> Atoms:
-    """The numbers of a tree of arrays as scalars, leaf by leaf; long leaves stay whole."""
+    """Return the numbers of a tree of arrays as scalars; an array longer than `FEW` stays whole."""
     parts: list[Array] = []
     for leaf in jax.tree.leaves(tree):
         leaf = jnp.asarray(leaf)
@@ -30,7 +32,7 @@ def split(tree: Any) -> Atoms:
 
 
 def join(parts: Atoms, like: Any) -> Any:
-    """The tree shaped as `like` whose numbers are `parts`, as `split` gave them."""
+    """Return the tree with the shape of `like` whose numbers are `parts`, as `split` gave them."""
     leaves, structure = jax.tree.flatten(like)
     queue = iter(parts)
     out = []

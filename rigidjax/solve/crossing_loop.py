@@ -1,9 +1,10 @@
-"""The zeros of a function along the motion, by steps and Newton's method within them.
+"""Locate the zeros of a function g along a motion, by steps and by Newton's method within a step.
 
-A pass through the loop attempts the next step, or a part of it up to the trial time of a crossing,
-which is therefore as accurate as a step. A step is taken again, up to the extremum of g, if the
-cubic through both ends, with their slopes, has more zeros than their signs show, or if g turns back
-before zero and the tangents at both ends do not exclude a zero.
+A pass through the loop attempts the next step, or a part of a step up to a trial time of the zero;
+the state at a zero is therefore as accurate as the end of a step. A step is taken again, only up to
+the extremum of g, in two cases: if the cubic through the values and slopes of g at both ends has
+more zeros than the signs of g at the ends show, or if g turns back before zero and the tangents at
+both ends do not exclude a zero.
 """
 
 from collections.abc import Callable
@@ -20,69 +21,77 @@ from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
 from rigidjax.solve.tableaus import Tableau
 
-# Newton's guesses in a step, from then on halves; and how often a step is taken again for a turn.
+# The number of Newton's guesses for one zero, after which intervals are halved. It is also the
+# largest number of times that a step is taken again because g turns in it.
 _GUESSES = 8
+# The largest number of guesses and halvings for one zero.
 _MOST = 70
 
 
 class Method(NamedTuple):
-    """An explicit method for a field, on (n, *bodies)."""
+    """Hold an explicit method and the field that it solves, on states (n, *bodies)."""
 
     tableau: Tableau
     field: Field
-    project: Callable[[Array], Array]
-    sizes: list[int]  # of the arrays of the state
+    project: Callable[[Array], Array]  # scales a quaternion to length 1
+    sizes: list[int]  # how many numbers each array of the state has
 
 
 class Path(NamedTuple):
-    """The numbers of a search, a last axis of bodies in each."""
+    """Hold the numbers of a run that is searched, each with a last axis of bodies if many."""
 
     t0: Array
-    stops: Array  # (J,) where the field jumps, and the last time
-    y0: Array  # (n,)
+    stops: Array  # (J,) the times at which the field jumps, then the end of the run
+    y0: Array  # (n,) the state at t0
     rtol: Array
     atol: Array
-    h0: Array  # the first step, NaN to choose one
+    h0: Array  # the length of the first step, NaN if it is to be chosen
 
     @property
     def before(self) -> Array:
-        """The last moment before each stop (J,): a stage there sees the field before the jump."""
+        """Return the last floating-point time before each jump, and the end of the run, (J,).
+
+        A stage at such a time evaluates the field as it is before the jump.
+        """
         return jnp.concatenate([before(self.stops[:-1]), self.stops[-1:]])
 
 
 class Motion(NamedTuple):
-    """The motion of a body, on (n, *bodies)."""
+    """Hold the motion of a body and the condition g along it, on states (n, *bodies)."""
 
-    attempt: Callable[[Step], tuple[Array, Array]]  # the state a step later, error over tolerance
-    order: int
-    longest: Array  # step
-    condition: Callable[[Array, Array], tuple[Array, ...]]  # (t, y): g, dg/dt, dy/dt, g's round-off
-    counts: Callable[[Array, Array, Array], Array]  # (t, y, steps): whether a zero is no round-off
-    project: Callable[[Array], Array]
+    # attempt(step) returns the state a step later, and the norm of its error over the tolerance.
+    attempt: Callable[[Step], tuple[Array, Array]]
+    order: int  # the order of this error
+    longest: Array  # the length of the longest step
+    # condition(t, y) returns g, dg/dt, dy/dt and the size that g may have by round-off.
+    condition: Callable[[Array, Array], tuple[Array, ...]]
+    # counts(t, y, steps) returns whether a zero after so many steps is more than round-off.
+    counts: Callable[[Array, Array, Array], Array]
+    project: Callable[[Array], Array]  # scales a quaternion to length 1
 
 
 class Search(NamedTuple):
-    """The crossings to find: upwards (1), downwards (−1) or both (0); so many at most."""
+    """Describe the crossings to find: their direction and the largest number of them."""
 
-    direction: int
-    many: int
-    max_steps: int
+    direction: int  # 1: g goes up through zero, −1: down, 0: both
+    many: int  # the largest number of crossings
+    max_steps: int  # the largest number of passes through the loop
 
 
 class Located(NamedTuple):
-    """The crossings found."""
+    """Hold the crossings found, and the state of the search at its end."""
 
-    times: Array  # (K, *bodies), NaN beyond the last
+    times: Array  # (K, *bodies), NaN after the last crossing
     states: Array  # (K, n, *bodies)
-    jumps: Array  # (K, *bodies), whether g jumps over zero there
-    number: Array
-    t: Array  # at the end
-    h: Array  # the next step, NaN where one was met
-    steps: Array  # passes
+    jumps: Array  # (K, *bodies), whether g jumps over zero at the crossing
+    number: Array  # the number of crossings found
+    t: Array  # the time at which the search ended
+    h: Array  # the length of the next step: 0 if none is left, NaN if the run met NaN
+    steps: Array  # the number of passes through the loop
 
 
 class _End(NamedTuple):
-    """An offset in the step, and g and dg/dt there."""
+    """Hold an offset x in a step, and g and dg/dt at this offset."""
 
     x: Array
     g: Array
@@ -90,30 +99,34 @@ class _End(NamedTuple):
 
 
 class _Body(NamedTuple):
-    """The state of the loop."""
+    """Hold the state of the search for one body, or for many in the last axis."""
 
     t: Array
     y: Array
-    h: Array  # the next step
-    side: Array  # of zero that g is on
+    h: Array  # the length of the next step
+    side: Array  # the side of zero that g is on: 1 above, −1 below, 0 if g was zero so far
     g: Array
-    rate: Array
-    stop: Array  # the index of the next one
-    refining: Array  # whether a zero is looked for in a step: at x, between two ends
-    x: Array
+    rate: Array  # dg/dt
+    stop: Array  # the index of the next stop
+    refining: Array  # whether a zero is looked for within a step, between `low` and `high`
+    x: Array  # the offset of the next guess
     low: _End
     high: _End
-    tries: Array
-    steps: Array
-    found: Array
+    tries: Array  # the number of guesses for a zero, or of steps taken again because g turns
+    steps: Array  # the number of passes
+    found: Array  # whether a zero has been found
     jumped: Array  # whether g jumped over the zero found last
 
 
 def locate(motion: Motion, search: Search, run: Path) -> Located:
-    """Return the crossings after `run.t0` through all `run.stops`; the first step is `run.h0`."""
+    """Return the crossings between `run.t0` and the last of `run.stops`.
+
+    The length of the first step is `run.h0`.
+    """
     t0, y0 = run.t0, run.y0
     g, rate, *_ = motion.condition(t0, y0)
-    # On the section but for round-off of the time: then the side is where g goes.
+    # The start is on the section to within the round-off of the time: then the side of zero is the
+    # side to which g goes.
     eps = jnp.finfo(t0.dtype).eps
     little = 16 * eps * jnp.maximum(jnp.abs(t0), jnp.abs(run.stops[-1])).astype(g.dtype)
     there = jnp.abs(g) <= little * jnp.abs(rate)
@@ -152,11 +165,13 @@ def locate(motion: Motion, search: Search, run: Path) -> Located:
 
 
 def _is_running(search: Search, run: Path, body: _Body) -> Array:
+    """Return whether the search goes on for each body: before its end, and without a new zero."""
     ahead = (body.stop < run.stops.shape[0]) & (body.steps < search.max_steps)
     return ahead & (body.h > 0) & ~body.found
 
 
 def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
+    """Return the state of the search after one more attempt at a step, or at a part of a step."""
     on = _is_running(search, run, body)
     t, h, y, side = body.t, body.h, body.y, body.side
     begin, end = take(run.stops, body.stop), take(run.before, body.stop)
@@ -168,13 +183,15 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
     late = jnp.where(last, end, jnp.minimum(t + length, end))
     after, norm = motion.attempt(Step(t, length, late, y))
     g, rate, slope, blur = motion.condition(late, after)
-    # Zero counts only where g came to it: not at the start, and not where it is zero all along.
+    # g = 0 counts as a crossing only where g was not zero before: neither at the start nor where g
+    # is zero all along.
     other = (side * g < 0) | ((g == 0) & (body.g != 0) & (side != 0))
     wanted = -side if search.direction == 0 else jnp.full_like(side, search.direction)
     asked = -side == wanted
     start, here = _End(jnp.zeros_like(length), body.g, body.rate), _End(length, g, rate)
 
-    # A step: accepted; or taken again as far as g turns; or else with a zero in it.
+    # A step whose error is below the tolerance is accepted as a whole, or taken again up to the
+    # time at which g turns (`shorter`), or searched for the zero in it (`crossed`).
     step = on & ~arrived & ~body.refining
     whole = run.stops[-1] - run.t0
     good, following = controlled(norm, motion.order, t, length, h, last, whole)
@@ -184,12 +201,13 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
     eps = jnp.finfo(h.dtype).eps
     long_enough = turn > 8 * eps * jnp.maximum(jnp.abs(t), eps * whole)
     shorter = good & hidden & long_enough & (body.tries < _GUESSES)
-    # A crossing the other way is not looked for, but for where it ended.
+    # A crossing in the direction that is not asked for is not located: the step is accepted, and
+    # only the side on which it ended is kept.
     crossed = good & ~shorter & other & asked
     accept = good & ~shorter & ~crossed
     next_h = jnp.where(shorter, turn, jnp.where(step & ~crossed, following, h))
 
-    # Newton's method between two ends of which one is on either side.
+    # Newton's method between two ends, one on each side of zero.
     refine = on & body.refining
     low = _choose(refine & ~other, here, body.low)
     high = _choose(refine & other, here, body.high)
@@ -222,8 +240,11 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
 
 
 def _newton(body: _Body, low: _End, high: _End, here: _End) -> tuple[Array, Array, Array, Array]:
-    """Whether the zero is near, or between ends that nothing is between; how far it is from `here`
-    if it is near; and else where to look next.
+    """Return where the zero between `low` and `high` is, seen from the last guess `here`.
+
+    **Returns** whether one move of Newton's method reaches the zero; whether the search has to end
+    at `here` anyway, since no time lies between the ends or all guesses are used up; the length of
+    the move, 0 if it does not reach the zero; and the offset of the next guess.
     """
     rate, eps = here.rate, jnp.finfo(body.h.dtype).eps
     move = (-here.g / jnp.where(rate == 0, jnp.ones_like(rate), rate)).astype(here.x.dtype)
@@ -240,28 +261,34 @@ def _newton(body: _Body, low: _End, high: _End, here: _End) -> tuple[Array, Arra
 
 
 def _choose(which: Array, a: _End, b: _End) -> _End:
+    """Return the end `a` for the bodies where `which` is true, and the end `b` for the others."""
     return _End(*(jnp.where(which, x, y) for x, y in zip(a, b, strict=True)))
 
 
 def _hidden(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array, Array]:
-    """Whether g may have more zeros between two ends than their signs tell, and the offset at which
-    the cubic through both, with their slopes, turns back from zero or beyond it.
+    """Return whether g may have more zeros between two ends than its signs there show.
+
+    `side` is the side of zero at the end `low`; `blur` is the size that g may have by round-off.
+    **Returns** also the offset at which the cubic through both ends, with their slopes, has its
+    extremum: there it turns back before zero or beyond it.
     """
     width = (high.x - low.x).astype(low.g.dtype)
     a, b = side * low.rate * width, side * high.rate * width
     first, last = side * low.g, side * high.g
     rise = last - first
-    # Its slope from 0 to 1 is a + c x + d x².
+    # The slope of the cubic is a + c x + d x², with x from 0 to 1 between the ends.
     c, d = 2 * (3 * rise - 2 * a - b), 3 * (a + b - 2 * rise)
     root = jnp.sqrt(jnp.maximum(c * c - 4 * a * d, 0))
     q = -0.5 * (c + jnp.where(c < 0, -root, root))
     one, other = a / jnp.where(q == 0, 1, q), q / jnp.where(d == 0, 1, d)
-    # The slope grows through zero at the least value, and falls at the largest.
+    # The slope grows through zero at the least value of the cubic, and falls through zero at the
+    # largest one.
     least, most = jnp.where(c < 0, other, one), jnp.where(c < 0, one, other)
 
     value = lambda x: first + x * (a + x * (0.5 * c + x * d / 3))  # noqa: E731
     within = lambda x: (x > 0) & (x < 1)  # noqa: E731
-    # Both tangents meet beyond zero: of a g that turns once nothing else is known.
+    # The tangents at both ends meet beyond zero. Of a g that turns once nothing more is known, so
+    # that a zero is not excluded.
     meet = (last - b - first) / jnp.where(a == b, 1, a - b)
     touch = (a < 0) & (b > 0) & (first + a * meet < -blur)
     two = (last > 0) & ((value(least) < -blur) | touch)
@@ -272,7 +299,12 @@ def _hidden(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array, Arr
 
 
 def _first_guess(side: Array, low: _End, high: _End) -> Array:
-    """The cubic in g through both ends with their slopes, at g = 0; or the middle."""
+    """Return the offset of the first guess for a zero between two ends.
+
+    The guess is the value at g = 0 of the cubic x(g) through both ends with their slopes. It is the
+    middle if g moves away from the other side of zero at one of the ends, or if the value of the
+    cubic is not between the ends.
+    """
     steady = (side * low.rate < 0) & (side * high.rate < 0)
     rise = jnp.where(steady, high.g - low.g, 1)
     u = -low.g / rise
@@ -289,10 +321,13 @@ def _first_guess(side: Array, low: _End, high: _End) -> Array:
 def step_with_error(
     method: Method, constants: Arrays, run: Path, step: Step
 ) -> tuple[Array, Array]:
-    """Return the state a step later, and the root mean square of its error over the tolerance."""
+    """Return the state a step later, and the root mean square of its error over the tolerance.
+
+    The error of each number is divided by the tolerance of this number.
+    """
     there = stages(method.tableau, method.field, constants, step)
     right = method.project(there.end)
-    # Derivatives hold the chosen steps constant.
+    # Derivatives hold the lengths of steps constant, so that the error has no derivative.
     left, after, h, slopes = lax.stop_gradient((step.y, right, step.h, there.slopes))
     error = error_estimate(method.tableau, method.sizes, h, slopes)
     largest = jnp.maximum(jnp.abs(left), jnp.abs(after))
@@ -304,10 +339,14 @@ def step_with_error(
 def controlled(
     norm: Array, order: int, t: Array, h: Array, kept: Array, last: Array, length: Array
 ) -> tuple[Array, Array]:
-    """Return whether a step is accepted, and the next one: 0 where none is left, NaN after a NaN.
+    """Return whether a step is accepted, and the length of the next step.
 
-    `norm` as of `step_with_error`; `kept` the step wanted before it was cut short as the `last`
-    before a stop; `length` of the run, whose round-off counts where that of `t` vanishes.
+    The length is 0 if no shorter step is left to try, and NaN if the step ended with NaN.
+
+    `norm` is the error over the tolerance, as `step_with_error` returns it, and `order` the order
+    of this error. The step began at `t` with the length `h`; `kept` is the length that it was to
+    have before it was cut short as the `last` step before a stop. `length` is that of the run: its
+    round-off is taken where the round-off of `t` vanishes.
     """
     good, following = next_step(norm, order, h)
     kept = lax.stop_gradient(kept)
@@ -320,7 +359,11 @@ def controlled(
 
 
 def outcome(h: Array, t: Array, end: Array, met: Array) -> dfx.RESULTS:
-    """Return the result of a search by its next step, its time, the last time, if it is full."""
+    """Return the result of a search that ended at the time `t`.
+
+    `h` is the length of the step that would follow, `end` the last time of the run, and `met` says
+    whether the search found as many crossings as it may.
+    """
     result = dfx.RESULTS.dt_min_reached
     for there, word in (
         (jnp.isnan(h), NONFINITE),
@@ -333,7 +376,7 @@ def outcome(h: Array, t: Array, end: Array, met: Array) -> dfx.RESULTS:
 
 
 def first_step(method: Method, constants: Arrays, run: Path) -> Array:
-    """Return the first step of a search."""
+    """Return the length of the first step of a search, from the state and the field at `run.t0`."""
     y0 = run.y0
     scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
     slope = method.field(constants, run.t0, y0)

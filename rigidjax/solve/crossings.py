@@ -1,17 +1,23 @@
-"""Times at which a motion meets a condition: the event that ends a run, and section crossings.
+"""Find the times at which a motion meets a condition g: the event of a run, or section crossings.
 
-Crossings are found without derivatives. For these the motion is run again to the times found, which
-are held fixed. The rest of g there and its rates ġ and g̈ along the motion give time and state by
-one step of Chebyshev's method, whose first and second derivatives are those of the crossing:
+Crossings are found without derivatives. To get the derivatives, the motion is run again up to the
+times found, which are held fixed. The remaining value of g there, and its rates ġ and g̈ along the
+motion, give the time and the state of the crossing by one step of Chebyshev's method, whose first
+and second derivatives are those of the crossing:
 
     τ = −(g/ġ)(1 + ½ g g̈/ġ²),   y = y* + f τ + ½ (df/dt) τ².
 
-Where g jumps over zero, halving finds the time; nothing tells how it changes: derivatives are NaN.
+Here τ is the time from the fixed time to the crossing, y* the state at the fixed time, f = dy/dt
+the vector field, and y the state at the crossing.
 
-A zero of round-off, of what the motion conserves or of a component that stays at zero, does not
-count. Its ġ is at most some ε (|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ), times the root of the number of steps. The
-size rᵢ of the terms of ẏᵢ is the length of the array of the state that i belongs to, taken of ẏ and
-of the change of ẏ where each y changes by the length of its array.
+Where g jumps over zero, halving finds the time of the jump. Nothing tells how this time changes
+with the numbers of the scene: its derivatives are NaN.
+
+A zero that is only round-off does not count: of a g that the motion conserves, or of a component
+that stays at zero. Its ġ is at most a small multiple of ε (|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ), times the root
+of the number of steps, where ε is the relative rounding error. The size rᵢ of the terms of ẏᵢ is a
+sum of two lengths of the array of the state that the number i belongs to: its length in ẏ, and its
+length in the change of ẏ when each number of y changes by the length of its array.
 """
 
 from collections.abc import Callable
@@ -67,24 +73,24 @@ State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 
 
 class Event(eqx.Module):
-    """The event that ends a run of `simulate`: the first zero of a condition.
+    """Describe the event that ends a run of `simulate`: the first zero of a condition.
 
     **Arguments:**
 
-    - `condition`: a Module or function `(t, state, body) → scalar`, smooth along the motion; it may
-      hold traced numbers. One that jumps over zero (`jnp.sign(…)`) is met where it jumps; its time
-      has NaN derivatives. Under a law with states of its own the state is a `Coupled`:
-      `state.motion.omega`, `state.own`.
-    - `direction`: 1 for a zero on the way up, −1 on the way down, 0 for both (as in SciPy), in the
-      order in which the run meets them.
-    - `max_step`: the longest step, s. A zero is found if the condition has changed its sign at the
-      end of a step, or has one extremum within it.
+    - `condition`: a Module or function `(t, state, body) → scalar` that is smooth along the motion;
+      it may hold traced numbers. A condition that jumps over zero (`jnp.sign(…)`) is met where it
+      jumps, and the time of the event then has NaN derivatives. Under a law with states of its own
+      the state is a `Coupled`: use `state.motion.omega` and `state.own`.
+    - `direction`: 1 for a zero on the way up, −1 for a zero on the way down, 0 for both (as in
+      SciPy). Up and down are meant in the order in which the run goes, also backwards in time.
+    - `max_step`: the longest step, s. A zero is found if the sign of the condition is different at
+      the end of a step, or if the condition has one extremum within the step.
 
-    A start at a zero does not count, nor does a condition that is always zero to round-off (see
-    `crossings`).
+    A start at a zero is no event, and neither is a zero of a condition that is always zero to
+    round-off (see `crossings`).
 
-    **Raises:** `TypeError`, `ValueError` for anything but a function, another direction, a step
-    that is not positive.
+    **Raises:** `TypeError` if `condition` is not a function; `ValueError` for another `direction`,
+    or for a `max_step` that is not positive.
 
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
     >>> flip = Event(lambda t, state, body: state.omega[1])
@@ -114,12 +120,16 @@ class Event(eqx.Module):
 
 
 class Crossings(eqx.Module, Generic[State]):
-    """The result of `crossings`.
+    """Hold the result of `crossings`.
 
-    **Fields:** `times` (K,) s, in the order of the run, NaN beyond the last; `states` there, of the
-    type of `state0`, with a leading axis; `count` their number; `result` a `diffrax.RESULTS`:
-    `successful` if the run reached `t1`, `event_occurred` if it ended with `max_crossings` of them,
-    or why it ended early; `num_steps` of the method, partial ones included.
+    **Fields:**
+
+    - `times`: (K,) s, the times of the crossings in the order of the run; NaN after the last one.
+    - `states`: the states at these times, of the type of `state0`, with a leading axis (K,).
+    - `count`: the number of crossings.
+    - `result`: a `diffrax.RESULTS`: `successful` if the run reached `t1`, `event_occurred` if it
+      ended at crossing number `max_crossings`, else the reason why it ended early.
+    - `num_steps`: the number of steps of the method, parts of steps included.
 
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
     >>> flips = rj.crossings(body, start, 0.0, 40.0, lambda t, state, body: state.omega[1])
@@ -135,7 +145,7 @@ class Crossings(eqx.Module, Generic[State]):
 
     @property
     def full(self) -> Array:
-        """Whether there are `max_crossings`: there may be more of them."""
+        """Return whether the run ended at crossing number `max_crossings`: more may follow it."""
         return self.result == dfx.RESULTS.event_occurred
 
 
@@ -155,35 +165,38 @@ def crossings(
     atol: ScalarLike | None = None,
     max_steps: int = 1_000_000,
 ) -> Crossings[State]:
-    """The crossings of a section: all zeros of a condition between two times.
+    """Return the crossings of a section: all zeros of a condition between two times.
 
     **Arguments:**
 
-    - `body`, `state0`, `torque`: as for `simulate`; `state0` at `t0`.
-    - `t0`, `t1`: s; `t1 < t0` goes back in time.
+    - `body`, `state0`, `torque`: as for `simulate`; `state0` is the state at `t0`.
+    - `t0`, `t1`: the start and the end of the run, s; `t1 < t0` goes back in time.
     - `condition`, `direction`: as for `Event`. The condition may depend on the time (a stroboscopic
       section is `sin(½(t − t₀)ω)`).
-    - `max_crossings`: K, the length of the results; the run ends with the last of them.
-    - `max_step`: the longest step, s, for a condition that is much faster than the motion: several
-      zeros in one step are found if the cubic through its ends, with their slopes, shows them.
-    - `solver`: `None` is the closed form for a free body, else `rigidjax.solvers.DormandPrince8`;
-      or an explicit method of `rigidjax.solvers`. `rtol`, `atol` as for `simulate`; a crossing is
-      as accurate as a step, that of a free body to round-off. `max_steps` with parts of steps.
+    - `max_crossings`: K, the length of the results; the run ends at crossing number K.
+    - `max_step`: the longest step, s, for a condition that changes much faster than the motion.
+      Several zeros in one step are found if the cubic through the values and slopes of the
+      condition at both ends of the step shows them.
+    - `solver`: an explicit method of `rigidjax.solvers`; `None` is the closed form for a free body,
+      and `rigidjax.solvers.DormandPrince8` for any other.
+    - `rtol`, `atol`: as for `simulate`. A crossing is as accurate as a step; in closed form it is
+      accurate to round-off.
+    - `max_steps`: the largest number of steps, parts of steps included.
 
     A start on the section does not count, and a tangential contact may be missed. A zero counts if
-    the condition goes through it 16 times as fast as round-off could make it (under a solver, times
-    the root of the number of steps): an energy minus its value has none. For many bodies use
-    `jax.vmap`.
+    the rate of the condition there is at least 16 times the rate that round-off could give it
+    (under a solver, times the root of the number of steps): the energy minus its initial value has
+    no crossing. For many bodies use `jax.vmap`.
 
-    **Returns** a `Crossings`. Times and states have first and second derivatives with respect to
-    all numbers of the scene, of `condition` and of `state0`, forward and reverse; near a tangential
-    contact they grow without bound, as the true ones do.
+    **Returns** a `Crossings`. Its times and states have first and second derivatives with respect
+    to all numbers of the scene, of `condition` and of `state0`, in forward and reverse mode. Near a
+    tangential contact these derivatives grow without bound, as the true ones do.
 
     Source: Newton's method on the step from the last accepted state, instead of Hénon's change of
     variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3).
 
-    **Raises:** `TypeError`, `ValueError` as `simulate`, for equal times, and for a condition that
-    is no number, is NaN at the start, or reads a part that the state does not have.
+    **Raises:** `TypeError` and `ValueError` as `simulate` does, for equal times, and for a
+    condition that is not a number, is NaN at the start, or reads a part that the state lacks.
 
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
     >>> flips = crossings(body, start, 0.0, 40.0, lambda t, state, body: state.omega[1])
@@ -211,7 +224,7 @@ def crossings(
 
 
 def checked_start(event: Event, body: Any, state0: Any, torque: Any, t: Array) -> Any:
-    """Return `state0` with the states of the torque; raise if the condition is no number there."""
+    """Return `state0` with the torque's own states; refuse a condition that is no number there."""
     state0 = with_own_states(body, state0, torque, t)
     try:
         eqx.filter_eval_shape(value, event, body, t, state0)
@@ -229,7 +242,7 @@ def checked_start(event: Event, body: Any, state0: Any, torque: Any, t: Array) -
 
 
 def value(event: Event, body: Any, t: Any, y: Any) -> Array:
-    """The condition of an event."""
+    """Return the condition of an event at the time `t` and the state `y`; refuse a truth value."""
     found = event.condition(t, y, body)
     if jnp.issubdtype(getattr(found, "dtype", type(found)), jnp.bool_):
         raise TypeError(
@@ -246,7 +259,11 @@ _value = eqx.filter_jit(value)
 def solve_until(
     setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
-    """As `solve`, up to the event; and the event's time and state, NaN if there is none."""
+    """Return what `solve` returns for a run up to the event, and the time and state of the event.
+
+    The states at times after the event are NaN. The time and the state of the event are NaN if the
+    run meets none.
+    """
     state0 = project_to_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
     given = setup.max_steps if isinstance(setup, DiffraxRun) else None
@@ -274,7 +291,10 @@ def solve_until(
 
 
 def _with_derivatives(crossing: Any, jumps: Array, inputs: Any) -> Any:
-    """The same numbers with NaN derivatives by `inputs` where they are NaN or the section jumps."""
+    """Return the numbers of `crossing`, with NaN derivatives where they are NaN or g jumps.
+
+    These derivatives are with respect to `inputs`; all other derivatives stay as they are.
+    """
 
     def lost(leaf: Array) -> Array:
         return jnp.where(
@@ -290,6 +310,7 @@ def _solved(
     setup: ClosedFormRun | DiffraxRun, event: Event, many: int, max_steps: int, state0: Any,
     ts: Array,
 ) -> Crossings:  # fmt: skip
+    """Return at most `many` crossings of `event` in a run of `setup` from `ts[0]` to `ts[1]`."""
     state0 = project_to_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
     found = located(crossed, Search(event.direction, many, max_steps), numbers)
@@ -304,7 +325,7 @@ def _solved(
 
 @eqx.filter_custom_jvp
 def _as_found(times: Array, states: Array, jumps: Array, *scene: Any) -> tuple[Array, Array]:
-    """The crossings of a `scene`: only derivatives run it once more."""
+    """Return the times and states found for a `scene`; only their derivatives run it once more."""
     return times, states
 
 
@@ -319,7 +340,10 @@ def _corrected(
     times: Array, jumps: Array, setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any,
     ts: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Times, in s, and states of the crossings found as functions of all numbers of the scene."""
+    """Return the crossings found at the fixed `times` as functions of all numbers of the scene.
+
+    **Returns** times and states; all times are s = σt, as in `Section`.
+    """
     crossed, (constants, *_) = section(setup, event, state0, ts)
     there = jnp.isfinite(times)
     last = jnp.max(jnp.where(there, times, lax.stop_gradient(crossed.time(ts[0]))))
@@ -330,47 +354,51 @@ def _corrected(
     return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
 
 
-# Samples of a free body's condition in one turn at its largest rate.
+# The number of samples of a free body's condition in one turn at the body's largest rate.
 _SAMPLES = 16
-# How many times its round-off the slope of a crossing is at least.
+# The rate of a condition at a crossing is at least this many times what round-off could make it.
 _CLEAR = 16
 
 
 class Section(NamedTuple):
-    """The section and the motion, in s = σt, which increases."""
+    """Hold a section and a motion as functions of the time s = σt, which increases along the run.
 
-    solver: AbstractExplicit | None  # None: the closed form
-    motion: Callable[[Arrays, Array, Array], Array]  # dy/ds, or y itself in closed form
-    rates: Callable[[Arrays, Array, Array], tuple[Array, Array, Array]]  # g, dg/ds, dy/ds
-    tree: Callable[[Array], Any]  # the state of a vector
-    sizes: list[int]  # of the arrays of the state
-    sign: Array
-    form: ByMomentum | None = None
+    σ is 1 if the run goes forwards in time t, and −1 if it goes backwards.
+    """
+
+    solver: AbstractExplicit | None  # `None` is the closed form
+    motion: Callable[[Arrays, Array, Array], Array]  # dy/ds; in closed form y itself
+    rates: Callable[[Arrays, Array, Array], tuple[Array, Array, Array]]  # g, dg/ds and dy/ds
+    tree: Callable[[Array], Any]  # the state from the vector of its numbers
+    sizes: list[int]  # how many numbers each array of the state has
+    sign: Array  # σ
+    form: ByMomentum | None = None  # if given, the numbers that are integrated instead of the state
 
     def vector(self, t: Array, state: Any) -> Array:
-        """The numbers that are integrated, of a state at the time t."""
+        """Return the vector of the numbers that are integrated from the state at the time `t`."""
         return ravel_pytree(state if self.form is None else self.form.enter(t, state))[0]
 
     def state(self, t: Array, y: Array) -> Any:
-        """The state at the time t of the numbers that are integrated."""
+        """Return the state at the time `t` from the vector `y` of the numbers integrated."""
         return self.tree(y) if self.form is None else self.form.leave(t, self.tree(y))
 
     def project(self, y: Array) -> Array:
+        """Return the vector `y` with its quaternion, if it has one, scaled to length 1."""
         return ravel_pytree(project_to_group(self.tree(y)))[0]
 
     def time(self, s: Array) -> Array:
-        """Time t at s, and the other way."""
+        """Return the time t at `s`, or s at the time t: each is σ times the other."""
         return self.sign.astype(s.dtype) * s
 
 
-# The constants of a section's functions, the run, its longest step.
+# The constants of a section's functions, the run that is searched, and its longest step.
 Numbers = tuple[Arrays, Path, Array]
 
 
 def section(
     setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
 ) -> tuple[Section, Numbers]:
-    """Return the section between `ts[0]` and `ts[-1]`, and what it is made of."""
+    """Return the section and motion of a run from `ts[0]` to `ts[-1]`, and their numbers."""
     form = by_momentum(setup.body, state0, setup.torque) if isinstance(setup, DiffraxRun) else None
 
     def condition(t: Array, y: Any) -> Array:
@@ -416,7 +444,11 @@ def section(
 
 
 def _spacing(body: Any, state0: Any, whole: Array) -> Array:
-    """A part of one turn at the largest rate that energy and momentum allow."""
+    """Return the interval between samples of a free body's condition, s.
+
+    It is a sixteenth of one turn at the largest rate that energy and momentum allow, or of the
+    length `whole` of the run if that is shorter than a radian at this rate.
+    """
     inertia = body if isinstance(body, Inertia) else body.inertia
     tensor, omega = lax.stop_gradient((inertia.tensor, state0.omega))
     momentum = jnp.sum(tensor * omega[None], axis=1)
@@ -427,7 +459,7 @@ def _spacing(body: Any, state0: Any, whole: Array) -> Array:
 
 
 def located(section: Section, what: Search, numbers: Numbers) -> Located:
-    """The first crossings on the way through `run.stops`, without derivatives."""
+    """Return the first crossings of a run, as many as `what` allows, without derivatives."""
     constants, run, longest = lax.stop_gradient(numbers)
     program = partial(_located, section, what)
     return Located(*in_lanes(program, constants, [*run, longest]))
@@ -436,13 +468,14 @@ def located(section: Section, what: Search, numbers: Numbers) -> Located:
 def _located(
     section: Section, what: Search, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
+    """Return the fields of `Located` in a list: the program of `located` for `in_lanes`."""
     run, longest = Path(*each[:-1]), each[-1]
     solver, motion = section.solver, layout.over(section.motion)
     project = jax.vmap(section.project, -1, -1) if layout.bodies else section.project
     seen, clear = (partial(layout.over(partial(f, section)), constants) for f in (_seen, _clear))
 
     def counts(s: Array, y: Array, steps: Array) -> Array:
-        # The round-off of steps adds up as a random walk does.
+        # The round-off of steps adds up as a random walk: with the root of their number.
         many = 1 if solver is None else jnp.sqrt(1 + steps.astype(y.dtype))
         return ~(clear(s, y) < _CLEAR * many)
 
@@ -459,19 +492,25 @@ def _located(
 
 
 def _lengths(sizes: list[int], a: Array) -> Array:
-    """The length of the array of a state that each number belongs to."""
+    """Return for each number of the vector `a` the length of the array that it belongs to.
+
+    `sizes` says how many numbers each array has.
+    """
     which = np.repeat(np.arange(len(sizes)), sizes)
     same = jnp.asarray(which[:, None] == which[None], a.dtype)
     return jnp.sqrt(jnp.sum(same * (a * a)[None], 1))
 
 
 def _push(sizes: list[int], y: Array) -> Array:
-    """A change of each number by the length of its array, in a direction along no body's axis."""
+    """Return a change of each number of `y` by up to the length of its array.
+
+    The direction of the change is along no axis of a body.
+    """
     return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _lengths(sizes, y)
 
 
 def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Array, ...]:
-    """g, dg/ds, dy/ds, and what g may be by round-off."""
+    """Return g, dg/ds and dy/ds at the time `s` and the state `y`, and the round-off of g."""
     of_g = lambda s, y: section.rates(constants, s, y)[0]  # noqa: E731
     noise = jax.jvp(of_g, (s, y), (s, _push(section.sizes, y)))[1]
     blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)
@@ -480,7 +519,7 @@ def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Arra
 
 
 def _clear(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
-    """The rate of g through zero over its round-off."""
+    """Return the rate of g through zero, divided by the rate that round-off could give it."""
     rates, sizes = partial(section.rates, constants, s), section.sizes
     _, rate, slope = rates(y)
     shift = jax.jvp(lambda y: rates(y)[2], (y,), (_push(sizes, y),))[1]
@@ -493,10 +532,14 @@ def _clear(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
 def correction(
     section: Section, constants: Arrays, s: Array, y: Array, there: Array
 ) -> tuple[Array, Array]:
-    """The crossing near `s`, and the state, by Chebyshev's method; as they are if not `there`."""
+    """Return the time and state of the crossing near `s`, by one step of Chebyshev's method.
+
+    `y` is the state at `s`. Where `there` is false, the step has the length 0.
+    """
     rates = partial(section.rates, constants)
     g, rate, slope = rates(s, y)
-    # These two meet only the square of what is zero: their derivatives are not wanted.
+    # Both second derivatives are multiplied by the square of g, which is zero at the crossing:
+    # their own derivatives are not needed.
     here = lax.stop_gradient((s, y))
     _, moved = jax.jvp(rates, here, (jnp.ones_like(s), lax.stop_gradient(slope)))
     _, second, turn = lax.stop_gradient(moved)

@@ -1,7 +1,8 @@
-"""A difference of values beside a derivative: does the derivative see all that the values do?
+"""Compare a derivative with a difference of values, to show what the derivative does not see.
 
-A torque that switches at a time or at a state depends on that time or state; the derivative of
-`jnp.where`, `jnp.sign` and the like does not. Two values on both sides of x show it.
+The effect of a torque that switches at a time or at a state depends on this time or state, but the
+derivatives of `jnp.where`, `jnp.sign` and the like leave this dependence out. Two values, one on
+each side of x, show it.
 """
 
 import warnings
@@ -17,21 +18,26 @@ from jaxtyping import Array
 
 from rigidjax import _checks
 
-# The step relative to each number, by the bytes of one: half of what a unit quaternion forgives.
+# The longest step relative to each number, by the bytes of one number. It is half of the change of
+# length that a unit quaternion is accepted with.
 _STEP = {8: 5e-7, 4: 5e-4}
-# The least size of values, relative to their rise along x: a value may be zero just there.
+# The least size of values, relative to their rise along x: a value may happen to be zero at x.
 _SLOW = 1e-3
-# What a second run is unsure of, relative to the error of the first.
+# The uncertainty of the values of a second run, relative to the error of the first run.
 _CLOSER = 0.01
-# The slopes differ where their distance is so many times what is known of it.
+# The slopes count as different where their distance is this many times its uncertainty.
 _UNSURE = 10.0
 
 
 class Slopes(NamedTuple):
-    """The slopes of a function along one direction, of the shape of its value.
+    """Hold the slopes of a function along one direction, in the shape of its value.
 
-    **Fields:** `derivative`; `difference` of values; `differ`, whether they do not agree; `ways`
-    how far each number of x moves in a unit of the direction.
+    **Fields:**
+
+    - `derivative`: the slope by the derivative.
+    - `difference`: the slope by a difference of values.
+    - `differ`: whether the two slopes do not agree.
+    - `ways`: how far each number of x moves in one unit of the direction.
     """
 
     derivative: Array
@@ -41,13 +47,20 @@ class Slopes(NamedTuple):
 
 
 def size_of(leaf: Array) -> Array:
-    """Return the size of each number; 1 for zeros alone, which are added to what is not known."""
+    """Return the size of each number of an array: its absolute value, or 1 if all are zero.
+
+    An array of zeros alone is taken as a small change of numbers whose size is not known here.
+    """
     return jnp.where(jnp.all(leaf == 0), jnp.ones_like(leaf), jnp.abs(leaf))
 
 
 @jax.jit
 def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple[Array, Any]:
-    """Return a step, and x a step before and after in a random direction, with a new first axis."""
+    """Return the length of a step, and the two points one step from `x` in a random direction.
+
+    The points before and after `x` are stacked in a new first axis. `value`, `value_error` and
+    `derivative` are those of the function at `x`.
+    """
     rng = np.random.default_rng(2)
 
     def random_way(leaf: Array) -> Array:
@@ -61,7 +74,8 @@ def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple
     rise = jnp.max(jnp.abs(_change(derivative, way)))
     size = jnp.maximum(jnp.max(jnp.abs(value)), _SLOW * rise)
     unsure = jnp.maximum(jnp.max(value_error), float(jnp.finfo(value.dtype).eps) * size)
-    # Values that change fast change by the root of what they are unsure of.
+    # The values change by the geometric mean of their size and their uncertainty, unless the step
+    # would be longer than `longest`.
     step = jnp.sqrt(unsure * size) / jnp.where(rise > 0, rise, 1)
     longest = _STEP[value.dtype.itemsize]
     step = jnp.where((rise > 0) & (step > 0), jnp.minimum(step, longest), longest)
@@ -74,7 +88,10 @@ def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple
 
 
 def values_at(value: Callable[[Any, Any], Array], sides: Any, tolerances: Array) -> Array:
-    """Return the values on both sides, NaN where the function refuses its known numbers."""
+    """Return the values on both sides of x; NaN on a side whose known numbers the function refuses.
+
+    Under `jit` the numbers are not known, and the function cannot refuse them.
+    """
     if not _checks.is_known((sides, tolerances)):
         return lax.map(lambda x: value(x, tolerances), sides)
     values: list[Any] = []
@@ -82,22 +99,24 @@ def values_at(value: Callable[[Any, Any], Array], sides: Any, tolerances: Array)
         try:
             values.append(value(side, tolerances))
         except RuntimeError:
-            # Flat bodies lie at the end of what a body can be, and one of the sides beyond it.
+            # A flat body is at the limit of what a body can be: one of the two sides is beyond it.
             values.append(np.nan)
     return jnp.stack(jnp.broadcast_arrays(*values))
 
 
 @jax.jit
 def slopes_of(x: Any, middle: Array, step: Array, sides: Any, values: Array, error: Any) -> Slopes:
-    """Return the slopes by the derivative of a `FunctionError`, and by the values on both sides.
+    """Return the slope of a function by its derivative, and by its values on both sides of `x`.
 
-    `middle` is the value at `x` of the tolerances of `values`.
+    The derivative, and the errors of value and derivative, are those of the `FunctionError` that
+    `error` is. `step` and `sides` are the results of `sides_of`, and `values` are the values at the
+    two `sides`. `middle` is the value at `x` under the tolerances of `values`.
     """
-    # The numbers have been rounded: the way between them is no longer the direction.
+    # The numbers of the sides have been rounded: their change is no longer along the direction.
     moved = jax.tree.map(lambda side, leaf: side - leaf[None], sides, x)
     rises = jax.vmap(lambda way: _change(error.derivative, way))(moved)
     there = jnp.isfinite(values)
-    # In the place of a value that is not there: the other one, mirrored.
+    # A value that is missing is replaced by the other one, mirrored at `middle`.
     values = jnp.where(there, values, 2 * middle[None] - values[::-1])
     rises = jnp.where(there, rises, -rises[::-1])
     derivative, difference = ((a[1] - a[0]) / (2 * step) for a in (rises, values))
@@ -116,7 +135,10 @@ def slopes_of(x: Any, middle: Array, step: Array, sides: Any, values: Array, err
 
 @jax.jit
 def errors_of_numbers(slopes: Slopes) -> Any:
-    """Return the error of the derivative by each number of x, as if that one had all of it."""
+    """Return the error of the derivative with respect to each number of x.
+
+    The difference of the slopes is attributed to each number in full, as if it were the only cause.
+    """
     slope = jnp.where(slopes.differ, jnp.abs(slopes.difference - slopes.derivative), 0)
 
     def of_leaf(way: Array) -> Array:
@@ -127,7 +149,7 @@ def errors_of_numbers(slopes: Slopes) -> Any:
 
 
 def warn_of_slopes(slopes: Slopes) -> None:
-    """Warn, where the slopes are known and differ, of what derivatives do not see."""
+    """Warn that the derivative misses a change of values, if the slopes are known and differ."""
     if not _checks.is_known(slopes) or not np.any(slopes.differ):
         return
     index = np.argmax(np.ravel(slopes.differ))
@@ -143,7 +165,7 @@ def warn_of_slopes(slopes: Slopes) -> None:
 
 
 def _change(derivative: Any, way: Any) -> Array:
-    """A derivative times a change of x: the change of the value."""
+    """Return the change of the value for the change `way` of x: the derivative times `way`."""
 
     def of_leaf(derivative: Array, way: Array) -> Array:
         many = derivative.ndim - way.ndim

@@ -1,7 +1,8 @@
-"""A step of an explicit Runge–Kutta method forward, for steps whose length is known.
+"""Take a step of an explicit Runge–Kutta method, whose length is known in advance.
 
-Its stages are written out, or a loop: with many tangents, as fits take them, that compiles two to
-three times sooner and runs as fast. Values take a tenth longer in the loop, reverse mode a third.
+The stages of the step are either written out or a loop. With many tangents, as in a fit, the loop
+compiles two to three times faster and runs as fast. Values alone take a tenth longer in the loop,
+and reverse mode takes a third longer.
 """
 
 from collections.abc import Callable
@@ -18,18 +19,18 @@ from rigidjax.rotation.barrier import barrier
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.tableaus import Row, Tableau
 
-# field(t, y) → dy/dt on any tree of arrays; fastest is a tuple of scalars, see `components`.
+# field(t, y) returns dy/dt for any tree of arrays y; a tuple of scalars is fastest (`components`).
 Field = Callable[[Any, Any], Any]
 
 
 class Rolled(eqx.Module):
-    """The steps of `solver`, the stages of each in a loop."""
+    """Wrap the explicit method `solver`, so that the stages of its steps are a loop."""
 
     solver: AbstractExplicit
 
 
 def in_a_loop(solver: Any) -> Any:
-    """An explicit method of order 4 or 5 with its stages in a loop; another as it is."""
+    """Return an explicit method of order 4 or 5 with its stages in a loop; any other as it is."""
     few = isinstance(solver, AbstractExplicit) and solver.tableau.order <= 5
     return Rolled(solver) if few else solver
 
@@ -37,24 +38,28 @@ def in_a_loop(solver: Any) -> Any:
 def change_in(
     solver: AbstractExplicit | Rolled, field: Field, t: Any, h: Array, y: Any, end: Any
 ) -> Any:
-    """How `y` changes in a step from `t` to `end`, of length `h`, not projected."""
+    """Return the change of `y` in a step from `t` to `end` of the length `h`.
+
+    The quaternion of a state is not scaled to length 1.
+    """
     if isinstance(solver, Rolled):
         return _rolled(solver.solver.tableau, field, t, h, y, end)
     return change_and_slope(solver.tableau, field, t, h, y, end)[0]
 
 
 def advance(tableau: Tableau, field: Field, t: Any, h: Array, y: Any) -> Any:
-    """The end of one step from `y`, not projected."""
+    """Return the state after one step from `y`, whose quaternion is not scaled to length 1."""
     return jax.tree.map(jnp.add, y, change_and_slope(tableau, field, t, h, y)[0])
 
 
 def change_and_slope(
     tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any = None
 ) -> tuple[Any, Any]:
-    """The change in one step from `y`, written out and not projected, and the slope at its start.
+    """Return the change of `y` in one step, and the slope at the start of the step.
 
-    `end` is the time of the last stages, if it is not to be `t + h` rounded. Without the barriers
-    XLA makes of each result one kernel, which repeats all stages before it.
+    The stages are written out, and the quaternion of a state is not scaled to length 1. `end` is
+    the time of the last stages if that is to be another number than `t + h` as it is rounded.
+    Without the barriers XLA makes one kernel for each result, which repeats all stages before it.
     """
     end = t + h if end is None else end
     slopes = [barrier(field(t, y))]
@@ -65,6 +70,8 @@ def change_and_slope(
 
 
 def _along(h: Array, row: Row, slopes: list[Any]) -> Any:
+    """Return `h` times the sum of the slopes, each multiplied by its weight in `row`."""
+
     def moved(*slopes: Array) -> Array:
         first, *rest = [w * k for w, k in zip(row.values(), slopes, strict=True)]
         return h.astype(first.dtype) * sum(rest, first)
@@ -73,7 +80,10 @@ def _along(h: Array, row: Row, slopes: list[Any]) -> Any:
 
 
 def _rolled(tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any) -> Any:
-    """The change in a step whose stages are a loop that carries the slopes which a row needs."""
+    """Return the change of `y` in a step whose stages are a loop.
+
+    The loop carries as many of the last slopes as the rows of the tableau need.
+    """
     count = len(tableau.a) + 1
     rows = np.zeros((count, max(i - min(row) for i, row in enumerate(tableau.a, 1))))
     for i, row in enumerate(tableau.a, 1):
@@ -96,4 +106,5 @@ def _rolled(tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any) 
 
 
 def _plus(y: Any, part: Array, slope: Any) -> Any:
+    """Return the tree `y` plus `part` times the tree `slope`."""
     return jax.tree.map(lambda a, k: a + part.astype(a.dtype) * k, y, slope)

@@ -1,8 +1,9 @@
-"""How far a run is from the exact motion of its numbers: a second run and three neighbours say.
+"""Compute how far a run is from the exact motion of its numbers, by a second run and neighbours.
 
-The error of the *steps* is the distance to a run at a fiftieth of the tolerance, or of equal steps
-half as long. The part of *round-off* is how far runs lie apart whose numbers differ by a unit in
-the last digit: these round differently, and their differences grow as rounding errors do.
+The error of the *steps* is the distance to a second run: one at a fiftieth of the tolerance, or one
+with equal steps half as long. The error of *round-off* is the spread of the run and of three
+neighbouring runs, whose numbers differ from those of the run by a unit in the last digit. Such runs
+round differently, and their differences grow as rounding errors do.
 """
 
 import dataclasses
@@ -26,42 +27,58 @@ from rigidjax.solve import difference, validation
 from rigidjax.solve.linear_map import as_known
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
 
-# Order 8 makes that 1.6 times the steps.
+# The tolerance of the second run relative to that of the first: a method of order 8 then takes 1.6
+# times as many steps.
 _CLOSER = 2e-2
-# The second run of a few steps would take the same ones: no step grows beyond ten times the last.
+# The second run ends a step at the ends of this many equal parts. Without these ends, a run of a
+# few steps would take the same steps again, since no step grows beyond ten times the last one.
 _CUTS = 8
-# Between its steps a run sees nothing: the law is looked at so many times, in so many parts of the
-# run. A change within a sample is so many times the median change of its part, or of the roundings.
+# A run sees nothing of the law between its stages. The law is therefore sampled, `_SAMPLES_OF_PART`
+# times in each of `_PARTS` parts of the run. A sample is sudden if its change is greater than
+# `_SUDDEN` times the median change of its part plus `_ROUGH` roundings.
 _PARTS, _SAMPLES_OF_PART, _SUDDEN, _ROUGH = 32, 512, 20.0, 1e3
-# Three deviations of four runs hold half of the true error in all but few of a thousand runs.
+# Three standard deviations of four runs (the run and its neighbours) are more than half of the true
+# error in all but a few of a thousand runs.
 _NEIGHBOURS, _DEVIATIONS = 3, 3.0
-# In float64 neighbours take at least this tolerance, for fewer steps.
+# In float64 the neighbours have at least this tolerance, so that they take fewer steps.
 _LOOSE = 1.5e-8
-# Half a radian, or half of the largest rate: errors do not add up any more.
+# Above half a radian, or half of the largest rate, errors do not add up any more.
 _LOST = 0.5
-# The size below which a number does not matter, as the defaults of `rtol` and `atol` have it.
+# The size below which a number does not matter: the ratio of `atol` to `rtol` in their defaults.
 _SMALL = 1e-3
-# Local errors and roundings grow alike. Round-off does not count where steps leave so many times
-# what roundings add up to without growth (of a function: nothing is known of its steps), at a
-# tolerance so far above a rounding.
+# The errors of single steps grow along a motion as roundings do. Round-off is therefore not
+# measured if the tolerance is above `_COARSE` roundings and the error of the steps is above
+# `_ABOVE` times what the roundings add up to without growth. Of a function nothing is known of its
+# steps: there the error of the steps has to be above `_PLAIN` roundings.
 _ABOVE, _PLAIN, _COARSE = 300.0, 1e6, 1e5
-# A search for a tolerance decreases it by so much at a time, and aims at so small a part of the
-# accuracy: errors follow the tolerance to a factor of eight. One above 0.1 rad does not.
+# A search for a tolerance multiplies it by no less than `_FARTHEST` from one run to the next, and
+# aims at the accuracy divided by `_AIM`: errors are proportional to the tolerance only to a factor
+# of eight, `_ALLOWED`. An error above `_FORESEEN` (0.1 rad) is not proportional to the tolerance,
+# and neither is the error of a run of fewer than `_FEW` steps.
 _FARTHEST, _AIM, _ALLOWED, _FORESEEN, _FEW = 1e-3, 20.0, 8.0, 0.1, 8
-# The least tolerances of a run, and of one to compare with, in roundings.
+# The least tolerance of a run that is searched for, and that of a run for comparison, in roundings.
 _FLOOR, _DEEPEST = 20.0, 4.0
 
 
 class Error(eqx.Module):
-    """How far each part of a state is from the exact motion of the given numbers: `Solution.error`.
+    """Hold the distance of each part of a state from the exact motion: `Solution.error`.
 
-    **Fields:** `ts` (T,) s; `steps`, `round_off` an array (T,) by name (`q`, `omega`, `x`, `v`,
-    `own.0`, …): of a quaternion the angle of the turn, rad, of others the length of the difference
-    (rad/s, m, m/s). `steps` is known to some percent (of `accuracy=`: too large by up to ten).
-    `round_off` is three standard deviations, and includes the effect of the last digits of body,
-    torque and start (in closed form also of the times); it is a bound if it is far below `steps`.
-    Both are NaN at times that the run did not reach, inf if a run for comparison did not. `sizes`
-    has the scale of each name: 1 rad, or the largest value in the run.
+    The exact motion is that of the given numbers of body, torque and start.
+
+    **Fields:**
+
+    - `ts`: (T,) s, the times of the states.
+    - `steps`: the error of the steps, one array (T,) for each name (`q`, `omega`, `x`, `v`,
+      `own.0`, …). For a quaternion it is the angle of the turn, rad; for other arrays it is the
+      length of the difference (rad/s, m, m/s). It is known to some percent (after `accuracy=` it is
+      too large by a factor of up to ten).
+    - `round_off`: the error of rounding, arrays by name as in `steps`: three standard deviations.
+      It includes the effect of the last digits of body, torque and start (in closed form also of
+      the times). Where it is far below `steps` it is a bound.
+    - `sizes`: the scale of each name: 1 rad for a quaternion, else the largest value in the run.
+
+    `steps` and `round_off` are NaN at times that the run did not reach, and inf at times that a run
+    for comparison did not reach.
 
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
     >>> error = rj.simulate(body, start, [0.0, 1.0, 20.0]).error
@@ -84,35 +101,44 @@ class Error(eqx.Module):
 
     @property
     def total(self) -> dict[str, Float[Array, " times"]]:
-        """Both parts together (T,), by name; inf where the state is `lost`."""
+        """Return the error of steps and round-off together (T,) by name; inf where `lost`."""
         both = jax.tree.map(jnp.hypot, self.steps, self.round_off)
         return jax.tree.map(lambda part: jnp.where(self.lost, jnp.inf, part), both)
 
     @property
     def relative(self) -> Float[Array, " times"]:
-        """The largest part (T,), rad, or relative to the largest value in the run."""
+        """Return the largest error of any name (T,), divided by its scale; inf where `lost`.
+
+        For a quaternion it is in rad, for others relative to the largest value in the run.
+        """
         return jnp.where(self.lost, jnp.inf, self._relative)
 
     @property
     def lost(self) -> Bool[Array, " times"]:
-        """Where nothing is known (T,): `relative` was above one half by then, as in chaos."""
+        """Return at which times (T,) the state is unknown, as in chaos.
+
+        It is unknown from the first time on at which the largest relative error is above one half.
+        """
         return lax.associative_scan(jnp.logical_or, self._relative > _LOST)
 
     @property
     def known_until(self) -> Float[Array, ""]:
-        """The last of `ts` at which the state is not lost, s."""
+        """Return the last of `ts` at which the state is not lost, s."""
         return self.ts[jnp.sum(~self.lost) - 1]
 
     @property
     def _relative(self) -> Array:
+        """Return the largest error of any name, divided by its scale, also where it is `lost`."""
         return _largest(jax.tree.map(jnp.hypot, self.steps, self.round_off), self.sizes)
 
 
 @eqx.filter_jit
 def error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None) -> Error:
-    """The error of the states `ys` that `setup` gave at `ts` in `count` steps.
+    """Return the error of the states `ys`, which the run `setup` gave at `ts` in `count` steps.
 
-    By another run `tried`, its tolerance and states, it is too large by up to ten.
+    The error of the steps is the distance to a second, closer run; a run in closed form has no such
+    error. `tried` has the tolerance and the states of an earlier, coarser run, if there is one: it
+    then takes the place of the second run, and the error is too large by a factor of up to ten.
     """
     setup, ts, ys, count, tried = _still((setup, ts, ys, count, tried))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
@@ -128,20 +154,27 @@ def error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None
 
 
 def _still(tree: Any) -> Any:
+    """Return the tree with its arrays held constant in derivatives."""
     return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_array(a) else a, tree)
 
 
 def _with_round_off(
     setup: Any, ts: Array, ys: Any, count: Array, steps: dict[str, Array], rtol: Array
 ) -> Error:
+    """Return the error of a run from that of its `steps`, and measure that of round-off.
+
+    Neighbouring runs measure the error of round-off. `rtol` is the tolerance of the run, and
+    `count` its number of steps.
+    """
     sizes, start = _sizes(ys), jax.tree.map(lambda leaf: leaf[0], ys)
     reached = jnp.isfinite(_largest(_apart(ys, ys), sizes))
-    # What rounding adds up to where nothing grows but the angle turned.
+    # What the roundings add up to, times `_ABOVE`, where nothing grows but the angle that the body
+    # has turned by.
     eps = float(jnp.finfo(ts.dtype).eps)
     plain = {name: _ABOVE * eps * count.astype(ts.dtype) ** 1.5 * sizes[name] for name in sizes}
     above = jnp.stack([(steps[name] > plain[name])[1:] for name in sizes])
     clear = jnp.all(above | ~reached[None, 1:]) & (rtol > _COARSE * eps)
-    # Then the neighbours take no step.
+    # Where round-off is not measured, the neighbours run from the start to the start: no step.
     times = jnp.where(clear, ts[0], ts)
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
     setup, ys, more = _cheaper(setup, start, times, ys, count)
@@ -155,7 +188,8 @@ def _with_round_off(
 
     rng = np.random.default_rng(0)
     near = jax.tree.map(lambda leaf: _nudged(leaf, rng, jnp.abs(leaf)), numbers)
-    # The closed form rounds its angle once, and numbers that differ may round to the same one.
+    # The closed form rounds its angle once, and different numbers may round to the same angle: the
+    # times of its neighbours differ, too.
     later = jnp.asarray(1.0 + eps * free * np.array([1.0, -1.0, 1.0]), ts.dtype)
     changes = more * jax.vmap(neighbour)(near, later)
     off = _lengths(start, _DEVIATIONS * jnp.sqrt(_spread(changes)))
@@ -169,9 +203,11 @@ def _with_round_off(
 
 
 def _cheaper(setup: Any, start: Any, ts: Array, ys: Any, count: Array) -> tuple[Any, Any, Any]:
-    """A set-up of fewer steps, its run, and what to multiply its round-off by.
+    """Return a set-up that takes fewer steps, its states, and the factor of its round-off.
 
-    Roundings grow alike at any tolerance; n of them add up to √n. float32 takes few steps anyway.
+    The round-off of the given set-up, which took `count` steps, is that of the new one times the
+    factor: roundings grow alike at any tolerance, and n of them add up to √n. A run in float32
+    takes few steps anyway, and is returned as it is, with the factor 1.
     """
     replayed = isinstance(setup, DiffraxRun) and setup.is_replayed
     if not replayed or ts.dtype == jnp.float32:
@@ -183,21 +219,23 @@ def _cheaper(setup: Any, start: Any, ts: Array, ys: Any, count: Array) -> tuple[
 
 
 def _apart(others: Any, ys: Any) -> dict[str, Array]:
-    """How far states are from others, part by part (T,)."""
+    """Return the distances of the states `ys` from the states `others`, (T,) by name."""
     return _lengths(jax.tree.map(lambda leaf: leaf[0], ys), jax.vmap(minus)(others, ys))
 
 
 def _lengths(state: Any, changes: Array) -> dict[str, Array]:
+    """Return the length of each named part of `changes`, which are changes of a state."""
     named = parts_by_name(state, changes).items()
     return {name.removeprefix("motion."): jnp.linalg.norm(part, axis=-1) for name, part in named}
 
 
 def largest_in_run(leaf: Array) -> Array:
-    """The largest length of an array of the states in the part of a run that it reached."""
+    """Return the largest length of an array (T, …) of states, over the times that a run reached."""
     return jnp.nanmax(jnp.linalg.norm(leaf.reshape(leaf.shape[0], -1), axis=-1))
 
 
 def _sizes(ys: Any) -> dict[str, Array]:
+    """Return the scale of each name: 1 rad for a quaternion, else the largest length in the run."""
     sizes = {}
     for name, leaf in zip(names(ys), jax.tree.leaves(ys), strict=True):
         name = name.removeprefix("motion.")
@@ -207,6 +245,7 @@ def _sizes(ys: Any) -> dict[str, Array]:
 
 
 def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
+    """Return the largest of the distances `apart` over all names, each divided by its scale."""
     return jnp.max(jnp.stack([apart[name] / sizes[name] for name in apart]), 0)
 
 
@@ -214,10 +253,11 @@ def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
 def solve_to(
     setup: DiffraxRun, state0: Any, ts: Array, accuracy: Array
 ) -> tuple[DiffraxRun, Any, Any]:
-    """Return a run with a global error of `accuracy`, if there is one.
+    """Return a run whose global error is below `accuracy`, if there is one.
 
-    The error of each run is its distance to the next, and decreases as the tolerance does.
-    **Returns** the set-up at its tolerance, its result, tolerance and states of the run before.
+    Runs are tried at smaller and smaller tolerances. The error of a run is its distance to the next
+    run, and decreases as the tolerance does. **Returns** the set-up at the tolerance found; what
+    `solve` returns for it; and the tolerance and the states of the run before it.
     """
     still = _still((setup, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
@@ -230,19 +270,20 @@ def solve_to(
 
     def closer(carry: Any) -> Any:
         (others, stats, _), _, before, rtol, ended = carry
-        # In a batch a body that is ready takes no step.
+        # In a batch, a body whose search has ended runs from the start to the start: no step.
         new = run(rtol, jnp.where(ended, ts[0], ts))
         off = jnp.nanmax(_largest(_apart(others, new[0]), _sizes(new[0]))[1:])
         wanted = before * still[3] / (_AIM * off)
         least = jnp.maximum(_FARTHEST * rtol, floor)
-        # A run that is lost foresees nothing, nor does one whose steps are not those of its
-        # tolerance: short runs end before their steps have grown so long.
+        # The error of a run that is lost says nothing of the next one. Neither does that of a run
+        # whose steps are not limited by its tolerance: a short run ends before its steps have grown
+        # so long.
         count, counted = (a["num_accepted_steps"].astype(ts.dtype) for a in (new[1], stats))
         more = (before / rtol) ** (1 / setup.solver.tableau.order)
         sound = (off < _FORESEEN) & (count >= _FEW) & (count >= 0.75 * more * counted)
         good = sound & (_ALLOWED * off * rtol <= before * still[3])
         following = jnp.where(sound, jnp.clip(wanted, least, jnp.maximum(rtol / 3, floor)), least)
-        # One that got nowhere will get nowhere.
+        # A run that reached none of the times will reach none at a smaller tolerance either.
         return new, (before, others), rtol, following, good | (rtol <= floor) | jnp.isnan(off)
 
     first = jnp.clip(jnp.sqrt(still[3]), 1e-6, 1e-4).astype(ts.dtype)
@@ -256,7 +297,7 @@ def solve_to(
 
 @eqx.filter_custom_jvp
 def _as_solved(setup: DiffraxRun, state0: Any, ts: Array, ys: Any) -> Any:
-    """The states, which `solve` has given: only derivatives run it once more."""
+    """Return the states `ys` that `solve` has given; only their derivatives run it once more."""
     return ys
 
 
@@ -268,25 +309,28 @@ def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
 
 
 def _with_tolerance(setup: DiffraxRun, rtol: Any) -> DiffraxRun:
-    """Return the set-up at another tolerance, `atol` as the defaults have it."""
+    """Return the set-up at another `rtol`, with `atol` in the ratio of the defaults."""
     return dataclasses.replace(setup, rtol=rtol, atol=_SMALL * rtol, throw=False)
 
 
 def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
-    """Return a time in each part of a run at which the law changes at once, else the start.
+    """Return a time for each part of a run: one at which the law changes suddenly, or the start.
 
     A pulse shorter than a step is passed over by every run in which no step ends within it. The law
-    is sampled in time, at one saved state for each part of the run; a sample is sudden where the
-    chord of its neighbours misses it far more than elsewhere in the part.
+    is therefore sampled in time, at one saved state for each part of the run. A sample is sudden if
+    its distance from the chord between its two neighbours is far greater than elsewhere in the
+    part. If the law does not depend on the time, no times are returned.
     """
     state0 = jax.tree.map(lambda leaf: leaf[0], ys)
     field = equations_of_motion(setup.body, state0, setup.torque)
     traced = jax.make_jaxpr(lambda t: field(t, state0, None))(ts[0]).jaxpr
     if not any(var is traced.invars[0] for equation in traced.eqns for var in equation.invars):
         return ts[:0]
-    # Uneven times: a pulse in every second of an even grid could fall between the samples.
+    # The samples are at uneven times: on an even grid, pulses that come once a second could all
+    # fall between the samples.
     uneven = np.random.default_rng(1).uniform(-0.25, 0.25, (_PARTS, _SAMPLES_OF_PART + 2))
-    # The first and last sample of a part are only neighbours: they are those of the next part.
+    # The first and the last sample of a part serve only as neighbours of others. Two adjacent parts
+    # therefore have two times in common.
     uneven[1:, :2] = uneven[:-1, -2:]
     number = _SAMPLES_OF_PART * np.arange(_PARTS)[:, None] + np.arange(_SAMPLES_OF_PART + 2) - 0.5
     share = np.clip((number + uneven) / (_PARTS * _SAMPLES_OF_PART), 0.0, 1.0)
@@ -311,9 +355,10 @@ def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
 
 
 def _closer(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
-    """Return the set-up of a closer run, the tolerance of the given one, their distance's factor.
+    """Return the set-up of a closer run, the tolerance of the given run, and a factor.
 
-    Steps of the closer run end at the `sudden` times, too.
+    The error of the given run is its distance to the closer run times the factor. Steps of the
+    closer run also end at the `sudden` times.
     """
     eps = float(jnp.finfo(ts.dtype).eps)
     most = None if setup.max_steps is None else 4 * setup.max_steps
@@ -341,16 +386,21 @@ def _closer(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
             "error: a second run needs a diffrax.PIDController or ConstantStepSize, got "
             f"{type(setup.controller).__name__}"
         )
-    # Of order 2; of a higher one it is a third too much at most.
+    # The factor is that of a method of order 2. For a method of higher order the error is then too
+    # large by a third at most.
     return dataclasses.replace(setup, dt0=0.5 * setup.dt0), jnp.zeros(()), 4 / 3
 
 
 class FunctionError(eqx.Module):
-    """A value and its derivative, with the error of each number: see `error_of`.
+    """Hold a value and its derivative, with the error of each number: see `error_of`.
 
-    **Fields:** `value`, and `derivative` by x, as `jax.grad` or `jax.jacfwd` have it;
-    `value_error` and `derivative_error` of their shapes, absolute. The latter holds what the
-    derivative misses of a difference of values.
+    **Fields:**
+
+    - `value`: the value of the function at x.
+    - `value_error`: the absolute error of the value, in its shape.
+    - `derivative`: the derivative with respect to x, as `jax.grad` or `jax.jacfwd` returns it.
+    - `derivative_error`: the absolute error of the derivative, in its shape. It includes what the
+      derivative misses of a difference of values.
 
     >>> rj.error_of(lambda x, **tolerances: x * x, 3.0).known
     Array(True, dtype=bool)
@@ -366,9 +416,9 @@ class FunctionError(eqx.Module):
 
     @property
     def known(self) -> Bool[Array, ""]:
-        """Whether the error of the derivative is below half of its length.
+        """Return whether the error of the derivative is below half of the derivative's length.
 
-        Where it is not, as in chaos, the derivative means nothing, finite or not.
+        If it is not, as in chaos, the derivative means nothing, even if it is finite.
         """
         size = jnp.linalg.norm(ravel_pytree(self.derivative)[0])
         return jnp.linalg.norm(ravel_pytree(self.derivative_error)[0]) < _LOST * size
@@ -381,27 +431,30 @@ def error_of(
     rtol: ScalarLike | None = None,
     atol: ScalarLike | None = None,
 ) -> FunctionError:
-    """Value and derivative of a function that runs through `simulate`, with their errors.
+    """Return the value and the derivative of a function that uses `simulate`, with their errors.
 
     **Arguments:**
 
-    - `f`: `f(x, rtol=…, atol=…) → array`, which hands both to every `simulate` in it (as
-      `**tolerances`). What does not depend on them, such as a closed form, has round-off alone.
-    - `x`: numbers, or a tree of them, all of one dtype. The derivative is taken in reverse mode
-      where the value is a scalar, else in forward mode.
-    - `rtol`, `atol`: those of the answer, by default those of `simulate`.
+    - `f`: a function `f(x, rtol=…, atol=…) → array`, which hands both tolerances to every
+      `simulate` in it (as `**tolerances`). A value that does not depend on them, such as that of a
+      closed form, has only the error of round-off.
+    - `x`: numbers, or a tree of numbers, all of one dtype. The derivative is taken in reverse mode
+      if the value is a scalar, else in forward mode.
+    - `rtol`, `atol`: the tolerances of the value and derivative that are returned; by default those
+      of `simulate`.
 
-    The second run has a fiftieth of them; where its distance is not far above round-off, three
-    more have the last digits of `x` changed (in a `vmap` always; zeros alone by those of 1). See
-    `Solution.error`. Each call compiles anew: put it into a `jax.jit` of your own to call it often.
+    A second run has a fiftieth of these tolerances. If its distance to the first is not far above
+    round-off (in a `vmap` always), three more runs have the last digits of `x` changed; an array of
+    zeros alone is changed by the last digits of 1. See `Solution.error`. Each call compiles anew:
+    put it into a `jax.jit` of your own to call it often.
 
-    Two more values lie beside `x` in a random direction, 5e-7 of each number away (5e-4 in
-    float32). Where their difference and the derivative do not agree, by more than the values are
-    unsure of, the derivative has this error, and a `UserWarning` says so: it misses what a switch
-    of a torque by time or state adds (`jnp.where`, `jnp.sign`), or a `stop_gradient`. Where `f`
-    refuses the numbers on one side (a flat body), the other side is taken, where on both, none.
-    Under `jit` it must take both. A pulse that all runs pass over is not seen here, see
-    `Solution.error`.
+    Two more values are computed on both sides of `x` in a random direction, 5e-7 of each number
+    away (5e-4 in float32). If their difference and the derivative disagree by more than the
+    uncertainty of the values, this is an error of the derivative, and a `UserWarning` says so. The
+    derivative then misses the effect of a torque that switches by time or state (`jnp.where`,
+    `jnp.sign`), or of a `stop_gradient`. If `f` refuses the numbers on one side of `x` (a flat
+    body), only the other side is used; if it refuses both sides, neither is used. Under `jit`, `f`
+    has to accept both. A pulse that all runs pass over is not noticed here: see `Solution.error`.
 
     **Returns** a `FunctionError`.
 
@@ -467,16 +520,21 @@ def error_of(
 
 
 def _spread(changes: Array) -> Array:
-    """The variance of runs that differ by so much from one more."""
+    """Return the variance over a run and its neighbours, which differ from it by `changes`."""
     mean = jnp.sum(changes, 0, keepdims=True) / (_NEIGHBOURS + 1)
     return (jnp.sum((changes - mean) ** 2, 0) + mean[0] ** 2) / _NEIGHBOURS
 
 
 def _nudged(leaf: Array, rng: np.random.Generator, size: Array) -> Array:
-    """Numbers changed by up to a unit in the last digit of `size`; what is symmetric stays so."""
+    """Return copies of `leaf`, one for each neighbour, that differ from it in the last digit.
+
+    Each number is changed by up to a unit in the last digit of its `size`. The change of a square
+    matrix is symmetric, so that a symmetric matrix stays symmetric.
+    """
     shape = (_NEIGHBOURS + 1) // 2, *leaf.shape
-    # Half a unit at least, and to both sides: a smaller change would often be rounded away, and a
-    # motion of many turns is a staircase of the last digits, which one side may not show.
+    # The change is half a unit at least, since a smaller one would often be rounded away. It goes
+    # to both sides: a motion of many turns is a staircase as a function of the last digits, and one
+    # side alone may not show a step of it.
     noise = rng.uniform(0.5, 1.0, shape) * rng.choice([-1.0, 1.0], shape)
     noise = np.concatenate([noise, -noise])[:_NEIGHBOURS]
     if leaf.ndim > 1 and leaf.shape[-1] == leaf.shape[-2]:

@@ -1,4 +1,4 @@
-"""Explicit Runge–Kutta methods of orders 4, 5 and 8 as solvers of diffrax."""
+"""Define explicit Runge–Kutta methods of orders 4, 5 and 8 as solvers of diffrax."""
 
 from typing import Any, ClassVar
 
@@ -19,7 +19,10 @@ from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
 
 
 class NestedInterpolation(dfx.AbstractLocalInterpolation):
-    """Dense output of a step by rows of `runge_kutta.nested`, its quaternion scaled to length 1."""
+    """Interpolate within a step by the polynomial `runge_kutta.nested`: the dense output.
+
+    `coefficients` are the rows of the polynomial. A quaternion is scaled to length 1.
+    """
 
     t0: Any
     t1: Any
@@ -27,6 +30,7 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
     coefficients: Any
 
     def evaluate(self, t0: RealLike, t1: RealLike | None = None, left: bool = True) -> Any:
+        """Return the state at the time `t0`, or, with `t1`, its change from `t0` to `t1`."""
         if t1 is not None:
             return jax.tree.map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
         length = self.t1 - self.t0
@@ -38,10 +42,11 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
 
 
 def onward(terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike) -> tuple[Array, Array]:
-    """The direction of a step, 1 or −1, and its length.
+    """Return the direction of a step, 1 or −1, and its length.
 
-    Backwards diffrax counts −t, so that `t1` is above `t0` all the same; only the control is
-    negative. A step is then one forwards, with slopes of the other sign: its stages are between.
+    Backwards in time diffrax counts −t, so that `t1` is above `t0` in both directions; only the
+    control `contr(t0, t1)` of the term is negative. A step backwards is then a step forwards with
+    slopes of the opposite sign, whose stages lie between `t0` and `t1`.
     """
     h = jnp.asarray(terms.contr(t0, t1))
     way = jnp.where(h < 0, -jnp.ones_like(h), jnp.ones_like(h))
@@ -49,12 +54,15 @@ def onward(terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike) -> tuple
 
 
 def cubic_rows(rise: Any, h: Any, left: Any, right: Any) -> tuple[Any, Any, Any]:
-    """F0, F1, F2 of the cubic with this `rise` over a step `h` and slopes `left` and `right`."""
+    """Return the rows F0, F1 and F2 of `runge_kutta.nested` for a cubic.
+
+    The cubic rises by `rise` over a step of the length `h`, with the slopes `left` and `right`.
+    """
     return rise, h * left - rise, 2 * rise - h * (left + right)
 
 
 class AbstractExplicit(dfx.AbstractAdaptiveSolver):
-    """All stages of `tableau` in a loop inside one step; subclasses name the tableau."""
+    """Take the steps of an explicit method, whose stages are a loop; a subclass has its tableau."""
 
     term_structure: ClassVar = dfx.ODETerm
     interpolation_cls: ClassVar = NestedInterpolation
@@ -92,9 +100,11 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
 
         step = Step(jnp.asarray(t0), h, jnp.asarray(t1), numbers)
         there = stages(self.tableau, field, [], step)
-        # Once, after the stages: inside them it changes the order (jaxsim#192).
+        # The quaternion is scaled to length 1 once, after the stages: inside the stages this would
+        # change the order of the method (jaxsim#192).
         y1 = project_to_group(tree(there.end))
-        # Derivatives hold the chosen steps constant: the error of a step is below the tolerance.
+        # Derivatives hold the lengths of steps constant. What this leaves out is the derivative of
+        # the error of a step, which is below the tolerance.
         sizes = [leaf.size for leaf in jax.tree.leaves(y0)]
         error = lax.stop_gradient(error_estimate(self.tableau, sizes, h, there.slopes))
         rows = dense_rows(self.tableau, field, step, there.slopes)
@@ -106,10 +116,10 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
 
 
 class RungeKutta4(AbstractExplicit):
-    """The classical Runge–Kutta method: order 4, four stages, an estimate of order 3.
+    """Solve by the classical Runge–Kutta method: order 4, four stages, an estimate of order 3.
 
-    For coarse tolerances (1e-3). A quaternion is scaled to |q| = 1 once per step, and in dense
-    output (cubic, as accurate as the steps).
+    It is for coarse tolerances (1e-3). A quaternion is scaled to |q| = 1 once per step, and in the
+    dense output, which is cubic and as accurate as the steps.
 
     Source: Kutta 1901; Hairer, Nørsett and Wanner (1993), II.1, doi:10.1007/978-3-540-78862-1.
 
@@ -125,9 +135,11 @@ class RungeKutta4(AbstractExplicit):
 
 
 class Tsitouras5(AbstractExplicit):
-    """Tsitouras' method of order 5, six stages, with an estimate of order 4.
+    """Solve by Tsitouras' method: order 5, six stages, an error estimate of order 4.
 
-    For tolerances about 1e-4 to 1e-6. Projection and dense output (quartic) as for `RungeKutta4`.
+    It is for tolerances from about 1e-4 to 1e-6. A quaternion is scaled to |q| = 1 once per step,
+    and in the dense output, which is quartic.
+
     Source: Tsitouras 2011, doi:10.1016/j.camwa.2011.06.002.
 
     >>> Tsitouras5().order(None)
@@ -138,10 +150,11 @@ class Tsitouras5(AbstractExplicit):
 
 
 class DormandPrince8(AbstractExplicit):
-    """The method DOP853 of order 8: twelve stages, estimates of orders 5 and 3.
+    """Solve by the method DOP853: order 8, twelve stages, error estimates of orders 5 and 3.
 
-    For everything smooth, from 1e-4 to round-off. Projection as for `RungeKutta4`; dense output of
-    degree 7 has three more stages, computed only where it is asked for.
+    It is for everything smooth, from tolerances of 1e-4 down to round-off. A quaternion is scaled
+    to |q| = 1 once per step, and in the dense output. The dense output is of degree 7 and has three
+    more stages, which are computed only where it is asked for.
 
     Source: Hairer, Nørsett and Wanner (1993), II.5 and II.6, doi:10.1007/978-3-540-78862-1; after
     Prince and Dormand 1981, doi:10.1016/0771-050X(81)90010-3.
@@ -154,7 +167,7 @@ class DormandPrince8(AbstractExplicit):
 
 
 def explicit(solver: AbstractExplicit | None) -> AbstractExplicit:
-    """The solver, `DormandPrince8` for `None`; `TypeError` for one that is not explicit."""
+    """Return the solver, or `DormandPrince8` for `None`; refuse a solver that is not explicit."""
     solver = DormandPrince8() if solver is None else solver
     wanted = "an explicit method of rigidjax.solvers"
     return _checks.require_instance(solver, AbstractExplicit, "solver", requirement=wanted)

@@ -1,4 +1,4 @@
-"""Lyapunov exponents: the long-term growth rates of small errors, in every direction."""
+"""Compute Lyapunov exponents: the long-term growth rates of small errors in every direction."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,17 +19,23 @@ from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.explicit import AbstractExplicit, explicit
 
-# Neighbouring intervals are not independent: the error is that of the means of so many parts.
+# Neighbouring intervals are not independent: the error of an exponent is that of the means over
+# this many parts of the run.
 _PARTS = 20
 
 
 class Exponents(eqx.Module):
-    """The result of `lyapunov_exponents`.
+    """Hold the result of `lyapunov_exponents`.
 
-    **Fields:** `values` (k,) 1/s, the largest first; `errors` (k,) one standard deviation of them,
-    from the differences between the means of twenty parts of the run, plus the sum of the steps'
-    tolerances; `times` (N,) the ends of the intervals, s; `running` (N, k) the values up to then;
-    `state` at the end; `result` a `diffrax.RESULTS`: `successful`, or why a run failed.
+    **Fields:**
+
+    - `values`: (k,) 1/s, the exponents, the largest first.
+    - `errors`: (k,) 1/s, one standard deviation of each exponent, from the differences between the
+      means over twenty parts of the run, plus the sum of the tolerances of all steps.
+    - `times`: (N,) s, the ends of the intervals after the transient.
+    - `running`: (N, k) 1/s, the exponents of the run up to each of these times.
+    - `state`: the state at the end of the run.
+    - `result`: a `diffrax.RESULTS`: `successful`, or the reason why a run failed.
 
     >>> still = lambda t, y, args: jnp.array([0.5, -1.0]) * y
     >>> lyapunov_exponents(still, jnp.zeros(2), 40.0, intervals=40, transient=20).running.shape
@@ -58,30 +64,37 @@ def lyapunov_exponents(
     atol: ScalarLike | None = None,
     max_steps: int = 100_000,
 ) -> Exponents:
-    """The spectrum of Lyapunov exponents along a motion, the largest first.
+    """Return the spectrum of Lyapunov exponents along a motion, the largest exponent first.
 
-    An orthonormal frame of tangents is solved along with the motion (continuous QR); the exponents
-    are the mean rates of its growth. Tangents of an attitude are small turns in body axes.
+    An orthonormal frame of tangent vectors is solved along with the motion (continuous QR), and the
+    exponents are the mean rates at which the vectors grow. Tangent vectors of an attitude are small
+    turns in body axes.
 
     **Arguments:**
 
-    - `field`: f(t, y, args), such as `rj.equations_of_motion(body, state0, torque)`, `scene.field`,
-      or your own on any array or Module of one dtype.
-    - `state0`: the state at `t0`; `time`: the length of the run, s.
-    - `number`: k, the number of exponents; `None` for all, 6 for an `Attitude`.
-    - `intervals`: N; the frame is made orthonormal to round-off after each.
-    - `transient`: intervals at the beginning that are not counted.
-    - `solver`, `rtol`, `atol`, `max_steps` (in an interval): as for `simulate`.
+    - `field`: a vector field `f(t, y, args)`: for example the result of
+      `rj.equations_of_motion(body, state0, torque)`, `scene.field`, or a function of your own on
+      any array or Module of one dtype.
+    - `state0`: the state at `t0`.
+    - `time`: the length of the run, s.
+    - `number`: k, the number of exponents; `None` computes all, which are 6 for an `Attitude`.
+    - `intervals`: the number of intervals of the run; after each, the frame is made orthonormal to
+      round-off.
+    - `transient`: the number of intervals at the beginning that are not counted.
+    - `t0`: the start of the run, s.
+    - `solver`, `rtol`, `atol`: as for `simulate`.
+    - `max_steps`: the largest number of steps in one interval.
 
-    Each conserved quantity, and the direction of the motion itself, gives a zero; it decreases as
-    (log t)/t, a trend that `errors` does not include: look at `running`.
+    Each conserved quantity gives an exponent of zero, and so does the direction of the motion
+    itself. In a run of the length t such an exponent decreases as (log t)/t, a trend that `errors`
+    does not include: look at `running`.
 
-    **Returns** an `Exponents`; NaN where a run fails: `result` says why.
+    **Returns** an `Exponents`. Its numbers are NaN if a run fails, and `result` says why.
 
     Source: Dieci, Russell and Van Vleck 1997, doi:10.1137/S0036142993247311; for orthonormal
     frames: Christiansen and Rugh 1997, doi:10.1088/0951-7715/10/5/004.
 
-    **Raises:** `TypeError`, `ValueError` for invalid numbers.
+    **Raises:** `TypeError` and `ValueError` for invalid arguments.
 
     >>> still = lambda t, y, args: jnp.array([0.5, -1.0]) * y
     >>> found = lyapunov_exponents(still, jnp.zeros(2), 40.0, intervals=40, transient=20)
@@ -125,7 +138,7 @@ def lyapunov_exponents(
 
 
 def _product(a: Array, b: Array) -> Array:
-    """`a @ b` of small matrices, which XLA fuses with the code around it."""
+    """Return the product `a @ b` of small matrices, which XLA fuses with the code around it."""
     return jnp.sum(a[:, :, None] * b[None], 1)
 
 
@@ -133,7 +146,11 @@ def _product(a: Array, b: Array) -> Array:
 def _solved(
     how: Any, field: Any, state0: Any, t0: Array, length: Array, rtol: Any, atol: Any
 ) -> Exponents:
-    # Whole numbers of Python are no arrays: `filter_jit` compiles for each.
+    """Return the exponents of `field` over the time `length` from `t0`.
+
+    `how` has the solver and the whole numbers of `lyapunov_exponents`.
+    """
+    # Whole numbers of Python are not arrays: `filter_jit` compiles anew for other numbers.
     solver, many, intervals, transient, max_steps = how
     state0 = project_to_group(state0)
     step = length / intervals
@@ -147,7 +164,8 @@ def _solved(
             both = (field(t, near, args), slope)
             return jax.jvp(minus_small, (near, y.motion), both)[1]
 
-        # Held orthonormal to second order: off that, the equations of a frame are unstable.
+        # The frame is held orthonormal to second order: the equations of a frame that is not
+        # orthonormal are unstable.
         frame = 1.5 * frame - 0.5 * _product(frame, _product(frame.T, frame))
         push = jax.linearize(rate, jnp.zeros(frame.shape[0], t.dtype))[1]
         pushed = jax.vmap(push, -1, -1)(frame)
@@ -158,7 +176,8 @@ def _solved(
     def interval(carry: Any, i: Array) -> Any:
         state, frame = carry
         ts = t0 + jnp.stack([i, i + 1]).astype(t0.dtype) * step
-        # Logarithms count from 1: `rtol` of them is then the same of what the tangents grow by.
+        # The logarithms of the growth begin at 1: `rtol` of a logarithm is then about `rtol` of the
+        # factor by which a tangent vector grows.
         start = Coupled(state, (frame, jnp.ones(many, t0.dtype)))
         run = adaptive(solver, along, ts, start, rtol=rtol, atol=atol, max_steps=max_steps)
         there = jax.tree.map(lambda leaf: leaf[-1], run.ys)
@@ -166,7 +185,8 @@ def _solved(
         off = run.num_steps.astype(t0.dtype) * (rtol * (1 + jnp.abs(logs - 1)) + atol)
         return (there.motion, jnp.linalg.qr(frame)[0]), (logs - 1, off, run.result)
 
-    # Any directions: along the axes they could be those of a part that nothing leaves.
+    # The first directions are random: along the axes they could lie in a part of the state space
+    # that no tangent vector leaves.
     shape = (dimension(state0), many)
     frame = jnp.linalg.qr(jax.random.normal(jax.random.key(0), shape, t0.dtype))[0]
     numbers = jnp.arange(intervals, dtype=jnp.int32)
@@ -179,7 +199,8 @@ def _solved(
     whole = count // _PARTS * _PARTS
     means = jnp.mean(rates[count - whole :].reshape(_PARTS, -1, many), axis=1)
     apart = jnp.var(means, axis=0, ddof=1) / _PARTS
-    # What the twenty equal parts leave out, up to 19 intervals at the start, counts whole.
+    # The twenty equal parts leave out up to 19 intervals at the start. The change of the mean by
+    # these intervals is added to the error in full.
     left = running[-1] - jnp.mean(means, axis=0)
     errors = jnp.sqrt(apart + left**2 + (jnp.mean(off[transient:], axis=0) / step) ** 2)
     first = jnp.argmax(jax.vmap(lambda result: result != dfx.RESULTS.successful)(results))

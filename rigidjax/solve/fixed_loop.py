@@ -1,7 +1,7 @@
-"""Fixed steps: the loop carries only a time, a step and the state's numbers.
+"""Solve with equal steps, in a loop that carries only a time, a step and the numbers of the state.
 
-`diffrax.diffeqsolve` can do more, at some cost in each step. There is no interpolation: the error
-at saved times is also the method's own.
+`diffrax.diffeqsolve` can do more, at some cost in each step. There is no interpolation here: the
+error at saved times is the method's own, as at the end of any step.
 """
 
 import functools
@@ -31,16 +31,22 @@ def fixed(
     substeps: Any,
     last: Any = None,
 ) -> Any:
-    """`substeps` fixed steps between each two times of `ts`.
+    """Solve a vector field with `substeps` equal steps between each two times of `ts`.
 
-    **Arguments:** `solver` a method of `rigidjax.solvers`; `field` a vector field `f(t, y, args)`
-    as of `equations_of_motion`; `ts` (T,) s; `y0` the state at `ts[0]`; `substeps` a whole number;
-    traced, it saves compiling again but has no reverse mode; `last` the index in `ts` at which to
-    stop, traced as well (no reverse mode): later times get `y0`; `None` goes to the end.
+    **Arguments:**
 
-    **Returns** the states at `ts`, with a leading time axis. Differentiable in both modes.
+    - `solver`: a method of `rigidjax.solvers`.
+    - `field`: a vector field `f(t, y, args)`, such as `equations_of_motion` returns.
+    - `ts`: (T,) s, the times of the states.
+    - `y0`: the state at `ts[0]`.
+    - `substeps`: a whole number. It may be traced: other numbers then do not compile again, but
+      there is no reverse mode.
+    - `last`: the index in `ts` at which to stop; later times get `y0`. It may be traced, and has no
+      reverse mode. `None` goes to the end.
 
-    **Raises:** `TypeError` for another solver, or as the solver does.
+    **Returns** the states at `ts`, with a leading time axis, differentiable in both modes.
+
+    **Raises:** `TypeError` for another solver, and the errors of the solver itself.
 
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), start)
@@ -70,7 +76,10 @@ def fixed(
 
 
 def first_rows(many: Any, one: Callable[..., Any], y: Any, rows: Any) -> Any:
-    """`rows` with the first `many`, which may be traced, that `one(y, i) → (y, row)` gives."""
+    """Return `rows` with the first `many` rows replaced by those that `one` returns.
+
+    `one(y, i) → (y, row)` takes the state `y` before row number `i`. `many` may be traced.
+    """
 
     def put(i: Array, now: tuple[Any, Any]) -> tuple[Any, Any]:
         y, row = one(now[0], i)
@@ -83,23 +92,30 @@ def first_rows(many: Any, one: Callable[..., Any], y: Any, rows: Any) -> Any:
 def step(
     stepper: AnyStepper, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None, before: int = 0
 ) -> Any:
-    """Step number `i` since `t0`, which has row `before + i` of the `inputs` by name."""
+    """Return the state after step number `i` since `t0`, which begins with the state `y`.
+
+    `h` is the length of each step. `inputs` has one array for each named input of the torque; the
+    step uses row `before + i` of each.
+    """
 
     def at(i: Array) -> Array:
-        # Adding h again and again would add up round-off (in a million steps 1e-3 in float32).
+        # Each time is computed from t0: a repeated sum of h would add up round-off (in a million
+        # steps to 1e-3 in float32).
         return t0 + i.astype(h.dtype) * h
 
     now = jax.tree.map(lambda a: _row(a, before + i), inputs)
     if not stepper.delays:
         return stepper.step(at(i), at(i + 1), h, y, now)
-    # A delayed input changes inside the step: one part up to each change, one to the end.
+    # A delayed input changes inside the step. The step is therefore taken in parts: one up to the
+    # change of each delayed input, and one to the end.
     parts, early, late = delayed_rows(stepper.delays, h, i, inputs, before)
     edges = jnp.concatenate([jnp.zeros(1, h.dtype), jnp.sort(parts), jnp.ones(1, h.dtype)])
 
     def part(y: Any, ends: tuple[Array, Array]) -> tuple[Any, None]:
         left, right = ends
-        # By its end: a part without length, of a delay of whole steps, still has the early value,
-        # by which the derivative with respect to the delay is multiplied.
+        # The end of a part decides which value it has. If a delay is a whole number of steps, the
+        # part before the change has the length 0, but still has the early value: the derivative
+        # with respect to the delay is multiplied by it.
         values = [jnp.where(right <= p, a, b) for p, a, b in zip(parts, early, late, strict=True)]
         t, end = at(i) + left * h, jnp.where(right == 1, at(i + 1), at(i) + right * h)
         return stepper.step(t, end, (right - left) * h, y, InputRow(now, tuple(values))), None
@@ -110,7 +126,11 @@ def step(
 def delayed_rows(
     delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: Any, before: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """The place in step `i`, from 0 to 1, where each delayed input changes (m,); its two values."""
+    """Return where in step `i` each delayed input changes (m,), and its values before and after.
+
+    The place of a change is from 0, the start of the step, to 1, its end. `delays` has the name and
+    the delay, s, of each of the m delayed inputs; `h`, `inputs` and `before` are as for `step`.
+    """
     parts, early, late = [], [], []
     for name, delay in delays:
         steps = delay.astype(h.dtype) / h
@@ -123,7 +143,7 @@ def delayed_rows(
 
 
 def first_row(law: Any, h: Array, inputs: Any) -> Any:
-    """The inputs of a torque at the start of their first row, for `bind`."""
+    """Return the inputs of the torque `law` at the start of their first row, for `bind`."""
     delays = delays_of(law)
     now = jax.tree.map(lambda a: a[0], inputs)
     if not delays:
@@ -134,15 +154,17 @@ def first_row(law: Any, h: Array, inputs: Any) -> Any:
 
 
 def _row(a: Array, i: Any) -> Array:
+    """Return row `i` of `a`; the first row before it, and the last row after it."""
     return lax.dynamic_index_in_dim(a, jnp.clip(i, 0, a.shape[0] - 1), 0, keepdims=False)
 
 
 def march(
     stepper: AnyStepper, h: Array, t0: Array, first: Array, count: int, y: Any, inputs: Any = None
 ) -> Any:
-    """`count` steps from number `first` on; `inputs` as for `step`.
+    """Return the state after `count` steps from step number `first` on, which begin with `y`.
 
-    In reverse mode the states at the starts of √count pieces are kept, and those in one piece.
+    `h`, `t0` and `inputs` are as for `step`. In reverse mode the steps are in about √count pieces:
+    the states at the starts of all pieces are kept, and the states within one piece at a time.
     """
     if platform() != "cpu":
         return in_pieces(lambda y, i: step(stepper, h, t0, i, y, inputs), first, count, y)

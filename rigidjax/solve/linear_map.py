@@ -1,7 +1,7 @@
-"""A linear function with its own transpose: `jax.custom_vjp` has no forward mode.
+"""Define a linear function together with its transpose: `jax.custom_vjp` has no forward mode.
 
-The rule for tangents is a primitive that knows both directions, so that `jax.jvp`, `jax.vjp`,
-`jax.vmap` and forward over reverse all go through a loop of unknown length.
+The rule for tangents is a primitive that knows the function and its transpose. With it `jax.jvp`,
+`jax.vjp`, `jax.vmap` and forward over reverse mode all work for a loop of unknown length.
 """
 
 from collections.abc import Callable
@@ -25,9 +25,11 @@ _ZERO: Any = ad.Zero
 
 
 def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) -> Arrays:
-    """`function(*given, *tangents)`, linear in these; its transpose is `transposed(*given, *bars)`.
+    """Return `function(*given, *tangents)`, a map linear in `tangents` that has its own transpose.
 
-    Neither may close over tracers. Derivatives by `given` are taken in forward mode only.
+    `transposed(*given, *bars)` returns the cotangents of `tangents` from those of the results.
+    Neither function may close over tracers. Derivatives with respect to `given` exist in forward
+    mode only.
     """
     outs = jax.eval_shape(lambda g, t: function(*g, *t), given, tangents)
     inputs, results = (
@@ -39,9 +41,9 @@ def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) 
 
 
 def as_known(known: Any, moved: Any) -> Any:
-    """The numbers `known` with the derivatives, of every order, of the same computed anew.
+    """Return the numbers `known` with the derivatives, of every order, of the numbers `moved`.
 
-    These may be NaN, and their derivatives, too.
+    `moved` are the same numbers computed once more. They may be NaN, and so may their derivatives.
     """
     return jax.tree.map(_known, known, moved)
 
@@ -57,10 +59,11 @@ def _known_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any
 
 
 def nan_derivatives(tree: Any, inputs: Any) -> Any:
-    """The same numbers; one that is not finite has NaN derivatives by `inputs`, in both modes.
+    """Return `tree`, of which a number that is not finite has NaN derivatives in both modes.
 
-    A state that a run did not reach is NaN by a `where`, whose derivative is 0: a wrong one. A
-    number that is not used has the cotangent 0 and leaves the gradient of the others as it is.
+    The derivatives are those with respect to `inputs`. A state that a run did not reach is NaN by a
+    `where`, whose derivative would be 0, which is wrong. A number that is not used has the
+    cotangent 0, and leaves the gradient of the other numbers as it is.
     """
     smooth, rest = eqx.partition(tree, eqx.is_inexact_array)
     outs, structure = jax.tree.flatten(smooth)
@@ -108,6 +111,7 @@ def _abstract(*_: Any, results: Any, **__: Any) -> Any:
 def _differentiated(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...], **params: Any
 ) -> Any:
+    """Return the results of the primitive and their tangents: its rule for forward mode."""
     number, function = params["number"], params["function"]
     out, parts = _linear_map.bind(*primals, **params), []
     moving = [not isinstance(t, ad.Zero) for t in tangents]
@@ -134,7 +138,7 @@ def _differentiated(
 
 
 def refuse(*_: Any) -> Arrays:
-    """The transpose of what has none."""
+    """Raise `TypeError`, in the place of the transpose of a map that has no transpose."""
     raise TypeError(
         "second derivatives through a solver are forward over reverse: wanted "
         "jax.jacfwd(jax.grad(f)) or jax.hessian(f), got reverse mode over a derivative, such as "
@@ -143,6 +147,7 @@ def refuse(*_: Any) -> Arrays:
 
 
 def _transposed(cotangents: Any, *args: Any, **params: Any) -> Any:
+    """Return the cotangents of the primitive's arguments: its rule for reverse mode."""
     number = params["number"]
     given = args[:number]
     if any(ad.is_undefined_primal(g) for g in given):
@@ -157,6 +162,7 @@ def _transposed(cotangents: Any, *args: Any, **params: Any) -> Any:
 
 
 def _batched(args: Any, dims: Any, **params: Any) -> Any:
+    """Return the results of the primitive on a batch, and their batch axes: its rule for `vmap`."""
     number = params["number"]
     size = next(a.shape[d] for a, d in zip(args, dims, strict=True) if d is not None)
     given, own = args[:number], dims[:number]
