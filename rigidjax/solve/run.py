@@ -47,7 +47,7 @@ _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 class ClosedFormRun(eqx.Module):
     """Hold the set-up of a run of a free body in closed form.
 
-    The state at one time costs the same at any time of the run.
+    The cost of a state is the same at any time of the run.
     """
 
     body: Inertia | MassProperties
@@ -292,10 +292,7 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
 
 @eqx.filter_jit
 def _end_of(setup: DiffraxRun, state0: Any, ts: Array) -> Any:
-    """Return the time and state at the end of a run, the length of the next step, and the count.
-
-    The count is that of the steps taken.
-    """
+    """Return time, state and length of the next step at the end of a run, and its step count."""
     state0 = with_own_states(setup.body, project_to_group(state0), setup.torque, ts[0])
     *_, stats, _, end = _integrated(setup, None, state0, ts)
     return *end, stats["num_steps"]

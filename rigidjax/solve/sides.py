@@ -76,7 +76,8 @@ class Sided(eqx.Module):
 def _declares(node: Any) -> bool:
     """Return whether a law declares jumps of its own.
 
-    A law of this package does if it has jumps, a law of the user if it has `jump_times`, even none.
+    A law of this package does if it has jumps; a law of a user does if it has the member
+    `jump_times`, even if that is empty.
     """
     if isinstance(node, type) or not hasattr(node, "jump_times"):
         return False

@@ -91,8 +91,8 @@ AnyStepper = Stepper | Carrying
 def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) -> AnyStepper:
     """Return the stepper of a vector field under `solver` (`None`: the cheapest).
 
-    `y0` is the state at the start. For a `count` of many steps, or one that is traced, it is a
-    `Carrying`.
+    `y0` is the state at the start. For a `count` of many steps, or one that is traced, the stepper
+    is a `Carrying`.
     """
     stepper = _stepper_of(solver, field, y0)._replace(delays=tuple(delays_of(field)))
     return Carrying(stepper) if not isinstance(count, int) or count >= _MANY else stepper
