@@ -26,9 +26,10 @@ from rigidjax.rotation.linalg3 import apply, solve
 
 
 class _Changing(eqx.Module):
-    """Compute the derivative of a state with Ω̃, from the time and the state with the body rate Ω.
+    """Compute the derivative of a state of the run from the time and the state with its body rate.
 
-    `body` has the inertia I₀, and `law` gives the inertia I at any time.
+    A state of the run has Ω̃ in the place of the body rate Ω (see the module). `body` has the
+    inertia I₀, and `law` gives the inertia I at any time.
     """
 
     body: Any
@@ -46,9 +47,10 @@ class _Changing(eqx.Module):
 
 
 class ByMomentum(eqx.Module):
-    """Compute the derivative of a state with Ω̃ in the place of Ω, and convert one to the other.
+    """Compute the derivative of a state of the run by momentum, and convert states to and from it.
 
-    `enter` replaces Ω by Ω̃, and `leave` replaces Ω̃ by Ω.
+    A state of the run has Ω̃ = I₀⁻¹ p in the place of the body rate Ω (see the module). `enter`
+    replaces Ω by Ω̃, and `leave` replaces Ω̃ by Ω.
     """
 
     field: Any  # a `_Changing`, or the `CoupledEquations` of one
@@ -57,11 +59,11 @@ class ByMomentum(eqx.Module):
         return self.field(t, self.leave(t, y))
 
     def enter(self, t: Any, y: Any) -> Any:
-        """Return the state with Ω̃ for the state `y` with the body rate Ω, at the time `t`, s."""
+        """Return the state of the run for the state `y` with its body rate, at the time `t`, s."""
         return self._with_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
 
     def leave(self, t: Any, y: Any) -> Any:
-        """Return the state with the body rate Ω for the state `y` with Ω̃, at the time `t`, s."""
+        """Return the state with its body rate for the state `y` of the run, at the time `t`, s."""
         return self._with_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
 
     def _with_rate(self, y: Any, rate: Any, t: Any) -> Any:
@@ -76,7 +78,7 @@ class ByMomentum(eqx.Module):
 
 
 def by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
-    """Return the equations for states with Ω̃ if the inertia is a function of time, else `None`.
+    """Return the equations by momentum if the inertia is a function of time, else `None`.
 
     `state0` is the state at the start, with the body rate; `torque` is that of `simulate`.
     """
@@ -94,7 +96,7 @@ def changing(torque: Any) -> ChangingInertia | None:
 
 
 def with_body_rates(form: ByMomentum | None, ts: Array, ys: Any) -> Any:
-    """Return the states `ys` of a run, saved at the times `ts` (T,), s, with their body rates Ω.
+    """Return the states `ys` of a run, saved at the times `ts` (T,), s, with their body rates.
 
     `form` are the equations of the run, or `None` if its states have the body rate already.
     """

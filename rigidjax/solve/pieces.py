@@ -118,9 +118,8 @@ class _Program:
         return lax.scan(whole, sums, (rows, firsts), reverse=True)[0]
 
     def pieces(self, first: Array) -> tuple[Array, int, int]:
-        """Return the number of the first step of each piece, and two more numbers.
-
-        These are the length of a piece and the number of steps that are left over.
+        """Return the number of the first step of each piece, the number of steps in a piece, and
+        the number of steps that are left over.
         """
         length = piece_length(self.count)
         many, left = divmod(self.count, length)

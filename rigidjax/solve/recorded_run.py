@@ -146,11 +146,12 @@ Moving = tuple[list[bool], list[bool]]
 def _again(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> tuple[Method, Arrays, Run, Record, Arrays]:
-    """Return the method, constants, run and record of a run to be taken once more, and a list.
+    """Return the method, constants, run and record of a run that is to be taken once more, and the
+    tangents or cotangents that are to be carried along.
 
-    The constants are those that have tangents, one copy for each body; the field of the method
-    takes these alone. `each` begins with the numbers of the run and the arrays of its record, and
-    ends with tangents or cotangents: the list returned.
+    The constants are those that `moving` selects, one copy for each body; the field of the method
+    takes these alone. `each` holds in a row the numbers of the run, the arrays of its record, and
+    the tangents or cotangents.
     """
     whole = trees[0].num_leaves
     one = method.field

@@ -124,7 +124,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             t0, _stops(controlled_by, t0, t1), between, y0, lax.stop_gradient(first),
             None if event is None else init_state.result,
         )  # fmt: skip
-        # What ends a run has no derivative.
+        # The condition and the controller, which can end a run, have no derivative.
         smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
         ys, end = states_of(method, smooth, constants, state, run)
         if order is not None:
@@ -137,7 +137,7 @@ class _Control(NamedTuple):
     """Hold a step controller with its progress meter, and call it after a step of one body."""
 
     static: Any  # controller, progress meter and `args`, without their arrays
-    arrays: Callable[[Arrays], Any]  # these, of the constants
+    arrays: Callable[[Arrays], Any]  # takes these arrays from the constants of the run
     tree: Callable[[Array], Any]  # makes of the numbers of a state what the controller takes
     order: Any  # of the error of a step
 

@@ -98,7 +98,10 @@ class DiffraxRun(eqx.Module):
 
 
 class Ends(eqx.Module):
-    """Evaluate, for `diffrax.Event`, the condition such as a collision that ends a scene's run."""
+    """Evaluate the condition that ends the run of a scene, such as a collision.
+
+    `diffrax.Event` calls it.
+    """
 
     scene: Any  # has ends(t, state) → bool and end_words(t, state) → str
 
@@ -135,7 +138,10 @@ def equations_of_motion(
 
 
 def direction(times: Array) -> Int[Array, ""] | None:
-    """Return the sign of the last of the `times` minus the first; `None` if it is known to be 1."""
+    """Return the sign of the change from the first to the last of the `times`.
+
+    It is `None` if it is known to be 1.
+    """
     ends = _checks.namespace(times).asarray(times)
     change = ends[-1] - ends[0]
     if _checks.is_known(times) and change > 0:
@@ -273,7 +279,7 @@ def refuse(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
 
 
 def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) -> None:
-    """Warn if a law switches by the time more often than steps can end at its switches."""
+    """Warn if a law has switches in time at more times than steps can end at."""
     missed = stats.get("switches_missed", False)
     if not _checks.is_known((missed, state0, ts)) or not np.any(np.asarray(missed)):
         return

@@ -1,4 +1,4 @@
-"""Evaluate each part of a torque that declares its jumps on the side of them where a step is.
+"""Evaluate each part of a torque that jumps on that side of its jumps on which a step lies.
 
 Two parts that jump at the same time have two stops, at which steps end, one a little after the
 other. Between the two stops the first part has its new value and the other part its old one, so
@@ -24,7 +24,7 @@ _OWN = (Held, Linear, Pulses, Tabulated, Delayed, Lagged)
 
 
 class Sided(eqx.Module):
-    """Evaluate a law on the side of its jumps where a step is.
+    """Evaluate a law on that side of its jumps on which a step lies.
 
     `jumps` (n,), s, are the times at which the law jumps, and `stops` (n,), s, the times at which
     steps end for them, at most some units of round-off away; `None` if the two are equal. `sign` is

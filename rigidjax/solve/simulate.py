@@ -224,7 +224,7 @@ def _adjoint(setup: DiffraxRun) -> dfx.AbstractAdjoint:
 
 
 def _accurate(setup: DiffraxRun, event: Any, state0: Any, times: Array, accuracy: Any) -> Solution:
-    """Return the solution, with its error, of a run with the tolerance that `accuracy` needs."""
+    """Return the solution, with its error, of a run whose tolerance gives the `accuracy`."""
     found, run, tried = solve_to(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
     sol = _solution(found, event, state0, times, None if event is not None else run)

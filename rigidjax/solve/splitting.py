@@ -164,14 +164,15 @@ class AbstractSplitting(dfx.AbstractSolver):
 
 
 class Splitting2(AbstractSplitting):
-    """Solve to order 2 by half a kick, the exact free motion, and half a kick (Strang).
+    """Solve the rotation to order 2 by half a kick, the exact free motion, and half a kick.
 
     This solver is for long runs with fixed steps, under torques that are small against the free
     motion and depend on time and attitude, not on the body rate. The error of the energy stays
     bounded, but not with an adaptive controller; there is no error estimate. The attitudes of dense
     output are on the group, and have the order of the method.
 
-    Source: Strang 1968, doi:10.1137/0705041, with the free flow of `rigidjax.exact.free_body`.
+    Source: Strang's splitting (1968), doi:10.1137/0705041, with the free flow of
+    `rigidjax.exact.free_body`.
 
     >>> import diffrax
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
@@ -185,7 +186,7 @@ class Splitting2(AbstractSplitting):
 
 
 class Splitting4(AbstractSplitting):
-    """Solve to order 4 by seven kicks and six free flows, in long runs.
+    """Solve the rotation to order 4 by seven kicks and six free flows, in long runs.
 
     See `Splitting2` for the conditions.
 
@@ -199,7 +200,7 @@ class Splitting4(AbstractSplitting):
 
 
 class Splitting6(AbstractSplitting):
-    """Solve to order 6 by twelve kicks and eleven free flows, in long runs.
+    """Solve the rotation to order 6 by twelve kicks and eleven free flows, in long runs.
 
     See `Splitting2` for the conditions.
 

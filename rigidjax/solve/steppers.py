@@ -1,4 +1,4 @@
-"""Make the fixed step of a method for a body and a torque, as a loop can call it.
+"""Make the fixed step of a method for a body and a torque, in a form that a loop can call.
 
 The numbers of a state are carried one by one (see `components`), but torques are called on arrays.
 For a body that turns, the momentum Π = IΩ is carried instead of the body rate Ω, which makes each
@@ -42,7 +42,7 @@ _MANY = 10_000
 
 
 class Stepper(NamedTuple):
-    """Hold the numbers y at the start of one body, their change in a step, and their state.
+    """Hold the fixed steps of one body: the numbers y at the start, their change, and their state.
 
     A step goes from the time `t` to `end`, s, and has the length `h`, s.
     """

@@ -23,7 +23,7 @@ from rigidjax.solve.switching_times import by_sides, separated, times_of
 
 
 def say_unseen(analysis: Analysis) -> None:
-    """Warn of each comparison with the time whose switches cannot be searched for."""
+    """Warn of each line of a law that may switch at times that cannot be searched for."""
     for line in dict.fromkeys(analysis.unseen):
         warnings.warn(
             f"simulate: a law may jump at a time that is not found before the run ({line}): steps "
@@ -55,7 +55,7 @@ class Traced(NamedTuple):
 
 
 def traced(function: Callable[..., Any], *like: Any) -> Traced:
-    """Return the function, traced once for arguments with the shapes and dtypes of `like`."""
+    """Return the `Traced` of a function for arguments with the shapes and dtypes of `like`."""
     closed, out = jax.make_jaxpr(function, return_shape=True)(*like)
     return Traced(closed, jax.tree.structure(out))
 

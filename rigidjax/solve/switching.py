@@ -1,4 +1,4 @@
-"""Find the times at which a vector field switches by the time, from its traced program.
+"""Find in the traced program of a vector field where it switches at times that no state decides.
 
 A law that a user writes, such as `jnp.where(t < self.te, push, 0.0)`, declares no `jump_times`, but
 the program of the field holds its comparison. If the comparison depends on the time and on no
@@ -115,7 +115,7 @@ class Switch(NamedTuple):
 
     @property
     def most(self) -> int:
-        """Return the most changes of one element that only rises or only falls."""
+        """Return the largest number of changes of an element that only rises or only falls."""
         return MOST if self.node.name in _LEVELS else 1
 
     @property
@@ -142,7 +142,7 @@ class Analysis(NamedTuple):
     # Kinks that are too many for a step to end at each; they serve the search for bent switches.
     kinks: list[Switch]
     by_state: list[str]  # the lines that switch by the state
-    unseen: list[str]  # the lines that may switch by the time where it cannot be searched for
+    unseen: list[str]  # the lines that may switch at times that cannot be searched for
 
 
 def _bodies(params: dict[str, Any]) -> Iterator[tuple[Any, Any]]:

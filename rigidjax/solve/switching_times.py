@@ -35,9 +35,10 @@ _GRID = 4096  # points of the grid on which a bent switch is searched for
 
 
 def _gap(switch: Switch, x: Any, *rest: Any) -> Any:
-    """Return the gap of each element of a switch, which is zero or whole where the element changes.
+    """Return the gap of each element of a switch.
 
-    `x` and `rest` are the operands of the equation, and its result.
+    The gap is zero, or a whole number, where the element changes. `x` and `rest` are the operands
+    of the equation, and its result.
     """
     name = switch.node.name
     if name == "clamp":
@@ -116,7 +117,7 @@ _Places = tuple[Array, Array, Array, Array]
 
 
 def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times:
-    """Find the times t, a < t ≤ b, s, at which the switches of a field change."""
+    """Find the times after a and until b, s, at which the switches of a field change."""
     start, end = lax.stop_gradient((a, b))
     # A switch that changes within some round-off of the start is taken to have changed before it.
     start = start + 8 * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end - start))
@@ -230,9 +231,10 @@ def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array
 def _halved(
     watched: list[_Watched], edges: Any, elements: Any, bases: list[Array], levels: Any
 ) -> list[Array]:
-    """Return, for each switch, the times (k,) from which its elements differ from their bases.
+    """Return, for each switch, the times (k,) at which its elements leave their `bases`.
 
-    They differ by at least the `levels`; the times are searched for between the `edges`.
+    An element leaves its base when it first differs from the base by its level. The times are found
+    by halving the intervals between the `edges`.
     """
 
     def half(_: Any, edges: Any) -> Any:

@@ -45,7 +45,7 @@ def _rows(text: str) -> tuple[Row, ...]:
 
 
 def numbers(text: str) -> tuple[float, ...]:
-    """Return the numbers of a table."""
+    """Return the numbers of a text, which are separated by spaces."""
     return tuple(map(float, text.split()))
 
 

@@ -261,7 +261,7 @@ def start(state0: Any, throw: bool) -> Any:
 
 
 def _guard(value: Array, bad: Any, message: str, throw: bool) -> Array:
-    """Return the value, or raise an error with this message if it is `bad`.
+    """Return the `value`, or raise an error with the `message` if it is `bad`.
 
     With `throw=False` a traced bad value becomes NaN instead: one bad body in a batch must not end
     the run of the others.
