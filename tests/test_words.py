@@ -18,6 +18,7 @@ ROOMS = (
     "datasets",
     "workprecision",
     "batch",
+    "solve",
 )
 FILES = [
     *PACKAGE.glob("*.py"),
@@ -25,9 +26,9 @@ FILES = [
 ]
 VERBS = frozenset(
     """
-    Add Apply Attract Call Check Compare Compute Connect Convert Copy Define Delay Derive Describe Draw Evaluate Find Follow Give
-    Handle Hold Import Integrate Interpolate Make Map Measure Name Normalise Prepare Present Print Provide Raise Read Refuse Return
-    Reverse Run Scale Set Share Show Simulate Solve Sort Store Sum Take Turn Wrap Write Yield
+    Add Apply Attract Call Check Choose Compare Compute Connect Control Convert Copy Define Delay Derive Describe Draw Evaluate Find Follow Give
+    Handle Hold Import Integrate Interpolate Locate Make Map Measure Name Normalise Prepare Present Print Provide Raise Read Refuse Return
+    Reverse Run Scale Set Share Show Simulate Solve Sort Store Sum Take Turn Warn Wrap Write Yield
     """.split()
 )
 
