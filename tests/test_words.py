@@ -22,6 +22,7 @@ ROOMS = (
     "elliptic",
     "tumblers",
     "cli",
+    "solve",
 )
 FILES = [
     *PACKAGE.glob("*.py"),
@@ -35,6 +36,7 @@ VERBS = frozenset(
     Estimate Fit Minimise
     Estimate Fit Identify Join Predict Warn
     Add Apply Attract Broadcast Call Check Compare Compute Connect Convert Copy Define Delay Derive Describe Draw Evaluate Find Follow Give
+    Add Apply Attract Call Check Choose Compare Compute Connect Control Convert Copy Define Delay Derive Describe Draw Evaluate Find Follow Give
     Handle Hold Import Integrate Interpolate Locate Make Map Measure Name Normalise Prepare Present Print Provide Raise Read Refuse Return
     Reverse Run Scale Set Share Show Simulate Solve Sort Store Sum Take Turn Warn Wrap Write Yield
     """.split()

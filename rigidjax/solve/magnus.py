@@ -1,6 +1,7 @@
-"""A step of order 4 for torques that do not depend on the attitude.
+"""Solve the rotation of a body by steps of order 4, for torques that do not read the attitude.
 
-Four Runge–Kutta stages of the body rate alone; then one turn by the exponential of Magnus' series.
+A step takes four Runge–Kutta stages of the body rate alone. It then turns the body once, by the
+exponential of Magnus' series.
 """
 
 from collections.abc import Callable
@@ -29,11 +30,20 @@ def change_and_turn(
     slope: Callable[[Any, Triple], Triple], rate: Callable[[Triple], Triple],
     t: Any, end: Any, h: Array, p: Triple,
 ) -> tuple[Triple, Four]:  # fmt: skip
-    """How momentum (or rate) `p` changes in a step from `t` to `end`, and the body turns in it.
+    """Return the change of the momentum (or body rate) `p` in a step, and the turn of the body.
 
-    **Arguments:** `slope(t, p)` dp/dt; `rate(p)` Ω; `h` the step, s. The rotation vector of the
-    step is `∫Ω dt + h²/12 Ω(t) × Ω(t+h)`, the integral by Simpson's rule with the middle of the
-    cubic through both ends. Source: Magnus 1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas,
+    The turn is a quaternion, scalar first, from which the identity (1, 0, 0, 0) is subtracted.
+
+    **Arguments:**
+
+    - `slope(t, p)`: the derivative dp/dt.
+    - `rate(p)`: the body rate Ω, rad/s, that belongs to `p`.
+    - `t`, `end`, `h`: the times at which the step begins and ends, s, and its length, s.
+    - `p`: the momentum, or the body rate, at the time `t`.
+
+    The rotation vector of the step is `∫Ω dt + h²/12 Ω(t) × Ω(t+h)`. Simpson's rule gives the
+    integral; its value at the middle of the step is that of the cubic through `p` and its
+    derivative at both ends. Source: Magnus 1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas,
     Nørsett and Zanna 2000, doi:10.1017/S0962492900002154, section 5.
     """
     change, first = change_and_slope(KUTTA4, slope, t, h, p, end)
@@ -49,7 +59,8 @@ def change_and_turn(
         for a, b, c, d in zip(left, between, right, cross(left, right), strict=True)
     )
     half = barrier(half)
-    # Short series: a step that turns by more than a radian has no digits to lose.
+    # The series of cos a − 1 and sin a / a, where a is half the angle of the turn, may be short: a
+    # step that turns the body by more than a radian has no correct digits that they could lose.
     x = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
     c = x * (-1 / 2 + x * (1 / 24 + x * (-1 / 720 + x * (1 / 40320))))
     s = 1.0 + x * (-1 / 6 + x * (1 / 120 + x * (-1 / 5040 + x * (1 / 362880))))
@@ -57,11 +68,12 @@ def change_and_turn(
 
 
 class Magnus4(dfx.AbstractSolver):
-    """Order 4 with fixed steps, for free bodies and torques of time and body rate only.
+    """Solve the rotation of a body, free or under torques of time and body rate, to order 4.
 
-    It does less work, with a smaller error, than `rigidjax.solvers.RungeKutta4` at the same step,
-    and is the default of `rigidjax.batch.rollout`. A step should turn the body by less than a
-    radian. Source: Magnus 1954, doi:10.1002/cpa.3160070404; see `change_and_turn`.
+    The steps have a fixed length. At equal steps this method does less work than
+    `rigidjax.solvers.RungeKutta4` and has a smaller error; it is the default of
+    `rigidjax.batch.rollout`. A step should turn the body by less than a radian. Source: Magnus
+    1954, doi:10.1002/cpa.3160070404; see `change_and_turn`.
 
     **Raises:** `TypeError` for a torque that depends on the attitude, or another state.
 
@@ -103,7 +115,8 @@ class Magnus4(dfx.AbstractSolver):
         start = split(y0)
         q, omega = start[:4], start[4:]
         way, h = (part.astype(y0.omega.dtype) for part in onward(terms, t0, t1))
-        # A law that says that it does not depend on the attitude gets none.
+        # The law says that it does not read the attitude: it is given NaN in its place, which
+        # shows in the result if the law reads it all the same.
         nowhere = jnp.full_like(y0.q, jnp.nan)
 
         def slope(t: Any, omega: Triple) -> Triple:
@@ -129,7 +142,11 @@ class Magnus4(dfx.AbstractSolver):
 
 
 def require_attitude(name: str, field: Any, y0: PyTree, instead: str) -> AttitudeEquations:
-    """`field`, if it is `AttitudeEquations` and the state an `Attitude`; else `TypeError`."""
+    """Return `field` if it is `AttitudeEquations` and the state `y0` an `Attitude`.
+
+    Else raise `TypeError`: the message says that the solver `name` does not fit, and to use the
+    solver `instead`.
+    """
     if isinstance(field, AttitudeEquations) and isinstance(y0, Attitude):
         return field
     raise TypeError(

@@ -1,8 +1,9 @@
-"""A body whose inertia is a function of time, integrated by its momentum.
+"""Integrate the momentum of a body whose inertia is a function of time.
 
-The momentum p = I(t) Ω obeys `dp/dt = p × Ω + τ` however I changes: where I jumps, p stays and Ω
-jumps, and no derivative of I is needed. States of the run have Ω̃ = I₀⁻¹ p in the place of Ω, with
-the inertia I₀ of the body that `simulate` was given: a rate, to which tolerances apply as to Ω.
+The momentum p = I(t) Ω obeys `dp/dt = p × Ω + τ`, however the inertia I changes; Ω is the body rate
+and τ the torque. Where I jumps, p stays as it is and Ω jumps, and no derivative of I is needed. A
+state of the run has Ω̃ = I₀⁻¹ p in the place of Ω, where I₀ is the inertia of the body that
+`simulate` was given. Ω̃ is a rate, so that tolerances apply to it as to Ω.
 """
 
 from typing import Any
@@ -25,7 +26,11 @@ from rigidjax.rotation.linalg3 import apply, solve
 
 
 class _Changing(eqx.Module):
-    """The slope of a state whose rate stands for the momentum, at a state with the true rate."""
+    """Compute the derivative of a state of the run from the time and the state with its body rate.
+
+    A state of the run has Ω̃ in the place of the body rate Ω (see the module). `body` has the
+    inertia I₀, and `law` gives the inertia I at any time.
+    """
 
     body: Any
     law: ChangingInertia
@@ -42,22 +47,27 @@ class _Changing(eqx.Module):
 
 
 class ByMomentum(eqx.Module):
-    """The equations of motion for states with Ω̃ in the place of Ω, and the way there and back."""
+    """Compute the derivative of a state of the run by momentum, and convert states to and from it.
 
-    field: Any  # `_Changing`, or `CoupledEquations` of it
+    A state of the run has Ω̃ = I₀⁻¹ p in the place of the body rate Ω (see the module). `enter`
+    replaces Ω by Ω̃, and `leave` replaces Ω̃ by Ω.
+    """
+
+    field: Any  # a `_Changing`, or the `CoupledEquations` of one
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None) -> Any:
         return self.field(t, self.leave(t, y))
 
     def enter(self, t: Any, y: Any) -> Any:
-        """Return the state of the run at the time `t`, s, of a state with the body rate."""
+        """Return the state of the run for the state `y` with its body rate, at the time `t`, s."""
         return self._with_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
 
     def leave(self, t: Any, y: Any) -> Any:
-        """Return the state with the body rate at the time `t`, s, of a state of the run."""
+        """Return the state with its body rate for the state `y` of the run, at the time `t`, s."""
         return self._with_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
 
     def _with_rate(self, y: Any, rate: Any, t: Any) -> Any:
+        """Return `y` with its rate w replaced by `rate(I(t), I₀, w)`."""
         motion, own = motion_of(y), y.own if isinstance(y, Coupled) else ()
         dtype = motion.omega.dtype
         inner: Any = self.field.field if isinstance(self.field, CoupledEquations) else self.field
@@ -68,7 +78,10 @@ class ByMomentum(eqx.Module):
 
 
 def by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
-    """Return the equations by momentum if the inertia is a function of time, else `None`."""
+    """Return the equations by momentum if the inertia is a function of time, else `None`.
+
+    `state0` is the state at the start, with the body rate; `torque` is that of `simulate`.
+    """
     if not isinstance(law := changing(torque), ChangingInertia) or hasattr(law.inertia, "feels"):
         return None
     field: Any = _Changing(body, law)
@@ -76,12 +89,15 @@ def by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
 
 
 def changing(torque: Any) -> ChangingInertia | None:
-    """Return the `ChangingInertia` that a torque is, or `None`."""
-    # Scenes of particles, and none, are no torques.
+    """Return the `ChangingInertia` that is the whole of a torque, or `None` if there is none."""
+    # A scene of particles and `None` also come here, and are no torques.
     parts = parts_of(torque) if isinstance(torque, ChangingInertia | Sum) else ()
     return parts[0] if len(parts) == 1 and isinstance(parts[0], ChangingInertia) else None
 
 
 def with_body_rates(form: ByMomentum | None, ts: Array, ys: Any) -> Any:
-    """Return the states `ys` at `ts` (T,) with their body rates."""
+    """Return the states `ys` of a run, saved at the times `ts` (T,), s, with their body rates.
+
+    `form` are the equations of the run, or `None` if its states have the body rate already.
+    """
     return ys if form is None else jax.vmap(form.leave)(ts, ys)

@@ -1,9 +1,10 @@
-"""Equal steps on a GPU: several in one kernel, and a reverse mode of two levels, written by hand.
+"""Run equal steps on a GPU, several in one kernel, with a reverse mode of two levels by hand.
 
-A kernel of one step waits for its numbers: with several steps in a turn of the loop, free bodies
-take three times as many steps a second. The kernel of a step backward has too many numbers for
-that: it is as slow as it is long, while JAX's transpose of a loop has as many steps in a turn as
-the loop itself. On a CPU neither gains anything.
+A kernel of one step waits for its numbers. With several steps in a turn of the loop, free bodies
+take three times as many steps a second. A kernel of a step backward has too many numbers to gain
+from this: it takes longer in proportion to its length. JAX's transpose of a loop has as many steps
+in a turn as the loop itself, so the loop backward is written here by hand, with one step in a turn.
+On a CPU neither the longer kernel nor the loop backward gains anything.
 """
 
 import dataclasses
@@ -22,13 +23,18 @@ from rigidjax.solve.batching import Arrays
 from rigidjax.solve.linear_map import linear_map
 from rigidjax.solve.stops import traced
 
-# Operations in a turn of the loop, about, and steps at most: a kernel twice as long compiles four
-# times as long and is no faster, half as long it takes a third longer.
+# About this many operations, and at most this many steps, are in a turn of the loop. Measured: a
+# kernel twice as long takes four times as long to compile and is no faster; with a kernel half as
+# long the run takes a third longer.
 _LONG, _MOST = 2800, 8
 
 
 def piece_length(count: int) -> int:
-    """Return about √count steps: a divisor of count if one is near, for less to compile."""
+    """Return the number of steps in a piece of a run of `count` steps, about √count.
+
+    If there is a divisor of `count` from √count to 2√count, it is taken: then no steps are left
+    over after the pieces, and there is less to compile.
+    """
     root = math.isqrt(count - 1) + 1
     near = [d for d in range(root, min(2 * root, count) + 1) if count % d == 0]
     return near[0] if near else root
@@ -36,7 +42,11 @@ def piece_length(count: int) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class _Program:
-    """Run `count` steps `call(constants, y, i)` on lists of arrays, `turn` in a kernel."""
+    """Run `count` steps of a program, forward and backward; `turn` of them are in a kernel.
+
+    `call(constants, y, i)` returns the state after the step of number `i` from the state `y`.
+    Constants and states are lists of arrays.
+    """
 
     call: Callable[[Arrays, Arrays, Array], Arrays]
     count: int
@@ -45,7 +55,10 @@ class _Program:
     def some(
         self, constants: Arrays, y: Arrays, first: Array, many: int, keep: bool = False
     ) -> tuple[Arrays, Any]:
-        """Return the end of `many` steps from number `first` on, and all their starts if `keep`."""
+        """Return the state after the `many` steps from number `first` on, which begin at `y`.
+
+        With `keep` also return the states at the starts of all these steps, else `None`.
+        """
 
         def one(y: Arrays, i: Array) -> tuple[Arrays, Any]:
             return self.call(constants, y, i), y if keep else None
@@ -53,7 +66,11 @@ class _Program:
         return lax.scan(one, y, first + jnp.arange(many, dtype=jnp.int32), unroll=self.turn)
 
     def forward(self, constants: Arrays, first: Array, y: Arrays) -> tuple[Arrays, Any]:
-        """Return the end, and the starts: of pieces of one length, of the steps left over."""
+        """Return the state after all steps from `y`, and the states from which `back` begins.
+
+        These are the starts of the pieces, which have one length, in rows; and the start of the
+        steps that are left over after the pieces.
+        """
         firsts, length, left = self.pieces(first)
 
         def piece(y: Arrays, begin: Array) -> tuple[Arrays, Arrays]:
@@ -68,7 +85,11 @@ class _Program:
     def back(
         self, constants: Arrays, moving: Sequence[bool], first: Array, starts: Any, bar: Arrays
     ) -> tuple[Arrays, Arrays]:
-        """Return the cotangents of the constants that are `moving`, and of the start."""
+        """Return the cotangents of the constants that are `moving`, and of the state at the start.
+
+        `moving` says of each constant whether it has a derivative. `starts` are the states that
+        `forward` returned, and `bar` is the cotangent of the state at the end.
+        """
         firsts, length, left = self.pieces(first)
         chosen = [c for c, m in zip(constants, moving, strict=True) if m]
 
@@ -97,22 +118,25 @@ class _Program:
         return lax.scan(whole, sums, (rows, firsts), reverse=True)[0]
 
     def pieces(self, first: Array) -> tuple[Array, int, int]:
-        """Return the first step of each piece, their length, and the number of steps left."""
+        """Return the number of the first step of each piece, the number of steps in a piece, and
+        the number of steps that are left over.
+        """
         length = piece_length(self.count)
         many, left = divmod(self.count, length)
         return first + length * jnp.arange(many, dtype=jnp.int32), length, left
 
 
 def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: Any) -> Any:
-    """Return the end of `count` steps `y = step(y, i)` from number `first` on.
+    """Return the state after `count` steps `y = step(y, i)` from the number i = `first` on.
 
-    In reverse mode the states at the starts of √count pieces are kept, and those in one piece.
-    Second derivatives are forward over reverse.
+    In reverse mode the states at the starts of about √count pieces are kept, and all states of one
+    piece at a time. Second derivatives are forward over reverse.
     """
     start, tree = jax.tree.flatten(y)
     one = traced(lambda y, i: jax.tree.leaves(step(tree.unflatten(y), i)), start, first)
     turn = min(max(_LONG // len(one.closed.jaxpr.eqns), 1), _MOST)
-    # A power of two, since pieces often are whole multiples of it.
+    # The number of steps in a turn is a power of two, because the length of a piece is often a
+    # whole multiple of a power of two.
     turn = 1 << (turn.bit_length() - 1)
     program, constants = _Program(one.call, count, turn), one.constants
     number = len(constants)
@@ -155,6 +179,6 @@ def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: An
 
 
 def _with(all_: Sequence[Any], which: Sequence[bool], some: Sequence[Any]) -> list[Any]:
-    """Return all arrays, with those that `which` selects replaced by `some`."""
+    """Return the list `all_`, in which `some` replace, in order, the arrays `which` selects."""
     rest = iter(some)
     return [next(rest) if w else a for a, w in zip(all_, which, strict=True)]

@@ -14,7 +14,7 @@ from rigidjax.solve.adaptive_loop import NONFINITE, finite
 
 
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
-    """Dense output of another interpolation, its quaternion scaled to length 1."""
+    """Interpolate the state in a step by `inner`, and scale its quaternion to length 1."""
 
     t0: Any
     t1: Any
@@ -28,7 +28,10 @@ class GroupInterpolation(dfx.AbstractLocalInterpolation):
 
 
 class _Build(eqx.Module):
-    """Makes a `GroupInterpolation` of a solver's dense information."""
+    """Make a `GroupInterpolation` from the dense information of a solver's step.
+
+    `inner_cls` is the class of the solver's own interpolation.
+    """
 
     inner_cls: Any = eqx.field(static=True)
 
@@ -41,14 +44,14 @@ def _of(part: str, name: str) -> Any:
 
 
 class Projected(dfx.AbstractWrappedSolver):
-    """Wraps a diffrax solver so that attitudes stay unit quaternions.
+    """Wrap a diffrax solver so that attitudes stay unit quaternions.
 
-    Each accepted step ends with q ← q/|q|, and so does every value of the dense output. The stages
-    are unchanged, because a change there alters the order (jaxsim#192). A state without a
-    quaternion passes through. A step that gives NaN or infinity ends the run with
-    `RESULTS.nonfinite`.
+    The quaternion q at the end of each accepted step, and in every value of the dense output, is
+    divided by its length |q|. The stages of a step are left as they are, because a change of q
+    inside a step alters the order of the method (jaxsim#192). A state without a quaternion is not
+    changed. A step that gives NaN or infinity ends the run with `RESULTS.nonfinite`.
 
-    **Arguments:** `solver` any `diffrax.AbstractSolver` on `Spin`, `Attitude` or `Rigid` states.
+    **Arguments:** `solver` is any `diffrax.AbstractSolver` on `Spin`, `Attitude` or `Rigid` states.
 
     >>> import diffrax
     >>> Projected(diffrax.Tsit5()).order(None)
@@ -62,7 +65,8 @@ class Projected(dfx.AbstractWrappedSolver):
 
     term_structure = _of("solver", "term_structure")
     term_compatible_contr_kwargs = _of("solver", "term_compatible_contr_kwargs")
-    # Adjoints set the one, controllers the others, on whatever is a Runge–Kutta or implicit method.
+    # Adjoints of diffrax set `scan_kind` on a Runge–Kutta method, and controllers set the members
+    # of the root finder on an implicit method; they look for these members on this wrapper.
     scan_kind = _of("solver", "scan_kind")
     root_finder = _of("solver", "root_finder")
     root_find_max_steps = _of("solver", "root_find_max_steps")
@@ -100,8 +104,9 @@ class Projected(dfx.AbstractWrappedSolver):
         solver_state: PyTree,
         made_jump: Bool[ArrayLike, ""],
     ) -> Any:
-        # A slope kept from the last step is the one before the projection; and diffrax computes it
-        # anew for all of a batch as soon as one body needs it. True: always anew, for each alone.
+        # A slope that the solver kept from the last step is the one before the projection. Also,
+        # diffrax computes this slope anew for all bodies of a batch as soon as one of them needs
+        # it. With `made_jump=True` it is computed in every step, whatever the other bodies do.
         del made_jump
         y1, error, dense, state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, True

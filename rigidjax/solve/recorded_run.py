@@ -1,4 +1,7 @@
-"""A run as one function of numbers, with derivatives of both modes, for one body or a batch."""
+"""Define a run as one function of its numbers, with derivatives in forward and reverse mode.
+
+The run is that of one body or, under `jax.vmap`, of a batch.
+"""
 
 from functools import partial
 from typing import Any
@@ -21,11 +24,19 @@ SMOOTH = len(Smooth._fields)
 def states_of(
     method: Method, smooth: list[bool], constants: Arrays, state: Any, run: Run
 ) -> tuple[Array, LoopState]:
-    """Return the states between (K, n), NaN where the run did not get, and the end of the loop.
+    """Return the states at the saved times (K, n), and the state of the loop at the end of the run.
 
-    `smooth` says which of the constants have derivatives. Those of the states and of the last state
-    are by these constants and the `Smooth` numbers of the run; the lengths of steps are held.
-    `state` of controller and progress meter is that at the start; bodies may share it.
+    The saved times are the K times `run.between`. A state has n numbers; at a time that the run did
+    not reach they are NaN. The derivatives of these states and of the last state are with respect
+    to the constants that `smooth` selects and to the `Smooth` numbers of the run; they hold the
+    lengths of the steps constant.
+
+    **Arguments:**
+
+    - `method`, `run`: the parts and the numbers of the run of one body.
+    - `smooth`: whether each of the `constants` has derivatives.
+    - `constants`: the arrays that the field, the condition and the controller hold.
+    - `state`: the states of controller and progress meter at the start; bodies may share them.
     """
     each, run_tree = jax.tree.flatten(run)
     first, state_tree = jax.tree.flatten(state)
@@ -33,8 +44,9 @@ def states_of(
     like = adaptive_loop.start(run._replace(state=state))
     shapes = jax.eval_shape(adaptive_loop.pack, like)
     trees = run_tree, state_tree
-    # The numbers between and at the end, then the record: its starts, rows and counts. The results
-    # that have derivatives, and those that the value has.
+    # `recorded` returns in a row: the states at the saved times; the end of the loop as `size`
+    # arrays; and the record, its starts as `size` arrays, its rows and its counts. `states` are the
+    # places of the arrays with derivatives in this row. `answer` returns the first `head` arrays.
     size = len(shapes)
     states, head = [0, 1, 1 + size, 1 + 2 * size], 1 + size
 
@@ -46,7 +58,10 @@ def states_of(
     recorded: Any = jax.custom_jvp(partial(mapped, partial(_forward, True), 0))
 
     def tangents_of(primals: Any, tangents: Any, pull: Any = None) -> tuple[Arrays, Arrays]:
-        """Return the result of `recorded` and the tangents of its states; transposed by `pull`."""
+        """Return the arrays of `recorded`, and the tangents of those that hold states.
+
+        The tangents are transposed by `pull`; reverse mode is refused if it is `None`.
+        """
         # A number without a tangent needs no derivative.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
         of_run = [t and i < SMOOTH for i, t in enumerate(there[number:])]
@@ -57,7 +72,7 @@ def states_of(
         given = [*primals, *found[head:]]
         if pull is None:
             return found, linear_map(push, refuse, given, along)
-        # The states between and at the end alone are transposed.
+        # Only the states at the saved times and at the end have a transpose.
         back = partial(mapped, partial(pull, moving), 2)
         return found, linear_map(lambda *args: push(*args)[:2], back, given, along)
 
@@ -83,9 +98,12 @@ def states_of(
 def _over_bodies(
     method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> tuple[Method, Run, Layout, Arrays]:
-    """Return the method and the run on (n, *bodies), and the constants without the first state.
+    """Return the method, the run, the layout and the constants, for arrays (n, *bodies).
 
-    The method of one body has `halt(constants, t, y)` and `control(again, constants, …)`.
+    The last of the `constants` given are the states of controller and progress meter at the start:
+    they become a part of the run. The `method` given is that of one body, in which `halt` and
+    `control` take the constants, as `halt(constants, t, y)` and `control(again, constants, …)`; in
+    the method returned they hold the constants.
     """
     run_tree, state_tree = trees
     run, count = run_tree.unflatten(each), len(constants) - state_tree.num_leaves
@@ -109,7 +127,7 @@ def _over_bodies(
 def _forward(
     record: bool, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    """Return the states between and the end, with the `record` if asked for."""
+    """Return the states at the saved times and the end of a run, with its record if `record`."""
     method, run, _, constants = _over_bodies(method, trees, layout, constants, each)
     kept = None
     if record or (run.between.shape[0] and layout.bodies):
@@ -121,14 +139,20 @@ def _forward(
     return [between, *adaptive_loop.pack(end), *jax.tree.leaves(kept if record else None)]
 
 
-# Which of the constants and which numbers of a run have tangents.
+# Two lists, which say of each of the constants and of each number of a run if it has a tangent.
 Moving = tuple[list[bool], list[bool]]
 
 
 def _again(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> tuple[Method, Arrays, Run, Record, Arrays]:
-    """Return a recorded run, the constants that move, one a body; and tangents or cotangents."""
+    """Return the method, constants, run and record of a run that is to be taken once more, and the
+    tangents or cotangents that are to be carried along.
+
+    The constants are those that `moving` selects, one copy for each body; the field of the method
+    takes these alone. `each` holds in a row the numbers of the run, the arrays of its record, and
+    the tangents or cotangents.
+    """
     whole = trees[0].num_leaves
     one = method.field
     method, run, layout, constants = _over_bodies(method, trees, layout, constants, each[:whole])
@@ -151,7 +175,10 @@ def _again(
 def _pushed(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    """Return the tangents of the states; `each` ends with those of the moving numbers."""
+    """Return the tangents of the states of a recorded run.
+
+    `each` ends with the tangents of the constants and numbers that `moving` selects.
+    """
     method, chosen, run, record, along = _again(moving, method, trees, layout, constants, each)
     rest = iter(along[len(chosen) :])
     smooth = adjoint.smooth_numbers(run)
@@ -168,7 +195,10 @@ def _pushed(
 def _pulled(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    """Return the cotangents of the moving numbers; `each` ends with those of the states."""
+    """Return the cotangents of the constants and numbers that `moving` selects.
+
+    `each` ends with the cotangents of the states at the saved times and at the end of the run.
+    """
     method, chosen, run, record, bars = _again(moving, method, trees, layout, constants, each)
     total, of_run = adjoint.cotangents(method, chosen, run, record, bars, any(moving[1][:3]))
     return [*total, *(a for a, moves in zip(of_run, moving[1], strict=False) if moves)]

@@ -1,4 +1,4 @@
-"""The adjoint of diffrax that runs the explicit methods of this package, for any vector field."""
+"""Define an adjoint for diffrax, which runs the explicit methods of this package for any field."""
 
 import dataclasses
 from collections.abc import Callable
@@ -22,30 +22,34 @@ from rigidjax.solve.recorded_run import states_of
 from rigidjax.solve.step_control import NORM, StandardController, Stopping, Watched
 from rigidjax.solve.stops import traced
 
-# Controllers that do not look at `args`: these may be large, and each body would have its own.
+# These controllers do not look at `args`, so they get none: `args` may be large, and each body of a
+# batch would have a copy.
 _WITHOUT_ARGS = (
     dfx.PIDController, dfx.ClipStepSizeController, dfx.ConstantStepSize, dfx.StepTo,
     StandardController, Stopping, Watched,
 )  # fmt: skip
 
-# diffrax rounds a step up to the end of a run that is nearer than so many units of round-off.
+# A step that would end within this many units of round-off of the end of a run ends there, as in
+# diffrax.
 _SLIVER = 100
 
 
 class ReplayAdjoint(dfx.AbstractAdjoint):
-    """Runs `diffrax.diffeqsolve` on records of its steps, with derivatives of both modes.
+    """Run `diffrax.diffeqsolve` on records of its steps, with derivatives in both modes.
 
-    For any vector field under the explicit methods of `rigidjax.solvers`. The steps are those that
-    the controller asks for; derivatives take the recorded steps once more, their lengths held.
-    `jax.grad`, `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over reverse) work, by all
-    numbers: of the field and what it closes over, `args`, the start, t0, t1, saved times and the
-    `jump_ts` of a `diffrax.ClipStepSizeController`. Under `jax.vmap` a step has the bodies in the
-    last axis of its arrays, which makes batches several times faster on CPU.
+    It runs any vector field under the explicit methods of `rigidjax.solvers`. The steps are those
+    that the controller asks for. Derivatives take the recorded steps once more, and hold their
+    lengths constant. `jax.grad`, `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over
+    reverse) work with respect to all numbers: those of the field and what it closes over, `args`,
+    the start, t0, t1, the saved times and the `jump_ts` of a `diffrax.ClipStepSizeController`.
+    Under `jax.vmap` a step has the bodies in the last axis of its arrays, which makes batches
+    several times faster on CPU.
 
-    **Arguments:** `otherwise` the adjoint that takes every other run: another solver,
-    `max_steps=None`, `SaveAt(dense=True)` or `SaveAt(steps=…)`, an event that is sought (with a
-    `root_finder`, a real number, or several conditions), a state of complex numbers or of several
-    dtypes. A boolean event without a `root_finder` ends a run here.
+    **Arguments:** `otherwise` is the adjoint that takes every other run: one with another solver,
+    `max_steps=None`, `SaveAt(dense=True)` or `SaveAt(steps=…)`; one with an event whose time is
+    sought (with a `root_finder`, a real number, or several conditions); and one with a state of
+    complex numbers or of several dtypes. A boolean event without a `root_finder` ends a run under
+    `ReplayAdjoint` itself.
 
     **Raises:** `TypeError` for `jax.grad` of a `jax.grad`: second derivatives are forward over
     reverse.
@@ -78,7 +82,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             more = dict(args=args, event=event, init_state=init_state)
             return self.otherwise.loop(progress_meter=progress_meter, **how, **more, **rest)
         y0, tree = ravel_pytree(init_state.y)
-        # Backwards in time diffrax counts −t.
+        # In a run backwards in time diffrax counts −t, so that the field changes its sign.
         way = jnp.where(jnp.asarray(terms.contr(t0, t1)) < 0, -1, 1).astype(y0.dtype)
         program = traced(
             lambda t, y: way * ravel_pytree(terms.vf(t, tree(y), args))[0].astype(y.dtype), t0, y0
@@ -95,7 +99,8 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         arrays, arrays_tree = jax.tree.flatten(lax.stop_gradient(arrays))
         given = lambda constants: arrays_tree.unflatten(constants[len(constants) - len(arrays) :])  # noqa: E731
         constants = constants + arrays
-        # Such controllers see a state as numbers in a row.
+        # A controller that takes no `args` and has the default norm may see the numbers of a state
+        # in a row.
         rows = plain and all(getattr(c, "norm", NORM) is NORM for c in controlled_by)
         method = Method(
             tableau=solver.tableau,
@@ -110,7 +115,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         )
         subs = _subs(saveat)
         asked = jnp.concatenate([t0[None][:0], *(s.ts for s in subs if s.ts is not None)])
-        # The times of several sets are taken in their order.
+        # Several sets of saved times are joined and sorted.
         order = jnp.argsort(lax.stop_gradient(asked)) if len(subs) > 1 else None
         state = (init_state.controller_state, init_state.progress_meter_state)
         state = lax.stop_gradient(jax.tree.map(jnp.asarray, state))
@@ -119,7 +124,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             t0, _stops(controlled_by, t0, t1), between, y0, lax.stop_gradient(first),
             None if event is None else init_state.result,
         )  # fmt: skip
-        # What ends a run has no derivative.
+        # The condition and the controller, which can end a run, have no derivative.
         smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
         ys, end = states_of(method, smooth, constants, state, run)
         if order is not None:
@@ -129,19 +134,27 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
 
 
 class _Control(NamedTuple):
-    """What a controller makes of a step of one body."""
+    """Hold a step controller with its progress meter, and call it after a step of one body."""
 
-    static: Any  # the controller, the progress meter and `args`, without their arrays
-    arrays: Callable[[Arrays], Any]  # these, of the constants
-    tree: Callable[[Array], Any]  # the numbers of a state, as the controller takes it
-    order: Any  # of the error
+    static: Any  # controller, progress meter and `args`, without their arrays
+    arrays: Callable[[Arrays], Any]  # takes these arrays from the constants of the run
+    tree: Callable[[Array], Any]  # makes of the numbers of a state what the controller takes
+    order: Any  # of the error of a step
 
     def __call__(self, again: bool, constants: Arrays, given: Any, numbers: Any) -> Any:
-        """Return whether a step is accepted, the time after it, the end of the next one, the states
-        of controller and progress meter, and the result.
+        """Return what the controller says of a step that was tried.
 
-        `given` are these states and the times t0, t1, begin and end of the step; `numbers` those of
-        the state before and after it and of its error. A step taken `again` shows no progress.
+        This is: whether it accepts the step, the time after the step, the end of the next step, the
+        new states of controller and progress meter, and the result of the run so far.
+
+        **Arguments:**
+
+        - `again`: whether a derivative takes a step once more; then the meter shows no progress.
+        - `constants`: the constants of the run, of which `arrays` takes those of the controller.
+        - `given`: the states of controller and progress meter; and the times at which the run
+          begins and ends, and at which the step begins and ends.
+        - `numbers`: the numbers of the state before the step, of the state after it, and of its
+          error.
         """
         controller, meter, args = eqx.combine(self.arrays(constants), self.static)
         (control, progress), (t0, last, begin, end) = given
@@ -149,7 +162,7 @@ class _Control(NamedTuple):
         keep, t, following, _, control, result = controller.adapt_step_size(
             begin, end, *states, args, error, self.order, control
         )
-        # As diffrax does: no step is a few units of round-off long because the run ends.
+        # As in diffrax, the end of the run leaves no step of a few units of round-off.
         t = jnp.minimum(t, last)
         near = last - _SLIVER * jnp.finfo(t.dtype).eps * jnp.abs(last)
         following = jnp.where(keep & (following > near), last, following)
@@ -159,7 +172,7 @@ class _Control(NamedTuple):
 
 
 def _replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: Any) -> bool:
-    """Return whether a run is one of those that are recorded, not one for another adjoint."""
+    """Return whether `ReplayAdjoint` records a run itself; if not, another adjoint takes it."""
     kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(state.y)}
     plain = isinstance(solver, AbstractExplicit) and max_steps is not None and not saveat.dense
     plain = plain and len(kinds) == 1 and jnp.issubdtype(min(kinds, key=str), jnp.floating)
@@ -171,12 +184,13 @@ def _replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: Any) 
 
 
 def _subs(saveat: Any) -> list[Any]:
+    """Return each `diffrax.SubSaveAt` of a `diffrax.SaveAt`."""
     is_sub = lambda s: isinstance(s, dfx.SubSaveAt)  # noqa: E731
     return [s for s in jax.tree.leaves(saveat.subs, is_leaf=is_sub) if is_sub(s)]
 
 
 def _nest(controller: Any) -> list[Any]:
-    """Return a controller and those inside it."""
+    """Return a list of a controller and all the controllers inside it, the outermost first."""
     found = []
     while isinstance(controller, dfx.AbstractStepSizeController):
         found.append(controller)
@@ -185,12 +199,12 @@ def _nest(controller: Any) -> list[Any]:
 
 
 def _stops(controllers: list[Any], t0: Array, t1: Array) -> Array:
-    """Return the times in order at which a step ends for a jump of the field, and the last time."""
+    """Return in order the times at which a step ends because the field jumps; t1 is the last."""
     jumps = [c.stops for c in controllers if type(c) is Stopping]
     for c in controllers:
         if type(c) is dfx.ClipStepSizeController and c.jump_ts is not None:
             ts = c.jump_ts.astype(t0.dtype)
-            # A step goes to t1 itself if a jump is beyond it; one at t0 is over.
+            # A jump beyond t1 has no step that ends at it, and one at t0 is over: both become t0.
             jumps.append(jnp.sort(jnp.where((t0 < ts) & (ts <= t1), ts, t0)))
     if len(jumps) > 1:
         jumps = [jnp.sort(jnp.concatenate(jumps))]
@@ -201,9 +215,13 @@ def _final(
     state: Any, saveat: Any, event: Any, args: Any, tree: Any, run: Run, asked: Array, ys: Array,
     end: LoopState,
 ) -> Any:  # fmt: skip
-    """Return the state of diffrax at the end of a run, with what is saved of it."""
+    """Return the state of `diffrax.diffeqsolve` at the end of a run, with all that it saves.
+
+    `state` is the state of `diffeqsolve` at the start; `tree` makes a state of the run from its
+    numbers; `asked` are the saved times, and `ys` the states at them; `end` is the end of the loop.
+    """
     t1 = run.stops[-1]
-    # Nothing is saved before a step is taken, but of a run that is over at its start.
+    # Before its first step a run saves nothing, unless it is over at its start.
     reached = (asked <= end.t) & ((end.t > run.t0) | (t1 <= run.t0))
     counts = [s.ts.shape[0] for s in _subs(saveat) if s.ts is not None]
     parts = [jnp.split(a, np.cumsum(counts)[:-1]) for a in (reached, ys)]
@@ -221,7 +239,8 @@ def _final(
             states.append(end.y[None])
         ts, states, there = (jnp.concatenate(a) for a in (ts, states, there))
         if sub.ts is not None:
-            # A function of the state has no value where there is none.
+            # Where the run has no state, `sub.fn` is called with the first one, at which it has a
+            # value; `masked` removes the result.
             states = jnp.where(there[:, None], states, run.y0)
         out = jax.vmap(lambda t, y: sub.fn(t, tree(y), args))(ts, states)
         if sub.ts is None:

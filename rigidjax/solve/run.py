@@ -1,4 +1,4 @@
-"""A run in one compiled piece: by the closed form, or by one `diffrax.diffeqsolve`."""
+"""Solve a run in one compiled piece, by the closed form or by one `diffrax.diffeqsolve`."""
 
 import dataclasses
 import warnings
@@ -45,7 +45,10 @@ _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 class ClosedFormRun(eqx.Module):
-    """A free body: the closed form, any time at the cost of one."""
+    """Hold the set-up of a run of a free body in closed form.
+
+    The cost of a state is the same at any time of the run.
+    """
 
     body: Inertia | MassProperties
     throw: bool = eqx.field(static=True)
@@ -53,37 +56,37 @@ class ClosedFormRun(eqx.Module):
 
 
 class DiffraxRun(eqx.Module):
-    """A run by diffrax: everything but the start and the times."""
+    """Hold the set-up of a run by diffrax: everything but the start and the times."""
 
     body: Inertia | MassProperties | None
     torque: Any
     solver: Any
     rtol: Any
     atol: Any
-    controller: Any  # one of the user's, in the place of tolerances
+    controller: Any  # the user's step controller in the place of tolerances, or `None`
     dt0: Any
     max_step: Any
     adjoint: Any
     progress_meter: dfx.AbstractProgressMeter
-    sign: Array | None  # of the direction of time; None: known to go forwards
+    sign: Array | None  # σ, 1 or −1, the direction of time; `None`: known to be 1
     max_steps: int | None = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
-    cuts: Array | None = None  # where a step has to end, beside the jumps of the torque
+    cuts: Array | None = None  # more times at which a step ends, besides the jumps of the torque
 
     @property
     def seeks_stops(self) -> bool:
-        """Whether steps end where the law switches, in s = σt."""
-        # A splitting looks into the field, of a known class.
+        """Return whether steps end where the law switches; the run is then in the time s = σt."""
+        # A splitting reads the members of the field, which has to be of a known class.
         return self.controller is None and not isinstance(self.solver, AbstractSplitting)
 
     @property
     def is_replayed(self) -> bool:
-        """Whether an explicit method of ours runs under tolerances and the adjoint of ours."""
+        """Return whether an `AbstractExplicit` runs under tolerances and `ReplayAdjoint`."""
         explicit = isinstance(self.solver, AbstractExplicit) and self.max_steps is not None
         return explicit and self.controller is None and isinstance(self.adjoint, ReplayAdjoint)
 
     def step_controller(self) -> Any:
-        """Return the controller of the steps, which ends a run that cannot go on."""
+        """Return the step controller, which also ends a run that cannot continue."""
         control = self.controller
         if control is None:
             control = StandardController(self.rtol, self.atol, self.max_step)
@@ -95,9 +98,12 @@ class DiffraxRun(eqx.Module):
 
 
 class Ends(eqx.Module):
-    """The condition that ends a run of a scene, such as a collision, as `diffrax.Event` asks it."""
+    """Evaluate the condition that ends the run of a scene, such as a collision.
 
-    scene: Any  # with ends(t, state) → bool and end_words(t, state) → str
+    `diffrax.Event` calls it.
+    """
+
+    scene: Any  # has ends(t, state) → bool and end_words(t, state) → str
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None, **_: object) -> Bool[Array, ""]:
         return self.scene.ends(t, y)
@@ -108,11 +114,12 @@ def equations_of_motion(
     state0: Spin | Attitude | Rigid | Point | Coupled,
     torque: Torque | AbstractScene | MovingFrame | None = None,
 ) -> Callable[..., Any]:
-    """Return the vector field of this body for states like `state0`, for `diffrax.ODETerm`.
+    """Return the vector field of `body` for states of the type of `state0`, for `diffrax.ODETerm`.
 
-    **Arguments** `body`, `state0`, `torque` as for `simulate`; under a torque with states of its
-    own `state0` is a `rigidjax.motion.coupled.Coupled`. **Raises** `TypeError` where they do not
-    fit.
+    **Arguments:** `body`, `state0` and `torque` are those of `simulate`. Under a torque with states
+    of its own `state0` is a `rigidjax.motion.coupled.Coupled`.
+
+    **Raises:** `TypeError` if body, state and torque do not fit together.
 
     >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))
     <class 'rigidjax.motion.equations.EulerEquations'>
@@ -131,21 +138,26 @@ def equations_of_motion(
 
 
 def direction(times: Array) -> Int[Array, ""] | None:
-    """Return `None` for times known to increase; else the sign of t's change, known or traced."""
+    """Return the sign of the change from the first to the last of the `times`.
+
+    It is `None` if it is known to be 1.
+    """
     ends = _checks.namespace(times).asarray(times)
     change = ends[-1] - ends[0]
     if _checks.is_known(times) and change > 0:
         return None
-    # A whole number: derivatives do not carry it along.
+    # The sign is an integer, so that derivatives do not carry it along.
     return jnp.asarray(jnp.sign(change), jnp.int32)
 
 
 def in_forward_time(
     sign: Array | None, field: Callable[..., Any], condition: Any, ts: Array
 ) -> tuple[Callable[..., Any], Any, Array, list[Array]]:
-    """Return a vector field, a condition, times and jump times in s = σt; `sign` is σ, or `None`.
+    """Return a vector field, a condition, saved times and jump times in the time s = σt.
 
-    The field takes the stops of its parts that jump, in s, as its third argument (see `adaptive`).
+    `sign` is σ, with which s increases, or `None` for 1; `condition` may be `None`. The field
+    returned takes as its third argument, in s, the stops of each of its parts that jump (see
+    `adaptive`).
     """
     time = partial(_signed, sign)
 
@@ -161,13 +173,14 @@ def in_forward_time(
 def solve(
     setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    """Return the states at `ts`, the counts of steps, and the result."""
-    # One jit around everything: an operation outside of it costs as much as a hundred steps.
+    """Return the states of a run at times `ts` (T,), s, the `Solution.stats`, and the result."""
+    # One `jit` encloses everything, because one operation outside of it costs as much as a hundred
+    # steps.
     state0 = given = project_to_group(state0)
     if isinstance(setup, ClosedFormRun):
         ys, stats, result = _free(setup, state0, ts)
     else:
-        # With the states of the torque, where it has some.
+        # If the torque has states of its own, they are integrated together with the body's.
         state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
         scene: Any = scene_of_force(setup.torque) if isinstance(state0, Point) else None
         watch = Ends(scene) if hasattr(scene, "ends") else None
@@ -186,7 +199,11 @@ def solve(
 def _integrated(
     setup: DiffraxRun, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
-    """Return the states at `ts`, counts, the result, and time, state and next step at the end."""
+    """Return the states at `ts`, the counts of steps, the result, and the end of the run.
+
+    The end is a tuple of the time, the state, and the length of the step that would follow. `watch`
+    is the condition that ends the run, or `None`.
+    """
     form = by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
     state0 = state0 if form is None else form.enter(ts[0], state0)
@@ -213,7 +230,7 @@ def _integrated(
 
 
 def _signed(sign: Array | None, t: Array) -> Array:
-    """Return s = σt, or t = σs; `sign` σ is `None` for s = t."""
+    """Return s = σt for a time t, or t = σs for a time s; σ is `sign`, or 1 if that is `None`."""
     return t if sign is None else sign.astype(t.dtype) * t
 
 
@@ -236,6 +253,7 @@ _NONFINITE_WORDS = (
 
 
 def _shortest_step_words(dtype: Any) -> str:
+    """Return the message for a run in which no step is short enough."""
     gap = np.spacing(np.asarray(1e9, dtype))
     return (
         "simulate: no step is short enough: the minimum step size, some units of round-off of the "
@@ -245,7 +263,7 @@ def _shortest_step_words(dtype: Any) -> str:
 
 
 def refuse(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
-    """Return the states `ys`, or an error in words where the run did not get to its end."""
+    """Return the states `ys`; raise an error in words if the run did not get to its end."""
     if changing(torque) is not None:
         ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
@@ -261,7 +279,7 @@ def refuse(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
 
 
 def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) -> None:
-    """Warn if a law switches by the time more often than steps can end at its switches."""
+    """Warn if a law has switches in time at more times than steps can end at."""
     missed = stats.get("switches_missed", False)
     if not _checks.is_known((missed, state0, ts)) or not np.any(np.asarray(missed)):
         return
@@ -280,18 +298,18 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
 
 @eqx.filter_jit
 def _end_of(setup: DiffraxRun, state0: Any, ts: Array) -> Any:
-    """Return where a run ends: time, state, next step, and the number of steps."""
+    """Return time, state and length of the next step at the end of a run, and its step count."""
     state0 = with_own_states(setup.body, project_to_group(state0), setup.torque, ts[0])
     *_, stats, _, end = _integrated(setup, None, state0, ts)
     return *end, stats["num_steps"]
 
 
-# Steps so much shorter than their mean that the motion stands still at one place.
+# If the last step is shorter than this share of the mean step, the run is stuck at one place.
 _STUCK = 1e-2
 
 
 def words_of_steps(setup: Any, state0: Any, ts: Array, error: RuntimeError) -> RuntimeError:
-    """Return the same error; if a run has taken all its steps, with what they were spent on."""
+    """Return an error like `error`; it says what the steps were spent on, if all were taken."""
     if _MANY_STEPS not in str(error) or not isinstance(setup, DiffraxRun):
         return error
     if not setup.is_replayed or not _checks.is_known((setup, state0, ts)):
@@ -319,6 +337,7 @@ def words_of_steps(setup: Any, state0: Any, ts: Array, error: RuntimeError) -> R
 
 
 def _free(setup: ClosedFormRun, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+    """Return the states at `ts` in closed form, the counts of steps (all 0), and the result."""
     ys = FreeMotion(setup.body, state0)(ts - ts[0])
     stats: Any = dict.fromkeys(_COUNTS, jnp.zeros((), int))
     if setup.throw:
@@ -333,7 +352,10 @@ def _free(setup: ClosedFormRun, state0: Any, ts: Array) -> tuple[Any, dict[str, 
 
 
 def refuse_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
-    """Return the states `ys` saved at `ts`; an error in the scene's words if it ended the run."""
+    """Return the states `ys` saved at `ts`; raise an error if the scene ended the run.
+
+    The message is in the words of the scene.
+    """
     ended, advice = stats["ended"], "; give throw=False to keep what came before it"
     if _checks.is_known(ended) and not np.any(np.asarray(ended)):
         return ys

@@ -1,7 +1,8 @@
-"""A step of an explicit Runge–Kutta method, its tangent and its transpose.
+"""Compute a step of an explicit Runge–Kutta method, its tangent and its transpose.
 
-The stages are a loop, so that XLA compiles only one evaluation of the field, and one vjp of it for
-the gradient. States are (n, *bodies): numbers first, bodies last.
+The stages are a loop, so that XLA compiles only one evaluation of the field and, for the gradient,
+one vector–Jacobian product of it. States are arrays (n, *bodies): the n numbers of a state are in
+the first axis. `*bodies` is one last axis in a batch of bodies, and no axis for one body.
 """
 
 from collections.abc import Callable
@@ -21,37 +22,39 @@ Field = Callable[[Arrays, Array, Array], Array]
 
 
 class Step(NamedTuple):
-    """A step: its time and length (*bodies), the state at its start (n, *bodies)."""
+    """Hold a step: the times of its start and end, its length, and the state at its start."""
 
-    t: Array
-    h: Array
-    end: Array  # t + h but for the last digit: before a jump it is the last moment before it
-    y: Array
+    t: Array  # (*bodies), s
+    h: Array  # (*bodies), s
+    # (*bodies), s: t + h but for the last digit; at a jump of the field the last moment before it.
+    end: Array
+    y: Array  # (n, *bodies)
 
 
 class Stages(NamedTuple):
-    """Times (s, *bodies), states and slopes (n, s, *bodies) at the stages; end (n, *bodies)."""
+    """Hold the s stages of a step and the state at its end; a slope is a value of the field."""
 
-    times: Array
-    places: Array
-    slopes: Array
-    end: Array
+    times: Array  # (s, *bodies)
+    places: Array  # (n, s, *bodies) the states at which the field is evaluated
+    slopes: Array  # (n, s, *bodies)
+    end: Array  # (n, *bodies)
     number: Any  # of the stages taken
 
 
 class Weights(NamedTuple):
-    """The tableau as arrays, over all stages: those of a step, then those of dense output alone."""
+    """Hold a tableau as arrays over all s stages: those of a step, then those of dense output."""
 
     a: Array  # (s, s)
     b: Array  # (s,)
-    c: Array
-    last: Array  # whether c is 1
+    c: Array  # (s,)
+    last: Array  # (s,) whether c is 1
     dense: Array  # (r, s) the rows of dense output
     errors: Array  # (1 or 2, s)
-    plain: int  # stages of a step
+    plain: int  # the number of stages of a step without dense output
 
 
 def weights(tableau: Tableau, dtype: Any) -> Weights:
+    """Return the weights of a tableau as arrays of the dtype."""
     c = np.array([0.0, *tableau.c, 1.0, *tableau.extra_c])
     rows = [{}, *tableau.a, tableau.b, *tableau.extra_a, *tableau.dense, *tableau.errors]
     table, whole = np.zeros((len(rows), c.size)), c.size
@@ -68,7 +71,10 @@ def weights(tableau: Tableau, dtype: Any) -> Weights:
 
 
 def _sum(row: Array, slopes: Array) -> Array:
-    """Σ row_i k_i over axis 1 of k (n, s, …), of which there may be fewer than weights."""
+    """Return Σ row_i k_i over axis 1 of the slopes k (n, s, …).
+
+    If there are fewer slopes than weights in `row`, the last weights are left out.
+    """
     row = row[: slopes.shape[1]]
     return jnp.sum(row.reshape(1, -1, *[1] * (slopes.ndim - 2)) * slopes, 1)
 
@@ -76,9 +82,10 @@ def _sum(row: Array, slopes: Array) -> Array:
 def stages(
     tableau: Tableau, field: Field, constants: Arrays, step: Step, dense: Any = False
 ) -> Stages:
-    """All stages of a step, if `dense` also those of dense output; `end` is not projected.
+    """Return all stages of a step, with those of dense output if `dense`.
 
-    If `dense` is traced and false, its stages are the state at the start, and their slopes 0.
+    The state at the end is not projected onto the group. If `dense` is traced and false, the stages
+    of dense output are at the start of the step, and their slopes are 0.
     """
     w = weights(tableau, step.y.dtype)
     count = w.plain if dense is False else w.c.size
@@ -92,7 +99,8 @@ def stages(
     empty = jnp.zeros((step.y.shape[0], count, *step.y.shape[1:]), step.y.dtype)
     times, places = jnp.zeros((count, *step.t.shape), step.t.dtype), empty
     if not isinstance(dense, bool):
-        # Where a field may have no value at 0, a stage that is left out must be somewhere else.
+        # The field may have no value at zeros, so a stage that is left out is at the start of the
+        # step.
         times, places = times + step.t[None], places + step.y[:, None]
         number = jnp.where(dense, number, np.int32(w.plain))
     begun = (times, places, empty)
@@ -104,14 +112,18 @@ def stages(
 def _stage(
     w: Weights, field: Field, constants: Arrays, step: Step, i: Array, slopes: Array
 ) -> tuple[Array, Array, Array]:
-    # Time may be kept in another precision than the state.
+    """Return the time, the state and the slope of stage i, from the `slopes` before it."""
+    # The time may have another precision than the state.
     y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _sum(w.a[i], slopes)
     t = jnp.where(w.last[i], step.end, step.t + w.c[i].astype(step.t.dtype) * step.h)
     return t, y, field(constants, t, y)
 
 
 def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
-    """The rows F0, F1, … of `nested` (r, n) of one body, times the length of the step."""
+    """Return the rows F0, F1, … (r, n) of dense output for `nested`, of a step of one body.
+
+    `slopes` are those of the stages of the step; the rows contain its length as a factor.
+    """
     w = weights(tableau, slopes.dtype)
     slopes = jnp.pad(slopes, ((0, 0), (0, w.c.size - w.plain)))
 
@@ -124,9 +136,10 @@ def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Arr
 
 
 def nested(theta: Array, rows: Array) -> Array:
-    """θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))) of rows (r, …) and θ from 0 to 1 in a step.
+    """Return θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))), of which F0, F1, … are the `rows`.
 
-    Added to the state at the start it is dense output: Hairer, Nørsett and Wanner (1993), II.6.
+    `theta` is θ, the part of the step that has passed, from 0 to 1. The sum of this value and the
+    state at the start of the step is dense output: Hairer, Nørsett and Wanner (1993), II.6.
     """
     total = jnp.zeros((), rows.dtype)
     for i in reversed(range(rows.shape[0])):
@@ -135,13 +148,15 @@ def nested(theta: Array, rows: Array) -> Array:
 
 
 def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) -> Array:
-    """The error of a step (n, *bodies).
+    """Return an estimate of the error of a step (n, *bodies).
 
-    Two estimates e5, e3 make e5 |e5|/√(|e5|² + 0.01 |e3|²), which falls as h⁸ (Hairer, Nørsett and
-    Wanner 1993, II.10). The lengths are those of each array of the state, of `sizes` numbers.
+    If the tableau has two estimates, e5 of order 5 and e3 of order 3, they are combined to
+    e5 |e5|/√(|e5|² + 0.01 |e3|²), which falls as h⁸ with the length h of the step (Hairer, Nørsett
+    and Wanner 1993, II.10). The norms |e5| and |e3| are taken over each array of the state alone;
+    `sizes` are the sizes of these arrays.
     """
     dtype, ones = slopes.dtype, [1] * (slopes.ndim - 2)
-    # All sums at once: for one body each is a kernel of its own.
+    # All sums are one operation, because for one body each sum would be a kernel of its own.
     rows = weights(tableau, dtype).errors[:, : slopes.shape[1]]
     found = jnp.sum(rows.reshape(len(rows), 1, -1, *ones) * slopes[None], 2)
     found = lift(h.astype(dtype), found) * found
@@ -150,7 +165,7 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     which = np.repeat(np.eye(len(sizes)), sizes, axis=1)
     which = jnp.asarray(which, dtype).reshape(*which.shape, *ones)
     high, low = jnp.sum(which[None] * (found * found)[:, None], 2)
-    # The smallest normal number keeps 0/0 out; no real estimate is as small as its root.
+    # The smallest normal number prevents 0/0. Its root is smaller than any estimate of a real step.
     ratio = jnp.sqrt(high / (high + 0.01 * low + float(jnp.finfo(dtype).tiny)))
     return found[0] * jnp.sum(which * ratio[:, None], 0)
 
@@ -159,9 +174,11 @@ def pulled(
     tableau: Tableau, field: Field, constants: Arrays, step: Step, there: Stages,
     cotangent: Array, of_slopes: Array | None = None,
 ) -> tuple[Arrays, Array, Array, Array]:  # fmt: skip
-    """The transpose of a step: cotangents of the constants, of time, of length, of the state.
+    """Return the cotangents of the constants, and of the time, length and state of a step.
 
-    `cotangent` is of the state at the end, `of_slopes` (n, s, *bodies) of all slopes.
+    This is the transpose of a step with the stages `there`. `cotangent` (n, *bodies) is that of the
+    state at the end of the step, and `of_slopes` (n, s, *bodies) are those of all slopes, or
+    `None`.
     """
     w, count = weights(tableau, step.y.dtype), there.slopes.shape[1]
     h, put = step.h.astype(step.y.dtype), lax.dynamic_update_index_in_dim
@@ -178,8 +195,9 @@ def pulled(
 
     none = jnp.zeros_like(there.slopes)
     below, seeds = lax.fori_loop(np.int32(0), there.number, stage, (none, none))
-    # The constants' share of all stages at once: it does not wait for the others. Each stage has
-    # constants of its own, and their shares are summed last: else each number is a kernel.
+    # The cotangents of the constants do not wait for each other, so all stages are transposed at
+    # once. Each stage gets a copy of the constants, and the cotangents of the copies are summed
+    # last: otherwise each number is a kernel.
     every = jax.vmap(lambda c, t, y: field(c, t, y), (0, 0, 1), 1)
     own = [jnp.broadcast_to(c, (count, *c.shape)) for c in constants]
     pull = jax.vjp(lambda c, t: every(c, t, there.places), own, there.times)[1]

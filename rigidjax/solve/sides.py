@@ -1,7 +1,8 @@
-"""The parts of a torque that declare their jumps, each on its own side of them.
+"""Evaluate each part of a torque that jumps on that side of its jumps on which a step lies.
 
-Two parts that jump at the same time have two stops, one a little after the other: between both the
-first part has its new value, the other its old one. So each jump has its own derivative.
+Two parts that jump at the same time have two stops, at which steps end, one a little after the
+other. Between the two stops the first part has its new value and the other part its old one, so
+that each jump has its own derivative.
 """
 
 from typing import Any
@@ -18,15 +19,16 @@ from rigidjax.motion.torques.piecewise import Held, Linear, Pulses, Tabulated
 from rigidjax.motion.torques.states import has_own_states
 from rigidjax.solve.switching import DECLARED
 
-# The laws of this package with jumps of their own; the others pass on those of their parts.
+# These laws of this package have jumps of their own; all others pass on the jumps of their parts.
 _OWN = (Held, Linear, Pulses, Tabulated, Delayed, Lagged)
 
 
 class Sided(eqx.Module):
-    """A law that is called on the side of its jumps that a step is on.
+    """Evaluate a law on that side of its jumps on which a step lies.
 
-    `stops` (n,) s are the times at which steps end for the `jumps` (n,) of the law, at most some
-    units of round-off away; `None` where they are the same. `sign` is as for `in_forward_time`.
+    `jumps` (n,), s, are the times at which the law jumps, and `stops` (n,), s, the times at which
+    steps end for them, at most some units of round-off away; `None` if the two are equal. `sign` is
+    the direction of time as for `in_forward_time`.
     """
 
     law: Any
@@ -35,14 +37,14 @@ class Sided(eqx.Module):
     sign: Any
 
     def __getattr__(self, name: str) -> Any:
-        # The law's members (`feels`, `rate_free`, …).
+        # All other members, such as `feels` or `rate_free`, are those of the law.
         if name.startswith("__") or name in ("law", "jumps", "stops", "sign"):
             raise AttributeError(name)
         return getattr(self.law, name)
 
     @property
     def law_name(self) -> str:
-        """The name of the law's class."""
+        """Return the name of the law's class."""
         return type(self.law).__name__
 
     def __call__(self, t: Any, *args: Any) -> Any:
@@ -51,15 +53,16 @@ class Sided(eqx.Module):
             return self.law(self.seen(t), *args)
 
     def seen(self, t: Any) -> Any:
-        """The time that the law is called with: `t`, or the nearest one on the side of the step."""
+        """Return the time to call the law at: `t`, or the nearest time on the side of the step."""
         if self.sign is None and self.stops is None:
             return t
         still = lax.stop_gradient(jnp.asarray(t))
         low = jnp.full_like(still, -jnp.inf)
         now = still
         if self.sign is not None:
-            # A law has its new value from the jump on; a step back that begins there wants the old
-            # one. The oldest JAX has no derivative of `nextafter`, not even one to be stopped.
+            # A law has its new value from the jump on, but a step back in time that begins at the
+            # jump needs the old value. The oldest supported JAX has no derivative of `nextafter`,
+            # not even inside `stop_gradient`, so `still` is stopped before.
             now = jnp.where(self.sign < 0, jnp.nextafter(still, low), still)
         if self.stops is not None:
             jumps, stops = (a.astype(still.dtype) for a in (self.jumps, self.stops))
@@ -71,7 +74,11 @@ class Sided(eqx.Module):
 
 
 def _declares(node: Any) -> bool:
-    """Return whether a law has jumps of its own, or says that it has none."""
+    """Return whether a law declares jumps of its own.
+
+    A law of this package does if it has jumps; a law of a user does if it has the member
+    `jump_times`, even if that is empty.
+    """
     if isinstance(node, type) or not hasattr(node, "jump_times"):
         return False
     if type(node).__module__.startswith("rigidjax."):
@@ -80,13 +87,17 @@ def _declares(node: Any) -> bool:
 
 
 def declared_jumps(field: Any) -> list[Array]:
-    """Return the `jump_times`, s, of each part of a vector field that has some."""
+    """Return the `jump_times`, s, of each part of a vector field that has jumps."""
     parts = filter(_declares, jax.tree.leaves(field, is_leaf=_declares))
     return [jumps for part in parts if (jumps := jnp.asarray(jumps_of(part))).shape[0]]
 
 
 def on_sides(field: Any, sign: Any, sides: Any) -> Any:
-    """Return the field whose parts are on their sides of `sides`, the stops of each, or `None`."""
+    """Return the field in which each part that declares jumps is a `Sided` law.
+
+    `sides` are the stops of each part that has jumps, in the order of `declared_jumps`, or `None`
+    if they are at the jumps themselves. `sign` is as for `Sided`.
+    """
     stops = iter(sides or ())
 
     def on_side(part: Any) -> Any:
@@ -94,7 +105,8 @@ def on_sides(field: Any, sign: Any, sides: Any) -> Any:
             return part
         jumps = jnp.asarray(jumps_of(part))
         own = next(stops, None) if jumps.shape[0] else None
-        # A law with states of its own has kinks alone, and is looked for by its class.
+        # A law with states of its own has kinks but no jumps, and is found later by its class: it
+        # stays as it is.
         return (
             part
             if has_own_states(part)

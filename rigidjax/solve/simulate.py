@@ -1,4 +1,4 @@
-"""`simulate`: the motion of a body or a particle, saved at given times."""
+"""Simulate the motion of a body or a particle, saved at given times."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -33,16 +33,17 @@ from rigidjax.solve.run import (
 from rigidjax.solve.solution import Solution, State, with_error
 from rigidjax.solve.splitting import AbstractSplitting
 
-# A torque must accept the given state: gravity on a `Spin` is an error that type checkers see.
+# A torque must accept the type of the state, so that type checkers refuse gravity on a `Spin`.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 
-# Made once: building a Module costs as much as ten steps.
+# These are made once, because to build a Module costs as much as ten steps.
 SOLVER = Projected(dfx.Dopri8())
 ADJOINT = dfx.RecursiveCheckpointAdjoint()
-# All that these adjoints of diffrax ask, `ReplayAdjoint` has.
+# `ReplayAdjoint` can do all that these adjoints of diffrax can, and takes their place.
 _EITHER_MODE = (type(None), dfx.ForwardMode, dfx.RecursiveCheckpointAdjoint)
-# A step that reverse mode runs again rounds differently. So near to round-off its length then
-# differs, too (2e-4 of a gradient at 1e-13): keep the start of every step of all but long runs.
+# A step that reverse mode runs again may round differently. Under tolerances so near to round-off
+# its length then differs, too, which changed a gradient by 2e-4 of it at 1e-13. Therefore the start
+# of every step is kept, except in long runs.
 _TIGHT, _EVERY_STEP = 1e-10, dfx.RecursiveCheckpointAdjoint(checkpoints=4096)
 
 
@@ -65,60 +66,70 @@ def simulate(
     throw: bool = True,
     progress_meter: dfx.AbstractProgressMeter | None = None,
 ) -> Solution[State]:
-    """The motion of a rigid body from `state0`, saved at `ts`.
+    """Simulate the motion of a rigid body from the state `state0`, saved at the times `ts`.
 
     **Arguments:**
 
-    - `body`: `Inertia` for `Spin` and `Attitude`, about the point that the body turns about;
-      `MassProperties` for `Rigid`; `None` for a `Point`.
-    - `state0`: `Spin(omega)`, `Attitude(q, omega)` or `Rigid(x, v, q, omega)` at `ts[0]`, of one
-      body. For many, `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`; with
-      `throw=False` return `.result`, too: one for each body.
-    - `ts`: (T,) increasing times, s, or decreasing ones, backwards in time. The first is the start.
+    - `body`: the body. It is an `Inertia`, about the point that the body turns about, for a `Spin`
+      or an `Attitude`; `MassProperties` for a `Rigid`; and `None` for a `Point`.
+    - `state0`: the state of one body at the time `ts[0]`: `Spin(omega)`, `Attitude(q, omega)`,
+      `Rigid(x, v, q, omega)`, or a `Point(x, v)`. For many bodies write
+      `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`; with `throw=False` return
+      `.result`, too, which says of each body how its run ended.
+    - `ts`: (T,) the times to save, s, of which the first is the start. They increase, or they
+      decrease for a run backwards in time.
     - `torque`: a torque of `rigidjax.torques`, or any callable Module `(t, state, body) → (3,)`,
-      N m, body frame; `None` for a free body. Steps end where it declares jumps (`jump_times`), and
-      where it compares the time with what no state changes (`jnp.where(t < te, …)`): such times are
-      found before the run, and have derivatives. Steps do not end at switches by the state, and
-      their derivatives are lost: end a run there by an `event`, and begin another. A torque's
-      own states (`rigidjax.torques.AbstractTorque`) are in `own`. For a `Point` it is a scene of
-      `rigidjax.scenes`, a `MovingFrame`, or a force per mass `(t, state, None) → (3,)`, m/s².
-    - `solver`: `None` is the cheapest accurate choice: the closed form (`rigidjax.exact`) for a
-      free body, else `rigidjax.solvers.DormandPrince8` (order 8), for any number of saved times;
-      with `max_steps=None` or `adjoint=diffrax.ForwardMode()` it is `diffrax.Dopri8`. It may be any
-      `diffrax.AbstractSolver`; a wrapper keeps attitudes unit quaternions, at every step and every
-      saved time. Between its steps the error of `DormandPrince8` is up to ten times `rtol`, that of
-      Dopri8 up to 26 times below `rtol=1e-10`.
-    - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
-      float32. Traced ones are not checked, and other values do not compile again. Scale `atol` to
-      the smallest number that matters. The closed form uses neither.
-    - `accuracy`: in the place of tolerances, how far the states may be from the exact motion: rad,
-      and relative to the largest value in the run. Two or more cheap runs find the tolerance.
-      `sol.error` is then known without more runs. Where it exceeds the accuracy (chaos, round-off),
-      a `UserWarning` says from which time on; under `jit` look at `sol.error.relative`.
-    - `dt0`, `stepsize_controller`: first step and controller where the tolerances are not enough,
-      such as `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
-    - `max_step`: the longest step, s, such as half of the shortest event in a law that steps could
-      pass over (a smooth bump, a switch by the state). The closed form takes no steps; a
-      `stepsize_controller` has its own limit.
-    - `adjoint`: how derivatives are taken, as in diffrax. `None` is `rigidjax.solvers.
-      ReplayAdjoint()` for the explicit methods of `rigidjax.solvers`: `jax.grad`, `jax.jacfwd`,
-      `jax.jacrev` and `jax.hessian` (forward over reverse) work, as in closed form, and `jax.grad`
-      of a `jax.grad` is refused. For other solvers it is `diffrax.RecursiveCheckpointAdjoint()` for
-      `jax.grad`, with 4096 checkpoints where `rtol` is known to be below 1e-10, and
-      `diffrax.ForwardMode()` is for `jax.jacfwd`. If you need only `jax.jacfwd` of a body,
-      `diffrax.ForwardMode()` is faster; it is not for a particle with few saved times.
-    - `event`: `(t, state, body) → scalar`, or an `Event` of it: the run ends at its first zero.
-      `event_time` and `event_state` of the solution are exact to the tolerances, with first and
-      second derivatives with respect to all numbers, also the condition's own; later `ys` are NaN,
-      and `result` is `event_occurred`. Without a zero they are NaN and the run goes to its end.
-      Events are for the closed form and the explicit methods of `rigidjax.solvers`; for a solver of
-      diffrax give `diffrax.Event` there.
+      N m, body frame; `None` for a free body. Steps end at the jumps that it declares
+      (`jump_times`). Steps also end where it compares the time with a value that no state changes
+      (`jnp.where(t < te, …)`): these times are found before the run, and have derivatives. Steps do
+      not end where the torque switches by the state, and the derivative of such a switch is lost:
+      end the run there by an `event`, and begin another one. The states of a torque's own
+      (`rigidjax.torques.AbstractTorque`) are in `own` of the solution. For a `Point` the torque is
+      a scene of `rigidjax.scenes`, a `MovingFrame`, or a force per mass `(t, state, None) → (3,)`,
+      m/s².
+    - `solver`: any `diffrax.AbstractSolver`; a wrapper keeps attitudes unit quaternions, at every
+      step and every saved time. `None` is the cheapest accurate choice, for any number of saved
+      times: the closed form (`rigidjax.exact`) for a free body, else
+      `rigidjax.solvers.DormandPrince8` (order 8). With `max_steps=None` or
+      `adjoint=diffrax.ForwardMode()` this choice is `diffrax.Dopri8` instead. Between the steps the
+      error of `DormandPrince8` is up to ten times `rtol`; that of `Dopri8` is up to 26 times `rtol`
+      if `rtol` is below 1e-10.
+    - `rtol`, `atol`: the relative and the absolute tolerance of the adaptive steps. The defaults
+      are 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in float32. Traced tolerances are not checked,
+      and other values do not compile again. Scale `atol` to the smallest number that matters. The
+      closed form uses neither.
+    - `accuracy`: how far the states may be from the exact motion, given in the place of tolerances.
+      For rotations it is an angle, rad; for all else it is relative to the largest value in the
+      run. Two or more cheap runs find the tolerance. `sol.error` is then known without more runs.
+      If `sol.error` exceeds the accuracy (chaos, round-off), a `UserWarning` says from which time
+      on; under `jit` look at `sol.error.relative`.
+    - `dt0`, `stepsize_controller`: the first step, s, and the step controller, if the tolerances
+      are not enough: `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`, for example.
+    - `max_step`: the longest step, s. Steps could pass over a short event in a law, such as a
+      smooth bump or a switch by the state: give half of the shortest one. The closed form takes no
+      steps; a `stepsize_controller` has its own limit.
+    - `adjoint`: how derivatives are taken, as in diffrax. For the explicit methods of
+      `rigidjax.solvers` the default `None` is `rigidjax.solvers.ReplayAdjoint()`: `jax.grad`,
+      `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over reverse) work, as in closed form,
+      and `jax.grad` of a `jax.grad` is refused. For other solvers `None` is
+      `diffrax.RecursiveCheckpointAdjoint()`, for `jax.grad`; it has 4096 checkpoints if `rtol` is
+      known to be below 1e-10. With these solvers give `diffrax.ForwardMode()` for `jax.jacfwd`. If
+      you need only `jax.jacfwd` of a body, `diffrax.ForwardMode()` is faster than the default; it
+      is not faster for a particle with few saved times.
+    - `event`: a condition `(t, state, body) → scalar`, or an `Event` of one: the run ends at its
+      first zero. `event_time` and `event_state` of the solution are exact to the tolerances, and
+      have first and second derivatives with respect to all numbers, also those of the condition;
+      later `ys` are NaN, and `result` is `event_occurred`. If the condition has no zero,
+      `event_time` and `event_state` are NaN and the run goes to its end. Events are for the closed
+      form and the explicit methods of `rigidjax.solvers`; with a solver of diffrax, call
+      `diffrax.diffeqsolve` with a `diffrax.Event`.
     - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
-    - `throw`: with `False` nothing in a run, and no bad start in a batch, raises an error: `result`
-      gives the reason, states not reached are NaN, as are their derivatives, and other bodies of
-      the batch get the same bits as without the bad one. The motion of an invalid traced body (a
-      mass that is not positive, moments of no real body) is NaN, its `result` `nonfinite_input`.
-      Known wrong numbers are refused in any case.
+    - `throw`: whether a run that fails raises an error. With `False` nothing in a run, and no bad
+      start in a batch, raises one: `result` gives the reason; the states that are not reached are
+      NaN, as are their derivatives; and the other bodies of a batch get the same bits as without
+      the bad one. The motion of an invalid traced body (with a mass that is not positive, or
+      moments of no real body) is NaN, and its `result` is `nonfinite_input`. Known wrong numbers
+      are refused in any case.
 
     **Returns** a `Solution`. A second call with other numbers of the same shapes does not compile
     again. Source: the equations of Newton and Euler (notes, eqs 50, 79, 84).
@@ -154,7 +165,7 @@ def simulate(
     if torque is None and solver is None and stepsize_controller is None and body is not None:
         found = _solution(ClosedFormRun(body, throw), event, state0, times)
         return found if accuracy is None else with_error(found, found.error, accuracy)
-    # As arrays: another tolerance does not compile again.
+    # The tolerances are arrays, so that another tolerance does not compile again.
     if stepsize_controller is None:
         rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
     setup = DiffraxRun(
@@ -183,18 +194,25 @@ def simulate(
 
 
 def _solver(solver: Any, adjoint: Any, event: Any, max_steps: int | None) -> Any:
-    """Return the solver of a run, on the group; `None` is the quickest one under this adjoint."""
+    """Return the solver of a run, which keeps attitudes on the group.
+
+    For `None` it is the quickest solver under this adjoint, event and limit of steps.
+    """
     if solver is None:
-        # Where forward mode is all that is asked, tangents go along with the run of diffrax.
+        # If forward mode alone is asked for, diffrax carries the tangents along with its run.
         forward = isinstance(adjoint, dfx.ForwardMode) and event is None
         return SOLVER if forward or max_steps is None else DormandPrince8()
-    # Ours project inside their one kernel; a second time outside of it breaks the kernel up.
+    # The solvers of this package project inside their one kernel; a second projection outside of it
+    # would break the kernel up.
     ours = isinstance(solver, AbstractExplicit | AbstractSplitting | Projected)
     return solver if ours else Projected(solver)
 
 
 def _adjoint(setup: DiffraxRun) -> dfx.AbstractAdjoint:
-    """Return the adjoint of a run; `ReplayAdjoint` where it takes the run, in either mode."""
+    """Return the adjoint of a run: `ReplayAdjoint` if it can take the place of the one given.
+
+    Else it is the one given or, for `None`, one for reverse mode.
+    """
     explicit = isinstance(setup.solver, AbstractExplicit) and setup.max_steps is not None
     if explicit and isinstance(setup.adjoint, _EITHER_MODE):
         return REPLAY
@@ -206,6 +224,7 @@ def _adjoint(setup: DiffraxRun) -> dfx.AbstractAdjoint:
 
 
 def _accurate(setup: DiffraxRun, event: Any, state0: Any, times: Array, accuracy: Any) -> Solution:
+    """Return the solution, with its error, of a run whose tolerance gives the `accuracy`."""
     found, run, tried = solve_to(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
     sol = _solution(found, event, state0, times, None if event is not None else run)
@@ -214,6 +233,7 @@ def _accurate(setup: DiffraxRun, event: Any, state0: Any, times: Array, accuracy
 
 
 def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None) -> Solution:
+    """Return the solution of a run; `run` is what `solve` returned, if that is known already."""
     event_time = event_state = None
     try:
         if run is not None:
@@ -231,6 +251,7 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
     if setup.throw and "ended" in stats:
         ys = refuse_ended(setup.torque, ys, stats, times)
     motion, own = (ys.motion, ys.own) if isinstance(ys, Coupled) else (ys, None)
-    # The set-up as arrays and the rest, so that `jax.jit` and `jax.vmap` can return it.
+    # The set-up is split into its arrays and the rest, so that `jax.jit` and `jax.vmap` can return
+    # it.
     arrays, rest = eqx.partition(setup, eqx.is_array)
     return Solution(times, motion, stats, result, arrays, rest, event_time, event_state, own)

@@ -1,4 +1,4 @@
-"""The result of a run."""
+"""Hold the result of a run, and compute its drift, growth of errors and error when asked."""
 
 import dataclasses
 import warnings
@@ -26,17 +26,24 @@ State = TypeVar("State", Spin, Attitude, Rigid, Point)
 
 
 class Solution(eqx.Module, Generic[State]):
-    """The result of `simulate`.
+    """Hold the result of `simulate`.
 
-    **Fields:** `ts` (T,) the given times, s; `ys` the states there, of the type of `state0`, with a
-    leading time axis, NaN at times that the run did not reach; `stats` a dict with `num_steps`,
-    `num_accepted_steps`, `num_rejected_steps`, for a `Point` also `drift` of its scene's conserved
-    quantities; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
-    `max_steps_reached`, `nonfinite`, `nonfinite_input` (no body has these numbers),
-    `dt_min_reached`, `event_occurred`. `event_time` s, `event_state` of the type of `state0` (under
-    a law with states a `Coupled`): NaN where it was not met, `None` where there is no event. `own`
-    a tuple of the states of the laws that have some, in the order of the laws, what is inside
-    another first, with a leading time axis, or `None`.
+    **Fields:**
+
+    - `ts` (T,): the given times, s.
+    - `ys`: the states at `ts`, of the type of `state0`, with a leading time axis; NaN at times that
+      the run did not reach.
+    - `stats`: a dict with `num_steps`, `num_accepted_steps` and `num_rejected_steps`; for a `Point`
+      also with `drift`, that of the conserved quantities of its scene.
+    - `result`: a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
+      `max_steps_reached`, `nonfinite`, `nonfinite_input` (no body has these numbers),
+      `dt_min_reached` or `event_occurred`.
+    - `event_time`, s, and `event_state`: the time and the state at the event. Both are NaN if the
+      event did not occur, and `None` if no event was given. The state has the type of `state0`;
+      under a law with states of its own it is a `Coupled`.
+    - `own`: a tuple of the states of the laws that have states of their own, each with a leading
+      time axis, or `None`. They are in the order of the laws; a law inside another one comes before
+      it.
 
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
     >>> sol = rj.simulate(body, start, [0.0, 1.0, 2.0])
@@ -49,7 +56,8 @@ class Solution(eqx.Module, Generic[State]):
     stats: dict[str, Any]
     result: dfx.RESULTS
     _arrays: Any
-    # A tree, no `PyTreeDef`: what Equinox leaves out of one is not itself after `pickle`.
+    # This is a tree and not a `PyTreeDef`: there the object by which Equinox marks what it leaves
+    # out is another object after `pickle`.
     _rest: Any = eqx.field(static=True)
     event_time: Float[Array, ""] | None = None
     event_state: Any = None
@@ -73,10 +81,11 @@ class Solution(eqx.Module, Generic[State]):
 
     @property
     def drift(self) -> dict[str, Array]:
-        """The drift of each conserved quantity of the scene, relative to its size.
+        """Return the drift of each quantity that the motion conserves, relative to its size.
 
-        See `rigidjax.drift`: energy, angular momentum in the world, its component along gravity…,
-        whichever this scene conserves; for a `Point` its scene decides. Zero is best.
+        See `rigidjax.drift`. The quantities may be the energy, the angular momentum in the world
+        frame or its component along gravity; the body and its torque decide which there are, and
+        for a `Point` its scene. Zero is best.
         """
         if "drift" in self.stats:
             return self.stats["drift"]
@@ -84,18 +93,18 @@ class Solution(eqx.Module, Generic[State]):
 
     @property
     def growth(self) -> Float[Array, " times"]:
-        """‖∂y(t)/∂y(t₀)‖ at each of `ts`: the growth of a small error at the start.
+        """Return the growth of a small error at the start, ‖∂y(t)/∂y(t₀)‖, at each time t of `ts`.
 
-        It is computed when it is read, by forward mode: about as many runs as the state has
-        numbers. It has no unit: each of q, Ω, x, v counts relative to its largest size in the run,
-        and the norm is the largest singular value.
+        The growth is computed when it is read, by forward mode, which takes about as many runs as
+        the state y has numbers. It has no unit: each of q, Ω, x and v is relative to its largest
+        size in the run, and the norm is the largest singular value.
 
-        A solver's own errors grow as much. If `growth * rtol` exceeds 1, the states have no correct
-        digit, and gradients through them mean nothing: a `UserWarning` names the first such time.
-        End the run earlier then, or fit shorter recordings.
+        The errors of the solver grow as much. Where `growth * rtol` exceeds 1, the states have no
+        correct digit, and gradients through them mean nothing: a `UserWarning` names the first such
+        time. End the run earlier then, or fit shorter recordings.
 
-        Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
-        Ruelle 1985, doi:10.1103/RevModPhys.57.617).
+        Source: the largest finite-time Lyapunov exponent is the logarithm of the growth over t
+        (Eckmann and Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
         found = _growth(self._setup, self.ts, self._states)
         rtol = None
@@ -117,17 +126,18 @@ class Solution(eqx.Module, Generic[State]):
 
     @property
     def error(self) -> Error:
-        """How far the states are from the exact motion of the given numbers: an `Error`.
+        """Return how far the states are from the exact motion of the given numbers, as an `Error`.
 
-        It is computed when it is read: by a run with a fiftieth of the tolerances (for fixed
-        steps: with half of the step), and, if round-off may count, by three runs with changed last
-        digits of body, torque and start (in closed form, of the times). A `UserWarning` names the
-        time after which nothing is known, as in chaos.
+        The error is computed when it is read, by a second run with a fiftieth of the tolerances
+        (for fixed steps, with half of the step). If round-off may count, three more runs have
+        changed last digits of body, torque and start (in closed form, of the times). A
+        `UserWarning` names the time after which nothing is known, as in chaos.
 
-        A torque that depends on the time is also sampled at 16 384 times, each part of the run at
-        one saved state: adaptive steps of the second run end at a pulse that both runs would pass
-        over. Not seen is a pulse between two samples, one that the torque has at other states only,
-        and under fixed steps one that falls between their stages.
+        A torque that depends on the time is also sampled at 16 384 times, in each part of the run
+        at one saved state. Adaptive steps of the second run end at a pulse that is found so, and
+        which both runs might otherwise pass over. Three kinds of pulses are not seen: one between
+        two samples; one that the torque has at other states only; and, under fixed steps, one that
+        falls between their stages.
 
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.5, 1.0])
         >>> law = rj.torques.Damping([0.1, 0.1, 0.1])
@@ -141,12 +151,12 @@ class Solution(eqx.Module, Generic[State]):
         return found
 
     def transition_matrix(self) -> Float[Array, "times n n"]:
-        """∂ state(t) / ∂ state(t₀) at each of `ts`, on the tangent spaces of the states.
+        """Return ∂ state(t) / ∂ state(t₀) at each of `ts`, on the tangent spaces of the states.
 
-        Rows and columns are small changes: Ω for a `Spin` (n = 3); δθ, Ω for an `Attitude` (6);
-        x, v, δθ, Ω for a `Rigid` (12); x, v for a `Point` (6). δθ, rad, is a turn in body axes,
-        q ⊗ exp(½δθ): three numbers. The columns are forward-mode derivatives, NaN at times that the
-        run did not reach. An event does not end this run.
+        Rows and columns are small changes of Ω for a `Spin` (n = 3); of δθ, Ω for an `Attitude`
+        (6); of x, v, δθ, Ω for a `Rigid` (12); and of x, v for a `Point` (6). The three numbers δθ,
+        rad, are a turn in body axes, q ⊗ exp(½δθ). The columns are forward-mode derivatives, NaN at
+        times that the run did not reach. The derivatives are those of a run that no event ends.
 
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
         >>> rj.simulate(body, start, [0.0, 2.0]).transition_matrix()[1, 2].tolist()
@@ -156,11 +166,11 @@ class Solution(eqx.Module, Generic[State]):
         return _transition(self._setup, self.ts, self.ys)
 
     def evaluate(self, t: ScalarLike) -> State:
-        """The state at any `t` between the first and the last of `ts`, s.
+        """Return the state at any time `t`, s, between the first and the last of `ts`.
 
-        The motion is computed again from the last saved state before `t`, with its own steps.
+        The motion is computed again from the last saved state before `t`, with steps of its own.
 
-        **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if `t` is outside.
+        **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if `t` is outside of `ts`.
         """
         t = _checks.array_of_shape(t, (), "t").astype(self.ts.dtype)
         way = jnp.sign(self.ts[-1] - self.ts[0])
@@ -183,12 +193,13 @@ class Solution(eqx.Module, Generic[State]):
 
 
 def with_error(sol: Solution, error: Error, accuracy: Any) -> Solution:
-    """The solution with its error; in words where that exceeds the accuracy asked for."""
+    """Return the solution with its error; warn if the error exceeds the accuracy asked for."""
     _say(error, accuracy, "simulate: the accuracy cannot be had")
     return dataclasses.replace(sol, _error=error)
 
 
 def _say(error: Error, most: Any, words: str) -> None:
+    """Warn with these words of the first time at which the relative error exceeds `most`."""
     if not _checks.is_known((error, most)) or not np.any(np.asarray(error.relative) > most):
         return
     i = int(np.argmax(np.asarray(error.relative) > most))
@@ -211,7 +222,7 @@ def _drift(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> dict[str, A
 
 @eqx.filter_jit
 def _transition(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, "times n n"]:
-    # A run that raises nothing, and which forward mode goes through.
+    # This run raises no error, and forward mode goes through it.
     plain = isinstance(setup, DiffraxRun) and not setup.is_replayed
     more = dict(adjoint=dfx.ForwardMode()) if plain else {}
     setup = dataclasses.replace(setup, throw=False, **more)
@@ -225,13 +236,13 @@ def _transition(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[
 
 @eqx.filter_jit
 def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, " times"]:
-    """The largest singular value of dy(t)/dy(t0), each part relative to its largest size."""
+    """Return the largest singular value of ∂y(t)/∂y(t₀), each part relative to its largest size."""
     start = jax.tree.map(lambda leaf: leaf[0], ys)
     each = parts_by_name(start, jnp.ones(dimension(start), ts.dtype)).values()
     both = zip(each, jax.tree.leaves(ys), strict=True)
     sizes = jnp.concatenate([a.reshape(-1) * largest_in_run(b) for a, b in both])
     sizes = jnp.where(sizes > 0, sizes, 1)
-    # A turn by δθ changes q by half of it.
+    # A turn by δθ changes q by half of δθ.
     for turned in rotation_slices(start):
         sizes = sizes.at[turned].multiply(2)
     change = _transition(setup, ts, ys) * (sizes[None] / sizes[:, None])[None]

@@ -1,4 +1,4 @@
-"""Every solver of ours, and the adjoint that runs them, in one module: `rigidjax.solvers`."""
+"""Provide every solver of this package, and the adjoint that runs them, as `rigidjax.solvers`."""
 
 from rigidjax._names import show
 from rigidjax.exact.diffrax_solver import FreeSolver as FreeSolver

@@ -1,7 +1,9 @@
-"""Splittings on the exact free flow: free motion in closed form, torque as kicks of momentum.
+"""Solve the rotation of a body by splitting: exact free motion, and kicks of the momentum.
 
-`A` is the free body (`rigidjax.exact`), `B` the kick `Π ← Π + c h τ(t, q)` at a fixed attitude; a
-step is `B(b1) A(a1) B(b2) … A(a1) B(b1)`: symmetric, and each part an exact Hamiltonian flow.
+`A` is the motion of the free body in closed form (`rigidjax.exact`). `B` is the kick
+`Π ← Π + c h τ(t, q)` of the momentum Π by the torque τ at a fixed attitude q, where h is the length
+of the step and c a weight. A step is `B(b1) A(a1) B(b2) … A(a1) B(b1)`: it is symmetric, and each
+of its parts is an exact Hamiltonian flow.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -36,7 +38,10 @@ from rigidjax.solve.tableaus import numbers
 
 
 class Composition(NamedTuple):
-    """A symmetric composition `B(b1) A(a1) … B(b1)`: its order, and the weights of A and B."""
+    """Hold a symmetric composition `B(b1) A(a1) … B(b1)` by its order and weights.
+
+    `flows` are the weights of A, and `kicks` those of B.
+    """
 
     order: int
     flows: tuple[float, ...]
@@ -44,7 +49,10 @@ class Composition(NamedTuple):
 
 
 def _symmetric(order: int, flows: tuple[float, ...], kicks: tuple[float, ...]) -> Composition:
-    """The composition with these first halves; the middle weights make the sums 1."""
+    """Return the composition whose weights begin with `flows` and `kicks`.
+
+    The middle weights follow from the sums, which are 1; the others from the symmetry.
+    """
     if len(flows) < len(kicks):
         middle = 1 - 2 * sum(kicks)
         flows = (*flows, 0.5 - sum(flows))
@@ -56,8 +64,9 @@ def _symmetric(order: int, flows: tuple[float, ...], kicks: tuple[float, ...]) -
 
 # Strang 1968, doi:10.1137/0705041.
 STRANG = Composition(2, (1.0,), (0.5, 0.5))
-# Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, methods SRKN6b and SRKN11b, for kicks
-# that commute with each other's commutators: these depend on attitude alone.
+# Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, methods SRKN6b and SRKN11b. They are for
+# kicks B that commute with [B, [B, A]]. Here they do, because both change the momentum alone, and
+# by a function of the attitude alone.
 SRKN6 = _symmetric(
     4,
     numbers("0.245298957184271 0.604872665711080"),
@@ -75,17 +84,20 @@ SRKN11 = _symmetric(
 
 
 class Frame(NamedTuple):
-    """The principal frame of a body; off-diagonal entries are zero and carry the tangents."""
+    """Hold the principal axes of a body, and the inertia and its inverse along these axes.
 
-    moments: Six
-    weights: Six  # the inverse
-    axes: Array  # columns
+    The off-diagonal entries of both are zero, and carry the tangents.
+    """
+
+    moments: Six  # the inertia, kg m²
+    weights: Six  # its inverse
+    axes: Array  # (3, 3), the axes as columns
 
 
 def principal(tensor: Array) -> Frame:
-    """The principal frame of an inertia (3, 3)."""
+    """Return the principal frame of an inertia `tensor` (3, 3), kg m²."""
     six, axes = principal_frame(tensor)
-    # Relative to the trace first: the cube of 1e37 kg m² is no number.
+    # The tensor is inverted relative to its trace, because the cube of 1e37 kg m² overflows.
     size = six[0] + six[1] + six[2]
     unit: Six = tuple(i / size for i in six)
     scale = determinant(unit)
@@ -94,7 +106,7 @@ def principal(tensor: Array) -> Frame:
 
 @jax.custom_jvp
 def rate_of(weights: Six, p: Triple) -> Triple:
-    """Ω of Π in principal axes."""
+    """Return the body rate Ω of the momentum `p`, both along the principal axes."""
     return weights[0] * p[0], weights[1] * p[1], weights[2] * p[2]
 
 
@@ -105,7 +117,10 @@ def rate_of_jvp(primals, tangents):
 
 
 class AbstractSplitting(dfx.AbstractSolver):
-    """Kicks and exact free flows in the order of `composition`, which subclasses name."""
+    """Solve the rotation of a body by kicks and exact free flows, as a composition orders them.
+
+    Subclasses name the `composition`.
+    """
 
     term_structure: ClassVar = dfx.ODETerm
     interpolation_cls: ClassVar = NestedInterpolation
@@ -137,7 +152,8 @@ class AbstractSplitting(dfx.AbstractSolver):
         field, way = field_of(terms)
         state, h = (y0.q, enter(solver_state, y0.omega)), jnp.asarray(t1 - t0) * way
         dq, dp = compose(self.composition, field, solver_state, jnp.asarray(t0) * way, h, state)
-        # Only the change goes back: IΩ times I⁻¹ is Ω to a rounding that is the same in each step.
+        # Only the change of the momentum is converted to a rate. I⁻¹(IΩ) is Ω but for a rounding
+        # error, which is the same in each step and would add up.
         omega = y0.omega + leave(solver_state, dp)
         y1 = Attitude(quaternion.normalise(y0.q + dq), omega)
         dense = dict(y0=y0, coefficients=_dense_rows(terms, t0, t1, args, y0, y1))
@@ -148,14 +164,15 @@ class AbstractSplitting(dfx.AbstractSolver):
 
 
 class Splitting2(AbstractSplitting):
-    """Order 2: half a kick, the exact free motion, half a kick (Strang).
+    """Solve the rotation to order 2 by half a kick, the exact free motion, and half a kick.
 
-    For long runs with fixed steps under torques that are small against the free motion and depend
-    on time and attitude, not on the body rate. The energy's error stays bounded; an adaptive
-    controller destroys that, and there is no error estimate. Dense output is on the group with the
-    order of the method.
+    This solver is for long runs with fixed steps, under torques that are small against the free
+    motion and depend on time and attitude, not on the body rate. The error of the energy stays
+    bounded, but not with an adaptive controller; there is no error estimate. The attitudes of dense
+    output are on the group, and have the order of the method.
 
-    Source: Strang 1968, doi:10.1137/0705041, with the free flow of `rigidjax.exact.free_body`.
+    Source: Strang's splitting (1968), doi:10.1137/0705041, with the free flow of
+    `rigidjax.exact.free_body`.
 
     >>> import diffrax
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
@@ -169,7 +186,9 @@ class Splitting2(AbstractSplitting):
 
 
 class Splitting4(AbstractSplitting):
-    """Order 4: seven kicks and six free flows. For long runs; see `Splitting2` for its conditions.
+    """Solve the rotation to order 4 by seven kicks and six free flows, in long runs.
+
+    See `Splitting2` for the conditions.
 
     Source: Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, method SRKN6b.
 
@@ -181,7 +200,9 @@ class Splitting4(AbstractSplitting):
 
 
 class Splitting6(AbstractSplitting):
-    """Order 6: twelve kicks and eleven free flows. For long runs; see `Splitting2`.
+    """Solve the rotation to order 6 by twelve kicks and eleven free flows, in long runs.
+
+    See `Splitting2` for the conditions.
 
     Source: Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, method SRKN11b.
 
@@ -193,8 +214,11 @@ class Splitting6(AbstractSplitting):
 
 
 def frame_of(field: Any, y0: Any) -> Frame:
-    """The principal frame of the field's body; `TypeError` for a field that is no `Attitude`'s."""
-    # Under a torque that feels the body rate a kick is no exact flow: the order would fall to 1.
+    """Return the principal frame of the body of a field on the `Attitude` state `y0`.
+
+    Raise `TypeError` for any other field or state, and for a torque that reads the body rate.
+    """
+    # Under a torque that reads the body rate a kick is no exact flow: the order would fall to 1.
     torque = require_attitude("Splitting", field, y0, "DormandPrince8").euler.torque
     if sees_rate(torque):
         raise TypeError(
@@ -206,39 +230,44 @@ def frame_of(field: Any, y0: Any) -> Frame:
 
 
 def enter(frame: Frame, omega: Array) -> Triple:
-    """Π in principal axes."""
+    """Return the momentum Π along the principal axes for the body rate `omega` in body axes."""
     return matvec(frame.moments, components_along(frame.axes, omega))
 
 
 def leave(frame: Frame, momentum: Triple) -> Array:
-    """Ω in body axes."""
+    """Return the body rate Ω in body axes for the `momentum` along the principal axes."""
     return jnp.stack(combine_columns(frame.axes, rate_of(frame.weights, momentum)))
 
 
 def compose(
     composition: Composition, field: AttitudeEquations, frame: Frame, t: Any, h: Any, state: Any
 ) -> tuple[Array, Triple]:
-    """How (q, Π in principal axes) changes in one step; q is not projected."""
+    """Return the changes of the attitude q and of the momentum Π in one step.
+
+    `t` and `h` are the time at its start and its length, s. `state` is q and Π at its start; Π is
+    along the principal axes of `frame`. The changed q is not projected onto the group.
+    """
     dtype = state[0].dtype
 
     def kicked(t: Any, weight: Any, q: Array, change: Triple) -> Triple:
         if field.euler.torque is None:
             return change
-        # A torque that says that it does not depend on the rate gets none.
+        # The torque says that it does not read the body rate: it is given NaN in its place.
         at = Attitude(q, jnp.full(3, jnp.nan, dtype))
         torque = components_along(
             frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia)
         )
         return add(change, tuple(weight * a for a in torque))
 
-    # A loop, not twelve copies: the flow is long to compile.
+    # The stages are a loop, not up to twelve copies, because the free flow takes long to compile.
     def stage(carry: Any, weights: tuple[Array, Array]) -> tuple[Any, None]:
         t, dq, change = carry
         drift, kick = weights
         length = drift.astype(dtype)
         momentum = add(state[1], change)
         _, (w, x, y, z) = flow(frame.moments, momentum, length)
-        # What the turn changes: momentum keeps its length to the last digit of this change.
+        # The momentum along the axes of the body changes as these turn. Only this change is added,
+        # so that the momentum keeps its length to the last digit of the change.
         change = add(change, change_by_inverse_rotation((w, x, y, z), momentum))
         turn = jnp.stack(
             [-(x * x + y * y + z * z) / (1 + w), *combine_columns(frame.axes, (x, y, z))]
@@ -260,7 +289,10 @@ def compose(
 def _dense_rows(
     terms: PyTree[dfx.AbstractTerm], t0: Any, t1: Any, args: PyTree, y0: PyTree, y1: PyTree
 ) -> Any:
-    """The quintic through both ends with first and second derivatives: of order 6."""
+    """Return the rows for `nested` of a quintic, which is dense output of order 6.
+
+    It has the values and the first and second derivatives of the motion at both ends of the step.
+    """
     way, length = onward(terms, t0, t1)
     h = way * length
 
@@ -272,7 +304,8 @@ def _dense_rows(
 
     (f0, s0), (f1, s1) = slopes(t0, y0), slopes(t1, y1)
 
-    # Backwards, diffrax's time falls as t rises; the second derivative keeps its sign.
+    # In a run backwards diffrax's time falls as t rises: first derivatives change their sign, which
+    # is that of `h`; second derivatives do not.
     def rows(a: Array, b: Array, k: Array, m: Array, u: Array, v: Array) -> Array:
         step = jnp.asarray(h, a.dtype)
         rise, second, third = cubic_rows(b - a, step, k, m)

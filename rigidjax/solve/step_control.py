@@ -1,4 +1,4 @@
-"""Control the lengths of steps: by a tolerance, to an end at NaN, and to stops."""
+"""Control the lengths of steps by a tolerance, end a run at NaN, and end steps at stops."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 from rigidjax._types import RealLike
 from rigidjax.solve.adaptive_loop import NONFINITE, before, finite, next_step, starting_step, take
 
-# The norm of an error by default: that of the numbers of a state in a row.
+# The default norm of an error, which is the same for a state and for its numbers in a row.
 NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
 
 
@@ -23,13 +23,15 @@ def _of(name: str) -> Any:
 
 
 class StandardController(dfx.AbstractAdaptiveStepSizeController):
-    """Chooses each step by the error of the last one, within `Watched`, which gives the first.
+    """Choose the length of each step by the error of the step before it.
 
-    As Hairer, Nørsett and Wanner (1993), II.4. An accepted step may be followed by a shorter one;
-    after one, `diffrax.PIDController` takes as long a step at least: on Arenstorf's orbit at 1e-13
-    it rejects 85 of 477 steps, this one 29 of 420, and closes to a third of the error.
+    It is used inside `Watched`, which chooses the first step. The rule is that of Hairer, Nørsett
+    and Wanner (1993), II.4: the step after an accepted one may be shorter. `diffrax.PIDController`
+    never shortens the step after an accepted one: on Arenstorf's orbit at a tolerance of 1e-13 it
+    rejects 85 of 477 steps. This controller rejects 29 of 420 steps there, and the orbit closes
+    with a third of the error.
 
-    **Arguments:** `rtol`, `atol` the tolerances; `dtmax` the longest step or `None`.
+    **Arguments:** `rtol` and `atol` are the tolerances; `dtmax` is the longest step, or `None`.
 
     >>> StandardController(1e-6, 1e-9).rtol
     1e-06
@@ -62,6 +64,7 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
         return t0 + self._limited(dt0), ()
 
     def _limited(self, length: Any) -> Any:
+        """Return the length of a step, or `dtmax` if that is shorter."""
         return length if self.dtmax is None else jnp.minimum(length, self.dtmax)
 
     def adapt_step_size(
@@ -88,13 +91,13 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
 
 
 class Watched(dfx.AbstractAdaptiveStepSizeController):
-    """Wraps an adaptive step controller so that a run that cannot continue ends at once.
+    """Wrap an adaptive step controller so that a run that cannot continue ends at once.
 
-    A start without a finite derivative, or a rejected step whose successor would be below a few
-    units of round-off of the time, ends the run: with `RESULTS.nonfinite` after NaN or infinity,
-    else with `RESULTS.dt_min_reached`. (`diffrax.PIDController` goes on until `max_steps`.)
+    A run ends if its start has no finite derivative, or if the step after a rejected one would be
+    shorter than a few units of round-off of the time. The result is `RESULTS.nonfinite` after NaN
+    or infinity, else `RESULTS.dt_min_reached`. (`diffrax.PIDController` goes on until `max_steps`.)
 
-    **Arguments:** `controller` any adaptive controller of diffrax.
+    **Arguments:** `controller` is any adaptive controller of diffrax.
 
     >>> Watched(dfx.PIDController(rtol=1e-6, atol=1e-9)).rtol
     1e-06
@@ -123,41 +126,47 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         func: Callable[..., PyTree],
         error_order: RealLike | None,
     ) -> tuple[Any, Any]:
-        # Neither the first step nor whether there is one has a derivative: none is traced.
+        # The first step has no derivative, and neither has the test whether there is one: all that
+        # follows is computed without tangents.
         arrays, rest = eqx.partition((terms, y0, dt0, args), eqx.is_array)
         terms, y0, dt0, args = eqx.combine(lax.stop_gradient(arrays), rest)
         begin, end = (lax.stop_gradient(jnp.asarray(t)) for t in (t0, t1))
         slope = func(terms, begin, y0, args)
         # A solver without an order of its error is refused by the inner controller.
         if dt0 is None and error_order is not None:
-            # diffrax takes 0.01 for any field that runs in a direction of time, as in `diffeqsolve`
-            # all do.
+            # diffrax itself takes 0.01 for any field that it wraps with a direction of time, as
+            # `diffeqsolve` does with every field.
             h = self._first_step(y0, slope, error_order).astype(begin.dtype)
-            # After NaN or infinity it is not positive; the inner controller gets any other.
+            # After NaN or infinity h is not positive; the inner controller then gets 1 in the place
+            # of h.
             sound = h > 0
             dt0 = jnp.where(sound, h, jnp.ones_like(h))
         else:
             sound = finite((y0, dt0, slope))
         first, inner = self.controller.init(terms, begin, end, y0, dt0, args, func, error_order)
-        # At t = 0 the round-off of t vanishes: that of the length of the run is taken.
+        # At t = 0 the round-off of t vanishes: there |t| is replaced by the round-off of the length
+        # of the run.
         least = jnp.finfo(begin.dtype).eps * jnp.abs(end - begin)
-        # A step of length 0 would be accepted for ever; one of length NaN ends the run.
+        # A step of length 0 would be accepted for ever, but a step of length NaN ends the run.
         shortest = begin + self._unit(begin, least)
         first = jnp.where(sound, jnp.maximum(first, shortest), jnp.nan)
         return first.astype(begin.dtype), (inner, least)
 
     def _first_step(self, y: PyTree, slope: PyTree, order: RealLike) -> Array:
-        """Return the first step from the state y and its derivative; 0 or NaN if either is lost."""
+        """Return the first step from the state `y` and its derivative `slope`.
+
+        It is 0 or NaN if one of the two is not finite; `order` is that of the error of a step.
+        """
         y, tree = ravel_pytree(y)
         scale = self.atol + self.rtol * jnp.abs(y)
-        # The norm of a state, or the same of its numbers in a row.
+        # The default norm takes the numbers of a state in a row; any other takes the state itself.
         of_state = (lambda numbers: numbers) if self.norm is NORM else tree
         both = (y, ravel_pytree(slope)[0])
         size, rate = (jnp.asarray(self.norm(of_state(a / scale))) for a in both)
         return starting_step(size, rate, order)
 
     def _unit(self, t: ArrayLike, least: ArrayLike) -> Array:
-        """Return the shortest step at the time t, some units of round-off."""
+        """Return the shortest step at the time `t`: some units of round-off of |t| or `least`."""
         return 8 * jnp.finfo(jnp.result_type(t)).eps * jnp.maximum(jnp.abs(t), least)
 
     def adapt_step_size(
@@ -177,7 +186,8 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         )
         unit = self._unit(left, least)
         stuck = ~keep & ~(right - left > unit)
-        # NaN in the shortest step that the times can tell apart may be absent in a shorter one.
+        # If NaN is in the shortest step that the times can tell apart, a shorter step might have
+        # none: the cause is then the length of the step.
         short = finite(y_error) | (t1 - t0 <= unit)
         why = dfx.RESULTS.where(short, dfx.RESULTS.dt_min_reached, NONFINITE)
         why = dfx.RESULTS.where(stuck & (result == dfx.RESULTS.successful), why, result)
@@ -185,13 +195,14 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
 
 
 class Stopping(dfx.AbstractAdaptiveStepSizeController):
-    """Wraps an adaptive step controller so that a step ends at each of the `stops`, where f jumps.
+    """Wrap an adaptive step controller so that steps end at the `stops`, where the field jumps.
 
-    A step ends at the last moment before a stop, and the next one begins at the stop with the
-    length that the controller wanted there. (`diffrax.ClipStepSizeController` goes on from the
-    length of the step that was cut: a stop then costs several short steps.)
+    A step ends at the last moment before a stop. The next step begins at the stop, and is at least
+    as long as the controller wanted the step before to be. (`diffrax.ClipStepSizeController` goes
+    on from the length of the step that was cut short: a stop then costs several short steps.)
 
-    **Arguments:** `controller` any adaptive controller of diffrax; `stops` (J,) times in order.
+    **Arguments:** `controller` is any adaptive controller of diffrax; `stops` (J,) are times in
+    order.
 
     >>> Stopping(dfx.PIDController(rtol=1e-6, atol=1e-9), jnp.array([0.5])).rtol
     1e-06
@@ -199,7 +210,7 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
 
     controller: Any
     stops: Any
-    # The index of the first stop after each.
+    # For each stop, the index of the first stop after it.
     following: Any
 
     def __init__(self, controller: dfx.AbstractStepSizeController, stops: Array):
@@ -233,7 +244,10 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         return jnp.minimum(first, self._next(index)[1]), (inner, first - t0, index)
 
     def _next(self, index: Any) -> tuple[Any, Any]:
-        """Return the stop of this index and the last moment before it; infinite after the last."""
+        """Return the stop of this `index`, and the last moment before it.
+
+        Both are infinite for an index after the last stop.
+        """
         none = jnp.full_like(self.stops[:1], jnp.inf)
         stop = take(jnp.concatenate([self.stops, none]), index)
         still = lax.stop_gradient(stop)

@@ -1,8 +1,9 @@
-"""A fixed step of a method, a body and a torque: their interface to a loop.
+"""Make the fixed step of a method for a body and a torque, in a form that a loop can call.
 
-Numbers are carried one by one (see `components`); torques are called on arrays all the same. A body
-that turns carries the momentum Π = IΩ instead of Ω, which makes each stage a third cheaper;
-Runge–Kutta methods do not notice a constant linear change of variables.
+The numbers of a state are carried one by one (see `components`), but torques are called on arrays.
+For a body that turns, the momentum Π = IΩ is carried instead of the body rate Ω, which makes each
+stage a third cheaper. The steps of a Runge–Kutta method are the same under a constant linear change
+of variables.
 """
 
 from collections.abc import Callable
@@ -35,16 +36,20 @@ from rigidjax.solve.explicit import AbstractExplicit, RungeKutta4
 from rigidjax.solve.magnus import Magnus4, change_and_turn, require_blind
 from rigidjax.solve.splitting import AbstractSplitting
 
-# Fewer steps lose too few roundings to pay for it: values take a tenth to a third longer.
+# Runs of at least this many steps use `Carrying`, with which values take a tenth to a third longer.
+# Shorter runs lose too little to rounding to pay for it.
 _MANY = 10_000
 
 
 class Stepper(NamedTuple):
-    """A step of one body."""
+    """Hold the fixed steps of one body: the numbers y at the start, their change, and their state.
 
-    start: Any  # numbers y
+    A step goes from the time `t` to `end`, s, and has the length `h`, s.
+    """
+
+    start: Any  # the numbers y at the start
     change: Callable[[Any, Any, Any, Any, Any], Any]  # (t, end, h, y, inputs of the law or None)
-    state: Callable[[Any], Any]  # of y
+    state: Callable[[Any], Any]  # the state that the numbers y stand for
     delays: tuple[tuple[str, Array], ...] = ()  # name and delay, s, of each delayed input
 
     def step(self, t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:
@@ -52,10 +57,11 @@ class Stepper(NamedTuple):
 
 
 class Carrying(NamedTuple):
-    """The same steps, which carry on what the last addition lost: round-off grows as √n, not as n.
+    """Hold the steps of the stepper `of`; each also adds what the last addition lost to rounding.
 
-    Source: Kahan 1965, doi:10.1145/363707.363723; Dekker 1971, doi:10.1007/BF01397083, for
-    |change| ≤ |y|. The lost digits have no derivative.
+    So round-off grows as √n with the number n of steps, not as n. The lost digits are carried along
+    with the numbers y, and have no derivative. Source: Kahan 1965, doi:10.1145/363707.363723;
+    Dekker 1971, doi:10.1007/BF01397083, for |change| ≤ |y|.
     """
 
     of: Stepper
@@ -83,13 +89,17 @@ AnyStepper = Stepper | Carrying
 
 
 def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) -> AnyStepper:
-    """The stepper of a vector field under `solver` (`None`: the cheapest) for `count` steps."""
+    """Return the stepper of a vector field under `solver` (`None`: the cheapest).
+
+    `y0` is the state at the start. For a `count` of many steps, or one that is traced, the stepper
+    is a `Carrying`.
+    """
     stepper = _stepper_of(solver, field, y0)._replace(delays=tuple(delays_of(field)))
     return Carrying(stepper) if not isinstance(count, int) or count >= _MANY else stepper
 
 
 def cheapest(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
-    """The method of order 4 that takes the least work."""
+    """Return the method of order 4 that takes the least work for this field."""
     attitude = isinstance(field, AttitudeEquations)
     blind = attitude and not sees_attitude(field.euler.torque)
     return Magnus4() if blind else RungeKutta4()
@@ -117,7 +127,7 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
 
 
 class _Turning(NamedTuple):
-    """Inertia, its inverse (six numbers each) and the torque, in the precision of the state."""
+    """Hold the inertia, its inverse as six numbers, and the torque, in the state's precision."""
 
     inertia: Inertia
     weights: Six
@@ -125,6 +135,7 @@ class _Turning(NamedTuple):
 
 
 def _turning(field: Any, y0: Any) -> _Turning | None:
+    """Return the parts of the field of a body that only turns; `None` for any other field."""
     euler = field.euler if isinstance(field, AttitudeEquations) else field
     if not isinstance(euler, EulerEquations) or not isinstance(y0, Spin | Attitude):
         return None
@@ -134,7 +145,11 @@ def _turning(field: Any, y0: Any) -> _Turning | None:
 
 
 def _free(body: Inertia, state0: Attitude) -> Stepper:
-    """Principal axes, held fixed in derivatives: the off-diagonal entries carry only tangents."""
+    """Return the stepper of a free body, whose momentum is along the principal axes.
+
+    Derivatives hold these axes fixed; the off-diagonal entries of the inertia along them carry only
+    tangents.
+    """
     frame = splitting.principal(body.tensor)
     weights, axes = frame.weights, frame.axes
     a, b, c, *_ = lax.stop_gradient(weights)
@@ -148,7 +163,8 @@ def _free(body: Inertia, state0: Attitude) -> Stepper:
         return (*product4(y[:4], turn), *dp)
 
     def state(y: Atoms) -> Attitude:
-        # The numbers are the turn since the start, seen from the axes: Aᵀ…A turns its vector.
+        # y[:4] is the quaternion of the turn since the start, with its vector along the principal
+        # axes; `combine_columns` gives the vector in body axes.
         turn = jnp.stack([y[0], *combine_columns(axes, y[1:4])])
         q = quaternion.normalise(quaternion.multiply(state0.q, turn))
         return Attitude(q, splitting.leave(frame, y[4:]))
@@ -158,7 +174,10 @@ def _free(body: Inertia, state0: Attitude) -> Stepper:
 
 @jax.custom_jvp
 def _free_slope(weights: Six, gaps: Triple, p: Triple) -> Triple:
-    """Π × Ω in principal axes."""
+    """Return dΠ/dt = Π × Ω for the momentum `p`, along the principal axes.
+
+    `weights` are the inverse of the inertia, and `gaps` the differences of its diagonal entries.
+    """
     return gaps[0] * (p[1] * p[2]), gaps[1] * (p[2] * p[0]), gaps[2] * (p[0] * p[1])
 
 
@@ -170,12 +189,14 @@ def _free_slope_jvp(primals, tangents):
 
 
 def _entries(a: Array) -> Six:
-    # Both halves, so that the derivative is symmetric as the matrix is.
+    """Return the six different entries of a symmetric matrix (3, 3)."""
+    # Both halves of the matrix are used, so that the derivative is symmetric as the matrix is.
     off = [0.5 * (a[i, j] + a[j, i]) for i, j in ((0, 1), (0, 2), (1, 2))]
     return a[0, 0], a[1, 1], a[2, 2], *off
 
 
 def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
+    """Return the stepper of `Magnus4` for a torque that does not read the attitude."""
     body, weights, torque = turning
     start, rate = split(state0), partial(matvec, weights)
 
@@ -184,7 +205,7 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
 
         def slope(t: Any, p: Triple) -> Triple:
             omega = barrier(rate(p))
-            # It gets no attitude that it could look at.
+            # The torque gets a `Spin`, which has no attitude that it could read.
             value = evaluate(law, t, Spin(jnp.stack(omega)), body)
             return add(cross(p, omega), split(value))
 
@@ -198,6 +219,7 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
 
 
 def _explicit(solver: AbstractExplicit | Rolled, turning: _Turning, state0: Any) -> Stepper:
+    """Return the stepper of an explicit method for a body that only turns."""
     body, weights, torque = turning
     start = split(state0)
     many = len(start) - 3
@@ -207,7 +229,8 @@ def _explicit(solver: AbstractExplicit | Rolled, turning: _Turning, state0: Any)
 
         def slope(t: Any, y: Atoms) -> Atoms:
             q, p = y[:many], y[many:]
-            # Shared by attitude and momentum; fenced: else each of seven results computes it again.
+            # Attitude and momentum share this rate. Without the barrier each of the seven results
+            # computes it again.
             omega = barrier(matvec(weights, p))
             pushed = cross(p, omega)
             if law is not None:
@@ -225,6 +248,11 @@ def _explicit(solver: AbstractExplicit | Rolled, turning: _Turning, state0: Any)
 
 
 def _of_slope(solver: Any, slope_under: Any, start: Atoms, state: Any, like: Any) -> Stepper:
+    """Return the stepper of an explicit method for the slope `slope_under(inputs)(t, y)`.
+
+    `like` is a state with the structure of the numbers y.
+    """
+
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         return _to_unit_length(y, change_in(solver, slope_under(inputs), t, h, y, end), like)
 
@@ -232,27 +260,33 @@ def _of_slope(solver: Any, slope_under: Any, start: Atoms, state: Any, like: Any
 
 
 def _to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
-    """The change that ends at a quaternion of length 1."""
+    """Return the `change` of the numbers `y`, corrected so that it ends at a unit quaternion.
+
+    `like` is a state with the structure of `y`; without an attitude the change is returned as it
+    is.
+    """
     if not isinstance(motion_of(like), HasAttitude):
         return change
-    # Fenced: else each part of the quaternion computes the whole change again.
+    # Without the barrier each part of the quaternion computes the whole change again.
     change = barrier(change)
     after, moved = (
         motion_of(join(part, like)).q for part in (jax.tree.map(jnp.add, y, change), change)
     )
     after, moved = components(after), components(moved)
-    # The last digit of this length is along q, so that it does not turn the body.
+    # A rounding error of this length changes q along itself, so that it does not turn the body.
     excess = jnp.minimum(square4(after) - 1.0, 1.0)
-    # 1 − 1/√(1 + e) as a series: a root and a quotient take a third of the step on a GPU. Its error
-    # e⁴/4 is below round-off for steps that turn the body by less than half a radian; after longer
-    # ones the next steps bring the length back.
+    # 1 − 1/√(1 + e), with the excess e, is computed by a series, because on a GPU a root and a
+    # quotient take a third of the time of a step. The error e⁴/4 of the series is below round-off
+    # for steps that turn the body by less than half a radian; after longer steps the next ones
+    # bring the length back to 1.
     less = barrier(excess * (0.5 - excess * (0.375 - 0.3125 * excess)))
     q = jnp.stack([d - less * a for d, a in zip(moved, after, strict=True)])
     return split(eqx.tree_at(lambda s: motion_of(s).q, join(change, like), q))
 
 
 def _split(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
-    # No step goes through Ω = I⁻¹Π and back, so that |Π| drifts by round-off of the flow alone.
+    """Return the stepper of a splitting."""
+    # No step converts Π to Ω = I⁻¹Π and back, so that |Π| drifts only by the round-off of the flow.
     frame = splitting.frame_of(field, state0)
 
     def change(t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:

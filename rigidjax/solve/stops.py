@@ -1,4 +1,4 @@
-"""A traced field and all the times at which its steps end: declared jumps, and switches found."""
+"""Find all times at which the steps of a field end: declared jumps, and switches in its trace."""
 
 import warnings
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from rigidjax.solve.switching_times import by_sides, separated, times_of
 
 
 def say_unseen(analysis: Analysis) -> None:
-    """Warn of comparisons with the time in which no switch can be looked for."""
+    """Warn of each line of a law that may switch at times that cannot be searched for."""
     for line in dict.fromkeys(analysis.unseen):
         warnings.warn(
             f"simulate: a law may jump at a time that is not found before the run ({line}): steps "
@@ -34,18 +34,18 @@ def say_unseen(analysis: Analysis) -> None:
 
 
 class Traced(NamedTuple):
-    """A traced function as `call(constants, *args)`, where the constants are arrays."""
+    """Hold a traced function, to be called as `call(constants, *args)` with arrays as constants."""
 
     closed: ClosedJaxpr
-    tree: Any  # of its result
+    tree: Any  # the structure of its result
 
     @property
     def constants(self) -> Arrays:
-        """The arrays that the function holds; numbers of NumPy stay in its program."""
+        """Return the JAX arrays that the function holds; numbers of NumPy stay in its program."""
         return [c for c in self.closed.consts if eqx.is_array(c)]
 
     def consts(self, constants: Arrays) -> Arrays:
-        """Return all constants of the program, with these arrays."""
+        """Return all constants of the program, in which `constants` replace the JAX arrays."""
         arrays = iter(constants)
         return [next(arrays) if eqx.is_array(c) else c for c in self.closed.consts]
 
@@ -55,7 +55,7 @@ class Traced(NamedTuple):
 
 
 def traced(function: Callable[..., Any], *like: Any) -> Traced:
-    """Trace a function of such arguments once."""
+    """Return the `Traced` of a function for arguments with the shapes and dtypes of `like`."""
     closed, out = jax.make_jaxpr(function, return_shape=True)(*like)
     return Traced(closed, jax.tree.structure(out))
 
@@ -63,7 +63,7 @@ def traced(function: Callable[..., Any], *like: Any) -> Traced:
 def constants_of(
     functions: list[Callable[..., Any]], *like: Any
 ) -> tuple[list[Callable[..., Any]], Arrays]:
-    """Return each function as `f(constants, *args)`, and the constants of all."""
+    """Return each function as `f(constants, *args)`, and the constants of all functions."""
     programs = [traced(function, *like) for function in functions]
     ends = np.cumsum([0, *(len(program.constants) for program in programs)])
 
@@ -75,22 +75,22 @@ def constants_of(
 
 
 class Stopped(NamedTuple):
-    """A field whose steps end at `stops` (k,), s, in order: where it jumps, or has a kink."""
+    """Hold a field with the times `stops` at which its steps end, where it jumps or has a kink."""
 
     field: Callable[..., Array]  # (constants, t, y)
     constants: Arrays
-    smooth: int  # of the constants the first, which may have derivatives
-    stops: Array
-    over: Array | None  # whether a part switches more often than it has places for
+    smooth: int  # the number of those constants, the first, that may have derivatives
+    stops: Array  # (k,), s, in order
+    over: Array | None  # whether a part switches more often than there are places for
 
 
 def stopped(
     function: Callable[..., Array], declared: list[Array], a: Array, b: Array, y: Array
 ) -> Stopped:
-    """Return the field `function(t, y, *sides)` between times a and b with all its stops.
+    """Return the field `function(t, y, *sides)` with all its stops between the times a and b, s.
 
-    `declared` are the jump times of each part that declares some; if there are more than one, each
-    part gets its stops as one of `sides`, in s.
+    `declared` are the jump times, s, of each part of the field that declares some. If more than one
+    part does, each of them gets its stops, s, as one of `sides`.
     """
     declared = [times.astype(a.dtype) for times in declared if times.size]
     likes = declared if len(declared) > 1 else []
@@ -112,7 +112,7 @@ def stopped(
     over, most = found.over, MOST + sum(times.shape[0] for times in declared)
     if stops.shape[0] > most:
         stops, over = stops[:most], over | (stops[most] < b)
-    # As one array: a loop that carries many is slower.
+    # The values at the switches are one array, because a loop that carries many arrays is slower.
     places = lax.stop_gradient((own, found._replace(times=own[:0])))
     one, unpacked = ravel_pytree(jax.tree.map(lambda leaf: leaf.astype(a.dtype), places))
     more, field = [*(sides if likes else []), one], by_sides(analysis)
@@ -125,4 +125,5 @@ def stopped(
 
 
 def _split(whole: Array, like: list[Array]) -> list[Array]:
+    """Return the parts of an array, as many and as long as those of `like`."""
     return list(jnp.split(whole, np.cumsum([a.shape[0] for a in like])[:-1]))

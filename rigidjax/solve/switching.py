@@ -1,12 +1,16 @@
-"""Find the times at which a vector field switches by the time, from its traced program.
+"""Find in the traced program of a vector field where it switches at times that no state decides.
 
-A law of one's own such as `jnp.where(t < self.te, push, 0.0)` declares no `jump_times`. The program
-of the field holds its comparison; if that depends on the time and on no state, the times at which
-it changes are found before the run by halving, however short a firing is: a comparison of straight
-lines in time, or of what only rises or only falls, changes once. The steps of the run end there.
-In the run each such comparison is replaced by the side of its stops that a step is on, so that no
-rounding decides it, and of two that change at the same time each has its own side. The derivative
-of a switching time is that of the implicit function `gap(p, t) = 0`.
+A law that a user writes, such as `jnp.where(t < self.te, push, 0.0)`, declares no `jump_times`, but
+the program of the field holds its comparison. If the comparison depends on the time and on no
+state, the times at which it changes are found before the run by halving, however short a firing is:
+a comparison of straight lines in time, or of a value that only rises or only falls, changes once.
+The steps of the run end at these times. In the run the comparison is replaced by the side of these
+stops on which a step is. So no rounding decides it, and two comparisons that change at the same
+time each have their own side.
+
+The gap of a comparison is the difference of its operands. It depends on the time t and on the
+constants p of the field, and the derivative of a switching time is that of the implicit function
+`gap(p, t) = 0`.
 """
 
 import os
@@ -25,25 +29,27 @@ from jax.extend.source_info_util import summarize
 
 from rigidjax.solve.batching import Arrays
 
-# The scope of a part that declares its jumps: no switch is looked for in it.
+# The name of the scope of a part that declares its jumps; no switch is searched for inside it.
 DECLARED = "rigidjax_declared_jumps"
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 
-# Primitives whose result changes where the first operand meets the second, where it meets zero, and
-# where it meets another whole number.
+# Primitives whose result changes where the first operand meets the second; and primitives whose
+# result changes where the first operand (for `rem` its quotient by the second) meets another whole
+# number. `sign`, which changes where its operand meets zero, is in `_jumps`.
 COMPARISONS = {"lt", "le", "gt", "ge", "lt_to", "le_to"}
 _LEVELS = {"floor", "ceil", "round", "convert_element_type", "rem"}
-# The ones whose result has a kink there.
+# Primitives whose result has a kink where an operand meets another one or, for `abs`, zero.
 KINKS = {"max", "min", "abs", "clamp"}
-# Primitives that choose by a comparison of elements, those that nothing is known of, and the ones
-# whose result varies between its jumps.
+# Primitives that choose by a comparison of elements; primitives of which nothing is known; and
+# primitives whose result varies between its jumps.
 _CHOICES = {"argmax", "argmin", "sort", "top_k", "bitcast_convert_type", "nextafter"}
 _OPAQUE = {"pure_callback", "io_callback", "custom_call", "ffi_call"}
 _SAWS = {"rem", "atan2", "sort", "top_k", "nextafter"}
-# Calls whose body becomes part of the program; and calls that stay whole, whose body is looked at.
+# Calls whose body becomes a part of the flat program; and calls that stay whole in it, but in whose
+# body switches are searched for.
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2"}
 _WHOLE = {"cond", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
-# Primitives that are linear in all operands, or in either of two.
+# Primitives that are linear in all operands together; and those that are linear in either of two.
 _LINEAR = {
     "add", "sub", "add_any", "neg", "copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze",
     "slice", "transpose", "rev", "concatenate", "reduce_sum", "cumsum", "expand_dims",
@@ -55,18 +61,21 @@ _MONOTONE = {
     "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "tanh", "logistic", "erf", "sinh",
     "asinh", "atan",
 }  # fmt: skip
-# How a value depends on the time: not; in constant pieces, which change only where another value
-# does; in a straight line; by rising or falling only; otherwise.
+# How a value depends on the time: not at all; in constant pieces, which change only where another
+# value changes; as a straight line; by rising only or falling only; or in any other way.
 CONSTANT, PIECES, STRAIGHT, MONOTONE, BENT = range(5)
 
-MOST = 64  # times of one law, and of one rounding
-_FEW = 32  # a comparison of more elements is a table
-_FEW_KINKS = 3  # more kinks in one operation cost more steps than they save
-NEAR = 16  # places at which it is looked for between them
+MOST = 64  # the most times at which one law, or one rounding, can change
+_FEW = 32  # a comparison of more elements than this is taken for a table
+_FEW_KINKS = 3  # more kinks than this in one operation cost more steps than they save
+NEAR = 16  # places between the points of a grid at which a bent switch is searched for
 
 
 class Node(NamedTuple):
-    """An equation of a flat program: its values have numbers, its inputs are these or literals."""
+    """Hold an equation of a flat program, in which each value has a number.
+
+    The inputs of the equation are such numbers or literals, and its outputs are such numbers.
+    """
 
     primitive: Any
     params: dict[str, Any]
@@ -79,60 +88,61 @@ class Node(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The primitive's name; that of the function for a call of `searchsorted`."""
+        """Return the name of the primitive; a call of `searchsorted` has the function's name."""
         return _name(self)
 
 
 class Program(NamedTuple):
-    """A function f(t, y, …) as a flat list of equations: value 0 is the time, value 1 the state."""
+    """Hold a function f(t, y, …) as a flat list of equations, whose values have numbers.
+
+    Value 0 is the time t, and value 1 is the state y.
+    """
 
     nodes: list[Node]
     constants: list[int]
-    inner: dict[int, Any]  # the constants of inner calls
+    inner: dict[int, Any]  # the constants of inner calls, by their numbers
     inputs: list[int]
     output: Any
 
 
 class Switch(NamedTuple):
-    """An equation whose result changes at once, or has a kink, at times that no state decides."""
+    """Hold an equation whose result jumps, or has a kink, at times that no state decides."""
 
     node: Node
-    degree: int
-    size: int  # of the elements that are compared
-    jumps: bool
+    degree: int  # how the operands depend on the time: `STRAIGHT`, …
+    size: int  # the number of elements that are compared
+    jumps: bool  # whether the result jumps; else it has a kink
 
     @property
     def most(self) -> int:
-        """The number of times at which one element may change, if it only rises or falls."""
+        """Return the largest number of changes of an element that only rises or only falls."""
         return MOST if self.node.name in _LEVELS else 1
 
     @property
     def places(self) -> int:
-        """The number of changes that are looked for."""
+        """Return the number of changes that are searched for."""
         return MOST + 2 * NEAR if self.degree == BENT else self.size * self.most
 
     @property
     def exact(self) -> bool:
-        """Whether no element can change more often than is looked for."""
+        """Return whether no element can change more often than is searched for."""
         return self.degree < BENT and self.most == 1
 
     @property
     def line(self) -> str:
-        """The primitive and the user's line that wrote the equation."""
+        """Return the primitive's name, and the line of the user's code that wrote the equation."""
         return f"{self.node.name}, {summarize(self.node.source)}"
 
 
 class Analysis(NamedTuple):
-    """The `switches` of a program, the lines that switch by the state, and those not understood.
-
-    `kinks` are too many for steps to end at each, and serve the search for bent switches.
-    """
+    """Hold the switches of a program, with the lines whose switches cannot be found."""
 
     program: Program
     switches: list[Switch]
+    # Kinks that are too many for a step to end at each; they serve the search for bent switches.
     kinks: list[Switch]
-    by_state: list[str]
-    unseen: list[str]
+    by_state: list[str]  # the lines that switch by the state
+    unseen: list[str]  # the lines that may switch at times that cannot be searched for
 
 
 def _bodies(params: dict[str, Any]) -> Iterator[tuple[Any, Any]]:
@@ -159,7 +169,7 @@ def _is_float(kind: Any) -> bool:
 
 
 def _jumps(name: str, params: dict[str, Any], kinds: list[Any]) -> bool:
-    """Return whether the result of an equation jumps where its floating operands do not."""
+    """Return whether the result of an equation may jump where its real operands do not."""
     if not kinds or not _is_float(kinds[0]):
         return False
     if name == "convert_element_type":
@@ -168,12 +178,12 @@ def _jumps(name: str, params: dict[str, Any], kinds: list[Any]) -> bool:
 
 
 def _bends(name: str, kinds: list[Any]) -> bool:
-    """Return whether the result of an equation has a kink where its floating operands have none."""
+    """Return whether the result of an equation has a kink where its real operands have none."""
     return bool(kinds) and _is_float(kinds[-1]) and name in KINKS
 
 
 def _any_switch(jaxpr: Any, bent: bool = False) -> bool:
-    """Return whether a program, or one within it, holds a jump, or if `bent` a kink."""
+    """Return whether a program, or one within it, may jump or, if `bent` is true, has a kink."""
     for eqn in jaxpr.eqns:
         name, kinds = _name(eqn), _kinds(eqn)
         if _jumps(name, eqn.params, kinds) or (bent and _bends(name, kinds)) or name in _OPAQUE:
@@ -184,7 +194,7 @@ def _any_switch(jaxpr: Any, bent: bool = False) -> bool:
 
 
 def flatten(closed: ClosedJaxpr) -> Program:
-    """Write a traced function as one list of equations; bodies of calls become part of it."""
+    """Return a traced function as one flat list of equations, with those in the bodies of calls."""
     numbers, nodes, inner = count(), [], {}
 
     def enter(jaxpr: Any, consts: Any, inputs: list[Any], declared: bool) -> list[Any]:
@@ -248,7 +258,10 @@ def degree_of(node: Node, operands: list[int]) -> int:
 
 
 def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
-    """Find the places where a traced field f(t, y, …) switches; `None` if it has no comparison."""
+    """Return the switches of a traced field f(t, y, …), or `None` if it has nothing that switches.
+
+    A switch is found by the program alone; its times are found by `switching_times`.
+    """
     if not _any_switch(closed.jaxpr, bent=True):
         return None
     program = flatten(closed)
@@ -262,7 +275,7 @@ def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
         degrees.update(dict.fromkeys(node.outputs, degree_of(node, operands)))
         if stateful:
             of_state.update(node.outputs)
-        # What is constant between the times of other switches has no times of its own.
+        # A value that is constant between the times of other switches has no times of its own.
         timed = max(operands, default=CONSTANT) > PIECES
         if not (timed or stateful) or node.declared or not _may_switch(node) or _is_ours(node):
             continue
@@ -283,18 +296,19 @@ def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
 
 
 def _is_ours(node: Node) -> bool:
-    """Return whether an equation is of this package, whose laws declare their jumps."""
+    """Return whether this package wrote an equation: its laws declare their jumps."""
     return summarize(node.source).startswith(_PACKAGE)
 
 
 def _may_switch(node: Node) -> bool:
+    """Return whether an equation has a jump or a kink, or may have one inside."""
     name = node.name
     jumps = _jumps(name, node.params, node.kinds) or _bends(name, node.kinds)
     return jumps or name in _OPAQUE or any(True for _ in _bodies(node.params))
 
 
 def _hides(node: Node) -> bool:
-    """Return whether an equation may switch where no switch can be looked for."""
+    """Return whether an equation may switch at times that cannot be searched for."""
     if node.name in _CHOICES | {"atan2"}:
         return True
     if node.name in _WHOLE | {"searchsorted"}:
@@ -303,7 +317,7 @@ def _hides(node: Node) -> bool:
 
 
 def _switch_of(program: Program, node: Node, operands: list[int], jumps: bool) -> Switch:
-    """Return the switch that an equation is."""
+    """Return an equation as a `Switch`; `operands` are the degrees of its operands."""
     name = node.name
     compared = operands[: 1 if name in _LEVELS - {"rem"} else 3]
     timed = [d for d in compared if d != CONSTANT]
@@ -313,13 +327,13 @@ def _switch_of(program: Program, node: Node, operands: list[int], jumps: bool) -
     shape = node.shapes[0].shape
     size = int(np.prod(shape)) * (2 if name == "clamp" else 1)
     if name == "searchsorted":
-        # Of one time among edges.
+        # A search for one time among edges is a switch; one for many times is taken for a table.
         size = _edges(program, node) if shape == () else _FEW + 1
     return Switch(node, max(timed) if steady else BENT, size, jumps)
 
 
 def _edges(program: Program, node: Node) -> int:
-    """Return the number of edges that one time is searched among."""
+    """Return the number of edges among which a call of `searchsorted` searches."""
     ((body, _),) = _bodies(node.params)
     return int(np.prod(body.invars[0].aval.shape))
 
@@ -327,9 +341,11 @@ def _edges(program: Program, node: Node) -> int:
 def evaluator(
     program: Program, wanted: list[Any], replaced: dict[int, Any] | None = None
 ) -> Callable[..., list[Any]]:
-    """Return a function (constants, *inputs) → the wanted values, of the equations they need.
+    """Return a function (constants, *inputs) → the `wanted` values of a program.
 
-    `replaced` has a function (read, *inputs) for the output of some equations.
+    It evaluates only the equations that these values need. `replaced` holds an object for the
+    outputs of some equations, by number: its `value(read, inputs)` takes the place of the equation,
+    and its `reads` are the inputs that it needs.
     """
     replaced = replaced or {}
     needed, nodes = {i for i in wanted if not isinstance(i, Literal)}, []

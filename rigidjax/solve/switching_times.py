@@ -1,9 +1,9 @@
-"""The times at which the switches of a traced field change, and the field on either side of them.
+"""Locate the times at which a traced field switches, and evaluate the field between them.
 
-A switch that only rises or only falls in time changes once: its time is found by halving between
-the ends of the run. One that is bent is looked for on a grid, and where its gap comes closest to
-zero between two points of it. The derivative of a time is that of the implicit function
-`gap(p, t) = 0`.
+A switch that only rises or only falls in time changes once: its time is found by halving the
+interval between the ends of the run. A bent switch, which does neither, is searched for on a grid,
+and between two points of the grid where its gap (see `switching`) comes closest to zero. The
+derivative of a time is that of the implicit function `gap(p, t) = 0` of the constants p.
 """
 
 from collections.abc import Callable
@@ -31,11 +31,15 @@ from rigidjax.solve.switching import (
 )
 
 _HALVINGS = {"float64": 62, "float32": 36}
-_GRID = 4096  # points of the search for a switch that is bent in time
+_GRID = 4096  # points of the grid on which a bent switch is searched for
 
 
 def _gap(switch: Switch, x: Any, *rest: Any) -> Any:
-    """Return what is zero, or a whole number, where the elements of a switch change."""
+    """Return the gap of each element of a switch.
+
+    The gap is zero, or a whole number, where the element changes. `x` and `rest` are the operands
+    of the equation, and its result.
+    """
     name = switch.node.name
     if name == "clamp":
         return jnp.concatenate([jnp.ravel(rest[0] - x), jnp.ravel(rest[0] - rest[1])])
@@ -47,7 +51,10 @@ def _gap(switch: Switch, x: Any, *rest: Any) -> Any:
 
 
 def _value(switch: Switch, x: Any, *rest: Any) -> Any:
-    """Return what changes, as numbers, an element each."""
+    """Return the value of each element of a switch, which is constant between its changes.
+
+    `x` and `rest` are the operands of the equation, and its result.
+    """
     name = switch.node.name
     if name in KINKS | {"searchsorted"}:
         return _gap(switch, x, *rest) > 0
@@ -55,21 +62,21 @@ def _value(switch: Switch, x: Any, *rest: Any) -> Any:
 
 
 class Times(NamedTuple):
-    """The times at which the switches of a field may change, in s, one for each place.
+    """Hold the times at which the switches of a field may change, one for each of k places.
 
-    A place is one change of one element of one switch.
+    A place is for one change of one element of one switch.
     """
 
-    times: Array  # (k,) with derivatives; the end of the run where nothing changes
-    element: Array  # (k,) of the switch
-    change: Array  # (k,) of the element's value
-    first: Arrays  # the values of the elements of each switch at the start
-    outputs: Arrays  # of a search among edges at the start; empty for other switches
+    times: Array  # (k,) s, with derivatives; the end of the run at a place where nothing changes
+    element: Array  # (k,) the element of the switch
+    change: Array  # (k,) the change of the element's value
+    first: Arrays  # for each switch the values of its elements at the start
+    outputs: Arrays  # the results of searches among edges at the start; empty for other switches
     over: Array  # whether an element changes more often than it has places
 
 
 class _Watched(NamedTuple):
-    """A switch of a program with its constants: its `size` elements as functions of the time."""
+    """Hold a switch of a program with its constants, to evaluate its elements at any time."""
 
     program: Program
     switch: Switch
@@ -77,11 +84,11 @@ class _Watched(NamedTuple):
 
     @property
     def still(self) -> "_Watched":
-        """The same switch without derivatives."""
+        """Return this switch without derivatives with respect to the constants."""
         return self._replace(constants=lax.stop_gradient(self.constants))
 
     def operands(self, t: Array) -> list[Any]:
-        """Return the operands and the result of the equation."""
+        """Return the operands and the result of the equation at the time t, s."""
         node = self.switch.node
         wanted = [*node.inputs, node.outputs[0]]
         return evaluator(self.program, wanted)(self.constants, t)
@@ -93,7 +100,7 @@ class _Watched(NamedTuple):
         return _gap(self.switch, *self.operands(t)).astype(t.dtype)
 
     def values(self, t: Array, element: Any) -> Array:
-        """Return the value of one element at each of the times t (k,)."""
+        """Return the value of one `element` at each of the times t (k,), s."""
         return self._of_each(self.value, t, element)
 
     def gaps(self, t: Array, element: Any) -> Array:
@@ -105,14 +112,14 @@ class _Watched(NamedTuple):
         return jax.vmap(lambda t, i: of(t)[i])(t, element)
 
 
-# Times, elements and changes at the places of a switch, and whether there are more.
+# The times, elements and changes at the places of a switch, and whether it has more changes.
 _Places = tuple[Array, Array, Array, Array]
 
 
 def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times:
-    """Find the times in a < t ≤ b at which the switches of a field change."""
+    """Find the times after a and until b, s, at which the switches of a field change."""
     start, end = lax.stop_gradient((a, b))
-    # What changes within some round-off of the start has changed.
+    # A switch that changes within some round-off of the start is taken to have changed before it.
     start = start + 8 * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end - start))
     watched = [_Watched(analysis.program, s, constants) for s in analysis.switches]
     others = [_Watched(analysis.program, s, constants) for s in analysis.kinks]
@@ -137,7 +144,7 @@ def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times
 
 
 def _of_steady(watched: list[_Watched], start: Array, end: Array) -> list[_Places]:
-    """Find the changes of what only rises or only falls."""
+    """Find the changes of the switches that only rise or only fall."""
     starts, rises, elements, levels = [], [], [], []
     for one in watched:
         element, level = (np.ravel(a) for a in np.mgrid[: one.switch.size, 1 : one.switch.most + 1])
@@ -158,7 +165,7 @@ def _of_steady(watched: list[_Watched], start: Array, end: Array) -> list[_Place
 
 
 def _of_bent(one: _Watched, start: Array, end: Array, known: list[Array]) -> _Places:
-    """Find the changes of a switch by a grid, to which the `known` times of others are added."""
+    """Find the changes of a bent switch on a grid with the `known` times of other switches."""
     before = jnp.concatenate(known) if known else jnp.zeros(0, start.dtype)
     low, high, element, over = _cells(one.still, start, end, lax.stop_gradient(before))
     base = one.still.values(low, element)
@@ -168,7 +175,7 @@ def _of_bent(one: _Watched, start: Array, end: Array, known: list[Array]) -> _Pl
     there = value != base
     t, moves = _moving(one, jnp.where(there, t, end), element, there)
     if known:
-        # Where an operand jumps, the switch moves as that jump does.
+        # Where the switch changes because an operand jumps, its time is that of the jump.
         near, still = jnp.argmin(jnp.abs(before[None] - t[:, None]), 1), lax.stop_gradient(t)
         same = jnp.abs(before[near] - still) <= 8 * jnp.finfo(t.dtype).eps * jnp.abs(still)
         t = jnp.where(there & ~moves & same, before[near], t)
@@ -176,7 +183,10 @@ def _of_bent(one: _Watched, start: Array, end: Array, known: list[Array]) -> _Pl
 
 
 def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array, ...]:
-    """Return intervals (k,) in which an element changes once, the element, and whether all fit."""
+    """Return the ends of k intervals in which an element changes at most once, and the elements.
+
+    Also return whether there are more changes than intervals for them.
+    """
     size, dtype = one.switch.size, start.dtype
     grid = start + (end - start) * jnp.linspace(0.0, 1.0, max(256, _GRID // size), dtype=dtype)
     if known.shape[0]:
@@ -187,12 +197,13 @@ def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array
     value, gap = jax.vmap(one.value)(grid), jax.vmap(one.gap)(grid)
     changes = jnp.ravel(value[1:] != value[:-1])
     many = jnp.sum(changes)
-    # The first of them: `nonzero` takes five times as long to compile.
+    # `top_k` finds the first changes; `nonzero` would take five times as long to compile.
     _, cell = lax.top_k(changes.astype(jnp.int32), MOST)
     row, element = cell // size, cell % size
     low = grid[row]
     high = jnp.where(jnp.arange(MOST) < many, grid[row + 1], low)
-    # Between two points it may be met twice, near where the gap comes closest to zero.
+    # Between two points of the grid an element may change twice, near the time at which its gap
+    # comes closest to zero.
     middle, sides = jnp.abs(gap[1:-1]), jnp.stack([jnp.abs(gap[:-2]), jnp.abs(gap[2:])])
     calm = (
         (value[1:-1] == value[:-2]) & (value[1:-1] == value[2:]) & jnp.all(middle[None] <= sides, 0)
@@ -220,7 +231,11 @@ def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array
 def _halved(
     watched: list[_Watched], edges: Any, elements: Any, bases: list[Array], levels: Any
 ) -> list[Array]:
-    """Return the first times (k,) at which elements are so far from their bases, of each switch."""
+    """Return, for each switch, the times (k,) at which its elements leave their `bases`.
+
+    An element leaves its base when it first differs from the base by its level. The times are found
+    by halving the intervals between the `edges`.
+    """
 
     def half(_: Any, edges: Any) -> Any:
         halves = []
@@ -240,11 +255,14 @@ def _halved(
 
 
 def _moving(one: _Watched, t: Array, element: Any, there: Array) -> tuple[Array, Array]:
-    """Return the times with the derivatives of implicit functions, and whether they have some."""
+    """Return the times `t` with the derivatives of implicit functions, and whether each has them.
+
+    `there` says of each time whether the `element` does change then.
+    """
     degree = one.switch.degree
     still, moves, slope, here = lax.stop_gradient(t), there, jnp.zeros_like(t), jnp.zeros_like(t)
     t = still
-    # Each step of Newton's method of value zero adds an order of derivatives.
+    # Each step of Newton's method here changes no value, and adds one order of derivatives.
     for _ in range(1 if degree == STRAIGHT else 2):
         gaps = lambda t: one.gaps(t, element)  # noqa: E731
         here, slope = jax.jvp(gaps, (t,), (jnp.ones_like(t),))
@@ -252,7 +270,7 @@ def _moving(one: _Watched, t: Array, element: Any, there: Array) -> tuple[Array,
         rise = here - lax.stop_gradient(here)
         t = t - jnp.where(moves, rise / jnp.where(moves, slope, 1), 0)
     if degree == BENT:
-        # A jump of the operand itself is no zero of its gap.
+        # Where an operand jumps, its gap has no zero, and the time is no implicit function of it.
         beside = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
         step, eps = jnp.abs(slope) * (still - beside), jnp.finfo(t.dtype).eps
         jump = jnp.abs(here - one.gaps(beside, element))
@@ -261,19 +279,22 @@ def _moving(one: _Watched, t: Array, element: Any, there: Array) -> tuple[Array,
 
 
 class _Side(NamedTuple):
-    """An equation's result by the stops that a step is past, in the place of its comparison."""
+    """Compute an equation's result from the stops that a step has passed, and not by comparing."""
 
     switch: Switch
-    number: int
-    places: slice
+    number: int  # of the switch
+    places: slice  # of the switch in `Times`
 
     @property
     def reads(self) -> list[Any]:
-        """The inputs of the equation that are still needed."""
+        """Return the inputs of the equation that the result still needs."""
         return [] if self.switch.exact else self.switch.node.inputs
 
     def value(self, read: Callable[[Any], Any], inputs: tuple[Any, ...]) -> Any:
-        """Return the result at the time `inputs[0]`, from the stops and values `inputs[-1]`."""
+        """Return the result at the time `inputs[0]`, s.
+
+        `inputs[-1]` is a pair of the stops and the `Times`; `read` returns the value of an input.
+        """
         node, (stops, found) = self.switch.node, inputs[-1]
         past = inputs[0] >= stops[self.places]
         steps, size = jnp.where(past, found.change[self.places], 0), self.switch.size
@@ -301,7 +322,7 @@ class _Side(NamedTuple):
 
 
 def by_sides(analysis: Analysis) -> Callable[..., Array]:
-    """Return the field f(constants, t, y, …, (stops, `Times`)) with its switches at the stops."""
+    """Return the field f(constants, t, y, …, (stops, `Times`)), whose jumps are at the stops."""
     replaced, begin = {}, 0
     for number, switch in enumerate(analysis.switches):
         if switch.jumps:
@@ -313,15 +334,16 @@ def by_sides(analysis: Analysis) -> Callable[..., Array]:
 
 
 def separated(times: Array, a: Array, b: Array) -> tuple[Array, Array]:
-    """Return stops between a and b in order, and those of each of `times` (k,); equal ones apart.
+    """Return the stops from a to b in order, and the stop of each of the `times` (k,), s.
 
-    Two jumps at the same time have a very short step between them, so that each has its derivative.
+    The stops of equal times are moved apart: two jumps at the same time have a very short step
+    between them, so that each has its own derivative.
     """
     inside = (times > a) & (times < b)
     t = jnp.where(inside, times, jnp.where(times <= a, a, b))
     still, last = lax.stop_gradient((t, b))
     count = np.arange(t.shape[0])
-    # Comparisons of few with each other are quicker than a sort.
+    # To compare few times with each other is quicker than to sort them.
     earlier = still[None] < still[:, None]
     earlier = earlier | ((still[None] == still[:, None]) & (count[None] < count[:, None]))
     rank = jnp.sum(earlier, 1)

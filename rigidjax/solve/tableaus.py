@@ -1,6 +1,6 @@
-"""Butcher tableaus of the explicit Runge–Kutta methods, with error estimates and dense output.
+"""Hold the Butcher tableaus of explicit Runge–Kutta methods, with error estimates and dense output.
 
-Each row is sparse, `{stage: weight}`: a zero weight costs nothing.
+Each row is sparse, `{stage: weight}`, so that a zero weight costs nothing.
 """
 
 from typing import NamedTuple
@@ -12,14 +12,20 @@ Row = dict[int, float]
 
 
 class Tableau(NamedTuple):
-    """An explicit Runge–Kutta method.
+    """Hold the numbers of an explicit Runge–Kutta method.
 
-    **Fields:** `order` of the solution; `c`, `a` nodes and weights of the stages after the first;
-    `b` the solution's weights; `errors` weights of one or two error estimates, the higher order
-    first, in which stage `len(a) + 1` is the derivative at the end of the step; `extra_c`,
-    `extra_a` stages that only dense output needs, counted on from there; `dense` weights, over all
-    these stages, of the corrections to the cubic through both ends and their slopes, in the nested
-    basis θ²(1−θ)², θ³(1−θ)², θ³(1−θ)³, … of Hairer, Nørsett and Wanner (1993), II.6.
+    **Fields:**
+
+    - `order`: the order of the solution.
+    - `c`, `a`: the nodes and the weights of the stages after the first.
+    - `b`: the weights of the solution.
+    - `errors`: the weights of one or two error estimates, that of higher order first. In them the
+      stage `len(a) + 1` is the derivative at the end of the step.
+    - `extra_c`, `extra_a`: the nodes and the weights of the stages that only dense output needs;
+      their numbers follow that of the derivative at the end of the step.
+    - `dense`: the weights, over all these stages, of the corrections to the cubic through both ends
+      of the step and their slopes. Their basis is θ²(1−θ)², θ³(1−θ)², θ³(1−θ)³, …, where θ is the
+      part of the step that has passed, from 0 to 1 (Hairer, Nørsett and Wanner 1993, II.6).
     """
 
     order: int
@@ -33,22 +39,24 @@ class Tableau(NamedTuple):
 
 
 def _rows(text: str) -> tuple[Row, ...]:
-    """Rows from a table: `stage:weight`, a semicolon between two rows."""
+    """Return the rows of a table of `stage:weight`, with a semicolon between two rows."""
     rows = [row.split() for row in text.split(";")]
     return tuple({int(i): float(w) for i, w in (part.split(":") for part in row)} for row in rows)
 
 
 def numbers(text: str) -> tuple[float, ...]:
-    """The numbers of a table."""
+    """Return the numbers of a text, which are separated by spaces."""
     return tuple(map(float, text.split()))
 
 
 def _sparse(row: np.ndarray) -> Row:
+    """Return the weights of a row that are not zero, by their stages."""
     return {i: float(w) for i, w in enumerate(row) if w != 0}
 
 
-# Kutta's method of 1901. The estimate puts the slope at the end of the step in the place of the
-# fourth stage: the result fulfils all conditions up to order 3, and Σ b a c² = 7/72, not 1/12.
+# Kutta's method of 1901. The error estimate is the difference from a second result, in which the
+# slope at the end of the step takes the place of the fourth stage. The second result fulfils all
+# conditions up to order 3; it has Σ b a c² = 7/72, where order 4 needs 1/12.
 KUTTA4 = Tableau(
     order=4,
     c=(0.5, 0.5, 1.0),
@@ -57,7 +65,7 @@ KUTTA4 = Tableau(
     errors=({3: 1 / 6, 4: -1 / 6},),
 )
 
-# Tsitouras 2011, doi:10.1016/j.camwa.2011.06.002; the numbers are diffrax's.
+# Tsitouras 2011, doi:10.1016/j.camwa.2011.06.002; the numbers are those of diffrax.
 _TSIT5 = dfx.Tsit5.tableau
 TSITOURAS5 = Tableau(
     order=5,
@@ -65,7 +73,7 @@ TSITOURAS5 = Tableau(
     a=tuple(_sparse(row) for row in _TSIT5.a_lower[:-1]),
     b=_sparse(_TSIT5.b_sol),
     errors=(_sparse(_TSIT5.b_error),),
-    # The θ⁴ coefficients of the paper's interpolant; the cubic fixes the rest.
+    # These are the coefficients of θ⁴ in the paper's interpolant; the cubic fixes the others.
     dense=_rows("""
     0:-1.0530884977290216 1:0.1017 2:2.490627285651252793 3:-16.54810288924490272
       4:47.37952196281928122 5:-34.87065786149660974 6:2.5
@@ -75,13 +83,13 @@ TSITOURAS5 = Tableau(
 # DOP853: Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I (1993), II.5 and
 # II.6, doi:10.1007/978-3-540-78862-1, after Prince and Dormand 1981,
 # doi:10.1016/0771-050X(81)90010-3.
-# Twelve stages, order 8, estimates of order 5 and 3, dense output of order 7. Fewer stages and
-# smaller constants than the 8(7) pair of 1981 that `diffrax.Dopri8` uses.
+# It has twelve stages, order 8, error estimates of orders 5 and 3, and dense output of order 7. It
+# has fewer stages and smaller constants than the 8(7) pair of 1981 that `diffrax.Dopri8` uses.
 (_B,) = _rows("""
     0:0.054293734116568765 5:4.450312892752409 6:1.8915178993145003 7:-5.801203960010585
       8:0.3111643669578199 9:-0.1521609496625161 10:0.20136540080403034 11:0.04471061572777259
 """)
-# The weights of the method of order 3 are the three below.
+# These are the three weights of the method of order 3.
 _THIRD = {0: 0.2440944881889764, 8: 0.7338466882816118, 11: 0.022058823529411766}
 DORMAND_PRINCE8 = Tableau(
     order=8,

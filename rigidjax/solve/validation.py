@@ -1,4 +1,4 @@
-"""Checks of the arguments of `simulate`, before anything is integrated."""
+"""Check the arguments of `simulate` before anything is integrated."""
 
 import warnings
 from typing import Any
@@ -23,7 +23,10 @@ from rigidjax.rotation.validation import tolerance
 
 
 def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[Any, Any, Array]:
-    """Body, start, times of a run, of one dtype; with `throw=False` bad traced numbers are NaN."""
+    """Return the body, start and times of a run, checked; start and times have one dtype.
+
+    With `throw=False` bad traced numbers become NaN and raise no error.
+    """
     ts = times(ts, throw)
     state0 = start(state0, throw)
     dtype = ts.dtype
@@ -69,7 +72,10 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
 
 
 def _require_one_frame(torque: Any) -> None:
-    """Refuse laws of the absolute body rate in a moving frame, where states have a relative one."""
+    """Raise `TypeError` for a law that needs the absolute body rate in a moving frame.
+
+    There the rate of a state is relative to the frame.
+    """
 
     def within(law: Any) -> list[Any]:
         inner = [p.torque for p in parts_of(law) if isinstance(p, BodyInFrame | ChangingInertia)]
@@ -86,7 +92,10 @@ def _require_one_frame(torque: Any) -> None:
 
 
 def one_dtype(tree: Any, name: str) -> Any:
-    """The dtype of all arrays of a tree, or `TypeError`."""
+    """Return the dtype of all arrays of a tree; raise `TypeError` if there are several.
+
+    The message begins with `name`.
+    """
     kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(tree)}
     if len(kinds) != 1:
         found = ", ".join(sorted(map(str, kinds)))
@@ -95,7 +104,7 @@ def one_dtype(tree: Any, name: str) -> Any:
 
 
 def warn_of_scale(body: Any, torque: Any) -> None:
-    """Warn of a torque on a body whose scale is arbitrary, unless it has the same scale."""
+    """Warn of a torque on a body whose scale is arbitrary, unless the torque has the same scale."""
     relative = isinstance(body, Inertia) and body.scale is not None
     alike = isinstance(torque, GravityGradient) and not torque.harmonics
     if relative and torque is not None and not alike:
@@ -107,7 +116,10 @@ def warn_of_scale(body: Any, torque: Any) -> None:
 
 
 def _body_of(numbers: Any, moves: bool = False) -> str:
-    """The advice for bare numbers."""
+    """Return the advice, for a message, to one who gave bare numbers in the place of a body.
+
+    `moves` says that the body moves as well as turns. For anything but numbers there is none.
+    """
     if not isinstance(numbers, (list, tuple, np.ndarray, jax.Array)):
         return ""
     if moves:
@@ -117,14 +129,20 @@ def _body_of(numbers: Any, moves: bool = False) -> str:
 
 
 def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
-    """The body; traced numbers of no real body are NaN, unless they may `throw`."""
+    """Return the body; if it is traced and no real body, its numbers are NaN.
+
+    With `throw` it raises an error instead.
+    """
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
     return check_body(body, tensor, body.mass if matter else None, throw)
 
 
 def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
-    """`rtol` and `atol`, by default suited to `dtype`; a warning if it cannot reach known ones."""
+    """Return `rtol` and `atol`, by default suited to `dtype`.
+
+    Warn if the dtype cannot reach a known `rtol`, and return the smallest that it can reach.
+    """
     double = dtype == jnp.float64
     usual = (1e-9, 1e-12) if double else (2e-5, 1e-7)
     if rtol is None and atol is None:
@@ -132,12 +150,13 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     rtol, atol = (u if g is None else g for u, g in zip(usual, (rtol, atol), strict=True))
     if not _checks.is_known((rtol, atol)):
         return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
-    # Floats of Python: those of NumPy would lift a float32 run to float64.
+    # These are floats of Python, because those of NumPy would lift a float32 run to float64.
     rtol, atol = _checks.known_float(rtol, "rtol"), _checks.known_float(atol, "atol")
     if not 0 < rtol < np.inf or not 0 <= atol < np.inf:
         raise ValueError(f"simulate: wanted rtol > 0 and atol >= 0, got rtol={rtol}, atol={atol}")
     floor = 100 * float(jnp.finfo(dtype).eps)
-    # A relative tolerance below this cannot be met: steps shrink until max_steps ends the run.
+    # A relative tolerance below this floor cannot be met: the steps would shrink until max_steps
+    # ends the run.
     if rtol < floor:
         advice = "" if double else "; set jax.config.update('jax_enable_x64', True) for float64"
         warnings.warn(
@@ -150,7 +169,10 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
 
 
 def times(ts: Any, throw: bool) -> Array:
-    """`ts` as an array of times that increase, or decrease; or NaN, if traced and not to throw."""
+    """Return `ts` as an array of times that increase, or that decrease, throughout.
+
+    Others raise an error; with `throw=False` they become NaN if they are traced.
+    """
     if isinstance(ts, (Spin, Attitude, Rigid, Point)):
         raise TypeError(f"ts: wanted times, got {type(ts).__name__}; the state comes before them")
     try:
@@ -183,7 +205,11 @@ def times(ts: Any, throw: bool) -> Array:
 
 
 def first_step(dt0: Any, times: Array) -> Array:
-    """The length of `dt0` in the precision of `times`; refused if it is no step to go on with."""
+    """Return the length of the step `dt0` in the precision of `times`.
+
+    Raise `ValueError` if it is known and is no step: zero, not finite, too short for the precision,
+    or negative in a run forwards in time.
+    """
     step = _checks.array_of_shape(dt0, (), "dt0").astype(times.dtype)
     known = _checks.is_known(times)
     if not _checks.is_known(step):
@@ -206,7 +232,10 @@ def first_step(dt0: Any, times: Array) -> Array:
 
 
 def start(state0: Any, throw: bool) -> Any:
-    """`state0` of one body, finite, with a unit quaternion; or NaN, as for `times`."""
+    """Return `state0`, checked to be of one body and finite, and to have a unit quaternion.
+
+    A bad one raises an error; with `throw=False` a traced quaternion that is not unit becomes NaN.
+    """
     wanted = "Spin, Attitude or Rigid, or Point without a body"
     _checks.require_single(state0, (Spin, Attitude, Rigid, Point), "state0", requirement=wanted)
     named, tree = jax.tree.flatten_with_path(state0)
@@ -232,7 +261,11 @@ def start(state0: Any, throw: bool) -> Any:
 
 
 def _guard(value: Array, bad: Any, message: str, throw: bool) -> Array:
-    """As `_checks.error_if`; but one bad body in a batch must not end the run of the others."""
+    """Return the `value`, or raise an error with the `message` if it is `bad`.
+
+    With `throw=False` a traced bad value becomes NaN instead: one bad body in a batch must not end
+    the run of the others.
+    """
     if throw or _checks.is_known(bad):
         return _checks.error_if(value, bad, message)
     return jnp.where(bad, jnp.full_like(value, jnp.nan), value)
