@@ -241,10 +241,13 @@ def test_a_segment_run_again_may_take_other_steps(monkeypatch):
     whole = once(jax.grad(value))(p)
     recorded, factor = adaptive_loop.recorded, [1.3]
 
-    def otherwise(method, constants, run, *rest):
-        # The arrays of the controller are its tolerances.
-        looser = jax.tree.map(lambda a: factor[0] * a, run.arrays)
-        return recorded(method, constants, run._replace(arrays=looser), *rest)
+    def otherwise(method, *rest):
+        # A smaller error is that of a looser tolerance.
+        def control(again, states, numbers):
+            *sides, error = numbers
+            return method.control(again, states, (*sides, error / factor[0]))
+
+        return recorded(method._replace(control=control), *rest)
 
     monkeypatch.setattr(adaptive_loop, "SEGMENT", 7)
     monkeypatch.setattr(adjoint, "recorded", otherwise)

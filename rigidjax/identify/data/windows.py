@@ -38,8 +38,9 @@ class Horizons(NamedTuple):
 
     >>> t = np.arange(6.0)
     >>> spin = rj.Spin(np.stack([t, 0 * t, 0 * t], 1))
-    >>> rj.identify.windows(t, spin, length=2).held_horizons().rms["omega"].tolist()  # it grows by
-    1 a step [1.0, 2.0]
+    >>> held = rj.identify.windows(t, spin, length=2).held_horizons()
+    >>> held.rms["omega"].tolist()   # the rate grows by 1 a step
+    [1.0, 2.0]
     """
 
     steps: np.ndarray
