@@ -20,7 +20,7 @@ from rigidjax.motion.torques import bind
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.fixed_loop import first_row, march
+from rigidjax.solve.fixed_loop import first_row, march_steps
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.pieces import piece_length
 from rigidjax.solve.splitting import AbstractSplitting
@@ -197,7 +197,7 @@ def _take_steps(
         def advance(carry: PyTree, first: Array) -> tuple[PyTree, PyTree]:
             # From one saved state, which is followed by the step `first`, to the next.
             y, carried = carry
-            y = march(stepper, h, t0, first, every, y, inputs)
+            y = march_steps(stepper, h, t0, first, every, y, inputs)
             if reduce is not None:
                 t = t0 + (first + every).astype(h.dtype) * h
                 carried = reduce(carried, t, stepper.state(y))

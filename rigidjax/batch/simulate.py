@@ -22,7 +22,7 @@ from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of, with_own_states
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
-from rigidjax.solve.adaptive_loop import NONFINITE, finite, of_body
+from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_of_body
 from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
 
@@ -135,10 +135,10 @@ def simulate(
     if isinstance(solver, Magnus4):
         raise ValueError("simulate: Magnus4 takes fixed steps; give Steps(size, number), not times")
     batch = check_batch(bodies, states0, torque, torque_axes)
-    ts = validation.times(ts_or_steps, True).astype(batch.dtype)
+    ts = validation.checked_times(ts_or_steps, True).astype(batch.dtype)
     if torque is not None or solver is not None:
         max_steps = _checks.integer(max_steps, "max_steps", 1)
-        rtol, atol = validation.tolerances(rtol, atol, batch.dtype)
+        rtol, atol = validation.checked_tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if solver is None else solver
     options = dict(solver=solver, rtol=rtol, atol=atol, max_steps=max_steps, adjoint=adjoint)
     division = chunk_of(chunk, batch.dtype, batch.num_bodies), mesh_of(devices)
@@ -195,7 +195,7 @@ def _statuses(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
 
     def status(row: PyTree, ys: PyTree) -> dfx.RESULTS:
         result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-        return of_body(result, one_body(batch.shared, row, batch.constants)[0])
+        return result_of_body(result, one_body(batch.shared, row, batch.constants)[0])
 
     return jax.vmap(status)(batch.per_body, ys)
 

@@ -55,7 +55,7 @@ def one_body(shared: PyTree, row: PyTree, constants: PyTree) -> tuple[Any, Any, 
     A state that is invalid becomes NaN.
     """
     body, state0, torque = eqx.combine(shared, row, constants)
-    return body, project_to_group(validation.start(state0, False)), torque
+    return body, project_to_group(validation.checked_start(state0, False)), torque
 
 
 def check_batch(

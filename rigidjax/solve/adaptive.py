@@ -15,7 +15,7 @@ from rigidjax.solve.adaptive_loop import NONFINITE, finite
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.step_control import StandardController, Stopping, Watched
-from rigidjax.solve.stops import stopped
+from rigidjax.solve.stops import program_with_stops
 
 REPLAY, NO_METER = ReplayAdjoint(), dfx.NoProgressMeter()
 
@@ -64,7 +64,7 @@ def _numbers(t: Any, y: Any, args: object) -> Array:
     return ravel_pytree(y)[0]
 
 
-def integrated(
+def integrate(
     solver: dfx.AbstractSolver,
     field: Callable[..., Any],
     ts: Array,
@@ -89,7 +89,7 @@ def integrated(
     if jumps is not None:
         numbers, tree = ravel_pytree(y0)
         of_one = lambda t, y, *sides: ravel_pytree(field(t, tree(y), sides or None))[0]  # noqa: E731
-        program = stopped(of_one, jumps, ts[0], ts[-1], numbers)
+        program = program_with_stops(of_one, jumps, ts[0], ts[-1], numbers)
         field, missed = _FieldOfNumbers(program.constants, program.field, tree), program.over
         if program.stops.size:
             controller = Stopping(controller, program.stops)
@@ -178,4 +178,4 @@ def adaptive(
     rtol, atol = (jnp.asarray(a, ts.dtype) for a in (rtol, atol))
     controller = Watched(StandardController(rtol, atol, max_step))
     how = dict(jumps=declared, halt=halt, dt0=dt0, max_steps=max_steps)
-    return integrated(solver, field, ts, y0, controller, **how)
+    return integrate(solver, field, ts, y0, controller, **how)

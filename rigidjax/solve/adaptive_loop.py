@@ -70,7 +70,7 @@ class Run(NamedTuple):
         A stage at such a time evaluates the field as it is before the jump.
         """
         jumps = lax.stop_gradient(self.stops[:-1])
-        gap = before(jumps) - jumps
+        gap = previous_number(jumps) - jumps
         return jnp.concatenate([self.stops[:-1] + gap, self.stops[-1:]])
 
 
@@ -101,7 +101,7 @@ def pack(loop: LoopState) -> Arrays:
 
     XLA makes a kernel for each array that goes into or comes out of a loop over blocks of bodies.
     """
-    rest = _by_dtype(loop._replace(y=None))
+    rest = _group_by_dtype(loop._replace(y=None))
     join = lambda leaves: jnp.concatenate([a.reshape(-1, *loop.t.shape) for a in leaves])  # noqa: E731
     return [loop.y, *(join([a.astype(kind) for a in leaves]) for kind, leaves in rest.items())]
 
@@ -113,7 +113,7 @@ def unpack(arrays: Arrays, like: LoopState) -> LoopState:
     """
     rest, tree = jax.tree.flatten(like._replace(y=None))
     parts = {}
-    for (kind, leaves), array in zip(_by_dtype(rest).items(), arrays[1:], strict=True):
+    for (kind, leaves), array in zip(_group_by_dtype(rest).items(), arrays[1:], strict=True):
         sizes = [a.size // max(like.t.size, 1) for a in leaves]
         parts[kind] = iter(jnp.split(array, np.cumsum(sizes)[:-1]))
     rest = [next(parts[_kind(a)]).reshape(a.shape).astype(a.dtype) for a in rest]
@@ -125,7 +125,7 @@ def _kind(a: Array) -> Any:
     return jnp.dtype(jnp.int32) if a.dtype == bool else a.dtype
 
 
-def _by_dtype(tree: Any) -> dict[Any, Arrays]:
+def _group_by_dtype(tree: Any) -> dict[Any, Arrays]:
     """Return the arrays of `tree` in lists, one list for each dtype that `_kind` returns."""
     parts: dict[Any, Arrays] = {}
     for a in jax.tree.leaves(tree):
@@ -150,7 +150,7 @@ class Segment(NamedTuple):
     number: Array  # the number of rows that are filled
 
 
-def before(t: Array) -> Array:
+def previous_number(t: Array) -> Array:
     """Return the largest floating-point number below the time `t`, as diffrax defines it.
 
     For t = 0 it is the largest negative normal number: XLA treats subnormal numbers as zero.
@@ -160,7 +160,7 @@ def before(t: Array) -> Array:
     return jnp.where(t == 0, -jnp.finfo(t.dtype).tiny, less).astype(t.dtype)
 
 
-def times_of(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
+def step_times(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
     """Return the start, length and end of the steps recorded in `rows` (4 + n, *bodies).
 
     All three have derivatives with respect to the stops. The start moves with the last stop before
@@ -226,7 +226,7 @@ def next_step(norm: Array, order: Any, h: Any) -> tuple[Array, Array]:
     return norm < 1, h * factor.astype(jnp.result_type(h))
 
 
-def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
+def result_of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
     """Return the result of a run, or `nonfinite_input` if a number of the body is not finite.
 
     In a batch, an inertia that no real body has is replaced by NaN instead of an error.
@@ -242,7 +242,7 @@ def per_body(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
     return jax.vmap(function, in_axes=-1, out_axes=-1) if run.t0.ndim else function
 
 
-def start(run: Run) -> LoopState:
+def initial_loop_state(run: Run) -> LoopState:
     """Return the state of the loop before the first step of `run`."""
     zero = jnp.zeros(run.t0.shape, jnp.int32)
     # A stop at the start or before it needs no step.
@@ -266,16 +266,16 @@ def is_running(method: Method, run: Run, loop: LoopState, until: Array | None) -
     return well & (loop.t < last) & (loop.steps < method.max_steps)
 
 
-def value(method: Method, constants: Arrays, run: Run) -> LoopState:
+def end_of_run(method: Method, constants: Arrays, run: Run) -> LoopState:
     """Return the loop state at the end of a run, for which no other state is saved."""
     return lax.while_loop(
         lambda loop: jnp.any(is_running(method, run, loop, None)),
         lambda loop: _attempt(method, constants, run, loop, None)[0],
-        start(run),
+        initial_loop_state(run),
     )
 
 
-def states_of_one(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState]:
+def states_of_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState]:
     """Return the states (K, n) of one body at `run.between`, and the loop state at the end.
 
     A state that the run did not reach is NaN. The stages of dense output are evaluated only in the
@@ -300,29 +300,29 @@ def states_of_one(method: Method, constants: Arrays, run: Run) -> tuple[Array, L
         return after, ys, k
 
     # A saved time at the start belongs to the first step, as far as that step is accepted.
-    state = (start(run), _unreached(run), jnp.zeros((), jnp.int32))
+    state = (initial_loop_state(run), _states_before_the_run(run), jnp.zeros((), jnp.int32))
     more = lambda state: is_running(method, run, state[0], None)  # noqa: E731
     loop, ys, _ = lax.while_loop(more, one, state)
     return ys, loop
 
 
-def _unreached(run: Run) -> Array:
+def _states_before_the_run(run: Run) -> Array:
     """Return the states (K, n, *bodies) before the first step: NaN, or y0 if the run ends at t0."""
     ended = run.stops[-1] <= run.t0
     still = jnp.where(lift(ended, run.y0), run.y0, jnp.nan)
     return jnp.broadcast_to(still[None], (run.between.shape[0], *run.y0.shape))
 
 
-def recording(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState, Record]:
+def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState, Record]:
     """Return the states at `run.between`, the loop state at the end, and the record of the run.
 
     The states are (K, n, *bodies), and NaN if the run did not reach them. The record is what
     derivatives need.
     """
-    loop, most = start(run), method.max_steps + run.stops.shape[0]
+    loop, most = initial_loop_state(run), method.max_steps + run.stops.shape[0]
     count = -(-most // SEGMENT) + 1
     starts = [jnp.zeros((count, *a.shape), a.dtype) for a in pack(loop)]
-    ys = _unreached(run)
+    ys = _states_before_the_run(run)
     rows = jnp.zeros((SEGMENT + _MORE + _MOST, HEAD + run.y0.shape[0], *run.t0.shape), ys.dtype)
     zero = jnp.zeros((), jnp.int32)
 
@@ -332,7 +332,7 @@ def recording(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopS
 
     def one(state: Any) -> Any:
         loop, ys, starts, rows, number, _ = state
-        after, rows, count = recorded(method, constants, run, loop, rows, None)
+        after, rows, count = record_segment(method, constants, run, loop, rows, None)
         if run.between.shape[0]:
             part = segment(rows, after.t, count)
             ys = states_at_saved_times(method, constants, run, part, ys)
@@ -373,7 +373,7 @@ def _attempt(
     step = Step(loop.t, h, end, loop.y)
     if until is not None:
         head = [a.astype(loop.y.dtype) for a in (loop.t, h, kind, loop.stop)]
-        begin, length, late = _where(moving, times_of(run, jnp.stack(head)), step[:3])
+        begin, length, late = _where(moving, step_times(run, jnp.stack(head)), step[:3])
         step = Step(begin, length, late, loop.y)
     there = stages(method.tableau, method.field, constants, step, dense)
     y = method.project(there.end)
@@ -417,7 +417,7 @@ def _where(which: Any, new: Any, old: Any) -> Any:
     return jax.tree.map(choose, new, old)
 
 
-def recorded(
+def record_segment(
     method: Method, constants: Arrays, run: Run, loop: LoopState, rows: Rows, until: Any
 ) -> tuple[LoopState, Rows, Array]:
     """Return the loop state after a segment of steps, the rows of these steps, and their number.
@@ -485,7 +485,7 @@ def states_at_saved_times(
 
         there, old = cut(inside), cut(ys)
         row = jnp.where(there[None], pick(part.rows, cut(index)), still)
-        step = Step(*times_of(run, row), row[HEAD:])
+        step = Step(*step_times(run, row), row[HEAD:])
         slopes = stages(method.tableau, method.field, constants, step, True).slopes
         new = state_in_step(method, jnp.where(there, cut(run.between), step.t), step, slopes)
         new = jnp.where(there[None], new, old)

@@ -22,14 +22,14 @@ from rigidjax.solve.adaptive_loop import (
     Record,
     Run,
     Segment,
+    initial_loop_state,
     is_running,
     per_body,
-    recorded,
+    record_segment,
     segment,
-    start,
     state_in_step,
     states_at_saved_times,
-    times_of,
+    step_times,
     unpack,
 )  # fmt: skip
 from rigidjax.solve.batching import Arrays, lift
@@ -53,7 +53,7 @@ def smooth_numbers(run: Run) -> Smooth:
     return Smooth(run.t0, run.stops, run.between, run.y0)
 
 
-def passed(run: Run, part: Segment) -> Array:
+def saved_times_before_rows(run: Run, part: Segment) -> Array:
     """Return how many of the saved times have passed at the start of each row of a segment.
 
     The saved times are `run.between`. The last number is that at the end of the segment `part`.
@@ -65,7 +65,7 @@ def passed(run: Run, part: Segment) -> Array:
     return jnp.where(ends <= lax.stop_gradient(run.t0)[None], 0, count)
 
 
-def of_saved(
+def transpose_saved_states(
     method: Method, run: Run, step: Step, slopes: Array, first: Array, last: Array, bars: Array,
     between: Array | None,
 ) -> tuple[Array | None, Step, Array]:  # fmt: skip
@@ -111,13 +111,13 @@ def replay_steps(
 
     def one(i: Array, state: tuple[Array, Array, Array, Array]) -> Any:
         y, ys, starts, _ = state
-        part = _again(method, *still, held, i)
+        part = _segment_of_record(method, *still, held, i)
         starts = lax.dynamic_update_index_in_dim(starts, y, i, 0)
 
         def step(k: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
             y, rows = both
             row = part.rows[k]
-            there = stages(method.tableau, method.field, constants, Step(*times_of(run, row), y))
+            there = stages(method.tableau, method.field, constants, Step(*step_times(run, row), y))
             rows = lax.dynamic_update_index_in_dim(rows, row.at[HEAD:].set(y), k, 0)
             return jnp.where(lift(row[2] >= STEP, y), method.project(there.end), y), rows
 
@@ -145,14 +145,14 @@ def cotangents(
     number, size = jnp.max(record.counts[0]), run.between.shape[0]
 
     def one(i: Array, sums: tuple[Arrays, Smooth]) -> tuple[Arrays, Smooth]:
-        part = _again(method, constants, run, record, number - 1 - i)
-        known = passed(run, part) if size else None
+        part = _segment_of_record(method, constants, run, record, number - 1 - i)
+        known = saved_times_before_rows(run, part) if size else None
 
         def step(k: Array, sums: tuple[Arrays, Smooth]) -> tuple[Arrays, Smooth]:
             total, of_run = sums
             k = part.number - 1 - k
             row = part.rows[k]
-            by = lambda t0, stops: times_of(run._replace(t0=t0, stops=stops), row)  # noqa: E731
+            by = lambda t0, stops: step_times(run._replace(t0=t0, stops=stops), row)  # noqa: E731
             (t, h, end), of_times = jax.vjp(by, run.t0, run.stops)
             here = Step(t, h, end, row[HEAD:])
             dense, seeds, of_slopes, between = False, None, None, of_run.between
@@ -161,11 +161,11 @@ def cotangents(
             there = stages(method.tableau, method.field, constants, here, dense)
             bar = jax.vjp(method.project, there.end)[1](of_run.y0)[0]
             if known is not None:
-                between, seeds, of_slopes = of_saved(
+                between, seeds, of_slopes = transpose_saved_states(
                     method, run, here, there.slopes, known[k], known[k + 1], bars[0],
                     between if timed else None,
                 )  # fmt: skip
-            by_constants, *rest = runge_kutta.pulled(
+            by_constants, *rest = runge_kutta.pull_back(
                 method.tableau, method.field, constants, here, there, bar, of_slopes
             )
             if seeds is not None:
@@ -192,9 +192,11 @@ def _where(there: Array, a: Array) -> Array:
     return jnp.where(lift(there, a), a, jnp.zeros_like(a))
 
 
-def _again(method: Method, constants: Arrays, run: Run, record: Record, number: Array) -> Segment:
+def _segment_of_record(
+    method: Method, constants: Arrays, run: Run, record: Record, number: Array
+) -> Segment:
     """Return the segment `number` of a record: recorded if it is the last, else run once more."""
-    like = start(run)
+    like = initial_loop_state(run)
     loop, after = (unpack([a[i] for a in record.starts], like) for i in (number, number + 1))
     # In the record, the count of steps and the result are those of the forward run: the segment
     # starts with fresh ones, so that neither ends it.
@@ -203,7 +205,7 @@ def _again(method: Method, constants: Arrays, run: Run, record: Record, number: 
     again = number < count - 1
     # The last segment is in the record: it takes no step here.
     until = jnp.where(again, lax.stop_gradient(after.t), -jnp.inf)
-    end, rows, count = recorded(method, constants, run, loop, record.rows, until)
+    end, rows, count = record_segment(method, constants, run, loop, record.rows, until)
     # If the rows had too little room for all steps, the derivative would be wrong: it becomes NaN.
     short = jnp.where(jnp.any(is_running(method, run, end, until)), jnp.nan, 0.0)
     rows = rows.at[:, HEAD:].add(short.astype(rows.dtype))

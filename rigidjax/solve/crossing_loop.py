@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve.adaptive_loop import NONFINITE, before, next_step, starting_step, take
+from rigidjax.solve.adaptive_loop import NONFINITE, next_step, previous_number, starting_step, take
 from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
 from rigidjax.solve.tableaus import Tableau
@@ -28,7 +28,7 @@ _GUESSES = 8
 _MOST = 70
 
 
-class Method(NamedTuple):
+class SearchMethod(NamedTuple):
     """Hold an explicit method and the field that it solves, on states (n, *bodies)."""
 
     tableau: Tableau
@@ -53,7 +53,7 @@ class Path(NamedTuple):
 
         A stage at such a time evaluates the field as it is before the jump.
         """
-        return jnp.concatenate([before(self.stops[:-1]), self.stops[-1:]])
+        return jnp.concatenate([previous_number(self.stops[:-1]), self.stops[-1:]])
 
 
 class Motion(NamedTuple):
@@ -194,10 +194,10 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
     # time at which g turns (`shorter`), or searched for the zero in it (`crossed`).
     step = on & ~arrived & ~body.refining
     whole = run.stops[-1] - run.t0
-    good, following = controlled(norm, motion.order, t, length, h, last, whole)
+    good, following = accept_and_next_step(norm, motion.order, t, length, h, last, whole)
     following = jnp.minimum(following, motion.longest)
     good = step & good
-    hidden, turn = _hidden(side, start, here, blur)
+    hidden, turn = _hidden_zero(side, start, here, blur)
     eps = jnp.finfo(h.dtype).eps
     long_enough = turn > 8 * eps * jnp.maximum(jnp.abs(t), eps * whole)
     shorter = good & hidden & long_enough & (body.tries < _GUESSES)
@@ -265,7 +265,7 @@ def _choose(which: Array, a: _End, b: _End) -> _End:
     return _End(*(jnp.where(which, x, y) for x, y in zip(a, b, strict=True)))
 
 
-def _hidden(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array, Array]:
+def _hidden_zero(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array, Array]:
     """Return whether g may have more zeros between two ends than its signs there show.
 
     `side` is the side of zero at the end `low`; `blur` is the size that g may have by round-off.
@@ -319,7 +319,7 @@ def _first_guess(side: Array, low: _End, high: _End) -> Array:
 
 
 def step_with_error(
-    method: Method, constants: Arrays, run: Path, step: Step
+    method: SearchMethod, constants: Arrays, run: Path, step: Step
 ) -> tuple[Array, Array]:
     """Return the state a step later, and the root mean square of its error over the tolerance.
 
@@ -336,7 +336,7 @@ def step_with_error(
     return right, jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
 
 
-def controlled(
+def accept_and_next_step(
     norm: Array, order: int, t: Array, h: Array, kept: Array, last: Array, length: Array
 ) -> tuple[Array, Array]:
     """Return whether a step is accepted, and the length of the next step.
@@ -375,7 +375,7 @@ def outcome(h: Array, t: Array, end: Array, met: Array) -> dfx.RESULTS:
     return result
 
 
-def first_step(method: Method, constants: Arrays, run: Path) -> Array:
+def first_step(method: SearchMethod, constants: Arrays, run: Path) -> Array:
     """Return the length of the first step of a search, from the state and the field at `run.t0`."""
     y0 = run.y0
     scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)

@@ -44,19 +44,19 @@ from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.torques.base import missing_state_message
 from rigidjax.solve import crossing_loop, validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
-from rigidjax.solve.adaptive_loop import of_body
+from rigidjax.solve.adaptive_loop import result_of_body
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.crossing_loop import (
     Located,
-    Method,
     Motion,
     Path,
     Search,
+    SearchMethod,
     first_step,
     outcome,
     step_with_error,
 )
-from rigidjax.solve.explicit import AbstractExplicit, explicit
+from rigidjax.solve.explicit import AbstractExplicit, require_explicit
 from rigidjax.solve.linear_map import as_known, nan_derivatives
 from rigidjax.solve.momentum import ByMomentum, by_momentum
 from rigidjax.solve.run import (
@@ -67,7 +67,7 @@ from rigidjax.solve.run import (
     in_forward_time,
     solve,
 )
-from rigidjax.solve.stops import constants_of, stopped
+from rigidjax.solve.stops import constants_of, program_with_stops
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 
@@ -210,12 +210,12 @@ def crossings(
     if _checks.is_known((begin, end)) and float(begin) == float(end):
         raise ValueError(f"t1: wanted another time than t0, got {float(end):g} for both")
     ts = jnp.stack([begin, end])
-    body, state0, times = validation.scene(body, state0, ts, torque, throw=False)
+    body, state0, times = validation.checked_scene(body, state0, ts, torque, throw=False)
     state0 = checked_start(event, body, state0, torque, times[0])
     if torque is None and solver is None and body is not None:
         return _solved(ClosedFormRun(body, False), event, many, max_steps, state0, times)
-    solver = explicit(solver)
-    rtol, atol = validation.tolerances(rtol, atol, times.dtype)
+    solver = require_explicit(solver)
+    rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
     way = direction_of(times)
     setup = DiffraxRun(
         body, torque, solver, rtol, atol, None, None, None, REPLAY, NO_METER, way, max_steps, False
@@ -314,29 +314,35 @@ def _solved(
     state0 = project_to_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
     found = located(crossed, Search(event.direction, many, max_steps), numbers)
-    times, states = _as_found(found.times, found.states, found.jumps, setup, event, state0, ts)
+    times, states = _with_derivatives_of_scene(
+        found.times, found.states, found.jumps, setup, event, state0, ts
+    )
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
     out = crossed.time(times), jax.vmap(crossed.state)(crossed.time(times), states)
     times, states = _with_derivatives(out, found.jumps, inputs)
     result = outcome(found.h, found.t, crossed.time(ts[-1]), found.number >= many)
-    result = of_body(result, setup.body)
+    result = result_of_body(result, setup.body)
     return Crossings(times, states, found.number, result, found.steps)
 
 
 @eqx.filter_custom_jvp
-def _as_found(times: Array, states: Array, jumps: Array, *scene: Any) -> tuple[Array, Array]:
+def _with_derivatives_of_scene(
+    times: Array, states: Array, jumps: Array, *scene: Any
+) -> tuple[Array, Array]:
     """Return the times and states found for a `scene`; only their derivatives run it once more."""
     return times, states
 
 
-@_as_found.def_jvp
+@_with_derivatives_of_scene.def_jvp
 def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     found, jumps, scene = primals[:2], primals[2], primals[3:]
-    moved, along = eqx.filter_jvp(partial(_corrected, found[0], jumps), scene, tangents[3:])
+    moved, along = eqx.filter_jvp(
+        partial(_crossings_of_scene, found[0], jumps), scene, tangents[3:]
+    )
     return as_known(found, moved), along
 
 
-def _corrected(
+def _crossings_of_scene(
     times: Array, jumps: Array, setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any,
     ts: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
@@ -411,7 +417,7 @@ def section(
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
     field, asked, along, jumps = in_forward_time(way, field, condition, ts[jnp.array([0, -1])])
     whole: Any = lambda s, y, *sides: ravel_pytree(field(s, tree(y), sides or None))[0]  # noqa: E731
-    program = stopped(whole, jumps, along[0], along[1], y0)
+    program = program_with_stops(whole, jumps, along[0], along[1], y0)
     longest = length = lax.stop_gradient(along[1] - along[0])
     if event.max_step is not None:
         longest = lax.stop_gradient(jnp.asarray(event.max_step, dtype))
@@ -472,7 +478,10 @@ def _located(
     run, longest = Path(*each[:-1]), each[-1]
     solver, motion = section.solver, layout.over(section.motion)
     project = jax.vmap(section.project, -1, -1) if layout.bodies else section.project
-    seen, clear = (partial(layout.over(partial(f, section)), constants) for f in (_seen, _clear))
+    seen, clear = (
+        partial(layout.over(partial(f, section)), constants)
+        for f in (_condition_and_round_off, _clearness)
+    )
 
     def counts(s: Array, y: Array, steps: Array) -> Array:
         # The round-off of steps adds up as a random walk: with the root of their number.
@@ -482,7 +491,7 @@ def _located(
     order, still = 1, jnp.zeros_like(run.rtol)
     attempt: Any = lambda step: (motion(constants, step.end, step.y), still)  # noqa: E731
     if solver is not None:
-        method = Method(solver.tableau, motion, project, section.sizes)
+        method = SearchMethod(solver.tableau, motion, project, section.sizes)
         h0 = first_step(method, constants, run)
         h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), longest)
         run = run._replace(h0=h0)
@@ -509,7 +518,9 @@ def _push(sizes: list[int], y: Array) -> Array:
     return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _lengths(sizes, y)
 
 
-def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Array, ...]:
+def _condition_and_round_off(
+    section: Section, constants: Arrays, s: Array, y: Array
+) -> tuple[Array, ...]:
     """Return g, dg/ds and dy/ds at the time `s` and the state `y`, and the round-off of g."""
     of_g = lambda s, y: section.rates(constants, s, y)[0]  # noqa: E731
     noise = jax.jvp(of_g, (s, y), (s, _push(section.sizes, y)))[1]
@@ -518,7 +529,7 @@ def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Arra
     return jnp.asarray(g), jnp.asarray(rate), slope, blur
 
 
-def _clear(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
+def _clearness(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
     """Return the rate of g through zero, divided by the rate that round-off could give it."""
     rates, sizes = partial(section.rates, constants, s), section.sizes
     _, rate, slope = rates(y)

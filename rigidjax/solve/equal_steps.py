@@ -29,7 +29,7 @@ class Rolled(eqx.Module):
     solver: AbstractExplicit
 
 
-def in_a_loop(solver: Any) -> Any:
+def roll_steps(solver: Any) -> Any:
     """Return an explicit method of order 4 or 5 with its stages in a loop; any other as it is."""
     few = isinstance(solver, AbstractExplicit) and solver.tableau.order <= 5
     return Rolled(solver) if few else solver

@@ -140,20 +140,20 @@ def error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None
     error. `tried` has the tolerance and the states of an earlier, coarser run, if there is one: it
     then takes the place of the second run, and the error is too large by a factor of up to ten.
     """
-    setup, ts, ys, count, tried = _still((setup, ts, ys, count, tried))
+    setup, ts, ys, count, tried = _without_derivatives((setup, ts, ys, count, tried))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
     if tried is not None:
         rtol, (before, others) = setup.rtol, tried
-        far = _largest(_apart(others, ys), _sizes(ys)) > _FORESEEN
+        far = _largest(_distances(others, ys), _sizes(ys)) > _FORESEEN
         factor = jnp.where(far, jnp.inf, _ALLOWED * rtol / before)
     elif not isinstance(setup, ClosedFormRun):
-        second, rtol, factor = _closer(setup, ts, _sudden_times(setup, ts, ys))
+        second, rtol, factor = _closer_run(setup, ts, _sudden_times(setup, ts, ys))
         others, *_ = solve(second, jax.tree.map(lambda leaf: leaf[0], ys), ts)
-    steps = jax.tree.map(lambda part: factor * part, _apart(others, ys))
+    steps = jax.tree.map(lambda part: factor * part, _distances(others, ys))
     return _with_round_off(setup, ts, ys, count, steps, rtol)
 
 
-def _still(tree: Any) -> Any:
+def _without_derivatives(tree: Any) -> Any:
     """Return the tree with its arrays held constant in derivatives."""
     return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_array(a) else a, tree)
 
@@ -167,7 +167,7 @@ def _with_round_off(
     `count` its number of steps.
     """
     sizes, start = _sizes(ys), jax.tree.map(lambda leaf: leaf[0], ys)
-    reached = jnp.isfinite(_largest(_apart(ys, ys), sizes))
+    reached = jnp.isfinite(_largest(_distances(ys, ys), sizes))
     # What the roundings add up to, times `_ABOVE`, where nothing grows but the angle that the body
     # has turned by.
     eps = float(jnp.finfo(ts.dtype).eps)
@@ -177,7 +177,7 @@ def _with_round_off(
     # Where round-off is not measured, the neighbours run from the start to the start: no step.
     times = jnp.where(clear, ts[0], ts)
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
-    setup, ys, more = _cheaper(setup, start, times, ys, count)
+    setup, ys, more = _cheaper_run(setup, start, times, ys, count)
 
     free = isinstance(setup, ClosedFormRun)
 
@@ -202,7 +202,7 @@ def _with_round_off(
     return Error(ts, steps, off, sizes)
 
 
-def _cheaper(setup: Any, start: Any, ts: Array, ys: Any, count: Array) -> tuple[Any, Any, Any]:
+def _cheaper_run(setup: Any, start: Any, ts: Array, ys: Any, count: Array) -> tuple[Any, Any, Any]:
     """Return a set-up that takes fewer steps, its states, and the factor of its round-off.
 
     The round-off of the given set-up, which took `count` steps, is that of the new one times the
@@ -218,7 +218,7 @@ def _cheaper(setup: Any, start: Any, ts: Array, ys: Any, count: Array) -> tuple[
     return setup, ys, jnp.sqrt(jnp.maximum(count / fewer, 1.0)).astype(ts.dtype)
 
 
-def _apart(others: Any, ys: Any) -> dict[str, Array]:
+def _distances(others: Any, ys: Any) -> dict[str, Array]:
     """Return the distances of the states `ys` from the states `others`, (T,) by name."""
     return _lengths(jax.tree.map(lambda leaf: leaf[0], ys), jax.vmap(minus)(others, ys))
 
@@ -259,7 +259,7 @@ def solve_to(
     run, and decreases as the tolerance does. **Returns** the set-up at the tolerance found; what
     `solve` returns for it; and the tolerance and the states of the run before it.
     """
-    still = _still((setup, state0, ts, accuracy))
+    still = _without_derivatives((setup, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
 
     sudden = _sudden_times(still[0], ts, jax.tree.map(lambda leaf: leaf[None], still[1]))
@@ -272,7 +272,7 @@ def solve_to(
         (others, stats, _), _, before, rtol, ended = carry
         # In a batch, a body whose search has ended runs from the start to the start: no step.
         new = run(rtol, jnp.where(ended, ts[0], ts))
-        off = jnp.nanmax(_largest(_apart(others, new[0]), _sizes(new[0]))[1:])
+        off = jnp.nanmax(_largest(_distances(others, new[0]), _sizes(new[0]))[1:])
         wanted = before * still[3] / (_AIM * off)
         least = jnp.maximum(_FARTHEST * rtol, floor)
         # The error of a run that is lost says nothing of the next one. Neither does that of a run
@@ -354,7 +354,7 @@ def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
     return lax.stop_gradient(lax.map(sudden, (times, saved)))
 
 
-def _closer(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
+def _closer_run(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
     """Return the set-up of a closer run, the tolerance of the given run, and a factor.
 
     The error of the given run is its distance to the closer run times the factor. Steps of the
@@ -472,7 +472,7 @@ def error_of(
         raise TypeError(f"f: wanted f(x, rtol=…, atol=…), got one where {error}") from None
     x = jax.tree.map(lambda leaf: _checks.numeric_array(leaf, "x"), x)
     dtype = ravel_pytree(x)[0].dtype
-    first = jnp.asarray(validation.tolerances(rtol, atol, dtype), dtype)
+    first = jnp.asarray(validation.checked_tolerances(rtol, atol, dtype), dtype)
     eps = float(jnp.finfo(dtype).eps)
     second = first * jnp.maximum(_CLOSER, _DEEPEST * eps / first[0])
 

@@ -41,7 +41,9 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
         return project_to_group(jax.tree.map(value, self.y0, self.coefficients))
 
 
-def onward(terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike) -> tuple[Array, Array]:
+def direction_and_length(
+    terms: PyTree[dfx.AbstractTerm], t0: RealLike, t1: RealLike
+) -> tuple[Array, Array]:
     """Return the direction of a step, 1 or −1, and its length.
 
     Backwards in time diffrax counts −t, so that `t1` is above `t0` in both directions; only the
@@ -93,7 +95,7 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
     ) -> Any:
         validation.one_dtype(y0, "state")
         numbers, tree = ravel_pytree(y0)
-        way, h = onward(terms, t0, t1)
+        way, h = direction_and_length(terms, t0, t1)
 
         def field(_: Any, t: Any, y: Array) -> Array:
             return way.astype(y.dtype) * ravel_pytree(terms.vf(t, tree(y), args))[0]
@@ -166,7 +168,7 @@ class DormandPrince8(AbstractExplicit):
     tableau: ClassVar[Tableau] = DORMAND_PRINCE8
 
 
-def explicit(solver: AbstractExplicit | None) -> AbstractExplicit:
+def require_explicit(solver: AbstractExplicit | None) -> AbstractExplicit:
     """Return the solver, or `DormandPrince8` for `None`; refuse a solver that is not explicit."""
     solver = DormandPrince8() if solver is None else solver
     wanted = "an explicit method of rigidjax.solvers"

@@ -17,7 +17,7 @@ from rigidjax.motion.equations import project_to_group
 from rigidjax.motion.manifold import dimension, minus_small, plus
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
-from rigidjax.solve.explicit import AbstractExplicit, explicit
+from rigidjax.solve.explicit import AbstractExplicit, require_explicit
 
 # Neighbouring intervals are not independent: the error of an exponent is that of the means over
 # this many parts of the run.
@@ -123,8 +123,8 @@ def lyapunov_exponents(
     dtype = validation.one_dtype(state0, "state0")
     length = _checks.checked_time(time, "time").astype(dtype)
     length = _checks.error_if(length, ~(length > 0), "time: wanted a positive time, s")
-    rtol, atol = validation.tolerances(rtol, atol, dtype)
-    solver = explicit(solver)
+    rtol, atol = validation.checked_tolerances(rtol, atol, dtype)
+    solver = require_explicit(solver)
     begin = _checks.checked_time(t0, "t0").astype(dtype)
     shapes = eqx.filter_eval_shape(lambda t, y: field(t, y, None), begin, state0)
     wanted, found = (jax.tree.map(jnp.shape, tree) for tree in (state0, shapes))

@@ -60,7 +60,7 @@ def fixed(
         left, right = ends
         h = (right - left) / jnp.asarray(substeps, left.dtype)
         if isinstance(substeps, int):
-            y = march(stepper, h, left, jnp.zeros((), jnp.int32), substeps, y)
+            y = march_steps(stepper, h, left, jnp.zeros((), jnp.int32), substeps, y)
         else:
             y = lax.fori_loop(0, substeps, lambda i, y: step(stepper, h, left, i, y), y)
         return y, y
@@ -158,7 +158,7 @@ def _row(a: Array, i: Any) -> Array:
     return lax.dynamic_index_in_dim(a, jnp.clip(i, 0, a.shape[0] - 1), 0, keepdims=False)
 
 
-def march(
+def march_steps(
     stepper: AnyStepper, h: Array, t0: Array, first: Array, count: int, y: Any, inputs: Any = None
 ) -> Any:
     """Return the state after `count` steps from step number `first` on, which begin with `y`.

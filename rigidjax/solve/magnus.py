@@ -22,7 +22,7 @@ from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import product4
 from rigidjax.solve.components import join, split
 from rigidjax.solve.equal_steps import change_and_slope
-from rigidjax.solve.explicit import NestedInterpolation, cubic_rows, onward
+from rigidjax.solve.explicit import NestedInterpolation, cubic_rows, direction_and_length
 from rigidjax.solve.tableaus import KUTTA4
 
 
@@ -114,7 +114,7 @@ class Magnus4(dfx.AbstractSolver):
     ) -> Any:
         start = split(y0)
         q, omega = start[:4], start[4:]
-        way, h = (part.astype(y0.omega.dtype) for part in onward(terms, t0, t1))
+        way, h = (part.astype(y0.omega.dtype) for part in direction_and_length(terms, t0, t1))
         # The law says that it does not read the attitude: it is given NaN in its place, which
         # shows in the result if the law reads it all the same.
         nowhere = jnp.full_like(y0.q, jnp.nan)

@@ -82,13 +82,15 @@ def by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
 
     `state0` is the state at the start, with the body rate; `torque` is that of `simulate`.
     """
-    if not isinstance(law := changing(torque), ChangingInertia) or hasattr(law.inertia, "feels"):
+    if not isinstance(law := momentum_changes(torque), ChangingInertia) or hasattr(
+        law.inertia, "feels"
+    ):
         return None
     field: Any = _Changing(body, law)
     return ByMomentum(CoupledEquations(field, body) if isinstance(state0, Coupled) else field)
 
 
-def changing(torque: Any) -> ChangingInertia | None:
+def momentum_changes(torque: Any) -> ChangingInertia | None:
     """Return the `ChangingInertia` that is the whole of a torque, or `None` if there is none."""
     # A scene of particles and `None` also come here, and are no torques.
     parts = parts_of(torque) if isinstance(torque, ChangingInertia | Sum) else ()

@@ -21,7 +21,7 @@ from jaxtyping import Array, PyTree
 
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.linear_map import linear_map
-from rigidjax.solve.stops import traced
+from rigidjax.solve.stops import trace_program
 
 # About this many operations, and at most this many steps, are in a turn of the loop. Measured: a
 # kernel twice as long takes four times as long to compile and is no faster; with a kernel half as
@@ -133,7 +133,7 @@ def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: An
     piece at a time. Second derivatives are forward over reverse.
     """
     start, tree = jax.tree.flatten(y)
-    one = traced(lambda y, i: jax.tree.leaves(step(tree.unflatten(y), i)), start, first)
+    one = trace_program(lambda y, i: jax.tree.leaves(step(tree.unflatten(y), i)), start, first)
     turn = min(max(_LONG // len(one.closed.jaxpr.eqns), 1), _MOST)
     # The number of steps in a turn is a power of two, because the length of a piece is often a
     # whole multiple of a power of two.

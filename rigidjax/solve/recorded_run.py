@@ -21,7 +21,7 @@ from rigidjax.solve.linear_map import linear_map, refuse
 SMOOTH = len(Smooth._fields)
 
 
-def states_of(
+def states_of_run(
     method: Method, smooth: list[bool], constants: Arrays, state: Any, run: Run
 ) -> tuple[Array, LoopState]:
     """Return the states at the saved times (K, n), and the state of the loop at the end of the run.
@@ -41,7 +41,7 @@ def states_of(
     each, run_tree = jax.tree.flatten(run)
     first, state_tree = jax.tree.flatten(state)
     number, smooth = len(constants) + len(first), [*smooth, *(False for _ in first)]
-    like = adaptive_loop.start(run._replace(state=state))
+    like = adaptive_loop.initial_loop_state(run._replace(state=state))
     shapes = jax.eval_shape(adaptive_loop.pack, like)
     trees = run_tree, state_tree
     # `recorded` returns in a row: the states at the saved times; the end of the loop as `size`
@@ -68,7 +68,7 @@ def states_of(
         moving = [s and t for s, t in zip(smooth, there[:number], strict=True)], of_run
         along = [t for t, m in zip(tangents, [*moving[0], *moving[1]], strict=True) if m]
         found = recorded(*primals)
-        push = partial(mapped, partial(_pushed, moving), len(along))
+        push = partial(mapped, partial(_push_forward, moving), len(along))
         given = [*primals, *found[head:]]
         if pull is None:
             return found, linear_map(push, refuse, given, along)
@@ -83,7 +83,7 @@ def states_of(
         return found, along
 
     def of_answer(primals: Any, tangents: Any) -> Any:
-        found, moved = tangents_of(primals, tangents, _pulled)
+        found, moved = tangents_of(primals, tangents, _pull_back)
         return with_zeros(found[:head], moved)
 
     def of_record(primals: Any, tangents: Any) -> Any:
@@ -131,11 +131,11 @@ def _forward(
     method, run, _, constants = _over_bodies(method, trees, layout, constants, each)
     kept = None
     if record or (run.between.shape[0] and layout.bodies):
-        between, end, kept = adaptive_loop.recording(method, constants, run)
+        between, end, kept = adaptive_loop.record_run(method, constants, run)
     elif run.between.shape[0]:
-        between, end = adaptive_loop.states_of_one(method, constants, run)
+        between, end = adaptive_loop.states_of_one_body(method, constants, run)
     else:
-        between, end = run.y0[None][:0], adaptive_loop.value(method, constants, run)
+        between, end = run.y0[None][:0], adaptive_loop.end_of_run(method, constants, run)
     return [between, *adaptive_loop.pack(end), *jax.tree.leaves(kept if record else None)]
 
 
@@ -143,7 +143,7 @@ def _forward(
 Moving = tuple[list[bool], list[bool]]
 
 
-def _again(
+def _moving_run(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> tuple[Method, Arrays, Run, Record, Arrays]:
     """Return the method, constants, run and record of a run that is to be taken once more, and the
@@ -156,7 +156,7 @@ def _again(
     whole = trees[0].num_leaves
     one = method.field
     method, run, layout, constants = _over_bodies(method, trees, layout, constants, each[:whole])
-    starts = len(jax.eval_shape(adaptive_loop.pack, adaptive_loop.start(run)))
+    starts = len(jax.eval_shape(adaptive_loop.pack, adaptive_loop.initial_loop_state(run)))
     *kept, rows, counts = each[whole : whole + starts + 2]
     there = moving[0][: len(constants)]
     layout, constants = layout.broadcast_to_bodies(constants, there, run.t0)
@@ -172,14 +172,14 @@ def _again(
     return method._replace(field=of_moving), chosen, run, record, bars
 
 
-def _pushed(
+def _push_forward(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
     """Return the tangents of the states of a recorded run.
 
     `each` ends with the tangents of the constants and numbers that `moving` selects.
     """
-    method, chosen, run, record, along = _again(moving, method, trees, layout, constants, each)
+    method, chosen, run, record, along = _moving_run(moving, method, trees, layout, constants, each)
     rest = iter(along[len(chosen) :])
     smooth = adjoint.smooth_numbers(run)
     still = zip(smooth, moving[1], strict=False)
@@ -192,13 +192,13 @@ def _pushed(
     return list(jax.jvp(again, (chosen, smooth), (along[: len(chosen)], of_run))[1])
 
 
-def _pulled(
+def _pull_back(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
     """Return the cotangents of the constants and numbers that `moving` selects.
 
     `each` ends with the cotangents of the states at the saved times and at the end of the run.
     """
-    method, chosen, run, record, bars = _again(moving, method, trees, layout, constants, each)
+    method, chosen, run, record, bars = _moving_run(moving, method, trees, layout, constants, each)
     total, of_run = adjoint.cotangents(method, chosen, run, record, bars, any(moving[1][:3]))
     return [*total, *(a for a, moves in zip(of_run, moving[1], strict=False) if moves)]

@@ -18,9 +18,9 @@ from rigidjax.motion.equations import project_to_group
 from rigidjax.solve.adaptive_loop import LoopState, Method, Run
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.recorded_run import states_of
+from rigidjax.solve.recorded_run import states_of_run
 from rigidjax.solve.step_control import NORM, StandardController, Stopping, Watched
-from rigidjax.solve.stops import traced
+from rigidjax.solve.stops import trace_program
 
 # These controllers do not look at `args`, so they get none: `args` may be large, and each body of a
 # batch would have a copy.
@@ -78,21 +78,21 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
     ) -> Any:  # fmt: skip
         how = dict(terms=terms, solver=solver, stepsize_controller=stepsize_controller)
         how |= dict(saveat=saveat, t0=t0, t1=t1, dt0=dt0, max_steps=max_steps)
-        if not _replayed(solver, saveat, event, max_steps, init_state):
+        if not _is_replayed(solver, saveat, event, max_steps, init_state):
             more = dict(args=args, event=event, init_state=init_state)
             return self.otherwise.loop(progress_meter=progress_meter, **how, **more, **rest)
         y0, tree = ravel_pytree(init_state.y)
         # In a run backwards in time diffrax counts −t, so that the field changes its sign.
         way = jnp.where(jnp.asarray(terms.contr(t0, t1)) < 0, -1, 1).astype(y0.dtype)
-        program = traced(
+        program = trace_program(
             lambda t, y: way * ravel_pytree(terms.vf(t, tree(y), args))[0].astype(y.dtype), t0, y0
         )
         constants, count, halt = program.constants, len(program.constants), None
         if event is not None:
-            condition = traced(lambda t, y: event.cond_fn(t, tree(y), args, **how), t0, y0)
+            condition = trace_program(lambda t, y: event.cond_fn(t, tree(y), args, **how), t0, y0)
             constants = constants + condition.constants
             halt = lambda given, t, y: condition.call(given[count:], t, y)  # noqa: E731
-        controlled_by = _nest(stepsize_controller)
+        controlled_by = _nested_controllers(stepsize_controller)
         plain = all(isinstance(c, _WITHOUT_ARGS) for c in controlled_by)
         control = (stepsize_controller, progress_meter, None if plain else args)
         arrays, static = eqx.partition(control, eqx.is_array)
@@ -113,7 +113,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             sizes=[leaf.size for leaf in jax.tree.leaves(init_state.y)],
             max_steps=max_steps,
         )
-        subs = _subs(saveat)
+        subs = _sub_save_ats(saveat)
         asked = jnp.concatenate([t0[None][:0], *(s.ts for s in subs if s.ts is not None)])
         # Several sets of saved times are joined and sorted.
         order = jnp.argsort(lax.stop_gradient(asked)) if len(subs) > 1 else None
@@ -126,7 +126,7 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         )  # fmt: skip
         # The condition and the controller, which can end a run, have no derivative.
         smooth = [i < count and eqx.is_inexact_array(c) for i, c in enumerate(constants)]
-        ys, end = states_of(method, smooth, constants, state, run)
+        ys, end = states_of_run(method, smooth, constants, state, run)
         if order is not None:
             ys = jnp.zeros_like(ys).at[order].set(ys)
         final = _final(init_state, saveat, event, args, tree, run, asked, ys, end)
@@ -171,7 +171,7 @@ class _Control(NamedTuple):
         return jax.tree.map(jnp.asarray, (keep, t, following, (control, progress), result))
 
 
-def _replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: Any) -> bool:
+def _is_replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: Any) -> bool:
     """Return whether `ReplayAdjoint` records a run itself; if not, another adjoint takes it."""
     kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(state.y)}
     plain = isinstance(solver, AbstractExplicit) and max_steps is not None and not saveat.dense
@@ -180,16 +180,16 @@ def _replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: Any) 
         values = jax.tree.leaves(state.event_values)
         plain = plain and event.root_finder is None and callable(event.cond_fn)
         plain = plain and jnp.issubdtype(jnp.result_type(values[0]), jnp.bool_)
-    return plain and not any(sub.steps for sub in _subs(saveat))
+    return plain and not any(sub.steps for sub in _sub_save_ats(saveat))
 
 
-def _subs(saveat: Any) -> list[Any]:
+def _sub_save_ats(saveat: Any) -> list[Any]:
     """Return each `diffrax.SubSaveAt` of a `diffrax.SaveAt`."""
     is_sub = lambda s: isinstance(s, dfx.SubSaveAt)  # noqa: E731
     return [s for s in jax.tree.leaves(saveat.subs, is_leaf=is_sub) if is_sub(s)]
 
 
-def _nest(controller: Any) -> list[Any]:
+def _nested_controllers(controller: Any) -> list[Any]:
     """Return a list of a controller and all the controllers inside it, the outermost first."""
     found = []
     while isinstance(controller, dfx.AbstractStepSizeController):
@@ -223,7 +223,7 @@ def _final(
     t1 = run.stops[-1]
     # Before its first step a run saves nothing, unless it is over at its start.
     reached = (asked <= end.t) & ((end.t > run.t0) | (t1 <= run.t0))
-    counts = [s.ts.shape[0] for s in _subs(saveat) if s.ts is not None]
+    counts = [s.ts.shape[0] for s in _sub_save_ats(saveat) if s.ts is not None]
     parts = [jnp.split(a, np.cumsum(counts)[:-1]) for a in (reached, ys)]
     each = iter(zip(*parts, strict=True))
 

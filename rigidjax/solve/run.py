@@ -29,16 +29,16 @@ from rigidjax.motion.equations import (
 )  # fmt: skip
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import validation
-from rigidjax.solve.adaptive import integrated
-from rigidjax.solve.adaptive_loop import NONFINITE, finite, of_body
+from rigidjax.solve.adaptive import integrate
+from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_of_body
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
-from rigidjax.solve.momentum import by_momentum, changing, with_body_rates
+from rigidjax.solve.momentum import by_momentum, momentum_changes, with_body_rates
 from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.sides import declared_jumps, on_sides
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.step_control import StandardController, Watched
-from rigidjax.solve.stops import traced
+from rigidjax.solve.stops import trace_program
 from rigidjax.solve.switching import MOST, analysis_of
 
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
@@ -186,14 +186,14 @@ def solve(
         watch = Ends(scene) if hasattr(scene, "ends") else None
         ys, stats, result, end = _integrated(setup, watch, state0, ts)
         if setup.throw:
-            ys = refuse(ys, result, setup.torque)
+            ys = raise_unless_complete(ys, result, setup.torque)
         if watch is not None:
             ended = result == dfx.RESULTS.event_occurred
             stats |= {"ended": ended, "end_time": end[0], "end_state": end[1]}
         if scene is not None:
             stats["drift"] = scene.drift(ts, ys)
     inputs = (setup.body, setup.torque, given, ts)
-    return nan_derivatives(ys, inputs), stats, of_body(result, setup.body)
+    return nan_derivatives(ys, inputs), stats, result_of_body(result, setup.body)
 
 
 def _integrated(
@@ -215,7 +215,7 @@ def _integrated(
             jumps = [*jumps, _signed(sign, setup.cuts)]
     elif dt0 is not None:
         dt0 = dt0 * jnp.sign(ts[-1] - ts[0])
-    out = integrated(
+    out = integrate(
         setup.solver, field, along, state0, setup.step_controller(), jumps=jumps, halt=halt,
         dt0=dt0, max_steps=setup.max_steps, adjoint=setup.adjoint,
         progress_meter=setup.progress_meter,
@@ -262,9 +262,9 @@ def _shortest_step_words(dtype: Any) -> str:
     )
 
 
-def refuse(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
+def raise_unless_complete(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
     """Return the states `ys`; raise an error in words if the run did not get to its end."""
-    if changing(torque) is not None:
+    if momentum_changes(torque) is not None:
         ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
     shortest = _shortest_step_words(jax.tree.leaves(ys)[0].dtype)
@@ -286,7 +286,7 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
     state0 = with_own_states(setup.body, state0, setup.torque, ts[0])
     form = by_momentum(setup.body, state0, setup.torque)
     field: Any = form or equations_of_motion(setup.body, state0, setup.torque)
-    analysis = analysis_of(traced(lambda t, y: field(t, y, None), ts[0], state0).closed)
+    analysis = analysis_of(trace_program(lambda t, y: field(t, y, None), ts[0], state0).closed)
     lines = [] if analysis is None else list(dict.fromkeys(s.line for s in analysis.switches))
     warnings.warn(
         f"simulate: a law switches by the time more than {MOST} times ({'; '.join(lines)}): steps "
@@ -351,7 +351,7 @@ def _free(setup: ClosedFormRun, state0: Any, ts: Array) -> tuple[Any, dict[str, 
     return ys, stats, dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
 
 
-def refuse_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
+def raise_if_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
     """Return the states `ys` saved at `ts`; raise an error if the scene ended the run.
 
     The message is in the words of the scene.

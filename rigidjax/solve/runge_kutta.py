@@ -170,7 +170,7 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     return found[0] * jnp.sum(which * ratio[:, None], 0)
 
 
-def pulled(
+def pull_back(
     tableau: Tableau, field: Field, constants: Arrays, step: Step, there: Stages,
     cotangent: Array, of_slopes: Array | None = None,
 ) -> tuple[Arrays, Array, Array, Array]:  # fmt: skip

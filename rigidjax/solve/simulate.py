@@ -24,8 +24,8 @@ from rigidjax.solve.run import (
     ClosedFormRun,
     DiffraxRun,
     direction,
-    refuse,
-    refuse_ended,
+    raise_if_ended,
+    raise_unless_complete,
     solve,
     warn_of_missed,
     words_of_steps,
@@ -143,7 +143,7 @@ def simulate(
     True
     """
     max_steps = None if max_steps is None else _checks.integer(max_steps, "max_steps", 1)
-    body, state0, times = validation.scene(body, state0, ts, torque, throw)
+    body, state0, times = validation.checked_scene(body, state0, ts, torque, throw)
     given = rtol is not None or atol is not None
     if stepsize_controller is not None and (given or accuracy is not None):
         raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
@@ -161,7 +161,7 @@ def simulate(
             _checks.positive_float(max_step, "max_step")
         max_step = jnp.asarray(max_step, times.dtype)
     if stepsize_controller is None:
-        rtol, atol = validation.tolerances(rtol, atol, times.dtype)
+        rtol, atol = validation.checked_tolerances(rtol, atol, times.dtype)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
         found = _solution(ClosedFormRun(body, throw), event, state0, times)
         return found if accuracy is None else with_error(found, found.error, accuracy)
@@ -170,7 +170,7 @@ def simulate(
         rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
     setup = DiffraxRun(
         body, torque, _solver(solver, adjoint, event, max_steps), rtol, atol, stepsize_controller,
-        None if dt0 is None else validation.first_step(dt0, times), max_step, adjoint,
+        None if dt0 is None else validation.checked_first_step(dt0, times), max_step, adjoint,
         progress_meter or NO_METER, direction(times), max_steps, throw,
     )  # fmt: skip
     setup = dataclasses.replace(setup, adjoint=_adjoint(setup))
@@ -238,7 +238,7 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
     try:
         if run is not None:
             ys, stats, result = run
-            ys = refuse(ys, result, setup.torque) if setup.throw else ys
+            ys = raise_unless_complete(ys, result, setup.torque) if setup.throw else ys
         elif event is None:
             ys, stats, result = solve(setup, state0, times)
         else:
@@ -249,7 +249,7 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
         raise words_of_steps(setup, state0, times, _checks.own_sentence(error)) from None
     warn_of_missed(setup, state0, times, stats)
     if setup.throw and "ended" in stats:
-        ys = refuse_ended(setup.torque, ys, stats, times)
+        ys = raise_if_ended(setup.torque, ys, stats, times)
     motion, own = (ys.motion, ys.own) if isinstance(ys, Coupled) else (ys, None)
     # The set-up is split into its arrays and the rest, so that `jax.jit` and `jax.vmap` can return
     # it.

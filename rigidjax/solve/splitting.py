@@ -32,9 +32,9 @@ from rigidjax.motion import Attitude
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import evaluate, sees_rate
 from rigidjax.rotation import quaternion
-from rigidjax.solve.explicit import NestedInterpolation, cubic_rows, onward
+from rigidjax.solve.explicit import NestedInterpolation, cubic_rows, direction_and_length
 from rigidjax.solve.magnus import require_attitude
-from rigidjax.solve.tableaus import numbers
+from rigidjax.solve.tableaus import parse_numbers
 
 
 class Composition(NamedTuple):
@@ -69,15 +69,15 @@ STRANG = Composition(2, (1.0,), (0.5, 0.5))
 # by a function of the attitude alone.
 SRKN6 = _symmetric(
     4,
-    numbers("0.245298957184271 0.604872665711080"),
-    numbers("0.0829844064174052 0.396309801498368 -0.0390563049223486"),
+    parse_numbers("0.245298957184271 0.604872665711080"),
+    parse_numbers("0.0829844064174052 0.396309801498368 -0.0390563049223486"),
 )
 SRKN11 = _symmetric(
     6,
-    numbers("""
+    parse_numbers("""
     0.123229775946271 0.290553797799558 -0.127049212625417 -0.246331761062075 0.357208872795928
     """),
-    numbers("""
+    parse_numbers("""
     0.0414649985182624 0.198128671918067 -0.0400061921041533 0.0752539843015807 -0.0115113874206879
     """),
 )
@@ -94,7 +94,7 @@ class Frame(NamedTuple):
     axes: Array  # (3, 3), the axes as columns
 
 
-def principal(tensor: Array) -> Frame:
+def frame_of_tensor(tensor: Array) -> Frame:
     """Return the principal frame of an inertia `tensor` (3, 3), kg m²."""
     six, axes = principal_frame(tensor)
     # The tensor is inverted relative to its trace, because the cube of 1e37 kg m² overflows.
@@ -226,7 +226,7 @@ def frame_of(field: Any, y0: Any) -> Frame:
             "flywheel), or does not say that it does not; only time and attitude may enter a kick: "
             "a law of your own says so by rate_free = True; for others use DormandPrince8"
         )
-    return principal(field.euler.inertia.tensor.astype(y0.omega.dtype))
+    return frame_of_tensor(field.euler.inertia.tensor.astype(y0.omega.dtype))
 
 
 def enter(frame: Frame, omega: Array) -> Triple:
@@ -293,7 +293,7 @@ def _dense_rows(
 
     It has the values and the first and second derivatives of the motion at both ends of the step.
     """
-    way, length = onward(terms, t0, t1)
+    way, length = direction_and_length(terms, t0, t1)
     h = way * length
 
     def slopes(t: Any, y: Any) -> tuple[Any, Any]:

@@ -12,7 +12,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, PyTree
 
 from rigidjax._types import RealLike
-from rigidjax.solve.adaptive_loop import NONFINITE, before, finite, next_step, starting_step, take
+from rigidjax.solve.adaptive_loop import (
+    NONFINITE,
+    finite,
+    next_step,
+    previous_number,
+    starting_step,
+    take,
+)
 
 # The default norm of an error, which is the same for a state and for its numbers in a row.
 NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
@@ -251,7 +258,7 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         none = jnp.full_like(self.stops[:1], jnp.inf)
         stop = take(jnp.concatenate([self.stops, none]), index)
         still = lax.stop_gradient(stop)
-        gap = jnp.where(jnp.isinf(still), 0, before(still) - still)
+        gap = jnp.where(jnp.isinf(still), 0, previous_number(still) - still)
         return stop, stop + gap
 
     def adapt_step_size(

@@ -150,7 +150,7 @@ def _free(body: Inertia, state0: Attitude) -> Stepper:
     Derivatives hold these axes fixed; the off-diagonal entries of the inertia along them carry only
     tangents.
     """
-    frame = splitting.principal(body.tensor)
+    frame = splitting.frame_of_tensor(body.tensor)
     weights, axes = frame.weights, frame.axes
     a, b, c, *_ = lax.stop_gradient(weights)
     gaps = (c - b, a - c, b - a)

@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.switching import MOST, Analysis, analysis_of
-from rigidjax.solve.switching_times import by_sides, separated, times_of
+from rigidjax.solve.switching_times import by_sides, separate_times, times_of
 
 
 def say_unseen(analysis: Analysis) -> None:
@@ -33,7 +33,7 @@ def say_unseen(analysis: Analysis) -> None:
         )
 
 
-class Traced(NamedTuple):
+class TracedProgram(NamedTuple):
     """Hold a traced function, to be called as `call(constants, *args)` with arrays as constants."""
 
     closed: ClosedJaxpr
@@ -54,17 +54,17 @@ class Traced(NamedTuple):
         return self.tree.unflatten(jaxpr_as_fun(closed)(*jax.tree.leaves(args)))
 
 
-def traced(function: Callable[..., Any], *like: Any) -> Traced:
-    """Return the `Traced` of a function for arguments with the shapes and dtypes of `like`."""
+def trace_program(function: Callable[..., Any], *like: Any) -> TracedProgram:
+    """Return the `TracedProgram` of a function for arguments with the shapes and dtypes of `like`."""
     closed, out = jax.make_jaxpr(function, return_shape=True)(*like)
-    return Traced(closed, jax.tree.structure(out))
+    return TracedProgram(closed, jax.tree.structure(out))
 
 
 def constants_of(
     functions: list[Callable[..., Any]], *like: Any
 ) -> tuple[list[Callable[..., Any]], Arrays]:
     """Return each function as `f(constants, *args)`, and the constants of all functions."""
-    programs = [traced(function, *like) for function in functions]
+    programs = [trace_program(function, *like) for function in functions]
     ends = np.cumsum([0, *(len(program.constants) for program in programs)])
 
     def call(i: int, constants: Arrays, *args: Any) -> Any:
@@ -74,7 +74,7 @@ def constants_of(
     return calls, [c for program in programs for c in program.constants]
 
 
-class Stopped(NamedTuple):
+class ProgramWithStops(NamedTuple):
     """Hold a field with the times `stops` at which its steps end, where it jumps or has a kink."""
 
     field: Callable[..., Array]  # (constants, t, y)
@@ -84,9 +84,9 @@ class Stopped(NamedTuple):
     over: Array | None  # whether a part switches more often than there are places for
 
 
-def stopped(
+def program_with_stops(
     function: Callable[..., Array], declared: list[Array], a: Array, b: Array, y: Array
-) -> Stopped:
+) -> ProgramWithStops:
     """Return the field `function(t, y, *sides)` with all its stops between the times a and b, s.
 
     `declared` are the jump times, s, of each part of the field that declares some. If more than one
@@ -94,20 +94,20 @@ def stopped(
     """
     declared = [times.astype(a.dtype) for times in declared if times.size]
     likes = declared if len(declared) > 1 else []
-    program = traced(function, a, y, *likes)
+    program = trace_program(function, a, y, *likes)
     analysis, number = analysis_of(program.closed), len(program.constants)
     if analysis is not None:
         say_unseen(analysis)
     if analysis is None or not analysis.switches:
         if not likes:
             stops = jnp.clip(jnp.sort(declared[0]), a, b) if declared else jnp.zeros(0, a.dtype)
-            return Stopped(program.call, program.constants, number, stops, None)
-        stops, each = separated(jnp.concatenate(declared), a, b)
+            return ProgramWithStops(program.call, program.constants, number, stops, None)
+        stops, each = separate_times(jnp.concatenate(declared), a, b)
         sides = _split(lax.stop_gradient(each), declared)
         call = lambda given, t, y: program.call(given[:number], t, y, *given[number:])  # noqa: E731
-        return Stopped(call, [*program.constants, *sides], number, stops, None)
+        return ProgramWithStops(call, [*program.constants, *sides], number, stops, None)
     found = times_of(analysis, program.closed.consts, a, b)
-    stops, each = separated(jnp.concatenate([*declared, found.times]), a, b)
+    stops, each = separate_times(jnp.concatenate([*declared, found.times]), a, b)
     *sides, own = _split(lax.stop_gradient(each), [*declared, found.times])
     over, most = found.over, MOST + sum(times.shape[0] for times in declared)
     if stops.shape[0] > most:
@@ -121,7 +121,7 @@ def stopped(
         *sides, one = given[number:]
         return field(program.consts(given[:number]), t, y, *sides, unpacked(one))
 
-    return Stopped(call, [*program.constants, *more], number, stops, over)
+    return ProgramWithStops(call, [*program.constants, *more], number, stops, over)
 
 
 def _split(whole: Array, like: list[Array]) -> list[Array]:

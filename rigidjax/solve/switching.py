@@ -283,7 +283,7 @@ def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
         jumps = _jumps(node.name, node.params, node.kinds)
         if jumps and stateful:
             by_state.append(where)
-        elif _hides(node):
+        elif _may_hide_switches(node):
             unseen += [where] * timed
         elif timed and not stateful:
             switch = _switch_of(program, node, operands, jumps)
@@ -307,7 +307,7 @@ def _may_switch(node: Node) -> bool:
     return jumps or name in _OPAQUE or any(True for _ in _bodies(node.params))
 
 
-def _hides(node: Node) -> bool:
+def _may_hide_switches(node: Node) -> bool:
     """Return whether an equation may switch at times that cannot be searched for."""
     if node.name in _CHOICES | {"atan2"}:
         return True

@@ -152,12 +152,12 @@ def _of_steady(watched: list[_Watched], start: Array, end: Array) -> list[_Place
         starts, rises = [*starts, first[element]], [*rises, last - first]
         elements, levels = [*elements, element], [*levels, level.astype(start.dtype)]
     edges = [(jnp.full(a.shape, start), jnp.full(a.shape, end)) for a in elements]
-    found = _halved(watched, edges, elements, starts, levels)
+    found = _bisect(watched, edges, elements, starts, levels)
     parts = []
     for one, t, element, level, change in zip(watched, found, elements, levels, rises, strict=True):
         rise, most = change[element], one.switch.most
         there = jnp.abs(rise) >= level
-        t, _ = _moving(one, jnp.where(there, t, end), element, there)
+        t, _ = _differentiable_times(one, jnp.where(there, t, end), element, there)
         over = jnp.any(jnp.abs(change) > most) & (most > 1)
         change = jnp.where(there, rise if most == 1 else jnp.sign(rise), 0)
         parts.append((t, jnp.asarray(element, jnp.int32), change, over))
@@ -170,10 +170,10 @@ def _of_bent(one: _Watched, start: Array, end: Array, known: list[Array]) -> _Pl
     low, high, element, over = _cells(one.still, start, end, lax.stop_gradient(before))
     base = one.still.values(low, element)
     level = np.full(low.shape, 0.5, start.dtype)
-    (t,) = _halved([one], [(low, high)], [element], [base], [level])
+    (t,) = _bisect([one], [(low, high)], [element], [base], [level])
     value = one.still.values(t, element)
     there = value != base
-    t, moves = _moving(one, jnp.where(there, t, end), element, there)
+    t, moves = _differentiable_times(one, jnp.where(there, t, end), element, there)
     if known:
         # Where the switch changes because an operand jumps, its time is that of the jump.
         near, still = jnp.argmin(jnp.abs(before[None] - t[:, None]), 1), lax.stop_gradient(t)
@@ -228,7 +228,7 @@ def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array
     return low, high, jnp.concatenate([element, which, which]), many > MOST
 
 
-def _halved(
+def _bisect(
     watched: list[_Watched], edges: Any, elements: Any, bases: list[Array], levels: Any
 ) -> list[Array]:
     """Return, for each switch, the times (k,) at which its elements leave their `bases`.
@@ -254,7 +254,9 @@ def _halved(
     return [high for _, high in lax.fori_loop(0, count, half, edges)]
 
 
-def _moving(one: _Watched, t: Array, element: Any, there: Array) -> tuple[Array, Array]:
+def _differentiable_times(
+    one: _Watched, t: Array, element: Any, there: Array
+) -> tuple[Array, Array]:
     """Return the times `t` with the derivatives of implicit functions, and whether each has them.
 
     `there` says of each time whether the `element` does change then.
@@ -333,7 +335,7 @@ def by_sides(analysis: Analysis) -> Callable[..., Array]:
     return lambda constants, *inputs: evaluate(constants, *inputs)[0]
 
 
-def separated(times: Array, a: Array, b: Array) -> tuple[Array, Array]:
+def separate_times(times: Array, a: Array, b: Array) -> tuple[Array, Array]:
     """Return the stops from a to b in order, and the stop of each of the `times` (k,), s.
 
     The stops of equal times are moved apart: two jumps at the same time have a very short step

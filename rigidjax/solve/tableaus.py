@@ -44,7 +44,7 @@ def _rows(text: str) -> tuple[Row, ...]:
     return tuple({int(i): float(w) for i, w in (part.split(":") for part in row)} for row in rows)
 
 
-def numbers(text: str) -> tuple[float, ...]:
+def parse_numbers(text: str) -> tuple[float, ...]:
     """Return the numbers of a text, which are separated by spaces."""
     return tuple(map(float, text.split()))
 
@@ -93,7 +93,7 @@ TSITOURAS5 = Tableau(
 _THIRD = {0: 0.2440944881889764, 8: 0.7338466882816118, 11: 0.022058823529411766}
 DORMAND_PRINCE8 = Tableau(
     order=8,
-    c=numbers("""
+    c=parse_numbers("""
     0.05260015195876773 0.0789002279381516 0.1183503419072274 0.2816496580927726 0.3333333333333333
     0.25 0.3076923076923077 0.6512820512820513 0.6 0.8571428571428571 1.0
     """),

@@ -22,13 +22,15 @@ from rigidjax.motion.torques.composite import parts_of
 from rigidjax.rotation.validation import tolerance
 
 
-def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[Any, Any, Array]:
+def checked_scene(
+    body: Any, state0: Any, ts: Any, torque: Any, throw: bool
+) -> tuple[Any, Any, Array]:
     """Return the body, start and times of a run, checked; start and times have one dtype.
 
     With `throw=False` bad traced numbers become NaN and raise no error.
     """
-    ts = times(ts, throw)
-    state0 = start(state0, throw)
+    ts = checked_times(ts, throw)
+    state0 = checked_start(state0, throw)
     dtype = ts.dtype
     for leaf in jax.tree.leaves(state0):
         dtype = jnp.promote_types(dtype, leaf.dtype)
@@ -138,7 +140,7 @@ def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
     return check_body(body, tensor, body.mass if matter else None, throw)
 
 
-def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
+def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     """Return `rtol` and `atol`, by default suited to `dtype`.
 
     Warn if the dtype cannot reach a known `rtol`, and return the smallest that it can reach.
@@ -168,7 +170,7 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     return rtol, atol
 
 
-def times(ts: Any, throw: bool) -> Array:
+def checked_times(ts: Any, throw: bool) -> Array:
     """Return `ts` as an array of times that increase, or that decrease, throughout.
 
     Others raise an error; with `throw=False` they become NaN if they are traced.
@@ -204,7 +206,7 @@ def times(ts: Any, throw: bool) -> Array:
     return _guard(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
 
 
-def first_step(dt0: Any, times: Array) -> Array:
+def checked_first_step(dt0: Any, times: Array) -> Array:
     """Return the length of the step `dt0` in the precision of `times`.
 
     Raise `ValueError` if it is known and is no step: zero, not finite, too short for the precision,
@@ -231,7 +233,7 @@ def first_step(dt0: Any, times: Array) -> Array:
     return abs(step)
 
 
-def start(state0: Any, throw: bool) -> Any:
+def checked_start(state0: Any, throw: bool) -> Any:
     """Return `state0`, checked to be of one body and finite, and to have a unit quaternion.
 
     A bad one raises an error; with `throw=False` a traced quaternion that is not unit becomes NaN.

@@ -239,7 +239,7 @@ def test_a_segment_run_again_may_take_other_steps(monkeypatch):
 
     p, turn = jnp.zeros(16), jnp.asarray(np.random.default_rng(2).normal(size=16))
     whole = once(jax.grad(value))(p)
-    recorded, factor = adaptive_loop.recorded, [1.3]
+    recorded, factor = adaptive_loop.record_segment, [1.3]
 
     def otherwise(method, *rest):
         # A smaller error is that of a looser tolerance.
@@ -250,7 +250,7 @@ def test_a_segment_run_again_may_take_other_steps(monkeypatch):
         return recorded(method._replace(control=control), *rest)
 
     monkeypatch.setattr(adaptive_loop, "SEGMENT", 7)
-    monkeypatch.setattr(adjoint, "recorded", otherwise)
+    monkeypatch.setattr(adjoint, "record_segment", otherwise)
     slopes = once(lambda p: (jax.grad(value)(p), jax.jvp(value, (p,), (turn,))[1]))
     reverse, forward = slopes(p)
     scale = float(jnp.abs(whole).max())

@@ -11,7 +11,7 @@ import rigidjax as rj
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import sees_attitude, sees_rate
 from rigidjax.solve import components, explicit, fixed
-from rigidjax.solve.equal_steps import in_a_loop
+from rigidjax.solve.equal_steps import roll_steps
 from rigidjax.solve.steppers import stepper_of
 
 BODY = rj.Inertia([[1.6, 0.1, 0.0], [0.1, 2.0, 0.2], [0.0, 0.2, 3.0]])
@@ -129,7 +129,7 @@ def test_derivatives_of_equal_steps(law):
 )
 def test_stages_in_a_loop_take_the_steps_of_those_written_out(plain, law, dtype):
     """Values and derivatives by the rate, in both modes."""
-    rolled = in_a_loop(plain)
+    rolled = roll_steps(plain)
     assert rolled is not plain
     body, start, ts, law = jax.tree.map(
         lambda a: jnp.asarray(a, dtype), (BODY, START, np.array([0.3, 0.5, 0.9]), law)

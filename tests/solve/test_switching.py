@@ -16,7 +16,7 @@ from once import once
 
 import rigidjax as rj
 from rigidjax import torques
-from rigidjax.solve.stops import traced
+from rigidjax.solve.stops import trace_program
 from rigidjax.solve.switching import analysis_of
 
 AXIS = np.array([0.0, 0.0, 1.0])
@@ -178,7 +178,7 @@ def test_second_derivatives(power):
     ids=["smooth", "branches of the state", "a long table", "a scan", "a series"],
 )  # fmt: skip
 def test_continuous_laws_have_no_switches(law, ends):
-    program = traced(lambda t, y: law(t, y[2]) * y, jnp.asarray(0.0), jnp.asarray(AXIS))
+    program = trace_program(lambda t, y: law(t, y[2]) * y, jnp.asarray(0.0), jnp.asarray(AXIS))
     analysis = analysis_of(program.closed)
     assert analysis is None or not analysis.unseen
     assert (0 if analysis is None else len(analysis.switches)) == ends

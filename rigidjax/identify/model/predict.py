@@ -27,7 +27,7 @@ from rigidjax.motion.torques.inputs import bind
 from rigidjax.motion.torques.states import freeze
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
 from rigidjax.solve.components import split
-from rigidjax.solve.equal_steps import advance, in_a_loop
+from rigidjax.solve.equal_steps import advance, roll_steps
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.fixed_loop import first_row, first_rows, step
 from rigidjax.solve.steppers import cheapest, stepper_of
@@ -104,7 +104,7 @@ class FixedSteps(AbstractIntegrator):
     ) -> PyTree:
         y0 = with_own_states(body, state0, torque, ts[0])
         field = equations_of_motion(body, y0, torque)
-        return fixed(in_a_loop(self.solver), field, ts, y0, self.substeps, self.last)
+        return fixed(roll_steps(self.solver), field, ts, y0, self.substeps, self.last)
 
     def refine(self) -> AbstractIntegrator:
         if self.substeps > FINEST:
@@ -220,7 +220,7 @@ class HeldSteps(AbstractIntegrator):
         before = max((len(rows) - ts.shape[0] for rows in inputs.values()), default=0)
         start = with_own_states(body, state0, bind(torque, first_row(torque, size, inputs)), 0.0)
         field = equations_of_motion(body, start, torque)
-        stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
+        stepper = stepper_of(roll_steps(cheapest(field)), field, start)
 
         def take_step(y: PyTree, i: Array) -> tuple[PyTree, PyTree]:
             y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
