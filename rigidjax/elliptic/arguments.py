@@ -12,10 +12,10 @@ from rigidjax.rotation.barrier import batch_as
 
 # The arguments and results of all functions are real numbers, of shapes that broadcast.
 Real = Float[ArrayLike, "..."]
-Result = Float[Array, "..."]
+RealOrArray = Float[Array, "..."]
 
 
-def to_common_dtype(**named: Real) -> tuple[Result, ...]:
+def to_common_dtype(**named: Real) -> tuple[RealOrArray, ...]:
     """Convert the arguments to arrays of one dtype and shape; Python numbers take the dtype of the
     arrays.
     """
@@ -54,7 +54,7 @@ def complement_pair(name: str, value: Real, complement: Real | None) -> dict[str
 
 
 @jax.custom_jvp
-def exact_complement(value: Result, complement: Result) -> Any:
+def exact_complement(value: RealOrArray, complement: RealOrArray) -> Any:
     """Return `value`, with the derivative −1 by its `complement` (1 − `value`) and the derivative 0
     by itself.
     """

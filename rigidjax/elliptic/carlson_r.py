@@ -22,7 +22,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from rigidjax.elliptic.arguments import Result
+from rigidjax.elliptic.arguments import RealOrArray
 
 # With these numbers of nodes the step is h < 0.5 (float64) or h < 0.9 (float32) for arguments in
 # ratios of 1e35.
@@ -33,7 +33,7 @@ _UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def r_integral(powers: tuple[float, ...], arguments: tuple[Result, ...]) -> Result:
+def r_integral(powers: tuple[float, ...], arguments: tuple[RealOrArray, ...]) -> RealOrArray:
     """Return ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt, where aᵢ are the `arguments` and bᵢ the `powers`.
 
     The aᵢ must be ≥ 0, the bᵢ multiples of ½, and the sum of the bᵢ must be above 1.

@@ -24,7 +24,7 @@ from jaxtyping import Array, PyTree
 
 from rigidjax.elliptic.arguments import (
     Real,
-    Result,
+    RealOrArray,
     complement_pair,
     exact_complement,
     to_common_dtype,
@@ -38,7 +38,9 @@ from rigidjax.rotation.stumpff import half_turns, parity
 _FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
 
 
-def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Result]:
+def sncndn(
+    u: Real, m: Real, m1: Real | None = None
+) -> tuple[RealOrArray, RealOrArray, RealOrArray]:
     """Return Jacobi's elliptic functions sn(u|m), cn(u|m) and dn(u|m).
 
     **Arguments:**
@@ -60,7 +62,7 @@ def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Re
     return s, c, d
 
 
-def am(u: Real, m: Real, m1: Real | None = None) -> Result:
+def am(u: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     """Return Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad, which is the inverse of F(φ|m) for m ≤ 1.
 
     **Arguments:** as `sncndn`. **Returns:** φ (DLMF 22.16.1–3). For m ≤ 1 it grows by π in each

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from rigidjax.elliptic.arguments import Result
+from rigidjax.elliptic.arguments import RealOrArray
 from rigidjax.rotation.stumpff import parity
 
 # For m1 up to this number the nome is below 0.0066: a few images, and two terms of the nome's own
@@ -28,7 +28,9 @@ LARGEST_M1 = 0.1
 _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 
 
-def sncndn_near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
+def sncndn_near_one(
+    u: RealOrArray, m: RealOrArray, m1: RealOrArray
+) -> tuple[RealOrArray, RealOrArray, RealOrArray]:
     """Return sn, cn and dn for 0 ≤ m1 ≤ 0.1, with an absolute error of the round-off of 1.
 
     The tangents of m must be minus the tangents of m1 = 1 − m.

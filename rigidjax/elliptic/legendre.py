@@ -20,7 +20,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from rigidjax.elliptic.arguments import Real, Result, complement_pair, to_common_dtype
+from rigidjax.elliptic.arguments import Real, RealOrArray, complement_pair, to_common_dtype
 from rigidjax.elliptic.carlson import rd, rf
 from rigidjax.elliptic.carlson_r import r_integral
 from rigidjax.rotation.stumpff import half_turns
@@ -30,7 +30,7 @@ from rigidjax.rotation.stumpff import half_turns
 _MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
 
 
-def ellipk(m: Real, m1: Real | None = None) -> Result:
+def ellipk(m: Real, m1: Real | None = None) -> RealOrArray:
     """Return the complete elliptic integral of the first kind, K(m) = ∫₀^{π/2} dθ/√(1 − m sin²θ).
 
     **Arguments:**
@@ -49,7 +49,7 @@ def ellipk(m: Real, m1: Real | None = None) -> Result:
     return _complete_first_kind(m1)
 
 
-def ellipe(m: Real, m1: Real | None = None) -> Result:
+def ellipe(m: Real, m1: Real | None = None) -> RealOrArray:
     """Return the complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
 
     **Arguments:** `m` ≤ 1 the parameter k² (a larger one gives NaN); `m1` as for `ellipk`.
@@ -63,7 +63,7 @@ def ellipe(m: Real, m1: Real | None = None) -> Result:
     return complete_integral((0, -1, 0), m1)
 
 
-def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) -> Result:
+def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) -> RealOrArray:
     """Return the complete integral of the third kind, ∫₀^{π/2} dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
     **Arguments**, in the order of Wolfram and mpmath:
@@ -83,7 +83,7 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
     return complete_integral((0, 0, 1), m1, n1)
 
 
-def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
+def ellipf(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     """Return the incomplete elliptic integral of the first kind, F(φ|m) = ∫₀^φ dθ/√(1 − m sin²θ).
 
     **Arguments:** `phi` the amplitude, rad, of any size; `m` the parameter k² with m sin²φ < 1
@@ -98,7 +98,7 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
     return _integral_at_any_amplitude((0, 0, 0), phi, m1)
 
 
-def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
+def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     """Return the incomplete elliptic integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ.
 
     **Arguments:** `phi` the amplitude, rad, of any size; `m` ≤ 1 the parameter k² (a larger one
@@ -116,7 +116,7 @@ def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
 
 def ellippiinc(
     n: Real, phi: Real, m: Real, m1: Real | None = None, n1: Real | None = None
-) -> Result:
+) -> RealOrArray:
     """Return the incomplete integral of the third kind, ∫₀^φ dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
     **Arguments**, in the order of Wolfram and mpmath:

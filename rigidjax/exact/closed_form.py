@@ -19,7 +19,7 @@ from rigidjax.exact.jacobi_duplication import (
     elliptic,
     half_period,
 )
-from rigidjax.rotation.barrier import barrier, one_kernel
+from rigidjax.rotation.barrier import barrier, compiled_as_one_kernel
 
 
 class Orbit(NamedTuple):
@@ -40,7 +40,7 @@ class Orbit(NamedTuple):
     swapped: Float[Array, ""]  # whether axis 1 has the largest moment
 
 
-@one_kernel
+@compiled_as_one_kernel
 def orbit(moments: Triple, momentum: Triple) -> Orbit:
     """Return the constants of the motion of a body with the principal moments I₁ ≤ I₂ ≤ I₃, any of
     which may be equal.
@@ -140,7 +140,7 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
     return y1 * r, y2 * r, y3 * r
 
 
-@one_kernel
+@compiled_as_one_kernel
 def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
     """Return the body momentum at the time t, and the quaternion of the turn from time 0 to t, in
     principal axes.

@@ -56,7 +56,7 @@ from rigidjax.exact.principal_axes import (
     tensor_in_axes,
 )
 from rigidjax.exact.sigma_form import Differences
-from rigidjax.rotation.barrier import one_kernel
+from rigidjax.rotation.barrier import compiled_as_one_kernel
 from rigidjax.rotation.linalg3 import components
 
 # Below this angle of the turn, rad, a series of third order in time is used. The second derivatives
@@ -83,7 +83,7 @@ def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
 @flow.defjvp
 def _flow_jvp(primals, tangents):
     motion, rows, _ = motion_and_derivatives(*primals)
-    d_out, d_turn, _ = _change_along(motion, rows, _variables(primals, tangents)[3])
+    d_out, d_turn, _ = _change_of_motion(motion, rows, _variables(primals, tangents)[3])
     return motion[:2], (d_out, d_turn)
 
 
@@ -100,13 +100,14 @@ def _variables(primals, tangents):
     )
 
 
-def _change_along(motion, rows, change):
+def _change_of_motion(motion, derivative_rows, change):
     """Return the changes of Π, the turn and Ω in `motion` for a `change` of the derivative
     variables.
 
-    `rows` holds the derivatives of Π, θ and Ω, where θ is the small rotation that changes the turn.
+    `derivative_rows` holds the derivatives of Π, θ and Ω, where θ is the small rotation that
+    changes the turn.
     """
-    out, theta, rate = (tuple(jnp.sum(row * change) for row in three) for three in rows)
+    out, theta, rate = (tuple(jnp.sum(row * change) for row in three) for three in derivative_rows)
     return out, half_product(motion[1], theta), rate
 
 
@@ -119,7 +120,7 @@ class MotionConstants(NamedTuple):
     orbit: Orbit
 
 
-@one_kernel
+@compiled_as_one_kernel
 def set_up(tensor: Mat3, omega: Vec3) -> MotionConstants:
     """Return the principal axes of the inertia `tensor`, and the constants of the motion in these
     axes.
@@ -174,7 +175,7 @@ def _at_each_time(function, t):
     return jax.lax.map(function, t) if t.size <= _LOOPED else jax.vmap(function)(t)
 
 
-@one_kernel
+@compiled_as_one_kernel
 def _body_motion_at(s: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
     """Return Ω(t) and the quaternion of the turn from time 0 to t, in body axes."""
     momentum, (w, *axis) = momentum_and_turn(s.orbit, t)
@@ -193,7 +194,7 @@ def _moments_and_momentum(tensor: Mat3, omega: Vec3, s: MotionConstants) -> tupl
     return moments, matvec(moments, components_along(s.axes, omega))
 
 
-@one_kernel
+@compiled_as_one_kernel
 def _input_derivatives(body: Float[Array, "12"], s: MotionConstants) -> Float[Array, "9 12"]:
     """Return the derivatives of `derivative_variables` with respect to `body`.
 
@@ -215,7 +216,7 @@ def _input_derivatives(body: Float[Array, "12"], s: MotionConstants) -> Float[Ar
     return jnp.concatenate([by_tensor, jnp.pad(by_omega, ((5, 1), (0, 0)))], axis=1)
 
 
-@one_kernel
+@compiled_as_one_kernel
 def _body_motion_and_derivatives(tensor: Mat3, omega: Vec3, s: MotionConstants, t: Scalar):
     """Return Ω(t) and the turn in body axes, and their derivatives with respect to
     `derivative_variables`.
@@ -241,7 +242,7 @@ class MotionDerivatives(NamedTuple):
 
 
 @jax.custom_jvp
-@one_kernel
+@compiled_as_one_kernel
 def motion_and_derivatives(moments: Six, momentum: Triple, t: Scalar):
     """Return Π(t), the quaternion of the turn and Ω(t), the derivatives of all three, and the parts
     of these derivatives.
@@ -260,7 +261,7 @@ def motion_and_derivatives(moments: Six, momentum: Triple, t: Scalar):
 def _motion_and_derivatives_jvp(primals, tangents):
     motion, rows, parts = motion_and_derivatives(*primals)
     (body, *k), (_, *d_k), inputs, change = _variables(primals, tangents)
-    d_motion = _change_along(motion, rows, change)
+    d_motion = _change_of_motion(motion, rows, change)
     d_parts = _second_order(body, inputs, change)
     at, changes = (*k, *primals[1:], motion, *parts), (*d_k, *tangents[1:], d_motion, *d_parts)
     return (motion, rows, parts), (d_motion, jax.jvp(_derivative_columns, at, changes)[1], d_parts)
@@ -325,7 +326,7 @@ def derivative_variables(parts, momentum: Triple, t: Scalar) -> Float[Array, "10
     return jnp.stack([body.d12, body.d23, body.k12, body.k13, body.k23, *momentum, k[2], t])
 
 
-@one_kernel
+@compiled_as_one_kernel
 def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
     """Return the result of `flow`, the derivatives of Π(t) − Π(0) by `derivative_variables`, and G
     = ∫ Π Πᵀ dt.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from rigidjax._types import Mat3, Scalar, Vec3
 from rigidjax.exact.components3 import Six, Triple
-from rigidjax.rotation.barrier import batch_as, one_kernel
+from rigidjax.rotation.barrier import batch_as, compiled_as_one_kernel
 
 # Jacobi's cyclic method converges quadratically; a 3×3 matrix needs four or five sweeps from
 # anywhere.
@@ -60,7 +60,7 @@ def combine_columns(axes: Mat3, v: Triple) -> Triple:
     return tuple(axes[i, 0] * v[0] + axes[i, 1] * v[1] + axes[i, 2] * v[2] for i in range(3))
 
 
-@one_kernel
+@compiled_as_one_kernel
 def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     """Return the rows of the matrix whose columns are principal axes of m, and the moments, by
     Jacobi's method.

@@ -23,7 +23,7 @@ from rigidjax.solve.tableaus import Row, Tableau
 Field = Callable[[Any, Any], Any]
 
 
-class Rolled(eqx.Module):
+class StepWithLoopedStages(eqx.Module):
     """Wrap the explicit method `solver`, so that the stages of its steps are a loop."""
 
     solver: AbstractExplicit
@@ -32,18 +32,23 @@ class Rolled(eqx.Module):
 def roll_steps(solver: Any) -> Any:
     """Return an explicit method of order 4 or 5 with its stages in a loop; any other as it is."""
     few = isinstance(solver, AbstractExplicit) and solver.tableau.order <= 5
-    return Rolled(solver) if few else solver
+    return StepWithLoopedStages(solver) if few else solver
 
 
 def change_in(
-    solver: AbstractExplicit | Rolled, field: Field, t: Any, h: Array, y: Any, end: Any
+    solver: AbstractExplicit | StepWithLoopedStages,
+    field: Field,
+    t: Any,
+    h: Array,
+    y: Any,
+    end: Any,
 ) -> Any:
     """Return the change of `y` in a step from `t` to `end` of the length `h`.
 
     The quaternion of a state is not scaled to length 1.
     """
-    if isinstance(solver, Rolled):
-        return _rolled(solver.solver.tableau, field, t, h, y, end)
+    if isinstance(solver, StepWithLoopedStages):
+        return _change_in_one_step(solver.solver.tableau, field, t, h, y, end)
     return change_and_slope(solver.tableau, field, t, h, y, end)[0]
 
 
@@ -79,7 +84,7 @@ def _along(h: Array, row: Row, slopes: list[Any]) -> Any:
     return jax.tree.map(moved, *[slopes[i] for i in row])
 
 
-def _rolled(tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any) -> Any:
+def _change_in_one_step(tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any) -> Any:
     """Return the change of `y` in a step whose stages are a loop.
 
     The loop carries as many of the last slopes as the rows of the tableau need.

@@ -133,7 +133,7 @@ class Error(eqx.Module):
 
 
 @eqx.filter_jit
-def error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None) -> Error:
+def estimate_error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None) -> Error:
     """Return the error of the states `ys`, which the run `setup` gave at `ts` in `count` steps.
 
     The error of the steps is the distance to a second, closer run; a run in closed form has no such

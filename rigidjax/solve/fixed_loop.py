@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from rigidjax.motion.torques.inputs import InputRow, delays_of
 from rigidjax.rotation.barrier import platform
-from rigidjax.solve.equal_steps import Rolled
+from rigidjax.solve.equal_steps import StepWithLoopedStages
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.pieces import in_pieces, piece_length
@@ -24,7 +24,7 @@ from rigidjax.solve.steppers import AnyStepper, stepper_of
 
 
 def fixed(
-    solver: AbstractExplicit | Rolled | Magnus4 | AbstractSplitting,
+    solver: AbstractExplicit | StepWithLoopedStages | Magnus4 | AbstractSplitting,
     field: Callable[..., Any],
     ts: Float[Array, " times"],
     y0: Any,

@@ -54,7 +54,7 @@ class Cause(eqx.Module):
         return self.words
 
 
-def status(search: Answer, model: Answer) -> str:
+def joined_status(search: Answer, model: Answer) -> str:
     """Return both answers in one line, which is `ok` if both are good and have no reasons."""
     if search == Answer(FOUND) and model == Answer(EXPLAINS):
         return "ok"
