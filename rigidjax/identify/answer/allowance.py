@@ -1,4 +1,4 @@
-"""Describe in words the errors, besides random ones, that the intervals of a fit allow for."""
+"""Describe the errors of sensors, besides random errors, that the intervals of a fit allow for."""
 
 from collections.abc import Sequence
 
@@ -14,10 +14,10 @@ from rigidjax.identify.uncertainty.considered import (
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 from rigidjax.identify.uncertainty.quantities import Quantity
 
-# At most this number of quantities is named in one sentence.
+# One sentence names at most this number of quantities.
 MOST = 3
-# A free bias is remarkable if it exceeds this share of the root mean square of the readings: the
-# bias of a gyro is a hundredth of the rates that are worth a fit.
+# A free bias is reported as large if it exceeds this share of the root mean square of the readings:
+# the bias of a real gyro is about a hundredth of the rates in a record that is worth a fit.
 REMARKABLE = 0.2
 _WAYS = {
     "scale": "an error of 1 % in the scale of one axis",
@@ -33,16 +33,17 @@ def allowance(
     moves: Moves,
     named: Sequence[Quantity],
 ) -> str:
-    """Return sentences on the sensor errors that the intervals allow for, and on those that they do
-    not.
+    """Return sentences on the sensor errors that the intervals of a fit allow for, and on the
+    sensor errors that the intervals do not allow for.
 
     **Arguments:**
 
     - `model`: the fitted model.
-    - `parts`: the considered errors, those of sensors with a `Tolerance`.
-    - `moves`: for each sensor without a tolerance, how far its usual errors would move the
-      quantities `named` (`considered.unit_moves`).
-    - `named`: the quantities.
+    - `parts`: the considered errors, which are the errors of the sensors with a `Tolerance`.
+    - `moves`: for each sensor without a tolerance a pair: the index of the sensor, and for each
+      kind of error ("scale", "cross_axis") how far a usual error would move each quantity in
+      `named` (from `considered.unit_moves`).
+    - `named`: the quantities to write about.
     """
     out = []
     sensors = model.records.sensors
@@ -64,11 +65,11 @@ def allowance(
 
 
 def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
-    """Describe the free biases without a prior that are as large as readings, in a text that is
-    empty if there is none.
+    """Describe the free biases without a prior that are not small beside the readings.
 
-    Such a bias takes up what the model of the motion lacks: the bias of a pendulum's gyro came out
-    as 1.6 rad/s. `quantities` are those of the fit.
+    The text is empty if there is no such bias. Such a bias stands for a part of the motion that the
+    model lacks: in one fit the bias of a pendulum's gyro came out as 1.6 rad/s. `model` is the
+    fitted model, and `quantities` are the reported quantities of the fit.
     """
     out = []
     for index, reading in enumerate(model.records.readings):
@@ -91,8 +92,10 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
 
 
 def _list_shifts(named: Sequence[Quantity], sizes: Float[np.ndarray, " quantities"]) -> str:
-    """Return the words that say by how much each quantity would move, with the half-width of its
-    interval.
+    """Return the words that say by how much each quantity in `named` would move.
+
+    `sizes` holds the size of each move, which is relative for a positive quantity. The words also
+    give half the width of the interval of each quantity, if this width is finite.
     """
     words = []
     for quantity, size in list(zip(named, sizes, strict=True))[:MOST]:

@@ -1,21 +1,24 @@
-"""Describe the two answers of a fit, on the search and on the model, and the advice that follows
-from them.
+"""Describe the two answers of a fit, and the advice that follows from the two answers.
+
+The first answer says whether the search found the best point, the second one whether the model
+explains the readings.
 """
 
 import equinox as eqx
 
-# These are the answers on the search.
+# These words are the possible answers on the search.
 FOUND, NOT_ALONE, NOT_ENDED = "found", "not alone", "not ended"
-# These are the answers on the model.
+# These words are the possible answers on the model.
 EXPLAINS, LEAVES, FAILS = "explains the readings", "leaves a part", "does not explain the readings"
 
-# Errors that are larger than the given noise by more than this factor are not those of a sensor.
+# Errors that exceed the given noise by more than this factor are not taken for sensor errors.
 FAR = 3.0
 
 
 class Answer(eqx.Module):
-    """Hold an answer in one `word` with its `reasons` in words; it is printed as
-    `word (reason; reason)`.
+    """Hold one answer of a fit: a `word`, and the `reasons` for this answer in words.
+
+    An answer is printed as `word (reason; reason)`.
 
     >>> print(Answer("not ended", ("max_steps reached",)))
     not ended (max_steps reached)
@@ -29,16 +32,18 @@ class Answer(eqx.Module):
 
 
 class Cause(eqx.Module):
-    """Hold the most likely cause of the errors of a sensor; it is printed as its words.
+    """Hold the most likely cause of the errors of a sensor.
+
+    A cause is printed as its `words`.
 
     **Fields:**
 
-    - `name`: of the cause.
+    - `name`: a short name of the cause, such as "drag".
     - `sensor`: the class of the sensor that has the errors.
-    - `share`: the share of the sum of squared errors that the cause explains; 1 for `misread`,
-      which explains the readings themselves; `None` for a guess.
+    - `share`: the share of the sum of squared errors that the cause explains. It is 1 for the cause
+      "misread" (the file was read with a wrong unit, axis or sign), and `None` for a guess.
     - `words`: the cause in words.
-    - `remedy`: what to do about it.
+    - `remedy`: what to do about the cause.
 
     >>> print(Cause("drag", "Gyro", 0.9, "a torque against the rate", "add a Damping"))
     a torque against the rate
@@ -55,7 +60,11 @@ class Cause(eqx.Module):
 
 
 def joined_status(search: Answer, model: Answer) -> str:
-    """Return both answers in one line, which is `ok` if both are good and have no reasons."""
+    """Return the answers on the `search` and on the `model` in one line.
+
+    The line is `ok` if the search found the best point, the model explains the readings, and
+    neither answer has a reason.
+    """
     if search == Answer(FOUND) and model == Answer(EXPLAINS):
         return "ok"
     return f"search: {search}; model: {model}"
@@ -73,11 +82,11 @@ def advice(
 
     **Arguments:**
 
-    - `search`, `model`: the two answers.
+    - `search`, `model`: the answers on the search and on the model.
     - `causes`: the likely causes of the errors.
-    - `kind`: the method of the covariance, in words.
-    - `above`: the size of the errors, in units of the given noise.
-    - `allowed`: the sentences of `allowance`.
+    - `kind`: the method by which the covariance was computed, in words, such as "jackknife".
+    - `above`: the size of the errors over the given noise.
+    - `allowed`: the sentences that `allowance` returned on the sensor errors.
     """
     remedies = list(dict.fromkeys(cause.remedy for cause in causes))
     tries = f" Try: {'; '.join(remedies)}." if remedies else ""

@@ -1,5 +1,5 @@
-"""Measure the quality of a fit: its covariance, its two answers, and the starts that fit as
-well.
+"""Measure the quality of a fit: its covariance, the answers on search and model, and the starts
+that ended at other points which fit as well.
 """
 
 import dataclasses
@@ -48,14 +48,15 @@ from rigidjax.identify.uncertainty.stretches import (
     stretches_of,
 )
 
-# The test for autocorrelated errors has this rate of false alarms: a fit tests many sensors and
-# channels.
+# The test for autocorrelated errors has this rate of false alarms. The rate is low because one fit
+# tests many sensors and channels.
 RARE = 1e-5
-# The test takes this number of lags.
+# The test for autocorrelated errors uses the autocorrelations at lags of 1 to this number of
+# samples.
 LAGS = 10
-# These are shares of the variance of the readings. A model fails if its errors exceed HALF of it,
-# or if their autocorrelated part exceeds a TENTH; errors below a QUARTER are small, if nothing else
-# is wrong.
+# These numbers are shares of the variance of the readings. A model fails if its errors exceed HALF
+# of this variance, or if the autocorrelated part of its errors exceeds a TENTH of this variance.
+# Errors below a QUARTER of this variance are small, if nothing else is wrong.
 HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
@@ -66,14 +67,24 @@ def goodness(
     times: CorrelationTimes,
     covariance: np.ndarray,
 ) -> tuple[float, int, Answer, tuple[int, ...]]:
-    """Return χ², its degrees of freedom, the answer on the model, and the sensors whose errors it
+    """Return the χ² of a fit and the answer on the model.
+
+    Four things are returned: χ², summed over the sensors whose noise is given; the degrees of
+    freedom of χ²; the answer on the model; and the indices of the sensors whose errors the model
     does not explain.
 
-    χ² counts the sensors whose noise is given. The size of the errors is compared with this noise
-    (by five standard deviations of χ², or of the median of the squares under a robust loss) and
-    with the variance of the readings. Ljung and Box's test (1978, doi:10.1093/biomet/65.2.297) says
-    whether the errors are white. Readings at full scale take no part. `covariance` (n, n) of the
-    free numbers is the one that white errors give. The sensors are returned by index.
+    The errors of a sensor count as larger than its given noise if χ² exceeds its mean by five of
+    its standard deviations; under a robust loss the median of the squared errors takes the place
+    of χ². The errors are also compared with the variance of the readings. Ljung and Box's test
+    (1978, doi:10.1093/biomet/65.2.297) says whether the errors are white. Readings at full scale
+    are left out.
+
+    **Arguments:**
+
+    - `model`, `noise`: the fitted model, and the standard deviations of the errors of its sensors.
+    - `linear`: the errors and their derivatives at the best point.
+    - `times`: the autocorrelation times of the errors.
+    - `covariance`: (n, n) the covariance of the free numbers for white errors.
     """
     chi2, count, word, free = 0.0, 0, EXPLAINS, linear.size
     words: list[str] = []
@@ -96,7 +107,8 @@ def goodness(
         slope = linear.slopes[index] * root[..., None]
         white = left <= tiny or _is_white(e * root, mask, slope, own, has_noise)
         has_clock_error = left > tiny and clock_cause(model, noise, linear, index) is not None
-        # Errors below a given noise, or small errors, cannot hide a missing part of the model.
+        # Errors that are no larger than the given noise, and errors that are small beside the
+        # readings, cannot hide a missing part of the model.
         small = has_noise or left <= QUARTER * varies + tiny
         if factor == 1.0 and white and small and not has_clock_error:
             continue
@@ -106,7 +118,7 @@ def goodness(
             word = FAILS
         word = LEAVES if word == EXPLAINS else word
         sensors.append(index)
-        # An error has the unit of the reading only if it has as many numbers as the reading.
+        # An error has the unit of the reading only if both have the same number of components.
         alike = int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
         share = left / varies if varies > tiny and alike else None
         span = None if white else times.longest
@@ -123,14 +135,18 @@ def _describe_errors(
     share: float | None,
     span: float | None,
 ) -> str:
-    """Describe the size and the times of the errors of a sensor.
+    """Describe how large the errors of a sensor are, and at which times.
 
     **Arguments:**
 
-    - `error`, `mask`: (R, T, k) the errors, and which of them count.
-    - `factor`: their size in units of the noise; 1 is not reported.
-    - `share`: their share of the variance of the readings, `None` if there is none.
-    - `span`: the samples over which they are autocorrelated, `None` for white errors.
+    - `model`, `reading`: the fitted model, and the readings of the sensor.
+    - `error`: (R, T, k) the errors in R recordings, at T times, of k components.
+    - `mask`: (R, T, k) true for the errors that count.
+    - `factor`: the size of the errors over the noise; 1 is not reported.
+    - `share`: the squared errors over the variance of the readings, or `None` if the readings are
+      constant or have another unit than the errors.
+    - `span`: the number of samples over which the errors are autocorrelated, or `None` for white
+      errors.
     """
     sensor, many = reading.sensor, max(int(mask.any(axis=-1).sum()), 1)
     size = np.sqrt(np.sum(error[mask] ** 2) / many)
@@ -150,7 +166,11 @@ def _describe_errors(
 
 
 def _describe_interval(model: Model, error: np.ndarray, mask: np.ndarray) -> str:
-    """Describe the shortest interval of time that contains half of the sum of squared errors."""
+    """Describe the shortest interval of time that contains half of the sum of squared errors.
+
+    The interval is taken from the recording with the largest sum. `error` (R, T, k) are the errors
+    of a sensor, and `mask` (R, T, k) is true for the errors that count.
+    """
     squares = np.sum(np.where(mask, error, 0.0) ** 2, axis=-1)
     row = int(np.argmax(squares.sum(axis=1)))
     count = int(model.counts[row])
@@ -168,8 +188,8 @@ def _describe_interval(model: Model, error: np.ndarray, mask: np.ndarray) -> str
 def _sums_of_squares(
     reading: Reading, error: np.ndarray, mask: np.ndarray
 ) -> tuple[float, float, float]:
-    """Return three sums of squares: of the errors, of the readings about their mean, and of the
-    round-off of the readings.
+    """Return three sums of squares: of the errors that `mask` (R, T, k) selects; of the readings
+    about their mean; and of the round-off of the readings.
     """
     values = np.asarray(reading.values)[reading.host_mask]
     varies = float(np.sum((values - values.mean(axis=0)) ** 2))
@@ -177,11 +197,12 @@ def _sums_of_squares(
 
 
 def _excess_by_median(squares: np.ndarray, size: int) -> float:
-    """Return the size of whitened errors over the size of noise, computed from the median of their
-    `squares`.
+    """Return the factor by which whitened errors are larger than noise of unit variance.
 
-    It is 1 unless the difference is significant. The median is taken because outliers are expected
-    under a robust loss, and they would dominate χ². `size` is the number of components of an error.
+    `squares` (N,) are the squared lengths of N errors of `size` components each. The factor is the
+    root of their median over the median for unit noise; it is 1 if the median of the squares is
+    less than five standard deviations above the median for unit noise. The median is taken because
+    outliers are expected under a robust loss, and outliers would dominate χ².
     """
     if not squares.size:
         return 1.0
@@ -198,10 +219,20 @@ def _is_white(
 ) -> bool:
     """Return whether the whitened errors `e` (R, T, k) are white, by Ljung and Box's test.
 
-    Fitted numbers take the part `slope covariance slopeᵀ` out of white errors and so correlate
-    them, which shows in many short recordings (Box and Pierce 1970,
-    doi:10.1080/01621459.1970.10481180); the test allows for it. If the noise is known
-    (`has_noise`), errors far below it are no evidence.
+    The fit removes the covariance `slope covariance slopeᵀ` from white errors and so makes the
+    errors correlated, which shows in many short recordings (Box and Pierce 1970,
+    doi:10.1080/01621459.1970.10481180). The test allows for this correlation.
+
+    **Arguments:**
+
+    - `e`: (R, T, k) the errors in R recordings, at T times, of k components.
+    - `used`: (R, T, k) true for the errors that count.
+    - `slope`: (R, T, k, m) the derivatives of the errors with respect to the m free numbers of each
+      recording.
+    - `covariance`: (R, m, m) the covariance of the free numbers of each recording, for white
+      errors.
+    - `has_noise`: whether the noise is known. If the noise is known, errors that are far smaller
+      than the noise are no evidence of autocorrelation.
     """
     from scipy.special import chdtrc
 
@@ -226,8 +257,10 @@ def _is_white(
 
 
 def _packed_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return the rows (R, T, m) without their mean, with the entries of the `mask` (R, T) first and
-    zeros after them.
+    """Return the masked entries of each row, moved to the front of the row, minus their mean.
+
+    `rows` (R, T, m) are R rows of T entries. The entries at which `mask` (R, T) is true come first,
+    in their order, and zeros follow.
     """
     order = np.argsort(~mask, axis=1, kind="stable")
     valid = np.take_along_axis(mask, order, axis=1)[..., None]
@@ -236,15 +269,23 @@ def _packed_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return np.where(valid, packed - mean, 0.0)
 
 
-# A search has ended if the least misfit is nearer than this distance, in standard deviations.
+# A search has ended if the distance to the minimum of the linearised problem, in standard
+# deviations, is below this number.
 AT_THE_END = 0.05
 
 
 def _search_answer(
     best_cost: float, ended: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
 ) -> Answer:
-    """Return the answer on the search, where `rivals` describes the starts that fit as well
-    elsewhere.
+    """Return the answer on the search.
+
+    **Arguments:**
+
+    - `best_cost`: the least cost of all starts.
+    - `ended`: whether the search reached a minimum.
+    - `rivals`: a description of the starts that ended at other points and fit as well, or "".
+    - `interrupted`: what was interrupted, in words.
+    - `remarks`: other remarks for the answer, in words.
     """
     if not np.isfinite(best_cost):
         return Answer(NOT_ENDED, ("no start gave a finite misfit",))
@@ -259,15 +300,18 @@ def _search_answer(
 def _count_rivals(
     starts: Sequence[Start], best_cost: float, margin: float, linear: Linearisation, x: Array
 ) -> int:
-    """Return the number of `starts` that ended at a point far from the best point x, by more than a
-    `margin`.
+    """Return the number of `starts` that converged to another point than the best point x.
+
+    Another point is one to which the linearised errors `linear` change, from x, by a sum of squares
+    of more than twice the `margin`. A start is not counted if its cost exceeds `best_cost` by at
+    most a hundredth of the `margin`.
     """
     count = 0
     for item in starts:
         if item.converged and item.cost > best_cost + 0.01 * margin:
             away = item.x - x
-            # Two points of a flat valley differ, but give the same readings: such points are no
-            # rivals.
+            # Two points of a flat valley differ, but predict the same readings: such points are not
+            # counted as different.
             count += linear.squared_change(np.asarray(away)) > 2 * margin
     return count
 
@@ -286,10 +330,12 @@ def assess(
 
     **Arguments:**
 
-    - `model`, `noise`: the model that was fitted, and its noise.
-    - `best`: the best point; `attempts`: the ends of all starts; `best_cost`: the least of their
-      costs.
-    - `original`: the model that the `Fit` holds, with the readings as they were given.
+    - `model`: the model that was fitted, whose readings may be padded.
+    - `best`: the best point.
+    - `noise`: the standard deviations of the errors of each sensor.
+    - `attempts`: the ends of the searches from all starts.
+    - `best_cost`: the least cost of the `attempts`.
+    - `original`: the model that the `Fit` holds, with the readings as the user gave them.
     - `interrupted`, `remarks`: reasons for the answer on the search, in words.
     """
     x = best.x
@@ -314,8 +360,8 @@ def assess(
     limits = flat_limit.flat_limits(
         model, numbers, -white.determined @ linear.slope, [n for n, _ in of]
     )
-    # In a long curved valley steps stay short, although there is hardly anything left to gain: a
-    # small distance to the minimum of the linearised problem then says that the search has ended.
+    # In a long curved valley the steps of a search stay short, although the misfit can hardly fall
+    # any more. The search has then ended if the minimum of the linearised problem is near.
     held = [limit.slope for limit in limits if limit.free < 0]
     near_end = AT_THE_END
     if count := nominal_count(model):
@@ -323,8 +369,9 @@ def assess(
     done = bool(best.converged) or uncertainty.distance_to_minimum(linear, white, held) < near_end
     chi2, dof, explanation, left = goodness(model, noise, linear, times, white.determined)
     believable = explanation.word != FAILS
-    # A start fits as well if its log-likelihood is within ten units, measured in the estimated
-    # noise if some noise is estimated; autocorrelated errors count as fewer errors.
+    # A start fits as well as the best one if its log-likelihood is at most ten units lower. The
+    # unit is that of the estimated noise if some noise is estimated, and autocorrelated errors
+    # count as fewer independent errors.
     guessed = not all(r.known_noise and not has_unit_noise(r) for r in model.records.readings)
     unit = 2 * best_cost / model.records.size if guessed else 1.0
     margin = 10.0 * unit * max(times.longest, 1.0)
@@ -386,8 +433,18 @@ def _allowance(
     quantities: Sequence[Quantity],
     slopes: np.ndarray,
 ) -> str:
-    """Return what the intervals of the moments and ratios allow for, or of the `Free`s if there are
-    no moments.
+    """Return the sentences of `allowance` on the intervals of the moments and ratios of a fit.
+
+    If no moment is reported, the sentences are on the intervals of the `Free`s.
+
+    **Arguments:**
+
+    - `model`, `noise`: the fitted model, and the standard deviations of the errors of its sensors.
+    - `linear`: the errors and their derivatives at the best point.
+    - `covariance`: (n, n) the covariance of the free numbers for white errors.
+    - `parts`: the considered errors of the sensors with a `Tolerance`.
+    - `quantities`: the m reported quantities.
+    - `slopes`: (m, n) the derivatives of the quantities with respect to the free numbers.
     """
     bodies = {log + name for name, chart in charts_by_suffix(model) for log in chart.log_names}
     free = {slot.name for slot in model.slots}
@@ -402,7 +459,10 @@ def _allowance(
 def _with_considered(
     covariance: uncertainty.Covariance, parts: tuple[considered.Consideration, ...], model: Model
 ) -> uncertainty.Covariance:
-    """Return the covariance with the part added that the considered errors `parts` make."""
+    """Return the `covariance` of a fit plus the covariance that the considered errors make.
+
+    `parts` are the considered errors, which are the errors of the sensors with a `Tolerance`.
+    """
     if not parts:
         return covariance
     root = considered.stacked_shifts(parts, len(covariance.determined))

@@ -1,9 +1,9 @@
 """Find the most likely cause of the errors of a fit.
 
-Each cause has a direction: the change of the readings that it would make along the fitted motion.
-The errors are regressed on this direction together with all free numbers (a score test: Rao 1948,
-doi:10.1017/S0305004100023987). A cause that the free numbers could absorb therefore explains
-nothing.
+Each cause has a direction: the change that the cause would make in the readings along the fitted
+motion. The errors are regressed on this direction together with the derivatives with respect to
+all free numbers (a score test: Rao 1948, doi:10.1017/S0305004100023987). A cause whose effect a
+change of the free numbers could also make therefore explains nothing.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,14 +30,14 @@ from rigidjax.identify.uncertainty.considered import slope_in_time
 from rigidjax.identify.uncertainty.covariance import Linearisation
 from rigidjax.motion.torques.base import Torque
 
-# A correction of the rates counts if it leaves less than the share BETTER of the error of the rates
-# as they were read, and less than the share LITTLE of the whole signal.
+# A corrected recording is believed if its error is less than BETTER times the error without the
+# correction, and less than LITTLE times the size of the whole signal.
 BETTER, LITTLE = 0.5, 0.3
-# Corrections that leave at most EQUAL times the least error cannot be told apart.
+# Corrections whose error is at most EQUAL times the least error cannot be told apart.
 EQUAL = 1.1
 _SAME = np.eye(3)
 
-# Each mistake in rates is corrected by a matrix.
+# These matrices (3, 3) correct the body rates for each mistake with which rates may be read.
 RATES = {
     "deg/s read as rad/s": _SAME * np.pi / 180,
     "rad/s read as deg/s": _SAME * 180 / np.pi,
@@ -58,18 +58,21 @@ ATTITUDES = {
 
 
 def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause | None:
-    """Return the mistake that was made when the rates of one body were read, or `None` if there is
-    none.
+    """Return the mistake with which the gyro or the attitudes of one body were read from a file.
 
-    The rates are compared with the rates between attitudes or, without attitudes, with Euler's
-    equations of the best body: there a correction counts only if this body is a real one. A
-    mirrored axis shows only under a torque.
+    The result is `None` if no mistake is likely. The rates of the gyro are compared with the rates
+    between successive attitudes. Without attitudes the rates are inserted in Euler's equations with
+    the inertia that fits best, and a correction is accepted only if this inertia is that of a real
+    body. Without attitudes, a mirrored axis shows only under a torque.
+
+    **Arguments:** `recordings` are the recordings of one body; `torque` is the torque of the model.
     """
     gyros = readings_of(recordings[0], Gyro)
     if not gyros:
         return None
     turn, scale = (getattr(gyros[0].sensor, name) for name in ("mounting", "scale"))
-    # A user who gives axes or scales far from those of the body has made no mistake.
+    # A user who gives a large mounting turn, or a scale far from 1, has considered the axes and the
+    # units of the sensor.
     if turn is not None and np.abs(turn).max() >= 0.1:
         return None
     if scale is not None and np.abs(np.asarray(scale) - 1).max() >= 0.1:
@@ -90,7 +93,7 @@ def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause 
             fits["the torque with the other sign"] = _euler_residual(
                 recordings, torque, _SAME, -1.0
             )
-        # A margin near 1 is that of a ball: every constant rate is a free motion of it.
+        # A margin near 1 belongs to a ball: any constant rate is a free motion of a ball.
         ratios = {name: left if -0.01 < m < 0.8 else np.inf for name, (left, m) in fits.items()}
     else:
         return None
@@ -104,10 +107,11 @@ def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause 
 def _euler_residual(
     recordings: Sequence[Recording], torque: Torque | None, turn: np.ndarray, sign: float = 1.0
 ) -> tuple[float, float]:
-    """Return the relative residual of Euler's equations, and the margin by which the best body is
-    real.
+    """Return the relative residual of Euler's equations for the inertia that fits best.
 
-    The rates are multiplied by the matrix `turn`, the torque by `sign`.
+    The second result is the margin of this inertia, which is positive for a real body
+    (`tensor_and_margin`). The rates of the `recordings` are multiplied by the matrix `turn` (3, 3),
+    and the `torque` is multiplied by `sign`.
     """
     balances = [balance_of_momentum(recording, torque, turn) for recording in recordings]
     matrix, side, momentum = (np.concatenate(part) for part in zip(*balances, strict=True))
@@ -121,10 +125,10 @@ def _rate_difference(
     attitudes: Sequence[tuple[np.ndarray, np.ndarray]],
     turn: np.ndarray,
 ) -> float:
-    """Return the relative difference between the read rates, multiplied by `turn`, and the rates
-    between attitudes.
+    """Return the relative difference between the rates of gyros and the rates between attitudes.
 
-    `attitudes` holds the times (n,) and the attitudes (n, 4) of each recording.
+    The rates that the gyros of the `recordings` read are multiplied by the matrix `turn` (3, 3).
+    `attitudes` holds the times (n,) and the quaternions (n, 4) of each recording.
     """
     left, size = 0.0, 1e-300
     for recording, (t, q) in zip(recordings, attitudes, strict=True):
@@ -140,15 +144,17 @@ def _rate_difference(
     return float(np.sqrt(left / size))
 
 
-# A cause is named if it explains more than the share ENOUGH of the squared errors, and at least
-# NEARLY of what the best cause explains.
+# A cause is named if it explains more than the share ENOUGH of the squared errors, and at least the
+# share NEARLY of what the best cause explains.
 ENOUGH, NEARLY = 0.7, 0.95
-# A direction is dropped if the part of it that the free numbers cannot absorb is below this share.
+# A direction has unit length. It is dropped if its part that no change of the free numbers can make
+# is shorter than this number.
 APART = 0.05
-# These causes are linear in their size only while the size is below SMALL.
+# The causes in LINEAR change the readings in proportion to their size only if the size is below
+# SMALL.
 LINEAR, SMALL = ("scale", "mounting", "skew"), 0.5
-# The entry SKEW[i, j, k] is 1 if the axis j reads a part of the component i by the k-th angle of
-# skew.
+# The entry SKEW[i, j, k] is 1 if the k-th angle of skew adds a part of component i to the reading
+# of axis j.
 SKEW = np.zeros((3, 3, 3))
 SKEW[1, 0, 0] = SKEW[2, 0, 1] = SKEW[2, 1, 2] = 1.0
 
@@ -160,7 +166,18 @@ def causes(
     linear: Linearisation,
     indices: Sequence[int],
 ) -> tuple[Cause, ...]:
-    """Return the most likely cause of the errors of each sensor in `indices`, if it has one."""
+    """Return the most likely cause of the errors of each sensor in `indices`.
+
+    A sensor without a likely cause is left out. If a file was most likely misread, this cause alone
+    is returned.
+
+    **Arguments:**
+
+    - `model`, `x`: the fitted model, and the free numbers (n,) at the best point.
+    - `noise`: the standard deviations of the errors of each sensor.
+    - `linear`: the errors and their derivatives at x.
+    - `indices`: the indices of the sensors whose errors the model does not explain.
+    """
     given = zip(
         stacking.recordings_on_host(model.records, model.counts), model.body_names, strict=True
     )
@@ -187,10 +204,14 @@ def causes(
 
 
 def clock_cause(model: Model, noise: Noise, linear: Linearisation, index: int) -> Cause | None:
-    """Return the cause "clock" if time stamps scatter by more than the jitter of the sensor, else
-    `None`.
+    """Return the cause "clock" if the time stamps of a sensor scatter by more than its jitter.
 
-    A late time stamp makes an error along the change of the readings in time, dy/dt.
+    Otherwise the result is `None`. A late time stamp makes an error along dy/dt, the derivative of
+    the readings y with respect to time.
+
+    **Arguments:** `model` is the fitted model, `noise` the standard deviations of the errors of
+    each sensor, `linear` the errors and their derivatives at the best point, and `index` the index
+    of the sensor.
     """
     sensor, error = model.records.readings[index].sensor, linear.raw[index]
     kept = linear.mask[index].all(axis=-1)
@@ -206,7 +227,7 @@ def clock_cause(model: Model, noise: Noise, linear: Linearisation, index: int) -
         return None
     along = np.sum(np.sum(error * slope, axis=-1)[moving] ** 2 / moved[moving])
     channels = np.sum(error[kept] ** 2, axis=0)
-    # Random errors of the same sizes have this share along the direction by chance.
+    # Random errors that are as large in each channel have this share along dy/dt by chance.
     ways = np.mean(slope[moving] ** 2 / moved[moving][:, None], axis=0)
     chance, share = float(ways @ channels / channels.sum()), float(along / channels.sum())
     if not share > chance + 0.5 * (1.0 - chance) + 1.0 / np.sqrt(moving.sum()):
@@ -219,7 +240,10 @@ def clock_cause(model: Model, noise: Noise, linear: Linearisation, index: int) -
 
 
 def _cause(name: str, sensor: AbstractSensor, share: float, words: str, remedy: str) -> Cause:
-    """Return a `Cause` whose words say which share of the squared errors it explains."""
+    """Return a `Cause` whose words end with the share of the squared errors that it explains.
+
+    The arguments are the fields of `Cause`, except that `sensor` is the sensor itself.
+    """
     kind = type(sensor).__name__
     explained = f"{100 * share:.0f} % of the squared errors of the {kind}"
     return Cause(name, kind, share, f"most likely {words}: {explained}", remedy)
@@ -228,10 +252,13 @@ def _cause(name: str, sensor: AbstractSensor, share: float, words: str, remedy: 
 def _largest_cause(
     sensor: AbstractSensor, rows: Sequence[tuple], shares: Sequence[tuple]
 ) -> Cause | None:
-    """Return the cause that explains the most, joined with the causes that explain nearly as much,
-    or `None`.
+    """Return the cause that explains the largest share of the squared errors of a `sensor`.
 
-    `rows` are those of `_candidate_causes`, `shares` the results of `_explained_share` for them.
+    Causes that explain nearly as large a share are joined to this cause by "or". The result is
+    `None` if the largest share is too small.
+
+    **Arguments:** `rows` is the result of `_candidate_causes`, and `shares` holds the result of
+    `_explained_share` for each row.
     """
     candidates = [
         (share, name, words.format(size=", ".join(f"{x:.2g}" for x in size)), remedy)
@@ -251,17 +278,21 @@ def _largest_cause(
 
 
 def _is_vector_error(sensor: AbstractSensor) -> bool:
-    """Return whether the errors of the sensor are readings minus predictions along three axes."""
+    """Return whether a `sensor` reads a vector along three axes, with an error for each axis."""
     return sensor.reading_shape == (3,) and sensor.components == 3
 
 
 def _candidate_causes(
     model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearisation, index: int
 ) -> tuple[tuple[str, np.ndarray, str, str], ...]:
-    """Return the name, direction (R, T, 3, c), words and remedy of each possible cause for one
-    sensor.
+    """Return a row for each possible cause of the errors of the sensor with this `index`.
 
-    A cause of c numbers, such as a bias of three, has c directions.
+    A row holds the name, the direction (R, T, 3, c), the words and the remedy of a cause. The
+    direction is the change of the readings in R recordings, at T times, along three axes. A cause
+    with c numbers, such as a bias with three components, has c directions.
+
+    **Arguments:** `model` is the fitted model, `x` the free numbers at the best point, `noise` the
+    standard deviations of the errors, and `linear` the errors and their derivatives at x.
     """
     reading = model.records.readings[index]
     t, shown = np.asarray(model.records.t), np.asarray(reading.values) - linear.raw[index]
@@ -295,11 +326,13 @@ def _candidate_causes(
 def _response(
     model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearisation, index: int
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function that maps torques τ (R, T, 3, c) to the changes of the body rate that
-    they make.
+    """Return a function that maps torques to the changes of the body rate that the torques make.
 
-    The change is `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt` with Φ = dΩ/dΩ₀ along the fitted motion. It is zero for a
-    sensor that is no `Gyro`.
+    Torques τ and changes have the shape (R, T, 3, c), for R recordings, T times and c torques. The
+    change is `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt`, where I is the inertia tensor and Φ = dΩ/dΩ₀ the derivative of
+    the body rate Ω with respect to the initial rate Ω₀ along the fitted motion. The change is zero
+    if the sensor with this `index` is not a `Gyro`. The other arguments are those of
+    `_candidate_causes`.
     """
     if not isinstance(model.records.readings[index].sensor, Gyro):
         return np.zeros_like
@@ -328,12 +361,20 @@ def _explained_share(
     free_columns: np.ndarray,
     direction: np.ndarray,
 ) -> tuple[float, np.ndarray]:
-    """Return the share of a sensor's squared errors that a `direction` explains, and the size of
-    the cause.
+    """Return the share of a sensor's squared errors that a cause explains, and the size of the
+    cause.
 
-    The `direction` (R, T, k, c) counts only by its part outside of the orthonormal columns
-    `free_columns` (R, N, m), which span what the free numbers can change. The size (c,) is the
-    least-squares coefficient of the direction.
+    The size (c,) holds the least-squares coefficients of the errors on the directions of the cause.
+
+    **Arguments:**
+
+    - `model`, `noise`, `linear`: the fitted model, the standard deviations of its errors, and the
+      errors and their derivatives at the best point.
+    - `index`: the index of the sensor.
+    - `free_columns`: (R, N, m) orthonormal columns. They span all changes of the N errors of each
+      recording that a change of the free numbers can make. These changes are subtracted from the
+      direction and from the errors.
+    - `direction`: (R, T, k, c) the directions of the cause.
     """
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]

@@ -1,5 +1,5 @@
-"""Fit by least squares from several starts, with the noise, the widths and the steps that the fit
-needs.
+"""Fit by least squares from several starts, and estimate unknown noise and the spread of deviations
+between recordings.
 """
 
 import dataclasses
@@ -45,16 +45,18 @@ from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 # At most this number of free numbers may be shared by all recordings, because the normal equations
 # are dense.
 MOST_SHARED = 1000
-# A model with fewer numbers takes ten times as long on a GPU as on a CPU, which starts each program
-# sooner.
+# A fit of a model whose arrays hold fewer numbers takes ten times as long on a GPU as on a CPU,
+# because a CPU starts each compiled program sooner.
 _FEW = 100_000
-# Integration steps are short enough if shorter ones change predictions by less than this part of
-# the noise.
+# Integration steps are short enough if shorter steps change all predictions by less than this
+# fraction of the noise.
 _MATTERS = 0.05
-# The noise is estimated in rounds. So is the width of the deviations of the recordings from a
-# shared number, by expectation and maximisation (Dempster, Laird and Rubin 1977; Laird and Ware
-# 1982, doi:10.2307/2529876). The rounds end after _ROUNDS, or at a relative change below _SETTLED.
-# A width that falls below _LEAST times its first value counts as zero.
+# The noise, and the standard deviation between recordings of a `Free` (its `spread`), are each
+# estimated in rounds: of the best point for the last estimate, then of a new estimate. For the
+# spread a round is one of expectation and maximisation (Dempster, Laird and Rubin 1977; Laird and
+# Ware 1982, doi:10.2307/2529876). There are at most _ROUNDS rounds, and they end once an estimate
+# changes by less than the fraction _SETTLED of itself. A spread does not fall below _LEAST times
+# its first value, which then stands for zero.
 _ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
 
 
@@ -76,20 +78,22 @@ def fit(
     **Arguments:**
 
     - `model`: the readings and the free numbers.
-    - `starts`: the number of starting points (regression first, then scattered ones). Each is
-      fitted to a quarter, a half and then the whole of the record.
-    - `initial`: (n,) a starting point of your own, tried first.
-    - `key`: random key of the scattered starts; without a key they are the same at each call.
+    - `starts`: the number of starting points. The first one comes from a regression, all others are
+      scattered at random. The search from each point fits a quarter, a half and then the whole of
+      the record.
+    - `initial`: (n,) a starting point of your own, which is tried first.
+    - `key`: the random key of the scattered starting points; without a key these points are the
+      same at each call.
     - `tolerance`: Levenberg–Marquardt stops when a step is shorter than `tolerance` standard
       deviations of each number (with all other numbers fixed), and changes the misfit as little.
-    - `max_steps`: the largest number of its steps.
-    - `descent`: a `Descent(optimiser, steps=…, batch=…)` of optax, which first improves each start
-      on a few recordings at a time. It pays for many recordings, where a step of least squares is
-      expensive.
-    - `checkpoint`: a file in which the end of each start is saved. A second call with the same
-      model and options continues after the last saved one, and ends at the same point to the last
-      bit on the same machine with the same versions.
-    - `progress`: a function such as `print`, called with a line of text after each start.
+    - `max_steps`: the largest number of Levenberg–Marquardt steps.
+    - `descent`: a `Descent(optimiser, steps=…, batch=…)` with an optimiser of optax, which first
+      improves each starting point on a few recordings at a time. It pays for many recordings, where
+      a step of least squares is expensive.
+    - `checkpoint`: a file in which the end of the search from each starting point is saved. A
+      second call with the same model and options continues after the last saved search, and ends at
+      the same point to the last bit on the same machine with the same versions.
+    - `progress`: a function such as `print`, called with a line of text after each search.
 
     **Returns** a `Fit` of the best point reached. It holds two answers:
 
@@ -97,12 +101,14 @@ def fit(
     - `fit.explanation`: `explains the readings` (the errors are white and as large as the sensor's
       noise), `leaves a part` (how large, and at which times), or `does not explain the readings`.
 
-    `fit.status` is both answers in a line, `ok` if all is well. `fit.causes` names what most likely
-    makes the errors, `fit.advice` says whether the intervals can be trusted. An interrupt (Ctrl-C)
-    ends the search and keeps the best point so far; the status says so.
+    `fit.status` holds both answers in one line, or `ok` if all is well. `fit.causes` names what
+    most likely makes the errors, and `fit.advice` says whether the intervals can be trusted. An
+    interrupt (Ctrl-C) ends the search and keeps the best point so far; the status then says that
+    the search was interrupted.
 
-    On a machine with a GPU a model of less than 100 000 numbers is fitted on the CPU, and the
-    report says so; not within `jax.default_device(…)`, nor if its arrays were put on a device.
+    On a machine with a GPU, a model whose arrays hold fewer than 100 000 numbers is fitted on the
+    CPU, and the report says so. Within `jax.default_device(…)`, or if an array of the model was put
+    on a device, the fit runs on that device.
 
     **Raises:** `TypeError` unless `model` is a `Model`, `ValueError` for fewer than one start, more
     than 1000 free numbers that recordings share (`descend` takes any number), a checkpoint that is
@@ -151,8 +157,8 @@ def fit(
         points += starting_points(model, starts - len(points), key)
     points, interrupts, rough = points[:starts], [], []
     if isinstance(padded.integrator, Adaptive):
-        # Choose the tolerance of the integrator before the search: the errors of long steps would
-        # slow the search down, and another tolerance compiles no other program.
+        # Choose the tolerance of the integrator before the search: integration errors would slow
+        # the search down. Another tolerance needs no new compilation.
         first = Attempt(points[0], blocks=errors_and_slopes(padded, points[0]))
         finer = _converged_integrator(first, task, rough)
         task = task if rough else task._replace(model=_with_integrator(padded, finer))
@@ -177,10 +183,10 @@ _ON_CPU = "computed on the CPU, which is faster than a GPU for so few readings"
 
 
 def _faster_device(model: Model) -> Any:
-    """Return the CPU for a small model on a machine with a GPU, unless a device was chosen; else
-    `None`.
+    """Return the CPU if a fit of the `model` is faster there than on the default device.
 
-    A device is chosen by `jax.default_device`, or by arrays that were put on a device.
+    Otherwise the result is `None`: for a large model, on a machine without a GPU, and if the user
+    chose a device by `jax.default_device` or put arrays of the model on a device.
     """
     chosen: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     if chosen is not None or jax.default_backend() == "cpu":
@@ -192,8 +198,9 @@ def _faster_device(model: Model) -> Any:
 
 
 def _with_original_readings(original: Model, fitted: Model) -> Model:
-    """Return the `fitted` model with the unpadded readings of the `original` model, but with the
-    jitter of the `fitted` one.
+    """Return the `fitted` model with the readings of the `original` model, which are not padded.
+
+    The estimated jitter of the `fitted` model is kept.
     """
     records = original.records
     for index, r in enumerate(fitted.records.readings):
@@ -211,8 +218,10 @@ def _cost(attempt: Attempt) -> float:
 
 
 def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
-    """Estimate the unknown noise and the best point in turn, and return the point and the task with
-    the new noise.
+    """Estimate the unknown noise of sensors and the best point alternately, until both settle.
+
+    `best` is the best point for the noise of the `task`. The result is the new best point, and the
+    task with the new noise.
     """
     if all(reading.known_noise for reading in task.model.records.readings):
         return best, task
@@ -222,8 +231,8 @@ def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
         model, noise = estimate_noise(task.model, best.x, blocks, task.noise)
         return task._replace(model=model, noise=noise)
 
-    # Repeat the estimate: the weights, the robust loss and the degrees of freedom that the fit
-    # takes from few readings depend on the noise.
+    # Repeat the estimate, because it changes three things on which it depends: the weights of the
+    # sensors, the weights of the robust loss, and the degrees of freedom that the fit uses up.
     for turn in range(_ROUNDS):
         before, task = task.noise, estimate(best, task)
         pairs = zip(before, task.noise, strict=True)
@@ -241,9 +250,10 @@ def _descend_from_each(
     progress: Callable[[str], Any] | None,
     interrupts: list[str],
 ) -> list[Array]:
-    """Return the end of the stochastic descent from each point.
+    """Return the end of the stochastic gradient descent from each of the starting `points`.
 
-    After an interrupt (Ctrl-C) a line is added to `interrupts`, and the rest is left out.
+    After an interrupt (Ctrl-C) a line is added to the list `interrupts`, and the remaining points
+    are left out. `progress` is called with a line of text; the random batches come from `key`.
     """
     keys = jax.random.split(jax.random.key(1) if key is None else key, len(points))
     out: list[Array] = []
@@ -263,14 +273,16 @@ def _search_from_each(
     progress: Callable[[str], Any] | None,
     interrupts: list[str],
 ) -> list[Attempt]:
-    """Return the end of the search from each point, continuing with the ends in the file
-    `checkpoint`.
+    """Return the end of the search from each of the starting `points`.
 
-    After an interrupt (Ctrl-C) a line is added to `interrupts`, and the rest is left out.
+    Searches whose end is in the file `checkpoint` are not repeated. After an interrupt (Ctrl-C) a
+    line is added to the list `interrupts`, and the remaining points are left out. `progress` is
+    called with a line of text after each search.
     """
     like, print_of = Attempt(points[0]), ""
     if checkpoint is not None:
-        # The misfits distinguish two torque functions of one name, which the fingerprint does not.
+        # Put the costs in the fingerprint, too: without the costs it would be the same for two
+        # different torque functions with one name.
         costs = [cost_of(task.model, point, task.noise) for point in points]
         print_of = fingerprint(points, task, costs)
     keep = Checkpoint(checkpoint, like, print_of)
@@ -283,8 +295,8 @@ def _search_from_each(
     try:
         for number, point in enumerate(points[len(keep.done) :], len(keep.done) + 1):
             latest = like
-            # Once a start explains the record, the others only have to show whether another motion
-            # does so as well: they may end at this misfit.
+            # Once one search has explained the record, later searches only have to show whether
+            # another motion explains the record as well: they may end at the same misfit.
             ended = [float(one.cost) for one in attempts if bool(one.converged)]
             aim = min(ended, default=np.inf)
             aim = aim if aim <= sufficient_misfit(task.model) else 0.0
@@ -306,8 +318,9 @@ def _search_from_each(
 
 
 def _with_blocks(best: Attempt, model: Model) -> Attempt:
-    """Return the attempt with errors and derivatives, which are computed unless the search ended
-    with them.
+    """Return the attempt `best` with the errors of the `model` and their derivatives.
+
+    The errors and derivatives are computed only if the attempt does not hold them already.
     """
     if best.blocks is not None:
         return best
@@ -316,7 +329,10 @@ def _with_blocks(best: Attempt, model: Model) -> Attempt:
 
 @eqx.filter_jit
 def _errors_alone(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors of all sensors without derivatives, which takes less time to compile."""
+    """Return the errors of all sensors at the free numbers x, without derivatives.
+
+    A program without derivatives takes less time to compile.
+    """
     return all_errors(model, x)
 
 
@@ -330,10 +346,11 @@ def _with_integrator(model: Model, integrator: AbstractIntegrator | None) -> Mod
 def _converged_integrator(
     best: Attempt, task: Task, remarks: list[str]
 ) -> AbstractIntegrator | None:
-    """Return the integrator whose predictions shorter steps do not change, or `None` if this is the
-    present integrator.
+    """Return an integrator with steps so short that shorter steps do not change the predictions.
 
-    If even the shortest steps change the predictions, a line is added to `remarks`.
+    The predictions are those of the model of the `task` at the point `best`. The result is `None`
+    if the present integrator of the model is accurate enough. If even the shortest steps still
+    change the predictions, a line is added to the list `remarks`.
     """
     model, (errors, _) = task.model, best.blocks
     steps, apart = model.integrator, 0.0
@@ -351,8 +368,9 @@ def _converged_integrator(
             break
         steps, errors = finer, exact
         if apart <= 8 * _MATTERS:
-            # The errors fall by more than a factor of 8 with twice as many steps of a method of
-            # order 4, or with a hundredth of the tolerance: no third comparison is needed.
+            # The integration errors fall by more than a factor of 8 with twice as many steps of a
+            # method of order 4, and with a hundredth of the tolerance: this integrator is accurate
+            # enough, and no further comparison is needed.
             break
     else:
         if apart > _MATTERS:
@@ -363,10 +381,11 @@ def _converged_integrator(
 
 
 def _estimate_widths_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
-    """Estimate the widths of deviations and the best point in turn, and return the point and the
-    task with the new widths.
+    """Estimate the unknown spreads of `Free`s and the best point alternately, until both settle.
 
-    These are the widths of the `Free`s whose deviations between recordings are to be estimated.
+    The spread of a `Free` is the standard deviation, between recordings, of its value about the
+    value that the recordings share. `best` is the best point for the spreads in the model of the
+    `task`. The result is the new best point, and the task with the new spreads.
     """
     indices = [index for index, slot in enumerate(task.model.slots) if slot.estimated]
     if not indices:
@@ -387,9 +406,11 @@ def _estimate_widths_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
 
 
 def _expected_widths(best: Attempt, task: Task, indices: list[int]) -> np.ndarray:
-    """Return the expected root mean square of the deviations of each slot in `indices`.
+    """Return the expected root mean square, over recordings, of the deviations of some `Free`s.
 
-    The expectation is over the posterior, which Laplace's method takes as normal.
+    `indices` are the indices of the slots of these `Free`s in the model of the `task`. The
+    expectation is over the posterior density at the point `best`, which Laplace's method takes as
+    normal.
     """
     linear = linearise(task.model, best.x, task.noise, best.blocks)
     variance, x = np.diag(white_covariance(linear).determined), np.asarray(best.x)

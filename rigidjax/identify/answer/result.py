@@ -30,9 +30,9 @@ class Start(eqx.Module):
     **Fields:**
 
     - `x`: (n,) the free numbers at the end.
-    - `cost`: half of the sum of squares at x.
+    - `cost`: half of the sum of squared residuals at x.
     - `converged`: whether the search converged.
-    - `fits`: whether x explains the data as well as the best point does.
+    - `fits`: whether x explains the data as well as the best point of all starts does.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> model = rj.identify.Model(record, rj.identify.PrincipalRatios())
@@ -53,32 +53,35 @@ class Fit(eqx.Module):
 
     - `model`: the model that was fitted.
     - `x`: (n,) the free numbers at the best point.
-    - `covariance`: (n, n) of x; infinite for undetermined numbers.
-    - `determined_covariance`: (n, n) the part of the covariance within the directions that the data
-      determine.
-    - `covariance_kind`: the method of the covariance, in words.
-    - `noises`: (R, k) for each sensor, the standard deviations of R recordings.
+    - `covariance`: (n, n) the covariance of x; infinite for numbers that the data do not determine.
+    - `determined_covariance`: (n, n) the part of the covariance within the directions of x that the
+      data determine.
+    - `covariance_kind`: the method by which the covariance was computed, in words.
+    - `noises`: for each sensor, (R, k) the standard deviations of the k components of its errors,
+      in each of R recordings.
     - `starts`: a `Start` for each starting point.
-    - `chi2`, `dof`: χ² and its degrees of freedom, of the sensors whose noise was given.
-    - `correlation`: the number of samples over which the errors are autocorrelated; 1 if white.
+    - `chi2`, `dof`: χ², summed over the sensors whose noise was given, and its degrees of freedom.
+    - `correlation`: the number of samples over which the errors are autocorrelated; 1 for white
+      errors.
     - `independent`: the number of independent errors.
-    - `singular_values`: (n,) of the whitened Jacobian with columns of length one; the numbers of
-      one recording alone are eliminated first.
-    - `null_directions`: (k, n) the directions that the data do not determine.
+    - `singular_values`: (n,) the singular values of the whitened Jacobian with columns of length
+      one. The free numbers that belong to one recording alone are eliminated first.
+    - `null_directions`: (k, n) the directions of x that the data do not determine.
     - `quantities`: all reported quantities.
-    - `search`: the first answer; its `word` is `found`, `not alone` or `not ended`.
-    - `explanation`: the second answer; its `word` is `explains the readings`, `leaves a part` or
-      `does not explain the readings`.
+    - `search`: the answer on the search; its `word` is `found`, `not alone` or `not ended`.
+    - `explanation`: the answer on the model; its `word` is `explains the readings`, `leaves a part`
+      or `does not explain the readings`.
     - `left`: the indices of the sensors whose errors the model does not explain.
-    - `limits`: the distance of each body from a flat one.
-    - `near`: (n,) the point at which derivatives are taken if the body is flat, else `None`.
-    - `freedom`: what the degrees of freedom of variances follow from.
-    - `linear`: errors and derivatives at the best point, from which all of this is computed.
+    - `limits`: the distance of each body from a flat body.
+    - `near`: (n,) the free numbers at which derivatives are taken if the body is flat, else `None`.
+    - `freedom`: the numbers from which the degrees of freedom of a variance are computed.
+    - `linear`: the errors and their derivatives at the best point, from which the covariance and
+      the answers are computed.
     - `considered`: the sensor errors that the covariance allows for by a `Tolerance`.
-    - `allowance`: the sentences on what the intervals allow for.
-    - `hidden_directions`: (k, n) the directions that one stretch of windows alone shows, whose
-      variance is infinite; for a fit of windows.
-    - `place`: where it was computed, in words, if that is not JAX's default device.
+    - `allowance`: the sentences on the sensor errors that the intervals allow for.
+    - `hidden_directions`: (k, n) for a fit of windows, the directions of x that only one stretch of
+      windows shows. The variance along these directions is infinite.
+    - `place`: where the fit was computed, in words, if that is not JAX's default device.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> [quantity.name for quantity in result.quantities[:2]], result.covariance.shape
@@ -113,7 +116,11 @@ class Fit(eqx.Module):
 
     @property
     def status(self) -> str:
-        """Return both answers in one line, which is `ok` if both are good and have no reasons."""
+        """Return the answers on the search and on the model in one line.
+
+        The line is `ok` if the search found the best point, the model explains the readings, and
+        neither answer has a reason.
+        """
         return answers.joined_status(self.search, self.explanation)
 
     @property
@@ -123,15 +130,17 @@ class Fit(eqx.Module):
 
     @property
     def derivative_point(self) -> Float[Array, " n"]:
-        """Return the free numbers at which derivatives are taken, x or for a flat body `near`."""
+        """Return the free numbers at which derivatives are taken: `near` for a flat body, else
+        `x`.
+        """
         return self.x if self.near is None else self.near
 
     @property
     def causes(self) -> tuple[Cause, ...]:
-        """Return the most likely causes of the errors that the model does not explain, if the
-        readings show them.
+        """Return the most likely causes of the errors that the model does not explain.
 
-        Each cause has `name`, `sensor`, `share`, `words` and `remedy`.
+        The tuple is empty if the readings show no cause. Each cause has `name`, `sensor`, `share`,
+        `words` and `remedy`.
         """
         if not self.left or self.linear is None:
             return ()
@@ -140,7 +149,7 @@ class Fit(eqx.Module):
     @property
     def advice(self) -> str:
         """Return words that say whether the intervals can be trusted, and what to try."""
-        # Do not use χ² under a robust loss, where outliers dominate it.
+        # Do not use χ² under a robust loss: outliers would dominate χ².
         above = np.sqrt(self.chi2 / self.dof) if self.model.loss is None else 1.0
         return answers.advice(
             self.search,
@@ -163,43 +172,45 @@ class Fit(eqx.Module):
 
     @property
     def body(self) -> Any:
-        """Return the body, or several bodies as a dict by name.
+        """Return the fitted body, or a dict of name → body for several bodies.
 
-        Its `scale` is "arbitrary" if the chart has no scale, such as one of ratios.
+        The `scale` of a body is "arbitrary" if its chart has no scale, such as a chart of ratios.
         """
         return self.model.bodies(self.x)
 
     @property
     def state0(self) -> Any:
-        """Return the state at the first time, for several recordings with a leading axis."""
+        """Return the state at the first time; for several recordings it has a leading axis."""
         return self.model.unpack(self.x).state0
 
     @property
     def values(self) -> dict[str, Array]:
-        """Return the value of each `Free` by name, in its unit."""
+        """Return a dict of name → value with the value of each `Free`, in its own unit."""
         return self.model.values(self.x)
 
     @property
     def spreads(self) -> dict[str, Array]:
-        """Return the `spread` of each `Free` that has one, given or estimated, by name and in its
-        unit.
+        """Return a dict of name → spread for each `Free` that has a spread, given or estimated.
+
+        The spread is the standard deviation between recordings, in the unit of the `Free`.
         """
         slots = self.model.slots
         return {s.name: s.spread * s.scale for s in slots if s.spread is not None}
 
     @property
     def noise(self) -> tuple[Float[Array, "*records _"], ...]:
-        """Return the standard deviations (k,) of each sensor, given or estimated.
+        """Return the standard deviations (k,) of the noise of each sensor, given or estimated.
 
-        For R recordings their shape is (R, k).
+        For R > 1 recordings the shape of the standard deviations is (R, k).
         """
         return tuple(n[0] for n in self.noises) if self.model.count == 1 else self.noises
 
     @property
     def jitter(self) -> tuple[Float[Array, "*records"] | None, ...]:
-        """Return the standard deviation of each sensor's time stamps, s, given or estimated.
+        """Return the standard deviation of the time stamps of each sensor, s, given or estimated.
 
-        It is `None` for a sensor without jitter, and has the shape (R,) for R recordings.
+        The entry of a sensor is `None` if it has no jitter; for R > 1 recordings it has the shape
+        (R,).
         """
         index = 0 if self.model.count == 1 else slice(None)
         jitters = (getattr(sensor, "jitter", None) for sensor in self.model.records.sensors)
@@ -207,17 +218,20 @@ class Fit(eqx.Module):
 
     @property
     def residuals(self) -> tuple[Float[Array, "*records times _"], ...]:
-        """Return reading minus prediction for each sensor, in its unit, with zero for a masked
-        reading.
+        """Return the residuals of each sensor, reading minus prediction, in the unit of the sensor.
 
-        For several recordings the residuals have a leading axis.
+        The residual of a masked reading is zero. For several recordings the residuals have a
+        leading axis.
         """
         errors = self._errors
         return tuple(e[0] for e in errors) if self.model.count == 1 else errors
 
     @property
     def _errors(self) -> tuple[Float[Array, "records times _"], ...]:
-        """Return the residuals with the axis of recordings, without the padding of a fit."""
+        """Return the residuals of each sensor with a leading axis of recordings.
+
+        The rows with which a fit pads the readings are left out.
+        """
         if self.linear is None:
             raise ValueError(
                 "Fit: wanted one with its errors, as identify.fit returns it, got linear = None"
@@ -227,7 +241,7 @@ class Fit(eqx.Module):
 
     @property
     def rms(self) -> tuple[float, ...]:
-        """Return the root mean square length of each sensor's errors, in its unit.
+        """Return the root mean square length of the errors of each sensor, in the sensor's unit.
 
         Readings at full scale are left out.
         """
@@ -242,10 +256,10 @@ class Fit(eqx.Module):
         return tuple(out)
 
     def interval(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Return the intervals of all reported quantities, as a dict of (low, high) by name.
+        """Return the intervals of all reported quantities, as a dict of name → (low, high).
 
-        The interval of a positive quantity is that of its logarithm. **Arguments:** `level` the
-        probability that an interval holds the true value. **Raises** `ValueError` for a level
+        The interval of a positive quantity is symmetric in its logarithm. **Arguments:** `level` is
+        the probability that an interval holds the true value. **Raises** `ValueError` for a level
         outside (0, 1).
         """
         return {quantity.name: quantity.interval(level) for quantity in self.quantities}
@@ -253,13 +267,14 @@ class Fit(eqx.Module):
     def interval_of(
         self, function: Callable[[Unpacked], Any], level: float = 0.95
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the interval (low, high) of a differentiable function of the fit.
+        """Return the interval (low, high) of a differentiable function of the fitted numbers.
 
-        It is computed from the covariance and the derivative of the function.
+        The interval is computed from the covariance and the derivative of the function.
 
         **Arguments:**
 
-        - `function`: from `Unpacked` to an array.
+        - `function`: a function that is given an `Unpacked` (the body, the states and the values at
+          a point) and returns an array.
         - `level`: the probability that the interval holds the true value.
 
         **Raises** as `interval`.
@@ -275,8 +290,8 @@ class Fit(eqx.Module):
             point = dataclasses.replace(point, noise=self.noises)
             return _checks.numeric_array(function(point), "function(point)")
 
-        # Compile one program for what x represents: outside of a trace each operation of JAX is a
-        # program of its own, and some ninety of them took seconds to compile.
+        # Unpack x in one compiled program: without `jit` each operation of JAX is compiled as a
+        # program of its own, and some ninety programs took seconds to compile.
         point, slopes = unpack_with_slopes(self.model, self.derivative_point)
         best = point if self.near is None else unpack_with_slopes(self.model, self.x)[0]
 
@@ -292,9 +307,9 @@ class Fit(eqx.Module):
         return interval_about(middle, slope, determined, null, reach, self.limits)
 
     def degrees_of_freedom(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom of the variances of functions whose derivative is `slope`.
+        """Return the degrees of freedom (…,) of the variance of each of several functions.
 
-        The `slope` (…, n) is taken with respect to the free numbers.
+        `slope` (…, n) holds the derivative of each function with respect to the n free numbers.
         """
         return (
             np.full(slope.shape[:-1], np.inf)
@@ -306,8 +321,8 @@ class Fit(eqx.Module):
     def undetermined_combinations(self) -> tuple[Combination, ...]:
         """Return the combinations of numbers that the data do not determine at all.
 
-        There are none if the data determine all numbers. Each combination has `names`, `changes`
-        and `in_words`.
+        The tuple is empty if the data determine all numbers. Each combination has `names`,
+        `changes` and `in_words`.
         """
         return undetermined_combinations(self)
 
@@ -318,8 +333,9 @@ class Fit(eqx.Module):
 
 
 def require_one_fit(fit: PyTree, name: str = "fit") -> Fit:
-    """Return the `fit`, and raise `TypeError` or `ValueError` unless it is one `Fit` and not a
-    batch.
+    """Return the `fit`, or raise an error that calls it `name`.
+
+    A `TypeError` is raised unless `fit` is a `Fit`, and a `ValueError` if it is a batch of fits.
     """
     _checks.require_instance(fit, Fit, name)
     if np.shape(fit.chi2) != ():

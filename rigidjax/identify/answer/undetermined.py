@@ -1,4 +1,4 @@
-"""Describe in words the numbers that a fit determines, and those that it does not."""
+"""Describe in words the numbers that a fit determines and the numbers that it does not."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -39,29 +39,31 @@ if TYPE_CHECKING:
 
 # A number belongs to a combination if it changes by more than this share of the largest change.
 PART = 1e-3
-# In the elimination a row counts as zero if its largest entry is below this share of the largest of
-# all entries.
+# In the elimination the remaining rows count as zero if all of their entries are below this share
+# of the largest entry of the matrix.
 ROUND_OFF = 1e-5
-# Two numbers change by the same factor if their factors differ by less than this share.
+# Several numbers change by the same factor if their relative changes differ by less than this share
+# of the largest relative change.
 EVEN = 0.01
-# Readings change along a direction if a hundredth of the sizes of the numbers moves the readings by
-# more than this number of standard deviations of all readings.
+# Readings change along a direction if a small step along it (of at most 0.01 in each free number)
+# moves all readings together by more than this number of standard deviations.
 CHANGED = 0.01
-# At most MOST names are written for a combination, and at most SEVERAL combinations.
+# A sentence on a combination lists at most MOST numbers, and a report has sentences on at most
+# SEVERAL combinations.
 MOST, SEVERAL = 6, 5
 
 
 class Combination(eqx.Module):
-    """Hold numbers that may change together without changing a reading.
+    """Hold a combination of numbers that may change together without changing a reading.
 
     **Fields:**
 
-    - `names`: of the numbers.
-    - `changes`: a small change of each.
-    - `units`: the unit of each change.
-    - `relative`: whether a change is relative instead.
-    - `unseen_switch`: whether readings do change, and only their derivatives do not, as for a time
-      or a state at which a torque switches.
+    - `names`: the names of the numbers.
+    - `changes`: a small change of each number.
+    - `units`: the unit of each change, "" for a relative change.
+    - `relative`: for each number, whether its change is relative.
+    - `unseen_switch`: whether the readings do change along the combination although their
+      derivatives are zero, as for a time or a state at which a torque switches.
 
     >>> Combination(("I1", "I2"), (0.01, 0.01), ("", ""), (True, True)).in_words
     'I1 and I2 rise together: only I1/I2 is determined.'
@@ -77,7 +79,7 @@ class Combination(eqx.Module):
 
     @property
     def in_words(self) -> str:
-        """Describe in a sentence or two what the data do not determine."""
+        """Describe the combination, which the data do not determine, in one or two sentences."""
         names, sizes = self.names, np.array(self.changes)
         if self.unseen_switch:
             return (
@@ -109,10 +111,11 @@ TENSOR = dict(zip(Tensor.plain_names, COMPONENTS, strict=True))
 
 
 def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
-    """Return the combinations that the data do not determine at all, each of few numbers.
+    """Return the combinations of numbers that the data of a fit do not determine at all.
 
-    By the reduced echelon form each combination has a number that no other combination has. Initial
-    attitudes are counted about the axes of the world or of the body, whichever need fewer numbers.
+    Each combination is made of few numbers: by the reduced echelon form it has one number that no
+    other combination has. Changes of the initial attitude are expressed about the axes of the world
+    or of the body, whichever makes combinations of fewer numbers.
     """
     null = np.asarray(fit.null_directions)
     if not null.size:
@@ -124,7 +127,8 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
     names, many = _names_and_units(fit.model), len(charts_by_suffix(fit.model))
     first, turns = len(labels(fit.model)), 3 * fit.model.count
     for other in (1, 0):
-        # Try attitudes about the axes of the world, then about those of the body.
+        # First leave out the changes of attitude about the axes of the body, then those about the
+        # axes of the world.
         begin = first + 6 * many + other * turns
         rows = np.delete(np.arange(len(names)), slice(begin, begin + turns))
         here, slope = [names[row] for row in rows], slopes[rows]
@@ -140,7 +144,8 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
         if best is None or np.count_nonzero(echelon) < np.count_nonzero(best[0]):
             best, basis = (echelon, here, size, values[rows]), changes
     assert best is not None and basis is not None
-    # Sort the combinations by their first numbers: the order of directions depends on round-off.
+    # Sort the combinations by the index of their first number: the order in which the elimination
+    # returns the combinations depends on round-off.
     rows = sorted((row for row in best[0] if row.any()), key=lambda row: np.flatnonzero(row)[0])
     switches = [_readings_change(fit, np.linalg.lstsq(basis.T, row)[0] @ null) for row in rows]
     both = zip(rows, switches, strict=True)
@@ -150,9 +155,10 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
 def _readings_change(fit: "Fit", direction: np.ndarray) -> bool:
     """Return whether readings change along a `direction` (n,) although their derivatives are zero.
 
-    This happens where a torque switches at a time or a state that the direction moves. Only the
-    part of the change that is odd in the step counts: a number that enters by its square has a
-    zero derivative, too, and makes an even change.
+    This happens if a torque switches at a time or a state that changes along the direction. The
+    change is half the difference of the readings after a step forwards and a step backwards. A
+    number on which the readings depend only by its square has zero derivatives, too, but it does
+    not change this difference.
     """
     if fit.model.torque is None:
         return False
@@ -172,14 +178,22 @@ def _combination_of_row(
     values: np.ndarray,
     switch: bool,
 ) -> Combination:
-    """Return the combination of a `row` (M,) of changes, with the `names`, `size` and `values` of
-    all M numbers.
+    """Return the `Combination` that a row of the reduced echelon form describes.
+
+    **Arguments:**
+
+    - `row`: (M,) the change of each of M numbers over the size of the number.
+    - `names`: the name and unit of each number, and whether its change is relative.
+    - `size`: (M,) the size of each number.
+    - `values`: (M,) the value of each number.
+    - `switch`: whether readings do change along the combination, because a torque switches.
     """
     order = np.flatnonzero(row)
-    # The largest change is a hundredth of the number, or of its size, and the first number rises.
+    # Scale the row so that its largest entry is a hundredth, and so that the first number rises.
+    # Multiply each entry by the size of its number.
     changes = 0.01 * np.sign(row[order[0]]) * row / np.abs(row).max() * size
     relative = np.array([name[2] for name in names])
-    # Numbers that all change by one factor get a shorter sentence.
+    # If all numbers change by the same factor, give relative changes: the sentence is then shorter.
     shares = np.where(relative, changes, changes / np.where(values == 0, np.inf, values))[order]
     if np.ptp(np.abs(shares)) < EVEN * np.abs(shares).max():
         changes[order] = 0.01 * shares / np.abs(shares).max()
@@ -194,8 +208,10 @@ def _combination_of_row(
 
 
 def _names_and_units(model: Model) -> list[tuple[str, str, bool]]:
-    """Return the name and the unit of each number of `_values_and_slopes`, and whether its changes
-    are relative.
+    """Return a row for each number that `_values_and_slopes` returns for this `model`.
+
+    A row holds the name of the number, its unit, and whether its changes are given as relative
+    changes.
     """
     out = labels(model)
     for name, chart in charts_by_suffix(model):
@@ -217,8 +233,8 @@ def _names_and_units(model: Model) -> list[tuple[str, str, bool]]:
 def _values_and_slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
     """Return the derivatives (M, n) and the values (M,) of all numbers that a report may name.
 
-    These are the reported numbers, the tensors of the bodies and the initial states, at a `point`
-    (n,) of the free numbers.
+    The numbers are the reported quantities, the components of the inertia tensors and the initial
+    states. The derivatives are taken with respect to the n free numbers, at `point` (n,).
     """
     reference = model.reference
     start = jax.vmap(ReferenceStates.start_at)(reference, point[model.index.start])
@@ -245,15 +261,16 @@ def _values_and_slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, 
 
 
 def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
-    """Return the mask (M,) of the numbers of which the `changes` (k, M) are to be reported.
+    """Return a mask (M,) of the numbers whose `changes` (k, M) along k directions are reported.
 
-    A body's tensor is reported by its moments, or by its components if changes turn its axes.
+    The changes of an inertia tensor are reported as changes of its moments, or as changes of its
+    components if some change turns its principal axes. `names` holds the names of the M numbers.
     """
     rows = bodies_of(fit.model, fit.derivative_point)
     mask = np.ones(len(names), bool)
     for (where, chart), body in zip(charts_by_suffix(fit.model), rows, strict=True):
-        # A chart may report the components of the tensor itself; the last entries of this name are
-        # those of `_values_and_slopes`.
+        # A chart may report the components of the tensor as well. Of several entries with one name,
+        # the last entry is the one that `_values_and_slopes` adds.
         every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]
         places = [some[-1] for some in every]
         mask[[i for some in every for i in some]] = False
@@ -264,7 +281,9 @@ def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.nda
 
 
 def _turn_axes(tensor: np.ndarray, changes: np.ndarray) -> bool:
-    """Return whether some of the `changes` (k, 6) of a `tensor` (3, 3) turn its principal axes."""
+    """Return whether any of the `changes` (k, 6) of the components of a `tensor` (3, 3) turns its
+    principal axes.
+    """
     steps = np.einsum("mk,kij->mij", changes, BASIS)
     _, axes = np.linalg.eigh(tensor)
     along = np.einsum("ia,kij,jb->kab", axes, steps, axes)
@@ -273,8 +292,10 @@ def _turn_axes(tensor: np.ndarray, changes: np.ndarray) -> bool:
 
 
 def _reduced_echelon_form(rows: np.ndarray) -> np.ndarray:
-    """Return the reduced echelon form of `rows` (k, M) by complete pivoting, with small entries set
-    to zero.
+    """Return the reduced row echelon form of a matrix, computed with complete pivoting.
+
+    `rows` (k, M) is the matrix. Rows that are zero up to round-off are left out, and small entries
+    are set to zero.
     """
     rows = np.array(rows)
     size, done = np.abs(rows).max(), 0
@@ -292,7 +313,7 @@ def _reduced_echelon_form(rows: np.ndarray) -> np.ndarray:
 
 
 def identifiability(fit: "Fit") -> tuple[str, ...]:
-    """Describe which quantities the data determine well, weakly, and not at all."""
+    """Describe which quantities the data of a fit determine well, weakly, and not at all."""
     lost = fit.explanation.word == FAILS
     if lost or fit.search.word == NOT_ENDED:
         why = "does not explain the data" if lost else "did not end in a minimum"
@@ -310,8 +331,9 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         first += len(chart.log_names) + len(chart.plain_names)
     for quantity in moments:
         wide = _half_width(quantity)
-        # The half-width of the logarithm is a relative one if it is narrow, and a factor if it is
-        # wide.
+        # `wide` is half the width of the interval of the logarithm. If it is small, it is the
+        # relative half-width; if it is large, the ends of the interval are exp(±wide) times the
+        # value.
         if not np.isfinite(wide) or wide > 1.5:
             out.append(f"{quantity.name} is not determined by these data.")
         elif wide > 0.05:
@@ -348,12 +370,18 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
 
 
 def _half_width(quantity: Quantity) -> float:
-    """Return half the width of the 95 % interval, for a positive quantity that of its logarithm."""
+    """Return half the width of the 95 % interval of a quantity.
+
+    For a positive quantity it is half the width of the interval of its logarithm.
+    """
     return float(quantile(0.95, quantity.freedom)) * reported_deviation(quantity)
 
 
 def _describe_rates(rates: Sequence[Quantity], count: int) -> str:
-    """Describe how well the initial body rates of `count` recordings are determined."""
+    """Describe how well the initial body rates of `count` recordings are determined.
+
+    `rates` holds the three components of each initial body rate, one after another.
+    """
     shares = []
     for index in range(count):
         three = rates[3 * index : 3 * index + 3]
@@ -369,7 +397,10 @@ def _describe_rates(rates: Sequence[Quantity], count: int) -> str:
 
 
 def _list_undetermined(fit: "Fit") -> list[str]:
-    """Describe what the data do not determine, in one sentence each."""
+    """Describe each combination of numbers that the data of a fit do not determine, in a sentence.
+
+    The list is empty if the data determine all numbers.
+    """
     combinations = undetermined_combinations(fit)
     if not combinations:
         return []
@@ -385,7 +416,11 @@ def _list_undetermined(fit: "Fit") -> list[str]:
 
 
 def scale_is_unseen(fit: "Fit") -> bool:
-    """Return whether an undetermined direction scales the whole body and changes nothing else."""
+    """Return whether the data leave the scale of the inertia tensor undetermined.
+
+    This is the case if some undetermined direction multiplies all components of the tensor by one
+    factor. For a model of several bodies the result is false.
+    """
     null = np.asarray(fit.null_directions)
     if not len(null) or isinstance(fit.model.chart, Bodies):
         return False
@@ -399,10 +434,11 @@ def scale_is_unseen(fit: "Fit") -> bool:
 
 
 def correlations(fit: "Fit") -> list[str]:
-    """Describe the pairs of reported quantities whose errors correlate by |ρ| > 0.95, in one
-    sentence each.
+    """Describe the pairs of reported quantities whose errors are strongly correlated.
 
-    Components of the tensor are left out: they follow from the moments and axes.
+    There is one sentence for each of at most five pairs with |ρ| > 0.95, where ρ is the correlation
+    coefficient. Components of the inertia tensor are left out, because they follow from the moments
+    and axes.
     """
     slope = np.asarray(value_and_slope(fit.model, fit.derivative_point)[1])[: len(fit.quantities)]
     covariance = slope @ np.asarray(fit.determined_covariance) @ slope.T
