@@ -1,10 +1,10 @@
 """Compute Carlson's symmetric elliptic integrals R_F, R_D, R_J and R_C.
 
 R_F and R_D are computed by duplication (Carlson 1995, doi 10.1007/BF02198293; DLMF 19.36(i)). Each
-step replaces every argument a by (a + λ)/4: this first halves the logarithm of the arguments'
-ratio, then divides their distance by four. In the end a Taylor series about their mean is exact to
-round-off. R_J is computed from its definition as an integral. The derivatives are integrals of the
-same kind (DLMF 19.18).
+step replaces every argument a by (a + λ)/4. The first steps halve the logarithm of the ratio of the
+arguments, and later steps divide the differences of the arguments by four. After the last step, a
+Taylor series about the mean of the arguments is exact to round-off. R_J is computed from its
+definition as an integral. The derivatives are integrals of the same kind (DLMF 19.18).
 """
 
 from functools import partial

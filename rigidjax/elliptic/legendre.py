@@ -7,7 +7,7 @@ differentiation:
     dI_jkl = [integrand at φ] dφ + (k + ½) I_{j+1,k+1,l} dm + l I_{j+1,k,l+1} dn
 
 F is I_000, E is I_{0,−1,0}, Π is I_001. Every integrand is positive, so no derivative is a
-difference of large numbers. The textbook formulas (DLMF 19.4) divide such differences by m m1.
+difference of large numbers. The textbook formulas (DLMF 19.4) divide such differences by m (1 − m).
 """
 
 import math
@@ -141,7 +141,7 @@ def ellippiinc(
 def integral(orders: tuple[int, int, int], sine: Array, cosine: Array, m1: Array, n1: Array) -> Any:
     """Return I_jkl for `orders` = (j, k, l), from the sine and cosine of φ with |φ| ≤ π/2.
 
-    It is computed from sine and cosine, not from φ, so that no digit is lost near π/2. `m1` is 1 −
+    The sine and the cosine are the arguments, not φ, so that no digit is lost near π/2. `m1` is 1 −
     m and `n1` is 1 − n.
     """
     j, k, last = orders
@@ -218,10 +218,11 @@ def _complete_first_kind_jvp(
 def _second_kind(s: Array, c2: Array, delta2: Array, m1: Array) -> Any:
     """Return E(φ|m) for |φ| ≤ π/2, from s = sin φ, c2 = cos²φ and delta2 = 1 − m s².
 
-    It follows DLMF 19.25.10 for 0 ≤ m ≤ 1 and DLMF 19.25.9 for m < 0: every term is then positive.
+    The formula is DLMF 19.25.10 for 0 ≤ m ≤ 1 and DLMF 19.25.9 for m < 0: with this choice every
+    term is positive.
     """
     m, one = 1 - m1, jnp.ones_like(s)
-    # E(φ|1) is sin φ; at φ = π/2 the terms below have no values of their own.
+    # E(φ|1) is sin φ; at φ = π/2 the terms below are not defined.
     end = delta2 == 0
     c2, delta2 = jnp.where(end, one, c2), jnp.where(end, one, delta2)
     above = m >= 0
