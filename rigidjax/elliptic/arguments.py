@@ -54,7 +54,7 @@ def complement_pair(name: str, value: Real, complement: Real | None) -> dict[str
 
 
 @jax.custom_jvp
-def exact_complement(value: Result, complement: Result) -> Any:
+def exact_complement(value: RealOrArray, complement: RealOrArray) -> Any:
     """Return `value` as a function of its `complement` (1 − `value`) alone.
 
     The derivative with respect to `complement` is −1, and the derivative with respect to `value` is
