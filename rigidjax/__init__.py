@@ -6,8 +6,8 @@ From the ground up: `quaternion`, `so3`, `euler` and `body`, `motion` and `torqu
 loaded when they are asked for. Most programs begin with `simulate`.
 
 Every function raises `TypeError` for an argument of another type (also half precision) and
-`ValueError` for a wrong shape; docstrings list the other errors. Under `jit` they are errors of
-`equinox`. A container of many states or bodies has equal leading axes in all of its parts;
+`ValueError` for a wrong shape; docstrings list the other errors. Under `jit` the errors are the
+ones of `equinox`. A container of many states or bodies has equal leading axes in all of its parts;
 functions and methods take one state or body. The examples assume `import rigidjax as rj` and
 `import jax.numpy as jnp`.
 """

@@ -27,11 +27,13 @@ _UNITS = {
     "t": "s", "ts": "s", "dt": "s", "delay": "s", "mass": "kg", "com": "m", "gravity": "m/s²",
     "i1": "kg m²", "i2": "kg m²", "i3": "kg m²", "inertia tensor": "kg m²", "torque": "N m",
 }  # fmt: skip
+# The powers of SI units in each unit, without angles.
 _DIMENSIONS: dict[str, dict[str, int]] = {
     "rad": {}, "rad/s": {"s": -1}, "s": {"s": 1}, "kg": {"kg": 1}, "m": {"m": 1},
     "m/s": {"m": 1, "s": -1}, "m/s²": {"m": 1, "s": -2}, "kg m²": {"kg": 1, "m": 2},
     "N m": {"kg": 1, "m": 2, "s": -2},
 }  # fmt: skip
+# The SI units of the dimensions of pint.
 _PINT = {"[length]": "m", "[mass]": "kg", "[time]": "s"}
 
 
@@ -48,8 +50,8 @@ def array_of_shape(
 
     Integers become the default float type. With `batched`, `value` may have leading axes before
     `shape`. `name` is the argument's name in messages, and `hint` a likely cause of a wrong shape.
-    A quantity with a unit must have the dimension of `unit`, or of the unit that belongs to `name`,
-    if there is one.
+    A quantity with a unit must have the dimension of `unit`; if `unit` is empty, it must have the
+    dimension of the unit that `_UNITS` lists for `name`, if any.
 
     **Raises:** `TypeError` for anything but an array of real numbers, for half precision (its 3
     digits cannot hold a rotation), and for another unit; `ValueError` for a wrong shape.
@@ -77,7 +79,9 @@ def _with_hint(hint: str) -> str:
 
 
 def type_name(value: object) -> str:
-    """Return the name of a value's type for a message, or of the value if it is a class."""
+    """Return the name of the type of `value` for a message; for an array the shape, and for a class
+    the name of the class.
+    """
     if isinstance(value, jax.Array):
         return f"an array of shape {value.shape}"
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
@@ -104,10 +108,11 @@ def numeric_array(value: object, name: str, unit: str = "") -> Array:
 
 
 def data_and_mask(value: object) -> tuple[Any, np.ndarray | None]:
-    """Return the data of a masked array and its mask, true where an entry has no value.
+    """Return two things: the data of a masked array; and its mask, true where an entry has no
+    value.
 
-    The mask is `None` if no entry is masked, and for a value that is no masked array, which is
-    returned unchanged.
+    The mask is `None` if no entry is masked. A value that is no masked array is returned unchanged,
+    with the mask `None`.
     """
     mask = getattr(value, "mask", None) if isinstance(value, np.ndarray) else None
     if mask is None:
@@ -133,9 +138,9 @@ def without_mask(value: object, name: str) -> Any:
 
 
 def _convert_to_si(value: Any, name: str, si_unit: str = "") -> Any:
-    """Return the numbers of quantities of astropy or pint in SI, and those of SciPy's `Rotation`.
+    """Return the numbers in SI units of a quantity of astropy or pint.
 
-    A `Rotation` becomes its quaternion (w, x, y, z). Other values are returned as they are.
+    A `Rotation` of SciPy becomes its quaternion (w, x, y, z). Other values are returned unchanged.
     """
     if is_rotation(value):
         # Written out, since `as_quat(scalar_first=True)` needs SciPy 1.14.
@@ -225,8 +230,8 @@ def namespace(value: object) -> Any:
 def error_if(value: PyTree, bad: Bool[ArrayLike, "..."], message: str) -> Any:
     """Return `value` unless `bad`; then raise an error with `message`, also under `jit`.
 
-    Outside a trace this is a `ValueError` with the text alone. Inside a trace it is
-    `equinox.error_if`; the result must be used, or the check is dropped.
+    Outside a trace the error is a `ValueError` with `message` alone. Inside a trace
+    `equinox.error_if` raises the error; the result must be used, or the check is dropped.
     """
     if is_known(bad):
         if bool(np.any(np.asarray(bad))):
@@ -236,26 +241,29 @@ def error_if(value: PyTree, bad: Bool[ArrayLike, "..."], message: str) -> Any:
 
 
 def own_sentence(error: RuntimeError) -> RuntimeError:
-    r"""Return an equal error with its own sentence alone, without the long text that Equinox
-    adds.
+    r"""Return an error of the same type, with the sentence of the check alone, without the long
+    text that Equinox adds.
     """
     match = re.search(r"^\S*EquinoxRuntimeError: (.+?)\n\n-+$", str(error), re.M | re.S)
     return type(error)(match[1]) if match else error
 
 
-# From so many rows on one compiled pass is quicker than NumPy, and they stay on their device.
+# For more rows than this number, one compiled pass is quicker than NumPy, and the rows stay on
+# their device.
 _MANY = 4096
 
 
 def first_bad_row(faults: Callable[[Any, Any], Any], rows: Array | np.ndarray) -> Any:
     """Return the index of the first of these known rows (n, …) that has a fault, −1 if none has.
 
-    `faults(xp, rows)` is (n,), true where there is one, by the functions of `xp`, which is NumPy or
-    `jax.numpy`. Define it once: for many rows it is compiled, and nobody waits for the index here.
+    `faults(xp, rows)` returns an array (n,) that is true for the rows with a fault; it uses the
+    functions of `xp`, which is NumPy or `jax.numpy`. Define `faults` once, at the head of a module:
+    for many rows it is compiled, and is compiled again for each new function. The index may be an
+    array of JAX that is still being computed.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         if rows.shape[0] > _MANY:
-            # Also within a trace, in which the index would not be known.
+            # Compute the index at once also within a trace, where it would otherwise not be known.
             with jax.ensure_compile_time_eval():
                 return _compiled_index_of_first(faults, rows)
         return _index_of_first_true(np, faults(np, np.asarray(rows)))
@@ -318,7 +326,9 @@ def require_sign(value: Array, name: str, requirement: str, *, zero: bool = Fals
 
 
 def check_if_known(check: Callable[..., Array], value: Array, *args: Any, **options: Any) -> Array:
-    """Return `check(value, …)` for known numbers, at least one; return other values unchanged."""
+    """Return `check(value, …)` if `value` holds known numbers, at least one; else return `value`
+    unchanged.
+    """
     return check(value, *args, **options) if is_known(value) and value.size else value
 
 
@@ -374,8 +384,9 @@ def require_single(
 def require_function(value: object, name: str, description: str, *, hint: str = "") -> Any:
     """Return `value` if it is a function and no class.
 
-    `description` is that of arguments and result for messages, such as "t → (3,)". The number of
-    arguments is checked if it begins with their list: "(t, state, body) → scalar".
+    `description` describes the arguments and the result in messages, such as "t → (3,)". If it
+    begins with a list of the arguments, as in "(t, state, body) → scalar", the number of arguments
+    is checked.
     """
     got = type_name(value)
     if callable(value) and not isinstance(value, type):
@@ -467,7 +478,9 @@ def escape_controls(text: object) -> str:
 
 
 def escape_formulas(text: object) -> str:
-    """Return the text as matplotlib shows it unchanged: no formula between `$`, no hidden label."""
+    """Return the text in a form that matplotlib shows unchanged: no formula between `$`, and no `_`
+    at the beginning, which would hide a label.
+    """
     text = str(text).replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
@@ -484,7 +497,7 @@ def _describe(value: object) -> str:
 
 
 def random_key(value: object, name: str = "key") -> Any:
-    """Return `value` if it is one random key of JAX, new or old."""
+    """Return `value` if it is one random key of JAX, of the new or of the old type."""
     array = isinstance(value, jax.Array)
     if array and jnp.issubdtype(value.dtype, jax.dtypes.prng_key) and value.shape == ():
         return value

@@ -39,7 +39,9 @@ def raise_attribute_error(module: str, name: str) -> ModuleType:
 
 @functools.cache
 def _public_paths() -> dict[str, str]:
-    """Return the shortest path of each public name, as `rj.torques.Sum`, also by its lower case."""
+    """Return the shortest path, such as `rj.torques.Sum`, of each public name; the keys are the
+    names as they are written, and in lower case.
+    """
     modules, paths = [("rj", sys.modules["rigidjax"])], {}
     for path, module in modules:
         for name in dir(module):

@@ -21,7 +21,9 @@ def fields_as_text(self: Any) -> str:
 
 
 def as_text(value: object) -> str:
-    """Return the numbers of an array, or its shape if it is traced or has many."""
+    """Return the numbers of an array as text; of a traced array, and of an array with more than
+    `MOST` numbers, return the shape.
+    """
     is_array = isinstance(value, (jax.Array, np.ndarray))
     if not is_array or isinstance(value, Tracer) or value.size > MOST:
         return eqx.tree_pformat(value)
@@ -29,8 +31,10 @@ def as_text(value: object) -> str:
 
 
 def time_as_text(t: Any, span: Any, digits: int = 6) -> str:
-    """Return a time with `digits` digits of the `span` of its record: seconds since 1970 need more
-    of them.
+    """Return the time `t` as text, so that differences of `span` (the duration of the record) keep
+    `digits` digits.
+
+    A time that is large beside the span, such as seconds since 1970, has more digits.
     """
     t, span = float(t), float(span)
     more = np.log10(abs(t) / span) if span > 0 and 0 < abs(t) < np.inf else 0.0

@@ -4,6 +4,8 @@ Functions return `Vec3`, `Mat3`, `Quat`, `Scalar`: JAX arrays. They take the `â€
 NumPy-like of the same shape. A function takes one body at a time; batch with `jax.vmap`.
 """
 
+import sys
+import typing
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -29,6 +31,14 @@ RealLike = Scalar | np.ndarray | float | int
 Vec3Like = Float[ArrayLike, "3"]
 Mat3Like = Float[ArrayLike, "3 3"]
 QuatLike = Float[ArrayLike, "4"] | Rotation
+
+if not typing.TYPE_CHECKING and sys.version_info >= (3, 12):
+    # So that `help` and editors show the name in place of a union. (beartype does not read such a
+    # type on Python 3.11.)
+    ScalarLike = typing.TypeAliasType("ScalarLike", ScalarLike)
+    Vec3Like = typing.TypeAliasType("Vec3Like", Vec3Like)
+    Mat3Like = typing.TypeAliasType("Mat3Like", Mat3Like)
+    QuatLike = typing.TypeAliasType("QuatLike", QuatLike)
 
 # Constructors take an array, or nested lists of numbers.
 Numbers = Sequence[Any]

@@ -40,7 +40,7 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     hint = "for an Inertia use pack_second_moment(body.second_moment), or pack_shape"
     _checks.require_single(body, MassProperties, "body", hint=hint)
     alpha = _bend_exponent(0.5 * jnp.log(body.mass), jnp.expm1)
-    shape = _factors(body.second_moment / body.mass)
+    shape = _log_scale_and_stretch(body.second_moment / body.mass)
     return jnp.concatenate([alpha[None], shape, body.com])
 
 
@@ -70,7 +70,7 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
     >>> pack_second_moment(jnp.eye(3))
     Array([0., 0., 0., 0., 0., 0.], dtype=float64)
     """
-    return _factors(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))
+    return _log_scale_and_stretch(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))
 
 
 def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
@@ -96,7 +96,9 @@ def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
     >>> pack_shape(jnp.diag(jnp.array([4.0, 4.0, 0.0])))  # a plate
     Array([0.5, 0.5, 0. , 0. , 0. ], dtype=float64)
     """
-    return _factors(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))[1:]
+    return _log_scale_and_stretch(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))[
+        1:
+    ]
 
 
 def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
@@ -202,7 +204,7 @@ def _root_of_trace_three(shape: Float[Array, "5"]) -> Mat3:
     return from_components(1.0 + d1, 1.0 + d2, 1.0 - d1 - d2, s12, s13, s23)
 
 
-def _factors(s: Mat3) -> Float[Array, "6"]:
+def _log_scale_and_stretch(s: Mat3) -> Float[Array, "6"]:
     """Return (ρ, d1, d2, s12, s23, s13) of 𝔖 = 3 e^{2ρ} (1 + V)² / Tr (1 + V)²."""
     total = _refuse_point(s[0, 0] + s[1, 1] + s[2, 2])
     root = _square_root(_quotient(require_real_second_moment(s), total))

@@ -12,10 +12,10 @@ from rigidjax.rotation.barrier import batch_as
 
 # The arguments and results of all functions are real numbers, of shapes that broadcast.
 Real = Float[ArrayLike, "..."]
-Result = Float[Array, "..."]
+RealOrArray = Float[Array, "..."]
 
 
-def to_common_dtype(**named: Real) -> tuple[Result, ...]:
+def to_common_dtype(**named: Real) -> tuple[RealOrArray, ...]:
     """Convert the arguments to arrays of one dtype and shape; Python numbers take the dtype of the
     arrays.
     """
@@ -55,8 +55,10 @@ def complement_pair(name: str, value: Real, complement: Real | None) -> dict[str
 
 @jax.custom_jvp
 def exact_complement(value: Result, complement: Result) -> Any:
-    """Return `value`, with the derivative −1 by its `complement` (1 − `value`) and the derivative 0
-    by itself.
+    """Return `value` as a function of its `complement` (1 − `value`) alone.
+
+    The derivative with respect to `complement` is −1, and the derivative with respect to `value` is
+    0.
     """
     return batch_as(value, complement)
 

@@ -1,10 +1,10 @@
 """Compute Carlson's symmetric elliptic integrals R_F, R_D, R_J and R_C.
 
 R_F and R_D are computed by duplication (Carlson 1995, doi 10.1007/BF02198293; DLMF 19.36(i)). Each
-step replaces every argument a by (a + λ)/4: this first halves the logarithm of the arguments'
-ratio, then divides their distance by four. In the end a Taylor series about their mean is exact to
-round-off. R_J is computed from its definition as an integral. The derivatives are integrals of the
-same kind (DLMF 19.18).
+step replaces every argument a by (a + λ)/4. The first steps halve the logarithm of the ratio of the
+arguments, and later steps divide the differences of the arguments by four. After the last step, a
+Taylor series about the mean of the arguments is exact to round-off. R_J is computed from its
+definition as an integral. The derivatives are integrals of the same kind (DLMF 19.18).
 """
 
 from functools import partial
@@ -16,14 +16,14 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from rigidjax.elliptic.arguments import Real, Result, to_common_dtype
+from rigidjax.elliptic.arguments import Real, RealOrArray, to_common_dtype
 from rigidjax.elliptic.carlson_r import directional_derivative, nan_below_zero, r_integral, scale_of
 
 # After this number of steps the series is exact for ratios over the whole range of the dtype.
 _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}
 
 
-def rf(x: Real, y: Real, z: Real) -> Result:
+def rf(x: Real, y: Real, z: Real) -> RealOrArray:
     """Return Carlson's integral of the first kind, R_F(x, y, z) = ½ ∫₀^∞ dt / √((t+x)(t+y)(t+z)).
 
     **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, all in one unit. Two zeros give
@@ -38,7 +38,7 @@ def rf(x: Real, y: Real, z: Real) -> Result:
     return _rf(to_common_dtype(x=x, y=y, z=z))
 
 
-def rd(x: Real, y: Real, z: Real) -> Result:
+def rd(x: Real, y: Real, z: Real) -> RealOrArray:
     """Return Carlson's R_D(x, y, z) = (3/2) ∫₀^∞ dt / ((t+z) √((t+x)(t+y)(t+z))), of the second
     kind.
 
@@ -53,7 +53,7 @@ def rd(x: Real, y: Real, z: Real) -> Result:
     return _rd(to_common_dtype(x=x, y=y, z=z))
 
 
-def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
+def rj_(x: Real, y: Real, z: Real, p: Real) -> RealOrArray:
     """Return Carlson's R_J(x, y, z, p) = (3/2) ∫₀^∞ dt / ((t+p) √((t+x)(t+y)(t+z))), of the third
     kind.
 
@@ -70,7 +70,7 @@ def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
     return 1.5 * r_integral((0.5, 0.5, 0.5, 1.0), to_common_dtype(x=x, y=y, z=z, p=p))
 
 
-def rc(x: Real, y: Real) -> Result:
+def rc(x: Real, y: Real) -> RealOrArray:
     """Return Carlson's R_C(x, y) = R_F(x, y, y) = ½ ∫₀^∞ dt / ((t+y) √(t+x)), made of arctangents
     and logarithms.
 

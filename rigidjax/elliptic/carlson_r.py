@@ -22,7 +22,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from rigidjax.elliptic.arguments import Result
+from rigidjax.elliptic.arguments import RealOrArray
 
 # With these numbers of nodes the step is h < 0.5 (float64) or h < 0.9 (float32) for arguments in
 # ratios of 1e35.
@@ -33,7 +33,7 @@ _UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def r_integral(powers: tuple[float, ...], arguments: tuple[Result, ...]) -> Result:
+def r_integral(powers: tuple[float, ...], arguments: tuple[RealOrArray, ...]) -> RealOrArray:
     """Return ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt, where aᵢ are the `arguments` and bᵢ the `powers`.
 
     The aᵢ must be ≥ 0, the bᵢ multiples of ½, and the sum of the bᵢ must be above 1.
@@ -59,7 +59,7 @@ def r_integral(powers: tuple[float, ...], arguments: tuple[Result, ...]) -> Resu
     count = (jnp.arange(nodes, dtype=dtype) + 0.5).reshape((nodes,) + (1,) * scale.ndim)
     t = jnp.exp(low[None] + step[None] * count)
 
-    # Begin the product with t: it then stays between the sizes of its factors.
+    # Begin the product with t: the product then stays between the sizes of its factors.
     product = t
     for a, power in zip(scaled, powers, strict=True):
         product = _divide(product, t + a[None], power)
@@ -83,7 +83,7 @@ def directional_derivative(
     arguments: tuple[Array, ...],
     directions: tuple[Array | SymbolicZero, ...],
 ) -> Any:
-    """Return the derivative of `r_integral` if its `arguments` move along `directions`."""
+    """Return the derivative of `r_integral` with respect to the `arguments`, along `directions`."""
     tangent = jnp.zeros_like(arguments[0])
     for i, direction in enumerate(directions):
         if powers[i] and not isinstance(direction, SymbolicZero):
@@ -102,8 +102,6 @@ def scale_of(arguments: tuple[Array, ...]) -> Any:
     """Return the largest of the `arguments`, or 1 if all are 0.
 
     The integrals are homogeneous: if the arguments are divided by this number, no square overflows.
-
-    The integrals are homogeneous: with arguments divided by it no square overflows.
     """
     largest = functools.reduce(jnp.maximum, arguments)
     return jnp.where(largest > 0, largest, 1)
@@ -112,7 +110,7 @@ def scale_of(arguments: tuple[Array, ...]) -> Any:
 def _divide(value: Array, x: Array, power: float) -> Any:
     """Return `value` divided by x^power, where `power` is a multiple of ½.
 
-    It divides by one factor x or √x after the other.
+    The value is divided by one factor x or √x after the other.
     """
     whole = math.floor(power)
     if power > whole:

@@ -8,8 +8,9 @@ For the derivatives, let φ = am(u|m) and u = F(φ|m). The derivative at fixed u
     X = −∂F/∂m = −½ ∫₀^u sd²(v) dv.
 
 The integrand is positive: X has all its digits at m = 0 and as m → 1, where the textbook formulas
-(Byrd & Friedman 1971, 710.51–53) divide a small difference by m m1. The second derivative in m also
-comes from X for m ≤ 0.9 or |u| ≤ 1, and otherwise from a sum over images (`jacobi_near_one.py`).
+(Byrd & Friedman 1971, 710.51–53) divide a small difference by m (1 − m). The second derivative with
+respect to m also comes from X for m ≤ 0.9 or |u| ≤ 1, and otherwise from a sum of hyperbolic
+functions, one for each half period (`jacobi_near_one.py`).
 """
 
 import math
@@ -24,7 +25,7 @@ from jaxtyping import Array, PyTree
 
 from rigidjax.elliptic.arguments import (
     Real,
-    Result,
+    RealOrArray,
     complement_pair,
     exact_complement,
     to_common_dtype,
@@ -33,24 +34,26 @@ from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, sncndn_near_one
 from rigidjax.elliptic.legendre import complete_integral, integral, mean_iterates
 from rigidjax.rotation.stumpff import half_turns, parity
 
-# If cn and dn are below this number, integrals over sd² depend on the ratio of cn and dn only (to
-# the square of the number).
+# If cn and dn are below this number, integrals over sd² depend on the ratio of cn and dn only, with
+# a relative error of about the square of this number.
 _FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
 
 
-def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Result]:
+def sncndn(
+    u: Real, m: Real, m1: Real | None = None
+) -> tuple[RealOrArray, RealOrArray, RealOrArray]:
     """Return Jacobi's elliptic functions sn(u|m), cn(u|m) and dn(u|m).
 
     **Arguments:**
 
     - `u`: real; the error grows as |u| eps.
     - `m`: the parameter k² (not the modulus k), any real number.
-    - `m1`: 1 − m. Give it if m is so near 1 that 1 − m loses digits: values and derivatives then
-      belong to m1, and m is used only where it is small.
+    - `m1`: 1 − m. Give it if m is so near 1 that 1 − m loses digits: values and derivatives are
+      then computed from m1, and m is used only where it is small.
 
     **Returns** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech, sech
-    (DLMF 22.5.3–4); m < 0 and m > 1 follow from DLMF 22.17. Derivatives of every order by u (DLMF
-    22.13(i)), m and m1 are exact.
+    (DLMF 22.5.3–4); m < 0 and m > 1 follow from DLMF 22.17. Derivatives of every order with respect
+    to u (DLMF 22.13(i)), m and m1 are exact.
 
     >>> [round(float(x), 12) for x in sncndn(1.0, 0.5)]
     [0.803001824896, 0.595976567672, 0.823161001632]
@@ -60,7 +63,7 @@ def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Re
     return s, c, d
 
 
-def am(u: Real, m: Real, m1: Real | None = None) -> Result:
+def am(u: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     """Return Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad, which is the inverse of F(φ|m) for m ≤ 1.
 
     **Arguments:** as `sncndn`. **Returns:** φ (DLMF 22.16.1–3). For m ≤ 1 it grows by π in each
@@ -76,7 +79,9 @@ def am(u: Real, m: Real, m1: Real | None = None) -> Result:
 
 
 def _functions_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any, Any]:
-    """Return sn, cn and dn for any real m, and the number of half turns in the amplitude."""
+    """Return four things: sn, cn and dn for any real m, and the number of half turns in the
+    amplitude.
+    """
     # By DLMF 22.17.2–4, m > 1 becomes 1/m, and cn and dn change places.
     above = m1 < 0
     divisor = jnp.where(above, m, 1)
@@ -114,7 +119,8 @@ def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
     c = jnp.where(tiny, 1 - square / 2, c)
     d = jnp.where(tiny, 1 - m * square / 2, d)
 
-    # This is the case m = 1. Beyond the clip sech would underflow, and its quotients with it.
+    # This is the case m = 1. Beyond the clip, sech would underflow, and quotients with sech would
+    # be wrong.
     largest = 0.97 * math.log(float(jnp.finfo(u.dtype).max))
     e = jnp.exp(-jnp.minimum(jnp.abs(u), largest))
     sech = 2 * e / (1 + e * e)
@@ -129,7 +135,7 @@ def _sncndn_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tu
     s, c, d = _sncndn(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
-        # The derivatives by u are DLMF 22.13.1–3.
+        # The derivatives with respect to u are DLMF 22.13.1–3.
         ds, dc, dd = c * d * du, -s * d * du, -m * s * c * du
     if not isinstance(dm1, SymbolicZero):
         sm, cm, dm = _derivatives_by_m(u, m, m1)
@@ -155,8 +161,8 @@ def _derivatives_by_m_jvp(
         ds, dc = (cm * d + c * dm) * du, -(sm * d + s * dm) * du
         dd = -(s * c + m * (sm * c + s * cm)) * du
     if not isinstance(dm1, SymbolicZero):
-        # Use the images for large u only: for small u they cancel to leave u³, while the integral
-        # then has no large terms.
+        # Use the sum over images for large u only: for small u the terms of the sum cancel to leave
+        # u³, while the integral has no large terms.
         near = (m1 < LARGEST_M1) & (jnp.abs(u) > 1)
         middle, one = jnp.full_like(m1, 0.5), jnp.ones_like(m1)
         far_m, far_m1 = jnp.where(near, middle, m), jnp.where(near, middle, m1)
@@ -174,17 +180,18 @@ def _derivatives_by_m_jvp(
 
 
 def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
-    """Return the derivatives of sn, cn and dn with respect to m, as their derivatives by the
-    amplitude φ times dn X.
+    """Return the derivatives of sn, cn and dn with respect to m at a fixed u, from the derivative
+    dn X of the amplitude φ with respect to m.
 
-    X is the integral in the docstring of this module; Carlson's R_D gives it for u reduced by half
+    X is the integral in the docstring of this module; Carlson's R_D gives X for u reduced by half
     periods.
     """
     s, c, d = _sncndn(u, m, m1)
     turns = _reduce_argument(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = parity(turns)
-    # X ~ 1/dn² must not overflow. If cn and dn are minute, X depends on their ratio only, except
-    # for a factor (to the square of the floor): multiply both by the same large number.
+    # X grows as 1/dn² and must not overflow. If cn and dn are tiny, X depends, except for a factor,
+    # only on the ratio of cn and dn (to the square of the floor): multiply cn and dn by the same
+    # large number.
     up = jnp.maximum(1, _FLOOR[np.dtype(u.dtype)] / jax.lax.stop_gradient(d))
     c, d, raised = c * up, d * up, m1 * up * up
     near = turns == 0
@@ -195,10 +202,8 @@ def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Any, Any,
 
 
 def _reduce_argument(u: Array, m1: Array) -> tuple[Any, Any, list[tuple[Any, Any]]]:
-    """Return the parts of the reduced argument, u = 2Kn + r.
-
-    They are n, the angle πr/2K, and the iterates of the arithmetic and geometric means of 1 and
-    √m1.
+    """Return three things for the reduced argument r in u = 2Kn + r: the number n of half periods;
+    the angle πr/(2K); and the iterates of the arithmetic and geometric means of 1 and √m1.
     """
     rows = mean_iterates(jnp.where(m1 == 0, 1, m1))
     turns, angle = half_turns(u * rows[-1][0])

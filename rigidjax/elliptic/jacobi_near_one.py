@@ -19,16 +19,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from rigidjax.elliptic.arguments import Result
+from rigidjax.elliptic.arguments import RealOrArray
 from rigidjax.rotation.stumpff import parity
 
-# For m1 up to this number the nome is below 0.0066: a few images, and two terms of the nome's own
-# series, are enough.
+# For m1 up to this number the nome is below 0.0066: a few images, and two terms of the series of
+# the nome in m1, are enough.
 LARGEST_M1 = 0.1
+# On either side of the nearest image, so many images are summed.
 _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 
 
-def sncndn_near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
+def sncndn_near_one(
+    u: RealOrArray, m: RealOrArray, m1: RealOrArray
+) -> tuple[RealOrArray, RealOrArray, RealOrArray]:
     """Return sn, cn and dn for 0 ≤ m1 ≤ 0.1, with an absolute error of the round-off of 1.
 
     The tangents of m must be minus the tangents of m1 = 1 − m.
@@ -66,9 +69,10 @@ def sncndn_near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, R
 
 @jax.custom_jvp
 def _power_exp(p: Array, y: Array, n: Array) -> Any:
-    """Return pⁿ e^y, with exact derivatives by p.
+    """Return pⁿ e^y, with exact derivatives with respect to p.
 
-    For n = 1 the second derivative by p is exactly 0; that of exp(y + n ln p) is not.
+    For n = 1 the second derivative with respect to p is exactly 0; if JAX differentiated exp(y + n
+    ln p), round-off would be left.
     """
     return jnp.exp(y + jnp.where(n == 0, 0, n * jnp.log(p)))
 

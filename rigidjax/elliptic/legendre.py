@@ -7,7 +7,7 @@ differentiation:
     dI_jkl = [integrand at φ] dφ + (k + ½) I_{j+1,k+1,l} dm + l I_{j+1,k,l+1} dn
 
 F is I_000, E is I_{0,−1,0}, Π is I_001. Every integrand is positive, so no derivative is a
-difference of large numbers. The textbook formulas (DLMF 19.4) divide such differences by m m1.
+difference of large numbers. The textbook formulas (DLMF 19.4) divide such differences by m (1 − m).
 """
 
 import math
@@ -20,7 +20,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from rigidjax.elliptic.arguments import Real, Result, complement_pair, to_common_dtype
+from rigidjax.elliptic.arguments import Real, RealOrArray, complement_pair, to_common_dtype
 from rigidjax.elliptic.carlson import rd, rf
 from rigidjax.elliptic.carlson_r import r_integral
 from rigidjax.rotation.stumpff import half_turns
@@ -30,7 +30,7 @@ from rigidjax.rotation.stumpff import half_turns
 _MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
 
 
-def ellipk(m: Real, m1: Real | None = None) -> Result:
+def ellipk(m: Real, m1: Real | None = None) -> RealOrArray:
     """Return the complete elliptic integral of the first kind, K(m) = ∫₀^{π/2} dθ/√(1 − m sin²θ).
 
     **Arguments:**
@@ -49,7 +49,7 @@ def ellipk(m: Real, m1: Real | None = None) -> Result:
     return _complete_first_kind(m1)
 
 
-def ellipe(m: Real, m1: Real | None = None) -> Result:
+def ellipe(m: Real, m1: Real | None = None) -> RealOrArray:
     """Return the complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
 
     **Arguments:** `m` ≤ 1 the parameter k² (a larger one gives NaN); `m1` as for `ellipk`.
@@ -63,7 +63,7 @@ def ellipe(m: Real, m1: Real | None = None) -> Result:
     return complete_integral((0, -1, 0), m1)
 
 
-def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) -> Result:
+def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) -> RealOrArray:
     """Return the complete integral of the third kind, ∫₀^{π/2} dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
     **Arguments**, in the order of Wolfram and mpmath:
@@ -83,7 +83,7 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
     return complete_integral((0, 0, 1), m1, n1)
 
 
-def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
+def ellipf(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     """Return the incomplete elliptic integral of the first kind, F(φ|m) = ∫₀^φ dθ/√(1 − m sin²θ).
 
     **Arguments:** `phi` the amplitude, rad, of any size; `m` the parameter k² with m sin²φ < 1
@@ -98,7 +98,7 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
     return _integral_at_any_amplitude((0, 0, 0), phi, m1)
 
 
-def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
+def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     """Return the incomplete elliptic integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ.
 
     **Arguments:** `phi` the amplitude, rad, of any size; `m` ≤ 1 the parameter k² (a larger one
@@ -116,7 +116,7 @@ def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
 
 def ellippiinc(
     n: Real, phi: Real, m: Real, m1: Real | None = None, n1: Real | None = None
-) -> Result:
+) -> RealOrArray:
     """Return the incomplete integral of the third kind, ∫₀^φ dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
     **Arguments**, in the order of Wolfram and mpmath:
@@ -141,7 +141,7 @@ def ellippiinc(
 def integral(orders: tuple[int, int, int], sine: Array, cosine: Array, m1: Array, n1: Array) -> Any:
     """Return I_jkl for `orders` = (j, k, l), from the sine and cosine of φ with |φ| ≤ π/2.
 
-    It is computed from sine and cosine, not from φ, so that no digit is lost near π/2. `m1` is 1 −
+    The sine and the cosine are the arguments, not φ, so that no digit is lost near π/2. `m1` is 1 −
     m and `n1` is 1 − n.
     """
     j, k, last = orders
@@ -218,10 +218,11 @@ def _complete_first_kind_jvp(
 def _second_kind(s: Array, c2: Array, delta2: Array, m1: Array) -> Any:
     """Return E(φ|m) for |φ| ≤ π/2, from s = sin φ, c2 = cos²φ and delta2 = 1 − m s².
 
-    It follows DLMF 19.25.10 for 0 ≤ m ≤ 1 and DLMF 19.25.9 for m < 0: every term is then positive.
+    The formula is DLMF 19.25.10 for 0 ≤ m ≤ 1 and DLMF 19.25.9 for m < 0: with this choice every
+    term is positive.
     """
     m, one = 1 - m1, jnp.ones_like(s)
-    # E(φ|1) is sin φ; at φ = π/2 the terms below have no values of their own.
+    # E(φ|1) is sin φ; at φ = π/2 the terms below are not defined.
     end = delta2 == 0
     c2, delta2 = jnp.where(end, one, c2), jnp.where(end, one, delta2)
     above = m >= 0

@@ -1,4 +1,5 @@
-"""Compute the values of the free motion in principal axes, as tuples of components.
+"""Compute the motion of a free body in principal axes; vectors and quaternions are tuples of
+scalars.
 
 The module `rigidjax.exact.derivatives` has the derivatives of these values.
 """
@@ -19,7 +20,7 @@ from rigidjax.exact.jacobi_duplication import (
     elliptic,
     half_period,
 )
-from rigidjax.rotation.barrier import barrier, one_kernel
+from rigidjax.rotation.barrier import barrier, compiled_as_one_kernel
 
 
 class Orbit(NamedTuple):
@@ -28,22 +29,22 @@ class Orbit(NamedTuple):
     """
 
     a: Scalar  # the reciprocal of the moment of axis 1
-    d12: Scalar  # 1/I₁ − 1/I₂; below 1/I₁ − 1/I₃ and 1/I₂ − 1/I₃
-    d13: Scalar
-    d23: Scalar
+    d12: Scalar  # 1/I₁ − 1/I₂
+    d13: Scalar  # 1/I₁ − 1/I₃
+    d23: Scalar  # 1/I₂ − 1/I₃
     P: Triple  # the initial momentum
     h: Scalar  # the length of the momentum
     modulus: Modulus
-    mu: Scalar
-    turn: Scalar
+    mu: Scalar  # the number μ of the phase ξ (see `elliptic`)
+    turn: Scalar  # the factor of the phase ξ (see `elliptic`)
     half: HalfPeriod
     swapped: Float[Array, ""]  # whether axis 1 has the largest moment
 
 
-@one_kernel
+@compiled_as_one_kernel
 def orbit(moments: Triple, momentum: Triple) -> Orbit:
     """Return the constants of the motion of a body with the principal moments I₁ ≤ I₂ ≤ I₃, any of
-    which may be equal.
+    which may be equal, and the initial body momentum `momentum`.
     """
     (i1, i2, i3), (p1, p2, p3) = moments, momentum
     r1, r2, r3 = 1.0 / i1, 1.0 / i2, 1.0 / i3
@@ -71,22 +72,25 @@ class ReducedTime(NamedTuple):
     """Hold a time from which a whole number of half periods was subtracted."""
 
     halves: Scalar  # the number of half periods that were subtracted
-    rest: Scalar
-    near: Scalar  # `rest`; on the separatrix clipped to the time to come to rest
+    rest: Scalar  # the time that is left
+    near: Scalar  # equal to `rest`, but clipped on the separatrix where the motion is at rest
 
 
 def reduce_time(u: Scalar, half_period: Scalar, m: Modulus) -> ReducedTime:
-    """Return the time u reduced by a whole number of half periods of length `half_period`."""
+    """Return the time u reduced by a whole number of half periods of length `half_period`.
+
+    The modulus `m` tells whether the motion is on the separatrix, where it comes to rest.
+    """
     count = jnp.round(u / half_period)
     rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half_period)
     return ReducedTime(count, rest, clip_at_rest(rest, m))
 
 
 def restore_periods(o: Orbit, f: Elliptic, u: ReducedTime) -> tuple[Elliptic, Scalar]:
-    """Return S, C, D and the phase at the whole time, from the functions `f` at the reduced time
-    `u.near`.
+    """Return two things: the functions S, C, D at the time before it was reduced, and that part of
+    the phase ξ at this time which `f` does not contain.
 
-    The phase is the part of ξ that `f` does not contain.
+    `f` holds the functions at the reduced time `u.near`, and `o` the constants of the motion.
     """
     big = jnp.maximum(o.modulus.p, o.modulus.q)
     whole = jnp.where(u.halves == 0, 0.0, u.halves)
@@ -107,11 +111,12 @@ def restore_periods(o: Orbit, f: Elliptic, u: ReducedTime) -> tuple[Elliptic, Sc
 
 
 def restore_identity(f: Elliptic, m: Modulus) -> Elliptic:
-    """Compute the larger one of C² and D² in `f` again from the smaller one, by D² − C² = (p −
+    """Return `f` with the larger of C² and D² computed again from the smaller, by D² − C² = (p −
     q)S².
 
-    Near the middle axis C and SD cancel. An error that the doublings made in both of them alike
-    cancels as well; an error in one of them alone does not, and this identity removes it.
+    Near the middle axis the terms of the momentum with C and with SD cancel. An equal error of C
+    and D, from the doublings, then cancels as well; an error of C alone or of D alone does not
+    cancel, and the identity removes this error.
     """
     gs = m.gap * f.S * f.S
     other = jnp.sqrt(jnp.where(gs > 0, f.C * f.C + gs, f.D * f.D - gs))
@@ -122,8 +127,8 @@ def restore_identity(f: Elliptic, m: Modulus) -> Elliptic:
 
 
 def momentum_at(o: Orbit, f: Elliptic) -> Triple:
-    """Return the body momentum from S, C, D in `f` at one time, in the labelling of the axes in
-    `o`.
+    """Return the body momentum at the time at which `f` holds S, C and D; the axes are labelled as
+    in `o`.
     """
     p1, p2, p3 = o.P
     f = restore_identity(f, o.modulus)
@@ -133,14 +138,14 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
     size = jnp.maximum(jnp.maximum(jnp.abs(y1), jnp.abs(y2)), jnp.abs(y3))
     still = size <= 0
     size = jnp.where(still, 1.0, size)
-    # The quotients of a steady spin are exactly ±1, and so its momentum stays the same to the last
-    # digit.
+    # For a steady spin the quotient of the only component by the size is exactly ±1, so that the
+    # momentum stays the same to the last digit.
     y1, y2, y3 = y1 / size, y2 / size, y3 / size
     r = o.h / jnp.sqrt(jnp.where(still, 1.0, y1 * y1 + y2 * y2 + y3 * y3))
     return y1 * r, y2 * r, y3 * r
 
 
-@one_kernel
+@compiled_as_one_kernel
 def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
     """Return the body momentum at the time t, and the quaternion of the turn from time 0 to t, in
     principal axes.
@@ -150,16 +155,16 @@ def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
 
 
 def motion_from_functions(o: Orbit, f: Elliptic, u: ReducedTime, t: Scalar) -> tuple[Triple, Four]:
-    """Return the body momentum at the time t and the turn from time 0 to t, from the elliptic
-    functions `f` at `u.near`.
+    """Return the body momentum at the time t and the quaternion of the turn from time 0 to t, from
+    the elliptic functions `f` at `u.near`, where `u` is the reduced time t/2.
     """
     f, phase = barrier(restore_periods(o, f, u))
     full = barrier(duplicate(f, o.modulus, o.mu, o.turn))
     _, k2, k3 = barrier(momentum_at(o, f))
     m1, m2, m3 = barrier(momentum_at(o, full))
 
-    # The quaternion b turns about an axis across the momentum at half the time; the rest of the
-    # turn is one about the momentum.
+    # The turn is the product (c, s Π(0)) ⊗ b of two quaternions: the first turns about the initial
+    # momentum, and b = (b0, 0, b2, b3) turns about an axis in the plane of axes 2 and 3.
     b0, b2, b3 = f.C, -o.d12 * f.S * k2 * f.C, -o.d13 * f.S * k3
     size = jnp.maximum(jnp.maximum(jnp.abs(b0), jnp.abs(b2)), jnp.abs(b3))
     b0, b2, b3 = barrier((b0 / size, b2 / size, b3 / size))

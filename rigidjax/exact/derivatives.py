@@ -1,21 +1,24 @@
-"""Compute the free flow in principal axes and its derivatives: (inertia, Π(0), t) → (Π(t), turn).
+"""Compute the motion of a free body in principal axes, and the derivatives of this motion.
 
-The derivative of the turn needs no elliptic integral of the third kind. Let R be the rotation from
-time 0 to t, and `δR = R hat(θ)` its change. The momentum is constant in space, `R Π(t) = Π(0)`, and
-this gives the part of θ across Π(t):
+The motion is a function of the inertia tensor I, the body momentum Π(0) at time 0 and the time t.
+Its results are the body momentum Π(t) and the turn, which is the rotation R of the body from time 0
+to t, as a quaternion.
+
+The derivative of the turn needs no elliptic integral of the third kind. Let `δR = R hat(θ)` be the
+change of R for a small change of the inputs, where θ is a small rotation vector, and let h = |Π|.
+The momentum is constant in space, `R Π(t) = Π(0)`, and this gives the component of θ normal to
+Π(t):
 
     Π(t) × (Rᵀ δΠ(0) − δΠ(t)) = h² θ − Π (Π·θ)
 
-The part along Π(t) follows from `d(Π·θ)/dt = Π·δΩ = ½ δE₂ + ½ Π·δK Π`, where K = I⁻¹ and E₂ = Π·KΠ
-is constant:
+The component of θ along Π(t) follows from `d(Π·θ)/dt = Π·δΩ = ½ δE₂ + ½ Π·δK Π`, where K = I⁻¹ and
+E₂ = Π·KΠ is constant:
 
     Π(t)·θ = ½ t δE₂ + ½ δK : ∫₀ᵗ Π Πᵀ dt + E₂ δt.
 
-Both δΠ(t) − δΠ(0) and R − 1 are proportional to the angle of the turn. The quotient by h² therefore
-loses no digits, except near rest, where the derivative comes from a Taylor series.
-
-δΠ(t) − δΠ(0) and R − 1 are proportional to the turn, so that the quotient by h² loses no digits
-except at rest, where the derivative comes from a Taylor series.
+Both δΠ(t) − δΠ(0) and R − 1 are proportional to the angle of the turn. The division of these
+formulas by h² therefore loses no digits, except near rest, where the derivative comes from a Taylor
+series.
 """
 
 import functools
@@ -56,26 +59,28 @@ from rigidjax.exact.principal_axes import (
     tensor_in_axes,
 )
 from rigidjax.exact.sigma_form import Differences
-from rigidjax.rotation.barrier import one_kernel
+from rigidjax.rotation.barrier import compiled_as_one_kernel
 from rigidjax.rotation.linalg3 import components
 
-# Below this angle of the turn, rad, a series of third order in time is used. The second derivatives
-# of the series have an error of the square of the angle; those of the other form have an error of
-# the round-off over the angle.
+# Below this angle of the turn, rad, the derivative of the turn comes from a series of third order
+# in time. The second derivatives of the series have an error of about the square of the angle; the
+# second derivatives of the closed form have an error of about the round-off divided by the angle.
 _STILL = {jnp.dtype("float32"): 5e-3, jnp.dtype("float64"): 5e-6}
 
 
-# Up to this number of times, a loop over the times compiles sooner than one batch. The loop is as
-# fast as the batch, except for the values (without derivatives) of one body.
+# Up to this number of times, a loop over the times is used: it compiles sooner than one batch of
+# all times. The loop is as fast as the batch, except if only the values of one body are computed,
+# without derivatives.
 _LOOPED = 1000
 
 
 @jax.custom_jvp
 def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
-    """Return Π(t) and the quaternion of the turn from time 0 to t.
+    """Return two things: the body momentum Π(t), and the quaternion of the turn from time 0 to t.
 
-    `moments` are the entries I11 ≤ I22 ≤ I33, I12, I13, I23 of the inertia tensor, the last three
-    zero in value; `momentum` is Π(0).
+    `moments` are the entries (I11, I22, I33, I12, I13, I23) of the inertia tensor in principal
+    axes, with I11 ≤ I22 ≤ I33. The last three entries are zero in value, but their derivatives are
+    not. `momentum` is Π(0).
     """
     return momentum_and_turn(orbit(moments[:3], momentum), t)
 
@@ -83,13 +88,16 @@ def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
 @flow.defjvp
 def _flow_jvp(primals, tangents):
     motion, rows, _ = motion_and_derivatives(*primals)
-    d_out, d_turn, _ = _change_along(motion, rows, _variables(primals, tangents)[3])
+    d_out, d_turn, _ = _change_of_motion(motion, rows, _variables(primals, tangents)[3])
     return motion[:2], (d_out, d_turn)
 
 
 def _variables(primals, tangents):
-    """Return the results of `reciprocal` and `derivative_variables`, each with its change along
-    `tangents`.
+    """Return four things: the result of `reciprocal`; the change of this result; the result of
+    `derivative_variables`; and the change of this result.
+
+    `primals` are (moments, momentum, t), as for `flow`, and `tangents` are the changes of these
+    three.
     """
     parts, changes = jax.jvp(reciprocal, primals[:2], tangents[:2])
     return (
@@ -100,18 +108,19 @@ def _variables(primals, tangents):
     )
 
 
-def _change_along(motion, rows, change):
-    """Return the changes of Π, the turn and Ω in `motion` for a `change` of the derivative
-    variables.
+def _change_of_motion(motion, derivative_rows, change):
+    """Return three things: the change of Π(t), the change of the quaternion of the turn, and the
+    change of Ω(t), if the result of `derivative_variables` changes by `change`.
 
-    `rows` holds the derivatives of Π, θ and Ω, where θ is the small rotation that changes the turn.
+    `motion` holds Π(t), the quaternion and Ω(t). `rows` holds the derivatives of Π(t), θ and Ω(t),
+    where θ is the small rotation vector that changes the turn.
     """
-    out, theta, rate = (tuple(jnp.sum(row * change) for row in three) for three in rows)
+    out, theta, rate = (tuple(jnp.sum(row * change) for row in three) for three in derivative_rows)
     return out, half_product(motion[1], theta), rate
 
 
 class MotionConstants(NamedTuple):
-    """Hold the constants of a free motion, which are values and never differentiated."""
+    """Hold the constants of a free motion as plain values, through which no derivative is taken."""
 
     axes: Mat3
     moments: Triple
@@ -119,10 +128,10 @@ class MotionConstants(NamedTuple):
     orbit: Orbit
 
 
-@one_kernel
+@compiled_as_one_kernel
 def set_up(tensor: Mat3, omega: Vec3) -> MotionConstants:
-    """Return the principal axes of the inertia `tensor`, and the constants of the motion in these
-    axes.
+    """Return the principal axes of the inertia `tensor`, and the constants, in these axes, of the
+    motion that begins with the body rate `omega`.
     """
     moments, axes = principal_frame(tensor)
     momentum = matvec(moments, components_along(axes, omega))
@@ -133,8 +142,11 @@ def set_up(tensor: Mat3, omega: Vec3) -> MotionConstants:
 def body_motion(
     tensor: Mat3, omega: Vec3, setting: MotionConstants, t: Float[Array, "*n"]
 ) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 4"]]:
-    """Return Ω(t) and the quaternion of the turn from time 0 to t, in body axes, at one time or at
-    many times t.
+    """Return two things: the body rate Ω(t), and the quaternion of the turn from time 0 to t, both
+    in body axes.
+
+    `t` is one time, or an array (n,) of times. `setting` is the result of `set_up` for the inertia
+    `tensor` and the initial body rate `omega`.
     """
     del tensor, omega
     return _at_each_time(lambda time: _body_motion_at(setting, time), t)
@@ -144,8 +156,9 @@ def body_motion(
 def _body_motion_jvp(primals, tangents):
     tensor, omega, setting, t = primals
     d_tensor, d_omega, _, d_t = tangents
-    # The derivative is a product of two matrices. Only one of them depends on time, so that the
-    # transposed part is short and the rest is compiled once.
+    # The derivative is a product of two matrices, of which only the left one depends on time. The
+    # part that is transposed for reverse mode is therefore short, and the right matrix is compiled
+    # once.
     first = _input_derivatives(jnp.concatenate([tensor.ravel(), omega]), setting)
     out, (rates, thetas) = _at_each_time(
         lambda time: _body_motion_and_derivatives(tensor, omega, setting, time), t
@@ -174,9 +187,11 @@ def _at_each_time(function, t):
     return jax.lax.map(function, t) if t.size <= _LOOPED else jax.vmap(function)(t)
 
 
-@one_kernel
+@compiled_as_one_kernel
 def _body_motion_at(s: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
-    """Return Ω(t) and the quaternion of the turn from time 0 to t, in body axes."""
+    """Return the body rate Ω(t) and the quaternion of the turn from time 0 to t, both in body axes,
+    of the motion with the constants `s`.
+    """
     momentum, (w, *axis) = momentum_and_turn(s.orbit, t)
     rate = tuple(p / i for p, i in zip(momentum, s.moments, strict=True))
     return jnp.stack(combine_columns(s.axes, rate)), jnp.stack(
@@ -185,24 +200,28 @@ def _body_motion_at(s: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
 
 
 def _moments_and_momentum(tensor: Mat3, omega: Vec3, s: MotionConstants) -> tuple[Six, Triple]:
-    """Return the moments and the momentum as functions of `tensor` and Ω(0) = `omega`.
+    """Return the entries of the inertia tensor, as for `flow`, and the momentum Π(0), both in the
+    principal axes of `s`.
 
-    The principal axes in `s` are held fixed.
+    The two results are differentiable functions of the inertia `tensor` and the body rate `omega`
+    at time 0. The principal axes are held fixed.
     """
     moments = tensor_in_axes(tensor, s.axes, s.moments)
     return moments, matvec(moments, components_along(s.axes, omega))
 
 
-@one_kernel
+@compiled_as_one_kernel
 def _input_derivatives(body: Float[Array, "12"], s: MotionConstants) -> Float[Array, "9 12"]:
-    """Return the derivatives of `derivative_variables` with respect to `body`.
+    """Return the derivatives (9, 12) of the first nine `derivative_variables`, all except t, with
+    respect to `body`.
 
-    `body` holds the nine entries of the inertia tensor, then Ω(0).
+    `body` (12,) holds the nine entries of the inertia tensor, then the three of Ω(0).
     """
     tensor, omega, axes = body[:9].reshape(3, 3), body[9:], s.axes
     moments, momentum = _moments_and_momentum(tensor, omega, s)
-    # In principal axes, δK = −K δI K is −BᵀδI B with B = A K, where A holds the axes. This is a
-    # batch of sums, not of products of matrices, for the reason given in `_body_motion_jvp`.
+    # In principal axes, δK = −K δI K is −BᵀδI B with B = A K, where the columns of A are the axes.
+    # The products are written as sums of products of entries, for the reason given in
+    # `_body_motion_jvp`.
     k = jnp.stack(symmetric_rows(reciprocal(moments, momentum)[1]))
     b = jnp.sum(axes[:, :, None] * k[None], axis=1)
     d_k = lambda i, j: -(b[:, None, i] * b[None, :, j]).ravel()  # noqa: E731
@@ -215,24 +234,28 @@ def _input_derivatives(body: Float[Array, "12"], s: MotionConstants) -> Float[Ar
     return jnp.concatenate([by_tensor, jnp.pad(by_omega, ((5, 1), (0, 0)))], axis=1)
 
 
-@one_kernel
+@compiled_as_one_kernel
 def _body_motion_and_derivatives(tensor: Mat3, omega: Vec3, s: MotionConstants, t: Scalar):
-    """Return Ω(t) and the turn in body axes, and their derivatives with respect to
-    `derivative_variables`.
+    """Return two pairs, both in body axes: Ω(t) and the quaternion of the turn; and the derivatives
+    of Ω(t) and of θ with respect to `derivative_variables`.
+
+    θ is the small rotation vector that changes the turn.
     """
     moments, momentum = _moments_and_momentum(tensor, omega, s)
     (_, (w, *axis), rate), rows, _ = motion_and_derivatives(moments, momentum, t)
     rate = combine_columns(s.axes, rate)
     turn = jnp.stack([w, *combine_columns(s.axes, tuple(axis))])
-    # Return rows, not matrices: stacking them takes five times as long for a batch as computing
-    # them.
+    # Return the derivatives as rows, not as matrices: in a batch, stacking the rows takes five
+    # times as long as computing them.
     in_body = jax.vmap(lambda *v: combine_columns(s.axes, v))
     return (jnp.stack(rate), turn), (in_body(*rows.rate), in_body(*rows.theta))
 
 
 class MotionDerivatives(NamedTuple):
-    """Hold the derivatives of Π(t), θ and Ω(t) with respect to `derivative_variables`: three rows
-    of ten for each.
+    """Hold the derivatives of Π(t), θ and Ω(t) with respect to `derivative_variables`: for each of
+    these vectors three rows of ten numbers.
+
+    θ is the small rotation vector that changes the turn.
     """
 
     momentum: Triple
@@ -241,12 +264,14 @@ class MotionDerivatives(NamedTuple):
 
 
 @jax.custom_jvp
-@one_kernel
+@compiled_as_one_kernel
 def motion_and_derivatives(moments: Six, momentum: Triple, t: Scalar):
-    """Return Π(t), the quaternion of the turn and Ω(t), the derivatives of all three, and the parts
-    of these derivatives.
+    """Return three things: the motion, which is (Π(t), quaternion of the turn, Ω(t)); the
+    derivatives of the motion, as `MotionDerivatives`; and the pair (rows, G) from which these are
+    computed.
 
-    The parts, which `_first_order` returns, are the derivatives of Π(t) − Π(0), and G = ∫ Π Πᵀ dt.
+    `_first_order` returns the pair: `rows` are the derivatives of Π(t) − Π(0), and G = ∫ Π Πᵀ dt
+    from 0 to t.
     """
     (out, turn), rows, g = _first_order(orbit(moments[:3], momentum), moments, momentum, t)
     _, k, energy2 = reciprocal(moments, momentum)
@@ -254,13 +279,13 @@ def motion_and_derivatives(moments: Six, momentum: Triple, t: Scalar):
     return motion, _derivative_columns(k, energy2, momentum, t, motion, rows, g), (rows, g)
 
 
-# The second derivatives come from the form of the motion in the whole tensor (`sigma_form`), which
-# is smooth to any order.
+# The second derivatives come from `sigma_form`, where the motion is a function of the whole inertia
+# tensor: this function is smooth to any order.
 @motion_and_derivatives.defjvp
 def _motion_and_derivatives_jvp(primals, tangents):
     motion, rows, parts = motion_and_derivatives(*primals)
     (body, *k), (_, *d_k), inputs, change = _variables(primals, tangents)
-    d_motion = _change_along(motion, rows, change)
+    d_motion = _change_of_motion(motion, rows, change)
     d_parts = _second_order(body, inputs, change)
     at, changes = (*k, *primals[1:], motion, *parts), (*d_k, *tangents[1:], d_motion, *d_parts)
     return (motion, rows, parts), (d_motion, jax.jvp(_derivative_columns, at, changes)[1], d_parts)
@@ -271,7 +296,8 @@ def _derivative_columns(
 ) -> MotionDerivatives:
     """Return the derivatives of `motion`, the first result of `motion_and_derivatives`.
 
-    `k` and `energy2` come from `reciprocal`; `rows` and `g` come from `_first_order`.
+    `k` (the matrix K) and `energy2` (E₂) come from `reciprocal`; `rows` (the derivatives of Π(t) −
+    Π(0)) and `g` (the matrix G) come from `_first_order`; `momentum` is Π(0).
     """
     out, turn, _ = motion
     p1, p2, p3 = momentum
@@ -314,23 +340,24 @@ def _derivative_columns(
 
 
 def derivative_variables(parts, momentum: Triple, t: Scalar) -> Float[Array, "10"]:
-    """Return d12, d23, k12, k13, k23, Π(0), k33 and t, the variables of all derivatives of this
-    module.
+    """Return d12, d23, k12, k13, k23, Π(0), k33 and t: all derivatives of this module are taken
+    with respect to these ten variables.
 
-    `parts` is the result of `reciprocal`, or the change of this result. k33 is the least diagonal
-    entry of K = I⁻¹. It is taken since the thickness of a rod then changes d12 alone; with k11 it
-    would change both k11 and d12 by 1/I₁², and the two would cancel.
+    `parts` is the result of `reciprocal`, or the change of this result; `momentum` and t are then
+    changes, too. Here kij are the entries of K = I⁻¹, and dij = kii − kjj. The variable k33 is the
+    least diagonal entry. With k33, the thickness of a rod changes d12 alone; with k11 instead, the
+    thickness would change both k11 and d12 by a term of 1/I₁², and the two terms would cancel.
     """
     body, k, _ = parts
     return jnp.stack([body.d12, body.d23, body.k12, body.k13, body.k23, *momentum, k[2], t])
 
 
-@one_kernel
+@compiled_as_one_kernel
 def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
-    """Return the result of `flow`, the derivatives of Π(t) − Π(0) by `derivative_variables`, and G
-    = ∫ Π Πᵀ dt.
+    """Return three things: the result of `flow`; the derivatives of Π(t) − Π(0) with respect to
+    `derivative_variables`, as three rows; and the matrix G = ∫ Π Πᵀ dt from 0 to t.
 
-    The argument `o` holds the constants of the motion.
+    `o` holds the constants of the motion; `moments`, `momentum` and t are as for `flow`.
     """
     u = reduce_time(0.5 * t, o.half.time, o.modulus)
     at = integrals(u.near, o.modulus, o.mu, o.turn)
@@ -346,10 +373,11 @@ def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
 
 
 def _second_order(body: Differences, inputs, change):
-    """Return the changes of the derivatives and of G, which `_first_order` returns, from the form
-    of the motion in the whole tensor.
+    """Return two things: the change of the derivatives that `_first_order` returns, and the change
+    of G, from `sigma_form`, where the motion is a function of the whole inertia tensor.
 
-    `inputs` are the `derivative_variables`, and `change` is the change of these variables.
+    `body` holds the matrix K. `inputs` is the result of `derivative_variables`, and `change` is the
+    change of these variables.
     """
 
     def of_inputs(x):
@@ -369,8 +397,8 @@ def _second_order(body: Differences, inputs, change):
 
 
 def reciprocal(moments: Six, momentum: Triple):
-    """Return the differences of the diagonal of K = I⁻¹, K itself, and E₂ = Π·KΠ, which is twice
-    the energy.
+    """Return three things: the `Differences` of K = I⁻¹; the six entries of K; and E₂ = Π·KΠ, which
+    is twice the energy.
     """
     i1, i2, i3, i12, i13, i23 = moments
     r = 1.0 / determinant(moments)

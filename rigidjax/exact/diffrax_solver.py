@@ -37,10 +37,10 @@ class FreeSolver(dfx.AbstractSolver):
     """Solve torque-free spins and attitudes in diffrax, where each step evaluates the closed form.
 
     Use it with `diffrax.ODETerm(rigidjax.equations_of_motion(inertia, y0))` of a `Spin` or an
-    `Attitude`, with no torque. One step over the whole interval does. Events, dense output and
+    `Attitude`, with no torque. One step over the whole interval is enough. Events, dense output and
     every adjoint work as with any solver.
 
-    **Raises:** `ValueError` for another term, or one with a torque.
+    **Raises:** `ValueError` for another term, or for equations with a torque.
 
     >>> import diffrax
     >>> y0 = rj.Spin([0.0, 1.0, 1e-4])
@@ -97,8 +97,8 @@ class FreeSolver(dfx.AbstractSolver):
 
 
 def field_of(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
-    """Return the vector field inside a term, and the direction of time that diffrax wraps around
-    the term.
+    """Return two things: the vector field inside a term, and the direction of time, 1 or −1, with
+    which diffrax wraps the term.
     """
     # Read attributes of the wrapped term: its methods `vf` and `contr`, the only ones that diffrax
     # promises, return numbers and not the inertia.
@@ -107,8 +107,8 @@ def field_of(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
 
 
 def _field(terms: PyTree[dfx.AbstractTerm]) -> EulerEquations:
-    """Return Euler's equations from inside a term, or raise an error if they are not those of a
-    free body.
+    """Return Euler's equations from inside a term; raise an error if the term holds other
+    equations, or equations with a torque.
     """
     field, _ = field_of(terms)
     euler = field.euler if isinstance(field, AttitudeEquations) else field

@@ -24,7 +24,8 @@ State = TypeVar("State", bound=HasSpin)
 
 
 class FreeBody(eqx.Module):
-    """Hold the whole motion of a free body: call it with one time, or call `at` with many times.
+    """Hold the motion of a free body for all times: call the object with one time, or its method
+    `at` with many times.
 
     The constants of the motion are computed once. **Arguments:** as for `free_body`.
 
@@ -52,8 +53,9 @@ class FreeBody(eqx.Module):
         return self.at(_checked_time(t, self.state0.omega))
 
     def at(self, ts: Float[Array, "*n"]) -> HasSpin:
-        """Return the states at the times `ts` (n,), s since `state0`, as `jax.vmap` does but
-        compiled sooner.
+        """Return the states at the times `ts` (n,), s since `state0`.
+
+        The result is that of `jax.vmap` over the times, but the method compiles sooner.
 
         >>> motion = FreeBody(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([0.0, 0.0, 1.0]))
         >>> motion.at(jnp.array([0.0, 10.0])).omega
@@ -75,10 +77,11 @@ class FreeBody(eqx.Module):
 
 
 class FreeMotion(eqx.Module):
-    """Hold the motion of a free body of any kind: a `FreeBody`, and for a `Rigid` also its path x +
-    v t.
+    """Hold the motion of a free body for any state: a `FreeBody`, and for a `Rigid` also the
+    straight path of the centre of mass.
 
-    Call it with a time, or with times (n,), s since `state0`. Times that are too long give NaN.
+    Call the object with a time, or with times (n,), s since `state0`. A time in which the body
+    turns by more than 1/eps rad gives NaN.
     """
 
     state0: Any
@@ -113,8 +116,10 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     **Returns** the state at `t`, of the type and dtype of `state0`. Use `jax.vmap` for many times
     or bodies; `FreeBody(inertia, state0)` keeps the constants of the motion.
 
-    With Π = IΩ and axes 1, 2, 3 in order of their moments, S, C, D Jacobi's functions in a scaling
-    that is symmetric in the axes (`rigidjax.exact.jacobi_duplication`) and `dᵢⱼ = 1/Iᵢ − 1/Iⱼ`,
+    Let Π = IΩ, with the axes 1, 2, 3 in the order of their moments, and `dᵢⱼ = 1/Iᵢ − 1/Iⱼ`. Let S,
+    C, D be Jacobi's functions in a scaling that is symmetric in the axes, and ξ the phase of these
+    functions (`rigidjax.exact.jacobi_duplication`); Ξ = 2ξ/|Π| with ξ at t/2. Then, with Π for
+    Π(0), with exp of a pure quaternion, and with |…| for the length of the last factor,
 
         Π(t) ∝ (Π₁C − d₂₃Π₂Π₃SD, Π₂CD + d₁₃Π₁Π₃S, Π₃D − d₁₂Π₁Π₂SC)              S, C, D at t
         q(t) = q(0) ⊗ exp(½(t/I₁ − Ξ) Π) ⊗ (C, 0, −d₁₂SΠ₂(t/2)C, −d₁₃SΠ₃(t/2))/|…|   S, C, D at t/2
@@ -125,9 +130,9 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     in t, has length 1, and `R(q) I Ω` is constant to round-off. A traced time in which the body
     turns by more than 1/eps rad gives NaN.
 
-    Derivatives by all arguments are closed forms, correct to second order at all these points, as
-    functions of the whole tensor. They grow with e^{λt} on an unstable axis, up to λt ≈ 150
-    (float32: 40).
+    Derivatives with respect to all arguments are closed forms, correct to second order at all these
+    points, as functions of the whole tensor. They grow with e^{λt} on an unstable axis, up to λt ≈
+    150 (float32: 40).
 
     **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, a `Rigid`;
     for known values also for NaN, a tensor that no mass has (a traced one gives NaN), a moment of
@@ -145,8 +150,8 @@ _jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0).at(t))
 
 
 def _checked_time(t: ScalarLike, omega: Array) -> Scalar:
-    """Return the time t, and raise an error if the dtype has no digit within one turn of the body
-    at t.
+    """Return the time t; raise an error if the body turns so far in this time that the dtype holds
+    no digit within one turn.
     """
     t = _checks.checked_time(t)
     if not _checks.is_known((t, omega)):
@@ -163,8 +168,8 @@ def _checked_time(t: ScalarLike, omega: Array) -> Scalar:
 
 
 def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
-    """Return the inertia after checks of body and state; an impossible body that is traced becomes
-    NaN.
+    """Return the inertia after checks of the body and the state; a traced inertia that no real body
+    has becomes NaN.
     """
     if isinstance(state0, HasPose) or not isinstance(state0, HasSpin):
         raise TypeError(

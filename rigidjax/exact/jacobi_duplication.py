@@ -1,13 +1,13 @@
-"""Compute the three elliptic functions of a free body by scaling and doubling, and half their
-period.
+"""Compute the three elliptic functions of a free body by repeated doubling of the argument, and the
+half period of these functions.
 
 A free body needs only the solution of
 
     S' = C D,   C' = −p S D,   D' = −q S C,   S(0) = 0, C(0) = D(0) = 1,
 
-with `C² = 1 − p S²` and `D² = 1 − q S²`. These functions are sn, cn, dn in a scaling that needs
-neither `p > q` nor `p, q ≠ 0`. For p = q = 0 the body is a sphere, or at rest; p = q is the
-separatrix; q = 0 is a symmetric top, or a spin about an axis. The computation starts from the
+with `C² = 1 − p S²` and `D² = 1 − q S²`. S, C and D are Jacobi's functions sn, cn, dn in a scaling
+that needs neither `p > q` nor `p, q ≠ 0`. For p = q = 0 the body is a sphere, or at rest; p = q is
+the separatrix; q = 0 is a symmetric top, or a spin about an axis. The computation starts from the
 Taylor series at `u/2^N` and applies the duplication formula N times (DLMF 22.6(ii)). Three measures
 keep the digits. The difference p − q is a separate number. While S is small, `1 − C` is doubled
 instead of C, by `1 − C(2u) = 2pS²D²/(C² + pS²D²)`. All denominators are sums of positive terms.
@@ -48,15 +48,15 @@ class Limits(NamedTuple):
 
     doublings: int  # the number of doublings from u/2^doublings to u
     agm: int  # steps of the arithmetic–geometric mean
-    floor: float  # |p − q|/max(p, q) at and below which the motion is the separatrix's
-    rest: float  # √max(p, q) |u| beyond which a motion on the separatrix rests
+    floor: float  # if |p − q|/max(p, q) is not above it, the motion is on the separatrix
+    rest: float  # the value of √max(p, q) |u| beyond which a separatrix motion rests
 
 
 def dtype_limits(dtype) -> Limits:
     """Return the limits of a dtype, float32 or float64.
 
-    The doublings reach the longest quarter period, `ln(4/√floor)`, and at this time C⁴ must not
-    underflow.
+    The number of doublings is enough for the longest quarter period, `ln(4/√floor)` in units of
+    1/√max(p, q), and at this time C⁴ must not underflow.
     """
     wide = dtype == jnp.float64
     return Limits(9, 11, 1e-64, 75.0) if wide else Limits(7, 9, 1e-33, 20.0)
@@ -68,8 +68,8 @@ def is_endless(m: Modulus) -> Bool[Array, ""]:
 
 
 def clip_at_rest(u: Scalar, m: Modulus) -> Scalar:
-    """Return the reduced time u, on the separatrix clipped to the time after which the motion is at
-    rest.
+    """Return the reduced time u; on the separatrix it is clipped to the time after which the motion
+    is at rest.
     """
     big = jnp.maximum(m.p, m.q)
     rest = dtype_limits(u.dtype).rest / jnp.sqrt(jnp.where(big > 0, big, 1.0))
@@ -77,9 +77,10 @@ def clip_at_rest(u: Scalar, m: Modulus) -> Scalar:
 
 
 def duplicate(f: Elliptic, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
-    """Return S, C, D and ξ at 2u from `f`, their values at u.
+    """Return S, C, D and ξ at the time 2u, from the values `f` of S, C, D and ξ at the time u.
 
-    The phase is ξ(2u) = 2ξ + arctan(B/A), computed as a product of complex numbers.
+    The phase is ξ(2u) = 2ξ + arctan(B/A), where A and B are `a` and `b` below; it is computed as a
+    product of complex numbers. For `mu` and `turn` see `elliptic`.
     """
     S, C, D, x, y = f
     s, cc, dd = S * S, C * C, D * D
@@ -129,8 +130,8 @@ def taylor_series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
 def growth_integral(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
     """Return ∫ S²/(1 + μS²) du = ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)) for a small S.
 
-    It is a power series in S. The recurrence of Legendre's polynomials gives the terms of the
-    roots, and a second recurrence those of 1/(1 + μS²).
+    The result is a power series in S. The recurrence of Legendre's polynomials gives the terms of
+    1/(√(1 − pS²) √(1 − qS²)), and a second recurrence multiplies this series by 1/(1 + μS²).
     """
     s = S * S
     e, f, w = (m.p + m.q) * s, (m.p * m.q) * (s * s), mu * s
@@ -146,8 +147,9 @@ def growth_integral(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
 def elliptic(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
     """Return S, C, D at u, and the phase `ξ = turn ∫₀ᵘ S²/(1 + μS²) du` with μ = `mu`.
 
-    `mu` lies between 0 and √(pq), and `turn` is κμ times a rate. `u` is reduced: |u| is at most a
-    quarter period.
+    `mu` lies between 0 and √(pq), and `turn` is the constant factor of the integral;
+    `closed_form.orbit` computes both numbers. `u` is a reduced time: |u| is at most a quarter
+    period.
     """
     n = dtype_limits(u.dtype).doublings
     f = taylor_series(u * 2.0**-n, m, mu, turn)
@@ -164,7 +166,8 @@ class HalfPeriod(NamedTuple):
 
 
 def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
-    """Return the least T > 0 with S(T) = 0, and the phase at T and the mean of S² from 0 to T.
+    """Return three things: the least time T > 0 with S(T) = 0; the phase ξ at T; and the mean of S²
+    from 0 to T.
 
     With λ² = max(p, q), a₀ = 1 and b₀ = √|p − q|/λ, the time is `T = π/(λ agm(a₀, b₀))` (DLMF
     19.8.5). With `c₁ = (a₀ − b₀)/2` and `c_{n+1} = c_n²/(4 a_{n+1})`, the mean is
@@ -191,7 +194,8 @@ def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
         0, dtype_limits(a.dtype).agm, _mean_step, start
     )
     time = math.pi / (a * jnp.sqrt(big))
-    # With turn = κμ h, the phase of a quarter period is ξ = κ h (π/2a) ½ μ/(λ² + μ) Σ.
+    # With turn = κ μ, the phase ξ of a quarter period is κ (π/2a) ½ μ/(λ² + μ) Σ, where Σ is
+    # `sum_parts`.
     phase = turn * time * 0.5 / (big + mu) * sum_parts
     return HalfPeriod(jnp.where(endless, jnp.inf, time), phase, total / big)
 

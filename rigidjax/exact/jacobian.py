@@ -1,15 +1,17 @@
 """Compute the first derivatives of the free momentum in closed form, in principal axes.
 
-Let E be that one of D and C which has no zero, f = S/E, `Y₂ = ∫ S²` and `Y = ∫ f²`. At fixed
-initial data the changes δS, δC, δD follow from `∂τ/∂p = ½ ∫ S²/C² …`, without any division by p, q
-or p − q:
+Let E be the one of the functions D and C that has no zero, let f = S/E, and let `Y₂ = ∫ S²` and `Y
+= ∫ f²` be integrals from time 0. The changes δS, δC, δD for changes of t, p and q follow from the
+derivative `∂τ/∂p = ½ ∫ S²/C² …` of the time τ as a function of S, without any division by p, q or p
+− q:
 
     θ = δt + ½ δ|p−q| Y + ½ δmax(p,q) Y₂
     δS = C D θ − ½ S³ δmax,   δC = −p S D θ − ½ S² C δmax (+ ½ S² δ|p−q|/C if q > p),   …
 
-Both integrals double, as in `Y(2u) = 2Y(u) + f(u)² f(2u)`, and grow by their means in each whole
-period. Off-diagonal entries of K enter through the divided differences of T = diag(D, 1, C), which
-the last doubling gives without a quotient. These derivatives are equal to those of `sigma_form`.
+Y₂ and Y at 2u follow from the values at u, as in `Y(2u) = 2Y(u) + f(u)² f(2u)`, and in each whole
+period Y₂ and Y grow by the period times the mean of S² or of f². Off-diagonal entries of K = I⁻¹
+enter through the divided differences of T = diag(D, 1, C), which the last doubling gives without a
+quotient. The derivatives are equal to the derivatives of the motion in `sigma_form`.
 """
 
 from typing import NamedTuple
@@ -47,13 +49,15 @@ def jacobian_and_integral(
     whole_periods: Scalar,
     mean: Scalar,
 ) -> tuple[tuple, Six]:
-    """Return the derivatives of Π(t) − Π(0) as three rows, and G = ∫ Π Πᵀ dt.
+    """Return two things: the derivatives of Π(t) − Π(0), as three rows of ten numbers; and the
+    matrix G = ∫ Π Πᵀ dt from 0 to t.
 
-    The columns are the derivatives with respect to d12, d23, k12, k13, k23, Π(0), k33 and t.
+    The ten columns are the derivatives with respect to d12, d23, k12, k13, k23, Π(0), k33 and t.
 
-    The off-diagonal entries in `body` must be zero. `half_time_integrals` are taken at half of the
-    reduced time, with C and D in the labelling of `body`. The time was reduced by `halves` half
-    periods, together of the length `whole_periods`. `mean` is the mean of S².
+    The off-diagonal entries in `body` must be zero; `momentum` is Π(0). The time t was reduced by
+    `halves` half periods, which together have the length `whole_periods`. `half_time_integrals`
+    holds the functions and the integrals at half of the reduced time; C and D belong to the axes as
+    `body` numbers them. `mean` is the mean of S² over a period.
     """
     d12, d13, d23 = body[:3]
     p1, p2, p3 = momentum
@@ -66,7 +70,8 @@ def jacobian_and_integral(
     grown2 = after.y2 + whole_periods * mean
     grown = after.y + whole_periods * (1.0 - top * mean) / jnp.where(halves == 0, 1.0, jnp.abs(gap))
 
-    # These are the divided differences of T = diag(D, 1, C) by k12, k13, k23.
+    # These are the divided differences of T = diag(D, 1, C): the entries 12, 13 and 23 of T change
+    # by these numbers times the changes of k12, k13 and k23.
     s = half_time_integrals.f.S * half_time_integrals.f.S
     cc, dd = (
         half_time_integrals.f.C * half_time_integrals.f.C,
@@ -81,8 +86,8 @@ def jacobian_and_integral(
     ss, tt = S * S, jnp.where(three, D, C)
     rw = 1.0 / (tt * tt + ss * z)
     m1, m2, m3 = y1 * rw, y2 * rw, y3 * rw
-    # For short times take the values minus 1, without a subtraction: only the small parts of C, D
-    # and W.
+    # For short times compute C − W, CD − W and D − W from C − 1, D − 1 and W − 1, which are small
+    # and are found without a subtraction.
     w1 = ss * (z - jnp.where(three, q, p))
     short = jnp.abs(w1) < 0.5
     c1 = jnp.where(C > 0, -p * ss / (1.0 + jnp.abs(C)), C - 1.0)
@@ -134,8 +139,8 @@ def jacobian_and_integral(
 
     rows = jax.vmap(lambda e: tangent(*e))(jnp.eye(10, dtype=t.dtype))
 
-    # The 22 entry of G comes first, then the other two diagonal entries by ∫A₁ and ∫A₃, then the
-    # off-diagonal entries.
+    # The entry 22 of G is computed first, then the entries 11 and 33 by the integrals of A₁ and A₃,
+    # then the off-diagonal entries.
     g22 = A1 * A3 * grown2 + (S * C * D * p2 * p2 + ss * p2 * u2) * rw
     still = d13 == 0
     rest = (g22 - p2 * p2 * t) / jnp.where(still, 1.0, d13)
@@ -148,8 +153,8 @@ def jacobian_and_integral(
 
 
 def integrals(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
-    """Return the elliptic functions at u as `elliptic` does, and the integrals Y₂ and Y from 0 to
-    u.
+    """Return the elliptic functions at the time u, as `elliptic` does, and the integrals Y₂ and Y
+    from 0 to u.
     """
     n = dtype_limits(u.dtype).doublings
     f = taylor_series(u * 2.0**-n, m, mu, turn)
@@ -160,7 +165,9 @@ def integrals(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
 
 
 def double_argument(g: Integrals, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
-    """Return the elliptic functions, Y₂ and Y at 2u from `g`, their values at u."""
+    """Return the elliptic functions, Y₂ and Y at the time 2u, from the values `g` of the functions
+    and integrals at the time u.
+    """
     f, three = g.f, m.gap > 0
     after = duplicate(f, m, mu, turn)
     a, b = f.S / jnp.where(three, f.D, f.C), after.S / jnp.where(three, after.D, after.C)

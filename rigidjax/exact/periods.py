@@ -18,8 +18,8 @@ from rigidjax.exact.principal_axes import components_along, principal_frame
 
 
 def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
-    """Return the time after which the body rates repeat, one rotation about the axis that the
-    momentum circles.
+    """Return the time after which the body rates repeat, while the momentum circles an axis of the
+    body once.
 
     In this time the angular momentum goes once round the axis of the smallest or largest moment in
     the body frame (5.41 days about the long axis for 4179 Toutatis). For a spin about a stable axis
@@ -32,8 +32,9 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
     **Returns** the period, a scalar, s.
 
-    `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, eᵢ the roots in `rigidjax.exact.sigma_form` (DLMF
-    19.8.5; Landau and Lifshitz, Mechanics, eq 37.11).
+    `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, with the eigenvalues e₁, e₂, e₃ of the matrix E in
+    `rigidjax.exact.sigma_form`, of which e₁ is the largest (DLMF 19.8.5; Landau and Lifshitz,
+    Mechanics, eq 37.11).
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
@@ -55,8 +56,8 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
     **Arguments:** as for `body_period`. **Returns** a scalar, s.
 
-    The angle in one body period is `χ ∓ 2π`, χ the turn of the body about its momentum: a complete
-    integral of the third kind (DLMF 19.8.7).
+    In one body period the axis turns by the angle `χ ∓ 2π`, where χ is the angle by which the body
+    turns about its momentum: a complete integral of the third kind (DLMF 19.8.7).
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 

@@ -1,6 +1,7 @@
-"""Compute principal axes as a fixed frame, which is chosen by value and never differentiated.
+"""Compute principal axes as a fixed frame, which is never differentiated.
 
-In this frame the off-diagonal entries of the inertia are exact zeros that carry the tangents.
+In this frame the off-diagonal entries of the inertia tensor are exactly zero in value, but their
+tangents (the changes in a derivative) are not.
 """
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 
 from rigidjax._types import Mat3, Scalar, Vec3
 from rigidjax.exact.components3 import Six, Triple
-from rigidjax.rotation.barrier import batch_as, one_kernel
+from rigidjax.rotation.barrier import batch_as, compiled_as_one_kernel
 
 # Jacobi's cyclic method converges quadratically; a 3×3 matrix needs four or five sweeps from
 # anywhere.
@@ -16,8 +17,8 @@ _SWEEPS = 6
 
 
 def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
-    """Return the inertia in its principal axes, in ascending order, and the matrix A of these axes
-    as columns (a rotation).
+    """Return two things: the entries of the inertia tensor in principal axes, with the moments
+    ascending; and the rotation matrix A whose columns are these axes.
 
     The method is Jacobi's, in which small moments keep their digits. A is held fixed in
     derivatives.
@@ -60,7 +61,7 @@ def combine_columns(axes: Mat3, v: Triple) -> Triple:
     return tuple(axes[i, 0] * v[0] + axes[i, 1] * v[1] + axes[i, 2] * v[2] for i in range(3))
 
 
-@one_kernel
+@compiled_as_one_kernel
 def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     """Return the rows of the matrix whose columns are principal axes of m, and the moments, by
     Jacobi's method.
@@ -76,8 +77,8 @@ def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     axes = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
 
     def rotate(_, state):
-        # Rotate always the last two axes, then move each axis on by one place: so only one rotation
-        # is compiled.
+        # Always rotate the last two axes, then move each axis on by one place: only one rotation is
+        # then compiled.
         d, o, axes = _rotate(*state)
         return tuple((x[1], x[2], x[0]) for x in (d, o, axes))
 
@@ -110,8 +111,8 @@ def _rotate(d, o, axes):
     """Return the state after a rotation of the last two axes that makes their off-diagonal entry
     zero.
 
-    `d` holds the diagonal entries, `o[k]` the off-diagonal entry that does not belong to axis k,
-    and `axes` the axes.
+    `d` holds the diagonal entries, `o[k]` the off-diagonal entry of the two axes other than k, and
+    `axes` the axes.
     """
     (first, second, third), (x, y, z), (u, v, w) = d, o, axes
     none = x == 0
@@ -130,8 +131,8 @@ def _rotate(d, o, axes):
 
 
 def _exchange_to_ascending(d, axes, i, j):
-    """Return the diagonal and the axes with axes i and j exchanged, one of them reversed, unless
-    d[i] ≤ d[j].
+    """Return the diagonal `d` and the `axes`; if d[i] > d[j], the entries and axes i and j are
+    exchanged, and one of the two axes is reversed.
     """
     wrong = d[i] > d[j]
     d, axes = list(d), list(axes)

@@ -14,19 +14,22 @@ reads
 
     Π(t) ∝ adj(T) Π + σ T (Π × KΠ),   T and σ at t,   |Π(t)| = h
 
-and, with k = Π(t/2), T and σ at u = t/2, W the factor left out for k, and `Y = ∫₀ᵘ σ² T⁻² du`,
-which doubles as `Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u)`,
+Let now k = Π(t/2), let T and σ be taken at u = t/2, let W be the divisor of the last formula (see
+`Divisor`), and let `Y = ∫₀ᵘ σ² T⁻² du`, with `Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u)`. Then
 
     G = ∫₀ᵗ Π Πᵀ dt = 2σ/(W det T) (adj(T)k)(adj(T)k)ᵀ − 2 adj(E₂ 1 − h² K) Y.
 
-Proof of the first: in principal axes of K it is Jacobi's solution with T = diag(D, 1, C), σ = S, by
-`E₃₃ − E₂₂ = (a₂ − a₃)(a₁h² − E₂) = p`, `E₁₁ − E₂₂ = q`, and both sides turn with the axes. All
-terms but `|…|` are polynomial in K: a sphere or a symmetric top is an ordinary point. (The second:
-differentiate in principal axes: with g = σ/τᵢ, g' = τⱼτₖ/τᵢ²; the mid point removes even terms.)
+Proof of the formula for Π(t): in principal axes of K, with the diagonal entries a₁, a₂, a₃, it is
+Jacobi's solution with T = diag(D, 1, C), σ = S, by `E₃₃ − E₂₂ = (a₂ − a₃)(a₁h² − E₂) = p`, `E₁₁ −
+E₂₂ = q`; and both sides of the formula turn with the axes. All terms but the length |Π(t)| are
+polynomial in K: a sphere or a symmetric top is an ordinary point. Proof of the formula for G:
+differentiate it in principal axes, where T = diag(τ₁, τ₂, τ₃) and g = σ/τᵢ has the derivative g' =
+τⱼτₖ/τᵢ²; the choice of the mid point k removes the even terms.
 
-The axes are principal at the point of evaluation: off-diagonal entries are zeros that carry
-tangents, diagonal differences are given as accurate numbers, and each entry uses the one of its
-equal forms that does not cancel.
+The functions are evaluated in principal axes of K. The off-diagonal entries of K are therefore zero
+in value, and only their tangents (the changes in a derivative) are not. The differences of the
+diagonal entries are arguments, and so they are accurate. If an entry of a matrix can be written in
+several equal forms, the form that does not cancel is used.
 """
 
 from typing import NamedTuple
@@ -42,8 +45,8 @@ from rigidjax.rotation.barrier import barrier
 
 
 class Differences(NamedTuple):
-    """Hold K = I⁻¹ without its trace, as differences of its diagonal entries and as off-diagonal
-    entries.
+    """Hold the symmetric matrix K = I⁻¹ up to a multiple of the unit matrix: the differences dij =
+    kii − kjj of diagonal entries, and the off-diagonal entries kij.
     """
 
     d12: Scalar
@@ -55,7 +58,10 @@ class Differences(NamedTuple):
 
 
 class Invariants(NamedTuple):
-    """Hold the entries of E − E₂₂ 1 and the numbers that they are made of.
+    """Hold the entries of E − E₂₂ 1 (see the head of this module) and the numbers from which these
+    entries are computed.
+
+    The entries are `q` (11), `p` (33), `e12`, `e13` and `e23`; `gap` is p − q, and `h2` is |Π|².
 
     The numbers `a1`, `a2`, `a3` are a₁h² − E₂, a₂h² − E₂ and E₂ − a₃h², where aᵢ are the diagonal
     entries of K.
@@ -74,7 +80,9 @@ class Invariants(NamedTuple):
 
 
 class Sigma(NamedTuple):
-    """Hold σ, T, adj T, det T and Y at some time, where T is scaled so that T₂₂ = 1."""
+    """Hold σ, T, adj T, det T and Y (see the head of this module) at some time, where σ and T are
+    scaled by one factor so that T₂₂ = 1.
+    """
 
     s: Scalar
     t: Six
@@ -84,7 +92,9 @@ class Sigma(NamedTuple):
 
 
 def invariants(body: Differences, momentum: Triple) -> Invariants:
-    """Return the invariants of a motion from K in `body` and Π(0) = `momentum`."""
+    """Return the `Invariants` of a motion, from the entries of K in `body` and from Π(0) =
+    `momentum`.
+    """
     d12, d13, d23, k12, k13, k23 = body
     p1, p2, p3 = momentum
     x1, x2, x3 = p1 * p1, p2 * p2, p3 * p3
@@ -110,13 +120,15 @@ def invariants(body: Differences, momentum: Triple) -> Invariants:
     )
 
 
-# These doublings are added to those of `dtype_limits`, so that the series of `sigma_near_zero` need
-# only two terms.
+# This many doublings are made in addition to the number in `dtype_limits`: two terms of the series
+# in `sigma_near_zero` are then enough.
 _MORE = 10
 
 
 def sigma_near_zero(u: Scalar, v: Invariants) -> Sigma:
-    """Return σ, T and Y at a minute u, from T = √(1 − x) with x = σ²E, to second order in x."""
+    """Return σ, T and Y at a tiny time u, from the series of T = √(1 − x) to second order in the
+    matrix x = σ² (E − E₂₂ 1).
+    """
     uu, zero = u * u, jnp.zeros_like(u)
     c1 = (v.p + v.q) * uu
     s = barrier(u * (1.0 - c1 / 6))
@@ -128,7 +140,7 @@ def sigma_near_zero(u: Scalar, v: Invariants) -> Sigma:
 
 
 def double_sigma(f: Sigma, v: Invariants) -> Sigma:
-    """Return σ, T and Y at 2u from `f`, their values at u."""
+    """Return σ, T and Y at the time 2u, from the values `f` of σ, T and Y at the time u."""
     t1, t2, t3, t12, t13, t23 = f.t
     s = f.s
     ss = s * s
@@ -168,12 +180,12 @@ def double_sigma(f: Sigma, v: Invariants) -> Sigma:
 
 
 class Divisor(NamedTuple):
-    """Hold the parts of W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²) that do not depend on Π.
+    """Hold the terms and factors that do not depend on Π in the divisor W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K
+    E₂ + |KΠ|²).
 
-    The index i is 1 if `first` is true, else 3; for these two, W is a sum of positive terms. The
-    number `square` is (T²)ᵢᵢ. The factor of σ² is
-    `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13 Π₁ Π₃ + |KΠ|² − less`, where K in KΠ is taken without its
-    diagonal.
+    The index i is 1 if `first` is true, else 3: with this choice W is a sum of positive terms. The
+    number `square` is (T²)ᵢᵢ. The factor of σ² is `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13 Π₁ Π₃ +
+    |KΠ|² − less`, where K in KΠ is taken without its diagonal.
     """
 
     first: Array
@@ -185,7 +197,7 @@ class Divisor(NamedTuple):
 
 
 def divisor(body: Differences, v: Invariants, f: Sigma) -> Divisor:
-    """Return the parts of W (see `Divisor`) that do not depend on Π."""
+    """Return the terms and factors of W that do not depend on Π, as a `Divisor`."""
     one, three = (body.d12, body.d12, body.k12), (body.d23, -body.d23, -body.k23)
     first, (t1, _, t3, t12, t13, t23) = v.gap > 0, f.t
     d, slant, k = (jnp.where(first, a, b) for a, b in zip(one, three, strict=True))
@@ -198,8 +210,8 @@ def divisor(body: Differences, v: Invariants, f: Sigma) -> Divisor:
 def momentum_and_part(
     body: Differences, w: Divisor, f: Sigma, momentum: Triple
 ) -> tuple[Triple, Six]:
-    """Return Π after the time of `f`, and 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ with W from the divisor
-    `w`.
+    """Return two things: the momentum that `momentum` becomes after the time u of `f`; and the
+    matrix 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ, with Π = `momentum` and W from `w`.
     """
     p1, p2, p3 = momentum
     d12, d13, d23, k12, k13, k23 = body
@@ -221,8 +233,9 @@ def momentum_and_part(
 def momentum_and_integral_by_quarters(
     body: Differences, momentum: Triple, v: Invariants, span: Scalar
 ) -> tuple[Triple, Six]:
-    """Return Π after the time `span`, and ∫ Π Πᵀ dt, computed in four parts because T has no
-    inverse at a quarter period.
+    """Return two things: Π after the time `span`, and the integral ∫ Π Πᵀ dt over this time.
+
+    The time is divided into four equal parts, because T has no inverse at a quarter period.
     """
     f, hh = sigma_at(0.125 * span, v), v.h2
     w = barrier(divisor(body, v, f))
@@ -237,7 +250,7 @@ def momentum_and_integral_by_quarters(
     )
 
     def take_eighth(i, state):
-        # Each part of the integral is taken about its middle.
+        # The integral over each of the four parts is computed from Π at the middle of the part.
         point, total = state
         point, part = momentum_and_part(body, w, f, point)
         odd = i % 2 == 1
@@ -247,7 +260,7 @@ def momentum_and_integral_by_quarters(
 
 
 def sigma_at(u: Scalar, v: Invariants) -> Sigma:
-    """Return σ, T and Y at u, from the Taylor series at a small part of u and repeated doubling."""
+    """Return σ, T and Y at the time u, from Taylor series at u/2ⁿ and n doublings."""
     n = dtype_limits(u.dtype).doublings + _MORE
     f = sigma_near_zero(u * 2.0**-n, v)
     return jax.lax.fori_loop(0, n, lambda _, g: double_sigma(g, v), f)
@@ -258,7 +271,8 @@ def period(v: Invariants) -> Scalar:
     and z is the largest.
 
     One step of Newton's method from the diagonal entry gives the derivatives of z to third order.
-    The other two eigenvalues enter only through symmetric functions, by the first step of the mean.
+    The other two eigenvalues, x and y, enter only through symmetric functions: the first step of
+    the arithmetic–geometric mean (agm) can be written in this way.
     """
     three = v.gap > 0
     top = jnp.where(three, v.p, v.q)
@@ -283,7 +297,10 @@ def period(v: Invariants) -> Scalar:
 
 
 def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tuple[Triple, Six]:
-    """Return Π(t) and G = ∫₀ᵗ Π Πᵀ dt, from K in `body` and Π(0) = `momentum`."""
+    """Return two things: Π(t), and G = ∫₀ᵗ Π Πᵀ dt.
+
+    `body` holds the entries of K = I⁻¹, and `momentum` is Π(0).
+    """
     v = barrier(invariants(body, momentum))
     m = jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap))
     endless = is_endless(m)

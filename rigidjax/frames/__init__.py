@@ -1,4 +1,4 @@
-"""Describe moving frames, and scenes of particles in them. No body is needed."""
+"""Describe moving frames, and particles that move in such frames. No rigid body is needed."""
 
 from rigidjax._names import show
 from rigidjax.frames.base import AbstractScene as AbstractScene, Force as Force

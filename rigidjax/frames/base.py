@@ -19,9 +19,10 @@ class AbstractScene(eqx.Module):
     `conserved`.
 
     `rigidjax.simulate(None, Point(x, v), ts, scene)` solves a scene; `diffrax.ODETerm(scene.field)`
-    is its term in plain diffrax. A scene that ends a run, for example at a collision, has two more
-    methods: `ends(t, state)`, true at the end, and `end_words(t, state)`, the reason (under `jit`
-    both are traced: words without numbers). `stats` of the solution then has `ended`, `end_time`
+    is the term of the scene in plain diffrax. A scene that ends a run, for example at a collision,
+    has two more methods: `ends(t, state)`, true at the end, and `end_words(t, state)`, the reason.
+    Under `jit` the state is traced, so that the reason cannot contain its numbers. `stats` of the
+    solution then has `ended`, `end_time`
     and `end_state`. Only scenes of a particle can end a run in this way.
 
     >>> class Spring(AbstractScene):
@@ -35,19 +36,23 @@ class AbstractScene(eqx.Module):
 
     @abc.abstractmethod
     def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
-        """Return d²x/dt² (3,), in the frame of the scene: forces per mass (notes, eq 84)."""
+        """Return the acceleration d²x/dt² (3,), m/s², in the frame of the scene (notes, eq 84)."""
 
     @abc.abstractmethod
     def conserved(self, t: ScalarLike, state: PyTree) -> dict[str, Scalar]:
-        """Return the conserved quantities of the exact motion, by name; empty if there are none."""
+        """Return the conserved quantities of the exact motion, by name; an empty `dict` if none is
+        known.
+        """
 
     def field(self, t: ScalarLike, y: PyTree, args: object = None) -> Any:
         """Return the vector field `(dx/dt, dv/dt)` as a `Point`, for `diffrax.ODETerm`."""
         return Point(y.v, self.acceleration(t, y))
 
     def drift(self, ts: Float[Array, " times"], ys: PyTree) -> dict[str, Scalar]:
-        """Return the largest change of each conserved quantity of `ys` at `ts` (T,) from its first
-        value.
+        """Return, by name, the largest change of each conserved quantity from its first value.
+
+        **Arguments:** `ts` (T,) times, s; `ys` the states at these times, with a leading axis T.
+
 
         >>> still = Point(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
         >>> float(rj.scenes.earth(0.8).drift(jnp.arange(2.0), still)["jacobi"])
@@ -76,7 +81,9 @@ class Force(AbstractScene):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times, s, at which the force jumps or has a kink, by its own `jump_times`."""
+        """Return the times, s, at which the force jumps or has a kink: the `jump_times` of
+        `force`.
+        """
         return jump_times_within(self.force)
 
     def acceleration(self, t: ScalarLike, state: PyTree) -> Vec3:
@@ -89,17 +96,16 @@ class Force(AbstractScene):
 
 
 def checked_force_per_mass(value: NumbersLike, force: object) -> Vec3:
-    """Return the value of a force after a check of its shape: a user's force may return
-    anything.
-    """
+    """Return `value`, the value of a user's `force`, after a check that its shape is (3,)."""
     name = getattr(force, "__name__", type(force).__name__)
     return _checks.array_of_shape(value, (3,), f"force {name}", hint="force per mass, m/s²")
 
 
 def jump_times_within(*laws: object) -> Float[Array, " n"]:
-    """Return the `jump_times` of the laws that have them, s.
+    """Return the jump times, s, of all `laws` that have an attribute `jump_times`.
 
-    A scene or torque that contains laws must pass their times on: a solver does not see them.
+    A scene or torque that contains laws must pass the jump times of these laws on: the solver reads
+    the `jump_times` of the outermost scene or torque only.
     """
     jumps = (getattr(law, "jump_times", None) for law in laws)
     times = [jnp.asarray(times, float) for times in jumps if times is not None]
@@ -107,7 +113,7 @@ def jump_times_within(*laws: object) -> Float[Array, " n"]:
 
 
 def cast_like(x: Array, *values: Array) -> tuple[Array, ...]:
-    """Return the constants of a scene in the dtype of the state `x`, so that float32 stays
+    """Return `values`, constants of a scene, in the dtype of the state `x`: float32 stays
     float32.
     """
     return tuple(value.astype(x.dtype) for value in values)

@@ -17,8 +17,8 @@ class Earth(AbstractScene):
     """Describe free fall and throws near one place of the turning Earth; `scenes.earth` makes it.
 
     The axes are east, north, up; up is the plumb line. Gravity is uniform and contains the
-    centrifugal acceleration at the origin; the change of the centrifugal acceleration with x' is
-    added. **Fields:** `latitude` rad, `gravity` m/s², `rate` rad/s.
+    centrifugal acceleration at the origin; the difference of the centrifugal acceleration between
+    x' and the origin is added. **Fields:** `latitude` rad, `gravity` m/s², `rate` rad/s.
 
     >>> scene = earth(0.5)
     >>> float(scene.latitude), float(scene.gravity)
@@ -35,7 +35,11 @@ class Earth(AbstractScene):
         return jnp.stack([jnp.zeros_like(north), north, up])
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """Return the acceleration g − Ω×(Ω×x') − 2Ω×v' (3,), m/s² (notes, eq 91)."""
+        """Return the acceleration g − Ω×(Ω×x') − 2Ω×v' (3,), m/s² (notes, eq 91).
+
+        Here x' and v' are the position and velocity of `state`, Ω is the Earth's angular velocity,
+        and g = (0, 0, −`gravity`).
+        """
         x, v = components(state.x), components(state.v)
         dtype = state.x.dtype
         _, north, up = components(self.angular_velocity().astype(dtype))
@@ -49,7 +53,11 @@ class Earth(AbstractScene):
         return {"jacobi": self.jacobi_integral(state)}
 
     def jacobi_integral(self, state: Point) -> Scalar:
-        """Return ½|v'|² + g z − ½|Ω × x'|², m²/s², conserved along the motion."""
+        """Return the Jacobi integral ½|v'|² + g z − ½|Ω × x'|², m²/s², conserved along the motion.
+
+        Here x' and v' are the position and velocity of `state`, z is the height, and g
+        `gravity`.
+        """
         require_point(state)
         x, v = components(state.x), components(state.v)
         dtype = state.x.dtype
@@ -60,10 +68,10 @@ class Earth(AbstractScene):
         return 0.5 * (speed - moved) + self.gravity.astype(dtype) * x[2]
 
     def eastward_deflection(self, height: ScalarLike) -> Scalar:
-        """Return the eastward deflection of a body dropped from `height` h, m: ⅓ Ω g cos λ
-        (2h/g)^{3/2}.
+        """Return the eastward deflection, m, of a body dropped from `height` h, m.
 
-        The formula is of first order in Ω (Landau and Lifshitz, Mechanics, sec. 39, problem 1).
+        It is ⅓ Ω g cos λ (2h/g)^{3/2}, correct to first order in Ω; λ is the latitude (Landau and
+        Lifshitz, Mechanics, sec. 39, problem 1).
 
         >>> round(float(earth(0.0).eastward_deflection(100.0)), 5)
         0.02195
@@ -79,7 +87,8 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
 
     **Arguments:** `latitude` λ, rad, geodetic, north positive; `gravity` along the plumb line,
     m/s²; `rate` Ω of the Earth, rad/s (WGS84: 7.292115e-5, one turn in 86164.1 s). States are
-    `Point(x, v)` in east, north, up from that place. **Raises:** `ValueError` for a latitude beyond
+    `Point(x, v)`: position and velocity in the axes east, north, up, from that place. **Raises:**
+    `ValueError` for a latitude beyond
     a right angle (degrees?) or gravity that is not positive.
 
     >>> earth(0.5).acceleration(0.0, Point([0.0, 0, 0], [0.0, 0, 0])).tolist()
@@ -110,8 +119,10 @@ class Foucault(AbstractScene):
     length: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """Return d²x'/dt² (3,), m/s²: the free acceleration minus its part along the string (notes,
-        eq 91).
+        """Return d²x'/dt² (3,), m/s², of the bob at x' (notes, eq 91).
+
+        The acceleration along the string is such that the bob keeps its distance from the pivot;
+        across the string the acceleration is that of a free particle.
         """
         x, v = components(state.x), components(state.v)
         a = components(self.place.acceleration(t, state))
@@ -123,7 +134,8 @@ class Foucault(AbstractScene):
         return {"jacobi": self.place.jacobi_integral(state), "length": length}
 
     def start(self, east: ScalarLike, north: ScalarLike) -> Point:
-        """Return the bob at rest, at the distances `east` and `north` from its lowest place, m.
+        """Return the bob at rest, at the horizontal distances `east` and `north`, m, from the
+        pivot.
 
         >>> foucault(0.5, 10.0).start(6.0, 0.0).x.tolist()
         [6.0, 0.0, -8.0]
@@ -133,8 +145,12 @@ class Foucault(AbstractScene):
     def state(
         self, east: ScalarLike, north: ScalarLike, east_speed: ScalarLike, north_speed: ScalarLike
     ) -> Point:
-        """Return the bob below the pivot at the horizontal place `east`, `north`, m, within the
-        string; speeds in m/s.
+        """Return the state of the bob below the pivot from its horizontal position and velocity.
+
+        **Arguments:** `east`, `north` the distances from the pivot, m, less than `length` together;
+        `east_speed`, `north_speed` the horizontal velocity, m/s. The height and the vertical
+        velocity follow from the constant length.
+
 
         >>> foucault(0.5, 10.0).state(6.0, 0.0, 4.0, 0.0).v.tolist()
         [4.0, 0.0, 3.0]
@@ -148,13 +164,17 @@ class Foucault(AbstractScene):
         return Point(jnp.stack([e, n, up]), jnp.stack([ve, vn, -(e * ve + n * vn) / up]))
 
     def small_swing(self, state: Point, t: ScalarLike) -> Point:
-        """Return the state of small swings at `t`, s, in closed form.
+        """Return the state of the bob at time `t`, s, in closed form, for small swings.
 
-        s = east + i north and Ω_z = Ω sin λ obey s'' + 2iΩ_z s' + ω₀² s = 0. The solution is s =
-        e^{−iΩ_z t} (A cos ωt + B sin ωt), ω² = ω₀² + Ω_z², ω₀² = g/L (Landau and Lifshitz,
+        The complex number s = east + i north obeys s'' + 2iΩ_z s' + ω₀² s = 0, with Ω_z = Ω sin λ
+        and
+        ω₀² = g/L for a string of length L. The solution is s = e^{−iΩ_z t} (A cos ωt + B sin ωt)
+        with
+        ω² = ω₀² + Ω_z²; the initial state gives A and B (Landau and Lifshitz,
         Mechanics, sec. 39, problem 3). Its error is of the order of (amplitude/length)².
 
-        **Arguments:** `state` at t = 0. **Returns** a `Point` at the height of the lowest place.
+        **Arguments:** `state` the state at t = 0. **Returns** a `Point` at the height of the lowest
+        place.
 
         >>> pendulum = foucault(0.5, 10.0)
         >>> pendulum.small_swing(pendulum.start(0.1, 0.0), 0.0).x[0]
@@ -167,7 +187,8 @@ class Foucault(AbstractScene):
         place = self.place
         up = (place.rate * jnp.sin(place.latitude)).astype(t.dtype)
         swing = jnp.sqrt(place.gravity.astype(t.dtype) / self.length.astype(t.dtype) + up * up)
-        # In axes that turn with the plane of swing the bob is a plain oscillator.
+        # In axes that turn with the plane of swing the equation of the bob is that of a harmonic
+        # oscillator.
         ax, ay, bx, by = x, y, (vx - up * y) / swing, (vy + up * x) / swing
         c, s = jnp.cos(swing * t), jnp.sin(swing * t)
         px, py = ax * c + bx * s, ay * c + by * s
@@ -179,7 +200,9 @@ class Foucault(AbstractScene):
         return Point(jnp.stack([ex, ey, -self.length.astype(t.dtype)]), jnp.stack([wx, wy, zero]))
 
     def precession_rate(self) -> Scalar:
-        """Return the rate of the plane of small swings, rad/s, −Ω sin λ: clockwise in the north.
+        """Return the rate at which the plane of small swings turns, rad/s: −Ω sin λ.
+
+        Seen from above, the plane turns clockwise in the northern hemisphere, where λ > 0.
 
         >>> round(float(2 * jnp.pi / -foucault(jnp.pi / 6, 67.0).precession_rate()))
         172328
@@ -193,9 +216,10 @@ def foucault(
     """Return the scene of Foucault's pendulum.
 
     **Arguments:** `latitude` λ, rad, north positive; `length` of the string, m; `gravity` m/s²,
-    along the plumb line; `rate` of the Earth, rad/s (WGS84 by default). All may be traced: latitude
-    and rate can be fitted to a record. **Raises:** `ValueError` for a length or gravity that is not
-    positive, a latitude in degrees.
+    along the plumb line; `rate` of the Earth, rad/s (WGS84 by default). All arguments may be
+    traced: `latitude` and `rate`, for example, can be fitted to measurements.
+    **Raises:** `ValueError` for a length or gravity that is not positive, or for a latitude beyond
+    a right angle (degrees?).
 
     >>> pendulum = foucault(0.85, 67.0)
     >>> pendulum.start(3.0, 0.0).v.tolist()

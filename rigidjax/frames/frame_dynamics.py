@@ -1,4 +1,4 @@
-"""Integrate motions inside a moving frame: of a particle, or of a body."""
+"""Integrate the motion of a particle or of a rigid body inside a moving frame."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -18,14 +18,16 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class InFrame(AbstractScene):
-    """Describe a particle whose motion is solved in a moving frame: eq 91 of the notes, corrected.
+    """Describe a particle whose motion is solved in a moving frame (notes, eq 91, corrected).
 
     **Arguments:**
 
-    - `frame`: the `MovingFrame` S'; states are in this frame.
-    - `inside`: force per mass in S', `(t, Point in S') → (3,)`, m/s², axes of S'.
-    - `outside`: force per mass in S, `(t, Point in S) → (3,)`, m/s², axes of S.
-    - `potential`: V(x') per mass, `(3,) → ()`, m²/s²; its force −∇V is taken by automatic
+    - `frame`: the `MovingFrame` S'; the states are positions and velocities in S'.
+    - `inside`: a force per mass, m/s², that is a function of the time and the state in S', `(t,
+      Point in S') → (3,)`, in the axes of S'.
+    - `outside`: a force per mass, m/s², that is a function of the time and the state in the
+      inertial frame S, `(t, Point in S) → (3,)`, in the axes of S.
+    - `potential`: V(x') per mass, `(3,) → ()`, m²/s²; the force −∇V comes from automatic
       differentiation. In a uniformly turning frame without other forces `conserved` has the Jacobi
       integral.
 
@@ -78,7 +80,7 @@ class InFrame(AbstractScene):
 
 
 def scene_of_force(force: object) -> AbstractScene:
-    """Return the scene that `simulate` solves, made from a scene, a moving frame or a plain
+    """Return the scene that `simulate` solves for `force`: a scene, a moving frame or a plain
     force.
     """
     if isinstance(force, AbstractScene):
@@ -94,8 +96,10 @@ def scene_of_force(force: object) -> AbstractScene:
 
 
 class FrameWrench(eqx.Module):
-    """Hold a force on the centre of mass, N, axes of S', and a torque about it, N m, body axes,
-    (3,).
+    """Hold the force and the torque on a body in a moving frame S'.
+
+    **Fields:** `force` (3,) on the centre of mass, N, axes of S'; `torque` (3,) about the centre of
+    mass, N m, body axes.
     """
 
     force: Vec3
@@ -103,22 +107,24 @@ class FrameWrench(eqx.Module):
 
 
 class BodyInFrame(eqx.Module):
-    """Give the torque, and for `Rigid` the force, that make a body's equations valid in a moving
-    frame.
+    """Give the inertial torque, and for `Rigid` the inertial force, on a body in a moving frame S'.
 
     Pass this to `simulate` as the torque of an `Attitude` or `Rigid` state in S'. Such a state has
-    q', body → S'; Ω', the rate relative to S', in body axes; x', v' of the centre of mass. With W =
-    Q'ᵀ Ω the frame's rate in body axes, Ω' = Ω_abs − W, and I dΩ_abs/dt = IΩ_abs × Ω_abs + τ, the
-    equation of Ω' is
+    q',
+    body → S', with the matrix Q'; Ω', the rate relative to S', in body axes; a `Rigid` state also
+    has x' and v', the position and velocity of the centre of mass in S'. The absolute rate is Ω_abs
+    = Ω' + W, where W = Q'ᵀ Ω is the rate Ω of the frame in body axes. It obeys I dΩ_abs/dt = IΩ_abs
+    × Ω_abs + τ, with the inertia I and the real torque τ. Hence the equation of Ω' is
 
     I dΩ'/dt = IΩ' × Ω' + [τ + IΩ_abs × Ω_abs − IΩ' × Ω' − I(Q'ᵀ dΩ/dt − Ω' × W)],
 
     and the centre of mass moves as a `Point` does (eq 91). **Arguments:** `frame` the `MovingFrame`
-    S'; `torque` the real τ, `(t, state in S', body) → (3,)`, N m, body axes, or a model that
-    returns a `Wrench`, with its force in the axes of S'; or `None`. `simulate` refuses torques that
-    need the absolute rate (wheels, `ChangingInertia`), inside a `BodyInFrame` or in a sum with it.
-    Source: notes, eqs 50, 91, for a body instead of a point. **Raises:** `TypeError` for a force on
-    a state that only turns.
+    S'; `torque` the real torque τ, `(t, state in S', body) → (3,)`, N m, body axes; or a model that
+    returns a `Wrench`, whose force is in the axes of S'; or `None`. `simulate` refuses torques that
+    need the absolute rate (wheels, `ChangingInertia`), both as this `torque` and in a sum with a
+    `BodyInFrame`.
+    Source: notes, eqs 50, 91, for a body instead of a point. **Raises:** `TypeError` for a
+    force on a state that has no position.
 
     >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
     >>> still = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, -1.0])

@@ -11,12 +11,14 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class Instant(eqx.Module):
-    """Hold the position, rotation and motion of a moving frame S' at one time; `MovingFrame.at(t)`
-    makes it.
+    """Hold the position, rotation and motion of a moving frame S' at one time.
+
+    `MovingFrame.at(t)` makes it; S is the inertial frame.
 
     **Fields:** `rotation` M (3, 3), S' → S; `rate` Ω (3,), rad/s, and `rate_change` dΩ/dt (3,),
-    rad/s², both in the axes of S'; `origin`, `origin_velocity`, `origin_acceleration` of S', (3,),
-    in the axes of S. The methods take x', v' in S'.
+    rad/s², both in the axes of S'; `origin` X (3,), `origin_velocity` dX/dt (3,) and
+    `origin_acceleration` d²X/dt² (3,), in the axes of S. The arguments `x` and `v` of the methods
+    are a position x' and a velocity v' in S'.
 
     >>> now = rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0)
     >>> now.rate.tolist(), now.coriolis([1.0, 0.0, 0.0]).tolist()
@@ -31,7 +33,7 @@ class Instant(eqx.Module):
     origin_acceleration: Vec3
 
     def to_inertial(self, state: PyTree) -> Any:
-        """Return a state given in S', transformed to S (notes, eqs 85, 88)."""
+        """Return `state`, which is given in S', transformed to S (notes, eqs 85, 88)."""
         _can_travel(state)
         turned = {}
         if hasattr(state, "x"):
@@ -47,7 +49,7 @@ class Instant(eqx.Module):
         return _replace_fields(state, turned)
 
     def from_inertial(self, state: PyTree) -> Any:
-        """Return a state given in S, transformed to S' (notes, eqs 86, 88)."""
+        """Return `state`, which is given in S, transformed to S' (notes, eqs 86, 88)."""
         _can_travel(state)
         turned = {}
         if hasattr(state, "x"):
@@ -63,41 +65,47 @@ class Instant(eqx.Module):
         return _replace_fields(state, turned)
 
     def to_inertial_axes(self, y: Vector) -> Vec3:
-        """Return the components in S, M y', of a vector given in S' (notes, eq 85): a force, a
-        direction.
+        """Return the components in S, M y, of a vector `y` (3,) given in the axes of S' (notes, eq
+        85).
         """
         y = _checks.array_of_shape(y, (3,), "y")
         return linalg3.apply(self.rotation.astype(y.dtype), y)
 
     def from_inertial_axes(self, y: Vector) -> Vec3:
-        """Return the components in S', Mᵀ y, of a vector given in S (notes, eq 86; f = MᵀF of eq
-        91).
+        """Return the components in S', Mᵀ y, of a vector `y` (3,) given in the axes of S (notes, eq
+        86).
         """
         y = _checks.array_of_shape(y, (3,), "y")
         return linalg3.apply(self.rotation.T.astype(y.dtype), y)
 
     def centrifugal(self, x: Vector) -> Vec3:
-        """Return the centrifugal acceleration −Ω × (Ω × x')."""
+        """Return the centrifugal acceleration −Ω × (Ω × x') (3,) at `x` = x', in the axes of S'."""
         x = _checks.array_of_shape(x, (3,), "x")
         rate = self.rate.astype(x.dtype)
         return linalg3.cross(linalg3.cross(rate, x), rate)
 
     def coriolis(self, v: Vector) -> Vec3:
-        """Return the Coriolis acceleration −2 Ω × v'."""
+        """Return the Coriolis acceleration −2 Ω × v' (3,) at `v` = v', in the axes of S'."""
         v = _checks.array_of_shape(v, (3,), "v")
         return 2 * linalg3.cross(v, self.rate.astype(v.dtype))
 
     def euler_acceleration(self, x: Vector) -> Vec3:
-        """Return the Euler acceleration −dΩ/dt × x'."""
+        """Return the Euler acceleration −dΩ/dt × x' (3,) at `x` = x', in the axes of S'."""
         x = _checks.array_of_shape(x, (3,), "x")
         return linalg3.cross(x, self.rate_change.astype(x.dtype))
 
     def translation(self) -> Vec3:
-        """Return the acceleration −Mᵀ d²X/dt² of an accelerated origin."""
+        """Return −Mᵀ d²X/dt² (3,), the inertial acceleration from an accelerated origin, axes of
+        S'.
+        """
         return -self.from_inertial_axes(self.origin_acceleration)
 
     def fictitious(self, x: Vector, v: Vector) -> Vec3:
-        """Return the sum of the four inertial accelerations (notes, eq 91)."""
+        """Return the sum of the four inertial accelerations (3,) at `x`, `v`, axes of S' (notes, eq
+        91).
+
+        The four are: centrifugal, Coriolis, Euler, and that from an accelerated origin.
+        """
         x, v = _checks.array_of_shape(x, (3,), "x"), _checks.array_of_shape(v, (3,), "v")
         turning = self.centrifugal(x) + self.coriolis(v) + self.euler_acceleration(x)
         return turning + self.translation().astype(x.dtype)

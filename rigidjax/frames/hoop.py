@@ -15,10 +15,12 @@ from rigidjax.rotation.linalg3 import components
 
 
 class Hoop(AbstractScene):
-    """Describe a bead that slides on a hoop turning about its vertical diameter; `scenes.hoop`
-    makes it.
+    """Describe a bead that slides on a hoop, which turns about its vertical diameter.
 
-    Axes of the hoop: x in its plane, y across it, z up; the centre is the origin. **Fields:**
+    `scenes.hoop` makes this scene.
+
+    The axes turn with the hoop: x is in the plane of the hoop, y across this plane, z up; the
+    centre of the hoop is the origin. **Fields:**
     `radius` m, `rate` rad/s, `gravity` m/s².
 
     >>> scene = hoop(2.0, 0.0)
@@ -31,8 +33,10 @@ class Hoop(AbstractScene):
     gravity: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """Return d²x'/dt² (3,), m/s²: gravity and the centrifugal acceleration along the hoop, and
-        the hoop's pull.
+        """Return d²x'/dt² (3,), m/s², of the bead at x', in the axes of the hoop.
+
+        It is the sum of gravity, of the centrifugal acceleration, and of the pull of the hoop in
+        its plane, which keeps the bead at the distance `radius` from the centre.
         """
         x, _, z = components(state.x)
         vx, _, vz = components(state.v)
@@ -48,8 +52,9 @@ class Hoop(AbstractScene):
         return {"jacobi": jacobi, "radius": jnp.sqrt(x * x + z * z)}
 
     def side_push(self, state: Point) -> Scalar:
-        """Return the hoop's force per mass across its plane, m/s² along y: 2Ω v_x, opposite to
-        Coriolis.
+        """Return the force per mass of the hoop on the bead along y, across the hoop's plane, m/s².
+
+        It is 2Ω v_x and balances the Coriolis acceleration.
 
         >>> float(hoop(1.0, 3.0).side_push(Point([0.0, 0, -1], [2.0, 0, 0])))
         12.0
@@ -58,7 +63,8 @@ class Hoop(AbstractScene):
         return 2 * cast_like(state.x, self.rate)[0] * state.v[0]
 
     def state(self, angle: ScalarLike, speed: ScalarLike = 0.0) -> Point:
-        """Return the bead at an angle from the lowest place, rad, with dθ/dt = `speed`, rad/s.
+        """Return the state of the bead at the angle θ = `angle` from the lowest place, rad, with
+        dθ/dt = `speed`, rad/s.
 
         >>> hoop(2.0, 3.0).state(0.0, 1.0).v.tolist()
         [2.0, 0.0, 0.0]
@@ -73,7 +79,9 @@ class Hoop(AbstractScene):
         return Point(radius * place, radius * speed.astype(angle.dtype) * along)
 
     def equilibrium_angle(self) -> Scalar:
-        """Return the stable equilibrium of the bead, rad: arccos(g/(Ω²R)), or 0 for a slow hoop.
+        """Return the angle of the bead's stable equilibrium from the lowest place, rad.
+
+        It is arccos(g/(Ω²R)), with the hoop's rate Ω and radius R, or 0 if g ≥ Ω²R.
 
         >>> float(hoop(1.0, 1.0).equilibrium_angle())
         0.0
@@ -84,10 +92,12 @@ class Hoop(AbstractScene):
 
 
 def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) -> Hoop:
-    """Return the scene of a bead without friction on a hoop that turns about its vertical diameter.
+    """Return the scene of a bead that slides without friction on a hoop with a vertical rotation
+    axis.
 
     **Arguments:** `radius` R, m; `rate` Ω, rad/s; `gravity` m/s². Source: Goldstein, Mechanics,
-    sec. 2.7 (θ'' = sin θ (Ω² cos θ − g/R)); notes, eq 91. **Raises:** `ValueError` for a radius
+    sec. 2.7 (θ'' = sin θ (Ω² cos θ − g/R) for the angle θ from the lowest place); notes, eq 91.
+    **Raises:** `ValueError` for a radius
     that is not positive.
 
     >>> hoop(1.0, 5.0).acceleration(0.0, Point([0.0, 0, -1], [0.0, 0, 0])).tolist()
@@ -99,7 +109,9 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
 
 
 class _Angle(eqx.Module):
-    """Compute the angle ½αt² + Ωt, with Ω the `rate` and α the `growth`."""
+    """Compute the angle Ωt + ½αt², rad, at time t, s; Ω is `rate`, rad/s, and α `growth`,
+    rad/s².
+    """
 
     rate: Scalar
     growth: Scalar

@@ -1,4 +1,4 @@
-"""Describe a body in orbit under the gravity-gradient torque: attitude in the orbital frame."""
+"""Describe the attitude of a body in a circular orbit, relative to the orbital frame."""
 
 from typing import ClassVar
 
@@ -16,8 +16,10 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class OrbitalGravityGradient(eqx.Module):
-    """Compute the gravity-gradient torque 3n² u × I u, with u away from the planet (Hughes 1986,
-    sec. 8.1).
+    """Compute the gravity-gradient torque 3n² u × I u (3,), N m, body axes (Hughes 1986, sec. 8.1).
+
+    Here n is `rate`, rad/s, the angular rate of a circular orbit; u is the unit vector away from
+    the planet, in body axes; I is the inertia of the body.
     """
 
     feels: ClassVar[type] = HasAttitude
@@ -31,10 +33,13 @@ class OrbitalGravityGradient(eqx.Module):
 
 
 def libration(rate: ScalarLike) -> BodyInFrame:
-    """Return the torque on a body in a circular orbit, for `simulate` with `Attitude` states.
+    """Return the gravity-gradient torque on a body in a circular orbit, for `simulate` with
+    `Attitude`
+    states relative to the orbital frame.
 
     The orbital frame has x away from the planet, y along the motion and z along the orbit's normal;
-    it turns at the rate n about z. `q` takes body axes to the orbital frame; `omega` is the rate
+    the frame turns at the rate n about z. `q` takes body axes to the orbital frame; `omega` is the
+    rate
     relative to this frame, in body axes.
 
     **Arguments:** `rate` n of the orbit, rad/s. Small librations in the orbital plane of a body
@@ -53,11 +58,11 @@ def libration(rate: ScalarLike) -> BodyInFrame:
 
 
 def libration_integral(state: PyTree, body: _inertia.Inertia, rate: ScalarLike) -> Scalar:
-    """Return the Jacobi integral of `libration`, J, which is conserved: ½Ω'·IΩ' + (3/2)n² u·Iu −
-    ½n² w·Iw.
+    """Return the conserved Jacobi integral of `libration`, J: ½Ω'·IΩ' + (3/2)n² u·Iu − ½n² w·Iw.
 
-    **Arguments:** `state` an `Attitude` in the orbital frame; `body` an `Inertia`; `rate` n, rad/s.
-    u and w are the frame's first and third axes in body axes (Hughes 1986, sec. 9.1).
+    **Arguments:** `state` an `Attitude` in the orbital frame; `body` an `Inertia`; `rate` n,
+    rad/s. Ω' is the rate relative to the orbital frame, I the inertia, u and w the unit vectors
+    along the frame's x and z, all in body axes (Hughes 1986, sec. 9.1).
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> at_rest = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])

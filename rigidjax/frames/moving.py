@@ -1,4 +1,4 @@
-"""Describe a moving frame with any R(t) and any origin(t) (notes, section 3, eqs 84–91)."""
+"""Describe a frame that turns and moves in any way (notes, section 3, eqs 84–91)."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,23 +17,26 @@ from rigidjax.rotation import linalg3
 
 
 class MovingFrame(eqx.Module):
-    """Describe a frame S' that turns and moves in any differentiable way, relative to an inertial
-    frame S.
+    """Describe a frame S' that turns and moves in any smooth way relative to an inertial frame S.
 
     Coordinates transform as x = X(t) + M(t) x' (notes, eqs 85, 86, with an origin added).
     **Arguments:**
 
-    - `rotation`: a function of time, s, to M (3, 3) or to its unit quaternion (4,), S' → S. Or a
-      function to a state with `q` and `omega`, such as a solution of `simulate` (its `evaluate` is
-      called) or a `FreeBody`: the frame is then fixed in the body, and derivatives through a solved
-      motion are in forward mode only. A Module (`frames.Uniform`) does not compile again for other
-      numbers; a new `lambda` does.
-    - `origin`: a function of time to X (3,), m, axes of S; `None` if the origins coincide.
-    - `rate`: Ω (3,), rad/s, **axes of S'**, as a function of time, if it is known; else Ω =
-      vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation, which always gives dΩ/dt.
+    - `rotation`: a function of the time, s, that returns the matrix M (3, 3), S' → S, or the unit
+      quaternion (4,) of M. It may also return a state with `q` and `omega`, as a solution of
+      `simulate` (whose `evaluate` is called) or a `FreeBody` does: the frame is then fixed in this
+      body, and derivatives through a solved motion are in forward mode only. A Module such as
+      `frames.Uniform` with other numbers is not compiled again; a new `lambda` is.
+    - `origin`: a function of the time that returns the origin X (3,) of S', m, axes of S; `None` if
+      the origins of S and S' coincide.
+    - `rate`: a function of the time that returns the angular velocity Ω (3,), rad/s, **axes of
+      S'**;
+      if it is `None`, Ω = vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation. dΩ/dt always
+      comes from automatic differentiation.
 
-    The numbers of a frame may be traced: a rate or an origin has gradients. **Raises:** `TypeError`
-    for another `rotation`; at its use, `ValueError` for a known value that is no rotation.
+    The numbers of a frame may be traced: motions in the frame can be differentiated with respect to
+    them. **Raises:** `TypeError` for a `rotation` that cannot be called; `ValueError`, when the
+    frame is used, if `rotation` returns a known value that is no rotation.
 
     >>> turntable = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
     >>> turntable.centrifugal([1.0, 0.0, 0.0], 0.3).tolist()
@@ -63,11 +66,11 @@ class MovingFrame(eqx.Module):
         self.rate = getattr(rotation, "rate", None) if rate is None else rate
 
     def matrix(self, t: ScalarLike) -> Mat3:
-        """Return M(t) (3, 3), S' → S (notes, eq 85)."""
+        """Return the rotation matrix M(t) (3, 3), S' → S (notes, eq 85)."""
         return rotation_models.matrix(self.rotation, _checks.checked_time(t))
 
     def at(self, t: ScalarLike) -> Instant:
-        """Return the frame at time `t`, s: M, Ω, dΩ/dt, and the origin with its two derivatives.
+        """Return the frame at time `t`, s, as an `Instant`: M, Ω, dΩ/dt, X, dX/dt and d²X/dt².
 
         >>> MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
@@ -80,7 +83,10 @@ class MovingFrame(eqx.Module):
         return Instant(self.matrix(t), rate, rate_change, origin, velocity, acceleration)
 
     def angular_velocity(self, t: ScalarLike) -> Vec3:
-        """Return Ω(t) (3,), rad/s, axes of S': `rate`, or vee(Mᵀ dM/dt) (notes, eqs 45–50)."""
+        """Return the angular velocity Ω(t) (3,), rad/s, axes of S' (notes, eqs 45–50).
+
+        It is `rate(t)` if the frame has a `rate`, else vee(Mᵀ dM/dt).
+        """
         t = _checks.checked_time(t)
         if self.rate is not None:
             return _checks.array_of_shape(self.rate(t), (3,), "rate").astype(t.dtype)
@@ -91,15 +97,15 @@ class MovingFrame(eqx.Module):
         return linalg3.vee(linalg3.product(m.T, m_dot))
 
     def to_inertial(self, state: PyTree, t: ScalarLike) -> Any:
-        """Return a state given in S', transformed to S, of the same type.
+        """Return `state`, which is given in S', transformed to S; its type does not change.
 
         **Arguments:** `state` a `Point`, `Attitude` or `Rigid`, or any Module with `x` and `v`,
-        with `q` and `omega`, or with all four; one state. `t` time, s. Then
+        with `q` and `omega`, or with all four fields; one state, not a batch. `t` the time, s. Then
 
         x = X + M x',  v = dX/dt + M (v' + Ω × x')  (notes, eqs 85, 87, 88), q = q_M q',  Ω_body =
         Ω'_body + (M')ᵀ Ω, both in body axes.
 
-        Many: `jax.vmap(frame.to_inertial)(states, times)`.
+        For many states use `jax.vmap(frame.to_inertial)(states, times)`.
 
         >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.to_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 0, 0]), 0.0).v.tolist()
@@ -108,7 +114,7 @@ class MovingFrame(eqx.Module):
         return self.at(t).to_inertial(state)
 
     def from_inertial(self, state: PyTree, t: ScalarLike) -> Any:
-        """Return a state given in S, transformed to S': the inverse of `to_inertial`.
+        """Return `state`, which is given in S, transformed to S': the inverse of `to_inertial`.
 
         **Arguments:** as for `to_inertial`. x' = Mᵀ(x − X), v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs
         86–88).
@@ -120,37 +126,46 @@ class MovingFrame(eqx.Module):
         return self.at(t).from_inertial(state)
 
     def centrifugal(self, x: Vector, t: ScalarLike) -> Vec3:
-        """Return the centrifugal acceleration −Ω × (Ω × x') (3,), m/s², axes of S', at `x` (3,), m
-        (notes, eq 91).
+        """Return the centrifugal acceleration −Ω × (Ω × x') (3,), m/s², axes of S' (notes, eq 91).
+
+        **Arguments:** `x` x' (3,), the position in S', m; `t` the time, s.
         """
         return self.at(t).centrifugal(x)
 
     def coriolis(self, v: Vector, t: ScalarLike) -> Vec3:
-        """Return the Coriolis acceleration −2 Ω × v' (3,), m/s², axes of S', at `v` (3,), m/s
-        (notes, eq 91).
+        """Return the Coriolis acceleration −2 Ω × v' (3,), m/s², axes of S' (notes, eq 91).
+
+        **Arguments:** `v` v' (3,), the velocity in S', m/s; `t` the time, s.
         """
         return self.at(t).coriolis(v)
 
     def euler_acceleration(self, x: Vector, t: ScalarLike) -> Vec3:
-        """Return the Euler acceleration −dΩ/dt × x' (3,), m/s², axes of S', at `x` (3,), m (eq 91,
+        """Return the Euler acceleration −dΩ/dt × x' (3,), m/s², axes of S' (eq 91, there
         "inercial").
+
+        **Arguments:** `x` x' (3,), the position in S', m; `t` the time, s.
         """
         return self.at(t).euler_acceleration(x)
 
     def translation(self, t: ScalarLike) -> Vec3:
-        """Return the acceleration by an accelerated origin, −Mᵀ d²X/dt² (3,), m/s², axes of S'."""
+        """Return −Mᵀ d²X/dt² (3,), m/s², axes of S': the inertial acceleration from an accelerated
+        origin.
+        """
         return self.at(t).translation()
 
     def acceleration(
         self, x: Vector, v: Vector, t: ScalarLike, force: Vector | None = None
     ) -> Vec3:
-        """Return the acceleration in S': eq 91 of the notes, corrected, with a moving origin.
+        """Return the acceleration d²x'/dt² (3,), m/s², of a particle in S' (notes, eq 91,
+        corrected).
 
-        d²x'/dt² = f − Ω×(Ω×x') − 2Ω×v' − dΩ/dt×x' − Mᵀ d²X/dt². (Eq 91 prints one more x'' inside
-        its bracket, a slip: see eq 90.)
+        d²x'/dt² = f − Ω×(Ω×x') − 2Ω×v' − dΩ/dt×x' − Mᵀ d²X/dt². (The notes have no moving origin,
+        and
+        eq 91 prints one more x'' inside its bracket, a slip: see eq 90.)
 
-        **Arguments:** `x`, `v` (3,) in S', m and m/s; `t` s; `force` f = MᵀF (3,) per mass, m/s²,
-        **axes of S'** (`force_from_inertial` makes it from F), `None` for a free particle.
+        **Arguments:** `x`, `v` (3,) position x' and velocity v' in S', m and m/s; `t` the time, s;
+        `force` the force per mass f = MᵀF (3,), m/s², **axes of S'** (`force_from_inertial` makes f
+        from F, in the axes of S), or `None` for a free particle.
 
         >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.acceleration([1.0, 0, 0], [0.0, -2, 0], 0.0).tolist()
@@ -161,25 +176,34 @@ class MovingFrame(eqx.Module):
         return free if force is None else _checks.array_of_shape(force, (3,), "force") + free
 
     def acceleration_to_inertial(self, x: Vector, v: Vector, a: Vector, t: ScalarLike) -> Vec3:
-        """Return the acceleration in S (3,), m/s², of a particle with `x`, `v`, `a` (3,) in S' at
-        `t` (eqs 89, 90).
+        """Return the acceleration in S (3,), m/s², of a particle whose motion in S' is given.
+
+        **Arguments:** `x`, `v`, `a` (3,) its position, velocity and acceleration in S', m, m/s and
+        m/s²; `t` the time, s. Source: notes, eqs 89, 90.
         """
         now, a = self.at(t), _checks.array_of_shape(a, (3,), "a")
         return now.to_inertial_axes(a - now.fictitious(x, v))
 
     def force_from_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
-        """Return f = MᵀF (3,): a force F, or any direction, in the axes of S' (notes, eq 91)."""
+        """Return MᵀF (3,), axes of S', of a force or direction F = `force` (3,), axes of S (notes,
+        eq 91).
+        """
         return linalg3.apply(self.matrix(t).T, _checks.array_of_shape(force, (3,), "force"))
 
     def force_to_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
-        """Return F = M f (3,): a force f, or any direction, in the axes of S (notes, eq 85)."""
+        """Return M f (3,), axes of S, of a force or direction f = `force` (3,), axes of S' (notes,
+        eq 85).
+        """
         return linalg3.apply(self.matrix(t), _checks.array_of_shape(force, (3,), "force"))
 
     def jacobi_integral(self, state: PyTree, t: ScalarLike, potential: ScalarLike = 0.0) -> Scalar:
-        """Return ½|v'|² − ½|Ω × x'|² + V, m²/s²: conserved if Ω and V(x') do not depend on time.
+        """Return the Jacobi integral ½|v'|² − ½|Ω × x'|² + V, m²/s².
 
-        **Arguments:** `state` a `Point` in S'; `t` s; `potential` V per mass at its place, m²/s².
-        Source: Goldstein, Mechanics, sec. 3.12 (in the three-body problem it is −C/2).
+        It is conserved if the origin is fixed and Ω and V(x') do not depend on time.
+
+        **Arguments:** `state` a `Point` in S', with x' and v'; `t` the time, s; `potential` the
+        potential V per mass at x', m²/s². Source: Goldstein, Mechanics, sec. 3.12. In the
+        three-body problem the integral is −C/2, with Jacobi's constant C.
         """
         require_point(state)
         speed = linalg3.dot(state.v, state.v)
@@ -188,8 +212,9 @@ class MovingFrame(eqx.Module):
         return 0.5 * (speed - linalg3.dot(moved, moved)) + v
 
     def compose(self, inner: "MovingFrame") -> "MovingFrame":
-        """Return the frame that moves as `inner` does **within this frame**: M = M₁M₂, X = X₁ +
-        M₁X₂.
+        """Return the frame that moves as `inner` does **within this frame**.
+
+        With the index 1 for this frame and 2 for `inner`: M = M₁M₂, X = X₁ + M₁X₂.
 
         >>> half = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
         >>> half.compose(half).at(0.0).rate.tolist()
@@ -199,14 +224,15 @@ class MovingFrame(eqx.Module):
         return MovingFrame(both.rotation, both.origin, both.rate)
 
     def inverse(self) -> "MovingFrame":
-        """Return S relative to S': M → Mᵀ, X → −MᵀX. `frame.compose(frame.inverse())` does not
-        move.
+        """Return the motion of S relative to S', as a frame with Mᵀ for M and −MᵀX for X.
+
+        `frame.compose(frame.inverse())` does not move.
         """
         back = _Inverse(self)
         return MovingFrame(back.rotation, back.origin, back.rate)
 
     def place(self, t: ScalarLike) -> Vec3:
-        """Return the origin X(t) (3,), m, axes of S."""
+        """Return the origin X(t) (3,) of S', m, axes of S."""
         t = _checks.checked_time(t)
         if self.origin is None:
             return jnp.zeros(3, t.dtype)
@@ -229,7 +255,8 @@ class _Composed(eqx.Module):
         return linalg3.product(self.outer.matrix(t), self.inner.matrix(t))
 
     def rate(self, t: ScalarLike) -> Any:
-        # Rates are added in one set of axes, which saves one derivative of the product.
+        # The angular velocities of both frames are added, in the axes of the inner frame: this
+        # needs no derivative of the product of the two rotations.
         carried = linalg3.apply(self.inner.matrix(t).T, self.outer.angular_velocity(t))
         return carried + self.inner.angular_velocity(t)
 

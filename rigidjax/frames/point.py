@@ -13,8 +13,9 @@ from rigidjax._types import Vectors
 class Point(eqx.Module):
     """Hold the position and velocity of a particle, in the frame of its scene.
 
-    **Arguments:** `x` (3,) position, m; `v` (3,) its velocity **in this frame**, m/s. Scenes with
-    units of their own (the restricted three-body problem) say so. Source: notes, eq 84 (x, and ẋ).
+    **Arguments:** `x` (3,) position, m; `v` (3,) velocity dx/dt **in this frame**, m/s. A scene
+    with
+    other units, as the restricted three-body problem, says so. Source: notes, eq 84.
 
     >>> Point([1.0, 0, 0], [0.0, 2, 0]).v.shape
     (3,)
@@ -35,7 +36,9 @@ class Point(eqx.Module):
 
 
 def require_point(state: PyTree, name: str = "state") -> Any:
-    """Return `state` if it has one place and one velocity; raise an error for anything else."""
+    """Return `state` if it has one position `x` and one velocity `v`; raise an error for anything
+    else.
+    """
     if isinstance(state, type) or not (hasattr(state, "x") and hasattr(state, "v")):
         raise TypeError(f"{name}: wanted a Point(x, v), got {_checks.type_name(state)}")
     for part in ("x", "v"):

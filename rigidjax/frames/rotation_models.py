@@ -16,7 +16,10 @@ from rigidjax.rotation.validation import require_near_unit, require_rotation_mat
 
 
 class Uniform(eqx.Module):
-    """Turn uniformly: M(t) = exp(t hat Ω), M(0) = 1, of `omega` Ω (3,), rad/s, axes of S or S'.
+    """Turn uniformly: M(t) = exp(t hat Ω), with M(0) = 1.
+
+    **Arguments:** `omega` the angular velocity Ω (3,), rad/s; its components in S and in S' are
+    equal.
 
     >>> Uniform([0.0, 0.0, 1.0])(jnp.pi).round(12)[0].tolist()
     [-1.0, -0.0, 0.0]
@@ -32,12 +35,15 @@ class Uniform(eqx.Module):
         return so3.exp(t * self.omega.astype(t.dtype))
 
     def rate(self, t: ScalarLike) -> Vec3:
-        """Return Ω, which is constant."""
+        """Return the angular velocity Ω (3,), rad/s, which is constant."""
         return self.omega.astype(_checks.checked_time(t).dtype)
 
 
 class AboutAxis(eqx.Module):
-    """Turn about a fixed `axis` (3,), of any length, by any `angle`, a function of time to rad.
+    """Turn about a fixed axis by an angle that is any function of the time.
+
+    **Arguments:** `axis` (3,), of any length but zero; `angle` a function of the time, s, that
+    returns the angle, rad.
 
     >>> float(AboutAxis([0.0, 0.0, 2.0], lambda t: 3.0 * t**2).rate(1.0)[2])
     6.0
@@ -63,14 +69,19 @@ class AboutAxis(eqx.Module):
         )
 
     def rate(self, t: ScalarLike) -> Vec3:
-        """Return Ω (3,), rad/s: the axis times the angle's derivative."""
+        """Return the angular velocity Ω (3,), rad/s: the unit axis times the time derivative of the
+        angle.
+        """
         t = _checks.checked_time(t)
         _, speed = jax.jvp(self.angle, (t,), (jnp.ones_like(t),))
         return speed * self.axis.astype(t.dtype)
 
 
 def with_forward_solves(rotation: PyTree) -> Any:
-    """Return `rotation` with its own solves in forward mode, which dΩ/dt needs."""
+    """Return `rotation` with the differential equations in it solved by `diffrax.ForwardMode`.
+
+    dΩ/dt is a forward-mode derivative, which `diffrax.RecursiveCheckpointAdjoint` refuses.
+    """
 
     def reverse(part: PyTree) -> bool:
         return isinstance(part, dfx.RecursiveCheckpointAdjoint)
@@ -86,7 +97,11 @@ def state_of(rotation: PyTree, t: Array) -> Any:
 
 
 def matrix(rotation: PyTree, t: Array) -> Mat3:
-    """Return M(t) of the rotation of a frame: a function to (3, 3) or (4,), or a solution."""
+    """Return the matrix M (3, 3), S' → S, of a frame's `rotation` at time `t`, s.
+
+    `rotation` is a function of the time that returns a matrix (3, 3), a quaternion (4,) or a state
+    with `q`; or it is a solution of `simulate`.
+    """
     value = state_of(rotation, t)
     value = getattr(value, "q", value)
     shape = jnp.shape(value)

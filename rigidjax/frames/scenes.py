@@ -1,4 +1,4 @@
-"""Provide scenes for `rigidjax.simulate(None, Point(x, v), ts, scene)`; no body is needed."""
+"""Provide scenes of a particle, for `rigidjax.simulate(None, Point(x, v), ts, scene)`."""
 
 from rigidjax._names import show
 from rigidjax.frames.earth import (

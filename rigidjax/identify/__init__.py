@@ -2,8 +2,8 @@
 
 `fit` finds the body and all other free numbers of a `Model`. `filter`, `step` and `smooth` follow a
 model with an unknown torque: they give states, torques and sensor errors with their standard
-deviations. `log_likelihood` is the logarithm of the density of the readings, with the unknown
-torques integrated out; `sample` draws a motion under random torques. `LogDensity` is the posterior
+deviations. `log_likelihood` is the logarithm of the density of the readings, after integration over
+the unknown torques; `sample` draws a motion under random torques. `LogDensity` is the posterior
 density of a fit: `posterior` draws from it, `refit` finds its maximum.
 """
 

@@ -1,3 +1,3 @@
-"""Import `read_table` in its former place, for programs that use `identify.csv_io.read_table`."""
+"""Import `read_table` at its old place, for programs that use `identify.csv_io.read_table`."""
 
 from rigidjax.cli.logs.table import read_table as read_table

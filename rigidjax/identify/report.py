@@ -91,7 +91,8 @@ def numbers(value: float, low: float, high: float) -> list[str]:
         if not np.isfinite(number):
             return str(number)
         top = _place(size if fixed else number)
-        # Show two digits after the first one of the uncertainty, or six digits without one.
+        # The number is shown to two digits after the first digit of the uncertainty, or with six
+        # digits if there is no uncertainty.
         last = _place(2 * min(gap, 8e307)) - 2 if 0 < gap < np.inf else top - 5
         last = min(max(last, top - 12), top - 2)
         return f"{number:.{max(-last, 0)}f}" if fixed else f"{number:.{top - last}e}"
@@ -101,17 +102,20 @@ def numbers(value: float, low: float, high: float) -> list[str]:
 
 
 def _place(number: float) -> int:
-    """Return the power of ten of the first digit of `number`; 0 for zero."""
+    """Return the power of ten (such as 2 for 345) of the first digit of `number`; 0 for zero."""
     return int(np.floor(np.log10(abs(number)))) if number else 0
 
 
 def _interval_as_text(texts: list[str]) -> str:
-    """Return as text the interval that `numbers` wrote in `texts`; "not determined" for NaN."""
+    """Return the interval as text, from the three `texts` that `numbers` returns; "not determined"
+    for NaN.
+    """
     return "not determined" if "nan" in texts[1:] else f"{texts[1]} … {texts[2]}"
 
 
 def verdict(fit: Fit) -> str:
-    """Return in words a fit's answers and advice, and how well the data determine each quantity.
+    """Return, in words, the answers and the advice of a fit, and how well the data determine each
+    quantity.
 
     **Arguments:** `fit` a result of `rigidjax.identify.fit`.
 
@@ -233,7 +237,8 @@ def write_json(
     'ok'
     """
     text = json.dumps(as_dict(fit, files, more), indent=2, ensure_ascii=False, allow_nan=False)
-    # A file name may hold bytes that are no character: such bytes are written as escapes.
+    # A file name may contain bytes that are not a valid character. Such bytes are written as
+    # escapes.
     Path(path).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
@@ -247,7 +252,8 @@ def write_html(
     files: Sequence[str] = (),
     more: Sequence[Row] = (),
 ) -> None:
-    """Write a fit as one page of HTML: status, table, words, errors, starts and figures.
+    """Write a fit as one page of HTML, with its status, a table of the quantities, the verdict in
+    words, the errors, the starts and figures.
 
     **Arguments:**
 
@@ -306,7 +312,8 @@ img {{ max-width: 100%; margin: 1rem 0 }}
 
 
 def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str:
-    """Return the status, the table and the words of a fit as HTML, for a page or a notebook.
+    """Return the status, the table of quantities and the verdict of a fit as HTML, for a page or a
+    notebook.
 
     **Arguments:** `fit`; `rate_unit` as for `rows`; `more` rows of further quantities, in the form
     of `rows`.

@@ -1,6 +1,4 @@
-"""Derive equations of motion from any Lagrangian by differentiation; Euler angles are the worked
-case.
-"""
+"""Derive equations of motion from any Lagrangian, such as that of a top in Euler angles."""
 
 from collections.abc import Callable
 from typing import Any
@@ -21,10 +19,10 @@ from rigidjax.rotation import euler, linalg3
 
 
 class Coordinates(eqx.Module):
-    """Hold the state of a Lagrangian system: coordinates and their rates.
+    """Hold the state of a Lagrangian system: the coordinates and their time derivatives.
 
     **Arguments:** `q` (n,) generalised coordinates, in the Lagrangian's units; `rate` (n,) dq/dt,
-    per second.
+    the same units per second.
 
     >>> Coordinates([0.1, 0.2], [0.0, 1.0]).rate.shape
     (2,)
@@ -45,8 +43,9 @@ class Coordinates(eqx.Module):
 
 
 class LagrangeEquations(eqx.Module):
-    """Evaluate Lagrange's equations of `lagrangian` and `force` as a vector field;
-    `equations_of_motion` makes it.
+    """Evaluate Lagrange's equations of a Lagrangian and of forces as a vector field.
+
+    `equations_of_motion` makes this Module and describes its fields.
 
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
     >>> round(float(pendulum.energy(Coordinates([0.0], [2.0]))), 6)  # ½ v² − 9.81 cos q
@@ -68,7 +67,10 @@ class LagrangeEquations(eqx.Module):
         )
 
     def energy(self, y: Coordinates) -> Scalar:
-        """Return Jacobi's integral `q̇·∂L/∂q̇ − L`, J: conserved without a `force`."""
+        """Return Jacobi's integral `q̇·∂L/∂q̇ − L`, J, of the state `y`.
+
+        It is conserved without a `force`, if L does not depend on the time.
+        """
         momentum = jax.grad(self._value, argnums=1)(y.q, y.rate)
         return jnp.sum(y.rate * momentum) - self._value(y.q, y.rate)
 
@@ -81,18 +83,22 @@ class LagrangeEquations(eqx.Module):
 def equations_of_motion(
     lagrangian: Callable[[Any, Any], Any], force: Callable[[Any, Any, Any], Any] | None = None
 ) -> LagrangeEquations:
-    """Return the vector field `f(t, y, args)` on `Coordinates` of any Lagrangian L(q, q̇).
+    """Return the vector field `f(t, y, args)` of any Lagrangian L(q, q̇); `y` is a `Coordinates`.
 
-    `d/dt ∂L/∂q̇ = ∂L/∂q + Q`, solved for q̈: `(∂²L/∂q̇∂q̇) q̈ = ∂L/∂q − (∂²L/∂q̇∂q) q̇ + Q`.
+    Lagrange's equations `d/dt ∂L/∂q̇ = ∂L/∂q + Q`, with generalised forces Q, are solved for q̈:
+    `(∂²L/∂q̇∂q̇) q̈ = ∂L/∂q − (∂²L/∂q̇∂q) q̇ + Q`.
 
-    **Arguments:** `lagrangian` a callable, best a Module (its numbers can be differentiated, and
-    changed without compiling again), `(q, q̇) → L`, J, with `q`, `q̇` (n,); `force` generalised
-    forces without a potential, `(t, q, q̇) → Q` (n,), or `None`. **Returns** a Module, for
+    **Arguments:** `lagrangian` a callable `(q, q̇) → L`, J, with `q`, `q̇` (n,), best a Module:
+    motions
+    can be differentiated with respect to the numbers of a Module, and other numbers need no new
+    compilation; `force` a callable `(t, q, q̇) → Q` (n,), the generalised forces without a
+    potential, or `None`. **Returns** a Module, for
     `diffrax.ODETerm`. The linear system is solved by cofactors for up to three coordinates, by LU
     (`lineax`) for more. Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after
     eq 57.
 
-    A singular ∂²L/∂q̇∂q̇ (a singular chart, a coordinate without mass) gives infinities or NaN.
+    If the matrix ∂²L/∂q̇∂q̇ is singular (at a singularity of the coordinates, or for a coordinate
+    without inertia), the result has infinities or NaN.
 
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
     >>> pendulum(0.0, Coordinates([jnp.pi / 2], [0.0])).rate
@@ -105,12 +111,13 @@ def equations_of_motion(
 
 
 class EulerAngleTop(eqx.Module):
-    """Compute L = ½ Ω·IΩ − U of a body about a fixed point, in the notes' Euler angles.
+    """Compute the Lagrangian L = ½ Ω·IΩ − U of a body about a fixed point, in 3-1-3 Euler angles.
 
-    **Arguments:** `inertia` about the fixed point (or the centre of mass, if free); `torque`, a
-    torque with a potential that does not depend on time, such as `HeavyTop`, or `None`. The object
-    is called with the angles (φ, θ, ψ), sequence 3-1-3, rad, and their rates, and returns L, J. L
-    is singular at sin θ = 0. Source: notes, eqs 33, 75, 81–83. **Raises:** `TypeError` for a torque
+    **Arguments:** `inertia` I about the fixed point (about the centre of mass for a free body);
+    `torque` a torque with a potential U that does not depend on time, such as `HeavyTop`, or
+    `None`. The object is called with the angles (φ, θ, ψ), sequence 3-1-3, rad, and the time
+    derivatives of these angles, and returns L, J; Ω is the body rate. Lagrange's equations of L are
+    singular at sin θ = 0. Source: notes, eqs 33, 75, 81–83. **Raises:** `TypeError` for a torque
     without a potential.
 
     >>> free = EulerAngleTop(rj.Inertia.from_principal(1.0, 1.0, 2.0))
@@ -143,8 +150,10 @@ class EulerAngleTop(eqx.Module):
 
 
 def to_attitude(y: Coordinates) -> Attitude:
-    """Return the attitude and body rate of `y`: 3-1-3 Euler angles, rad, and their rates (notes,
-    eqs 33, 81–83).
+    """Return the attitude and body rate that belong to Euler angles and their time derivatives.
+
+    **Arguments:** `y` with `q` the 3-1-3 Euler angles (φ, θ, ψ), rad, and `rate` their time
+    derivatives, rad/s. Source: notes, eqs 33, 81–83.
 
     >>> to_attitude(Coordinates([0.0, 0.0, 0.0], [0.0, 0.0, 2.0])).omega.tolist()
     [0.0, 0.0, 2.0]
@@ -155,7 +164,7 @@ def to_attitude(y: Coordinates) -> Attitude:
 
 
 def from_attitude(state: HasAttitude) -> Coordinates:
-    """Return the 3-1-3 Euler angles and their rates of an attitude and a body rate.
+    """Return the 3-1-3 Euler angles of an attitude and a body rate, with their time derivatives.
 
     **Arguments:** `state` with `.q` (4,), body → world, and `.omega` (3,), rad/s. **Raises:**
     `ValueError` (`EquinoxRuntimeError` under `jit`) at sin θ = 0, where the angles are not unique

@@ -1,4 +1,4 @@
-"""Derive Lie–Poisson equations from any Hamiltonian of the body's momentum."""
+"""Derive Lie–Poisson equations from any Hamiltonian of the angular momentum of a body."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,9 +18,9 @@ _WANTED = "of the momentum to H, J"
 
 
 class Momentum(eqx.Module):
-    """Hold the state of Lie–Poisson motion: the angular momentum in the body.
+    """Hold the state of a Lie–Poisson motion: the angular momentum, in body axes.
 
-    **Arguments:** `pi` (3,) Π = IΩ, N m s, body frame.
+    **Arguments:** `pi` (3,) the angular momentum Π = IΩ, N m s, body frame.
 
     >>> Momentum([1.0, 0.0, 0.0]).pi.shape
     (3,)
@@ -33,10 +33,13 @@ class Momentum(eqx.Module):
 
 
 class MomentumAndDirection(eqx.Module):
-    """Hold the state of a heavy top reduced by its symmetry: momentum, and a fixed direction.
+    """Hold the state of a heavy top reduced by its symmetry: angular momentum, and a direction
+    fixed in the world.
 
-    **Arguments:** `pi` (3,) Π, N m s, body frame; `gamma` (3,) γ = Rᵀ d, body frame, of a vector d
-    that is fixed in the world. Any length and unit: for `HeavyTopHamiltonian` d = g, m/s².
+    **Arguments:** `pi` (3,) the angular momentum Π, N m s, body frame; `gamma` (3,) the vector γ =
+    Rᵀ
+    d, body frame, where d is a vector fixed in the world and R the attitude, body → world. d has
+    any length and unit; for `HeavyTopHamiltonian` it is the acceleration of gravity g, m/s².
 
     >>> MomentumAndDirection([1.0, 0.0, 0.0], [0.0, 0.0, -9.81]).gamma.shape
     (3,)
@@ -52,8 +55,9 @@ class MomentumAndDirection(eqx.Module):
 
 
 class LiePoisson(eqx.Module):
-    """Evaluate `dΠ/dt = Π × ∇H(Π)` as a vector field, H the `hamiltonian`; `lie_poisson` makes
-    it.
+    """Evaluate `dΠ/dt = Π × ∇H(Π)` as a vector field; H is the `hamiltonian`.
+
+    `lie_poisson` makes this Module.
     """
 
     hamiltonian: Callable[[Any], Any]
@@ -63,8 +67,9 @@ class LiePoisson(eqx.Module):
 
 
 class LiePoissonWithDirection(eqx.Module):
-    """Evaluate the vector field of a `hamiltonian` H(Π, γ); `lie_poisson_with_direction` makes
-    it.
+    """Evaluate the vector field of a `hamiltonian` H(Π, γ).
+
+    `lie_poisson_with_direction` makes this Module and has the equations.
     """
 
     hamiltonian: Callable[[Any, Any], Any]
@@ -78,11 +83,13 @@ class LiePoissonWithDirection(eqx.Module):
 
 
 def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
-    """Return the vector field `dΠ/dt = Π × ∇H(Π)` on `Momentum`, of any Hamiltonian H(Π).
+    """Return the vector field `dΠ/dt = Π × ∇H(Π)` of any Hamiltonian H(Π); its state is a
+    `Momentum`.
 
     **Arguments:** `hamiltonian` a callable, best a Module, `Π → H`, J, with Π (3,), N m s, body
-    frame; ∇H is then the body rate Ω. For `½ Π·I⁻¹Π`, `RotationalHamiltonian(inertia)`, these are
-    Euler's equations. H and the Casimir |Π|² are conserved. Source: Marsden and Ratiu, Introduction
+    frame; ∇H is then the body rate Ω. For H = ½ Π·I⁻¹Π, which is `RotationalHamiltonian(inertia)`,
+    the equations are Euler's. H and the Casimir |Π|² are conserved. Source: Marsden and Ratiu,
+    Introduction
     to Mechanics and Symmetry, §§1.2, 1.3.
 
     >>> H = RotationalHamiltonian(rj.Inertia.from_principal(1.0, 2.0, 2.0))
@@ -93,8 +100,11 @@ def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
 
 
 def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoissonWithDirection:
-    """Return the heavy-top vector field of any H(Π, γ): `dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ`, `dγ/dt = γ
-    × ∂H/∂Π`.
+    """Return the heavy-top vector field of any Hamiltonian H(Π, γ).
+
+    `dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ` and `dγ/dt = γ × ∂H/∂Π`, with the angular momentum Π (3,), N m
+    s, and a world-fixed vector γ (3,), both in the body frame; the state is a
+    `MomentumAndDirection`.
 
     **Arguments:** `hamiltonian` a callable, best a Module, `(Π, γ) → H`, J; for a heavy top
     `HeavyTopHamiltonian(inertia, top)`. H and the Casimirs |γ|² and Π·γ are conserved. Source: the
@@ -114,9 +124,10 @@ def _require_invertible(inertia: _inertia.Inertia) -> _inertia.Inertia:
 
 
 class RotationalHamiltonian(eqx.Module):
-    """Compute H = ½ Π·I⁻¹Π, the energy of rotation, J, a function of Π (3,).
+    """Compute the energy of rotation H = ½ Π·I⁻¹Π, J, of the angular momentum Π (3,), body frame.
 
-    **Arguments:** `inertia` about the centre of mass or a fixed point. **Raises:** `ValueError` for
+    **Arguments:** `inertia` I about the centre of mass or a fixed point. **Raises:** `ValueError`
+    for
     a moment known to be zero.
 
     >>> RotationalHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0))([0.0, 0.0, 2.0])
@@ -134,10 +145,12 @@ class RotationalHamiltonian(eqx.Module):
 
 
 class HeavyTopHamiltonian(eqx.Module):
-    """Compute H = ½ Π·I⁻¹Π − m c·γ with γ = Rᵀ g, the energy of a heavy top, J.
+    """Compute the energy of a heavy top, H = ½ Π·I⁻¹Π − m c·γ, J.
 
-    **Arguments:** `inertia` about the fixed point; `top` a `HeavyTop`, which gives m and c. The
-    object is a function of Π (3,) and γ (3,), m/s², body frame; `start` makes the state.
+    **Arguments:** `inertia` I about the fixed point; `top` a `HeavyTop`, which gives the mass m and
+    the
+    centre of mass c. The object is a function of the angular momentum Π (3,), N m s, and of gravity
+    γ = Rᵀ g (3,), m/s², both in the body frame. `start` makes the state of the vector field.
     **Raises:** `ValueError` for a moment known to be zero.
 
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0, 0.5], [0.0, 0, -9.81])
@@ -166,7 +179,7 @@ class HeavyTopHamiltonian(eqx.Module):
         return 0.5 * dot(pi, apply(self.inverse, pi)) - self.top.mass * dot(self.top.com, gamma)
 
     def start(self, state: HasAttitude) -> MomentumAndDirection:
-        """Return Π = IΩ and γ = Rᵀ g of an attitude and a body rate."""
+        """Return Π = IΩ and γ = Rᵀ g of a `state` with the attitude R and the body rate Ω."""
         pi: Vec3 = apply(self.inertia.tensor, state.omega)
         return MomentumAndDirection(pi, quaternion.rotate_inverse(state.q, self.top.gravity))
 

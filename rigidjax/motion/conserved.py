@@ -59,13 +59,14 @@ def conserved(
     nothing is conserved. **Returns** a dict of the conserved quantities of this state, with one set
     of names for all times:
 
-    - `energy`, J: every torque has a potential and none depends on time;
-    - `momentum` (3,), kg m²/s, world frame, `R(IΩ + h)`, and `momentum_squared`, the Casimir
-      `|IΩ + h|²`: no external torque (h is the wheels' momentum);
-    - `momentum_along_axis`, kg m²/s: the only torque has no part along this axis (gravity, field);
-    - `linear_momentum` (3,), kg m/s, world frame: no force acts on the body;
-    - `momentum_about_origin` (3,), kg m²/s, world frame, `m x × v + R(IΩ + h)`: free, or attracted
-      by the origin.
+    - `energy`, J, if every torque has a potential and no torque depends on time;
+    - `momentum` (3,), kg m²/s, world frame, `R(IΩ + h)`, and `momentum_squared`, the Casimir `|IΩ +
+      h|²`, if there is no external torque (h is the momentum of the wheels);
+    - `momentum_along_axis`, kg m²/s, if the only external torque has no component along a fixed
+      axis of the world, such as the direction of gravity or of a field;
+    - `linear_momentum` (3,), kg m/s, world frame, if no force acts on the body;
+    - `momentum_about_origin` (3,), kg m²/s, world frame, `m x × v + R(IΩ + h)`, if the body is
+      free, or attracted by the origin.
 
     Source: Noether's theorem; Marsden and Ratiu, Introduction to Mechanics and Symmetry, §§1.3,
     1.4.
@@ -118,8 +119,8 @@ def drift(
 
     **Arguments:** `ts` (T,) s; `ys` states with a leading time axis, as a `Coupled` if the torque
     has states of its own; `body`, `torque` as for `simulate`. **Returns** for each name of
-    `conserved` the largest distance from its value at `ts[0]`, divided by the largest kinetic
-    energy, momentum, or momentum squared of the run.
+    `conserved` the largest distance of the quantity from its value at `ts[0]`, divided by the
+    largest kinetic energy, momentum, or momentum squared of the run.
 
     >>> import jax
     >>> body, ts = rj.Inertia.from_principal(1.0, 2.0, 3.0), jax.numpy.linspace(0.0, 9.0, 4)
@@ -156,7 +157,9 @@ def drift(
 def _state_and_torques(
     body: Body, state: PyTree, torque: Torque | None, t: ScalarLike
 ) -> tuple[Any, tuple[Any, ...], Scalar]:
-    """Return the body's state, its torques with their own states inserted, and the time."""
+    """Return three things: the state of the body; the torques, with the states of the torques
+    inserted; and the time.
+    """
     if isinstance(state, Coupled):
         state, torque = state.motion, freeze(torque, state.own)
     parts = parts_of(torque)
@@ -174,8 +177,8 @@ def _energy(body: Body, state: HasSpin, parts: tuple[Any, ...], t: Scalar) -> Sc
 
 
 def _momentum(body: Body, state: HasSpin, parts: tuple[Any, ...], t: ScalarLike) -> Vec3:
-    """Return the whole angular momentum, (3,), body frame: that of the body plus that of the
-    wheels.
+    """Return the whole angular momentum, (3,), kg m²/s, body frame: the sum of the momenta of the
+    body and of the wheels.
     """
     momentum = angular_momentum(body, state)
     for part in parts:

@@ -108,11 +108,11 @@ class EulerEquations(eqx.Module):
         _checks.require_single(inertia, Inertia, "inertia", hint=_HINT)
         if torque is not None:
             require_law(torque)
-        # Traced numbers are checked when a motion is computed: on its way a fit may reach numbers
-        # that no body has.
+        # Traced numbers are checked when a motion is computed: an optimiser may try numbers that no
+        # body has during a fit.
         self.inertia = inertia.require_invertible() if _checks.is_known(inertia.tensor) else inertia
-        # The inverse is computed once per solve: a division inside the field costs 25 times as much
-        # as the rest of it.
+        # The inverse is computed once per solve: a division inside the vector field costs 25 times
+        # as much as the rest of the field.
         self.inverse = inverse(inertia.tensor)
         self.torque = torque
 

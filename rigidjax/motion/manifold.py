@@ -1,10 +1,10 @@
 """Compute small changes of a state: ⊕, ⊖, the size of a change, and the names of its parts.
 
 A state is any tree of arrays: a `Spin`, an `Attitude`, a `Rigid`, a `Coupled`, a `frames.Point`, an
-array. A change of a state is one vector, with the numbers of the leaves in their order. A
-quaternion q of a state with an attitude has three numbers there, the rotation vector δθ (rad, body
-frame) of `q exp(δθ)`: a change of a `Rigid` is (x, v, δθ, Ω). Source: Solà, Deray and Atchuthan
-2018, arXiv:1812.01537, right-⊕ and right-⊖.
+array. A change of a state is one vector, with the changes of all leaves in the order of the leaves.
+The change of a quaternion q has three numbers, the rotation vector δθ (rad, body frame) in `q
+exp(δθ)`: a change of a `Rigid` consists of the changes of x and v, δθ, and the change of Ω. Source:
+Solà, Deray and Atchuthan 2018, arXiv:1812.01537, right-⊕ and right-⊖.
 """
 
 import math
@@ -37,8 +37,8 @@ def names(state: PyTree) -> tuple[str, ...]:
 def parts_by_name(
     state: PyTree, change: Float[Array, "*batch n"]
 ) -> dict[str, Float[Array, "*batch _"]]:
-    """Return the numbers of each leaf in a change, by name; a quaternion has three numbers
-    there.
+    """Return those numbers of a change that belong to each leaf, by the name of the leaf; a
+    quaternion has three numbers in a change.
     """
     cut = (change[..., place] for place in _places(state))
     return dict(zip(names(state), cut, strict=True))
@@ -93,7 +93,10 @@ def tangent(state: PyTree, change: Float[Array, " n"]) -> Any:
 
 
 def tangent_to_vector(state: PyTree, tangent_vector: PyTree) -> Float[Array, " n"]:
-    """Return the change whose `tangent` at `state` is `tangent_vector`: its inverse."""
+    """Return the change whose `tangent` at `state` is `tangent_vector`.
+
+    This function is the inverse of `tangent`.
+    """
     return _vector(
         tangent_vector,
         state,
@@ -126,7 +129,11 @@ def _leaf_by_leaf(
     of_quaternion: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> Any:
-    """Return the tree of `of_quaternion` or `of_others`, of each leaf and its part of `change`."""
+    """Return a tree like `state`, whose leaves are `of_quaternion(leaf, part)` for quaternions and
+    `of_others(leaf, part)` for other leaves.
+
+    Here `part` holds the numbers of `change` that belong to the leaf.
+    """
     (leaves, tree), out = jax.tree.flatten(state), []
     for leaf, place, turned in zip(leaves, _places(state), _is_quaternion(state), strict=True):
         part = change[place] if turned else change[place].reshape(jnp.shape(leaf))
@@ -140,7 +147,11 @@ def _vector(
     of_quaternions: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> Array:
-    """Return one vector of `of_quaternions` or `of_others`, of the leaves of two trees in pairs."""
+    """Return one vector, made of `of_quaternions(a, b)` for quaternions and `of_others(a, b)` for
+    other leaves.
+
+    Here a is a leaf of the tree `first`, and b the leaf at the same place of the tree `second`.
+    """
     pairs = zip(
         jax.tree.leaves(first), jax.tree.leaves(second), _is_quaternion(second), strict=True
     )

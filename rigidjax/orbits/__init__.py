@@ -1,4 +1,5 @@
-"""Solve the three-body problem and Hill's: periodic orbits, families, manifolds; no body is needed.
+"""Solve the circular restricted three-body problem and Hill's problem: periodic orbits, families of
+such orbits, and their invariant manifolds. No rigid body is needed.
 
 `rigidjax.simulate(None, Point(x, v), ts, orbits.cr3bp(mu))` solves one motion.
 """

@@ -1,5 +1,5 @@
-"""Follow families of periodic orbits: continuation by the orbit's derivatives, stability,
-branches.
+"""Follow families of periodic orbits: find their members, their stability and their branch
+points.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing, ind
 if TYPE_CHECKING:
     from rigidjax.orbits.reversible_scene import AbstractReversible
 
-# Steps of the search for a branching.
+# The largest number of steps in the search for a branch point.
 _MOST = 60
 
 
@@ -31,17 +31,20 @@ def family(
     *,
     hold: str = "x",
 ) -> PeriodicOrbit:
-    """Return the members of the family of `orbit` at which the number `hold` has the given
+    """Return the members of the family of `orbit` at which the coordinate `hold` has the given
     `values`.
 
-    The members are computed one by one: the member before and its tangent give the start, which
-    `periodic_orbit` corrects.
+    The members are computed one after another: the last member and the tangent of the family there
+    predict the next member, which Newton's method corrects as in `periodic_orbit`.
 
-    **Arguments:** `orbit`, near the first member; `values` (N,), each near the value before it;
-    `hold` `"x"`, `"z"`, `"vy"` or `"period"`, which must be monotone along the family (use `follow`
-    past a fold). **Returns** a `PeriodicOrbit` with a leading axis; its derivatives by μ and
-    `values` are those of the family, forward and reverse. **Raises:** `ValueError`
-    (`EquinoxRuntimeError` under `jit`) with the value at which the family was lost.
+    **Arguments:** `orbit` a `PeriodicOrbit` near the first member; `values` (N,), each near the
+    value
+    before it; `hold` `"x"`, `"z"`, `"vy"` or `"period"`, a quantity that must be monotone along the
+    family (use `follow` past a fold). **Returns** a `PeriodicOrbit` with a leading axis N. It can
+    be differentiated with respect to μ and `values` in forward and reverse mode; the derivatives
+    are exact (implicit function theorem). **Raises:** `ValueError`
+    (`EquinoxRuntimeError` under `jit`) with the first value at which Newton's method
+    found no member.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> start = moon.lyapunov_guess(1, 0.01)
@@ -64,7 +67,11 @@ def family(
 
 
 def _is_lost(start: Array, numbers: Array, left: Array) -> Array:
-    """Return, for each member, whether Newton's method failed or found another solution."""
+    """Return (N,) booleans: whether Newton's method failed or left the family at each member.
+
+    **Arguments:** `start` (4,) the numbers x, z, v_y, T/2 of the orbit before the first member;
+    `numbers` (N, 4) those numbers of the members; `left` (N,) the largest residuals.
+    """
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
     return ~((left <= correction.usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
@@ -73,8 +80,10 @@ def _is_lost(start: Array, numbers: Array, left: Array) -> Array:
 def _orbits_or_error(
     numbers: Array, is_lost: Array, place: Callable[[int], str], message: str, advice: str
 ) -> PeriodicOrbit:
-    """Return the members as orbits; raise an error if one was lost, with `place` of its number if
-    it is known.
+    """Return the members as a `PeriodicOrbit`, or raise an error if `is_lost` (N,) is true of any.
+
+    **Arguments:** `numbers` (N, 4) x, z, v_y, T/2 of the members. The error says `message`, then
+    `place(i)` with the index i of the first lost member if `is_lost` is known, then `advice`.
     """
     known = _checks.is_known(is_lost) and bool(is_lost.any())
     words = message + (place(int(np.argmax(np.asarray(is_lost)))) if known else "") + advice
@@ -89,7 +98,8 @@ def _members_at_values(
     still = jax.tree.map(lambda n: lax.stop_gradient(n) if eqx.is_array(n) else n, scene)
 
     def step(previous: Array, value: Scalar) -> Any:
-        # The start of Newton's method has no derivative: the orbit found does not depend on it.
+        # The start of Newton's method is not differentiated: the converged orbit does not depend on
+        # the start.
         previous, aim = lax.stop_gradient(previous), lax.stop_gradient(value)
         guess = previous[free] + _slope_along_family(still, previous, index) * (
             aim - previous[index]
@@ -98,7 +108,7 @@ def _members_at_values(
         numbers = correction.insert_held(root, value, index)
         return numbers, (numbers, left)
 
-    # The guess is corrected first: the tangent is needed at an orbit.
+    # The guess is corrected first: the tangent of the family exists only at an exact member.
     held_now = lax.stop_gradient(start[index])
     root, _ = correction.correct_orbit(index, tolerance, still, start[free], held_now)
     _, out = lax.scan(step, correction.insert_held(root, start[index], index), held_value)
@@ -108,11 +118,13 @@ def _members_at_values(
 def family_slope(
     scene: "AbstractReversible", orbit: PeriodicOrbit, *, hold: str = "x"
 ) -> PeriodicOrbit:
-    """Return the derivative by `hold` of an orbit's start and period along its family.
+    """Return the derivative of an orbit's start and period along its family, with respect to
+    `hold`.
 
-    **Arguments:** `orbit` a member of the family; `hold` as in `family`. **Returns** the
-    derivatives in the shape of an orbit: `.period` is d period/d hold. They are exact (implicit
-    function theorem). **Raises:** `ValueError` at a fold of the family in `hold`.
+    **Arguments:** `orbit` a member of the family; `hold` as in `family`. **Returns** a
+    `PeriodicOrbit`
+    that holds derivatives: `.period` is d period/d hold, for example. The derivatives are exact
+    (implicit function theorem). **Raises:** `ValueError` at a fold of the family in `hold`.
 
     >>> hill, start = rj.orbits.hill(), rj.Point([0.3, 0, 0], [0.0, 1.6, 0])
     >>> orbit = hill.periodic_orbit(rj.orbits.PeriodicOrbit(start, 1.2))
@@ -128,8 +140,11 @@ def family_slope(
 def _slope_along_family(
     scene: "AbstractReversible", numbers: Array, index: int
 ) -> Float[Array, "3"]:
-    """Return the derivative of the other three numbers of an orbit by the held number, along its
-    family.
+    """Return (3,) derivatives, along the family of an orbit, with respect to one of its four
+    numbers.
+
+    **Arguments:** `numbers` (4,) x, z, v_y, T/2 of the orbit; `index` selects the number with
+    respect to which the other three are differentiated.
     """
     _, matrix = correction.value_and_jacobian(
         lambda n: correction.periodicity_residual(scene, n), numbers
@@ -141,7 +156,7 @@ def _slope_along_family(
 def _family_slope(scene: "AbstractReversible", numbers: Array, index: int) -> PeriodicOrbit:
     unknown = _slope_along_family(scene, numbers, index)
     change = orbit_of(correction.insert_held(unknown, jnp.ones_like(unknown[0]), index))
-    # To hold `period` means the whole period; the fourth of `numbers` is half of it.
+    # The last of `numbers` is half the period, but `hold="period"` means the whole period.
     return jax.tree.map(lambda leaf: 0.5 * leaf, change) if index == 3 else change
 
 
@@ -155,12 +170,16 @@ def follow(
 ) -> PeriodicOrbit:
     """Return the next `count` members of a family, at fixed steps of arclength, past its folds.
 
-    Pseudo-arclength continuation in (x, z, v_y, T/2): each member is a `step` along the tangent,
-    then Newton's method across the tangent (Keller 1977, in Applications of Bifurcation Theory).
+    The method is pseudo-arclength continuation in (x, z, v_y, T/2): it goes a `step` along the
+    tangent of the family, then corrects by Newton's method across the tangent (Keller 1977, in
+    Applications of Bifurcation Theory).
 
-    **Arguments:** `orbit` a member, not returned; `step` arclength, with the sign of the direction;
-    `rising` the number that grows at first for a positive `step`. **Returns** a `PeriodicOrbit`
-    with a leading axis; for derivatives of a member give it to `periodic_orbit`. **Raises:**
+    **Arguments:** `orbit` a member, which is not returned; `step` the arclength from each member to
+    the
+    next, negative for the opposite direction; `count` the number of members; `rising` `"x"`, `"z"`,
+    `"vy"` or `"period"`, the quantity that grows in the first step if `step` is positive.
+    **Returns** a `PeriodicOrbit` with a leading axis; to differentiate a member, give it to
+    `periodic_orbit` first. **Raises:**
     `ValueError` (`EquinoxRuntimeError` under `jit`) with the number of members found before the
     family was lost.
     """
@@ -187,7 +206,10 @@ def _follow_family(
         return correction.periodicity_residual(scene, numbers)
 
     def tangent(matrix: Array, previous: Array) -> Array:
-        """Return the unit direction in which the residual stays 0, on the side of `previous`."""
+        """Return the unit tangent (4,) of the family, which has a positive product with `previous`.
+
+        `matrix` (3, 4) is the Jacobian of the residual; its product with the tangent is zero.
+        """
         rows = jnp.concatenate([matrix, previous[None]])
         along = jnp.linalg.solve(rows, jnp.zeros(4, start.dtype).at[3].set(1))
         return along / jnp.sqrt(jnp.sum(along * along))
@@ -210,8 +232,10 @@ def _follow_family(
 
 
 def stability_indices(monodromy: Float[Array, "6 6"]) -> Complex[Array, "2"]:
-    """Return the two indices ν = ½(λ + 1/λ) of the multipliers λ that are not 1, from tr M and tr
-    M².
+    """Return the two stability indices ν = ½(λ + 1/λ) of the `monodromy` matrix M.
+
+    λ and 1/λ are the two pairs of eigenvalues (multipliers) other than 1, 1; the indices are
+    computed from tr M and tr M².
     """
     total = jnp.trace(monodromy) - 2
     squares = jnp.sum(monodromy * monodromy.T) + 2
@@ -233,15 +257,19 @@ def bifurcation(
 ) -> PeriodicOrbit:
     """Return the member between two members of a family at which a stability index equals `value`.
 
-    At 1 a family of the same period branches off, or the family has a fold; at −1 one of twice the
-    period; at cos(2πp/q) one of q times the period. `index` 1 of planar Lyapunov orbits belongs to
-    motion across the plane; the halo orbits begin at its value 1.
+    Where an index is 1, a family of the same period branches off, or the family has a fold. Where
+    an index is −1, a family of twice the period branches off; where an index is cos(2πp/q), with
+    whole p and q, a family of q times the period. For planar Lyapunov orbits `index` 1 belongs to
+    motion out of the plane, and the halo orbits branch off where this index is 1.
 
-    **Arguments:** `orbit`, `other` two members near each other, with the value between their
-    indices; `index` 0 or 1 of `stability_indices`; `value` of this index; `hold` the number of the
-    family for the search, `"x"`, `"z"`, `"vy"` or `"period"`. The search runs on the host. Source:
+    **Arguments:** `orbit`, `other` two members near each other, with `value` between their
+    stability
+    indices; `index` 0 or 1, an index into `stability_indices`; `value` the wanted stability index;
+    `hold` the quantity that the search varies along the family, `"x"`, `"z"`, `"vy"` or `"period"`.
+    The search runs in Python, not under `jit`. Source:
     Howell 1984, doi:10.1007/BF01358403; Robin and Markellos 1980, doi:10.1007/BF01231183.
-    **Raises:** `ValueError` if the value does not lie between, or the indices are complex.
+    **Raises:** `ValueError` if `value` does not lie between the two stability indices, or if the
+    indices are complex.
     """
     from scipy.optimize import brentq
 

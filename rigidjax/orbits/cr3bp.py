@@ -1,5 +1,5 @@
-"""Describe the circular restricted three-body problem, and its limit near the small body: Hill's
-problem.
+"""Describe the circular restricted three-body problem, and Hill's problem, its limit near the small
+body.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,11 @@ from rigidjax.rotation.linalg3 import components
 
 
 def smallest_distance(dtype: DTypeLike) -> float:
-    """Return eps^0.4, the distance r at which an attraction is known only to eps/r = eps^0.6."""
+    """Return the distance r = eps^0.4 at which a run ends, since the attraction loses its digits.
+
+    eps is the machine epsilon of `dtype`. Positions have rounding errors of about eps, so that the
+    relative error of the attraction at r is about eps/r = eps^0.6.
+    """
     return float(jnp.finfo(dtype).eps) ** 0.4
 
 
@@ -27,9 +31,11 @@ class ThreeBody(AbstractReversible):
     """Describe a particle under two bodies on circular orbits; `orbits.cr3bp(mu)` makes it.
 
     The axes rotate, with the origin at the common centre of mass, the first body (mass 1 − μ) at
-    (−μ, 0, 0), the second (mass μ) at (1 − μ, 0, 0). Units: their distance, their total mass, and
-    1/(their angular rate); their period is 2π. **Fields:** `mu` μ, scalar; `radii` (2,) of the
-    bodies, for collisions.
+    (−μ, 0, 0), the second (mass μ) at (1 − μ, 0, 0). The units are the distance between the bodies,
+    the
+    total mass of the bodies, and 1/(angular rate of the bodies); hence the period of the bodies is
+    2π. **Fields:** `mu` the mass ratio μ; `radii` (2,) the radii of the bodies, at which a run ends
+    by a collision.
 
     >>> scene = cr3bp(0.5)
     >>> [float(r) for r in scene.distances(jnp.array([0.0, 0.0, 0.0]))]
@@ -40,8 +46,10 @@ class ThreeBody(AbstractReversible):
     radii: Float[Array, "2"]
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """Return d²x/dt² (3,), rotating axes: attraction, centrifugal and Coriolis (notes, eq
-        91).
+        """Return d²x/dt² (3,), rotating axes (notes, eq 91).
+
+        It is the sum of the attraction of both bodies and the centrifugal and Coriolis
+        accelerations.
         """
         x, y, z = components(state.x)
         vx, vy, _ = components(state.v)
@@ -54,8 +62,10 @@ class ThreeBody(AbstractReversible):
         return jnp.stack([2 * vy + x - a1 * first - a2 * second, y - 2 * vx - pull * y, -pull * z])
 
     def potential(self, x: Vector) -> Scalar:
-        """Return U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ at `x` (3,) (Szebehely, sec. 1.5, no
-        constant).
+        """Return the potential U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ at the position `x` (3,).
+
+        r₁ and r₂ are the distances from the two bodies. The acceleration without Coriolis is +∇U
+        (Szebehely 1967, sec. 1.5, where U has an additional constant).
         """
         x = _checks.array_of_shape(x, (3,), "x")
         r1, r2 = self.distances(x)
@@ -63,14 +73,17 @@ class ThreeBody(AbstractReversible):
         return 0.5 * (x[0] * x[0] + x[1] * x[1]) + (1 - mu) / r1 + mu / r2
 
     def distances(self, x: Vector) -> tuple[Scalar, Scalar]:
-        """Return the distances of a place (3,) from the first and from the second body."""
+        """Return the distances of the position `x` (3,) from the first and from the second body."""
         a, b, c = components(_checks.array_of_shape(x, (3,), "x"))
         mu = self.mu.astype(a.dtype)
         first, second, flat = a + mu, (a - 1) + mu, b * b + c * c
         return jnp.sqrt(first * first + flat), jnp.sqrt(second * second + flat)
 
     def jacobi_constant(self, state: Point) -> Scalar:
-        """Return C = 2U − |v|², conserved along the motion (Szebehely 1967, eq 1.5(20)).
+        """Return Jacobi's constant C = 2U − |v|², conserved along the motion, with U as in
+        `potential`.
+
+        Source: Szebehely 1967, eq 1.5(20).
 
         >>> float(rj.orbits.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
         4.0
@@ -79,8 +92,9 @@ class ThreeBody(AbstractReversible):
         return self.speed_squared(state.x, 0.0) - jnp.sum(state.v * state.v)
 
     def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:
-        """Return |v|² = 2U(x) − C at `x` (3,) for C = `jacobi`; it is negative where no particle
-        with this C can be.
+        """Return |v|² = 2U(x) − C at the position `x` (3,) for Jacobi's constant C = `jacobi`.
+
+        The result is negative where no particle with this C can be.
         """
         u = self.potential(x)
         return 2 * u - _checks.array_of_shape(jacobi, (), "jacobi").astype(u.dtype)
@@ -90,10 +104,12 @@ class ThreeBody(AbstractReversible):
         xs: Float[ArrayLike, " columns"] | Sequence[float],
         ys: Float[ArrayLike, " rows"] | Sequence[float],
     ) -> Float[Array, "rows columns"]:
-        """Return 2U on a grid of the plane z = 0, rows along y; a particle of constant C stays
-        where 2U ≥ C.
+        """Return 2U on a grid of the plane z = 0; a particle with Jacobi's constant C stays where
+        2U ≥
+        C.
 
-        **Arguments:** `xs`, `ys` places along the axes. `matplotlib.pyplot.contour(xs, ys, grid,
+        **Arguments:** `xs` (columns,), `ys` (rows,) the coordinates x and y of the grid.
+        `matplotlib.pyplot.contour(xs, ys, grid,
         levels=[C])` draws the curve of zero velocity (Szebehely 1967, sec. 4.7).
 
         >>> rj.orbits.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
@@ -111,28 +127,34 @@ class ThreeBody(AbstractReversible):
         return jax.vmap(along, (None, 0))(columns, rows.astype(columns.dtype))
 
     def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-        """Return the distances from the two bodies, and the distances at which a collision ends the
-        run.
+        """Return two arrays (2,): the distances from both bodies; and the distances that count as a
+        collision.
         """
         gaps = jnp.stack(self.distances(state.x))
         return gaps, jnp.maximum(self.radii.astype(gaps.dtype), smallest_distance(gaps.dtype))
 
     @property
     def lagrange_points(self) -> Float[Array, "5 3"]:
-        """Return L1 … L5 (5, 3), rotating axes (Szebehely 1967, sec. 4.4), differentiable by μ."""
+        """Return the positions of L1 … L5 (5, 3), rotating axes, differentiable with respect to μ.
+
+        Source: Szebehely 1967, sec. 4.4.
+        """
         return richardson.lagrange_points(self.mu)
 
     def hessian(self, x: Vector) -> Mat3:
-        """Return the second derivatives of U (3, 3) at a place."""
+        """Return the matrix (3, 3) of the second derivatives of the potential U at the position `x`
+        (3,).
+        """
         return jax.hessian(self.potential)(_checks.array_of_shape(x, (3,), "x"))
 
     def exponents(self, x: Vector) -> Complex[Array, "6"]:
-        """Return the six exponents λ of small motions e^{λt} about an equilibrium in the plane.
+        """Return the six exponents λ of small motions e^{λt} about an equilibrium point with z = 0.
 
-        **Arguments:** `x` (3,), such as a row of `lagrange_points`. The equilibrium is stable to
-        first order if no real part is positive: L4 and L5 below Routh's μ = ½(1 − √(23/27)), L1–L3
-        never. In the plane λ⁴ + (4 − U_xx − U_yy) λ² + U_xx U_yy − U_xy² = 0, across it λ² = U_zz
-        (Szebehely 1967, sec. 5.2).
+        **Arguments:** `x` (3,) the equilibrium, such as a row of `lagrange_points`. The equilibrium
+        is
+        stable to first order if no λ has a positive real part: L4 and L5 are for μ below Routh's
+        value ½(1 − √(23/27)), and L1–L3 never are. Motions in the plane obey λ⁴ + (4 − U_xx − U_yy)
+        λ² + U_xx U_yy − U_xy² = 0, motions along z obey λ² = U_zz (Szebehely 1967, sec. 5.2).
 
         >>> moon = rj.orbits.cr3bp(0.0121505856)
         >>> bool((moon.exponents(moon.lagrange_points[3]).real < 1e-12).all())
@@ -148,16 +170,20 @@ class ThreeBody(AbstractReversible):
         return jnp.concatenate([roots, -roots])
 
     def lyapunov_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
-        """Return a start near a planar Lyapunov orbit about L1, L2 or L3, for `periodic_orbit`.
+        """Return an approximate planar Lyapunov orbit about L1, L2 or L3, as a guess for
+        `periodic_orbit`.
 
-        **Arguments:** `point` 1, 2 or 3; `amplitude` along x. Source: `richardson.orbit_guess`.
+        **Arguments:** `point` 1, 2 or 3; `amplitude` along x, in the scene's unit. Source:
+        `richardson.orbit_guess`.
         """
         return richardson.orbit_guess(self.mu, point, amplitude, None)
 
     def halo_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
-        """Return a start near a halo orbit about L1, L2 or L3, for `periodic_orbit(…, hold="z")`.
+        """Return an approximate halo orbit about L1, L2 or L3, a guess for `periodic_orbit(…,
+        hold="z")`.
 
-        **Arguments:** `point` 1, 2 or 3; `amplitude` along z, whose sign is that of the branch.
+        **Arguments:** `point` 1, 2 or 3; `amplitude` along z, in the scene's unit: its sign selects
+        the northern or the southern branch.
         Source: Richardson 1980, doi:10.1007/BF01229511 (third order).
         """
         return richardson.orbit_guess(self.mu, point, None, amplitude)
@@ -166,9 +192,12 @@ class ThreeBody(AbstractReversible):
 def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> ThreeBody:
     """Return the circular restricted three-body problem with mass ratio μ.
 
-    **Arguments:** `mu` μ = m₂/(m₁ + m₂), 0 < μ ≤ ½ (Earth–Moon 0.01215…); `radii` (2,) of the two
-    bodies in units of their distance. A run that comes closer ends, with the collision's body, time
-    and distance; for radii of zero it ends at a distance that float64 cannot resolve. **Raises:**
+    **Arguments:** `mu` μ = m₂/(m₁ + m₂) for the masses m₁ and m₂ of the bodies, 0 < μ ≤ ½
+    (Earth–Moon
+    0.01215…); `radii` (2,) the radii of the two bodies in units of the distance between them. A run
+    that comes closer to a body than its radius ends with a message that says the body, the time and
+    the distance. For radii of zero a run ends at the distance where rounding spoils the attraction
+    (`smallest_distance`). **Raises:**
     `ValueError` for μ outside (0, ½] (`EquinoxRuntimeError` under `jit`). Source: notes, eq 91,
     with a uniform Ω = (0, 0, 1); Szebehely 1967, Theory of Orbits.
 
@@ -186,11 +215,13 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
 
 
 class Hill(AbstractReversible):
-    """Describe a particle near a small body on a circular orbit about a large one; `orbits.hill()`
-    makes it.
+    """Describe Hill's problem: a particle near a small body on a circular orbit about a large body.
 
-    The rotating axes are centred on the small body, with x away from the large body. Units: μ^{1/3}
-    of the bodies' distance, and 1/(their angular rate). **Field:** `radius` of the small body.
+    `orbits.hill()` makes this scene.
+
+    The rotating axes are centred on the small body, with x away from the large body. The unit of
+    length is μ^{1/3} times the distance between the bodies, with the mass ratio μ; the unit of time
+    is 1/(angular rate of the bodies). **Field:** `radius` of the small body.
 
     >>> scene = hill()
     >>> float(scene.acceleration(0.0, Point([1.0, 0, 0], [0.0, 0, 0]))[0])  # 3 x − x/r³
@@ -200,7 +231,7 @@ class Hill(AbstractReversible):
     radius: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """Return d²x/dt² = 2 v_y + 3x − x/r³, −2 v_x − y/r³, −z − z/r³."""
+        """Return d²x/dt² (3,): 2 v_y + 3x − x/r³, −2 v_x − y/r³, −z − z/r³, with r = |x|."""
         x, y, z = components(state.x)
         vx, vy, _ = components(state.v)
         square = x * x + y * y + z * z
@@ -208,7 +239,7 @@ class Hill(AbstractReversible):
         return jnp.stack([2 * vy + 3 * x - pull * x, -2 * vx - pull * y, -z - pull * z])
 
     def jacobi_constant(self, state: Point) -> Scalar:
-        """Return C = 3x² − z² + 2/r − |v|² (Hill 1878).
+        """Return Jacobi's constant C = 3x² − z² + 2/r − |v|², with r = |x| (Hill 1878).
 
         >>> float(Hill(jnp.asarray(0.0)).jacobi_constant(Point([1.0, 0, 0], [0.0, 0, 0])))
         5.0
@@ -219,8 +250,8 @@ class Hill(AbstractReversible):
         return 3 * x * x - z * z + 2 / jnp.sqrt(x * x + y * y + z * z) - speed
 
     def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
-        """Return the distance from the small body, and the distance at which a collision ends the
-        run.
+        """Return two arrays (1,): the distance from the small body; and the distance that counts as
+        a collision.
         """
         gap = jnp.sqrt(jnp.sum(state.x * state.x, keepdims=True))
         least = jnp.maximum(self.radius.astype(gap.dtype), smallest_distance(gap.dtype))
@@ -228,7 +259,7 @@ class Hill(AbstractReversible):
 
     @property
     def lagrange_points(self) -> Float[Array, "2 3"]:
-        """Return L1 and L2 (2, 3), at x = ∓3^{−1/3}."""
+        """Return the positions of L1 and L2 (2, 3): (∓3^{−1/3}, 0, 0)."""
         place = jnp.zeros(3, self.radius.dtype).at[0].set(3.0 ** (-1 / 3))
         return jnp.stack([-place, place])
 
@@ -236,7 +267,8 @@ class Hill(AbstractReversible):
 def hill(radius: ScalarLike = 0.0) -> Hill:
     """Return the scene of Hill's problem, the limit of `cr3bp(mu)` as μ → 0 in units of μ^{1/3}.
 
-    **Arguments:** `radius` of the small body, in these units, for collisions. Source: Hill 1878,
+    **Arguments:** `radius` of the small body, in units of μ^{1/3} times the distance between the
+    bodies; a run ends when the particle comes closer. Source: Hill 1878,
     doi:10.2307/2369430; Szebehely 1967, sec. 10.4.
 
     >>> hill().lagrange_points[1].round(12).tolist()

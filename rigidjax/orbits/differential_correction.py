@@ -1,4 +1,4 @@
-"""Find periodic orbits by Newton's method, with the derivatives of their family."""
+"""Find periodic orbits by Newton's method, differentiably."""
 
 from collections.abc import Callable
 from typing import Any
@@ -25,7 +25,8 @@ MAX_STEPS = 25
 class PeriodicOrbit(eqx.Module):
     """Hold a periodic orbit: a state on it, and its period.
 
-    **Arguments:** `state` a `Point`; `period` its period, in the scene's unit of time.
+    **Arguments:** `state` a `Point`, a state on the orbit; `period` the period, in the scene's unit
+    of time.
 
     >>> float(PeriodicOrbit(Point([0.9, 0, 0], [0.0, -0.5, 0]), 3.0).period)
     3.0
@@ -48,16 +49,21 @@ def periodic_orbit(
     """Return the periodic orbit near `guess`, by differentiable correction.
 
     The method finds orbits that are symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and
-    most others in use. These cross the plane at a right angle (y = v_x = v_z = 0) twice a period.
-    Newton's method on three of (x, z, v_y, T/2) makes y, v_x, v_z vanish at the half period.
+    most others in use. Such an orbit crosses the plane at a right angle (y = v_x = v_z = 0) twice a
+    period
+    T. Newton's method changes three of (x, z, v_y, T/2) at the first crossing until y, v_x, v_z
+    vanish at T/2.
 
     **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right angle;
-    `hold` the number that stays fixed, `"x"`, `"z"`, `"vy"` or `"period"`, which labels the orbit
-    within its family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` the largest
-    |y|, |v_x|, |v_z| at the half period, 1e-12 by default (1e-4 in float32).
+    `hold` the quantity that stays fixed, `"x"`, `"z"`, `"vy"` or `"period"`, and so selects one
+    orbit
+    of the family (use `"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` the largest
+    accepted |y|, |v_x|, |v_z| at the half period, by default 1e-12 (1e-4 in float32).
 
-    **Returns** a `PeriodicOrbit`. Its derivatives by μ and the held number are those of the family,
-    by the implicit function theorem, forward and reverse. Source: Howell 1984,
+    **Returns** a `PeriodicOrbit`. It can be differentiated, in forward and reverse mode, with
+    respect to
+    the numbers of the scene (μ) and the held quantity: the derivatives come from the implicit
+    function theorem. Source: Howell 1984,
     doi:10.1007/BF01358403. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton's
     method does not converge.
 
@@ -77,7 +83,8 @@ def periodic_orbit(
     words += "hold another of x, z, vy, period, or loosen the tolerance"
     unknown = _checks.error_if(unknown, bad, words)
     corrected = insert_held(unknown, numbers[index], index)
-    # A half period of zero solves the equations of every start.
+    # A half period of zero solves the equations for every start: Newton's method must not end
+    # there.
     ratio = corrected[3] / numbers[3]
     words = "periodic_orbit: Newton's method went from the guess to an orbit of less than half or "
     words += "more than twice its period; start nearer"
@@ -86,12 +93,15 @@ def periodic_orbit(
 
 
 def index_of_held(hold: str) -> int:
-    """Return the index of `hold` among the four numbers of a crossing."""
+    """Return the index of the quantity `hold` in (x, z, v_y, T/2)."""
     return _NAMES.index(_checks.require_option(hold, _NAMES, "hold"))
 
 
 def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
-    """Return the four numbers of an orbit that crosses y = 0 at a right angle: x, z, v_y, T/2."""
+    """Return x, z, v_y, T/2 (4,) of an orbit of period T that crosses y = 0 at a right angle.
+
+    Raise an error if the state of `guess` does not cross the plane y = 0 at a right angle.
+    """
     made = "lyapunov_guess and halo_guess make one"
     wanted = "a PeriodicOrbit(state, period)"
     _checks.require_instance(guess, PeriodicOrbit, "guess", requirement=wanted, hint=made)
@@ -106,14 +116,14 @@ def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
 
 
 def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
-    """Return the orbit with these four numbers: the inverse of `crossing`."""
+    """Return the orbit with the `numbers` x, z, v_y, T/2 (4,): the inverse of `crossing`."""
     x, z, vy, half = components(numbers)
     zero = jnp.zeros_like(x)
     return PeriodicOrbit(Point(jnp.stack([x, zero, z]), jnp.stack([zero, vy, zero])), 2 * half)
 
 
 def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> Float[Array, "4"]:
-    """Return the four numbers of a crossing: the three unknown ones with the held one inserted at
+    """Return x, z, v_y, T/2 (4,): the three numbers `unknown`, with `held_value` put in at
     `index`.
     """
     parts = list(unknown)
@@ -122,16 +132,19 @@ def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> F
 
 
 def usual_tolerance(numbers: Array) -> float:
-    """Return the tolerance of y, v_x, v_z at the half period: 1e-12, in float32 1e-4."""
+    """Return the default tolerance for y, v_x, v_z at the half period: 1e-12, or 1e-4 in
+    float32.
+    """
     return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
 
 
 def integrate(
     scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **options: Any
 ) -> dfx.Solution:
-    """Return the motion from 0 to `t`, with derivatives in forward mode.
+    """Return the solution from `state` at time 0 to time `t`, with derivatives in forward mode.
 
-    Further arguments `options` are those of `diffrax.diffeqsolve`.
+    **Arguments:** `rtol`, `atol` the tolerances of a step; `options` further arguments of
+    `diffrax.diffeqsolve`.
     """
     motion = dfx.ODETerm(scene.field), dfx.Dopri8(), jnp.zeros_like(t), t, None, state
     options |= dict(adjoint=dfx.ForwardMode(), max_steps=100_000, throw=False)
@@ -143,7 +156,10 @@ def integrate(
 def state_after(
     scene: AbstractScene, numbers: Float[Array, "6"], t: Array, *, rtol: float, atol: float
 ) -> Float[Array, "6"]:
-    """Return (x, v) at a time `t` after the state `numbers`; raise an error if the solve fails."""
+    """Return (x, v) (6,) after a motion of duration `t` that starts at (x, v) = `numbers` (6,).
+
+    Raise an error if the solve fails.
+    """
     out = integrate(scene, Point(numbers[:3], numbers[3:]), t.astype(numbers.dtype), rtol, atol)
     end: Any = out.result.error_if(out.ys, out.result != dfx.RESULTS.successful)
     return jnp.concatenate([end.x[0], end.v[0]])
@@ -152,8 +168,8 @@ def state_after(
 def transition_matrix(
     scene: AbstractScene, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
 ) -> Float[Array, "6 6"]:
-    """Return the state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) from `state`, by forward
-    mode.
+    """Return the state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) of the motion that starts at
+    `state`.
     """
     _checks.require_instance(state, Point, "state", requirement="a Point(x, v)")
     t = _checks.require_finite(_checks.array_of_shape(t, (), "t"), "t")
@@ -164,12 +180,15 @@ def transition_matrix(
 def _transition_matrix(
     scene: AbstractScene, numbers: Array, t: Array, rtol: float, atol: float
 ) -> Array:
-    # The tangents are solved along with the motion.
+    # Forward mode solves the six variational equations together with the motion.
     return jax.jacfwd(lambda n: state_after(scene, n, t, rtol=rtol, atol=atol))(numbers)
 
 
 def periodicity_residual(scene: AbstractScene, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
-    """Return y, v_x and v_z at the half period: an orbit is periodic if they vanish."""
+    """Return y, v_x and v_z (3,) at the half period; the orbit is periodic if all three vanish.
+
+    **Arguments:** `numbers` (4,) x, z, v_y at time 0, and the half period T/2.
+    """
     orbit = orbit_of(numbers)
     tight = float(jnp.finfo(numbers.dtype).eps)
     out = integrate(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight)
@@ -179,14 +198,17 @@ def periodicity_residual(scene: AbstractScene, numbers: Float[Array, "4"]) -> Fl
 
 
 def value_and_jacobian(f: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
-    """Return f(x) and its Jacobian from one pass in forward mode."""
+    """Return f(x) (m,) and the Jacobian (m, n) of `f` at `x` (n,), from one pass in forward
+    mode.
+    """
     along = jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 1))
     return along(jnp.eye(x.shape[0], dtype=x.dtype))
 
 
 def newton(f: Callable[[Array], Array], x: Array, tolerance: float) -> Array:
-    """Return a zero of `f` near `x`, by Newton steps until the residual is below a tenth of the
-    tolerance.
+    """Return a zero of `f` near `x`, by Newton's method.
+
+    The steps end when all |f| are below a tenth of `tolerance`, or after `MAX_STEPS` steps.
     """
 
     def is_unfinished(carry: tuple[Array, Array, Array]) -> Any:
@@ -197,15 +219,17 @@ def newton(f: Callable[[Array], Array], x: Array, tolerance: float) -> Array:
         x, _, count = carry
         missed, slope = value_and_jacobian(f, x)
         moved = x - jnp.linalg.solve(slope, missed)
-        # The residual is that at the start of this step: it costs no further solve. Newton's method
-        # converges quadratically, so that the result is better still.
+        # The returned residual is that before this step, since the residual after the step would
+        # cost a further solve. Newton's method converges quadratically, so that the residual after
+        # the step is smaller still.
         return jnp.where(jnp.isfinite(moved), moved, x), jnp.max(jnp.abs(missed)), count + 1
 
     return lax.while_loop(is_unfinished, step, (x, jnp.full_like(x[0], jnp.inf), 0))[0]
 
 
-# Newton's method itself is not differentiated. The rule below is linear in the tangents, so that
-# one rule serves jacfwd and grad, although the solves inside run in forward mode.
+# Newton's method itself is not differentiated: `_correct_orbit_jvp` is its derivative. That rule is
+# linear in the tangents, so that it serves `jax.jacfwd` and `jax.grad`, although the solves inside
+# run in forward mode.
 @eqx.filter_jit
 def _corrected_numbers(
     scene: AbstractScene, unknown: Array, held_value: Array, index: int, tolerance: float
@@ -229,8 +253,8 @@ def _correct_orbit_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents
     root, left = correct_orbit(index, tolerance, scene, unknown, held)
-    # All derivatives of the residual are one matrix, so that the rule stays linear in the tangents
-    # and can be transposed.
+    # All derivatives of the residual are computed as one matrix, which multiplies the tangents: the
+    # rule stays linear in the tangents, and JAX can transpose it.
     numbers, rest = eqx.partition(scene, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(numbers)
     flat, unflatten = ravel_pytree((leaves, held, root))
@@ -242,7 +266,7 @@ def _correct_orbit_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 
     matrix = jax.jacfwd(residual)(flat)
     paths = {path: dot for path, dot in jax.tree.leaves_with_path(scene_dot) if dot is not None}
-    # A leaf without a tangent does not change.
+    # A leaf of the scene without a tangent counts as constant.
     named = jax.tree.leaves_with_path(numbers)
     dots = [paths.get(path, jnp.zeros_like(leaf)) for path, leaf in named]
     held_dot = jnp.zeros_like(held) if held_dot is None else held_dot

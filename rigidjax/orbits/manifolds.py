@@ -1,4 +1,4 @@
-"""Compute stable and unstable manifolds of periodic orbits."""
+"""Compute the stable and unstable invariant manifolds of periodic orbits."""
 
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,21 +22,24 @@ from rigidjax.solve.run import Ends
 if TYPE_CHECKING:
     from rigidjax.orbits.reversible_scene import AbstractReversible
 
-# A motion backwards in time is the mirror image in y → −y: x, y, z, vx, vy, vz.
+# The signs of x, y, z, vx, vy, vz in the mirror image, y → −y and t → −t, of a motion: the image is
+# a motion, too.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 Branch = Literal["stable", "unstable"]
 _TIGHT = dict(rtol=1e-13, atol=1e-14)
-# Each step of inverse iteration reduces the error of an eigenvector to a hundredth at most.
+# The number of steps of inverse iteration; each step reduces the error of an eigenvector at least a
+# hundredfold.
 _ITERATIONS = 12
 
 
 class Manifold(eqx.Module):
     """Hold motions that start near a periodic orbit, or approach it.
 
-    **Fields:** `ts` (T,) since the start near the orbit, in the scene's unit, decreasing for a
+    **Fields:** `ts` (T,) times since the start near the orbit, in the scene's unit, negative for a
     stable manifold; `states` a `Point` with axes (N, T), one motion for each phase, NaN after a
-    collision; `phases` (N,) of their starts on the orbit, in periods; `multiplier` λ, by which a
-    small distance along the manifold grows in a period.
+    collision; `phases` (N,) the points of the orbit at which the motions start, in periods since
+    `orbit.state`; `multiplier` λ, the factor by which a small distance from the orbit grows in one
+    period along the manifold.
 
     >>> ts, phases = jnp.array([0.0, 0.1]), jnp.array([0.0])
     >>> states = Point(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)))
@@ -51,10 +54,12 @@ class Manifold(eqx.Module):
 
 
 def unstable_direction(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]:
-    """Return the multiplier λ of an orbit with the largest size, and its eigenvector, of length 1.
+    """Return two things: the real multiplier λ of an orbit with the largest |λ|; and its unit
+    eigenvector (6,).
 
-    They are found from traces, inverse iteration and one bordered solve; they are NaN if no
-    multiplier is real and larger than 1.
+    λ is an eigenvalue of the `monodromy` matrix and follows from its traces; inverse iteration and
+    one bordered linear solve give the eigenvector. Both results are NaN if no real multiplier has
+    |λ| > 1.
     """
     index = continuation.stability_indices(monodromy)
     real = jnp.abs(index.imag) <= 1e-6 * jnp.abs(index)
@@ -64,7 +69,8 @@ def unstable_direction(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Ar
     safe = jnp.where(free, index, 2.0)
     value = safe + jnp.sign(safe) * jnp.sqrt(safe * safe - 1)
     eye = jnp.eye(6, dtype=monodromy.dtype)
-    # The shift differs from the eigenvalue by √eps: else the matrix may be singular to round-off.
+    # The shift of the inverse iteration differs from the eigenvalue by the factor 1 + √eps: a shift
+    # by the eigenvalue itself may make the matrix exactly singular.
     near = value * (1 + jnp.finfo(value.dtype).eps ** 0.5)
     still, shift = lax.stop_gradient((monodromy, near))
 
@@ -76,8 +82,8 @@ def unstable_direction(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Ar
 
     first = jnp.asarray(np.full(6, 6**-0.5), monodromy.dtype)
     right, left = lax.fori_loop(0, _ITERATIONS, square_and_scale, (first, first))
-    # The bordered system (M − λ) v + m left = 0, right · v = 1 is regular although M − λ is not; it
-    # gives v its derivatives.
+    # The bordered system (M − λ) v + m left = 0, right · v = 1 is regular although M − λ is
+    # singular; the derivatives of the eigenvector v come from this system.
     top = jnp.concatenate([monodromy - value * eye, left[:, None]], 1)
     last = jnp.concatenate([right, jnp.zeros(1, right.dtype)])[None]
     wanted = jnp.zeros(7, right.dtype).at[6].set(1)
@@ -113,7 +119,7 @@ def _manifold_point(
     distance: Scalar,
 ) -> tuple[Point, Scalar]:
     value, vector = unstable_direction(scene.monodromy(orbit))
-    # The mirror image of the unstable manifold is the stable one, with the opposite phase.
+    # The mirror image of the unstable manifold is the stable manifold, with the opposite phase.
     turned = phase if branch == "unstable" else -phase
     turned = turned - lax.stop_gradient(jnp.floor(turned))
     later = partial(state_after, scene, t=turned * orbit.period, **_TIGHT)
@@ -139,17 +145,26 @@ def manifold(
 ) -> Manifold:
     """Return motions from an unstable periodic orbit, or towards it: its invariant manifolds.
 
-    **Arguments:** `orbit` as of `periodic_orbit`; `branch` `"unstable"` (motions leave it) or
-    `"stable"` (they approach it, and times decrease); `time` their length, two periods by default;
-    `side` 1 for the branch that goes to larger x at the orbit's start, −1 for the other; `count` N
-    motions, from equal phases of the orbit; `samples` T times of each; `distance` of the starts
-    from the orbit, in (x, v): their error is of the order of its square.
+    **Arguments:**
 
-    The direction is the eigenvector of the monodromy matrix with the largest multiplier, moved
-    along the orbit by the transition matrix. The stable manifold is the mirror image, in y → −y, of
-    the unstable one. **Returns** a `Manifold`. Source: Koon, Lo, Marsden and Ross 2011, Dynamical
+    - `orbit`: a `PeriodicOrbit`, as `periodic_orbit` returns it.
+    - `branch`: `"unstable"` (the motions leave the orbit) or `"stable"` (the motions approach the
+      orbit, and are computed backwards in time).
+    - `time`: the duration of the motions, two periods by default.
+    - `side`: 1 for the half of the manifold that goes to larger x at the start of the orbit, −1 for
+      the opposite half.
+    - `count`: the number N of motions, which start at equally spaced phases of the orbit.
+    - `samples`: the number T of times of each motion.
+    - `distance`: the distance between the start of each motion and the orbit, in (x, v). The error
+      of the manifold is of the order of the square of this distance.
+
+    The start lies off the orbit in the direction of the eigenvector of the monodromy matrix with
+    the
+    largest multiplier, moved along the orbit by the transition matrix. The stable manifold is the
+    mirror image, in y → −y, of the unstable manifold. **Returns** a `Manifold`. Source: Koon, Lo,
+    Marsden and Ross 2011, Dynamical
     Systems, the Three-Body Problem and Space Mission Design, sec. 7.4. **Raises:** `ValueError` for
-    an orbit without a real multiplier larger than 1, and for another word.
+    an orbit without a real multiplier of size above 1.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
@@ -181,11 +196,13 @@ def manifold_start(
     side: int = 1,
     distance: ScalarLike = 1e-5,
 ) -> Point:
-    """Return the start of the motion of a manifold that belongs to a phase of the orbit.
+    """Return the state near the orbit at which the motion of a manifold with the given phase
+    starts.
 
-    **Arguments:** `phase` in periods from the orbit's start, of any size; others as for `manifold`.
-    Derivatives by `phase`, the orbit and the scene's numbers are in forward mode: with them
-    Newton's method finds connections between orbits.
+    **Arguments:** `phase` the point of the orbit, in periods since `orbit.state`, any number; the
+    remaining arguments as for `manifold`. The result can be differentiated in forward mode, with
+    respect to `phase`, the orbit and the scene's numbers; with such derivatives Newton's method
+    finds connections between orbits.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
@@ -214,7 +231,7 @@ def _manifold_trajectories(
     turn = branch == "stable"
 
     def mirror_if_stable(state: Point) -> Point:
-        # The stable manifold is integrated forwards in time as its mirror image.
+        # The mirror image of the stable manifold is integrated forwards in time.
         return Point(state.x * mirror[:3], state.v * mirror[3:]) if turn else state
 
     def path(start: Point) -> Point:

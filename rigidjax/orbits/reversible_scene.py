@@ -1,4 +1,4 @@
-"""Describe scenes that are symmetric under time reversal: their periodic orbits, families,
+"""Describe scenes that are symmetric under time reversal: periodic orbits, families and
 stability.
 """
 
@@ -17,7 +17,9 @@ from rigidjax.orbits.differential_correction import PeriodicOrbit
 
 
 class AbstractReversible(AbstractScene):
-    """Define a scene that does not change under (t, y) → (−t, −y): `ThreeBody` and `Hill`.
+    """Define a scene whose equations do not change under (t, y) → (−t, −y).
+
+    Such scenes are `ThreeBody` and `Hill`.
 
     An orbit that crosses the xz-plane at a right angle twice is then periodic (Roy and Ovenden
     1955, doi:10.1093/mnras/115.3.296).
@@ -25,13 +27,13 @@ class AbstractReversible(AbstractScene):
 
     @abc.abstractmethod
     def approach(self, t: ScalarLike, state: Point) -> tuple[Array, Array]:
-        """Return the distances from the bodies (k,), and the distances at which a collision ends a
-        run.
+        """Return two arrays (k,): the distances from the k bodies; and the distances that count as
+        a collision.
         """
 
     @abc.abstractmethod
     def jacobi_constant(self, state: Point) -> Scalar:
-        """Return Jacobi's constant C of a state."""
+        """Return Jacobi's constant C of `state`, which is conserved along the motion."""
 
     def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
         return {"jacobi": self.jacobi_constant(state)}
@@ -42,7 +44,7 @@ class AbstractReversible(AbstractScene):
         return jnp.any(gaps <= least)
 
     def end_words(self, t: ScalarLike, state: Point) -> str:
-        """Return a sentence about a collision: the body, the time, and the distance."""
+        """Return a sentence that says the body, the time and the distance of a collision."""
         gaps = self.approach(t, state)[0]
         if not _checks.is_known(gaps):
             return "the particle collided with one of the scene's bodies"
@@ -51,22 +53,25 @@ class AbstractReversible(AbstractScene):
         return f"collision with {which} at t = {when:.9g}, distance {near.min():.3g}"
 
     def monodromy(self, orbit: PeriodicOrbit) -> Float[Array, "6 6"]:
-        """Return the transition matrix over one period; its eigenvalues are 1, 1 and pairs λ,
-        1/λ.
+        """Return the monodromy matrix of an orbit: the state-transition matrix over one period.
+
+        Its eigenvalues are 1, 1 and two pairs λ, 1/λ.
         """
         return self.transition(orbit.state, orbit.period)
 
     def stability_indices(self, orbit: PeriodicOrbit) -> Complex[Array, "2"]:
-        """Return the two indices ν = ½(λ + 1/λ) of the multipliers λ ≠ 1, the larger real part
-        first.
+        """Return the two stability indices ν = ½(λ + 1/λ) of an orbit, the larger real part first.
 
-        The orbit is stable to first order if both are real and |ν| ≤ 1. Many:
+        λ and 1/λ are the two pairs of eigenvalues of `monodromy` other than 1, 1.
+
+        The orbit is stable to first order if both indices are real with |ν| ≤ 1. For many orbits
+        use
         `jax.vmap(scene.stability_indices)(scene.family(…))`. Source: Howell 1984,
         doi:10.1007/BF01358403; from traces: Bray and Goudas 1967, Adv. Astron. Astrophys. 5, 71.
         """
         return continuation.stability_indices(self.monodromy(orbit))
 
-    # Functions whose first argument is the scene.
+    # These functions are methods here: their first argument is the scene.
     transition = differential_correction.transition_matrix
     periodic_orbit = differential_correction.periodic_orbit
     family = continuation.family

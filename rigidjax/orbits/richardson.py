@@ -1,5 +1,5 @@
-"""Find the equilibrium points, and starts near Lyapunov and halo orbits: Richardson's third
-order.
+"""Compute the equilibrium points, and approximate Lyapunov and halo orbits by Richardson's
+expansion.
 """
 
 import math
@@ -15,8 +15,9 @@ from rigidjax.orbits.differential_correction import PeriodicOrbit
 
 
 def lagrange_points(mu: Scalar) -> Float[Array, "5 3"]:
-    """Return L1 … L5 (5, 3) of 0 < μ ≤ ½ by Euler's quintics (Szebehely 1967, sec. 4.4), rotating
-    axes.
+    """Return the positions of L1 … L5 (5, 3), rotating axes, for 0 < μ ≤ ½.
+
+    L1, L2 and L3 are roots of Euler's quintic polynomials (Szebehely 1967, sec. 4.4).
     """
     between, beyond, opposite = distances(mu)
     half, zero, height = 0.5 - mu, jnp.zeros_like(mu), jnp.full_like(mu, 0.75**0.5)
@@ -26,7 +27,9 @@ def lagrange_points(mu: Scalar) -> Float[Array, "5 3"]:
 
 
 def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Return the distances of L1 and L2 from the second primary, and of L3 from the first."""
+    """Return three distances: of L1 and of L2 from the second body; and of L3 from the first
+    body.
+    """
     one = jnp.ones_like(mu)
     hill = jnp.cbrt(mu / (3 * (1 - mu)))
     between = _polynomial_root([one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3))
@@ -37,8 +40,10 @@ def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
 
 
 def _polynomial_root(coefficients: list[Scalar], start: Scalar) -> Scalar:
-    """Return a root of a polynomial by Newton's method, highest power first; `start` is near it for
-    every μ.
+    """Return a root of a polynomial by seven steps of Newton's method from `start`.
+
+    The coefficient of the highest power comes first. The starts in `distances` are so near to the
+    roots, for every μ, that seven steps are enough.
     """
 
     def step(_: object, x: Scalar) -> Scalar:
@@ -53,11 +58,13 @@ def _polynomial_root(coefficients: list[Scalar], start: Scalar) -> Scalar:
 def orbit_guess(
     mu: Scalar, point: int, along_x: ScalarLike | None, along_z: ScalarLike | None
 ) -> PeriodicOrbit:
-    """Return a start on the xz-plane near the orbit about L1, L2 or L3 (`point`) with the given
-    amplitude.
+    """Return an approximate orbit about L1, L2 or L3 (`point` 1, 2 or 3) that starts on the
+    xz-plane.
 
-    Either `along_x` (the amplitude of a planar Lyapunov orbit) or `along_z` (that of a halo orbit;
-    its sign is the branch) is given; it is small beside the distance to the nearer body. Source:
+    Either `along_x`, the amplitude of a planar Lyapunov orbit, or `along_z`, the amplitude of a
+    halo
+    orbit, whose sign selects the branch, is a number; the other argument is `None`. The amplitude
+    is small compared with the distance from the point to the nearer body. Source:
     Richardson 1980, Celest. Mech. 22, 241, doi:10.1007/BF01229511, at τ = 0.
     """
     if point not in (1, 2, 3):
@@ -124,7 +131,11 @@ def _amplitude(value: ScalarLike | None) -> Scalar:
 
 
 def _legendre(mu: Scalar, unit: Scalar, point: int, n: int) -> Scalar:
-    """Return the n-th coefficient of the potential about the point (Richardson 1980, eq 8)."""
+    """Return the coefficient c_n of the expansion of the potential about a collinear point.
+
+    **Arguments:** `mu` μ; `unit` the distance of the point from the nearer body; `point` 1, 2 or 3
+    for L1, L2, L3. Source: Richardson 1980, eq 8.
+    """
     g = unit
     if point == 3:
         return ((1 - mu) + mu * (g / (1 + g)) ** (n + 1)) / g**3

@@ -56,7 +56,7 @@ def compute_once(x: Array) -> Array:
     return x / jnp.where(x == x, 1, 2)
 
 
-def one_kernel(function: Function) -> Function:
+def compiled_as_one_kernel(function: Function) -> Function:
     """Return `function`, of trees of arrays, compiled as one kernel where it is not batched.
 
     Many small kernels for one body take long to compile; XLA on CPU makes one kernel of a loop with
@@ -105,9 +105,9 @@ def one_kernel(function: Function) -> Function:
 def batch_as(tree: PyTree, args: PyTree) -> Any:
     """Return `tree` with every leaf batched if any leaf of `args` is batched.
 
-    This repeats what the batching rule of `one_kernel` returns. Under `jit`, JAX takes the axes of
-    a batch from the function and the values from the rule for its derivative. Where the two differ,
-    arrays have wrong shapes, and no error is raised.
+    This repeats what the batching rule of `compiled_as_one_kernel` returns. Under `jit`, JAX takes
+    the axes of a batch from the function and the values from the rule for its derivative. Where the
+    two differ, arrays have wrong shapes, and no error is raised.
     """
     return _broadcast(tree, args)
 

@@ -1,4 +1,4 @@
-"""Solve a vector field in one call of `diffrax.diffeqsolve`; a step ends where the field jumps."""
+"""Solve a vector field in one call of `diffrax.diffeqsolve`; steps end where the field jumps."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -26,13 +26,16 @@ class AdaptiveRun(NamedTuple):
     **Fields:**
 
     - `ys`: the states at `ts`; NaN at a time that the run did not reach.
-    - `num_steps`: the number of all steps; `num_rejected`: the number of rejected steps.
+    - `num_steps`: the number of all steps, rejected steps included.
+    - `num_rejected`: the number of rejected steps.
     - `result`: a `diffrax.RESULTS`, which says how the run ended.
-    - `last_time`: the time at the end of the run, s; `last`: the state at `last_time`.
-    - `next_step`: the length of the step that would follow, s; NaN under any adjoint but
+    - `last_time`: the time at the end of the run, s.
+    - `last`: the state at `last_time`.
+    - `next_step`: the length of the step that would follow, s; NaN if the adjoint is not a
       `ReplayAdjoint`.
-    - `missed`: whether a part of the field switches at more times than the search for switching
-      times has room for; `None` if no part of the field compares anything with the time.
+    - `missed`: whether some part of the field switches more often than the search for switching
+      times can store; the steps then do not end at every switch. `None` if the field has no switch
+      in time.
     """
 
     ys: Any
@@ -46,9 +49,11 @@ class AdaptiveRun(NamedTuple):
 
 
 class _FieldOfNumbers(eqx.Module):
-    """Wrap a field that takes the numbers of a state as one vector, so that it takes the state.
+    """Convert the argument and the result of a vector field between a state and one vector.
 
-    diffrax calls it with the state; `tree` turns a vector of numbers back into a state.
+    The function `field(constants, t, numbers)` takes and returns all numbers of a state as one
+    vector. diffrax calls this object with the state itself; the function `tree` makes a state from
+    a vector of numbers.
     """
 
     constants: Any
@@ -78,12 +83,13 @@ def integrate(
     adjoint: dfx.AbstractAdjoint = REPLAY,
     progress_meter: dfx.AbstractProgressMeter = NO_METER,
 ) -> AdaptiveRun:
-    """Return the run of diffrax at the times `ts` (T,) s under any step size controller.
+    """Run diffrax under any step size controller, and return the states at the times `ts` (T,), s.
 
-    **Arguments:** `controller`, `adjoint` and `progress_meter` are as for `diffrax.diffeqsolve`,
-    the others as for `adaptive`. `jumps` has one array of times, s, for each part of the field
-    that jumps. With `jumps`, `ts` has to increase, and steps end at the jumps and at the times with
-    which the field compares the time t. With `None`, no step is cut short for a jump.
+    **Arguments:** `controller`, `adjoint` and `progress_meter` are as for `diffrax.diffeqsolve`;
+    the other arguments are as for `adaptive`. `jumps` is a list with one array of times, s, for
+    each part of the field that jumps, or `None`. If it is a list, `ts` has to increase; steps end
+    at the jumps, and at each time with which the field compares its argument t. If it is `None`, no
+    step is cut short for a jump.
     """
     missed = None
     if jumps is not None:
@@ -93,7 +99,7 @@ def integrate(
         field, missed = _FieldOfNumbers(program.constants, program.field, tree), program.over
         if program.stops.size:
             controller = Stopping(controller, program.stops)
-    # The last of `ts` is the end of the last step: its state needs no dense output.
+    # The last of `ts` is the end of the last step, so that the state there needs no dense output.
     subs = [dfx.SubSaveAt(t1=True, fn=_numbers)]
     subs += [dfx.SubSaveAt(ts=ts[1:-1], fn=_numbers)] if ts.shape[0] > 2 else []
     out = dfx.diffeqsolve(
@@ -107,15 +113,16 @@ def integrate(
     done = jnp.where(ts[0] > ts[-1], last_time <= ts[-1], last_time >= ts[-1])
     rows = [jnp.where(done, last, jnp.nan)][: ts.shape[0] - 1]
     if between:
-        # diffrax leaves t = inf in a row that the run did not reach: its state is no state.
+        # diffrax writes t = inf into each row that the run did not reach; the numbers in the state
+        # of such a row mean nothing.
         there = jnp.isfinite(times[0])[:, None]
         rows = [jnp.where(there, between[0], jnp.nan), *rows]
     numbers, tree = ravel_pytree(y0)
     ys = jax.vmap(tree)(jnp.concatenate([numbers[None], *rows]))
     ill = ~done
     if not isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
-        # A controller of equal steps looks at no error estimate: it continues with NaN to the end
-        # of the run and reports success.
+        # A controller of equal steps does not look at the error estimate. After a NaN it therefore
+        # goes on to the end of the run and reports success.
         ill = ill | ~finite(ys)
     ill = ill & (out.result == dfx.RESULTS.successful)
     result = dfx.RESULTS.where(ill, NONFINITE, out.result)
@@ -147,22 +154,22 @@ def adaptive(
     - `ts`: (T,) s, the times of the states, in increasing order.
     - `y0`: the state at `ts[0]`.
     - `rtol`, `atol`: scalars, the relative and the absolute tolerance of each step.
-    - `dt0`: the length of the first step, s; `None` chooses it from the field.
+    - `dt0`: the length of the first step, s; with `None` the length is chosen from the field.
     - `max_step`: the longest step, s; `None` sets no limit.
     - `max_steps`: the largest number of steps, rejected steps included.
     - `jumps`: times, s, in any order, at which the field jumps; a step ends at each of them. If
-      several parts of the field jump, give one array for each part: the field then gets as its
-      `args` the times at which steps end, one array for each part. Times with which the field
-      itself compares the time t are found without `jumps`.
+      several parts of the field jump, give a list with one array for each part. The field then gets
+      such a list as its `args`: for each part the times at which steps end. Times with which the
+      field compares its argument t, as in `jnp.where(t < 1, …)`, need not be given.
     - `halt`: a condition `halt(t, y)`, tested after each accepted step; the run ends where the
       condition is true.
 
-    The result has derivatives with respect to all numbers of the field, `ts`, `jumps` and `y0`; the
-    lengths of the steps are held constant for them.
+    The result has derivatives with respect to all numbers of the field, `ts`, `jumps` and `y0`;
+    these derivatives hold the lengths of the steps constant.
 
-    **Returns** an `AdaptiveRun`. A run ends early if it needs more than `max_steps`, if `halt` ends
-    it, or if it meets a NaN that no shorter step avoids: `result` says so, and the states that it
-    did not reach are NaN.
+    **Returns** an `AdaptiveRun`. A run ends early if it needs more than `max_steps` steps, if
+    `halt` is true, or if it meets a NaN that no shorter step avoids. The field `result` then gives
+    the reason, and each state that the run did not reach is NaN.
 
     **Raises:** `TypeError` for a state of several dtypes, or of another dtype than `ts`.
 

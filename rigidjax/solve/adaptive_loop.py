@@ -1,8 +1,9 @@
 """Run an explicit method under any step controller of diffrax, for one body or for many.
 
-The bodies are in the last axis of every array. For derivatives the steps are recorded in segments:
-a record has the start of each segment, and the steps of the last segment alone. A derivative runs
-the other segments once more to get their steps.
+The bodies are in the last axis of every array. For derivatives the steps are recorded. A run is
+divided into segments of `SEGMENT` steps; the record stores the state at the start of each segment,
+but the single steps of the last segment only. A derivative runs each earlier segment once more to
+get the steps of this segment.
 """
 
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from rigidjax.solve.tableaus import Tableau
 # diffrax inherits this member from optimistix, and type checkers do not find it there.
 NONFINITE: Any = dfx.RESULTS.nonfinite
 
-# The number of steps in one segment of a record, rejected steps included.
+# The number of steps in one segment of a record (see the module), rejected steps included.
 SEGMENT = 512
 # Additional rows for a segment that is run again: if the second program rounds differently, the
 # segment may take a few steps more.
@@ -32,14 +33,15 @@ _MORE = 64
 # (When each row was written into the record directly, second derivatives were wrong for several
 # blocks of bodies whose segments were run again, on jaxlib 0.12.0.1.)
 _BLOCK, _MOST = 560, 8
-# The safety factor of the length of the next step, and the limits of its ratio to the last one.
+# The next step has the length that the error estimate suggests, times the safety factor `_SAFETY`.
+# The ratio of this length to the length of the last step is limited to `_SMALLEST` … `_LARGEST`.
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 # The number of saved times of one body whose states are computed together.
 _TOGETHER = 16
 
 
 class Method(NamedTuple):
-    """Hold the parts of a run that are not arrays: its method, its functions and its limits."""
+    """Hold what is not an array in a run: the tableau of the method, functions and limits."""
 
     tableau: Tableau
     field: Field  # on states (n, *bodies)
@@ -53,7 +55,7 @@ class Method(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Hold the numbers of a run, each with a last axis of bodies if there are many."""
+    """Hold the arrays of a run, each with a last axis of bodies if there are several bodies."""
 
     t0: Array  # the start of the run
     stops: Array  # (J,) the times at which the field jumps, then the end of the run
@@ -67,7 +69,8 @@ class Run(NamedTuple):
     def before(self) -> Array:
         """Return the last floating-point time before each jump, and the end of the run, (J,).
 
-        A stage at such a time evaluates the field as it is before the jump.
+        The last stage of a step that ends at a jump is evaluated at this earlier time, so that it
+        sees the field as it is before the jump.
         """
         jumps = lax.stop_gradient(self.stops[:-1])
         gap = previous_number(jumps) - jumps
@@ -75,7 +78,9 @@ class Run(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """Hold the state of the loop over steps; after the last step it is the end of the run."""
+    """Hold all that the loop over steps carries; after the last step it describes the end of the
+    run.
+    """
 
     y: Array  # (n, *bodies) the state at the time t
     t: Array
@@ -87,19 +92,21 @@ class LoopState(NamedTuple):
     state: Any  # the states of the step controller and the progress meter
 
 
-# A recorded attempt at a step is one row (4 + n, *bodies). The first `HEAD` entries are the start
-# of the step, its length, its kind and the index of the next stop; the rest is the state at the
-# start. The kind is NONE if the step was rejected or not taken, STEP for a step, and LAST for a
-# step that ends at the stop.
+# Each recorded attempt at a step is one row (4 + n, *bodies). The first `HEAD` = 4 entries are the
+# start time of the step, its length, its kind and the index of the next stop; the other n entries
+# are the state at the start. The kind is NONE if the step was rejected or not taken, LAST if the
+# accepted step ends at the next stop, and STEP for any other accepted step.
 Rows = Array
 HEAD = 4
 NONE, STEP, LAST = range(3)
 
 
 def pack(loop: LoopState) -> Arrays:
-    """Return a loop state as few arrays: its y (n, *bodies), and all the rest, one array per dtype.
+    """Return a loop state as a short list of arrays.
 
-    XLA makes a kernel for each array that goes into or comes out of a loop over blocks of bodies.
+    The first array is y (n, *bodies). All other fields are joined, with one array for each dtype.
+    Few arrays are wanted because XLA makes a kernel for each array that goes into or comes out of a
+    loop over blocks of bodies.
     """
     rest = _group_by_dtype(loop._replace(y=None))
     join = lambda leaves: jnp.concatenate([a.reshape(-1, *loop.t.shape) for a in leaves])  # noqa: E731
@@ -121,12 +128,16 @@ def unpack(arrays: Arrays, like: LoopState) -> LoopState:
 
 
 def _kind(a: Array) -> Any:
-    """Return the dtype in which `pack` stores an array: int32 for a boolean one, else its own."""
+    """Return the dtype in which `pack` stores the array `a`: int32 if `a` is boolean, else its
+    dtype.
+    """
     return jnp.dtype(jnp.int32) if a.dtype == bool else a.dtype
 
 
 def _group_by_dtype(tree: Any) -> dict[Any, Arrays]:
-    """Return the arrays of `tree` in lists, one list for each dtype that `_kind` returns."""
+    """Return the arrays of `tree` in lists, one list for each dtype that `_kind` returns for an
+    array.
+    """
     parts: dict[Any, Arrays] = {}
     for a in jax.tree.leaves(tree):
         parts.setdefault(_kind(a), []).append(a)
@@ -153,7 +164,8 @@ class Segment(NamedTuple):
 def previous_number(t: Array) -> Array:
     """Return the largest floating-point number below the time `t`, as diffrax defines it.
 
-    For t = 0 it is the largest negative normal number: XLA treats subnormal numbers as zero.
+    For t = 0 the result is the largest negative normal number, because XLA treats subnormal numbers
+    as zero.
     """
     t = lax.stop_gradient(t)
     less = jnp.nextafter(t, jnp.full_like(t, -jnp.inf))
@@ -163,8 +175,9 @@ def previous_number(t: Array) -> Array:
 def step_times(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
     """Return the start, length and end of the steps recorded in `rows` (4 + n, *bodies).
 
-    All three have derivatives with respect to the stops. The start moves with the last stop before
-    it (with `run.t0` before the first stop). The end moves with the stop if the step ends at one.
+    Start, length and end have derivatives with respect to the stops. The start of a step moves with
+    the last stop before it (with `run.t0` before the first stop). The end of a step moves with a
+    stop only if the step ends at this stop.
     """
     t, h, kind, stop = lax.stop_gradient(rows[:HEAD])
     stop, last = stop.astype(jnp.int32), kind == LAST
@@ -177,7 +190,7 @@ def step_times(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
 
 
 def take(a: Array, index: Array) -> Array:
-    """Return `a[index]` of each body, where `a` is (J, *bodies) and `index` (*many, *bodies)."""
+    """Return `a[index]` of each body; `a` has shape (J, *bodies), `index` (*many, *bodies)."""
     count = a.shape[0]
     a = a.reshape(count, *[1] * (index.ndim + 1 - a.ndim), *a.shape[1:])
     if count == 1:
@@ -200,14 +213,15 @@ def finite(tree: Any) -> Bool[Array, ""]:
 
 
 def starting_step(size: Array, rate: Array, order: Any) -> Array:
-    """Return the length of a first step from the norms of a state and of its derivative.
+    """Return the length of a first step from the norms of a state and of its time derivative.
 
-    `size` is the norm of the state and `rate` that of its derivative, both divided by the
-    tolerance; `order` is the order of the error estimate. The formula is that of Hairer, Nørsett
-    and Wanner (1993), II.4, with one change: the second derivative is taken as that of an
-    oscillation, rate²/size. To measure it, the field would have to be compiled once more.
+    `size` is the norm of the state divided by the tolerance, and `rate` is the norm of its time
+    derivative divided by the tolerance; `order` is the order of the error estimate. The formula is
+    that of Hairer, Nørsett and Wanner (1993), II.4, with one change: the norm of the second
+    derivative is taken to be rate²/size, as for an oscillation. To measure the second derivative,
+    the field would have to be compiled once more.
     """
-    # A state of zeros says nothing about the time in which it changes: `size` has a lower limit.
+    # A state of zeros gives no time scale, rate/size would be infinite: `size` gets a lower limit.
     quickness = rate / jnp.maximum(size, 1e-4 * rate)
     guess = (0.01 / (rate * jnp.maximum(quickness, 1))) ** (1 / order)
     return jnp.where(rate < 1e-5, 1e-4, jnp.minimum(1 / quickness, guess)).astype(size.dtype)
@@ -229,15 +243,17 @@ def next_step(norm: Array, order: Any, h: Any) -> tuple[Array, Array]:
 def result_of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
     """Return the result of a run, or `nonfinite_input` if a number of the body is not finite.
 
-    In a batch, an inertia that no real body has is replaced by NaN instead of an error.
+    In a batch, an inertia that no real body can have has been replaced by NaN, because no error can
+    be raised for a single body.
     """
     return dfx.RESULTS.where(finite(body), result, dfx.RESULTS.nonfinite_input)  # pyright: ignore
 
 
 def per_body(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `function`, which takes the arrays of one body, as a function of the arrays of `run`.
+    """Map `function`, which takes arrays of one body, over the last axis if `run` has several
+    bodies.
 
-    If `run` has many bodies, they are in the last axis of its arrays.
+    If `run` has one body, `function` is returned unchanged.
     """
     return jax.vmap(function, in_axes=-1, out_axes=-1) if run.t0.ndim else function
 
@@ -257,8 +273,8 @@ def initial_loop_state(run: Run) -> LoopState:
 def is_running(method: Method, run: Run, loop: LoopState, until: Array | None) -> Array:
     """Return whether each body still has a step to take.
 
-    The run of a body lasts to the last of `run.stops`, or to the time `until`, the end of a
-    segment, if that is not `None`.
+    The run of a body lasts to the last of `run.stops`. If `until` is not `None`, it is the time at
+    which a segment ends, and the run lasts no longer than that.
     """
     well = per_body(run, lambda result: result == dfx.RESULTS.successful)(loop.result)
     last = lax.stop_gradient(run.stops[-1])
@@ -267,7 +283,7 @@ def is_running(method: Method, run: Run, loop: LoopState, until: Array | None) -
 
 
 def end_of_run(method: Method, constants: Arrays, run: Run) -> LoopState:
-    """Return the loop state at the end of a run, for which no other state is saved."""
+    """Return the loop state at the end of a run, without saving any state before the end."""
     return lax.while_loop(
         lambda loop: jnp.any(is_running(method, run, loop, None)),
         lambda loop: _attempt(method, constants, run, loop, None)[0],
@@ -276,10 +292,10 @@ def end_of_run(method: Method, constants: Arrays, run: Run) -> LoopState:
 
 
 def states_of_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState]:
-    """Return the states (K, n) of one body at `run.between`, and the loop state at the end.
+    """Return the states (K, n) of one body at the saved times, and the loop state at the end.
 
-    A state that the run did not reach is NaN. The stages of dense output are evaluated only in the
-    steps that contain one of the times.
+    The saved times are the K times `run.between`. A state that the run did not reach is NaN. The
+    stages of dense output are evaluated only in steps that contain a saved time.
     """
     size = run.between.shape[0]
 
@@ -299,7 +315,7 @@ def states_of_one_body(method: Method, constants: Arrays, run: Run) -> tuple[Arr
         ys, k = lax.while_loop(lambda state: next_time(state[1]) <= after.t, save, (ys, k))
         return after, ys, k
 
-    # A saved time at the start belongs to the first step, as far as that step is accepted.
+    # A saved time equal to the start of the run gets its state when the first step is accepted.
     state = (initial_loop_state(run), _states_before_the_run(run), jnp.zeros((), jnp.int32))
     more = lambda state: is_running(method, run, state[0], None)  # noqa: E731
     loop, ys, _ = lax.while_loop(more, one, state)
@@ -314,10 +330,10 @@ def _states_before_the_run(run: Run) -> Array:
 
 
 def record_run(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState, Record]:
-    """Return the states at `run.between`, the loop state at the end, and the record of the run.
+    """Return three things: the saved states, the loop state at the end, and the record of the run.
 
-    The states are (K, n, *bodies), and NaN if the run did not reach them. The record is what
-    derivatives need.
+    The saved states (K, n, *bodies) are the states at the K times `run.between`; a state that the
+    run did not reach is NaN. Derivatives are computed from the record.
     """
     loop, most = initial_loop_state(run), method.max_steps + run.stops.shape[0]
     count = -(-most // SEGMENT) + 1
@@ -349,21 +365,24 @@ def _attempt(
     method: Method, constants: Arrays, run: Run, loop: LoopState, until: Array | None,
     dense: Any = False,
 ) -> tuple[LoopState, Array, tuple[Step, Array]]:  # fmt: skip
-    """Return the loop state after one attempt at a step of every body, and the attempt itself.
+    """Return the loop state after one attempted step of every body, and the attempt itself.
 
-    **Returns** the loop state, the row of the attempt, and its step with the slopes of all stages.
-    `dense` says whether the stages of dense output are evaluated, too. `until` is the end of a
-    segment that is run again, else `None`: only steps that are run again have derivatives with
-    respect to the times of the run.
+    **Returns** three things: the loop state after the attempt; the recorded row of the attempt; and
+    a pair of the step and the slopes of its stages. `dense` says whether the stages of dense output
+    are evaluated, too. If a segment is run again for derivatives, `until` is the time at which it
+    ends; else `until` is `None`. Only steps that are run again have derivatives with respect to the
+    times of the run.
     """
-    # The loop around this has found that some body has a step to take; other bodies may have none.
+    # The loop that calls this function goes on while any body has a step to take; other bodies may
+    # have none.
     on = is_running(method, run, loop, until) if run.t0.ndim else True
     stop, end = lax.stop_gradient((take(run.stops, loop.stop), take(run.before, loop.stop)))
-    # A stop that a body has already reached, such as the second of two at one time, needs no step.
+    # A body needs no step to a stop that it has already reached, such as the second of two stops at
+    # the same time.
     arrived = on & (loop.t >= stop) if run.stops.shape[0] > 1 else False
     moving = on if arrived is False else on & ~arrived
-    # No step goes over a stop, however the controller rounds: its stages would evaluate the field
-    # on both sides of the jump.
+    # No step goes beyond a stop, however the controller rounds: the stages of such a step would
+    # evaluate the field on both sides of the jump.
     last = loop.end >= end
     end = jnp.where(last, end, loop.end)
     if until is not None:
@@ -407,9 +426,11 @@ def _attempt(
 
 
 def _where(which: Any, new: Any, old: Any) -> Any:
-    """Return the arrays (…, *bodies) of `new` for the bodies where `which` is true, else of `old`.
+    """Return the arrays (…, *bodies) of `new` for bodies where `which` is true, else those of
+    `old`.
 
-    If `which` is the constant `True`, all arrays are those of `new`, in the dtypes of `old`.
+    If `which` is the constant `True`, the arrays of `new` are returned for all bodies, converted to
+    the dtypes of `old`.
     """
     if which is True:
         return jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), new, old)
@@ -420,9 +441,11 @@ def _where(which: Any, new: Any, old: Any) -> Any:
 def record_segment(
     method: Method, constants: Arrays, run: Run, loop: LoopState, rows: Rows, until: Any
 ) -> tuple[LoopState, Rows, Array]:
-    """Return the loop state after a segment of steps, the rows of these steps, and their number.
+    """Return the loop state after a segment of steps, the recorded rows of the steps, and their
+    number.
 
-    The segment ends where `rows` is full or the run ends, or, if it is run again, at `until`.
+    A segment that is recorded for the first time (`until` is `None`) ends when `rows` is full or
+    the run ends. A segment that is run again ends at the time `until`.
     """
     many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))
     room = rows.shape[0] - (_MORE if until is None else 0) - _MOST
@@ -454,17 +477,21 @@ def segment(rows: Rows, end: Array, count: Array) -> Segment:
 def states_at_saved_times(
     method: Method, constants: Arrays, run: Run, part: Segment, ys: Array
 ) -> Array:
-    """Return `ys` (K, n, *bodies) with the states added whose times lie in the segment `part`."""
+    """Return `ys` (K, n, *bodies), with each state filled in whose time lies in the segment `part`.
+
+    The K times are `run.between`.
+    """
     size, many = run.between.shape[0], run.t0.ndim > 0
     width = 1 if many else min(size, _TOGETHER)
-    # All times are searched for at once: in a loop, each search would be many small kernels.
+    # The steps of all saved times are looked up at once: in a loop, each look-up would be many
+    # small kernels.
     ts = lax.stop_gradient(run.between)
     search = per_body(run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1)
     index = search(part.times, ts)
     inside = (index >= 0) | (part.times[0] <= lax.stop_gradient(run.t0))[None]
     index, inside = jnp.maximum(index, 0), inside & (ts <= part.end[None])
-    # A time outside of the segment gets a step of length 0 at the segment's first state, where the
-    # field has a value; the result is not used.
+    # For a saved time outside of the segment a step of length 0 at the segment's first state is
+    # evaluated, because the field has a finite value there; the result is not used.
     still = part.rows[0].at[1:3].set(0)
     pick = jax.vmap(lambda rows, i: rows[i], (-1 if many else None, -1), -1)
     if not many:
@@ -476,7 +503,8 @@ def states_at_saved_times(
         method, still = method._replace(field=field, project=project), still[:, None]
 
     def window(i: Array, ys: Array) -> Array:
-        # A window that reaches beyond the last time is moved back: some states are computed twice.
+        # A window that would reach beyond the last saved time is moved back, so that some states
+        # are computed twice.
         number = jnp.minimum(first + i * width, size - width)
 
         def cut(a: Array) -> Array:
@@ -501,8 +529,8 @@ def states_at_saved_times(
 def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
     """Return the state (n, *bodies) at the time `t` in a step from the slopes of all its stages."""
     theta = ((t - step.t) / jnp.where(step.h == 0, 1, step.h)).astype(slopes.dtype)
-    # The polynomial is evaluated for the weights of the slopes, one number for each stage; for the
-    # rows F_r of dense output it would be n numbers each.
+    # The polynomial in θ is evaluated for the weights of the slopes, which are one number for each
+    # stage. To evaluate it for the rows F_r of dense output would take n numbers for each row.
     rows = weights(method.tableau, slopes.dtype).dense
     shares = nested(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
     rise = jnp.sum(shares[None] * slopes, 1)

@@ -1,9 +1,10 @@
 """Compute tangents and cotangents of a recorded run by a second pass over its steps.
 
-The derivative is that of the steps taken, whose lengths are held constant; a step that was cut
-short at a stop moves with the stop. All segments but the last are run once more. If the second
-program rounds differently, a segment may have other steps between its two ends: the derivative is
-then that of these other steps, which is the same to within the tolerance.
+The function that is differentiated is the sequence of steps that the run took. Their lengths are
+held constant, except that a step that was cut short at a stop moves with the stop. Each segment of
+the record but the last is run once more. If the second program rounds differently, it may divide a
+segment into other steps; the derivative is then that of these steps, and the difference is within
+the tolerance.
 """
 
 from functools import partial
@@ -37,9 +38,10 @@ from rigidjax.solve.runge_kutta import Step, stages
 
 
 class Smooth(NamedTuple):
-    """Hold the numbers of a run that have derivatives, or the tangents or cotangents of them.
+    """Hold the fields of a `Run` that have derivatives, or the tangents or cotangents of these
+    fields.
 
-    The fields have the names that they have in `Run`.
+    The fields have the same names and shapes as in `Run`.
     """
 
     t0: Array
@@ -54,14 +56,16 @@ def smooth_numbers(run: Run) -> Smooth:
 
 
 def saved_times_before_rows(run: Run, part: Segment) -> Array:
-    """Return how many of the saved times have passed at the start of each row of a segment.
+    """Return the number of saved times before the start of each recorded row of the segment `part`.
 
-    The saved times are `run.between`. The last number is that at the end of the segment `part`.
+    The saved times are `run.between`. One more number is appended: the number of saved times before
+    the end of the segment.
     """
     ends = jnp.concatenate([jnp.minimum(part.times, part.end[None]), part.end[None]])
     search = lambda ts, t: jnp.searchsorted(ts, t, side="right").astype(jnp.int32)  # noqa: E731
     count = per_body(run, search)(lax.stop_gradient(run.between), ends)
-    # A saved time at the start of the run belongs to the first step: it has not passed before it.
+    # A saved time equal to the start of the run belongs to the first step, and is not counted as
+    # before it.
     return jnp.where(ends <= lax.stop_gradient(run.t0)[None], 0, count)
 
 
@@ -69,20 +73,27 @@ def transpose_saved_states(
     method: Method, run: Run, step: Step, slopes: Array, first: Array, last: Array, bars: Array,
     between: Array | None,
 ) -> tuple[Array | None, Step, Array]:  # fmt: skip
-    """Return the cotangents of a step from those of the states that are saved within the step.
+    """Return the cotangents of a step from the cotangents of the states that are saved within it.
 
-    This is the transpose of `state_in_step`, for all saved times in the step and all bodies.
-    `slopes` are those of all stages of the step. The saved times in it have the numbers from
-    `first` to `last` − 1. `bars` (K, n, *bodies) are the cotangents of all saved states, and
-    `between` are the cotangents of the saved times so far, or `None` if those are not wanted.
-    **Returns** `between` with the cotangents of the times in this step added (or `None`), the
-    cotangents of the step, and the cotangents of its slopes.
+    This is the transpose of `state_in_step`, for all saved times in the step and for all bodies.
+
+    **Arguments:**
+
+    - `step`, `slopes`: the step, and the slopes (values of the field) at all its stages.
+    - `first`, `last`: the indices of the saved times in this step go from `first` to `last` − 1.
+    - `bars`: (K, n, *bodies), the cotangents of all saved states.
+    - `between`: the cotangents of the saved times, as far as they are summed up, or `None` if these
+      cotangents are not wanted.
+
+    **Returns** three things: the array `between`, to which the cotangents of the saved times in
+    this step are added (or `None`); the cotangents of the step; and the cotangents of the slopes.
     """
     state_at, most = partial(state_in_step, method), run.between.shape[0] - 1
     pick = per_body(run, lambda a, index: a[index])
 
-    # The times in a step are taken one after the other: of many bodies, only a few have as many
-    # times in one step as the body that has the most.
+    # The saved times in a step are treated one after the other. An axis for them would have the
+    # length of the largest number of saved times in a step of any body, and most bodies have far
+    # fewer.
     def one(state: Any) -> Any:
         number, total, by = state
         inside, there = number < last, jnp.minimum(number, most)
@@ -103,10 +114,10 @@ def replay_steps(
 ) -> tuple[Array, Array, Array, Array]:
     """Return the states of a recorded run, computed once more by its recorded steps.
 
-    The lengths of the steps are held constant for derivatives, except where a step was cut short
-    at a stop. **Returns** the states (K, n, *bodies) at `run.between`; the state at the end of the
-    run; the states at the starts of the segments, followed by the last state; and the rows of the
-    last segment with these states.
+    The lengths of the steps are held constant for derivatives, except where a step was cut short at
+    a stop. **Returns** four things: the states (K, n, *bodies) at `run.between`; the state at the
+    end of the run; the states at the starts of the segments, followed by the state at the end; and
+    the rows of the last segment, which contain the recomputed states.
     """
 
     def one(i: Array, state: tuple[Array, Array, Array, Array]) -> Any:
@@ -139,8 +150,9 @@ def cotangents(
 ) -> tuple[Arrays, Smooth]:
     """Return the cotangents of the constants and of the run: the transpose of `replay_steps`.
 
-    `bars` are the cotangents of the states at `run.between` and of the state at the end. The
-    cotangents of the times of the run are computed only if `timed` is true; else they are 0.
+    `bars` is a list of two arrays: the cotangents of the states at `run.between`, and the cotangent
+    of the state at the end of the run. The cotangents of the times of the run are computed only if
+    `timed` is true; else they are 0.
     """
     number, size = jnp.max(record.counts[0]), run.between.shape[0]
 
@@ -170,7 +182,7 @@ def cotangents(
             )
             if seeds is not None:
                 rest = [a + b for a, b in zip(rest, (seeds.t, seeds.h, seeds.y), strict=True)]
-            # The cotangents of a body that has no step in this row may be NaN: they are not used.
+            # The cotangents of a body without a step in this row may be NaN, and are replaced by 0.
             on = row[2] >= STEP
             by_t, by_h, by_y = (_where(on, a) for a in rest)
             by_t0, by_stops = of_times((by_t, by_h, jnp.zeros_like(end)))
@@ -195,18 +207,21 @@ def _where(there: Array, a: Array) -> Array:
 def _segment_of_record(
     method: Method, constants: Arrays, run: Run, record: Record, number: Array
 ) -> Segment:
-    """Return the segment `number` of a record: recorded if it is the last, else run once more."""
+    """Return the segment of the given `number` with its rows of steps.
+
+    The rows of the last segment are read from the record. Any other segment is run once more.
+    """
     like = initial_loop_state(run)
     loop, after = (unpack([a[i] for a in record.starts], like) for i in (number, number + 1))
-    # In the record, the count of steps and the result are those of the forward run: the segment
-    # starts with fresh ones, so that neither ends it.
+    # The record has the step count and the result of the forward run, either of which could end the
+    # segment. The segment therefore starts with a step count of 0 and a successful result.
     loop = loop._replace(steps=like.steps, result=like.result)
     count, filled = (jnp.max(a) for a in record.counts)
     again = number < count - 1
-    # The last segment is in the record: it takes no step here.
+    # The steps of the last segment are in the record, so that it takes no step here.
     until = jnp.where(again, lax.stop_gradient(after.t), -jnp.inf)
     end, rows, count = record_segment(method, constants, run, loop, record.rows, until)
-    # If the rows had too little room for all steps, the derivative would be wrong: it becomes NaN.
+    # If there are more steps than rows, the derivative would be wrong: it is set to NaN.
     short = jnp.where(jnp.any(is_running(method, run, end, until)), jnp.nan, 0.0)
     rows = rows.at[:, HEAD:].add(short.astype(rows.dtype))
     count = jnp.where(again, count, filled)

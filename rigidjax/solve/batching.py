@@ -1,8 +1,8 @@
-"""Run a program on many bodies, which are in the last axis of every array under any `jax.vmap`.
+"""Run a program on many bodies, with the bodies in the last axis of every array.
 
 XLA on CPU makes vector instructions for arrays whose last axis is the batch. `jax.vmap` puts the
-batch first, which is many times slower in a loop over small states; `custom_vmap` moves the batch
-to the end.
+batch axis first, which makes a loop over small states many times slower. Therefore a rule of
+`jax.custom_batching.custom_vmap` moves the batch axis of any `jax.vmap` to the end.
 """
 
 from collections.abc import Callable
@@ -20,8 +20,8 @@ from rigidjax.rotation.barrier import platform
 
 Arrays = list[Any]
 
-# The number of bodies that go through a loop together on CPU. They are few, so that their numbers
-# stay in the first-level cache.
+# The number of bodies that go through a loop together on CPU. It is small, so that the arrays of
+# these bodies stay in the first-level cache.
 BLOCK = 16
 
 
@@ -32,7 +32,7 @@ class Layout(NamedTuple):
     shared: tuple[bool, ...]  # for each constant, whether all bodies share it: it has no such axis
 
     def over(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return `function(constants, t, y)`, which is for one body, as one for all bodies."""
+        """Map `function(constants, t, y)`, which takes the arrays of one body, over all bodies."""
         axes = [None if s else -1 for s in self.shared]
         return jax.vmap(function, (axes, -1, -1), -1) if self.bodies else function
 
@@ -55,8 +55,9 @@ class Layout(NamedTuple):
         return self._replace(shared=shared), constants
 
 
-# `program(layout, constants, each)` takes constants, which bodies may share, and arrays of which
-# each body has its own. It returns a list of arrays of which each body has its own.
+# `program(layout, constants, each)` takes two lists of arrays: `constants`, which bodies may share,
+# and `each`, in whose arrays each body has values of its own. It returns a list of arrays in which
+# each body has values of its own.
 Program = Callable[[Layout, Arrays, Arrays], Arrays]
 
 
@@ -65,10 +66,15 @@ def in_lanes(
 ) -> Arrays:
     """Return the result of `program`, run with the bodies of any `jax.vmap` in the last axis.
 
-    Bodies may share an array of `constants`; of the arrays `each`, every body has its own. The
-    program is linear in the last `linear` of the arrays `each`: a `jax.vmap` over these alone gives
-    many directions of one motion, which are not counted as bodies. `layout` is the layout of the
-    arrays as they are given; `None` is one body.
+    **Arguments:**
+
+    - `program`: see `Program`.
+    - `constants`: arrays, each of which all bodies may share.
+    - `each`: arrays in which each body has values of its own.
+    - `linear`: the number of arrays at the end of `each` in which the program is linear, such as
+      tangents. A `jax.vmap` over these arrays alone gives several tangents of one motion; its axis
+      is not treated as an axis of bodies.
+    - `layout`: the layout of the given arrays; `None` stands for one body.
     """
     was = Layout(False, (True,) * len(constants)) if layout is None else layout
     number = len(constants)
@@ -115,8 +121,8 @@ def in_lanes(
         return [first(a) for a in out], [True] * len(out)
 
     answer: Any = jax.custom_jvp(lambda *args: call(*args))
-    # The derivative rule of `custom_vmap` itself gives wrong shapes in a batch of tangents: `_jvp`
-    # takes its place.
+    # The derivative rule of `custom_vmap` gives wrong shapes for a batch of tangents, so that
+    # `_jvp` is used instead.
     answer.defjvp(partial(_jvp, program, was, number, linear), symbolic_zeros=True)
     return answer(*constants, *each)
 
@@ -129,15 +135,17 @@ def _jvp(
     primals: tuple[PyTree, ...],
     tangents: tuple[PyTree, ...],
 ) -> tuple[Arrays, Arrays]:
-    """Return the result of a program and its tangent, which one call of `in_lanes` computes.
+    """Return the result of a program and the tangent of the result, computed in one call of
+    `in_lanes`.
 
-    The first `number` of `primals` are constants. `was` is the layout of the arrays, and `linear`
+    The first `number` of `primals` are the constants. `was` is the layout of the arrays; `linear`
     is as for `in_lanes`.
     """
     constants, each = list(primals[:number]), list(primals[number:])
     moving = [not isinstance(t, SymbolicZero) for t in tangents]
-    # Tangents go among the arrays of each body, so that those of shared constants need a last axis
-    # of bodies; `with_tangents` adds the same axis to the constants themselves.
+    # The tangents are passed with the arrays `each`, in which every body has values of its own. The
+    # tangents of shared constants therefore need a last axis of bodies; `with_tangents` adds the
+    # same axis to these constants.
     _, along = was.broadcast_to_bodies(list(tangents[:number]), moving[:number], each[0])
     along = [t for t, m in zip([*along, *tangents[number:]], moving, strict=True) if m]
 
@@ -161,7 +169,8 @@ def _jvp(
 def _in_blocks(program: Program, layout: Layout, number: int, *args: Any) -> Arrays:
     """Return the result of a program, computed on CPU for at most `BLOCK` bodies at a time.
 
-    The first `number` of `args` are constants; of the other arrays each body has its own.
+    The first `number` of `args` are the constants; in the other arrays each body has values of its
+    own.
     """
     constants, each = list(args[:number]), list(args[number:])
     count = each[0].shape[-1] if layout.bodies else 1

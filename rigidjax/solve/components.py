@@ -1,8 +1,8 @@
 """Convert a state to a tuple of scalars, and back.
 
-XLA on CPU makes one kernel of a loop over a tuple of scalars; in a batch, the loop is over a tuple
-of (N,) arrays and uses vector instructions. A loop over (7,) or (N, 7) arrays becomes many small
-kernels.
+XLA on CPU compiles a loop that carries a tuple of scalars to one kernel. In a batch of N states
+such a loop carries a tuple of (N,) arrays and uses vector instructions. A loop that carries (7,) or
+(N, 7) arrays becomes many small kernels.
 """
 
 import math
@@ -14,13 +14,13 @@ from jax import lax
 from jaxtyping import Array
 
 Atoms = tuple[Array, ...]
-# An array of more numbers than this stays whole: to write out each of its numbers costs more time
-# to compile than it gains.
+# An array of more numbers than this is not split: to treat each number by itself would cost more
+# time to compile than it saves.
 FEW = 32
 
 
 def split(tree: Any) -> Atoms:
-    """Return the numbers of a tree of arrays as scalars; an array longer than `FEW` stays whole."""
+    """Return the numbers of a tree of arrays as scalars; arrays longer than `FEW` are not split."""
     parts: list[Array] = []
     for leaf in jax.tree.leaves(tree):
         leaf = jnp.asarray(leaf)
@@ -32,7 +32,7 @@ def split(tree: Any) -> Atoms:
 
 
 def join(parts: Atoms, like: Any) -> Any:
-    """Return the tree with the shape of `like` whose numbers are `parts`, as `split` gave them."""
+    """Return the tree that `split` converted to `parts`; `like` is a tree of the same shapes."""
     leaves, structure = jax.tree.flatten(like)
     queue = iter(parts)
     out = []

@@ -1,10 +1,11 @@
 """Locate the zeros of a function g along a motion, by steps and by Newton's method within a step.
 
-A pass through the loop attempts the next step, or a part of a step up to a trial time of the zero;
-the state at a zero is therefore as accurate as the end of a step. A step is taken again, only up to
-the extremum of g, in two cases: if the cubic through the values and slopes of g at both ends has
-more zeros than the signs of g at the ends show, or if g turns back before zero and the tangents at
-both ends do not exclude a zero.
+Each pass through the loop attempts the next step, or only a part of a step, which ends at the
+guessed time of a zero. The state at a zero is therefore as accurate as the state at the end of a
+step. A step may contain zeros that the signs of g at its two ends do not show. In two cases the
+step is therefore taken once more, only up to the extremum of g: if the cubic polynomial through the
+values and slopes of g at both ends has such zeros; or if this polynomial turns back before zero,
+but the tangents at both ends do not exclude a zero.
 """
 
 from collections.abc import Callable
@@ -21,8 +22,8 @@ from rigidjax.solve.batching import Arrays, lift
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
 from rigidjax.solve.tableaus import Tableau
 
-# The number of Newton's guesses for one zero, after which intervals are halved. It is also the
-# largest number of times that a step is taken again because g turns in it.
+# The number of guesses for one zero by Newton's method; after them the interval is halved. It is
+# also the largest number of times that a step is taken again because g has an extremum in it.
 _GUESSES = 8
 # The largest number of guesses and halvings for one zero.
 _MOST = 70
@@ -38,7 +39,7 @@ class SearchMethod(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Hold the numbers of a run that is searched, each with a last axis of bodies if many."""
+    """Hold the arrays of a run that is searched for zeros; a batch adds a last axis of bodies."""
 
     t0: Array
     stops: Array  # (J,) the times at which the field jumps, then the end of the run
@@ -51,7 +52,8 @@ class Path(NamedTuple):
     def before(self) -> Array:
         """Return the last floating-point time before each jump, and the end of the run, (J,).
 
-        A stage at such a time evaluates the field as it is before the jump.
+        The last stage of a step that ends at a jump is evaluated at this earlier time, so that it
+        sees the field as it is before the jump.
         """
         return jnp.concatenate([previous_number(self.stops[:-1]), self.stops[-1:]])
 
@@ -59,13 +61,15 @@ class Path(NamedTuple):
 class Motion(NamedTuple):
     """Hold the motion of a body and the condition g along it, on states (n, *bodies)."""
 
-    # attempt(step) returns the state a step later, and the norm of its error over the tolerance.
+    # attempt(step) returns the state after the step, and the norm of its error divided by the
+    # tolerance.
     attempt: Callable[[Step], tuple[Array, Array]]
     order: int  # the order of this error
     longest: Array  # the length of the longest step
-    # condition(t, y) returns g, dg/dt, dy/dt and the size that g may have by round-off.
+    # condition(t, y) returns g, dg/dt, dy/dt and the size that g may have from round-off alone.
     condition: Callable[[Array, Array], tuple[Array, ...]]
-    # counts(t, y, steps) returns whether a zero after so many steps is more than round-off.
+    # counts(t, y, steps) returns whether a zero of g after this number of steps is a true zero, and
+    # not only round-off.
     counts: Callable[[Array, Array, Array], Array]
     project: Callable[[Array], Array]  # scales a quaternion to length 1
 
@@ -91,7 +95,9 @@ class Located(NamedTuple):
 
 
 class _End(NamedTuple):
-    """Hold an offset x in a step, and g and dg/dt at this offset."""
+    """Hold an end of the interval that contains a zero: the offset x from the start of the step, s,
+    and g and dg/dt at this offset.
+    """
 
     x: Array
     g: Array
@@ -125,8 +131,8 @@ def locate(motion: Motion, search: Search, run: Path) -> Located:
     """
     t0, y0 = run.t0, run.y0
     g, rate, *_ = motion.condition(t0, y0)
-    # The start is on the section to within the round-off of the time: then the side of zero is the
-    # side to which g goes.
+    # If g is zero at the start to within the round-off of the time, the sign of dg/dt tells on
+    # which side of zero the motion is.
     eps = jnp.finfo(t0.dtype).eps
     little = 16 * eps * jnp.maximum(jnp.abs(t0), jnp.abs(run.stops[-1])).astype(g.dtype)
     there = jnp.abs(g) <= little * jnp.abs(rate)
@@ -165,13 +171,14 @@ def locate(motion: Motion, search: Search, run: Path) -> Located:
 
 
 def _is_running(search: Search, run: Path, body: _Body) -> Array:
-    """Return whether the search goes on for each body: before its end, and without a new zero."""
+    """Return for each body whether its search goes on: the run has not ended, and no zero is found.
+    """
     ahead = (body.stop < run.stops.shape[0]) & (body.steps < search.max_steps)
     return ahead & (body.h > 0) & ~body.found
 
 
 def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
-    """Return the state of the search after one more attempt at a step, or at a part of a step."""
+    """Return the state of the search after one more attempted step or part of a step."""
     on = _is_running(search, run, body)
     t, h, y, side = body.t, body.h, body.y, body.side
     begin, end = take(run.stops, body.stop), take(run.before, body.stop)
@@ -183,15 +190,16 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
     late = jnp.where(last, end, jnp.minimum(t + length, end))
     after, norm = motion.attempt(Step(t, length, late, y))
     g, rate, slope, blur = motion.condition(late, after)
-    # g = 0 counts as a crossing only where g was not zero before: neither at the start nor where g
-    # is zero all along.
+    # g = 0 counts as a crossing only if g was not zero before. A zero at the start does not count,
+    # and neither does a g that is always zero.
     other = (side * g < 0) | ((g == 0) & (body.g != 0) & (side != 0))
     wanted = -side if search.direction == 0 else jnp.full_like(side, search.direction)
     asked = -side == wanted
     start, here = _End(jnp.zeros_like(length), body.g, body.rate), _End(length, g, rate)
 
-    # A step whose error is below the tolerance is accepted as a whole, or taken again up to the
-    # time at which g turns (`shorter`), or searched for the zero in it (`crossed`).
+    # If the error of a step is below the tolerance, one of three things happens: the step is
+    # accepted; or the step is taken again up to the extremum of g (`shorter`); or the zero of g in
+    # the step is searched for (`crossed`).
     step = on & ~arrived & ~body.refining
     whole = run.stops[-1] - run.t0
     good, following = accept_and_next_step(norm, motion.order, t, length, h, last, whole)
@@ -202,12 +210,13 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
     long_enough = turn > 8 * eps * jnp.maximum(jnp.abs(t), eps * whole)
     shorter = good & hidden & long_enough & (body.tries < _GUESSES)
     # A crossing in the direction that is not asked for is not located: the step is accepted, and
-    # only the side on which it ended is kept.
+    # only the new side of zero is stored.
     crossed = good & ~shorter & other & asked
     accept = good & ~shorter & ~crossed
     next_h = jnp.where(shorter, turn, jnp.where(step & ~crossed, following, h))
 
-    # Newton's method between two ends, one on each side of zero.
+    # Newton's method in the interval from `low` to `high`, at whose ends g is on opposite sides of
+    # zero.
     refine = on & body.refining
     low = _choose(refine & ~other, here, body.low)
     high = _choose(refine & other, here, body.high)
@@ -240,11 +249,13 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
 
 
 def _newton(body: _Body, low: _End, high: _End, here: _End) -> tuple[Array, Array, Array, Array]:
-    """Return where the zero between `low` and `high` is, seen from the last guess `here`.
+    """Take one step of Newton's method for the zero between `low` and `high`, from the guess
+    `here`.
 
-    **Returns** whether one move of Newton's method reaches the zero; whether the search has to end
-    at `here` anyway, since no time lies between the ends or all guesses are used up; the length of
-    the move, 0 if it does not reach the zero; and the offset of the next guess.
+    **Returns** four things: whether this step reaches the zero; whether the search has to end at
+    `here` in any case, because no floating-point time lies between `low` and `high` or all guesses
+    are used up; the length of the step, or 0 if the step does not reach the zero; and the offset of
+    the next guess.
     """
     rate, eps = here.rate, jnp.finfo(body.h.dtype).eps
     move = (-here.g / jnp.where(rate == 0, jnp.ones_like(rate), rate)).astype(here.x.dtype)
@@ -266,11 +277,12 @@ def _choose(which: Array, a: _End, b: _End) -> _End:
 
 
 def _hidden_zero(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array, Array]:
-    """Return whether g may have more zeros between two ends than its signs there show.
+    """Return whether g may have zeros between `low` and `high` that its signs there do not show.
 
-    `side` is the side of zero at the end `low`; `blur` is the size that g may have by round-off.
-    **Returns** also the offset at which the cubic through both ends, with their slopes, has its
-    extremum: there it turns back before zero or beyond it.
+    `side` is the sign of g at `low`; `blur` is the size that g may have from round-off alone.
+    **Returns** a second result, too: the offset of the extremum of the cubic polynomial that has
+    the values and slopes of g at `low` and `high`. If g has two zeros, one lies on each side of
+    this extremum.
     """
     width = (high.x - low.x).astype(low.g.dtype)
     a, b = side * low.rate * width, side * high.rate * width
@@ -281,14 +293,14 @@ def _hidden_zero(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array
     root = jnp.sqrt(jnp.maximum(c * c - 4 * a * d, 0))
     q = -0.5 * (c + jnp.where(c < 0, -root, root))
     one, other = a / jnp.where(q == 0, 1, q), q / jnp.where(d == 0, 1, d)
-    # The slope grows through zero at the least value of the cubic, and falls through zero at the
-    # largest one.
+    # The slope of the cubic increases through zero at its minimum, and decreases through zero at
+    # its maximum.
     least, most = jnp.where(c < 0, other, one), jnp.where(c < 0, one, other)
 
     value = lambda x: first + x * (a + x * (0.5 * c + x * d / 3))  # noqa: E731
     within = lambda x: (x > 0) & (x < 1)  # noqa: E731
-    # The tangents at both ends meet beyond zero. Of a g that turns once nothing more is known, so
-    # that a zero is not excluded.
+    # The tangents at both ends meet beyond zero. A function with one extremum and these tangents
+    # may reach zero, so that a zero is not excluded.
     meet = (last - b - first) / jnp.where(a == b, 1, a - b)
     touch = (a < 0) & (b > 0) & (first + a * meet < -blur)
     two = (last > 0) & ((value(least) < -blur) | touch)
@@ -299,11 +311,12 @@ def _hidden_zero(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array
 
 
 def _first_guess(side: Array, low: _End, high: _End) -> Array:
-    """Return the offset of the first guess for a zero between two ends.
+    """Return the offset of the first guess for a zero of g between `low` and `high`.
 
-    The guess is the value at g = 0 of the cubic x(g) through both ends with their slopes. It is the
-    middle if g moves away from the other side of zero at one of the ends, or if the value of the
-    cubic is not between the ends.
+    The guess is x(0), where x(g) is the cubic polynomial in g that has the offsets and the slopes
+    dx/dg at `low` and `high`. The guess is the middle of the interval if g moves away from zero at
+    `low` or towards zero at `high`, or if x(0) lies outside of the interval. `side` is the sign of
+    g at `low`.
     """
     steady = (side * low.rate < 0) & (side * high.rate < 0)
     rise = jnp.where(steady, high.g - low.g, 1)
@@ -321,9 +334,9 @@ def _first_guess(side: Array, low: _End, high: _End) -> Array:
 def step_with_error(
     method: SearchMethod, constants: Arrays, run: Path, step: Step
 ) -> tuple[Array, Array]:
-    """Return the state a step later, and the root mean square of its error over the tolerance.
+    """Return the state after the step, and the norm of its error.
 
-    The error of each number is divided by the tolerance of this number.
+    The norm is the root mean square over the numbers of the state of error divided by tolerance.
     """
     there = stages(method.tableau, method.field, constants, step)
     right = method.project(there.end)
@@ -341,12 +354,18 @@ def accept_and_next_step(
 ) -> tuple[Array, Array]:
     """Return whether a step is accepted, and the length of the next step.
 
-    The length is 0 if no shorter step is left to try, and NaN if the step ended with NaN.
+    The next length is 0 if a shorter step would be below the round-off of the time, and NaN if the
+    step ended with NaN.
 
-    `norm` is the error over the tolerance, as `step_with_error` returns it, and `order` the order
-    of this error. The step began at `t` with the length `h`; `kept` is the length that it was to
-    have before it was cut short as the `last` step before a stop. `length` is that of the run: its
-    round-off is taken where the round-off of `t` vanishes.
+    **Arguments:**
+
+    - `norm`: the error divided by the tolerance, as `step_with_error` returns it.
+    - `order`: the order of this error.
+    - `t`, `h`: the time at which the step began, and its length, s.
+    - `last`: whether the step was the last before a stop, and was cut short to end there.
+    - `kept`: the length, s, that the step would have had if it had not been cut short.
+    - `length`: the length of the run, s. Near t = 0, where the round-off of t vanishes, the
+      round-off of this length is taken instead.
     """
     good, following = next_step(norm, order, h)
     kept = lax.stop_gradient(kept)
@@ -361,8 +380,9 @@ def accept_and_next_step(
 def outcome(h: Array, t: Array, end: Array, met: Array) -> dfx.RESULTS:
     """Return the result of a search that ended at the time `t`.
 
-    `h` is the length of the step that would follow, `end` the last time of the run, and `met` says
-    whether the search found as many crossings as it may.
+    `h` is the length of the step that would follow (see `accept_and_next_step`), `end` is the last
+    time of the run, and `met` says whether the search found the largest allowed number of
+    crossings.
     """
     result = dfx.RESULTS.dt_min_reached
     for there, word in (

@@ -1,23 +1,25 @@
-"""Find the times at which a motion meets a condition g: the event of a run, or section crossings.
+"""Find the times at which a function g of the motion is zero: an event, or section crossings.
 
-Crossings are found without derivatives. To get the derivatives, the motion is run again up to the
-times found, which are held fixed. The remaining value of g there, and its rates ġ and g̈ along the
-motion, give the time and the state of the crossing by one step of Chebyshev's method, whose first
-and second derivatives are those of the crossing:
+The crossings are found without derivatives. To get the derivatives, the motion is computed again up
+to the times of the crossings, which are now constants. At such a fixed time g is zero but for a
+small error. From g and its time derivatives ġ and g̈ along the motion, one step of Chebyshev's
+method gives the time and the state of the crossing; the first and second derivatives of this step
+are those of the crossing:
 
     τ = −(g/ġ)(1 + ½ g g̈/ġ²),   y = y* + f τ + ½ (df/dt) τ².
 
 Here τ is the time from the fixed time to the crossing, y* the state at the fixed time, f = dy/dt
 the vector field, and y the state at the crossing.
 
-Where g jumps over zero, halving finds the time of the jump. Nothing tells how this time changes
-with the numbers of the scene: its derivatives are NaN.
+If g jumps over zero, the time of the jump is found by halving an interval. How this time depends on
+the parameters is not known, so that its derivatives are NaN.
 
-A zero that is only round-off does not count: of a g that the motion conserves, or of a component
-that stays at zero. Its ġ is at most a small multiple of ε (|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ), times the root
-of the number of steps, where ε is the relative rounding error. The size rᵢ of the terms of ẏᵢ is a
-sum of two lengths of the array of the state that the number i belongs to: its length in ẏ, and its
-length in the change of ẏ when each number of y changes by the length of its array.
+A zero that is only round-off does not count. Such zeros occur if the motion conserves g, or if g is
+a component of the state that stays at zero. At such a zero |ġ| is at most a small multiple of ε
+(|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ) times the square root of the number of steps. Here ε is the relative
+rounding error, and rᵢ is the size of the terms that are summed up in ẏᵢ. This size is estimated as
+the sum of two norms, taken over that array of the state (Ω, x, …) to which yᵢ belongs: the norm of
+ẏ, and the norm of the change of ẏ when each number of y changes by the norm of its array.
 """
 
 from collections.abc import Callable
@@ -78,11 +80,12 @@ class Event(eqx.Module):
     **Arguments:**
 
     - `condition`: a Module or function `(t, state, body) → scalar` that is smooth along the motion;
-      it may hold traced numbers. A condition that jumps over zero (`jnp.sign(…)`) is met where it
-      jumps, and the time of the event then has NaN derivatives. Under a law with states of its own
-      the state is a `Coupled`: use `state.motion.omega` and `state.own`.
+      it may hold traced numbers. If the condition jumps over zero (`jnp.sign(…)`), the event is at
+      the jump, and its time has NaN derivatives. Under a law with states of its own the state is a
+      `Coupled`: use `state.motion.omega` and `state.own`.
     - `direction`: 1 for a zero on the way up, −1 for a zero on the way down, 0 for both (as in
-      SciPy). Up and down are meant in the order in which the run goes, also backwards in time.
+      SciPy). In a run backwards in time, the way up means that the condition increases from step to
+      step, that is with decreasing t.
     - `max_step`: the longest step, s. A zero is found if the sign of the condition is different at
       the end of a step, or if the condition has one extremum within the step.
 
@@ -224,7 +227,9 @@ def crossings(
 
 
 def checked_start(event: Event, body: Any, state0: Any, torque: Any, t: Array) -> Any:
-    """Return `state0` with the torque's own states; refuse a condition that is no number there."""
+    """Return `state0` with the torque's own states; refuse a condition that is no number at
+    `state0`.
+    """
     state0 = with_own_states(body, state0, torque, t)
     try:
         eqx.filter_eval_shape(value, event, body, t, state0)
@@ -259,10 +264,10 @@ _value = eqx.filter_jit(value)
 def solve_until(
     setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
-    """Return what `solve` returns for a run up to the event, and the time and state of the event.
+    """Return the three results of `solve` for a run up to the event, and the event's time and
+    state.
 
-    The states at times after the event are NaN. The time and the state of the event are NaN if the
-    run meets none.
+    The states at times after the event are NaN. If no event occurs, its time and state are NaN.
     """
     state0 = project_to_group(state0)
     crossed, numbers = section(setup, event, state0, ts)
@@ -291,9 +296,11 @@ def solve_until(
 
 
 def _with_derivatives(crossing: Any, jumps: Array, inputs: Any) -> Any:
-    """Return the numbers of `crossing`, with NaN derivatives where they are NaN or g jumps.
+    """Return the arrays of `crossing`, but with NaN derivatives with respect to `inputs` in two
+    cases.
 
-    These derivatives are with respect to `inputs`; all other derivatives stay as they are.
+    The cases are: an array element that is NaN itself; and a crossing at which g jumps over zero,
+    which `jumps` marks. All other derivatives stay as they are.
     """
 
     def lost(leaf: Array) -> Array:
@@ -329,7 +336,9 @@ def _solved(
 def _with_derivatives_of_scene(
     times: Array, states: Array, jumps: Array, *scene: Any
 ) -> tuple[Array, Array]:
-    """Return the times and states found for a `scene`; only their derivatives run it once more."""
+    """Return the `times` and `states` of the crossings; only their derivatives run the `scene`
+    again.
+    """
     return times, states
 
 
@@ -346,9 +355,11 @@ def _crossings_of_scene(
     times: Array, jumps: Array, setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any,
     ts: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return the crossings found at the fixed `times` as functions of all numbers of the scene.
+    """Return the times and states of the crossings near the fixed `times`, with derivatives.
 
-    **Returns** times and states; all times are s = σt, as in `Section`.
+    The derivatives are with respect to all numbers of the scene, that is of `setup`, `event`,
+    `state0` and `ts`. `jumps` says for each crossing whether g jumps over zero there. The `times`
+    and the times returned are s = σt, as in `Section`.
     """
     crossed, (constants, *_) = section(setup, event, state0, ts)
     there = jnp.isfinite(times)
@@ -362,7 +373,8 @@ def _crossings_of_scene(
 
 # The number of samples of a free body's condition in one turn at the body's largest rate.
 _SAMPLES = 16
-# The rate of a condition at a crossing is at least this many times what round-off could make it.
+# At a true crossing the rate of the condition is at least this many times the rate that round-off
+# could cause.
 _CLEAR = 16
 
 
@@ -404,7 +416,7 @@ Numbers = tuple[Arrays, Path, Array]
 def section(
     setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
 ) -> tuple[Section, Numbers]:
-    """Return the section and motion of a run from `ts[0]` to `ts[-1]`, and their numbers."""
+    """Return the section of a run from `ts[0]` to `ts[-1]`, and the `Numbers` of its functions."""
     form = by_momentum(setup.body, state0, setup.torque) if isinstance(setup, DiffraxRun) else None
 
     def condition(t: Array, y: Any) -> Array:
@@ -452,8 +464,9 @@ def section(
 def _spacing(body: Any, state0: Any, whole: Array) -> Array:
     """Return the interval between samples of a free body's condition, s.
 
-    It is a sixteenth of one turn at the largest rate that energy and momentum allow, or of the
-    length `whole` of the run if that is shorter than a radian at this rate.
+    The interval is the period of one turn at the largest rate that energy and momentum allow,
+    divided by 16. If the run is so short that the body turns by less than a radian at this rate,
+    the interval is the length `whole` of the run divided by 16.
     """
     inertia = body if isinstance(body, Inertia) else body.inertia
     tensor, omega = lax.stop_gradient((inertia.tensor, state0.omega))
@@ -465,7 +478,7 @@ def _spacing(body: Any, state0: Any, whole: Array) -> Array:
 
 
 def located(section: Section, what: Search, numbers: Numbers) -> Located:
-    """Return the first crossings of a run, as many as `what` allows, without derivatives."""
+    """Return the first crossings of a run, at most the number in `what`, without derivatives."""
     constants, run, longest = lax.stop_gradient(numbers)
     program = partial(_located, section, what)
     return Located(*in_lanes(program, constants, [*run, longest]))
@@ -484,7 +497,8 @@ def _located(
     )
 
     def counts(s: Array, y: Array, steps: Array) -> Array:
-        # The round-off of steps adds up as a random walk: with the root of their number.
+        # The round-off of n steps adds up as a random walk does, to about √n times that of one
+        # step.
         many = 1 if solver is None else jnp.sqrt(1 + steps.astype(y.dtype))
         return ~(clear(s, y) < _CLEAR * many)
 
@@ -501,9 +515,9 @@ def _located(
 
 
 def _lengths(sizes: list[int], a: Array) -> Array:
-    """Return for each number of the vector `a` the length of the array that it belongs to.
+    """Return for each number of the vector `a` the norm of that part of `a` to which it belongs.
 
-    `sizes` says how many numbers each array has.
+    The vector `a` consists of arrays in a row; `sizes` are the numbers of elements of these arrays.
     """
     which = np.repeat(np.arange(len(sizes)), sizes)
     same = jnp.asarray(which[:, None] == which[None], a.dtype)
@@ -511,9 +525,9 @@ def _lengths(sizes: list[int], a: Array) -> Array:
 
 
 def _push(sizes: list[int], y: Array) -> Array:
-    """Return a change of each number of `y` by up to the length of its array.
+    """Return a test change of the state `y`: each number changes by up to the norm of its array.
 
-    The direction of the change is along no axis of a body.
+    The change has components along all axes of the body. `sizes` is as for `_lengths`.
     """
     return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _lengths(sizes, y)
 
@@ -530,7 +544,7 @@ def _condition_and_round_off(
 
 
 def _clearness(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
-    """Return the rate of g through zero, divided by the rate that round-off could give it."""
+    """Return |dg/ds| at a zero of g, divided by the rate that round-off alone could cause there."""
     rates, sizes = partial(section.rates, constants, s), section.sizes
     _, rate, slope = rates(y)
     shift = jax.jvp(lambda y: rates(y)[2], (y,), (_push(sizes, y),))[1]
@@ -545,12 +559,12 @@ def correction(
 ) -> tuple[Array, Array]:
     """Return the time and state of the crossing near `s`, by one step of Chebyshev's method.
 
-    `y` is the state at `s`. Where `there` is false, the step has the length 0.
+    `y` is the state at the time `s`. If `there` is false, the step has the length 0.
     """
     rates = partial(section.rates, constants)
     g, rate, slope = rates(s, y)
-    # Both second derivatives are multiplied by the square of g, which is zero at the crossing:
-    # their own derivatives are not needed.
+    # The second derivatives of g and of y are multiplied by g², which is zero at the crossing, as
+    # is its first derivative. The derivatives of these second derivatives are therefore not needed.
     here = lax.stop_gradient((s, y))
     _, moved = jax.jvp(rates, here, (jnp.ones_like(s), lax.stop_gradient(slope)))
     _, second, turn = lax.stop_gradient(moved)

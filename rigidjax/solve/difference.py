@@ -1,8 +1,8 @@
-"""Compare a derivative with a difference of values, to show what the derivative does not see.
+"""Compare a derivative with a finite difference, to show what the derivative leaves out.
 
-The effect of a torque that switches at a time or at a state depends on this time or state, but the
-derivatives of `jnp.where`, `jnp.sign` and the like leave this dependence out. Two values, one on
-each side of x, show it.
+If a torque switches at a certain time or state, the motion depends on this time or state, but the
+derivatives of `jnp.where`, `jnp.sign` and similar functions leave this dependence out. A difference
+of two values of the function, one on each side of x, includes it.
 """
 
 import warnings
@@ -18,14 +18,15 @@ from jaxtyping import Array
 
 from rigidjax import _checks
 
-# The longest step relative to each number, by the bytes of one number. It is half of the change of
-# length that a unit quaternion is accepted with.
+# The longest step of the difference, relative to each number, for numbers of 8 and of 4 bytes. It
+# is half of the error of |q| up to which a quaternion q is accepted as a unit quaternion.
 _STEP = {8: 5e-7, 4: 5e-4}
-# The least size of values, relative to their rise along x: a value may happen to be zero at x.
+# A value may happen to be zero at x. The size of the value is therefore taken to be at least this
+# part of its change when each number of x changes by its own size.
 _SLOW = 1e-3
 # The uncertainty of the values of a second run, relative to the error of the first run.
 _CLOSER = 0.01
-# The slopes count as different where their distance is this many times its uncertainty.
+# Two slopes count as different if their difference is more than this many times its uncertainty.
 _UNSURE = 10.0
 
 
@@ -34,10 +35,10 @@ class Slopes(NamedTuple):
 
     **Fields:**
 
-    - `derivative`: the slope by the derivative.
-    - `difference`: the slope by a difference of values.
-    - `differ`: whether the two slopes do not agree.
-    - `ways`: how far each number of x moves in one unit of the direction.
+    - `derivative`: the slope computed from the derivative.
+    - `difference`: the slope computed from a difference of values.
+    - `differ`: whether the two slopes differ by more than their uncertainty.
+    - `ways`: the direction: by how much each number of x changes, without its sign.
     """
 
     derivative: Array
@@ -49,7 +50,7 @@ class Slopes(NamedTuple):
 def size_of(leaf: Array) -> Array:
     """Return the size of each number of an array: its absolute value, or 1 if all are zero.
 
-    An array of zeros alone is taken as a small change of numbers whose size is not known here.
+    If all numbers are zero, their natural size is not known, and 1 is taken.
     """
     return jnp.where(jnp.all(leaf == 0), jnp.ones_like(leaf), jnp.abs(leaf))
 
@@ -58,8 +59,8 @@ def size_of(leaf: Array) -> Array:
 def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple[Array, Any]:
     """Return the length of a step, and the two points one step from `x` in a random direction.
 
-    The points before and after `x` are stacked in a new first axis. `value`, `value_error` and
-    `derivative` are those of the function at `x`.
+    The two points are stacked in a new first axis. `value`, `value_error` and `derivative` are
+    those of the function at `x`.
     """
     rng = np.random.default_rng(2)
 
@@ -74,8 +75,8 @@ def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple
     rise = jnp.max(jnp.abs(_change(derivative, way)))
     size = jnp.maximum(jnp.max(jnp.abs(value)), _SLOW * rise)
     unsure = jnp.maximum(jnp.max(value_error), float(jnp.finfo(value.dtype).eps) * size)
-    # The values change by the geometric mean of their size and their uncertainty, unless the step
-    # would be longer than `longest`.
+    # The length of the step is chosen such that the value changes by the geometric mean of its size
+    # and its uncertainty, but is at most `longest`.
     step = jnp.sqrt(unsure * size) / jnp.where(rise > 0, rise, 1)
     longest = _STEP[value.dtype.itemsize]
     step = jnp.where((rise > 0) & (step > 0), jnp.minimum(step, longest), longest)
@@ -88,9 +89,9 @@ def sides_of(x: Any, value: Array, value_error: Array, derivative: Any) -> tuple
 
 
 def values_at(value: Callable[[Any, Any], Array], sides: Any, tolerances: Array) -> Array:
-    """Return the values on both sides of x; NaN on a side whose known numbers the function refuses.
+    """Return the values of the function at the two points `sides`; NaN at a point that it refuses.
 
-    Under `jit` the numbers are not known, and the function cannot refuse them.
+    Under `jit` the numbers of the points are not known, and the function cannot refuse them.
     """
     if not _checks.is_known((sides, tolerances)):
         return lax.map(lambda x: value(x, tolerances), sides)
@@ -99,7 +100,8 @@ def values_at(value: Callable[[Any, Any], Array], sides: Any, tolerances: Array)
         try:
             values.append(value(side, tolerances))
         except RuntimeError:
-            # A flat body is at the limit of what a body can be: one of the two sides is beyond it.
+            # A flat body is at the limit of what a real body can be, so that one of the two points
+            # is no real body.
             values.append(np.nan)
     return jnp.stack(jnp.broadcast_arrays(*values))
 
@@ -108,15 +110,20 @@ def values_at(value: Callable[[Any, Any], Array], sides: Any, tolerances: Array)
 def slopes_of(x: Any, middle: Array, step: Array, sides: Any, values: Array, error: Any) -> Slopes:
     """Return the slope of a function by its derivative, and by its values on both sides of `x`.
 
-    The derivative, and the errors of value and derivative, are those of the `FunctionError` that
-    `error` is. `step` and `sides` are the results of `sides_of`, and `values` are the values at the
-    two `sides`. `middle` is the value at `x` under the tolerances of `values`.
+    **Arguments:**
+
+    - `x`: the numbers at which the derivative is taken.
+    - `middle`: the value at `x`, computed with the same tolerances as `values`.
+    - `step`, `sides`: the results of `sides_of`.
+    - `values`: the values at the two points `sides`, NaN if there is none.
+    - `error`: a `FunctionError` with the derivative, and with the errors of value and derivative.
     """
-    # The numbers of the sides have been rounded: their change is no longer along the direction.
+    # The numbers of the two points have been rounded, so that their difference is not exactly along
+    # the direction.
     moved = jax.tree.map(lambda side, leaf: side - leaf[None], sides, x)
     rises = jax.vmap(lambda way: _change(error.derivative, way))(moved)
     there = jnp.isfinite(values)
-    # A value that is missing is replaced by the other one, mirrored at `middle`.
+    # A missing value is replaced by 2 `middle` minus the other value.
     values = jnp.where(there, values, 2 * middle[None] - values[::-1])
     rises = jnp.where(there, rises, -rises[::-1])
     derivative, difference = ((a[1] - a[0]) / (2 * step) for a in (rises, values))
@@ -137,7 +144,8 @@ def slopes_of(x: Any, middle: Array, step: Array, sides: Any, values: Array, err
 def errors_of_numbers(slopes: Slopes) -> Any:
     """Return the error of the derivative with respect to each number of x.
 
-    The difference of the slopes is attributed to each number in full, as if it were the only cause.
+    The error with respect to each number is so large that it alone would explain the whole
+    difference of the two slopes.
     """
     slope = jnp.where(slopes.differ, jnp.abs(slopes.difference - slopes.derivative), 0)
 

@@ -1,9 +1,10 @@
-"""Compute how far a run is from the exact motion of its numbers, by a second run and neighbours.
+"""Estimate the error of a run by a second, more accurate run and three slightly changed runs.
 
-The error of the *steps* is the distance to a second run: one at a fiftieth of the tolerance, or one
-with equal steps half as long. The error of *round-off* is the spread of the run and of three
-neighbouring runs, whose numbers differ from those of the run by a unit in the last digit. Such runs
-round differently, and their differences grow as rounding errors do.
+The error of the *steps* is the distance of the states from the states of a second run. The second
+run has a fiftieth of the tolerance or, with equal steps, half of the step. The error of *round-off*
+is three standard deviations over four runs: the run itself and three neighbours, whose inputs
+(body, torque and start) differ from the inputs of the run by about a unit in the last digit. The
+neighbours round differently, and the differences between them grow as rounding errors do.
 """
 
 import dataclasses
@@ -27,36 +28,45 @@ from rigidjax.solve import difference, validation
 from rigidjax.solve.linear_map import as_known
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
 
-# The tolerance of the second run relative to that of the first: a method of order 8 then takes 1.6
-# times as many steps.
+# The tolerance of the second run divided by the tolerance of the run. With this value a method of
+# order 8 takes 1.6 times as many steps.
 _CLOSER = 2e-2
-# The second run ends a step at the ends of this many equal parts. Without these ends, a run of a
-# few steps would take the same steps again, since no step grows beyond ten times the last one.
+# The second run is divided into this many equal parts, and a step ends at the end of each part.
+# Otherwise a run of a few steps would take the same steps again, because no step is longer than ten
+# times the step before it.
 _CUTS = 8
-# A run sees nothing of the law between its stages. The law is therefore sampled, `_SAMPLES_OF_PART`
-# times in each of `_PARTS` parts of the run. A sample is sudden if its change is greater than
-# `_SUDDEN` times the median change of its part plus `_ROUGH` roundings.
+# A run evaluates the torque law at its stages only. To find short pulses between the stages, the
+# law is sampled at `_SAMPLES_OF_PART` times in each of `_PARTS` parts of the run. A sample is
+# called sudden if its distance from the chord between its neighbours is greater than `_SUDDEN`
+# times the median of these distances in the part, plus `_ROUGH` roundings.
 _PARTS, _SAMPLES_OF_PART, _SUDDEN, _ROUGH = 32, 512, 20.0, 1e3
-# Three standard deviations of four runs (the run and its neighbours) are more than half of the true
-# error in all but a few of a thousand runs.
+# The number of neighbouring runs, and the number of standard deviations that are reported. Three
+# standard deviations over four runs (the run and its neighbours) exceed half of the true error in
+# all but a few of a thousand runs.
 _NEIGHBOURS, _DEVIATIONS = 3, 3.0
-# In float64 the neighbours have at least this tolerance, so that they take fewer steps.
+# In float64 the neighbours are run at this tolerance or a larger one, so that they take fewer
+# steps.
 _LOOSE = 1.5e-8
-# Above half a radian, or half of the largest rate, errors do not add up any more.
+# A state counts as lost if its error is above half a radian, or above half of the largest value in
+# the run: such errors no longer grow in proportion.
 _LOST = 0.5
-# The size below which a number does not matter: the ratio of `atol` to `rtol` in their defaults.
+# An array smaller than this does not matter. It is the ratio of the default `atol` to the default
+# `rtol`.
 _SMALL = 1e-3
-# The errors of single steps grow along a motion as roundings do. Round-off is therefore not
-# measured if the tolerance is above `_COARSE` roundings and the error of the steps is above
-# `_ABOVE` times what the roundings add up to without growth. Of a function nothing is known of its
-# steps: there the error of the steps has to be above `_PLAIN` roundings.
+# The errors of single steps grow along a motion in the same way as rounding errors do. If the
+# errors of the steps are much larger from the beginning, round-off can be neglected. It is
+# therefore not measured if both the tolerance is above `_COARSE` roundings, and the error of the
+# steps is above `_ABOVE` times the sum of the roundings without growth. The steps inside a function
+# given to `error_of` are not known; there the error of the steps has to be above `_PLAIN`
+# roundings. A rounding is the relative rounding error of the dtype.
 _ABOVE, _PLAIN, _COARSE = 300.0, 1e6, 1e5
-# A search for a tolerance multiplies it by no less than `_FARTHEST` from one run to the next, and
-# aims at the accuracy divided by `_AIM`: errors are proportional to the tolerance only to a factor
-# of eight, `_ALLOWED`. An error above `_FORESEEN` (0.1 rad) is not proportional to the tolerance,
-# and neither is the error of a run of fewer than `_FEW` steps.
+# The search for a tolerance multiplies the tolerance by at least `_FARTHEST` from one run to the
+# next. It aims at the wanted accuracy divided by `_AIM`, because errors are proportional to the
+# tolerance only up to a factor of eight, `_ALLOWED`. An error above `_FORESEEN` (0.1 rad) is not
+# proportional to the tolerance, and neither is the error of a run of fewer than `_FEW` steps.
 _FARTHEST, _AIM, _ALLOWED, _FORESEEN, _FEW = 1e-3, 20.0, 8.0, 0.1, 8
-# The least tolerance of a run that is searched for, and that of a run for comparison, in roundings.
+# The smallest tolerance, in roundings: `_FLOOR` in the search for a tolerance, and `_DEEPEST` for a
+# run that serves for comparison only.
 _FLOOR, _DEEPEST = 20.0, 4.0
 
 
@@ -70,11 +80,11 @@ class Error(eqx.Module):
     - `ts`: (T,) s, the times of the states.
     - `steps`: the error of the steps, one array (T,) for each name (`q`, `omega`, `x`, `v`,
       `own.0`, …). For a quaternion it is the angle of the turn, rad; for other arrays it is the
-      length of the difference (rad/s, m, m/s). It is known to some percent (after `accuracy=` it is
-      too large by a factor of up to ten).
-    - `round_off`: the error of rounding, arrays by name as in `steps`: three standard deviations.
-      It includes the effect of the last digits of body, torque and start (in closed form also of
-      the times). Where it is far below `steps` it is a bound.
+      length of the difference (rad/s, m, m/s). This error is accurate to some percent; after
+      `simulate(…, accuracy=…)` it may be too large by a factor of up to ten.
+    - `round_off`: the error of rounding, three standard deviations, in arrays by name as in
+      `steps`. It includes the effect of the last digits of body, torque and start (in closed form
+      also of the times). If this error is far below `steps`, only an upper bound is given.
     - `sizes`: the scale of each name: 1 rad for a quaternion, else the largest value in the run.
 
     `steps` and `round_off` are NaN at times that the run did not reach, and inf at times that a run
@@ -101,7 +111,9 @@ class Error(eqx.Module):
 
     @property
     def total(self) -> dict[str, Float[Array, " times"]]:
-        """Return the error of steps and round-off together (T,) by name; inf where `lost`."""
+        """Return the error of steps and round-off together, one array (T,) by name; inf where
+        `lost`.
+        """
         both = jax.tree.map(jnp.hypot, self.steps, self.round_off)
         return jax.tree.map(lambda part: jnp.where(self.lost, jnp.inf, part), both)
 
@@ -109,15 +121,17 @@ class Error(eqx.Module):
     def relative(self) -> Float[Array, " times"]:
         """Return the largest error of any name (T,), divided by its scale; inf where `lost`.
 
-        For a quaternion it is in rad, for others relative to the largest value in the run.
+        For a quaternion the error is an angle, rad; for other arrays it is relative to the largest
+        value in the run.
         """
         return jnp.where(self.lost, jnp.inf, self._relative)
 
     @property
     def lost(self) -> Bool[Array, " times"]:
-        """Return at which times (T,) the state is unknown, as in chaos.
+        """Return for each of the times (T,) whether the state is unknown, as in chaos.
 
-        It is unknown from the first time on at which the largest relative error is above one half.
+        The state is unknown from the first time on at which the largest relative error is above one
+        half.
         """
         return lax.associative_scan(jnp.logical_or, self._relative > _LOST)
 
@@ -133,12 +147,13 @@ class Error(eqx.Module):
 
 
 @eqx.filter_jit
-def error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None) -> Error:
+def estimate_error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None) -> Error:
     """Return the error of the states `ys`, which the run `setup` gave at `ts` in `count` steps.
 
-    The error of the steps is the distance to a second, closer run; a run in closed form has no such
-    error. `tried` has the tolerance and the states of an earlier, coarser run, if there is one: it
-    then takes the place of the second run, and the error is too large by a factor of up to ten.
+    The error of the steps is the distance to a second, more accurate run; a run in closed form has
+    no error of steps. `tried`, if given, is a pair of the tolerance and the states of an earlier
+    run at a larger tolerance. This earlier run is then used instead of a second run, and the error
+    is too large by a factor of up to ten.
     """
     setup, ts, ys, count, tried = _without_derivatives((setup, ts, ys, count, tried))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
@@ -161,20 +176,22 @@ def _without_derivatives(tree: Any) -> Any:
 def _with_round_off(
     setup: Any, ts: Array, ys: Any, count: Array, steps: dict[str, Array], rtol: Array
 ) -> Error:
-    """Return the error of a run from that of its `steps`, and measure that of round-off.
+    """Measure the error of round-off of a run by neighbouring runs, and return the whole error.
 
-    Neighbouring runs measure the error of round-off. `rtol` is the tolerance of the run, and
+    `steps` is the known error of the steps, by name. `rtol` is the tolerance of the run, and
     `count` its number of steps.
     """
     sizes, start = _sizes(ys), jax.tree.map(lambda leaf: leaf[0], ys)
     reached = jnp.isfinite(_largest(_distances(ys, ys), sizes))
-    # What the roundings add up to, times `_ABOVE`, where nothing grows but the angle that the body
-    # has turned by.
+    # This is `_ABOVE` times the sum of the rounding errors of n = `count` steps, about n^1.5
+    # roundings, in a motion without growth of errors: n^0.5 for the body rate, and once more n for
+    # the angle.
     eps = float(jnp.finfo(ts.dtype).eps)
     plain = {name: _ABOVE * eps * count.astype(ts.dtype) ** 1.5 * sizes[name] for name in sizes}
     above = jnp.stack([(steps[name] > plain[name])[1:] for name in sizes])
     clear = jnp.all(above | ~reached[None, 1:]) & (rtol > _COARSE * eps)
-    # Where round-off is not measured, the neighbours run from the start to the start: no step.
+    # If round-off is not measured, all times of the neighbours are the start, so that they take no
+    # step.
     times = jnp.where(clear, ts[0], ts)
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
     setup, ys, more = _cheaper_run(setup, start, times, ys, count)
@@ -188,8 +205,8 @@ def _with_round_off(
 
     rng = np.random.default_rng(0)
     near = jax.tree.map(lambda leaf: _nudged(leaf, rng, jnp.abs(leaf)), numbers)
-    # The closed form rounds its angle once, and different numbers may round to the same angle: the
-    # times of its neighbours differ, too.
+    # The closed form rounds its angle only once, and neighbours may get the same rounded angle. The
+    # times of its neighbours are therefore changed, too.
     later = jnp.asarray(1.0 + eps * free * np.array([1.0, -1.0, 1.0]), ts.dtype)
     changes = more * jax.vmap(neighbour)(near, later)
     off = _lengths(start, _DEVIATIONS * jnp.sqrt(_spread(changes)))
@@ -203,11 +220,13 @@ def _with_round_off(
 
 
 def _cheaper_run(setup: Any, start: Any, ts: Array, ys: Any, count: Array) -> tuple[Any, Any, Any]:
-    """Return a set-up that takes fewer steps, its states, and the factor of its round-off.
+    """Return three things: a set-up that takes fewer steps, its states, and a factor for round-off.
 
-    The round-off of the given set-up, which took `count` steps, is that of the new one times the
-    factor: roundings grow alike at any tolerance, and n of them add up to √n. A run in float32
-    takes few steps anyway, and is returned as it is, with the factor 1.
+    The round-off of the given set-up, which took `count` steps, is the round-off of the new set-up
+    times the factor. The factor is √(`count` / number of new steps): the round-off of n steps adds
+    up to about √n times that of one step, and it grows along the motion in the same way at any
+    tolerance. A run in float32 takes few steps anyway; its set-up and states `ys` are returned
+    unchanged, with the factor 1.
     """
     replayed = isinstance(setup, DiffraxRun) and setup.is_replayed
     if not replayed or ts.dtype == jnp.float32:
@@ -219,12 +238,12 @@ def _cheaper_run(setup: Any, start: Any, ts: Array, ys: Any, count: Array) -> tu
 
 
 def _distances(others: Any, ys: Any) -> dict[str, Array]:
-    """Return the distances of the states `ys` from the states `others`, (T,) by name."""
+    """Return the distances of the states `ys` from the states `others`, one array (T,) by name."""
     return _lengths(jax.tree.map(lambda leaf: leaf[0], ys), jax.vmap(minus)(others, ys))
 
 
 def _lengths(state: Any, changes: Array) -> dict[str, Array]:
-    """Return the length of each named part of `changes`, which are changes of a state."""
+    """Return the length of each array (`q`, `omega`, …) in the `changes` of a `state`, by name."""
     named = parts_by_name(state, changes).items()
     return {name.removeprefix("motion."): jnp.linalg.norm(part, axis=-1) for name, part in named}
 
@@ -253,11 +272,12 @@ def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
 def solve_to(
     setup: DiffraxRun, state0: Any, ts: Array, accuracy: Array
 ) -> tuple[DiffraxRun, Any, Any]:
-    """Return a run whose global error is below `accuracy`, if there is one.
+    """Search for a tolerance at which the global error of a run is below `accuracy`.
 
-    Runs are tried at smaller and smaller tolerances. The error of a run is its distance to the next
-    run, and decreases as the tolerance does. **Returns** the set-up at the tolerance found; what
-    `solve` returns for it; and the tolerance and the states of the run before it.
+    Runs are tried at smaller and smaller tolerances. The error of each run is estimated by its
+    distance to the next run, and scaled in proportion to the tolerance. **Returns** three things:
+    the set-up at the tolerance found; the results of `solve` for this set-up; and a pair of the
+    tolerance and the states of the run before.
     """
     still = _without_derivatives((setup, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
@@ -270,14 +290,15 @@ def solve_to(
 
     def closer(carry: Any) -> Any:
         (others, stats, _), _, before, rtol, ended = carry
-        # In a batch, a body whose search has ended runs from the start to the start: no step.
+        # In a batch, a body whose search has ended is run with all times equal to the start, and
+        # takes no step.
         new = run(rtol, jnp.where(ended, ts[0], ts))
         off = jnp.nanmax(_largest(_distances(others, new[0]), _sizes(new[0]))[1:])
         wanted = before * still[3] / (_AIM * off)
         least = jnp.maximum(_FARTHEST * rtol, floor)
-        # The error of a run that is lost says nothing of the next one. Neither does that of a run
-        # whose steps are not limited by its tolerance: a short run ends before its steps have grown
-        # so long.
+        # The error of a run predicts the error of the next run in two cases not: if the error is so
+        # large that the run is lost; and if the steps are not limited by the tolerance, as in a run
+        # so short that it ends before the steps have grown to their full length.
         count, counted = (a["num_accepted_steps"].astype(ts.dtype) for a in (new[1], stats))
         more = (before / rtol) ** (1 / setup.solver.tableau.order)
         sound = (off < _FORESEEN) & (count >= _FEW) & (count >= 0.75 * more * counted)
@@ -297,7 +318,7 @@ def solve_to(
 
 @eqx.filter_custom_jvp
 def _as_solved(setup: DiffraxRun, state0: Any, ts: Array, ys: Any) -> Any:
-    """Return the states `ys` that `solve` has given; only their derivatives run it once more."""
+    """Return the states `ys`, known from `solve`; only their derivatives call `solve` once more."""
     return ys
 
 
@@ -309,17 +330,19 @@ def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
 
 
 def _with_tolerance(setup: DiffraxRun, rtol: Any) -> DiffraxRun:
-    """Return the set-up at another `rtol`, with `atol` in the ratio of the defaults."""
+    """Return the set-up with the given `rtol`, and with an `atol` of 1e-3 times `rtol`."""
     return dataclasses.replace(setup, rtol=rtol, atol=_SMALL * rtol, throw=False)
 
 
 def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
-    """Return a time for each part of a run: one at which the law changes suddenly, or the start.
+    """Return one time for each part of a run: a time at which the law changes suddenly, or the
+    start.
 
-    A pulse shorter than a step is passed over by every run in which no step ends within it. The law
-    is therefore sampled in time, at one saved state for each part of the run. A sample is sudden if
-    its distance from the chord between its two neighbours is far greater than elsewhere in the
-    part. If the law does not depend on the time, no times are returned.
+    A run does not notice a pulse that is shorter than a step and that no stage hits. The law is
+    therefore sampled in time, at one saved state for each part of the run. A sample is sudden if
+    its distance from the chord between its two neighbours is far greater than such distances
+    elsewhere in the part. The start of the run is returned for a part without a sudden sample. If
+    the law does not depend on the time, no times are returned.
     """
     state0 = jax.tree.map(lambda leaf: leaf[0], ys)
     field = equations_of_motion(setup.body, state0, setup.torque)
@@ -329,8 +352,8 @@ def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
     # The samples are at uneven times: on an even grid, pulses that come once a second could all
     # fall between the samples.
     uneven = np.random.default_rng(1).uniform(-0.25, 0.25, (_PARTS, _SAMPLES_OF_PART + 2))
-    # The first and the last sample of a part serve only as neighbours of others. Two adjacent parts
-    # therefore have two times in common.
+    # The first and the last sample of a part serve only as neighbours of other samples. Two
+    # adjacent parts therefore have two times in common.
     uneven[1:, :2] = uneven[:-1, -2:]
     number = _SAMPLES_OF_PART * np.arange(_PARTS)[:, None] + np.arange(_SAMPLES_OF_PART + 2) - 0.5
     share = np.clip((number + uneven) / (_PARTS * _SAMPLES_OF_PART), 0.0, 1.0)
@@ -355,10 +378,10 @@ def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
 
 
 def _closer_run(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
-    """Return the set-up of a closer run, the tolerance of the given run, and a factor.
+    """Return three things: the set-up of a more accurate run, the given tolerance, and a factor.
 
-    The error of the given run is its distance to the closer run times the factor. Steps of the
-    closer run also end at the `sudden` times.
+    The error of the given run is its distance to the more accurate run times the factor. Steps of
+    the more accurate run also end at the `sudden` times.
     """
     eps = float(jnp.finfo(ts.dtype).eps)
     most = None if setup.max_steps is None else 4 * setup.max_steps
@@ -386,8 +409,9 @@ def _closer_run(setup: Any, ts: Array, sudden: Array) -> tuple[Any, Any, float]:
             "error: a second run needs a diffrax.PIDController or ConstantStepSize, got "
             f"{type(setup.controller).__name__}"
         )
-    # The factor is that of a method of order 2. For a method of higher order the error is then too
-    # large by a third at most.
+    # With half of the step the error of a method of order 2 is a quarter, so that its error is 4/3
+    # of the distance. For a method of higher order the factor 4/3 makes the error too large by at
+    # most a third.
     return dataclasses.replace(setup, dt0=0.5 * setup.dt0), jnp.zeros(()), 4 / 3
 
 
@@ -399,8 +423,9 @@ class FunctionError(eqx.Module):
     - `value`: the value of the function at x.
     - `value_error`: the absolute error of the value, in its shape.
     - `derivative`: the derivative with respect to x, as `jax.grad` or `jax.jacfwd` returns it.
-    - `derivative_error`: the absolute error of the derivative, in its shape. It includes what the
-      derivative misses of a difference of values.
+    - `derivative_error`: the absolute error of the derivative, in its shape. It includes the
+      difference between the derivative and a finite difference, if that difference is significant
+      (see `error_of`).
 
     >>> rj.error_of(lambda x, **tolerances: x * x, 3.0).known
     Array(True, dtype=bool)
@@ -520,21 +545,23 @@ def error_of(
 
 
 def _spread(changes: Array) -> Array:
-    """Return the variance over a run and its neighbours, which differ from it by `changes`."""
+    """Return the variance over a run and its neighbours, whose differences from the run are
+    `changes`.
+    """
     mean = jnp.sum(changes, 0, keepdims=True) / (_NEIGHBOURS + 1)
     return (jnp.sum((changes - mean) ** 2, 0) + mean[0] ** 2) / _NEIGHBOURS
 
 
 def _nudged(leaf: Array, rng: np.random.Generator, size: Array) -> Array:
-    """Return copies of `leaf`, one for each neighbour, that differ from it in the last digit.
+    """Return copies of the array `leaf`, one for each neighbouring run, changed in the last digit.
 
-    Each number is changed by up to a unit in the last digit of its `size`. The change of a square
-    matrix is symmetric, so that a symmetric matrix stays symmetric.
+    Each number is changed by half to one unit in the last digit of its `size`, up or down. The
+    change of a square matrix is symmetric, so that a symmetric matrix stays symmetric.
     """
     shape = (_NEIGHBOURS + 1) // 2, *leaf.shape
-    # The change is half a unit at least, since a smaller one would often be rounded away. It goes
-    # to both sides: a motion of many turns is a staircase as a function of the last digits, and one
-    # side alone may not show a step of it.
+    # The change is at least half a unit, because a smaller change would often be rounded away.
+    # Numbers are changed up in one copy and down in another: as a function of the last digits, the
+    # result of a long motion is a staircase, and a change to one side may stay on the same stair.
     noise = rng.uniform(0.5, 1.0, shape) * rng.choice([-1.0, 1.0], shape)
     noise = np.concatenate([noise, -noise])[:_NEIGHBOURS]
     if leaf.ndim > 1 and leaf.shape[-1] == leaf.shape[-2]:

@@ -19,9 +19,9 @@ from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
 
 
 class NestedInterpolation(dfx.AbstractLocalInterpolation):
-    """Interpolate within a step by the polynomial `runge_kutta.nested`: the dense output.
+    """Interpolate the state within a step (dense output) by the polynomial `runge_kutta.nested`.
 
-    `coefficients` are the rows of the polynomial. A quaternion is scaled to length 1.
+    `coefficients` are the rows F0, F1, … of the polynomial. A quaternion is scaled to length 1.
     """
 
     t0: Any
@@ -46,9 +46,9 @@ def direction_and_length(
 ) -> tuple[Array, Array]:
     """Return the direction of a step, 1 or −1, and its length.
 
-    Backwards in time diffrax counts −t, so that `t1` is above `t0` in both directions; only the
-    control `contr(t0, t1)` of the term is negative. A step backwards is then a step forwards with
-    slopes of the opposite sign, whose stages lie between `t0` and `t1`.
+    In a run backwards in time diffrax uses −t as the time, so that `t1` > `t0` in both directions;
+    only the control `contr(t0, t1)` of the term is negative. A step backwards is therefore computed
+    as a step forwards from `t0` to `t1` with slopes of the opposite sign.
     """
     h = jnp.asarray(terms.contr(t0, t1))
     way = jnp.where(h < 0, -jnp.ones_like(h), jnp.ones_like(h))
@@ -58,13 +58,14 @@ def direction_and_length(
 def cubic_rows(rise: Any, h: Any, left: Any, right: Any) -> tuple[Any, Any, Any]:
     """Return the rows F0, F1 and F2 of `runge_kutta.nested` for a cubic.
 
-    The cubic rises by `rise` over a step of the length `h`, with the slopes `left` and `right`.
+    The cubic changes by `rise` over a step of the length `h`; its slopes at the start and the end
+    of the step are `left` and `right`.
     """
     return rise, h * left - rise, 2 * rise - h * (left + right)
 
 
 class AbstractExplicit(dfx.AbstractAdaptiveSolver):
-    """Take the steps of an explicit method, whose stages are a loop; a subclass has its tableau."""
+    """Take the steps of an explicit Runge–Kutta method; a subclass sets its `tableau`."""
 
     term_structure: ClassVar = dfx.ODETerm
     interpolation_cls: ClassVar = NestedInterpolation
@@ -105,8 +106,8 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
         # The quaternion is scaled to length 1 once, after the stages: inside the stages this would
         # change the order of the method (jaxsim#192).
         y1 = project_to_group(tree(there.end))
-        # Derivatives hold the lengths of steps constant. What this leaves out is the derivative of
-        # the error of a step, which is below the tolerance.
+        # Derivatives hold the lengths of steps constant. The derivative through the lengths is left
+        # out; it is as small as the error of a step, which is below the tolerance.
         sizes = [leaf.size for leaf in jax.tree.leaves(y0)]
         error = lax.stop_gradient(error_estimate(self.tableau, sizes, h, there.slopes))
         rows = dense_rows(self.tableau, field, step, there.slopes)
@@ -155,8 +156,8 @@ class DormandPrince8(AbstractExplicit):
     """Solve by the method DOP853: order 8, twelve stages, error estimates of orders 5 and 3.
 
     It is for everything smooth, from tolerances of 1e-4 down to round-off. A quaternion is scaled
-    to |q| = 1 once per step, and in the dense output. The dense output is of degree 7 and has three
-    more stages, which are computed only where it is asked for.
+    to |q| = 1 once per step, and in the dense output. The dense output has degree 7. It needs three
+    more stages, which are computed only if it is asked for.
 
     Source: Hairer, Nørsett and Wanner (1993), II.5 and II.6, doi:10.1007/978-3-540-78862-1; after
     Prince and Dormand 1981, doi:10.1016/0771-050X(81)90010-3.

@@ -19,8 +19,8 @@ from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.explicit import AbstractExplicit, require_explicit
 
-# Neighbouring intervals are not independent: the error of an exponent is that of the means over
-# this many parts of the run.
+# The growth rates in neighbouring intervals are not independent. The error of an exponent is
+# therefore computed from the means over this many parts of the run.
 _PARTS = 20
 
 
@@ -148,7 +148,8 @@ def _solved(
 ) -> Exponents:
     """Return the exponents of `field` over the time `length` from `t0`.
 
-    `how` has the solver and the whole numbers of `lyapunov_exponents`.
+    `how` is a tuple of the solver and of four integers of `lyapunov_exponents`: the number of
+    exponents, `intervals`, `transient` and `max_steps`.
     """
     # Whole numbers of Python are not arrays: `filter_jit` compiles anew for other numbers.
     solver, many, intervals, transient, max_steps = how
@@ -176,8 +177,9 @@ def _solved(
     def interval(carry: Any, i: Array) -> Any:
         state, frame = carry
         ts = t0 + jnp.stack([i, i + 1]).astype(t0.dtype) * step
-        # The logarithms of the growth begin at 1: `rtol` of a logarithm is then about `rtol` of the
-        # factor by which a tangent vector grows.
+        # The logarithm of the growth starts at 1, not at 0, because a relative tolerance of a
+        # number near 0 would ask for too many digits. A relative error of `rtol` of the logarithm
+        # is then about the same relative error of the growth.
         start = Coupled(state, (frame, jnp.ones(many, t0.dtype)))
         run = adaptive(solver, along, ts, start, rtol=rtol, atol=atol, max_steps=max_steps)
         there = jax.tree.map(lambda leaf: leaf[-1], run.ys)
@@ -199,8 +201,8 @@ def _solved(
     whole = count // _PARTS * _PARTS
     means = jnp.mean(rates[count - whole :].reshape(_PARTS, -1, many), axis=1)
     apart = jnp.var(means, axis=0, ddof=1) / _PARTS
-    # The twenty equal parts leave out up to 19 intervals at the start. The change of the mean by
-    # these intervals is added to the error in full.
+    # The twenty equal parts leave out up to 19 intervals at the start. The amount by which these
+    # intervals change the mean is added to the error in full.
     left = running[-1] - jnp.mean(means, axis=0)
     errors = jnp.sqrt(apart + left**2 + (jnp.mean(off[transient:], axis=0) / step) ** 2)
     first = jnp.argmax(jax.vmap(lambda result: result != dfx.RESULTS.successful)(results))

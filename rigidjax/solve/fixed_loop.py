@@ -1,7 +1,7 @@
-"""Solve with equal steps, in a loop that carries only a time, a step and the numbers of the state.
+"""Solve with equal steps, in a loop that carries little more than the state.
 
-`diffrax.diffeqsolve` can do more, at some cost in each step. There is no interpolation here: the
-error at saved times is the method's own, as at the end of any step.
+`diffrax.diffeqsolve` can do more, but costs more time in each step. Every saved time is the end of
+a step, so that no interpolation adds to the error of the method.
 """
 
 import functools
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from rigidjax.motion.torques.inputs import InputRow, delays_of
 from rigidjax.rotation.barrier import platform
-from rigidjax.solve.equal_steps import Rolled
+from rigidjax.solve.equal_steps import StepWithLoopedStages
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.pieces import in_pieces, piece_length
@@ -24,7 +24,7 @@ from rigidjax.solve.steppers import AnyStepper, stepper_of
 
 
 def fixed(
-    solver: AbstractExplicit | Rolled | Magnus4 | AbstractSplitting,
+    solver: AbstractExplicit | StepWithLoopedStages | Magnus4 | AbstractSplitting,
     field: Callable[..., Any],
     ts: Float[Array, " times"],
     y0: Any,
@@ -39,10 +39,10 @@ def fixed(
     - `field`: a vector field `f(t, y, args)`, such as `equations_of_motion` returns.
     - `ts`: (T,) s, the times of the states.
     - `y0`: the state at `ts[0]`.
-    - `substeps`: a whole number. It may be traced: other numbers then do not compile again, but
-      there is no reverse mode.
-    - `last`: the index in `ts` at which to stop; later times get `y0`. It may be traced, and has no
-      reverse mode. `None` goes to the end.
+    - `substeps`: a whole number, the number of steps. It may be traced: another number then does
+      not compile again, but reverse mode does not work.
+    - `last`: the index in `ts` at which to stop; the states at later times are set to `y0`. The
+      index may be traced; reverse mode does not work with it. `None` goes to the end.
 
     **Returns** the states at `ts`, with a leading time axis, differentiable in both modes.
 
@@ -92,10 +92,11 @@ def first_rows(many: Any, one: Callable[..., Any], y: Any, rows: Any) -> Any:
 def step(
     stepper: AnyStepper, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None, before: int = 0
 ) -> Any:
-    """Return the state after step number `i` since `t0`, which begins with the state `y`.
+    """Return the state after step number `i` since the time `t0`; `y` is the state before this
+    step.
 
-    `h` is the length of each step. `inputs` has one array for each named input of the torque; the
-    step uses row `before + i` of each.
+    `h` is the length of each step, s. `inputs` has one array for each named input of the torque;
+    the step uses row `before + i` of each array.
     """
 
     def at(i: Array) -> Array:
@@ -113,9 +114,10 @@ def step(
 
     def part(y: Any, ends: tuple[Array, Array]) -> tuple[Any, None]:
         left, right = ends
-        # The end of a part decides which value it has. If a delay is a whole number of steps, the
-        # part before the change has the length 0, but still has the early value: the derivative
-        # with respect to the delay is multiplied by it.
+        # The value of an input in a part depends on whether the end of the part lies after the
+        # change. If a delay is a whole number of steps, the part before the change has the length
+        # 0, but it still gets the value before the change: this value enters the derivative with
+        # respect to the delay.
         values = [jnp.where(right <= p, a, b) for p, a, b in zip(parts, early, late, strict=True)]
         t, end = at(i) + left * h, jnp.where(right == 1, at(i + 1), at(i) + right * h)
         return stepper.step(t, end, (right - left) * h, y, InputRow(now, tuple(values))), None
@@ -126,10 +128,13 @@ def step(
 def delayed_rows(
     delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: Any, before: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Return where in step `i` each delayed input changes (m,), and its values before and after.
+    """Return where in step `i` each delayed input changes, and its values before and after the
+    change.
 
-    The place of a change is from 0, the start of the step, to 1, its end. `delays` has the name and
-    the delay, s, of each of the m delayed inputs; `h`, `inputs` and `before` are as for `step`.
+    **Returns** three things: the places (m,) of the changes, from 0 at the start of the step to 1
+    at its end; a list of the m values before the changes; and a list of the m values after them.
+    `delays` has the name and the delay, s, of each of the m delayed inputs; `h`, `inputs` and
+    `before` are as for `step`.
     """
     parts, early, late = [], [], []
     for name, delay in delays:
@@ -143,7 +148,8 @@ def delayed_rows(
 
 
 def first_row(law: Any, h: Array, inputs: Any) -> Any:
-    """Return the inputs of the torque `law` at the start of their first row, for `bind`."""
+    """Return the inputs of the torque `law` at the start of the first step, as `bind` takes them.
+    """
     delays = delays_of(law)
     now = jax.tree.map(lambda a: a[0], inputs)
     if not delays:
@@ -154,17 +160,18 @@ def first_row(law: Any, h: Array, inputs: Any) -> Any:
 
 
 def _row(a: Array, i: Any) -> Array:
-    """Return row `i` of `a`; the first row before it, and the last row after it."""
+    """Return row `i` of `a`; for an `i` before the first or after the last row return that row."""
     return lax.dynamic_index_in_dim(a, jnp.clip(i, 0, a.shape[0] - 1), 0, keepdims=False)
 
 
 def march_steps(
     stepper: AnyStepper, h: Array, t0: Array, first: Array, count: int, y: Any, inputs: Any = None
 ) -> Any:
-    """Return the state after `count` steps from step number `first` on, which begin with `y`.
+    """Return the state after `count` steps, beginning with step number `first` and the state `y`.
 
-    `h`, `t0` and `inputs` are as for `step`. In reverse mode the steps are in about √count pieces:
-    the states at the starts of all pieces are kept, and the states within one piece at a time.
+    `h`, `t0` and `inputs` are as for `step`. In reverse mode the run is divided into about √count
+    pieces. The states at the starts of all pieces are stored; the states within a piece are stored
+    for one piece at a time.
     """
     if platform() != "cpu":
         return in_pieces(lambda y, i: step(stepper, h, t0, i, y, inputs), first, count, y)

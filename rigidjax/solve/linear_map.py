@@ -1,7 +1,8 @@
-"""Define a linear function together with its transpose: `jax.custom_vjp` has no forward mode.
+"""Define a linear function together with a transpose of its own.
 
-The rule for tangents is a primitive that knows the function and its transpose. With it `jax.jvp`,
-`jax.vjp`, `jax.vmap` and forward over reverse mode all work for a loop of unknown length.
+The tangent rule of a run is such a function, a JAX primitive that holds the function and its
+transpose. Then `jax.jvp`, `jax.vjp`, `jax.vmap` and forward over reverse mode all work for a loop
+of unknown length; with `jax.custom_vjp` forward mode would not work.
 """
 
 from collections.abc import Callable
@@ -27,9 +28,9 @@ _ZERO: Any = ad.Zero
 def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) -> Arrays:
     """Return `function(*given, *tangents)`, a map linear in `tangents` that has its own transpose.
 
-    `transposed(*given, *bars)` returns the cotangents of `tangents` from those of the results.
-    Neither function may close over tracers. Derivatives with respect to `given` exist in forward
-    mode only.
+    `transposed(*given, *bars)` returns the cotangents of `tangents` from `bars`, the cotangents of
+    the results. Neither function may close over tracers. Derivatives with respect to `given` exist
+    in forward mode only.
     """
     outs = jax.eval_shape(lambda g, t: function(*g, *t), given, tangents)
     inputs, results = (
@@ -43,7 +44,8 @@ def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) 
 def as_known(known: Any, moved: Any) -> Any:
     """Return the numbers `known` with the derivatives, of every order, of the numbers `moved`.
 
-    `moved` are the same numbers computed once more. They may be NaN, and so may their derivatives.
+    `moved` are the same numbers, computed once more for their derivatives. The values of `moved`
+    may be NaN, and so may the derivatives.
     """
     return jax.tree.map(_known, known, moved)
 
@@ -59,11 +61,12 @@ def _known_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any
 
 
 def nan_derivatives(tree: Any, inputs: Any) -> Any:
-    """Return `tree`, of which a number that is not finite has NaN derivatives in both modes.
+    """Return `tree`, but with NaN derivatives with respect to `inputs` for numbers that are not
+    finite.
 
-    The derivatives are those with respect to `inputs`. A state that a run did not reach is NaN by a
-    `where`, whose derivative would be 0, which is wrong. A number that is not used has the
-    cotangent 0, and leaves the gradient of the other numbers as it is.
+    Forward and reverse mode both give NaN. This is needed because a state that a run did not reach
+    is set to NaN by `jnp.where`, whose derivative would be 0, which is wrong. If such a number is
+    not used, its cotangent is 0, and it does not change the gradient.
     """
     smooth, rest = eqx.partition(tree, eqx.is_inexact_array)
     outs, structure = jax.tree.flatten(smooth)
@@ -162,7 +165,7 @@ def _transposed(cotangents: Any, *args: Any, **params: Any) -> Any:
 
 
 def _batched(args: Any, dims: Any, **params: Any) -> Any:
-    """Return the results of the primitive on a batch, and their batch axes: its rule for `vmap`."""
+    """Return the results of the primitive for a batch, and the batch axes of the results."""
     number = params["number"]
     size = next(a.shape[d] for a, d in zip(args, dims, strict=True) if d is not None)
     given, own = args[:number], dims[:number]

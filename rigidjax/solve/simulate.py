@@ -17,7 +17,7 @@ from rigidjax.motion.coupled import Coupled
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import NO_METER, REPLAY
 from rigidjax.solve.crossings import Event, checked_start, solve_until
-from rigidjax.solve.error import error_of_run, solve_to
+from rigidjax.solve.error import estimate_error_of_run, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.run import (
@@ -228,7 +228,7 @@ def _accurate(setup: DiffraxRun, event: Any, state0: Any, times: Array, accuracy
     found, run, tried = solve_to(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
     sol = _solution(found, event, state0, times, None if event is not None else run)
-    error = error_of_run(found, times, sol._states, sol.stats["num_steps"], tried)
+    error = estimate_error_of_run(found, times, sol._states, sol.stats["num_steps"], tried)
     return with_error(sol, error, accuracy)
 
 

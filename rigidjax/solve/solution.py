@@ -19,7 +19,7 @@ from rigidjax.motion.conserved import drift
 from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.manifold import dimension, minus_small, parts_by_name, plus, rotation_slices
 from rigidjax.motion.torques.states import require_stateless
-from rigidjax.solve.error import Error, error_of_run, largest_in_run
+from rigidjax.solve.error import Error, estimate_error_of_run, largest_in_run
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, solve
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
@@ -146,7 +146,7 @@ class Solution(eqx.Module, Generic[State]):
         """
         if self._error is not None:
             return self._error
-        found = error_of_run(self._setup, self.ts, self._states, self.stats["num_steps"])
+        found = estimate_error_of_run(self._setup, self.ts, self._states, self.stats["num_steps"])
         _say(found, 0.5, "error: nothing is known of the states")
         return found
 

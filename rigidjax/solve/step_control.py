@@ -248,9 +248,13 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
     ) -> tuple[Any, Any]:
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         index = jnp.sum(self.stops <= t0, dtype=jnp.int32)
-        return jnp.minimum(first, self._next(index)[1]), (inner, first - t0, index)
+        return jnp.minimum(first, self._stop_and_moment_before(index)[1]), (
+            inner,
+            first - t0,
+            index,
+        )
 
-    def _next(self, index: Any) -> tuple[Any, Any]:
+    def _stop_and_moment_before(self, index: Any) -> tuple[Any, Any]:
         """Return the stop of this `index`, and the last moment before it.
 
         Both are infinite for an index after the last stop.
@@ -276,11 +280,11 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
         )
-        stop, end = self._next(index)
+        stop, end = self._stop_and_moment_before(index)
         reached = keep & (t1 >= end)
         length = lax.stop_gradient(right - left)
         length = jnp.where(reached, jnp.maximum(length, kept), length)
         left = jnp.where(reached, stop, left)
         index = jnp.where(reached, take(self.following, index), index)
-        right = jnp.minimum(left + length, self._next(index)[1])
+        right = jnp.minimum(left + length, self._stop_and_moment_before(index)[1])
         return keep, left, right, jumped | reached, (inner, length, index), result

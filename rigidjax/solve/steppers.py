@@ -31,7 +31,7 @@ from rigidjax.rotation.kernels import product4, square4
 from rigidjax.rotation.linalg3 import components
 from rigidjax.solve import splitting
 from rigidjax.solve.components import Atoms, join, split
-from rigidjax.solve.equal_steps import Rolled, change_in
+from rigidjax.solve.equal_steps import StepWithLoopedStages, change_in
 from rigidjax.solve.explicit import AbstractExplicit, RungeKutta4
 from rigidjax.solve.magnus import Magnus4, change_and_turn, require_blind
 from rigidjax.solve.splitting import AbstractSplitting
@@ -113,7 +113,7 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
         return _free(turning.inertia, y0) if turning.torque is None else _magnus(turning, y0)
     if isinstance(solver, AbstractSplitting):
         return _split(solver, field, y0)
-    if not isinstance(solver, AbstractExplicit | Rolled):
+    if not isinstance(solver, AbstractExplicit | StepWithLoopedStages):
         raise TypeError(
             f"no fixed steps of {type(solver).__name__} on {type(y0).__name__}; wanted "
             "RungeKutta4, Tsitouras5 or DormandPrince8 of rigidjax.solvers, or, for an Attitude, "
@@ -218,7 +218,9 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
     return Stepper((*start[:4], *matvec(_entries(body.tensor), start[4:])), change, state)
 
 
-def _explicit(solver: AbstractExplicit | Rolled, turning: _Turning, state0: Any) -> Stepper:
+def _explicit(
+    solver: AbstractExplicit | StepWithLoopedStages, turning: _Turning, state0: Any
+) -> Stepper:
     """Return the stepper of an explicit method for a body that only turns."""
     body, weights, torque = turning
     start = split(state0)

@@ -55,7 +55,7 @@ class TracedProgram(NamedTuple):
 
 
 def trace_program(function: Callable[..., Any], *like: Any) -> TracedProgram:
-    """Return the `TracedProgram` of a function for arguments with the shapes and dtypes of `like`."""
+    """Return the `TracedProgram` of a function for arguments of the shapes and dtypes of `like`."""
     closed, out = jax.make_jaxpr(function, return_shape=True)(*like)
     return TracedProgram(closed, jax.tree.structure(out))
 

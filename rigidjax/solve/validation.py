@@ -62,12 +62,16 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
     if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
         raise TypeError(
             f"Rigid moves as well as turns: wanted MassProperties, got {type(body).__name__}"
-            + _body_of(body, moves=True)
+            + _advice_for_bare_numbers(body, moves=True)
         )
     if not isinstance(state0, Rigid | Point) and not isinstance(body, Inertia):
         raise TypeError(
             f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
-            + ("; pass body.inertia" if isinstance(body, MassProperties) else _body_of(body))
+            + (
+                "; pass body.inertia"
+                if isinstance(body, MassProperties)
+                else _advice_for_bare_numbers(body)
+            )
         )
     if body is not None:
         _checks.require_single(body, type(body), "body")
@@ -117,7 +121,7 @@ def warn_of_scale(body: Any, torque: Any) -> None:
         )
 
 
-def _body_of(numbers: Any, moves: bool = False) -> str:
+def _advice_for_bare_numbers(numbers: Any, moves: bool = False) -> str:
     """Return the advice, for a message, to one who gave bare numbers in the place of a body.
 
     `moves` says that the body moves as well as turns. For anything but numbers there is none.

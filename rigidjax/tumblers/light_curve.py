@@ -106,7 +106,7 @@ class LightCurve(eqx.Module):
     @property
     def status(self) -> str:
         """Return both answers in one line, which is `ok` if both are good and have no reasons."""
-        return answers.status(self.search, self.explanation)
+        return answers.joined_status(self.search, self.explanation)
 
     @property
     def ok(self) -> bool:

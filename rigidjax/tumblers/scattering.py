@@ -71,7 +71,7 @@ class Geometric(AbstractScattering):
         return emission
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-        p, _, more, _, _ = _side_products(shape, sun, observer)
+        p, _, more, _, _ = _lommel_seeliger_numbers(shape, sun, observer)
         return 0.5 * math.pi * _ratio_or_zero(more, p)
 
 
@@ -93,7 +93,7 @@ class LommelSeeliger(AbstractScattering):
         return 2.0 * incidence * emission / (incidence + emission)
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-        p, q, more, w, rest = _side_products(shape, sun, observer)
+        p, q, more, w, rest = _lommel_seeliger_numbers(shape, sun, observer)
         return math.pi * _ratio_or_zero(more, p + q) * (1.0 - rest * _excess(w, rest))
 
 
@@ -140,7 +140,7 @@ def unit_direction(value: Vec3Like | Numbers, name: str) -> Vec3:
     return v / jnp.sqrt(dot(v, v))
 
 
-def _side_products(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
+def _lommel_seeliger_numbers(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
     """Return |p|, |q|, |p||q| + p·q, z² and 1 − z², the numbers of `LommelSeeliger`.
 
     Here p and q are multiplied by the product of the semi-axes.

@@ -59,7 +59,7 @@ class Cause(eqx.Module):
         return self.words
 
 
-def status(search: Answer, model: Answer) -> str:
+def joined_status(search: Answer, model: Answer) -> str:
     """Return the answers on the `search` and on the `model` in one line.
 
     The line is `ok` if the search found the best point, the model explains the readings, and

@@ -121,7 +121,7 @@ class Fit(eqx.Module):
         The line is `ok` if the search found the best point, the model explains the readings, and
         neither answer has a reason.
         """
-        return answers.status(self.search, self.explanation)
+        return answers.joined_status(self.search, self.explanation)
 
     @property
     def ok(self) -> bool:

@@ -63,7 +63,7 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
     _checks.require_instance(windows.starts, type(model.reference.state), "windows.starts")
     require_inputs_of_windows(model.torque, windows)
     model_on_windows, x = _on_windows(model, fit.x, windows)
-    errors = _errors(model_on_windows, x)[0]
+    errors = _errors_by_sensor(model_on_windows, x)[0]
     return average_by_horizon(windows.starts, errors[:, 1:])
 
 
@@ -94,6 +94,6 @@ def _on_windows(
 
 
 @eqx.filter_jit
-def _errors(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
+def _errors_by_sensor(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
     """Return the errors of all sensors at the free numbers x, computed in one compiled program."""
     return all_errors(model, x)

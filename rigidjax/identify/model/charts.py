@@ -1,4 +1,4 @@
-"""Map unconstrained numbers to bodies, all of them physically possible, by charts for a fit."""
+"""Map unconstrained numbers to physically possible bodies by charts, for a fit."""
 
 import abc
 from collections.abc import Mapping, Sequence
@@ -15,13 +15,16 @@ from rigidjax.body import parameters as charts, validation
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of as tensor_of
 from rigidjax.body.symmetric3 import swap_trace
 
-# These parts of a `MassProperties` may be free, at these places in `pack`.
+# This maps each part of a `MassProperties` that may be free to the indices of its numbers in the
+# result of `rigidjax.body.parameters.pack`.
 _PARTS = {"mass": (0,), "com": (7, 8, 9), "inertia": (1, 2, 3, 4, 5, 6)}
 Numbers = Float[Array, " chart"]
 Rows = Float[Array, "rows chart"]
-# The components of a tensor are in the order of their names.
+# These are the components of a symmetric tensor in the order xx, yy, zz, yz, xz, xy, as in
+# `Tensor.plain_names`.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
-# The basis of symmetric tensors is in this order.
+# BASIS[k] is the symmetric tensor whose component COMPONENTS[k] is one and whose other components
+# are zero.
 BASIS = np.zeros((6, 3, 3))
 for _k, (_i, _j) in enumerate(COMPONENTS):
     BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
@@ -38,7 +41,7 @@ class AbstractBodyChart(eqx.Module):
       their logarithms.
     - `plain_names`: the names of reported quantities of either sign, which `plain(body)` returns;
       none unless given.
-    - `unit`: of the reported quantities.
+    - `unit`: the unit of the reported quantities.
 
     >>> class Spheres(AbstractBodyChart):  # one number: the logarithm of the moment
     ...     size, unit, log_names = 1, "kg m²", ("I",)
@@ -56,8 +59,8 @@ class AbstractBodyChart(eqx.Module):
     log_names: eqx.AbstractVar[tuple[str, ...]]
     plain_names: ClassVar[tuple[str, ...]] = ()
     unit: ClassVar[str] = ""
-    # This is the scale of the bodies that a user gets from `Model`. Within a fit bodies have no
-    # scale: a torque on a body of arbitrary scale would be refused there.
+    # This is the argument `scale` of the `Inertia` that a user gets from `Model`. Within a fit an
+    # `Inertia` is not marked as of arbitrary scale, since a torque on such a body would be refused.
     scale: ClassVar[str | None] = None
 
     @abc.abstractmethod
@@ -72,9 +75,9 @@ class AbstractBodyChart(eqx.Module):
         """Return rows B such that BᵀB is the part of a misfit's second derivative that comes from
         the curvature of the chart.
 
-        The curvature matters if a body may be flat (`rigidjax.body.parameters.flat_bend`); without
-        rows it is left out. **Arguments:** `vector` the numbers; `slope` the derivative of the
-        misfit with respect to these numbers.
+        The curvature matters if a body may be flat (`rigidjax.body.parameters.flat_bend`). A chart
+        that returns no rows leaves the curvature out. **Arguments:** `vector` the numbers; `slope`
+        the derivative of the misfit with respect to these numbers.
         """
         return jnp.zeros((0, self.size), vector.dtype)
 
@@ -91,9 +94,10 @@ class Ratios(AbstractBodyChart):
     """Map five numbers to the inertia tensor up to scale: two ratios of moments and the principal
     axes.
 
-    It is for free motion, which cannot show the scale. Its five numbers are those of a root of the
-    second moment 𝔖 of fixed scale (`rigidjax.body.parameters`), so that a flat body is an ordinary
-    point.
+    It is for free motion, from which the scale cannot be found. The five numbers describe a square
+    root of the matrix of second moments 𝔖 = ∫ r rᵀ dm, whose scale is fixed
+    (`rigidjax.body.parameters.pack_shape`). In this way a flat body, whose 𝔖 is singular, is an
+    ordinary point of the chart.
 
     >>> Ratios().logs(Ratios().body(jnp.zeros(5)))
     Array([0., 0.], dtype=float64)
@@ -120,8 +124,9 @@ class Ratios(AbstractBodyChart):
 class PrincipalRatios(AbstractBodyChart):
     """Map two numbers to two ratios of moments, if the body axes are known to be principal.
 
-    Its two numbers are those of the roots of the second moments λ1, λ2, λ3 along the axes, of fixed
-    scale (notes, eqs 72, 76–78), so that every pair of numbers obeys the triangle inequalities.
+    The two numbers describe the square roots of the second moments λ1, λ2, λ3 along the axes, whose
+    scale is fixed (notes, eqs 72, 76–78). In this way the moments of inertia obey the triangle
+    inequalities for every pair of numbers.
 
     >>> PrincipalRatios().body(jnp.zeros(2)).moments.sum().round(12)  # Tr I = 2, as of `Ratios`
     Array(2., dtype=float64)
@@ -160,10 +165,11 @@ def _typical_moments(value: object) -> Array:
 
 
 class Tensor(AbstractBodyChart):
-    """Map six numbers to the inertia tensor with its scale, which a known torque or momentum shows.
+    """Map six numbers to the inertia tensor with its scale, which can be found with a known torque
+    or momentum.
 
-    Its six numbers are the logarithm of the size of 𝔖 in units of `typical`, and the five numbers
-    of `Ratios`.
+    The six numbers are the logarithm of the size of the matrix of second moments 𝔖 in units of
+    `typical`, and the five numbers of `Ratios`.
 
     **Arguments:** `typical` kg m², the rough size of the moments, with which a fit starts.
     **Raises** `ValueError` if it is not positive.
@@ -198,8 +204,8 @@ class Principal(AbstractBodyChart):
     """Map three numbers to three moments with their scale, if the body axes are known to be
     principal.
 
-    Its three numbers are the logarithm of the size of 𝔖 in units of `typical`, and the two numbers
-    of `PrincipalRatios`.
+    The three numbers are the logarithm of the size of the second moments in units of `typical`, and
+    the two numbers of `PrincipalRatios`.
 
     **Arguments:** as for `Tensor`.
 
@@ -228,8 +234,8 @@ class Principal(AbstractBodyChart):
 class Mass(AbstractBodyChart):
     """Map numbers to mass, centre of mass and inertia, either all ten numbers or some of them.
 
-    Forces must show them. The numbers are changes from the `guess` in the chart of
-    `rigidjax.body.parameters.pack`.
+    The recording must contain forces, without which the mass cannot be found. The numbers are
+    changes from the numbers of the `guess` in the chart `rigidjax.body.parameters.pack`.
 
     **Arguments:**
 
@@ -240,7 +246,8 @@ class Mass(AbstractBodyChart):
       `["inertia"]` for a body that was weighed and balanced, `["mass"]` for a load of known shape,
       `["com"]` for a centre that moved.
 
-    **Raises:** `TypeError` for a guess of another type; `ValueError` for another word, or none.
+    **Raises:** `TypeError` for a guess of another type; `ValueError` if `free` contains another
+    word, or nothing.
 
     >>> box = rj.shapes.box(2.0, [1.0, 1.0, 1.0])
     >>> float(Mass(box).body(jnp.zeros(10)).mass), Mass(box, ["inertia"]).log_names
@@ -271,13 +278,13 @@ class Mass(AbstractBodyChart):
 
     @property
     def _places(self) -> list[int]:
-        """Return the places of the free numbers among the ten numbers of `pack`."""
+        """Return the indices of the free numbers among the ten numbers of `pack`."""
         return sorted(place for name in self.free for place in _PARTS[name])
 
     @property
     def _length(self) -> Array:
-        """Return the size of the body, m, in which the centre is counted as a number of order
-        one.
+        """Return the size of the body, m, which is the unit of the free numbers of the centre of
+        mass.
         """
         return jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
 
@@ -347,12 +354,15 @@ def _pad(x: Float[Array, "*rows n"], leading: int, trailing: int) -> Float[Array
 
 
 class Bodies(eqx.Module):
-    """Hold the charts of several bodies, whose numbers follow one another.
+    """Hold the charts of several bodies; the vector of numbers holds the numbers of one body after
+    the other.
 
-    Charts of one form are stacked, so that one program serves all recordings.
+    Charts of the same type and shapes (one form) are stacked, so that one program serves all
+    recordings.
 
     **Fields:** `names` and `charts` of the bodies; `kinds` the stacked charts, one for each form;
-    for each body `kind_of` the index of its form, and `row_of` its row in the stacked chart.
+    `kind_of` the index of the form of each body; `row_of` the row of each body in its stacked
+    chart.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -388,7 +398,7 @@ class Bodies(eqx.Module):
         return sum(chart.size for chart in self.charts)
 
     def all(self, vector: Float[Array, " numbers"]) -> dict[str, Any]:
-        """Return every body by its name."""
+        """Return every body by its name, from the numbers `vector` of all bodies."""
         rows = zip(self.names, self.charts, numbers_of(self, vector), strict=True)
         return {name: scaled_body(chart, numbers) for name, chart, numbers in rows}
 
@@ -404,8 +414,8 @@ class Bodies(eqx.Module):
             body = chart.body(vector[: chart.size])
             leaves, form = jax.tree.flatten(body)
             if chosen is not None:
-                # Choose leaf by leaf: the trees may differ, since the body of a `Known` may have a
-                # scale, which is no number.
+                # The choice is made leaf by leaf, since the tree structures may differ: the body of
+                # a `Known` may have a `scale`, which is static.
                 both = zip(leaves, jax.tree.leaves(chosen), strict=True)
                 body = jax.tree.unflatten(form, [jnp.where(kind == index, *pair) for pair in both])
             chosen = body
@@ -423,7 +433,8 @@ def scaled_body(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProp
 def places_of(
     body: AbstractBodyChart | Bodies, body_indices: Int[Array, " records"] | None, count: int
 ) -> Int[np.ndarray, "records numbers"]:
-    """Return the places of the numbers of each recording's body among the numbers of all bodies.
+    """Return the indices (R, K) of the numbers of each recording's body among the numbers of all
+    bodies.
 
     **Arguments:** `body` the chart or charts; `body_indices` (R,) the index of each recording's
     body, or `None` for one body; `count` R. The rows of smaller charts are filled with −1.
@@ -439,8 +450,7 @@ def places_of(
 def body_of_recording(
     body: AbstractBodyChart | Bodies, vector: Numbers, body_index: Int[Array, ""] | None
 ) -> Inertia | MassProperties:
-    """Return the body of one recording from a row `vector` that begins with the numbers of this
-    body.
+    """Return the body of one recording, from a `vector` that begins with the numbers of this body.
 
     `body_index` is the index of the body among several, or `None` for one body.
     """
@@ -456,13 +466,17 @@ def chart_list(body: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...
 
 
 def numbers_of(body: AbstractBodyChart | Bodies, vector: Array | np.ndarray) -> list[Any]:
-    """Return the numbers `vector` of one body or of several, split into those of each chart."""
+    """Return the list of the numbers of each chart, from the numbers `vector` of one body or of
+    several bodies.
+    """
     sizes = [chart.size for chart in chart_list(body)]
     return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
 
 
 def as_list(bodies: PyTree) -> list[Any]:
-    """Return the result of `Model.bodies`, one body or a dict of several, as a list."""
+    """Return the result of `Model.bodies`, which is one body or a dict of several bodies, as a list
+    of bodies.
+    """
     return list(bodies.values()) if isinstance(bodies, dict) else [bodies]
 
 

@@ -1,4 +1,4 @@
-"""Find the free numbers inside a scene, the leaf that each one moves, and how it moves the leaf."""
+"""Find the free numbers of a scene: which leaf of the scene each number changes, and how."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -24,16 +24,17 @@ class Free(eqx.Module):
       `lambda s: s.sensors[0].bias` or `lambda s: s.torque.coefficient`. The value in the scene is
       the starting value.
     - `name`: its name in reports.
-    - `scale`: its natural size, in its unit; the fit counts in this size.
-    - `each`: `False` for one value for all recordings; `True` for a value for each; `"body"` for a
-      value for each body; or a sequence of labels, one for each recording: recordings with the same
-      label share a value.
+    - `scale`: its natural size, in its unit; inside the fit the number is in units of this size.
+    - `each`: `False` for one value for all recordings; `True` for a value for each recording;
+      `"body"` for a value for each body; or a sequence of labels, one for each recording:
+      recordings with the same label share a value.
     - `positive`: whether the fit moves the logarithm of the number, so that its sign is kept.
     - `prior`: the standard deviation of a normal prior about the starting value (in its unit;
       relative for `positive`), or `None`.
-    - `spread`: the standard deviation by which recordings deviate from the shared value, each by a
-      number of its own (in its unit; relative for `positive`); `"estimated"` to estimate it from
-      three recordings or more, with one `scale` as first guess; `None` for no deviations.
+    - `spread`: the standard deviation of the deviations of single recordings from the shared value,
+      where each recording has its own deviation (in the unit of the number; relative for
+      `positive`); `"estimated"` to estimate it from three recordings or more, with one `scale` as
+      first guess; `None` for no deviations.
     - `unit`: its unit in reports; `None` finds the unit of a bias, delay, clock offset, mounting,
       tilt or place.
 
@@ -88,8 +89,8 @@ class Free(eqx.Module):
 
 
 def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
-    """Return the argument `each` of a `Free` if it is valid, with labels as a tuple; else raise an
-    error.
+    """Return the argument `each` of a `Free`, with labels as a tuple; raise an error, in which the
+    argument is called `name`, if `each` is not valid.
     """
     if isinstance(each, bool):
         return each
@@ -100,24 +101,28 @@ def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
 
 
 class Slot(eqx.Module):
-    """Hold a `Free` whose leaf in the scene has been found.
+    """Hold a `Free` whose leaf in the scene (as a JAX tree) has been found.
 
-    It contains no function, so that a second model does not compile again. A *step* is the change
-    of the leaf in units of `scale`.
+    It contains no function, since a new function in a second model would force a new compilation. A
+    *step* is the change of the leaf in units of `scale`.
 
     **Fields:**
 
-    - `path`: of the leaf in the scene.
-    - `name`, `unit`, `positive`, `scale`: those of the `Free`.
+    - `path`: the path of the leaf in the scene.
+    - `name`, `unit`, `positive`, `scale`: the arguments of the `Free` with these names.
     - `each`: whether each recording has a value of its own.
-    - `shape`: of a step; it is that of the leaf, or broadcasts to it.
-    - `labels`: of the groups of recordings that share a value.
-    - `groups`: (R,) the group of each recording, `None` for one value for all.
-    - `prior`, `spread`: in units of `scale`, or `None`.
+    - `shape`: the shape of a step, which is the shape of the leaf or broadcasts to the shape of the
+      leaf.
+    - `labels`: the labels of the groups of recordings that share a value.
+    - `groups`: (R,) the index of the group of each recording, `None` for one value for all
+      recordings.
+    - `prior`, `spread`: the standard deviations `prior` and `spread` of the `Free`, in units of
+      `scale`, or `None`.
     - `estimated`: whether the spread is estimated.
-    - `column`: of the first step in the row of a recording.
-    - `shared`: (groups, *shape) the places of the shared steps among all free numbers.
-    - `own`: (R, *shape) the places of each recording's own step, or of its deviation.
+    - `column`: the index of the first step in the row of a recording.
+    - `shared`: (groups, *shape) the indices of the shared steps among all free numbers.
+    - `own`: (R, *shape) the indices of the own step of each recording, or of its deviation from the
+      shared step, among all free numbers.
     """
 
     path: tuple[Any, ...] = eqx.field(static=True)
@@ -142,8 +147,8 @@ class Slot(eqx.Module):
         return slice(self.column, self.column + int(np.prod(self.shape, dtype=int)))
 
     def move(self, start: Array, step: Array) -> Array:
-        """Return the value that lies `step` away from `start`, where `step` is in units of the
-        scale.
+        """Return the value of the leaf that lies a `step` away from its value `start`, where `step`
+        is in units of the scale.
         """
         if self.positive:
             return start * jnp.exp(step * self.scale)
@@ -159,7 +164,8 @@ class Slot(eqx.Module):
 def group_of_each(
     each: str | tuple[Any, ...], bodies: Sequence[str], name: str
 ) -> tuple[Int[Array, " records"], tuple[str, ...]]:
-    """Return the index of each recording's group, and the labels of the groups.
+    """Return two things: the index (R,) of the group of each recording; and the labels of the
+    groups.
 
     The groups are the bodies of the recordings for `each` "body", else the labels in `each`.
     `bodies` (R,) names the body of each recording.
@@ -226,7 +232,8 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
 def leaf_at(
     where: Callable[[Any], Any], tree: PyTree, name: str, role: str
 ) -> tuple[tuple[Any, ...], Any]:
-    """Return the path of the leaf of a tree that `where` picks, and the leaf, an array of numbers.
+    """Return two things: the path of the leaf of a tree that `where` picks; and the leaf, an array
+    of numbers.
 
     `name` and `role` are words for error messages: the object that has `where`, and the object that
     needs a starting value.
@@ -267,12 +274,15 @@ def _implied_unit(scene: Scene, path: tuple[Any, ...]) -> str:
     return getattr(holder, "unit", "")
 
 
-# Each member of a sensor belongs to this tolerance.
+# This maps the name of a member of a sensor to the name of the tolerance from a data sheet that
+# limits this member.
 TOLERANCES = {"scale": "scale", "skew": "cross_axis", "bias": "bias", "offset": "clock"}
 
 
 def _tolerance_at(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
-    """Return the tolerance of a sensor for its member at `path`, or `None` without a tolerance."""
+    """Return the tolerance of a sensor for its member at `path` in the scene, or `None` if there is
+    none.
+    """
     if len(path) != 3 or getattr(path[0], "name", "") != "sensors":
         return None
     tolerance = getattr(scene.sensors[path[1].idx], "tolerance", None)
@@ -280,7 +290,9 @@ def _tolerance_at(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
 
 
 def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"]) -> Scene:
-    """Return the scene with its free numbers moved by the steps in the row of a recording."""
+    """Return the scene with the leaf of each slot moved by the steps in `row`, the free numbers of
+    a recording.
+    """
     paths = [slot.path for slot in slots]
     values = []
     for slot, start in zip(slots, leaves_at(scene, paths), strict=True):
@@ -290,7 +302,7 @@ def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"
 
 
 def leaves_at(scene: Scene, paths: Sequence[tuple[Any, ...]]) -> tuple[Array, ...]:
-    """Return the leaves of a scene at the `paths`."""
+    """Return the leaves of a scene at the `paths`, as arrays."""
     leaves = dict(jax.tree.leaves_with_path(scene))
     return tuple(jnp.asarray(leaves[path]) for path in paths)
 

@@ -1,4 +1,4 @@
-"""Find the place of each recording's numbers among all free numbers of a model."""
+"""Find the indices of the numbers of each recording among all free numbers of a model."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,22 +12,25 @@ from rigidjax.identify.model.free import Slot
 
 
 class Index(eqx.Module):
-    """Hold the places of each recording's numbers among the n free numbers x of a model.
+    """Hold the places (indices) of the numbers of each recording among the n free numbers x of a
+    model.
 
     x holds the numbers of the bodies, then the shared steps of the slots, then the numbers that
-    belong to one recording alone: its initial state, part by part, and its own steps. The row of a
-    recording holds the numbers of its body, the step of each slot, and its initial state. A slot
-    with deviations has one step in the row, which is the sum of two numbers of x.
+    belong to one recording alone, which are the initial states and the own steps of the recordings.
+    The row of a recording holds the numbers of its body, the step of each slot, and its initial
+    state. A slot with deviations has one step in the row, which is the sum of two numbers of x: the
+    shared step and the deviation of the recording.
 
     **Fields:**
 
     - `places`: (R, columns) the place in x of each column of the rows. A slot with deviations has a
-      second column at the end. A column without a number has the place n: charts differ in size.
+      second column at the end. A column that stands for no number, as in the row of a body whose
+      chart has fewer numbers, has the place n.
     - `start`: (R, k) the places of the initial states.
-    - `columns`: the column of the row to which each column of `places` is added.
+    - `columns`: for each column of `places`, the column of the row to which its number is added.
     - `alone`: the columns of the numbers that one recording has alone.
     - `width`: the number of columns of a row.
-    - `bodies`: the number of the numbers of all bodies.
+    - `bodies`: how many numbers of x describe the bodies.
     - `first`: the first column of the initial state.
     - `size`: n.
     """
@@ -56,14 +59,15 @@ def index_of(
     slots: Sequence[Slot],
     kinds: int,
 ) -> tuple[Index, tuple[Slot, ...]]:
-    """Return the index of a model, and its slots with their places.
+    """Return two things: the `Index` of a model; and its slots with their places in x.
 
     **Arguments:**
 
-    - `bodies`: (R, K) the places of the numbers of each recording's body, −1 for none.
-    - `size`: the number of the numbers of all bodies.
+    - `bodies`: (R, K) the places in x of the numbers of each recording's body, −1 where a body has
+      fewer than K numbers.
+    - `size`: how many numbers describe all bodies.
     - `slots`: the free numbers in scenes.
-    - `kinds`: the number of parts of an initial state, each of three numbers.
+    - `kinds`: the number of three-vectors in an initial state, such as 2 for attitude and rate.
     """
     count, end = len(bodies), size
 
@@ -113,5 +117,5 @@ def index_of(
 
 
 def _with_places(slot: Slot, column: int, shared: Array | None, own: Array | None) -> Slot:
-    """Return the slot with its column and its places."""
+    """Return the slot with the fields `column`, `shared` and `own` replaced."""
     return dataclasses.replace(slot, column=column, shared=shared, own=own)

@@ -56,21 +56,24 @@ from rigidjax.motion.torques.base import AbstractForce, Torque, require_law
 from rigidjax.motion.torques.composite import parts_of
 from rigidjax.motion.torques.inputs import delays_of, inputs_of
 
-# In a step of the filter the body turns by at most this angle, rad: the classical method of order 4
-# then has an error of 5e-8 of the turn.
+# In one step of the filter the body turns by at most this angle, rad. For this angle the error of
+# the classical Runge–Kutta method of order 4 is 5e-8 of the angle.
 TURN_OF_A_FILTER_STEP = 0.05
-# Times are even if their steps differ by no more than this part of the first step.
+# Times count as evenly spaced if no step differs from the first step by more than this fraction of
+# the first step.
 EVEN = 1e-3
 
 
 class AbstractPull(eqx.Module):
-    """Compute residuals that pull the numbers of a fit, in addition to those of readings and
-    priors.
+    """Compute residuals that pull the free numbers x of a fit towards chosen values, in addition to
+    the residuals of readings and priors.
     """
 
     @abc.abstractmethod
     def __call__(self, model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-        """Return the residuals, in standard deviations."""
+        """Return the residuals (j,) at the free numbers x (n,) of the `model`, in standard
+        deviations.
+        """
 
 
 class Unpacked(eqx.Module):
@@ -100,46 +103,50 @@ class Unpacked(eqx.Module):
 
 
 class Model(eqx.Module):
-    """Hold the recordings of one body or several, and the description of the n numbers x that are
-    free in their scenes.
+    """Hold the recordings of one body or of several bodies, and the description of the n free
+    numbers x of the scenes of the recordings.
 
     **Arguments:**
 
-    - `recording`: one `Recording`, or a sequence of them with the same sensors: each has its own
-      initial state, and all share the body. Or `Windows` of a record of measured states: each is a
-      short recording whose start is known, or free about the measured one.
+    - `recording`: one `Recording`, or a sequence of recordings with the same sensors: each
+      recording has its own initial state, and all recordings share the body. Or `Windows` of a
+      record of measured states: each window is a short recording whose initial state is known, or
+      free about the measured state.
     - `chart`: the chart of the body: `Ratios()` (the full tensor up to scale), `PrincipalRatios()`
-      (if the body axes are known to be principal), `Tensor()` or `Principal()` (the same with the
-      scale), `Mass(guess)` (all ten numbers), or `Known(body)`. For several bodies give recordings
-      and charts by the names of the bodies, as in
-      `Model({"proof": [a, b], "box": [c]}, {"proof": Known(body), "box": Tensor(1e-3)})`.
+      (if the body axes are known to be principal), `Tensor()` or `Principal()` (the full or the
+      principal tensor with its scale), `Mass(guess)` (all ten numbers), or `Known(body)`. For
+      several bodies give recordings and charts by the names of the bodies, as in `Model({"proof":
+      [a, b], "box": [c]}, {"proof": Known(body), "box": Tensor(1e-3)})`.
     - `torque`: the torque on the body in every recording, or `None`. It reads the inputs of a
       recording by name: `rigidjax.torques.Input("speed")`.
     - `process`: an unknown torque as noise, a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of
-      them. `filter`, `smooth` and `LogDensity` integrate it out; `fit` takes its mean, zero.
+      such torques. `filter`, `smooth` and `LogDensity` integrate over this torque; `fit` sets it to
+      its mean, zero.
     - `walks`: sensor errors that drift, a sequence of `Walk(where, deviation, density)`. `filter`,
-      `smooth` and `LogDensity` follow them; `fit` takes them as constant.
+      `smooth` and `LogDensity` follow the drift; `fit` takes the errors as constant.
     - `free`: other free numbers, a sequence of `Free(where, name, …)`: one value for all, or one
       for each body, group or recording.
     - `loss`: a robust loss, `SoftL1()` or `Huber()`; `None` for plain least squares.
     - `prior`: `Entropic(guess, weight)`, a prior about a roughly known body, or `None`.
-    - `integrator`: of a forced motion, `FixedSteps(n)` or `Adaptive(rtol, atol)`; `None` chooses by
-      the sampling. `Adaptive()` is quicker if the torque is smooth and the body turns by 0.1 rad or
-      more between readings, but slow if the torque reads a noisy log. The motion of a free body is
-      computed by the closed form. Windows, and recordings whose inputs are samples, take one step
-      of order 4 from each time to the next, with the samples held.
+    - `integrator`: of a forced motion, `FixedSteps(n)` or `Adaptive(rtol, atol)`; `None` chooses an
+      integrator by the sampling. `Adaptive()` is quicker if the torque is smooth and the body turns
+      by 0.1 rad or more between readings, but slow if the torque reads a noisy log. The motion of a
+      free body is computed by the closed form. Windows, and recordings whose inputs are samples,
+      take one step of order 4 from each time to the next, and the samples are held constant during
+      this step.
     - `stretches`: the number of stretches into which windows are divided. Deviations come from
       leaving out one stretch after the other; a stretch should be longer than the errors of the
       model last.
-    - `noise_each`: whether an estimated noise is one number for all recordings (`False`), for each
-      (`True`), for each body (`"body"`), or for the recordings with the same label (a sequence).
+    - `noise_each`: whether an estimated noise is one number for all recordings (`False`), one for
+      each recording (`True`), one for each body (`"body"`), or one for all recordings with the same
+      label (a sequence of labels, one for each recording).
 
     The model finds channels that were cut off at full scale. A reading at full scale counts as "at
     least that much", as with a sensor's `limit`.
 
-    The motion starts at the first time of each recording. Its state is the smallest one that
-    sensors and torque need: `Spin`, `Attitude` or `Rigid`. **Raises:** `TypeError` for arguments of
-    another type; `ValueError` if they do not fit together.
+    The motion starts at the first time of each recording. The state of the motion is the smallest
+    type of state that sensors and torque need: `Spin`, `Attitude` or `Rigid`. **Raises:**
+    `TypeError` for arguments of another type; `ValueError` if they do not fit together.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> model = rj.identify.Model(record, rj.identify.Ratios())
@@ -236,8 +243,8 @@ class Model(eqx.Module):
         elif integrator is None and torque is not None:
             integrator = integrator_for(turn)
         self.integrator = integrator
-        # Without a filter the number is not needed, and it would only make recordings with other
-        # gaps compile again.
+        # Without a filter the number of its steps is not needed. The number would only force a new
+        # compilation for recordings whose times have another widest interval.
         filtered = process is not None or self.walks
         self.filter_steps = filter_steps_of(self) if filtered else 1
 
@@ -253,7 +260,7 @@ class Model(eqx.Module):
 
     @property
     def recordings(self) -> tuple[Recording, ...]:
-        """Return the recordings as a tuple, one by one."""
+        """Return the recordings as a tuple, each without the padding of the stacked recordings."""
         return tuple(
             stacking.take_rows(stacking.pick_records(self.records, index), count)
             for index, count in enumerate(np.asarray(self.counts).tolist())
@@ -268,21 +275,23 @@ class Model(eqx.Module):
     def typical_rate(self) -> Scalar:
         """Return the typical body rate of the first recording, rad/s.
 
-        It is the unit of the free numbers of the initial rate.
+        The free numbers of the initial rate of this recording are in units of the typical rate.
         """
         return self.reference.rate[0]
 
     def start(self, body: PyTree = None, omega: NumbersLike | None = None) -> Float[Array, " n"]:
-        """Return free numbers with which a fit may start, or those of a planned motion.
+        """Return free numbers (n,) with which a fit may start, or the free numbers of a planned
+        motion.
 
-        The numbers of `Free`s have their starting values.
+        Each number of a `Free` has its starting value.
 
         **Arguments:**
 
-        - `body`: an `Inertia` or `MassProperties`, a sphere for `None`; for several bodies a dict
-          of those that are roughly known.
+        - `body`: an `Inertia` or `MassProperties`, a sphere for `None`; for several bodies a dict,
+          by name, of the bodies that are roughly known.
         - `omega`: (3,) the initial rate in all recordings, rad/s, body frame. With `None` it is the
-          first reading of a gyro, or the rate between attitudes (0 if these are traced).
+          first reading of a gyro, or the rate between measured attitudes (0 if the readings are
+          traced).
 
         **Raises:** `ValueError` for a body that the chart does not hold, or a wrong shape.
         """
@@ -314,8 +323,9 @@ class Model(eqx.Module):
         rest = self.size - vector.size - spin.size
         own = sum(s.own.size for s in self.slots if s.own is not None)
         zeros = xp.zeros(rest - own, kind), xp.zeros(own, kind)
-        # The order is that of `Index`: bodies and shared steps, then initial states with the rates
-        # last, then own steps.
+        # The order of the free numbers is the order that `Index` describes: bodies and shared
+        # steps, then initial states, in which the rates come last, then the steps of one recording
+        # alone.
         parts = [xp.asarray(vector, kind), zeros[0], spin.reshape(-1), zeros[1]]
         return jnp.asarray(xp.concatenate(parts))
 
@@ -343,16 +353,16 @@ class Model(eqx.Module):
     def values(self, x: Float[Array, " n"]) -> dict[str, Array]:
         """Return the value of each `Free` at the free numbers x, by name, in its unit.
 
-        The shape is (R, …) for a value for each recording, (groups, …) for one for each group. A
-        `Free` named "drag" with a `spread` has the shared value under "drag", and the values of all
-        recordings under "drag, own".
+        The shape is (R, …) if each recording has a value, and (groups, …) if each group of
+        recordings has a value. For a `Free` named "drag" with a `spread` the shared value is under
+        "drag", and the values of the R recordings are under "drag, own".
         """
         return values_of(self, require_numbers(self, x))
 
     def motion(self, x: Float[Array, " n"]) -> Any:
         """Return the states at the times of the recording, with a leading time axis.
 
-        For several recordings there is an axis of recordings before it.
+        For several recordings an axis of recordings comes before the time axis.
         """
         x = require_numbers(self, x)
 
@@ -364,9 +374,10 @@ class Model(eqx.Module):
         return stacking.pick_records(states, 0) if self.count == 1 else states
 
     def errors(self, x: Float[Array, " n"]) -> tuple[Float[Array, "*records times _"], ...]:
-        """Return reading minus prediction for each sensor at the free numbers x, in its unit.
+        """Return reading minus prediction for each sensor at the free numbers x, in the sensor's
+        unit.
 
-        It is zero for a masked reading.
+        The difference is zero for a masked reading.
         """
         x = require_numbers(self, x)
         out = all_errors(self, x)
@@ -376,9 +387,12 @@ class Model(eqx.Module):
 class _Data(NamedTuple):
     """Hold the parts of a model that come from its recordings or windows.
 
-    **Fields**, besides those of `Model`: `sensors` of one recording; `kinds` the number of parts,
-    of three numbers each, of an initial state that is free; `widest` the longest time between two
-    samples, s.
+    Fields with the name of a field of `Model` have the same meaning here. **Further fields:**
+
+    - `sensors`: the sensors of one recording.
+    - `kinds`: the number of three-vectors (such as attitude and rate) of a free initial state, 0 if
+      the initial state is known.
+    - `widest`: the longest time between two successive samples, s; 0 for windows.
     """
 
     records: Recording
@@ -395,7 +409,7 @@ class _Data(NamedTuple):
 def _data_of_recordings(
     recordings: list[Recording], torque: Torque | None, charts: AbstractBodyChart | Bodies
 ) -> _Data:
-    """Return the data of recordings, each of which starts in a free state."""
+    """Return the `_Data` of recordings whose initial states are free."""
     _require_recordings(recordings)
     recordings = with_limits(recordings)
     _require_inputs(torque, [recording.inputs for recording in recordings])
@@ -404,8 +418,8 @@ def _data_of_recordings(
     records, counts = stacking.stack(recordings)
     sensors = recordings[0].sensors
     state_kind = _state_kind(sensors, torque, charts)
-    # The readings are known even if the torque is traced: keep the numbers of the reference known
-    # as well.
+    # The readings are concrete arrays even if the torque is traced by JAX. The reference states are
+    # computed at compile time, so that they are concrete arrays, too.
     with jax.ensure_compile_time_eval():
         reference = reference_of(recordings, state_kind)
     kinds = dimension(stacking.pick_records(reference.state, 0)) // 3
@@ -416,8 +430,8 @@ def _data_of_recordings(
 def _data_of_windows(
     windows: Windows, torque: Torque | None, charts: AbstractBodyChart | Bodies, stretches: int
 ) -> _Data:
-    """Return the data of windows, each of which starts in its measured state, or in a free state
-    about it.
+    """Return the `_Data` of windows, each of which starts in its measured state, or in a free state
+    about the measured state.
     """
     require_inputs_of_windows(torque, windows)
     records = windows.records()
@@ -439,7 +453,7 @@ def _require_parts(
     prior: object,
     integrator: object,
 ) -> None:
-    """Raise `TypeError` unless the parts of a model have the right types."""
+    """Raise `TypeError` unless the arguments of a `Model` have the right types."""
     for one in chart_list(charts):
         known = isinstance(one, Inertia | MassProperties)
         hint = "give a known body as Known(body)" if known else ""
@@ -473,8 +487,8 @@ def unpack_numbers(model: Model, x: Float[Array, " n"]) -> Unpacked:
 
 
 def unpack_with_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
-    """Return the quantities that x represents, and their derivatives by x along a new last axis of
-    each array.
+    """Return two things: the quantities that x represents; and the derivatives of these quantities
+    with respect to x, along a new last axis of each array.
     """
     slopes, point = _unpack_with_jacobian(without_samples(model), x)
     return point, slopes
@@ -482,15 +496,17 @@ def unpack_with_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, U
 
 @eqx.filter_jit
 def _unpack_with_jacobian(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
-    """Return the derivatives of `unpack_numbers` and its result, computed in one program."""
+    """Return two things, computed in one program: the derivatives of `unpack_numbers(model, x)`
+    with respect to x; and its result.
+    """
     return with_jacobian(lambda x: unpack_numbers(model, x), x)
 
 
 def without_samples(model: Model) -> Model:
-    """Return a model of known numbers that has only the first time of each recording.
+    """Return the model with only the first time of each recording, as NumPy arrays.
 
-    The quantities that x represents depend on no reading. A program that computes them from this
-    model is compiled once, and not again for recordings of another length.
+    The quantities that x represents depend on no reading. A program that computes these quantities
+    from the shortened model is compiled once, and not again for recordings of another length.
     """
     records = jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, model.records)
     return with_parts(model, records=stacking.take_rows(records, 1, axis=1))
@@ -530,7 +546,7 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
 
 
 def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
-    """Return the starting value that each slot has in each recording."""
+    """Return, for each slot, its starting values (R, *shape) in the R recordings."""
     leaves, out = dict(jax.tree.leaves_with_path(scene_template(model, model.records))), []
     for slot in model.slots:
         leaf = jnp.asarray(leaves[slot.path])
@@ -540,20 +556,20 @@ def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
 
 
 def filter_steps_of(model: Model) -> int:
-    """Return the number of steps that a filter needs in the widest gap between two times of a
-    model.
+    """Return the number of steps that a filter needs in the longest interval between two successive
+    times of a model.
     """
     widest = np.max(np.diff(np.asarray(model.records.t), axis=1), initial=0.0)
     turn = 1.5 * float(widest) * float(np.max(np.asarray(model.reference.rate)))
-    # A NaN in a recording gives no number of steps: take one step, and let later checks refuse the
-    # NaN.
+    # A NaN in a recording gives no number of steps. One step is taken in this case, and later
+    # checks refuse the NaN.
     steps = turn / TURN_OF_A_FILTER_STEP
     return math.ceil(steps) if 1.0 < steps < math.inf else 1
 
 
 def require_one(model: PyTree) -> Model:
-    """Return `model`, and raise `TypeError` or `ValueError` unless it is one `Model` and not a
-    batch.
+    """Return `model`, and raise `TypeError` or `ValueError` unless `model` is a single `Model`, not
+    a batch of models.
     """
     _checks.require_instance(model, Model, "model")
     records, rate = model.records, model.reference.rate
@@ -570,7 +586,9 @@ def require_one(model: PyTree) -> Model:
 
 
 def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
-    """Return the free numbers x, and raise an error unless they are numbers of this model."""
+    """Return the free numbers x as an array, and raise an error unless x has the shape and dtype of
+    the free numbers of this model, and is finite.
+    """
     require_one(model)
     hint = "model.start(body) makes them"
     numbers = _checks.numeric_array(x, "x")
@@ -589,10 +607,11 @@ def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
 
 
 def with_parts(model: Model, **parts: Any) -> Model:
-    """Return the model with the fields `parts` replaced, without checks.
+    """Return the model with its fields replaced by the values in `parts` (by field name), without
+    checks.
 
-    `dataclasses.replace` would call `Model(…)`, and `equinox.tree_at` cannot replace a tuple
-    without leaves.
+    `dataclasses.replace` would call `Model(…)`, and `equinox.tree_at` cannot replace a tuple that
+    has no leaves.
     """
     new = object.__new__(Model)
     for field in dataclasses.fields(Model):
@@ -601,8 +620,8 @@ def with_parts(model: Model, **parts: Any) -> Model:
 
 
 def _require_states(windows: Windows, kind: type) -> None:
-    """Raise `TypeError` if the torque needs a state with more parts than the measured states
-    have.
+    """Raise `TypeError` unless the measured states of the windows are of the type `kind`, which the
+    torque needs.
     """
     if not isinstance(windows.starts, kind):
         raise TypeError(
@@ -612,7 +631,9 @@ def _require_states(windows: Windows, kind: type) -> None:
 
 
 def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) -> None:
-    """Raise `ValueError` if the torque reads an input that a recording lacks."""
+    """Raise `ValueError` if the torque reads an input that is missing in the `inputs` of a
+    recording.
+    """
     for number, of_one in enumerate(inputs):
         missing = [name for name in inputs_of(torque) if name not in of_one]
         if missing:
@@ -624,7 +645,9 @@ def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) 
 
 
 def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
-    """Raise `ValueError` if windows lack an input of the torque, or samples that a delay reads."""
+    """Raise `ValueError` if the windows lack an input that the torque reads, or samples before or
+    after a window that a delayed input needs.
+    """
     missing = [name for name in inputs_of(torque) if name not in windows.inputs]
     if missing:
         have = ", ".join(map(repr, windows.inputs)) or "none"
@@ -638,7 +661,9 @@ def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
 
 
 def describe_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
-    """Describe the delays that, at the free numbers x, read inputs outside of their windows."""
+    """Describe the delays that, at the free numbers x, read samples of the inputs outside of the
+    windows; return one text for each delay.
+    """
     if model.clusters is None or not delays_of(model.torque):
         return []
     t, rows = np.asarray(model.records.t)[0], max(len(a[0]) for a in model.records.inputs.values())
@@ -662,7 +687,9 @@ def _samples_read(torque: Torque | None, recording: Recording) -> list[str]:
 
 
 def _require_even_times(torque: Torque | None, recording: Recording, number: int) -> None:
-    """Raise `ValueError` if the torque reads inputs that are samples at uneven times."""
+    """Raise `ValueError` if the torque reads inputs that are samples, and the times of the
+    recording are not evenly spaced.
+    """
     names, steps = _samples_read(torque, recording), np.diff(np.asarray(recording.t, float))
     if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
         raise ValueError(
@@ -673,7 +700,9 @@ def _require_even_times(torque: Torque | None, recording: Recording, number: int
 
 
 def _require_held_steps(integrator: object) -> None:
-    """Raise `ValueError` for an integrator that does not hold samples in its steps."""
+    """Raise `ValueError` unless the integrator is `None` or a `HeldSteps`, which holds samples
+    constant over each step.
+    """
     if integrator is not None and not isinstance(integrator, HeldSteps):
         raise ValueError(
             "integrator: samples as inputs are held through one step from each time to the next; "
@@ -683,7 +712,9 @@ def _require_held_steps(integrator: object) -> None:
 
 
 def _charts_and_names(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
-    """Return all recordings, the chart or charts, and the name of the body of each recording."""
+    """Return three things: the list of all recordings; the chart, or the `Bodies` of several
+    charts; and the name of the body of each recording.
+    """
     if isinstance(recording, Mapping) or isinstance(body, Mapping):
         if not (isinstance(recording, Mapping) and isinstance(body, Mapping)):
             raise TypeError(
@@ -715,8 +746,8 @@ def _charts_and_names(recording: Any, body: Any) -> tuple[list[Recording], Any, 
 
 
 def _require_recordings(recordings: Sequence[Any]) -> None:
-    """Raise an error unless these are known recordings, at least one, each of them without a
-    batch.
+    """Raise an error unless there is at least one recording, and each recording is concrete (not
+    traced by JAX) and not a batch.
     """
     if not recordings:
         raise ValueError("Model: wanted at least one Recording, got an empty sequence")
@@ -737,7 +768,7 @@ def _require_recordings(recordings: Sequence[Any]) -> None:
 
 
 def _numbers_in_chart(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " chart"]:
-    """Return the numbers of a body in a chart, or zeros, the start of the chart, for `None`."""
+    """Return the numbers that represent a body in a chart, or zeros for `None`."""
     if body is None:
         return _host_zeros(chart.size)
     one = validation.require_single_body(body, (Inertia, MassProperties), "body")
@@ -764,7 +795,7 @@ def _state_kind(
 ) -> type:
     """Return the smallest type of state that sensors and torque need.
 
-    It raises `ValueError` if they need a body with a mass and the chart has none.
+    It raises `ValueError` if a sensor or the torque needs a mass and the chart has none.
     """
     needed = [sensor.feels for sensor in sensors]
     if torque is not None:

@@ -1,4 +1,6 @@
-"""Solve normal equations from which the numbers of one recording alone are eliminated (Schur)."""
+"""Solve normal equations after elimination of the numbers that only one recording has (Schur
+complement).
+"""
 
 from collections.abc import Sequence
 
@@ -10,10 +12,16 @@ from jaxtyping import Array, Float, Int
 
 
 class OwnBlocks(eqx.Module):
-    """Hold the part of a normal matrix for the numbers that belong to one recording alone.
+    """Hold the blocks of a normal matrix for the numbers that belong to one recording alone.
 
-    **Fields:** `own` (R, k, k) the blocks of these numbers; `sides` (R, k, s) the blocks between
-    these numbers and those of the core; `at` (R, k) the places of these numbers among all numbers.
+    Each of the R recordings has k such own numbers. The core is the s numbers that recordings
+    share.
+
+    **Fields:**
+
+    - `own`: (R, k, k) the blocks of the own numbers of each recording.
+    - `sides`: (R, k, s) the blocks between the own numbers and the numbers of the core.
+    - `at`: (R, k) the indices of the own numbers among all n numbers.
     """
 
     own: Float[Array, "records k k"]
@@ -24,8 +32,9 @@ class OwnBlocks(eqx.Module):
 class NormalMatrix(eqx.Module):
     """Hold a normal matrix of n numbers.
 
-    **Fields:** `core` (s, s) the block of the first s numbers, which recordings share; `own_blocks`
-    the rest, or `None` if all n numbers are in the core.
+    **Fields:** `core` (s, s) the block of the core, which is the first s numbers, shared by
+    recordings; `own_blocks` the blocks of the other numbers, which belong to one recording each, or
+    `None` if all n numbers are in the core.
     """
 
     core: Float[Array, "s s"]
@@ -38,7 +47,7 @@ class NormalMatrix(eqx.Module):
         return self._join_rows(jnp.diagonal(self.core), own)
 
     def add_diagonal(self, diagonal: Float[Array, " n"]) -> "NormalMatrix":
-        """Return the matrix with the numbers `diagonal` added to its diagonal."""
+        """Return the matrix with `diagonal` (n,) added to its diagonal."""
         shared, own = self._split_rows(diagonal)
         core, alone = self.core + jnp.diag(shared), self.own_blocks
         if alone is None:
@@ -48,15 +57,19 @@ class NormalMatrix(eqx.Module):
         )
 
     def with_rows(self, rows: Float[Array, "m n"]) -> "NormalMatrix":
-        """Return the matrix with residuals added whose derivatives are `rows`.
+        """Return the normal matrix of a larger problem, which has m more residuals.
 
+        The `rows` (m, n) are the derivatives of the m residuals with respect to the n numbers.
         These residuals may depend only on numbers of the core.
         """
         rows = rows[:, : self.core.shape[0]]
         return NormalMatrix(self.core + rows.T @ rows, self.own_blocks)
 
     def in_units(self, unit: Float[Array, " n"]) -> "NormalMatrix":
-        """Return the matrix of the numbers if they are counted in the units `unit`."""
+        """Return the matrix D M D, where M is this matrix and D the diagonal matrix of `unit` (n,).
+
+        It is the normal matrix with respect to x / `unit` instead of the numbers x.
+        """
         shared, own = self._split_rows(unit)
         core, alone = self.core * (shared[:, None] * shared[None, :]), self.own_blocks
         if alone is None:
@@ -75,7 +88,9 @@ class NormalMatrix(eqx.Module):
         return self._join_rows(first, jnp.einsum("rkl,rl->rk", alone.own, own) + from_core)
 
     def solve(self, rhs: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
-        """Return the x with `matrix @ x = rhs`, or NaN unless the matrix is positive definite."""
+        """Return the solution x of `matrix @ x = rhs`, or NaN unless the matrix is positive
+        definite.
+        """
         alone, count = self.own_blocks, self.core.shape[0]
         if alone is None:
             return _solve_by_cholesky(self.core, rhs)
@@ -87,15 +102,19 @@ class NormalMatrix(eqx.Module):
         return self._join_rows(first, last).reshape(rhs.shape)
 
     def _split_rows(self, x: Array) -> tuple[Array, Array]:
-        """Return the rows of x (n, …) that belong to the core, and those (R, k, …) that belong to
-        one recording alone.
+        """Return two parts of x (n, …): the rows (s, …) of the core; and the rows (R, k, …) that
+        belong to one recording alone.
+
+        Without numbers of one recording alone both results are x.
         """
         return (
             (x, x) if self.own_blocks is None else (x[: self.core.shape[0]], x[self.own_blocks.at])
         )
 
     def _join_rows(self, shared: Array, own: Array | None) -> Array:
-        """Return all rows (n, …), from those of the core and those of one recording alone."""
+        """Return all rows (n, …), from the rows `shared` (s, …) of the core and the rows `own` (R,
+        k, …) of one recording alone.
+        """
         if self.own_blocks is None:
             return shared
         first, at = shared.shape[0], self.own_blocks.at
@@ -111,25 +130,31 @@ def _solve_by_cholesky(matrix: Array, rhs: Array) -> Array:
 def normal_of(
     blocks: Sequence[Array], places: Array, size: int, own: np.ndarray | None = None
 ) -> NormalMatrix:
-    """Return the normal matrix Σ JᵀJ of the blocks J (R, T, j, m) of all sensors.
+    """Return the normal matrix Σ JᵀJ of the Jacobians J (R, T, j, m) of all sensors.
+
+    J holds the derivatives of j residuals at T times with respect to the m numbers of one of R
+    recordings.
 
     **Arguments:**
 
     - `blocks`: J of each sensor.
-    - `places`: (R, m) the places of their columns among all numbers.
-    - `size`: the number of all numbers.
+    - `places`: (R, m) the index of each column of J among all numbers; a column that stands for no
+      number has the index `size`.
+    - `size`: how many numbers there are in all.
     - `own`: the columns of the numbers that one recording has alone; `None` puts all numbers into
-      the core.
+      the core, the dense first block of the result.
     """
     count, columns = places.shape
     alone = np.zeros(0, int) if own is None else own
     rest = np.setdiff1d(np.arange(columns), alone)
     squares = jnp.zeros((count, columns, columns), blocks[0].dtype)
     for rows in blocks:
-        # On a CPU a product of matrices takes a fifth of the time of an `einsum` over two axes.
+        # On a CPU this product of matrices takes a fifth of the time of an `einsum` that sums over
+        # the axes of times and residuals.
         flat = rows.reshape(count, -1, columns)
         squares = squares + flat.swapaxes(1, 2) @ flat
-    # A column without a number goes to an additional last row, which is dropped.
+    # A column that stands for no number is added to an additional last row and column, which are
+    # dropped below.
     last = size - count * alone.size
     at = jnp.minimum(places[:, rest], last)
     core = jnp.zeros((last + 1, last + 1), squares.dtype)

@@ -1,5 +1,5 @@
-"""Predict the states of a body at the times of a recording, and the readings of sensors along
-them.
+"""Predict the states of a body at the times of a recording, and the readings of sensors in these
+states.
 """
 
 import abc
@@ -33,13 +33,14 @@ from rigidjax.solve.fixed_loop import first_row, first_rows, step
 from rigidjax.solve.steppers import cheapest, stepper_of
 from rigidjax.solve.tableaus import KUTTA4
 
-# With TURN_A_STEP rad in a step, a method of order 5 has an error of 1e-9 a radian. With
-# TURN_OF_ORDER_4 a method of order 4 has this error, at two thirds of the cost of a step.
+# If the body turns by TURN_A_STEP rad in each step, a method of order 5 has an error of 1e-9 for
+# each radian of the turn. A method of order 4 has this error with TURN_OF_ORDER_4 rad in each step,
+# and one of its steps costs two thirds of a step of order 5.
 TURN_A_STEP, TURN_OF_ORDER_4 = 0.1, 0.02
 # More fixed steps than this number between two samples cost more than adaptive steps.
 FINEST = 32
-# Adaptive steps are refined to the relative tolerance _LEAST at most; each refinement has the
-# factor _CLOSER.
+# A refinement multiplies the relative tolerance of adaptive steps by _CLOSER. The tolerance never
+# becomes smaller than _LEAST.
 _LEAST, _CLOSER = 2.5e-14, 1e-2
 
 
@@ -49,9 +50,9 @@ State = Spin | Attitude | Rigid
 class AbstractIntegrator(eqx.Module):
     """Integrate a forced motion inside a fit, with derivatives in forward mode.
 
-    At its end a fit compares its predictions with those of shorter steps (`refine`). If a
-    prediction changes by more than a twentieth of its noise, the fit goes on with the shorter
-    steps.
+    At its end a fit compares its predictions with the predictions of an integrator of shorter steps
+    (`refine`). If a prediction changes by more than a twentieth of its noise, the fit goes on with
+    the shorter steps.
 
     >>> class Halves(AbstractIntegrator):  # two equal steps from one sample to the next
     ...     def states(self, body, state0, ts, torque):
@@ -70,20 +71,22 @@ class AbstractIntegrator(eqx.Module):
         """
 
     def refine(self) -> "AbstractIntegrator | None":
-        """Return an integrator of shorter steps for comparison, or `None` if there is none."""
+        """Return an integrator of shorter steps for comparison, or `None` if shorter steps are not
+        possible.
+        """
         return None
 
 
 class FixedSteps(AbstractIntegrator):
     """Integrate with the same number of fixed steps between any two samples.
 
-    It is the cheapest one if samples are close together, as in logs of 100 Hz and more.
+    It is the cheapest integrator if samples are close together, as in logs of 100 Hz and more.
 
     **Arguments:**
 
     - `substeps`: the number of steps between two samples.
-    - `solver`: the method, one of `rigidjax.solvers`; Tsitouras's of order 5 unless given.
-    - `last`: the index of the last time that is needed, `None` for all.
+    - `solver`: the method, one of `rigidjax.solvers`; by default Tsitouras's method of order 5.
+    - `last`: the index of the last time whose state is needed, `None` for all times.
 
     >>> FixedSteps(2).substeps
     2
@@ -113,8 +116,10 @@ class FixedSteps(AbstractIntegrator):
 
 
 def _tolerance_field(name: str) -> Callable[[ScalarLike], Array]:
-    """Return a function that converts a field to an array, so that another value compiles no new
-    program.
+    """Return a function that converts the value of the field `name` to an array.
+
+    A compiled program takes an array as an argument, so that another value needs no new
+    compilation.
     """
     return lambda value: jnp.asarray(_checks.known_float(value, name), jnp.result_type(float))
 
@@ -123,7 +128,7 @@ class Adaptive(AbstractIntegrator):
     """Integrate with steps that are chosen by tolerances, through `rigidjax.simulate`.
 
     **Arguments:** `rtol`, `atol` as for `rigidjax.simulate`. In float32 `rtol` is at least 1.2e-5.
-    Another tolerance does not compile again.
+    A fit with another tolerance is not compiled again.
 
     >>> float(Adaptive().rtol)
     1e-09
@@ -139,8 +144,8 @@ class Adaptive(AbstractIntegrator):
     def states(
         self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
     ) -> PyTree:
-        # The padding of a shorter record repeats its last time, which a solver refuses: let the
-        # repeated times grow a little.
+        # The padding of a shorter record repeats its last time, but a solver refuses equal times. A
+        # small growing time is added to the repeated times.
         first = jnp.zeros(1, bool)
         repeats = jnp.cumsum(jnp.concatenate([first, jnp.diff(ts) <= 0]).astype(ts.dtype))
         out = simulate(
@@ -163,7 +168,9 @@ class Adaptive(AbstractIntegrator):
 
 
 def integrator_for(turn: float) -> AbstractIntegrator:
-    """Return the integrator for a body that turns by at most `turn` rad between two samples."""
+    """Return an integrator that suits a body that turns by at most `turn` rad between two
+    samples.
+    """
     if turn <= TURN_OF_ORDER_4:
         return FixedSteps(1, solvers.RungeKutta4())
     substeps = max(1, math.ceil(turn / TURN_A_STEP))
@@ -187,10 +194,10 @@ def states_at(
 class HeldSteps(AbstractIntegrator):
     """Integrate with one step of order 4 between samples, and hold the inputs in each step.
 
-    Samples are evenly spaced. A delayed input changes inside a step, which is then split at the
-    change.
+    The samples must be evenly spaced in time. The value of a delayed input changes inside a step;
+    the step is then split at the change.
 
-    **Arguments:** `last` the index of the last time that is needed, `None` for all.
+    **Arguments:** `last` the index of the last time whose state is needed, `None` for all times.
 
     >>> HeldSteps().last
     """
@@ -212,9 +219,10 @@ class HeldSteps(AbstractIntegrator):
     ) -> PyTree:
         """Return the states at `ts` (T,) under a torque that is driven by `inputs`.
 
-        The inputs are arrays (before + T, *k) by name. Row before + i is held in the step from time
-        i, and the last row beyond the last time. A torque's own states follow the rows before the
-        first time, while the body is held at its initial state.
+        The inputs are arrays (before + T, *k) by name, where `before` is the number of samples
+        before the first time `ts[0]`. Row before + i is held constant in the step from `ts[i]` to
+        `ts[i + 1]`. The torque's own states (such as the state of a motor) are first integrated
+        over the rows before `ts[0]`, while the body is held at its initial state.
         """
         count, size = ts.shape[0] - 1, (ts[1] - ts[0]).astype(state0.omega.dtype)
         before = max((len(rows) - ts.shape[0] for rows in inputs.values()), default=0)
@@ -240,7 +248,11 @@ class HeldSteps(AbstractIntegrator):
 
 
 def shift_in_time(field: Callable[..., Any], t: Array, state: PyTree, offset: Array) -> PyTree:
-    """Return the state at t + `offset`, s, by four steps of the classical method of order 4."""
+    """Return the state at the time t + `offset`, s, from the `state` at the time t, s.
+
+    It takes four equal steps of the classical Runge–Kutta method of order 4 along the vector field
+    `field`.
+    """
     h = offset / 4.0
     for index in range(4):
         state = advance(KUTTA4, lambda t, y: field(t, y, None), t + index * h, h, state)
@@ -248,9 +260,10 @@ def shift_in_time(field: Callable[..., Any], t: Array, state: PyTree, offset: Ar
 
 
 def body_of_equations(body: Body, state_type: type) -> Body:
-    """Return the body of the equations of motion of a state of this type.
+    """Return the body as the equations of motion of a state of type `state_type` need it.
 
-    Only the equations of a `Rigid` need the mass; all others take the inertia alone.
+    Only the equations of motion of a `Rigid` state need the mass; for all other states the result
+    is the `Inertia`.
     """
     return body.inertia if isinstance(body, MassProperties) and state_type is not Rigid else body
 
@@ -264,17 +277,17 @@ def sensor_inputs(
     states: PyTree,
     delay: Array | None = None,
 ) -> tuple[Array, PyTree, Callable[[Array, PyTree], SensorInput]]:
-    """Return the times and states that a sensor reads, and the function that makes its input at one
-    time.
+    """Return three things: the times at which a sensor reads; the states at these times; and a
+    function that makes the `SensorInput` from one time and state.
 
     **Arguments:**
 
-    - `sensor`: it reads at t + `offset`, if its clock is behind.
-    - `body`, `torque`: of the motion.
-    - `ts`: (T,) the times of the readings.
+    - `sensor`: the sensor; if it has a clock offset, it reads at t + `offset` for the time stamp t.
+    - `body`, `torque`: the body and the torque of the motion.
+    - `ts`: (T,) the time stamps of the readings, s.
     - `state0`, `states`: the initial state, and the states at `ts`; `Coupled` if a torque has
       states of its own.
-    - `delay`: s, a further delay, one number or (T,).
+    - `delay`: a further time, s, that is added to the clock offset, one number or (T,).
     """
     turned = body_of_equations(body, type(state0))
     field = equations_of_motion(turned, state0, torque)
@@ -305,8 +318,9 @@ def errors_along(
     states: PyTree,
     input_at: Callable[[Array, PyTree], SensorInput],
 ) -> Float[Array, "times k"]:
-    """Return the errors of readings `values` (T, …) of a sensor, from the three results of
-    `sensor_inputs`.
+    """Return the errors (T, k) of readings `values` (T, …) of a sensor.
+
+    The arguments `times`, `states` and `input_at` are the three results of `sensor_inputs`.
     """
 
     def error(t: Array, state: PyTree, value: Array) -> Array:
@@ -315,13 +329,15 @@ def errors_along(
     lowpass = getattr(sensor, "lowpass", None)
     if lowpass is None:
         return jax.vmap(error)(times, states, values)
-    # The error of a zero reading is minus the prediction, which the filter then smooths.
+    # The error of a reading of zero is minus the prediction. The low-pass filter smooths this
+    # prediction, not the reading.
     return values + lowpass(times, jax.vmap(error)(times, states, jnp.zeros_like(values)))
 
 
 def _error_of(sensor: AbstractSensor, motion: SensorInput, value: Array) -> Array:
-    """Return the error of a reading after checks, since a user may have written the method
-    `error`.
+    """Return the error (k,) of the reading `value`, with a check of its shape and readable errors.
+
+    The checks are needed since a user may have written the sensor's method `error`.
     """
     name = type(sensor).__name__
     try:
@@ -360,12 +376,12 @@ def simulate_readings(
 
     - `sensor`: an `AbstractSensor`, or a sequence of them along one motion.
     - `body`, `state0`, `ts` (T,) s, `torque`: as for `rigidjax.simulate`. `MassProperties` are
-      allowed for all states; a sensor's `place` is then in their frame.
+      allowed for all states; a sensor's `place` is then in the frame of the `MassProperties`.
     - `key`: of `jax.random`, to add normal noise of the sensor's `noise`, and to scatter the times
-      by its `jitter`; `None` for readings without either.
+      by its `jitter`; `None` for readings without noise and jitter.
 
-    **Returns** readings (T, …) by the sensor's `reading_shape`, in its unit, for
-    `Recording(ts, (sensor, readings))`; for a sequence of sensors a tuple of them.
+    **Returns** readings (T, *reading_shape) in the sensor's unit, for `Recording(ts, (sensor,
+    readings))`; for a sequence of sensors a tuple with the readings of each sensor.
 
     **Raises:** `TypeError` for anything but a sensor, and for a state without the parts that the
     sensor reads; `ValueError` for a key if the sensor's noise is `None`, and for a sensor of your
@@ -429,8 +445,8 @@ def _readings(
 
 
 def _require_sensor(sensor: PyTree, state0: State, key: object) -> None:
-    """Raise an error unless this is a sensor that can read this state, with known noise if there is
-    a key.
+    """Raise an error unless `sensor` is a sensor that can read the state `state0`, and has a known
+    noise if a random `key` is given.
     """
     name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
     _checks.require_instance(sensor, AbstractSensor, "sensor", requirement=wanted)

@@ -17,7 +17,8 @@ class AbstractLoss(eqx.Module):
     """Define a robust loss ρ(s), a function of the squared length s of an error in units of its
     noise.
 
-    A reading counts as a whole, so that the loss does not depend on the frame.
+    The loss is a function of the length of a reading's error vector, so that it does not depend on
+    the frame.
 
     >>> class Squares(AbstractLoss):  # no outliers: ρ(s) = s
     ...     def shrink(self, error):
@@ -30,7 +31,7 @@ class AbstractLoss(eqx.Module):
 
     @abc.abstractmethod
     def shrink(self, error: Float[Array, " k"]) -> Float[Array, " k"]:
-        """Return the error scaled so that its square is ρ(s), for least squares."""
+        """Return the error (k,) scaled so that its squared length is ρ(s), for least squares."""
 
     @abc.abstractmethod
     def weight(self, error: Float[Array, " k"]) -> Scalar:
@@ -48,8 +49,8 @@ class SoftL1(AbstractLoss):
     It is `ρ(s) = 2c²(√(1 + s/c²) − 1)`, SciPy's `soft_l1` (Charbonnier et al. 1997,
     doi:10.1109/83.551699).
 
-    **Arguments:** `scale` c, the error at which it turns from quadratic to linear, in standard
-    deviations. **Raises:** `ValueError` for a scale that is not positive.
+    **Arguments:** `scale` c, the error at which the loss turns from quadratic to linear, in
+    standard deviations. **Raises:** `ValueError` for a scale that is not positive.
 
     >>> bool(jnp.linalg.norm(SoftL1(3.0).shrink(jnp.array([300.0, 0, 0]))) < 45)
     True
@@ -100,10 +101,10 @@ class Entropic(eqx.Module):
     two bodies.
 
     For a `Mass` chart D is `rigidjax.body.divergence`, the divergence of the pseudo-inertias J. For
-    other charts the second moments 𝔖 take the place of J; for a chart without a scale they are
-    divided by their traces. D is a sum of squares: with `J₀ = L₀ L₀ᵀ` of the guess and
-    `L₀⁻¹ J L₀⁻ᵀ = C Cᵀ`, `D = Σ_{i>j} c_ij² + Σ_i (c_ii² − 1 − 2 log c_ii)`. A weight w has the
-    effect of w/2 readings drawn from the guess.
+    other charts the matrices of second moments 𝔖 = ∫ r rᵀ dm take the place of J; for a chart
+    without a scale each 𝔖 is divided by its trace. D is a sum of squares: with the pseudo-inertia
+    `J₀ = L₀ L₀ᵀ` of the guess and `L₀⁻¹ J L₀⁻ᵀ = C Cᵀ`, `D = Σ_{i>j} c_ij² + Σ_i (c_ii² − 1 − 2 log
+    c_ii)`. A weight w has the effect of w/2 readings drawn from the guess.
 
     **Arguments:** `guess` an `Inertia`, or `MassProperties` for a `Mass` chart; `weight` w > 0.
     Source: Lee, Wensing and Park 2020, doi:10.1109/TRO.2019.2926491 (the divergence).
@@ -122,8 +123,10 @@ class Entropic(eqx.Module):
     def residuals(
         self, body: Inertia | MassProperties, to_scale: bool = True
     ) -> Float[Array, " n"]:
-        """Return numbers whose squares add up to `2 w D`, from the shapes of the bodies alone
-        unless `to_scale`.
+        """Return numbers whose squares add up to `2 w D`.
+
+        If `to_scale` is false, each matrix is divided by its trace first, so that D compares only
+        the shapes of the two bodies.
         """
         if isinstance(body, MassProperties) and isinstance(self.guess, MassProperties):
             here, there = _pseudo_inertia(body), _pseudo_inertia(self.guess)
@@ -144,7 +147,8 @@ def _root_of_divergence(c: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return `√(c² − 1 − 2 log c)` with the sign of c − 1, which is smooth through c = 1."""
     x = c - 1.0
     near = jnp.abs(x) < 1e-2
-    # The series is that of (x + 1)² − 1 − 2 log(1 + x) = 2 x² (1 − x/3 + x²/4 − x³/5 + …).
+    # This is the series in parentheses in (1 + x)² − 1 − 2 log(1 + x) = 2 x² (1 − x/3 + x²/4 − x³/5
+    # + …).
     series = 1.0 - x * (1 / 3 - x * (1 / 4 - x * (1 / 5 - x * (1 / 6 - x * (1 / 7 - x / 8)))))
     far = jnp.where(near, 2.0, c)
     exact = jnp.sign(far - 1.0) * jnp.sqrt(far * far - 1.0 - 2.0 * jnp.log(far))

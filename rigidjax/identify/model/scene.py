@@ -24,9 +24,9 @@ class Scene(eqx.Module):
     **Fields:**
 
     - `body`: the body.
-    - `torque`: the known torque on it, or `None`.
-    - `process`: the unknown torque on it, as noise, or `None`.
-    - `sensors`: in the order of the readings.
+    - `torque`: the known torque on the body, or `None`.
+    - `process`: the unknown torque on the body, as noise, or `None`.
+    - `sensors`: the sensors, in the order of the readings.
     - `start`: the state at the first time of the recording.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -43,7 +43,7 @@ class Scene(eqx.Module):
 
 
 def require_process(process: PyTree) -> None:
-    """Raise `TypeError` unless `process` is an unknown torque or a `Sum` of them."""
+    """Raise `TypeError` unless `process` is an unknown torque or a `Sum` of unknown torques."""
     wanted = "a RandomTorque, a CorrelatedTorque or a Sum of them"
     for part in parts_of(process) or (process,):
         _checks.require_instance(
@@ -52,7 +52,9 @@ def require_process(process: PyTree) -> None:
 
 
 def require_known_torque(torque: Torque | None) -> None:
-    """Raise `TypeError` for a torque with unknown parts, which belong to the process."""
+    """Raise `TypeError` if the torque or a summand of it is an unknown torque, which belongs in the
+    argument `process`.
+    """
     for part in parts_of(torque):
         if isinstance(part, RandomTorque | CorrelatedTorque):
             raise TypeError(

@@ -30,14 +30,14 @@ from rigidjax.rotation.barrier import batch_as, platform
 if TYPE_CHECKING:
     from rigidjax.identify.model.model import Model
 
-# A `Row` holds the free numbers of a recording; a `BodyIndex` is the index of its body, `None` for
-# one body.
+# A `Row` holds the free numbers of one recording. A `BodyIndex` is the index of the body of a
+# recording among several bodies, or `None` for one body.
 Row = Float[Array, " columns"]
 BodyIndex = Array | None
-# The blocks are the errors (R, T, k) of each sensor, and their derivatives (R, T, k, m) by the m
-# numbers of a row.
+# `Blocks` are two tuples with one array for each sensor: the errors (R, T, k); and the derivatives
+# (R, T, k, m) of these errors with respect to the m numbers of a row.
 Blocks = tuple[tuple[Array, ...], tuple[Array, ...]]
-# The noise holds the standard deviations (R, k) of each sensor, for R recordings and k components.
+# `Noise` holds the standard deviations (R, k) of each sensor, for R recordings and k components.
 Noise = tuple[Float[Array, "records _"], ...]
 
 
@@ -57,7 +57,9 @@ def scene_from_row(
 
 
 def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[Any, Any]:
-    """Return the states at the times of a recording, and the torque with its inputs."""
+    """Return two things: the states at the times of a recording; and the torque with the inputs of
+    the recording bound to it.
+    """
     assert scene.body is not None and scene.start is not None
     body: Any = body_of_equations(scene.body, model.state_kind)
     functions = {name: source for name, source in record.inputs.items() if callable(source)}
@@ -72,7 +74,7 @@ def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[An
 
 
 def torque_of_scene(scene: Scene, record: Recording) -> Torque | None:
-    """Return the torque of a scene, which reads the inputs of a recording."""
+    """Return the torque of a scene with the inputs of a recording bound to it, or `None`."""
     return bind(scene.torque, sources_of(record))
 
 
@@ -84,15 +86,16 @@ def errors_of_recording(
     body_index: BodyIndex,
     delay: Array | None = None,
 ) -> tuple[Array, ...]:
-    """Return the errors (T, k) of each sensor in one recording, in its unit, with zero for a masked
-    reading.
+    """Return the errors (T, k) of each sensor in one recording, in the unit of the sensor.
+
+    The error is reading minus prediction; it is zero for a masked reading.
 
     **Arguments:**
 
     - `row`: the free numbers of the recording.
-    - `record`, `reference`: its readings, and its reference state.
-    - `body_index`: the index of its body.
-    - `delay`: s, by which all clocks are behind, in addition to their offsets.
+    - `record`, `reference`: the readings of the recording, and its reference state.
+    - `body_index`: the index of the body of the recording, or `None` for one body.
+    - `delay`: a time, s, that is added to the clock offset of each sensor; `None` for none.
     """
     scene = scene_from_row(model, row, record, reference, body_index)
     return errors_of_scene(model, scene, record, delay)
@@ -101,7 +104,9 @@ def errors_of_recording(
 def errors_of_scene(
     model: "Model", scene: Scene, record: Recording, delay: Array | None = None
 ) -> tuple[Array, ...]:
-    """Return the errors of `errors_of_recording` from the scene of the recording."""
+    """Return the same errors (T, k) of each sensor as `errors_of_recording`, for a given scene of
+    the recording.
+    """
     states, torque = motion_of_scene(model, scene, record)
     assert scene.body is not None and scene.start is not None
     out, motion = [], (scene.body, torque, record.t, scene.start, states)
@@ -112,10 +117,12 @@ def errors_of_scene(
 
 
 def over_records(function: Callable[..., PyTree], model: "Model", *rows: PyTree) -> Any:
-    """Return `function(*rows, record, reference, body_index)` of every recording.
+    """Return `function(*rows, record, reference, body_index)` of every recording, with a leading
+    axis of recordings.
 
-    On a CPU the recordings follow one after another: XLA makes one kernel of a loop over a few
-    dozen numbers, whereas batched scalars in the inner loop run at half the speed.
+    On a CPU the recordings are computed one after another. XLA compiles the loop of one recording,
+    over a few dozen numbers, to one kernel; batched over recordings, this loop runs at half the
+    speed.
     """
     trees = *rows, model.records, model.reference, model.body_indices
     arrays, rest = eqx.partition(trees, eqx.is_array)
@@ -136,7 +143,7 @@ def over_records(function: Callable[..., PyTree], model: "Model", *rows: PyTree)
 def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
     """Return the errors (R, T, k) of each sensor at the free numbers x.
 
-    Derivatives by x are computed recording by recording, in forward mode.
+    Derivatives with respect to x are computed recording by recording, in forward mode.
     """
     return by_recording(model.index.rows(x), model, errors_of_recording)
 
@@ -147,7 +154,8 @@ def by_recording(
 ) -> Any:
     """Return `function(model, row, record, reference, body_index)` of every recording.
 
-    Only derivatives by the rows are defined; they are those of `errors_and_jacobians`.
+    Only derivatives with respect to the rows are defined. They are computed as in
+    `errors_and_jacobians`.
     """
 
     def function_of_row(row: Row, *rest: PyTree) -> Any:
@@ -158,7 +166,9 @@ def by_recording(
 
 @by_recording.def_jvp
 def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
-    """Return the value and the tangent of `by_recording`."""
+    """Return two things: the value of `by_recording`; and its tangent along the tangent of the
+    rows.
+    """
     (rows, model, function), (step, *rest) = primals, tangents
     if jax.tree.leaves(rest):
         raise TypeError(
@@ -173,10 +183,11 @@ def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree
 def errors_and_jacobians(
     model: "Model", x: Float[Array, " n"], function: Callable[..., PyTree] = errors_of_recording
 ) -> tuple[Any, Any]:
-    """Return `function` of every recording, and its derivatives (R, …, m) by the free numbers.
+    """Return two things: `function` of every recording (R, …); and its derivatives (R, …, m) with
+    respect to the free numbers.
 
-    The m derivatives are in the columns of `model.index`. Readings are differentiated by free
-    numbers in this function and nowhere else.
+    The m columns are those of `model.index.places`. Derivatives of readings with respect to free
+    numbers are computed by this function and nowhere else.
     """
     out, slopes = _values_and_jacobians(model, model.index.rows(x), function)
     columns = jnp.asarray(model.index.columns, jnp.int32)
@@ -188,10 +199,13 @@ def errors_and_jacobians(
 def _values_and_jacobians(
     model: "Model", rows: Array, function: Callable[..., PyTree[Array]]
 ) -> tuple[PyTree[Array], PyTree[Array]]:
-    """Return `function` of every recording, and its derivatives by the columns of the rows."""
+    """Return two things: `function` of every recording; and its derivatives with respect to the
+    numbers in the row of the recording.
+    """
 
     def value_and_jacobian(row: Row, *rest: PyTree) -> tuple[PyTree, PyTree]:
-        # For a dozen numbers and one long loop forward mode is cheaper to compile and to run.
+        # Forward mode is cheaper than reverse mode, to compile and to run, for a dozen numbers and
+        # one long loop over time.
         slopes, out = with_jacobian(lambda row: function(model, row, *rest), row)
         return out, slopes
 
@@ -214,8 +228,8 @@ def delay_derivatives(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Arra
 
 
 def with_jacobian(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tuple[Any, Any]:
-    """Return the derivative (…, n) of a function at x, in forward mode, and the value (…) of the
-    function.
+    """Return two things, computed in forward mode: the derivatives (…, n) of a function at x with
+    respect to x; and the value (…) of the function.
     """
 
     def value_and_aux(x: Array) -> tuple[PyTree, PyTree]:
@@ -226,7 +240,9 @@ def with_jacobian(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tu
 
 
 def whiten(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors (R, T, k) of each sensor as `standardised_errors` scales them."""
+    """Return the errors (R, T, k) of each sensor in standard deviations, the first result of
+    `standardised_errors`.
+    """
     out = []
     for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
         limit = getattr(reading.sensor, "limit", None)
@@ -238,12 +254,12 @@ def whiten(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, ".
 def decorrelate(
     e: Float[Array, "*rows k"], v: Float[Array, "*rows k"]
 ) -> tuple[Float[Array, "*rows k"], Float[Array, "*rows k"]]:
-    """Return errors that are independent and of variance one, from errors e (…, k) of covariance
-    `1 + v vᵀ`.
+    """Return two arrays (…, k), from errors e (…, k) whose covariance is `1 + v vᵀ`: independent
+    errors of variance one; and the logarithms of conditional variances.
 
-    They are `L⁻¹ e`, with L the Cholesky factor of the covariance. The second result is the
-    logarithms of the squared diagonal of L, which are those of the variance of each error given the
-    errors before it.
+    The independent errors are `L⁻¹ e`, where L is the Cholesky factor of the covariance. The
+    conditional variance of a component is its variance if all components before it are given, which
+    is the square of the diagonal element of L.
     """
     along, total = jnp.cumsum(v * e, axis=-1), 1.0 + jnp.cumsum(v * v, axis=-1)
     none = jnp.zeros_like(total[..., :1])
@@ -255,10 +271,11 @@ def decorrelate(
 def in_deviations(
     x: Array | np.ndarray, sigma: Array | np.ndarray, jitter_error: Array | None
 ) -> Float[Array, "..."] | Float[np.ndarray, "..."]:
-    """Return changes x (R, T, k, n) of a sensor's errors, in standard deviations.
+    """Return changes x (R, T, k, n) of a sensor's errors, converted to standard deviations.
 
-    They are scaled as `standardised_errors` scales the errors, with the noise `sigma` (R, k) and
-    the error `jitter_error` (R, T, k) by a time stamp.
+    The changes are scaled as `standardised_errors` scales the errors themselves, with the noise
+    `sigma` (R, k). If there is a `jitter_error` (R, T, k), which is the error due to a time stamp
+    that is one standard deviation late, they are also made independent by `decorrelate`.
     """
     x = x / sigma[:, None, :, None]
     if jitter_error is None:
@@ -274,19 +291,19 @@ def standardised_errors(
     limit: Float[Array, " k"] | None,
     jitter_error: Float[Array, "times k"] | None,
 ) -> tuple[Float[Array, "times k"], Bool[Array, "times k"], Float[Array, "times k"] | None]:
-    """Return the errors of one sensor in standard deviations, a mask of saturated channels, and the
-    effect of jitter.
+    """Return three things: the errors of one sensor in standard deviations; a mask of saturated
+    channels; and the effect of jitter.
 
-    The effect of jitter is the logarithm of the factor by which it multiplies each variance, or
-    `None` without jitter. A saturated channel says "at least that much", and counts as
-    `√(−2 log Φ(z))`, where z is the excess of the prediction over the limit (Tobin 1958,
-    doi:10.2307/1907382).
+    The effect of jitter is the logarithm of the factor by which jitter multiplies each variance, or
+    `None` without jitter. A saturated channel says "at least that much". Its error is `√(−2 log
+    Φ(z))` in magnitude, where z is the excess of the prediction over the limit in standard
+    deviations and Φ is the normal distribution function (Tobin 1958, doi:10.2307/1907382).
 
     **Arguments:**
 
-    - `values`, `mask`: the readings, and where there are any.
-    - `error`: (T, k) in the unit of the sensor.
-    - `sigma`: (k,) the noise.
+    - `values`, `mask`: the readings, and a mask (T,) that is true where there is a reading.
+    - `error`: (T, k) reading minus prediction, in the unit of the sensor.
+    - `sigma`: (k,) the standard deviation of the noise, in this unit.
     - `limit`: (k,) the full scale, or `None`.
     - `jitter_error`: (T, k) the error that a time stamp makes if it is one standard deviation late,
       or `None`.
@@ -297,15 +314,16 @@ def standardised_errors(
         full = (jnp.abs(values) >= limit[None] * (1 - 1e-6)) & mask[:, None]
     if jitter_error is not None:
         v = jitter_error / sigma[None]
-        # The reading of a channel at full scale does not tell the error of its time stamp.
+        # The reading of a channel at full scale carries no information about the error of its time
+        # stamp.
         white, wider = decorrelate(scaled, jnp.where(full, 0.0, v))
         scaled = jnp.where(full, scaled / jnp.sqrt(1.0 + v * v), white)
     if limit is None:
         return scaled, full, wider
     side = jnp.sign(values)
     z = jnp.where(full, -side * scaled, 0.0)
-    # Beyond five standard deviations the term is set to zero, since its root has no derivative at
-    # zero.
+    # For a large z the root underflows to zero, where a square root has no derivative. The error is
+    # therefore set to zero beyond z = 5.
     root = jnp.sqrt(-2.0 * jax.scipy.special.log_ndtr(jnp.minimum(z, 5.0)))
     return jnp.where(full, -side * jnp.where(z < 5.0, root, 0.0), scaled), full, wider
 
@@ -315,7 +333,8 @@ def reading_residuals(
 ) -> tuple[Array, ...]:
     """Return the residuals (R, T, k) of the readings of each sensor, for least squares.
 
-    They are whitened, shrunk by the robust loss, and multiplied by the `weights`.
+    The errors are divided by their standard deviations, shrunk by the robust loss, and multiplied
+    by the `weights` (R, T).
     """
     out = []
     for scaled in whiten(model, errors, noise):
@@ -328,18 +347,20 @@ def reading_residuals(
 def residuals_and_jacobians(
     function: Callable[[tuple], tuple], errors: tuple, slopes: tuple
 ) -> tuple[tuple, tuple]:
-    """Return `function(errors)`, and its derivatives (R, T, k, n) from the `slopes` of the
-    errors.
+    """Return two things: `function(errors)`; and its derivatives (R, T, k, n) with respect to n
+    numbers, from the derivatives `slopes` of the errors with respect to these numbers.
     """
-    # Each residual depends on the errors of its own reading alone, so that this is cheap.
+    # Each residual depends only on the errors of the same reading, so that this product with the
+    # derivative is cheap.
     value, push = jax.linearize(function, errors)
     return value, jax.vmap(push, in_axes=-1, out_axes=-1)(slopes)
 
 
 def prior_weights(model: "Model") -> Float[Array, " n"]:
-    """Return one over the standard deviation of the prior of each free number, a prior about zero.
+    """Return the weight (n,) of each free number: one over the standard deviation of its prior,
+    whose mean is zero.
 
-    It is zero for a number without a prior.
+    The weight is zero for a number without a prior.
     """
     weights = jnp.zeros(model.index.size, model.records.t.dtype)
     for slot in model.slots:
@@ -353,8 +374,8 @@ def prior_weights(model: "Model") -> Float[Array, " n"]:
 
 
 def extra_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-    """Return the residuals that depend on several numbers, which are those of the prior of the body
-    and of a pull.
+    """Return the residuals (j,) of the prior of the body and of an `AbstractPull`, each of which
+    may depend on several free numbers.
     """
     out = [jnp.zeros(0, x.dtype)]
     if model.prior is not None:
@@ -367,8 +388,8 @@ def extra_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]
 
 
 def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """Return all residuals that do not belong to readings: n of the priors, then the
-    `extra_residuals`.
+    """Return all residuals that do not belong to readings: first n residuals of the priors of the n
+    free numbers, then the `extra_residuals`.
     """
     return jnp.concatenate([prior_weights(model) * x, extra_residuals(model, x)])
 
@@ -376,7 +397,7 @@ def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]
 def reading_weights(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
     """Return the weight (R, T) of each reading in the normal equations.
 
-    The robust loss gives the weight; it is zero for a masked reading.
+    The weight is dρ/ds of the robust loss ρ, or 1 without a loss. It is zero for a masked reading.
     """
     masks = [reading.mask for reading in model.records.readings]
     if model.loss is None:
@@ -387,5 +408,5 @@ def reading_weights(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[
 
 
 def half_sum(tree: PyTree) -> Float[Array, ""]:
-    """Return half the sum of the squares of all leaves."""
+    """Return half the sum of the squares of all numbers in a tree of arrays."""
     return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

@@ -45,12 +45,12 @@ class Walk(eqx.Module):
 
 
 class Drift(eqx.Module):
-    """Hold a `Walk` whose leaf in the scene has been found.
+    """Hold a `Walk` whose leaf in the scene (as a JAX tree) has been found.
 
-    It contains no function, so that a second model does not compile again.
+    It contains no function, since a new function in a second model would force a new compilation.
 
-    **Fields:** `path` of the leaf in the scene; `deviation` and `density` of the `Walk`, in the
-    shape of the leaf.
+    **Fields:** `path` the path of the leaf in the scene; `deviation` and `density` those numbers of
+    the `Walk`, broadcast to the shape of the leaf.
     """
 
     path: tuple[Any, ...] = eqx.field(static=True)
@@ -83,12 +83,14 @@ def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]
 
 
 def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
-    """Return the numbers of a scene that drift."""
+    """Return the values of the drifting sensor errors of a scene, one array for each of the
+    `drifts`.
+    """
     return leaves_at(scene, [drift.path for drift in drifts])
 
 
 def require_nonnegative(value: NumbersLike, name: str) -> Array:
-    """Return the numbers `value` as an array, and raise `ValueError` unless they are finite and not
+    """Return `value` as an array, and raise `ValueError` unless its numbers are finite and not
     below zero.
     """
     array, wanted = _checks.numeric_array(value, name), "a finite number that is not below zero"
@@ -98,9 +100,10 @@ def require_nonnegative(value: NumbersLike, name: str) -> Array:
 
 
 def broadcast_to_shape(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
-    """Return one number, or numbers of this `shape`, as an array of this shape.
+    """Return `value`, one number or an array of shape `shape`, broadcast to `shape`.
 
-    It raises `ValueError` for another shape, or for a number below zero.
+    It raises `ValueError`, in which the argument is called `name`, if `value` has another shape, or
+    a number below zero.
     """
     numbers = require_nonnegative(value, name)
     if numbers.shape not in ((), shape):

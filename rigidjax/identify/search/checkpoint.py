@@ -1,4 +1,6 @@
-"""Write the finished starts of a fit to a file, from which a killed search can continue."""
+"""Write the results of the finished starts of a fit to a file, from which a killed search can
+continue.
+"""
 
 import contextlib
 import dataclasses
@@ -20,7 +22,9 @@ from rigidjax.identify.search.stages import Attempt
 
 
 def without_arrays(attempt: Attempt) -> Attempt:
-    """Return the attempt without its errors and their derivatives, which take much memory."""
+    """Return the attempt with `blocks` set to `None`: the errors and derivatives take much
+    memory.
+    """
     return attempt if attempt.blocks is None else dataclasses.replace(attempt, blocks=None)
 
 
@@ -52,7 +56,7 @@ def require_folder(path: str | Path) -> None:
 def fingerprint(*trees: PyTree) -> str:
     """Return a hash of the numbers and the structure of `trees`, equal in every process.
 
-    A function counts by its name alone.
+    Of a function only the name enters the hash.
     """
     leaves, structure = jax.tree.flatten(trees)
     words, digest = [repr(structure)], hashlib.sha256()
@@ -63,13 +67,14 @@ def fingerprint(*trees: PyTree) -> str:
         array = np.asarray(leaf)
         words.append(f"{array.dtype} {array.shape}")
         digest.update(array.tobytes())
-    # Leave out addresses in memory, which differ between processes.
+    # Addresses in memory are left out, since they differ between processes.
     digest.update(re.sub("0x[0-9a-f]+", "", "\n".join(words)).encode())
     return digest.hexdigest()
 
 
 class Checkpoint:
-    """Hold the end of the search from each finished start, and save these ends to a file.
+    """Hold the result (an `Attempt`) of the search from each finished start, and save the results
+    to a file.
 
     **Arguments:**
 
@@ -90,7 +95,9 @@ class Checkpoint:
             self._read(self.path)
 
     def save(self, attempts: Sequence[Attempt]) -> None:
-        """Write the finished `attempts` to the file, which is replaced in one step."""
+        """Write the finished `attempts` to the file; the old file is replaced in one (atomic)
+        step.
+        """
         if self.path is None:
             return
         head = dict(print_of=self.print_of, done=len(attempts))
@@ -112,7 +119,9 @@ class Checkpoint:
                 part.unlink(missing_ok=True)
 
     def _read(self, path: Path) -> None:
-        """Read the finished starts of a file; raise `ValueError` for a file of another search."""
+        """Read the results of the finished starts from a file; raise `ValueError` for a file of
+        another search.
+        """
         try:
             with path.open("rb") as file:
                 head = json.loads(file.readline())

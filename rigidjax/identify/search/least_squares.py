@@ -1,4 +1,6 @@
-"""Minimise a cost by the method of Levenberg and Marquardt, for any kind of normal equations."""
+"""Minimise a cost by the method of Levenberg and Marquardt, for dense or block-structured normal
+equations.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,31 +14,35 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from rigidjax.identify.model.normal import NormalMatrix
 
-# The damping of a first step is in units of the diagonal of the normal equations (Marquardt 1963):
-# a damping of one makes a step half as long as a Gauss–Newton step.
+# CAREFUL and BOLD are the damping of a first step that is cautious, and of one that is close to a
+# Gauss–Newton step. The unit of a damping is the diagonal of the normal equations (Marquardt 1963):
+# if the normal matrix is diagonal, a damping of one halves a Gauss–Newton step.
 CAREFUL, BOLD = 1.0, 1e-3
-# One step changes a number that is scaled to order one by no more than this.
+# One step changes a number of order one by no more than this.
 LONGEST = 2.0
 # A step with at most this damping counts as a Gauss–Newton step.
 FREE = 1e-2
-# A step supports the quadratic model of the cost if its actual gain is more than this part of its
-# predicted gain.
+# The gain of a step is the fall of the cost. A step supports the quadratic model of the cost if its
+# actual gain is more than this fraction of its predicted gain.
 FAIR = 0.25
-# The problem counts as linear if the ratio of actual to predicted gain is as near to one as this.
+# The problem counts as linear if the ratio of actual to predicted gain differs from one by less
+# than this.
 LINEAR = 0.05
 # A search ends if it would need more than PATIENCE steps, at its present pace, to reach the cost at
-# which another search ended. The pace is the fall of the logarithm of the misfit in a step,
-# averaged over all steps; in this average each step counts half as much as the next one.
+# which another search ended. The pace is the mean fall of the logarithm of the cost in a step. In
+# this mean the weight of each step is half the weight of the next step. FIRST_PACE is the pace
+# before the first step.
 PATIENCE, FIRST_PACE = 25.0, 4.0
-# A search with more damping than this is stuck: no step moves it any more.
+# A search with more damping than this is stuck: its steps are too short to change the point.
 STUCK = 1e12
-# A cost counts as noisy, like the cost by adaptive integration, if three things are true. Two steps
-# in succession are refused. The second step raises the cost by more than NOISY times its predicted
-# gain, and by a larger multiple of it than the first step does. The predicted gain is less than
-# LITTLE of the cost. A smooth cost is raised by smaller and smaller multiples as steps get shorter.
+# A cost counts as noisy, such as a cost computed by adaptive integration, if three things are true.
+# Two steps in succession are refused. The second step raises the cost by more than NOISY times its
+# predicted gain, and by a larger multiple of this gain than the first step does. The predicted gain
+# is less than the fraction LITTLE of the cost. A smooth cost is raised by smaller and smaller
+# multiples of the predicted gain as steps get shorter.
 NOISY, LITTLE = 10.0, 1e-4
-# Errors of sensors of unknown noise are taken to be at least this part of their unit: smaller
-# errors are round-off.
+# Errors of sensors of unknown noise are taken to be at least this fraction of the unit of the
+# errors: smaller errors are round-off.
 EXACT = 1e-6
 
 
@@ -51,19 +57,19 @@ def _setting_as_array(value: ArrayLike) -> np.ndarray:
 class Settings(eqx.Module):
     """Hold the settings of a search as arrays: another value does not compile the search again.
 
-    **Arguments**; zero switches each of the last four off:
+    **Arguments**; each of the last four is switched off by zero:
 
     - `tolerance`: the search has converged if the next step changes each number by less than this
-      many of its standard deviations with all other numbers fixed.
+      many standard deviations of the number, computed with all other numbers fixed.
     - `damping`: the damping of the first step.
     - `steps`: the largest number of steps.
     - `aim`: a cost that another search reached; this search ends if it would need more than
-      `PATIENCE` steps to reach it at its present pace.
-    - `near`: the search ends at this cost.
-    - `count`: the number of errors, if their size is unknown; the standard deviation of an error is
-      then the root of their mean square. It is one otherwise.
-    - `level`: the search ends after a step that gains about what was predicted, but less than this
-      part of what a fit gains from noise alone.
+      `PATIENCE` steps to reach this cost at its present pace.
+    - `near`: the search ends at a cost of this value or less.
+    - `count`: the number of errors, if the noise is unknown; the standard deviation of an error is
+      then estimated by the root mean square of all errors. With zero it is one.
+    - `level`: the search ends after a step whose gain is about the predicted gain, but less than
+      this fraction of the gain of a fit from noise alone.
     """
 
     tolerance: Any = eqx.field(converter=_setting_as_array)
@@ -83,15 +89,15 @@ class LMState(eqx.Module):
     - `first`: the cost at the start.
     - `point`: the best point so far.
     - `cost`, `normal`, `slope`: the cost, its normal matrix and its gradient at the best point.
-    - `trial`, `hoped`: the next point, and its predicted gain.
+    - `trial`, `hoped`: the next point to evaluate, and the predicted gain there.
     - `damping`: the damping of the step to the next point.
     - `pace`: the mean fall of the logarithm of the cost in a step.
     - `taken`: the number of evaluations.
     - `done`, `converged`: whether the search has ended, and whether it converged.
     - `evaluation`, `evaluated_at_best`: the values kept from the last evaluation, and whether this
       evaluation was at the best point.
-    - `rise`: the rise of the cost at the last trial over its predicted gain; zero if the trial was
-      better.
+    - `rise`: the rise of the cost at the last trial point divided by the predicted gain; zero if
+      the trial point was better.
     """
 
     first: Float[Array, ""]
@@ -133,13 +139,14 @@ def minimise(
       information as the normal matrix (scoring).
     - `start`: (n,) the point at which the search begins; if no steps are allowed, only this point
       is evaluated.
-    - `order_one`: (n,) one for numbers of order one, which no step moves far; zero for other
-      numbers.
+    - `order_one`: (n,) one for numbers of order one, which no step changes by more than `LONGEST`;
+      zero for other numbers.
     - `settings`: the settings of the search.
     - `zeros`: a tree of zeros with the shapes of the values to keep.
-    - `zero_normal`: zeros of the shapes of the normal matrix, if it has more than a core.
-    - `gain_of_noise`: a function from the kept values and the normal matrix to the gain of a fit
-      from noise alone (see `Settings.level`), or `None`.
+    - `zero_normal`: zeros with the shapes of the normal matrix, if it is not one dense matrix
+      (`NormalMatrix.own_blocks`).
+    - `gain_of_noise`: given the kept values and the normal matrix, this function returns the gain
+      of a fit from noise alone (see `Settings.level`); or `None`.
     """
     number, kind = start.size, start.dtype
     begun = LMState(
@@ -175,8 +182,9 @@ def _next_state(
 ) -> LMState:
     """Return the state of a search after an evaluation of its trial point.
 
-    The state holds the next trial point. **Arguments:** `state` the state before the evaluation;
-    `evaluation` the result of `evaluate` at its trial point; the others as for `minimise`.
+    The new state holds the next trial point. **Arguments:** `state` the state before the
+    evaluation; `evaluation` the result of `evaluate` at the trial point of this state; all other
+    arguments as for `minimise`.
     """
     values, cost, normal, slope = evaluation
     parts = jax.tree.leaves((cost, normal, slope))
@@ -185,7 +193,8 @@ def _next_state(
     better = finite & ((cost < state.cost) | first)
     ratio = (state.cost - cost) / jnp.where(state.hoped > 0, state.hoped, 1.0)
     grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > FAIR, 0.5, 2.0))
-    # If the misfit falls like that of a linear problem, damping only makes steps shorter.
+    # If the cost falls as predicted by the linear model, damping is not needed and only makes steps
+    # shorter.
     linear = (jnp.abs(ratio - 1.0) < LINEAR) & (state.damping > FREE)
     grown = jnp.where(linear, 0.01, grown)
     damping = state.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
@@ -213,7 +222,8 @@ def _next_state(
     size = jnp.sqrt(2.0 * jnp.maximum(cost, 0.0) / jnp.maximum(settings.count, 1.0))
     unit = jnp.where(settings.count > 0, jnp.maximum(size, EXACT), 1.0)
     small = (jnp.max(jnp.abs(move) * root) < settings.tolerance * unit) & (damping <= FREE)
-    # Round-off refuses every step at the minimum itself: stop if nothing can be gained.
+    # At the minimum itself round-off makes every step look worse, and each is refused. The search
+    # stops if the predicted gain is only round-off.
     bottom = hoped <= 1e-14 * jnp.abs(cost)
     ended = small if gain_of_noise is None else small | flat
     converged = sound & (ended | noisy | (bottom & ~better & ~first))
@@ -244,7 +254,8 @@ def _next_state(
 def _damped_step(
     normal: NormalMatrix, slope: Array, order_one: Array, damping: Array
 ) -> tuple[Array, Array]:
-    """Return the damped step (n,) from a point, and the root (n,) of the normal matrix's diagonal.
+    """Return two things: the damped step (n,) from a point; and the square root (n,) of the
+    diagonal of the normal matrix.
 
     **Arguments:** `normal` and `slope` the normal matrix and the gradient at the point; `order_one`
     as for `minimise`; `damping` in units of the diagonal of the normal matrix. The step is
@@ -252,7 +263,8 @@ def _damped_step(
     """
     diagonal = normal.diagonal
     diagonal = jnp.maximum(diagonal, jnp.maximum(1e-12 * jnp.max(diagonal), 1e-300))
-    # Scale columns to length one, so that Cholesky's factor loses no digits to units.
+    # Columns are scaled to length one, so that the Cholesky factorisation loses no digits if units
+    # are very different.
     root = jnp.sqrt(diagonal)
     damped = damping * jnp.maximum(diagonal, order_one) / root**2
     move = -normal.in_units(1.0 / root).add_diagonal(damped).solve(slope / root) / root

@@ -13,24 +13,26 @@ from rigidjax.identify.model.terms import Blocks, Noise, delay_derivatives, read
 from rigidjax.identify.uncertainty.covariance import linearise, white_covariance
 from rigidjax.identify.uncertainty.degrees_of_freedom import leverages
 
-# The estimate of noise and jitter together takes at most this many rounds.
+# The joint estimate of noise and jitter takes at most this many iterations.
 ROUNDS = 500
 
 
 def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tuple[Model, Noise]:
-    """Return the model with the estimated jitter of its sensors, and the noise of its sensors.
+    """Return two things: the model with the estimated jitter of its sensors; and the noise of its
+    sensors.
 
-    The noise (R, k) of a sensor with k channels in R recordings is the given one. If none is given
-    it is the scatter of the sensor's errors: one number for all channels and for all recordings of
-    a group. Fitted numbers make the errors smaller, by a large part if readings are few. The
-    estimate is corrected for this part, which is the leverage of the sensor at the present `noise`,
-    as in restricted maximum likelihood.
+    The noise (R, k) of a sensor with k channels in R recordings is the noise that the sensor
+    states. If the sensor states no noise, it is estimated from the scatter of the sensor's errors,
+    as one number for all channels and for all recordings of a group. A fit makes the errors smaller
+    than the noise, by a large factor if readings are few. The estimate is corrected for this effect
+    by the leverage of the sensor's readings at the present `noise`, as in restricted maximum
+    likelihood.
 
     **Arguments:**
 
     - `x`: (n,) the free numbers of the `model`.
     - `blocks`: the errors and derivatives at x, as `terms.errors_and_jacobians` returns them.
-    - `noise`: the present estimate.
+    - `noise`: the present estimate of the noise, (R, k) of each sensor.
     """
     errors = blocks[0]
     weights = reading_weights(model, errors, noise)
@@ -52,7 +54,8 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
                 variance = parts / np.maximum(np.bincount(groups, mask.sum(axis=(1, 2))), 1)
             else:
                 variance = _variance_by_median(squares, mask, groups)
-            # Noise is at least round-off, since even the errors of perfect data are divided by it.
+            # The noise is never less than round-off, since even the errors of perfect data are
+            # divided by the noise.
             floor = 1e-15 * float(np.abs(np.asarray(reading.values)).max() + 1e-300)
             each = np.maximum(np.sqrt(variance / share), floor)[groups]
             each = np.broadcast_to(each[:, None], sigma.shape)
@@ -74,7 +77,9 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
 
 
 def initial_noise(model: Model) -> Noise:
-    """Return the noise of each sensor, or a tenth of its signal if its noise is to be estimated."""
+    """Return the noise (R, k) of each sensor; it is a tenth of the sensor's signal if it is to be
+    estimated.
+    """
     out = []
     for reading in model.records.readings:
         sensor = reading.sensor
@@ -92,9 +97,9 @@ def _variance_by_median(squares: np.ndarray, mask: np.ndarray, groups: np.ndarra
     """Return the variance of each group's errors, by a median that outliers hardly change.
 
     The median is taken over the readings of a group. An estimate with the weights of the robust
-    loss would be too small without outliers, and too large with many of them. **Arguments:**
-    `squares` (R, T) the squared lengths of the errors; `mask` (R, T, k) the channels that count;
-    `groups` (R,) the group of each recording.
+    loss would be too small without outliers, and too large with many outliers. **Arguments:**
+    `squares` (R, T) the squared lengths of the errors; `mask` (R, T, k) true for the channels that
+    are used; `groups` (R,) the group of each recording.
     """
     half, _ = median_of_chi2(mask.shape[-1])
     whole = mask.all(axis=-1)
@@ -103,7 +108,9 @@ def _variance_by_median(squares: np.ndarray, mask: np.ndarray, groups: np.ndarra
 
 
 def median_of_chi2(size: int) -> tuple[float, float]:
-    """Return the median of χ² with `size` degrees of freedom, and the density at the median."""
+    """Return two numbers for χ² with `size` degrees of freedom: its median; and its density
+    there.
+    """
     from scipy.special import chdtri, gammaln
 
     median = float(chdtri(size, 0.5))
@@ -113,15 +120,17 @@ def median_of_chi2(size: int) -> tuple[float, float]:
 
 
 def _shares_left(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[np.ndarray]:
-    """Return the share of the squared errors that fitted numbers leave, for each sensor and group.
+    """Return, for each sensor, the shares (groups,) of the squared errors that remain after a fit.
 
-    A share is 0.1 at least.
+    The share of a group is one minus the leverage of the fitted numbers on a reading, and at least
+    0.1.
     """
     groups, readings = np.asarray(model.noise_groups), model.records.readings
     sizes = [np.bincount(groups, one.channel_mask.sum(axis=(1, 2))) for one in readings]
     held = model.prior, model.pull, *((slot.prior, slot.spread) for slot in model.slots)
     if len(readings) * sizes[0].size == 1 and not jax.tree.leaves(held):
-        # Without priors, and with a single noise, these readings alone determine all numbers.
+        # Without priors, and with a single noise, the sum of the leverages is the number of fitted
+        # numbers.
         taken = [np.array([x.size])]
     else:
         linear = linearise(model, x, noise, blocks)
@@ -138,14 +147,16 @@ def _noise_and_jitter(
     known_noise: bool,
     tau: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the most likely σ (R,) and τ (R,) of errors whose covariance is `σ² + τ² u uᵀ`.
+    """Return the most likely noise σ (R,) and jitter τ (R,) of errors of covariance `σ² 1 + τ² u
+    uᵀ`.
 
-    The two are found in turn: τ² by Fisher's scoring of the squares along u, whose mean is `σ² + τ²
-    |u|²`, and σ² by expectation and maximisation.
+    The iteration updates τ² and σ² alternately: τ² by Fisher scoring of the squared components of
+    the errors along u, whose mean is `σ² + τ² |u|²`; and σ² by a step of expectation and
+    maximisation (EM).
 
     **Arguments:**
 
-    - `e`: (R, T, k) the errors; `u`: (R, T, k) the change of the prediction in time.
+    - `e`: (R, T, k) the errors; `u`: (R, T, k) the time derivative of the prediction.
     - `count`: (R, T) the number of channels that were read.
     - `groups`: (R,) the group of each recording; the recordings of a group share σ and τ.
     - `known_noise`: whether σ is known; it is then 1.

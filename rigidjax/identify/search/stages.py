@@ -1,4 +1,6 @@
-"""Find the least misfit from one start: Levenberg–Marquardt over growing parts of records."""
+"""Find the least misfit from one start: Levenberg–Marquardt fits to longer and longer beginnings of
+the records.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -21,36 +23,41 @@ from rigidjax.identify.model.predict import FixedSteps, HeldSteps
 from rigidjax.identify.model.terms import Blocks, Noise
 from rigidjax.identify.search.least_squares import BOLD, CAREFUL, LMState, Settings, minimise
 
-# These parts of a record are fitted one after the other. A long record has many wrong minima, in
-# which the phase slips by whole turns; a short record has none.
+# The beginning of a record, of these fractions of its length, is fitted one after the other. A fit
+# to a long record has many wrong minima, in which the phase is wrong by whole turns; a fit to a
+# short record has no such minima.
 HORIZONS = (0.25, 0.5, 1.0)
-# If there are at least this many recordings, the normal equations eliminate the numbers that belong
-# to one recording alone.
+# If there are at least this many recordings, the numbers that belong to one recording alone are
+# eliminated from the normal equations.
 MANY = 16
 # One run of the compiled search takes this many steps. An interrupt is noticed between two runs.
 STRIDE = 25
-# A search has reached the minimum if a stride lowers the misfit by less than this share of it.
+# A search has reached the minimum if one run of STRIDE steps lowers the misfit by less than this
+# fraction of the misfit.
 SETTLED = 1e-7
-# A fit to a part of the record may raise the misfit of the whole record by at most this factor.
+# A fit to the beginning of a record may raise the misfit of the whole record by at most this
+# factor.
 WILD = 100.0
-# A search over windows ends about TOLERANCES tolerances from the least misfit (0.05 standard
-# deviations by default). It ends when a step gains less than the square of this distance, counted
-# as a part of the gain of a fit from noise alone. A rough search ends at the part ROUGH.
+# A search over windows ends at a distance of about TOLERANCES times the tolerance from the minimum,
+# which is 0.05 standard deviations by default. It ends when the gain of a step, divided by the gain
+# of a fit from noise alone, is less than the square of this distance. A rough search ends when this
+# ratio is less than ROUGH.
 TOLERANCES, ROUGH = 500.0, 1.0
-# The first searches over windows use a ninth and a third of each window, if such a part has at
-# least SHORTEST steps of time; each of these searches takes at most FEW steps.
+# The first searches over windows use one ninth (then one third) of each window, as PARTS says, if
+# this fraction of a window has at least SHORTEST time steps. Each of these searches takes at most
+# FEW steps of Levenberg and Marquardt.
 PARTS, SHORTEST, FEW = (9, 3), 5, 10
-# The motion is followed for this many samples after the last sample with a weight, since a low-pass
-# filter takes its slopes from later samples.
+# The motion is integrated for this many samples beyond the last sample with a weight, since a
+# low-pass filter computes the slope at a sample from later samples, too.
 _BEYOND = 2
 
 
 class Evaluation(NamedTuple):
-    """Hold the values that a search keeps of its last evaluation.
+    """Hold the values that a search keeps from its last evaluation of the cost.
 
     **Fields:** `blocks` the errors of all readings and their derivatives
-    (`terms.errors_and_jacobians`); `pulls` (R, m) the part of each of R recordings in the gradient,
-    by the m numbers of the recording.
+    (`terms.errors_and_jacobians`); `pulls` (R, m) the gradient of the cost of each of R recordings
+    with respect to the m free numbers of the recording.
     """
 
     blocks: Blocks
@@ -58,15 +65,15 @@ class Evaluation(NamedTuple):
 
 
 class Attempt(eqx.Module):
-    """Hold the end of the search from one start.
+    """Hold the result of the search from one start.
 
     **Fields:**
 
-    - `x`: (n,) the free numbers.
-    - `cost`: half the sum of squares at x.
+    - `x`: (n,) the free numbers at the end of the search.
+    - `cost`: half the sum of the squared residuals at x.
     - `converged`: whether the search converged.
-    - `blocks`: the errors and their derivatives at x (`terms.errors_and_jacobians`), `None` if not
-      known.
+    - `blocks`: the errors and their derivatives at x (`terms.errors_and_jacobians`), or `None` if
+      they were not kept.
     """
 
     x: Float[Array, " n"]
@@ -78,8 +85,9 @@ class Attempt(eqx.Module):
 class Task(NamedTuple):
     """Hold what a search has to fit, and how precisely.
 
-    **Fields:** `model` to be fitted; `noise` of its sensors; `tolerance`, in standard deviations;
-    `max_steps` of the search.
+    **Fields:** `model` the model to be fitted; `noise` the noise of its sensors; `tolerance` the
+    tolerance of the search, in standard deviations (`Settings.tolerance`); `max_steps` the largest
+    number of steps of the search.
     """
 
     model: Model
@@ -89,7 +97,9 @@ class Task(NamedTuple):
 
     @property
     def stride(self) -> int:
-        """Return the number of steps of the search before it next notices an interrupt (Ctrl-C)."""
+        """Return the number of steps of one compiled run, after which an interrupt (Ctrl-C) is
+        noticed.
+        """
         return min(STRIDE, self.max_steps)
 
 
@@ -103,13 +113,13 @@ def least_squares_from(
 ) -> LMState:
     """Return the last state of a least-squares search over the free numbers of a model.
 
-    The normal equations are added up recording by recording.
+    The normal matrix is the sum of the matrices of the single recordings.
 
     **Arguments:**
 
     - `model`: the readings and the free numbers.
-    - `x`: (n,) the start.
-    - `noise`: the noise of the sensors.
+    - `x`: (n,) the free numbers at which the search starts.
+    - `noise`: the noise (R, k) of each sensor.
     - `weights`: (R, T) the weights of the readings, zero for readings that are not fitted.
     - `settings`: the settings of the search.
     """
@@ -126,7 +136,8 @@ def least_squares_from(
         total, pulls = jnp.zeros((), kind), jnp.zeros(places.shape, kind)
         for e, row in zip(residuals, rows, strict=True):
             total = total + jnp.sum(e**2)
-            # As in `normal_of`, a product of matrices is several times as fast as an `einsum`.
+            # On a CPU a product of matrices is several times as fast as an `einsum`, as in
+            # `normal_of`.
             flat = row.reshape(model.count, -1, places.shape[1])
             pulls = pulls + (e.reshape(model.count, 1, -1) @ flat)[:, 0]
         slope = jnp.zeros(number + 1, kind).at[places].add(pulls)
@@ -158,18 +169,18 @@ def least_squares_from(
 
 
 def _gain_of_noise(model: Model, evaluation: Evaluation, normal: NormalMatrix) -> Float[Array, ""]:
-    """Return `½ tr(K G⁻¹)`, the mean gain in the cost of windows by a fit to noise alone.
+    """Return `½ tr(K G⁻¹)`, the expected gain in the cost of windows by a fit to noise alone.
 
-    It is the mean excess of the cost at the true numbers over the least cost. G is the normal
+    The gain is the excess of the cost at the true numbers over the least cost. G is the normal
     matrix of the shared numbers, from which the initial states of the windows are eliminated. K is
-    the sum of g gᵀ over stretches of windows, with g the gradient of the cost of a stretch, within
-    which errors may be alike: Takeuchi 1976; Burnham and Anderson 2002, doi:10.1007/b97636, section
-    7.2. The gradient by the initial states is left out: near the least cost each initial state is
-    at its own optimum.
+    the sum of g gᵀ over stretches of windows, where g is the gradient of the cost of one stretch.
+    Errors may be correlated within a stretch (Takeuchi 1976; Burnham and Anderson 2002,
+    doi:10.1007/b97636, section 7.2). The gradient with respect to the initial states is left out:
+    near the least cost each initial state is at its own optimum.
     """
     assert model.clusters is not None
-    # There is a row for each window, although there are fewer stretches: the number of stretches is
-    # not known when this function is compiled.
+    # The array has a row for each window, although there are fewer stretches than windows: the
+    # number of stretches is not known when this function is compiled.
     slopes = jnp.zeros((model.count, model.size), normal.core.dtype)
     slopes = slopes.at[model.clusters[:, None], model.index.places].add(
         evaluation.pulls, mode="drop"
@@ -184,17 +195,19 @@ def _gain_of_noise(model: Model, evaluation: Evaluation, normal: NormalMatrix) -
 
 
 def is_order_one(model: Model, kind: DTypeLike) -> Float[Array, " n"]:
-    """Return one for each free number that is of order one, and zero for each number of a `Free`.
+    """Return an array (n,) with one for each free number of order one, and zero for each number of
+    a `Free`.
 
     The user chooses the unit of a `Free`, so that its numbers may have any size. **Arguments:**
-    `kind` the type of the result.
+    `kind` the dtype of the result.
     """
     ones = jnp.zeros(model.size, kind).at[: model.index.bodies].set(1.0)
     return ones.at[model.index.start].set(1.0)
 
 
 def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
-    """Return the rows (m, n) that the curvature of the bodies' charts adds to the Jacobian at x.
+    """Return the rows B (m, n) by which the curvature of the bodies' charts adds BᵀB to the normal
+    matrix at x.
 
     The `slope` (n,) is the gradient of the cost at x; see `AbstractBodyChart.bend`.
     """
@@ -205,10 +218,11 @@ def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
 
 
 def _until_last_weight(model: Model, weights: Float[Array, "records times"]) -> Model:
-    """Return the model with its motion followed only to the last time that has a weight.
+    """Return the model with an integrator that stops soon after the last time with a positive
+    weight.
 
-    The motion goes on for `_BEYOND` more samples, if the record has them. An adaptive integration
-    is not changed.
+    The integrator goes on for `_BEYOND` more samples, if the record has so many. A model with an
+    adaptive integrator is returned unchanged.
     """
     steps = model.integrator
     if not isinstance(steps, FixedSteps | HeldSteps):
@@ -221,10 +235,10 @@ def _until_last_weight(model: Model, weights: Float[Array, "records times"]) -> 
 
 
 def _zeros_of_evaluation(model: Model, kind: DTypeLike) -> Evaluation:
-    """Return an `Evaluation` of zeros, of the type `kind`.
+    """Return an `Evaluation` of zeros, of the dtype `kind`.
 
-    Its shapes are computed from the model alone, because to trace `terms.errors_and_jacobians`
-    takes seconds.
+    The shapes are computed from the shapes in the model, since tracing `terms.errors_and_jacobians`
+    for its shapes would take seconds.
     """
     count, times = model.records.t.shape
     columns = model.index.places.shape[1]
@@ -236,13 +250,15 @@ def _zeros_of_evaluation(model: Model, kind: DTypeLike) -> Evaluation:
 
 def whole_record(model: Model) -> Float[Array, "records times"]:
     """Return the weights (R, T) for a fit to the whole of each record: ones."""
-    # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
+    # NumPy is used since, outside of a trace, each operation of JAX takes as long as a run of 100
+    # steps.
     return jnp.asarray(np.ones(model.records.t.shape, model.records.t.dtype))
 
 
 def weights_of_beginning(model: Model, part: float) -> Float[Array, "records times"]:
-    """Return the weights (R, T) for a fit to the first `part` of each record: first ones, then
-    zeros.
+    """Return the weights (R, T) for a fit to the beginning of each record.
+
+    The weight is one in the first fraction `part` of the record's duration, then zero.
     """
     t = np.asarray(model.records.t)
     since, length = t - t[:, :1], t[:, -1:] - t[:, :1]
@@ -250,7 +266,9 @@ def weights_of_beginning(model: Model, part: float) -> Float[Array, "records tim
 
 
 def _attempt_of(state: LMState) -> Attempt:
-    """Return the best point of a search as an attempt, with its errors if they were kept."""
+    """Return the best point of a search as an `Attempt`, with the errors there if they were
+    kept.
+    """
     blocks = state.evaluation.blocks if bool(state.evaluated_at_best) else None
     return Attempt(state.point, state.cost, state.converged, blocks)
 
@@ -265,16 +283,16 @@ def _search_stride(
     steps: int | None = None,
     level: float | None = None,
 ) -> LMState:
-    """Return the last state of a search after one stride from x.
+    """Return the last state of a search after one stride (one compiled run of a few steps) from x.
 
     **Arguments:**
 
-    - `x`: (n,) the start.
+    - `x`: (n,) the free numbers at the start of the stride.
     - `task`: the model, its noise, and the tolerance.
     - `weights`: (R, T) the weights of the readings.
     - `damping`, `aim`, `level`: as for `Settings`; `margin` is `Settings.near`.
     - `steps`: the largest number of steps, `task.stride` unless given. Without a `level` the search
-      ends about `TOLERANCES` tolerances from the least misfit.
+      ends at a distance of about `TOLERANCES` tolerances from the minimum.
     """
     steps, count = task.stride if steps is None else steps, nominal_count(task.model)
     level = (TOLERANCES * task.tolerance) ** 2 if level is None else level
@@ -283,18 +301,19 @@ def _search_stride(
 
 
 def _evaluate_at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
-    """Return the state of a search that evaluates x and takes no step.
+    """Return the state of a search that evaluates the cost at x and takes no step.
 
-    It is computed by the compiled program of the search, so that nothing else is compiled.
+    The evaluation uses the compiled program of the search, so that no second program is compiled.
     """
     return least_squares_from(model, x, noise, whole_record(model), Settings(0.0, 1.0, 0))
 
 
 def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Blocks:
-    """Return the errors of all readings at x and their derivatives.
+    """Return two things, as `terms.errors_and_jacobians` does: the errors of all readings at x; and
+    the derivatives of these errors with respect to the free numbers.
 
-    They are those of `terms.errors_and_jacobians`, computed by the compiled program of the search,
-    so that nothing else is compiled.
+    The compiled program of the search computes the errors and derivatives, so that no second
+    program is compiled.
     """
     kind, sensors = model.records.t.dtype, model.records.sensors
     ones = (np.ones((model.count, sensor.components), kind) for sensor in sensors)
@@ -314,17 +333,19 @@ def polish(
     aim: float = 0.0,
     watch: Callable[[Attempt], None] = lambda attempt: None,
 ) -> Attempt:
-    """Return the end of a search over the whole of the records, which goes on stride by stride.
+    """Return the result of a search over the whole of the records, in strides of `STRIDE` steps.
 
-    It ends when a stride changes nothing. Large damping alone can look like convergence: each
-    stride after the first one therefore begins with little damping.
+    The search ends when a stride hardly changes the misfit. Large damping alone makes steps short,
+    which can look like convergence. Each stride after the first stride therefore begins with little
+    damping.
 
     **Arguments:**
 
     - `begin`: the attempt at the first point.
     - `task`: the task of the search.
     - `damping`: the damping of the first stride.
-    - `aim`: the cost that another start reached; a search that does not lead to it ends early.
+    - `aim`: the cost that another start reached; a search that is not likely to reach this cost
+      ends early.
     - `watch`: a function that is called with the attempt after each stride.
     """
     attempt, weights = begin, whole_record(task.model)
@@ -332,19 +353,20 @@ def polish(
         before = float(attempt.cost)
         end = _search_stride(attempt.x, task, weights, BOLD if first else damping, aim)
         if not np.isfinite(float(end.cost)):
-            # The misfit is not finite any more: go back to the point before this stride.
+            # The misfit has become infinite or NaN. The search returns to the point before this
+            # stride.
             attempt = Attempt(attempt.x, cost_of(task.model, attempt.x, task.noise))
             watch(attempt)
             break
         attempt = _attempt_of(end)
-        # Round-off refuses every step at the minimum, so the search also ends if the misfit does
-        # not fall any more. This test needs a whole stride: with a small `max_steps`, one or two
-        # steps may all be refused only because they are too long.
+        # At the minimum every step may be refused because of round-off. The search therefore also
+        # ends if the misfit does not fall any more. This test needs a whole stride: with a small
+        # `max_steps`, one or two steps may all be refused only because they are too long.
         stands = before - float(attempt.cost) < SETTLED * (1.0 + abs(before))
         stands = stands and task.stride == STRIDE
         settled = bool(attempt.converged) or stands
-        # The search is hopeless if the misfit would still be above the aim after another fall by
-        # the factor of this stride.
+        # The search is hopeless if the misfit would still be above the aim after another stride
+        # that lowers the misfit by the same factor as this stride.
         hopeless = aim > 0 and not settled and float(attempt.cost) ** 2 > aim * before
         attempt = dataclasses.replace(attempt, converged=settled)
         watch(attempt)
@@ -360,17 +382,19 @@ def fit_in_stages(
     aim: float = 0.0,
     watch: Callable[[Attempt], None] = lambda attempt: None,
 ) -> Attempt:
-    """Return the end of the search from one start, over growing parts of each record.
+    """Return the result of the search from one start, in fits to longer and longer beginnings of
+    each record.
 
-    The whole record is fitted first. If this fit does not explain the record, its beginning is
-    fitted, then more of it, and then all of it (`HORIZONS`).
+    The whole record is fitted first. If this fit does not explain the record, the first quarter of
+    the record is fitted, then its first half, and then the whole record (`HORIZONS`).
 
     **Arguments:**
 
-    - `x`: (n,) the start.
+    - `x`: (n,) the free numbers at the start.
     - `task`: the task of the search.
-    - `aim`: the cost that another start reached; a search that does not lead to it ends early.
-    - `watch`: a function that is called with each point reached over the whole of the records.
+    - `aim`: the cost that another start reached; a search that is not likely to reach this cost
+      ends early.
+    - `watch`: a function that is called with each `Attempt` at a fit to the whole of the records.
     """
     model, noise, *_ = task
     if model.clusters is not None:
@@ -382,33 +406,36 @@ def fit_in_stages(
         return at_once
     level = float(end.first)
     for part in HORIZONS[:-1]:
-        # A part of the record need not be fitted to convergence.
+        # The fit to the beginning of the record need not converge.
         weights = weights_of_beginning(model, part)
         end = _search_stride(x, task, weights, CAREFUL, aim * part, aim * part)
-        # A point that explains only a part of the record may be far off later, for instance if its
-        # drag has the wrong sign.
+        # A point that explains the beginning of the record may be far off later in the record, for
+        # instance if its drag has the wrong sign.
         after = cost_of(model, end.point, noise)
         if after < WILD * max(level, 1e-300):
             x, level = end.point, after
         if aim * part > 0 and not bool(end.converged) and float(end.cost) > WILD * aim * part:
-            # Another start explains this part of the record, and this start does not: give it up.
+            # Another start explains the beginning of the record, and this start does not. This
+            # start is given up.
             attempt = Attempt(x, level)
             watch(attempt)
             return attempt
     attempt = polish(Attempt(x), task, damping=CAREFUL, aim=aim, watch=watch)
     if not float(at_once.cost) < (1.0 - SETTLED) * float(attempt.cost):
         return attempt
-    # The fit to the beginning may have led away from the least misfit of the whole record.
+    # The fits to the beginning of the record may have led away from the minimum of the whole
+    # record's misfit.
     return at_once if bool(at_once.converged) else polish(at_once, task, aim=aim, watch=watch)
 
 
 def _fit_windows(
     x: Float[Array, " n"], task: Task, aim: float, watch: Callable[[Attempt], None]
 ) -> Attempt:
-    """Return the end of the search from one start over windows; arguments as for `fit_in_stages`.
+    """Return the result of the search from one start over windows; arguments as for
+    `fit_in_stages`.
 
-    The first searches are over a ninth and a third of each window, because a long run with poor
-    numbers diverges.
+    The first searches use the first ninth, then the first third of each window, since a prediction
+    over a long time with poor numbers diverges.
     """
     model, begin = task.model, x
     length = model.records.t.shape[1] - 1
@@ -425,7 +452,9 @@ def _fit_windows(
 
 
 def has_unit_noise(reading: Reading) -> bool:
-    """Return whether the noise of a reading is only the unit of its errors, and not their size."""
+    """Return whether the noise of a reading is only a unit for its errors, whose size is not
+    known.
+    """
     return getattr(reading.sensor, "nominal", False)
 
 
@@ -436,10 +465,10 @@ def nominal_count(model: Model) -> int:
 
 
 def sufficient_misfit(model: Model) -> float:
-    """Return a misfit that only the true motion reaches.
+    """Return a misfit that is low enough to accept a fit: wrong minima have a larger misfit.
 
-    For a sensor of known noise it is twice the mean of half χ²; for others it allows errors of
-    about 1 % of the signal.
+    A sensor of known noise adds twice the expected value of half its χ². A sensor of unknown noise
+    adds a term that allows errors of about 1 % of the signal.
     """
     return sum(
         (1.0 if reading.known_noise and not has_unit_noise(reading) else 0.01) * count_of(reading)

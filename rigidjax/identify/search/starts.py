@@ -1,4 +1,6 @@
-"""Find the starting points of a fit: by a regression if the data allow it, then by scatter."""
+"""Find the starting points of a fit: first by a regression if the data allow it, then by random
+scatter.
+"""
 
 import equinox as eqx
 import jax
@@ -22,10 +24,11 @@ from rigidjax.motion.torques.states import has_states
 def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[Float[Array, " n"]]:
     """Return `count` starting points (n,) of a fit: the regression first, then scattered points.
 
-    The scattered points lie about the regression or all over the chart of the body, and their
-    initial rates differ by about a tenth. A `Free` starts at its given value. There is only one
-    point if neither a body nor initial rates are free. **Arguments:** `key` the random key of the
-    scatter; without a key the points are the same at each call.
+    The scattered points lie about the regression or all over the chart of the body. Their initial
+    rates differ from the measured rates by about a tenth of the typical rate. A `Free` starts at
+    its value in the scene. There is only one point if neither a body nor initial rates are free.
+    **Arguments:** `key` the random key of the scatter; without a key the points are the same at
+    each call.
     """
     recordings = (
         stacking.recordings_on_host(model.records, model.counts) if model.index.bodies else ()
@@ -41,7 +44,7 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
         regressed = regress_inertia(recordings, model.torque) if recordings else None
     start = model.start(regressed)
     bodies, spins = slice(model.index.bodies), np.asarray(model.index.start)[:, -3:]
-    # Use NumPy's generator: that of JAX takes seconds to compile.
+    # NumPy's random generator is used, since the generator of JAX takes seconds to compile.
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)
     out = []
     # If neither a body nor initial rates are free, there is nothing to scatter.
@@ -60,9 +63,10 @@ def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) ->
 
     The equation `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. With a torque τ
     the components are found by least squares; without a torque they are, up to scale, the right
-    singular vector of the smallest singular value. The result is moved to the nearest real body. It
-    is `None` if samples are too few or too far apart, if the torque depends on more than time and
-    rate, or if the tensor has no positive trace.
+    singular vector of the smallest singular value. Second moments that are too small or negative
+    are raised to 1 % of the largest, so that the result is a possible body. The result is `None` if
+    samples are too few or too far apart, if the torque depends on more than time and rate, or if
+    the tensor has no positive trace.
     """
     balances = []
     for recording in recordings:
@@ -84,11 +88,12 @@ def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) ->
 
 
 def tensor_and_margin(matrix: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the components (6,) of a tensor by least squares, and the margin by which it is real.
+    """Return two things: the components (6,) of an inertia tensor by least squares; and a margin,
+    which is positive if a body can have this tensor.
 
     The components solve `matrix @ components = rhs`, with `matrix` (n, 6) and `rhs` (n,). If `rhs`
-    is zero, the tensor has the trace one. The margin is the smallest eigenvalue of the second
-    moment over the largest: it is positive for a real body.
+    is zero, the tensor has the trace one. The margin is the smallest eigenvalue of the tensor's
+    matrix of second moments divided by the largest eigenvalue in magnitude.
     """
     if np.abs(rhs).max() > 0:
         components = np.linalg.lstsq(matrix, rhs, rcond=None)[0]
@@ -111,9 +116,10 @@ def balance_of_momentum(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Euler's equations integrated over a recording, as linear equations for the inertia.
 
-    The equations are those for the recorded rates multiplied by the matrix `turn`. They have rows
-    (n, 6), for the six components of the inertia, and right sides (n,). The third result is the
-    rows (n, 6) of the angular momentum alone.
+    The rates in the equations are the recorded rates multiplied by the matrix `turn` (3, 3). The
+    three results are: the matrix (n, 6) of the equations for the six components of the inertia; the
+    right sides (n,), from the torque; and the part (n, 6) of the matrix that comes from the angular
+    momentum, without the integral of Ω × IΩ.
     """
     t, w = rates(recording)
     w, pushed = w @ turn.T, np.zeros((t.size, 3))
@@ -126,8 +132,8 @@ def balance_of_momentum(
     total, impulse = momenta + integral[:, :-1], integral[:, -1:]
 
     def less_mean(x: np.ndarray) -> np.ndarray:
-        # The integrated equations are constant in time: compare each sample with the mean over the
-        # record. Sixty samples are enough.
+        # Each integrated equation has an unknown constant of integration. The difference of each
+        # sample from the mean over the record does not contain it. About sixty samples are enough.
         samples = (x - x.mean(axis=0))[:: max(1, t.size // 60)]
         return samples.transpose(0, 2, 1).reshape(-1, x.shape[1])
 

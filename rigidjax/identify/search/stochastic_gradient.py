@@ -25,18 +25,18 @@ from rigidjax.identify.search.noise import initial_noise
 if TYPE_CHECKING:
     import optax
 
-# One run of the compiled program takes this many steps. An interrupt, or a misfit that is NaN, is
-# noticed between two runs.
+# One run of the compiled program takes this many steps. An interrupt (Ctrl-C), or a misfit that is
+# not finite, is noticed between two runs.
 STRIDE = 50
 
 
 class Descent(eqx.Module):
     """Hold the options of a stochastic gradient descent, which uses a few recordings in each step.
 
-    Each step draws `batch` recordings without replacement, and gives the optimiser the gradient of
-    their misfit by all free numbers (Robbins and Monro 1951, doi:10.1214/aoms/1177729586). The free
-    numbers are unconstrained and of order one, so that a learning rate of 0.01 moves each number by
-    about a hundredth of its size in a step.
+    Each step draws `batch` recordings without replacement. The optimiser gets the gradient of the
+    misfit of these recordings with respect to all free numbers (Robbins and Monro 1951,
+    doi:10.1214/aoms/1177729586). The free numbers are unconstrained and of order one, so that a
+    learning rate of 0.01 moves each number by about a hundredth of its size in a step.
 
     **Arguments:**
 
@@ -84,17 +84,17 @@ def descend(
 
     **Arguments:**
 
-    - `model`: the readings and the free numbers. A sensor without a given noise counts with a noise
-      of a tenth of its signal.
+    - `model`: the readings and the free numbers. The noise of a sensor whose noise is `None` is
+      taken as a tenth of its signal.
     - `descent`: the optimiser, the number of steps and the size of a batch.
     - `initial`: (n,) the free numbers to begin with, `model.start()` unless given.
     - `key`: random key of the batches; without a key the batches are the same at each call.
     - `progress`: a function such as `print`, called with a line of text after every 50 steps.
 
-    **Returns** the free numbers x (n,) after the last step. If a misfit is not finite, they are
-    those before the 50 steps in which this happens; after an interrupt (Ctrl-C) they are those
-    reached so far. `model.unpack(x)` returns the body and the values, `model.scenes(x)` the scenes.
-    **Raises:** `ValueError` for a batch of more recordings than there are.
+    **Returns** the free numbers x (n,) after the last step. If a misfit becomes infinite or NaN,
+    the result is x before the 50 steps in which this happens. After an interrupt (Ctrl-C) it is the
+    last x that was reached. `model.unpack(x)` returns the body and the values, `model.scenes(x)`
+    the scenes. **Raises:** `ValueError` for a batch of more recordings than there are.
 
     >>> import optax
     >>> ts = jnp.linspace(0.0, 3.0, 31)
@@ -128,11 +128,12 @@ def descend_from(
     key: PRNGKeyArray,
     progress: Callable[[str], Any] | None = None,
 ) -> tuple[Float[Array, " n"], bool]:
-    """Return the last point of a descent, and whether it ended without an interrupt (Ctrl-C).
+    """Return two things: the free numbers (n,) at the end of a descent; and whether the descent
+    ended without an interrupt (Ctrl-C).
 
-    If a misfit is not finite, the point is the one before the `STRIDE` steps in which this happens.
-    **Arguments:** `start` (n,) the free numbers to begin with; `noise` the noise of the sensors;
-    the others as for `descend`.
+    If a misfit becomes infinite or NaN, the first result is the free numbers before the `STRIDE`
+    steps in which this happens. **Arguments:** `start` (n,) the free numbers to begin with; `noise`
+    the noise of the sensors; all other arguments as for `descend`.
     """
     if descent.batch > model.count:
         raise ValueError(
@@ -160,8 +161,8 @@ def descend_from(
 def _descent_steps(
     x: Float[Array, " n"], memory: PyTree, model: Model, noise: Noise, descent: Descent, keys: Array
 ) -> tuple[Float[Array, " n"], PyTree, Float[Array, " steps"]]:
-    """Return free numbers, the optimiser's memory and misfits after a step for each of the
-    `keys`.
+    """Return three things after one step for each of the random `keys`: the free numbers x; the
+    state of the optimiser, `memory`; and the misfit of each step.
     """
 
     def step(carry: tuple, key: Array) -> tuple[tuple, Array]:
@@ -169,7 +170,8 @@ def _descent_steps(
         update: Any = descent.optimiser.update
         rows = jax.random.choice(key, model.count, (descent.batch,), replace=False)
         cost, slope = jax.value_and_grad(misfit_of)(x, model, noise, rows)
-        # optax multiplies its integer count of steps with floats: allow it under strict promotion.
+        # optax multiplies its integer count of steps by floats, which strict promotion would
+        # refuse.
         with jax.numpy_dtype_promotion("standard"):
             move, memory = update(slope, memory, x)
         return (x + move, memory), cost
@@ -179,10 +181,11 @@ def _descent_steps(
 
 
 def misfit_of(x: Float[Array, " n"], model: Model, noise: Noise, rows: Array) -> Float[Array, ""]:
-    """Return the misfit of some recordings, scaled up to all recordings, and of the priors.
+    """Return the misfit of some recordings, scaled up to the number of all recordings, plus the
+    misfit of the priors.
 
-    The recordings have the indices `rows`. The mean of this misfit over batches is the misfit of
-    the whole model.
+    The `rows` are the indices of the recordings. The mean of this sum over random batches is the
+    misfit of the whole model.
     """
     few, sizes = chosen_recordings(model, rows), stacking.pick_records(noise, rows)
     weights = jnp.ones_like(few.records.t)

@@ -18,7 +18,8 @@ from rigidjax.rotation.linalg3 import cross, dot
 
 
 class AttitudeSensor(ClockedSensor):
-    """Measure the attitude as a quaternion (w, x, y, z), body → world; q and −q are equal.
+    """Measure the attitude as a quaternion (w, x, y, z), body → world; q and −q mean the same
+    attitude.
 
     The error is the rotation vector, in the sensor's axes, from the predicted attitude to the
     reading, `log((q exp(mounting))⁻¹ q_read)`: its length is the angle between the two attitudes.
@@ -61,7 +62,9 @@ class AttitudeSensor(ClockedSensor):
         return _quaternions(values) if values.shape[1:] == (3, 3) else values
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return which rows of `values` are no unit quaternions, (T,) true where wrong, and why."""
+        """Return two things: a mask (T,) of the rows of `values` that are not unit quaternions; and
+        the reason in words.
+        """
         wanted = "wanted (w, x, y, z) with the scalar first"
         return _has_wrong_length(values), f"the quaternion at index {{index}} is not unit; {wanted}"
 
@@ -86,9 +89,9 @@ def _quaternions(matrices: np.ndarray) -> np.ndarray:
 
 
 def _mounted_attitude(q: Array, mounting: Vec3 | None) -> Array:
-    """Return the attitude of a sensor's axes on a body of attitude q.
+    """Return the attitude (quaternion) of the axes of a sensor on a body of attitude q.
 
-    The rotation vector `mounting` leads from the body's axes to the sensor's axes.
+    The rotation vector `mounting` (3,), rad, turns the body's axes into the sensor's axes.
     """
     return q if mounting is None else quaternion.multiply(q, quaternion.exp(mounting))
 
@@ -104,15 +107,16 @@ def _unit_vector(world: NumbersLike) -> Vec3:
 class Direction(ClockedSensor):
     """Measure the direction, in the sensor's axes, of an object of known direction in the world.
 
-    Examples are a sun sensor, a tracker of one star, a sensor of the vertical. The error is the
-    chord from the prediction to the reading, in the plane across the reading: two numbers, rad for
-    small errors, of length 2 at most. Readings (T, 3) are unit vectors.
+    Examples are a sun sensor, a tracker of one star, a sensor of the vertical. The error is a
+    vector in the plane orthogonal to the reading, which has two components. It points from the
+    prediction to the reading, and its length is the chord between the two unit vectors: the angle
+    in rad for small errors, 2 at most. Readings (T, 3) are unit vectors.
 
     **Arguments:**
 
     - `world`: (3,) the direction in the world frame, of any length.
-    - `noise`: the standard deviation across the line of sight, rad, one number or (2,); `None` to
-      estimate it.
+    - `noise`: the standard deviation of each component of the error, rad, one number or (2,);
+      `None` estimates the noise.
     - `mounting`, `offset`, `jitter`: as for `AttitudeSensor`.
 
     **Raises** `ValueError` for a direction of length zero, a noise that is not positive, NaN.
@@ -131,8 +135,8 @@ class Direction(ClockedSensor):
 
     def error(self, motion: SensorInput, reading: Array) -> Float[Array, "2"]:
         predicted = self._predict(motion)
-        # The axes across the reading are data: no derivative passes through them. Axes across the
-        # prediction would jump as the motion changes.
+        # The axes orthogonal to the reading are data, so that no derivative passes through these
+        # axes. Axes orthogonal to the prediction would jump as the motion changes.
         first, second = _orthogonal_pair(reading)
         # The chord is sin θ / cos ½θ = 2 sin ½θ; the bound prevents a division by zero for opposite
         # directions.
@@ -142,9 +146,9 @@ class Direction(ClockedSensor):
     def reading_of(self, motion: SensorInput, error: Float[Array, "2"]) -> Vec3:
         """Return a reading (3,) whose error has the length of `error` (2,).
 
-        The components of the two errors are equal to first order. Here they are taken along axes
-        across the prediction, which are turned from the axes across the reading by the angle
-        between the prediction and the reading.
+        The error of the reading that is returned has the components of `error` only to first order:
+        `error` is applied along axes orthogonal to the prediction, whereas the method `error` uses
+        axes orthogonal to the reading.
         """
         predicted = self._predict(motion)
         first, second = _orthogonal_pair(predicted)
@@ -160,12 +164,14 @@ class Direction(ClockedSensor):
         )
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return which rows of `values` are no unit vectors, (T,) true where wrong, and why."""
+        """Return two things: a mask (T,) of the rows of `values` that are not unit vectors; and the
+        reason in words.
+        """
         return _has_wrong_length(values), "the direction at index {index} is not of length 1"
 
 
 def _has_wrong_length(rows: np.ndarray) -> np.ndarray:
-    """Return (T,) whether the length of each row of `rows` (T, k) differs from 1."""
+    """Return a mask (T,), true where the length of a row of `rows` (T, k) differs from 1."""
     return np.abs(np.linalg.norm(rows, axis=1) - 1) > 1e-6
 
 
@@ -184,7 +190,7 @@ class Marker(ClockedSensor):
 
     - `place`: (3,) r, the point, m, body frame; for a body that moves, in the frame of its
       `MassProperties`.
-    - `noise`: m, one number or (3,), `None` to estimate it.
+    - `noise`: the standard deviation, m, one number or (3,); `None` estimates the noise.
     - `origin`: (3,) m, world frame, the fixed point of a body on a pivot; `None` for a body that
       moves (`Rigid`, with `MassProperties`).
     - `offset`, `jitter`: s, as for `Gyro`.
@@ -198,7 +204,8 @@ class Marker(ClockedSensor):
     [0.25, 0.0, 0.0]
     """
 
-    # The position of a body on a pivot is known: the sensor needs only the attitude.
+    # The position of the pivot is known, so that the sensor needs only the attitude of a body on a
+    # pivot.
     feels: ClassVar[Any] = property(lambda self: HasPose if self.origin is None else HasAttitude)
     unit: ClassVar[str] = "m"
     place: Vec3 = eqx.field(converter=base.array_field("place"), default=None)
@@ -325,9 +332,11 @@ class Range(ClockedSensor):
         return (reading - predicted)[None]
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return which of the distances `values` are below zero, (T,) true where wrong, and why.
+        """Return two things: a mask (T,) of the distances `values` that are below zero; and the
+        reason in words.
 
-        A sensor with a bias may read such distances.
+        A sensor with a bias may read distances below zero, so that the mask is then false
+        everywhere.
         """
         if self.bias is not None:
             return np.zeros(values.shape, bool), ""

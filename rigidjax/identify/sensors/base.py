@@ -22,9 +22,9 @@ class SensorInput(eqx.Module):
     - `t`: the time, s.
     - `state`: a `Spin`, `Attitude` or `Rigid`.
     - `body`: the `Inertia` or `MassProperties`.
-    - `field`: the equations of motion `f(t, state, args)`. In them torques with states of their
-      own, such as wheels, have the states that they have at `t`.
-    - `own`: the states of these torques at `t`, in the order of `Solution.own`, for a sensor of a
+    - `field`: the equations of motion `f(t, state, args)`. A torque with its own states, such as a
+      wheel, keeps in these equations the states that it has at `t`.
+    - `own`: the own states of the torques at `t`, in the order of `Solution.own`, for a sensor of a
       wheel or a motor.
 
     >>> body, state = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
@@ -54,7 +54,8 @@ class SensorInput(eqx.Module):
 
 
 class AbstractSensor(eqx.Module):
-    """Define a sensor: the shape of its readings, the state it needs, and the error of a reading.
+    """Define a sensor: the shape of its readings, the state that it needs, and the error of a
+    reading.
 
     To make a sensor of your own, write a subclass with the method `error` and these members:
 
@@ -65,15 +66,15 @@ class AbstractSensor(eqx.Module):
 
     Optional members:
 
-    - `offset`: s, if the sensor's clock is behind: the reading at t belongs to t + offset.
+    - `offset`: the clock offset, s: the reading with the time stamp t was taken at t + offset.
     - `limit`: (k,) the full scale of each channel, in the unit of the error.
-    - `lowpass`: a `LowPass`, if the error is reading minus prediction.
-    - `refusal(values)`: a method that returns which rows cannot be readings, (T,) true where wrong,
-      and why.
+    - `lowpass`: a `LowPass`; it is allowed only if the error is reading minus prediction.
+    - `refusal(values)`: a method that returns two things: a mask (T,) of the rows that cannot be
+      readings; and the reason in words.
     - `typical_rate(t, values)`: a method that returns the rough rate of the body, rad/s, from the
-      unmasked readings, if no other sensor shows it.
-    - `reading_of(motion, error)`: a method that returns the reading with this error, for
-      `simulate_readings`, if the error is not reading minus prediction.
+      unmasked readings; it is used if no other sensor gives the rate.
+    - `reading_of(motion, error)`: a method that returns the reading whose error is `error`, for
+      `simulate_readings`; it is needed if the error is not reading minus prediction.
     - `suspect`: the name, the words and the remedy of a cause for large errors of this sensor,
       which a fit names if it finds no other cause.
 
@@ -100,9 +101,10 @@ class AbstractSensor(eqx.Module):
 
 
 def array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]:
-    """Return a converter, for `eqx.field`, of a field to finite numbers of this `shape`.
+    """Return a converter, for `eqx.field`, of a value to an array of finite numbers of this
+    `shape`.
 
-    The numbers are an array, so that a fit may move them; `name` names the field in error messages.
+    A fit may change the numbers since they are an array; `name` names the field in error messages.
     """
 
     def convert(value: NumbersLike) -> Array:
@@ -120,9 +122,10 @@ def optional_array_field(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[
 
 
 def deviations_field(size: int = 3) -> Callable[[Any], Array | None]:
-    """Return a converter of one number, or of `size` numbers, to standard deviations (size,).
+    """Return a converter, for `eqx.field`, of one number or `size` numbers to standard deviations
+    (size,).
 
-    It leaves `None` unchanged.
+    The converter leaves `None` unchanged.
     """
     return lambda value: positive_numbers(value, "noise", "a positive standard deviation", size)
 
@@ -169,9 +172,10 @@ def jitter_of(jitter: object) -> Jitter | None:
 
 
 class ClockedSensor(AbstractSensor):
-    """Define a sensor whose clock may be behind by an `offset`, and its time stamps have `jitter`.
+    """Define a sensor whose time stamps may have a constant error `offset` and a random error
+    `jitter`.
 
-    It reads a vector (3,), unless a subclass sets another shape.
+    The sensor reads a vector (3,), unless a subclass sets another shape.
     """
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)

@@ -14,9 +14,11 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 
-# An interval longer than _GAP usual intervals is a gap, after which the filter starts anew.
+# An interval between two samples is a gap (a hole in the log) if it is longer than _GAP times the
+# median interval. After a gap the filter starts anew.
 _GAP = 3.0
-# The third powers of numbers and of intervals must be finite in float32, too.
+# Times and values must not be larger than this, since their third powers must be finite in float32,
+# too.
 _LARGEST = 1e12
 _ROOT = math.sqrt(2.0)
 
@@ -25,8 +27,8 @@ class LowPass(eqx.Module):
     """Apply a low-pass filter of first or second order (Butterworth), as in the chips of gyros.
 
     Give the filter to a sensor (`Gyro(0.01, lowpass=LowPass(40.0))`): the predictions then pass the
-    same filter as the readings. Without it a fit mistakes the lag of the filter for an offset of
-    the clock.
+    same filter as the readings. Without this filter a fit mistakes the lag of the readings for an
+    offset of the clock.
 
     The filter is `ẏ = w(u − y)` for order 1, and `ÿ + √2 w ẏ + w² y = w² u` for order 2, with the
     input u, the output y and w = 2π · cutoff. It is solved exactly from sample to sample, for an
@@ -74,14 +76,15 @@ class LowPass(eqx.Module):
             return values
         w = 2 * math.pi * self.cutoff.astype(values.dtype)
         gaps = jnp.diff(t)
-        # The padding of a shorter record repeats the last time of the record: give the padding
-        # usual intervals. Its samples are masked, so that their values do not matter.
+        # The padding of a shorter record repeats the last time of the record. The padding gets the
+        # median interval here. Its samples are masked, so that their values do not matter.
         is_last = gaps <= 0
         usual = jnp.nanmedian(jnp.where(is_last, jnp.nan, gaps))
         gaps = jnp.where(is_last, usual, gaps)
         after_gap = gaps > _GAP * usual
         before, after = _end_slopes(gaps, jnp.diff(values, axis=0), after_gap, is_last)
-        # On each interval u = u₀ + b s + c s² + d s³, with s the time since its begin.
+        # On each interval u = u₀ + b s + c s² + d s³, where s is the time since the begin of the
+        # interval.
         h = gaps[:, None]
         chord = jnp.diff(values, axis=0) / h
         c, d = (3 * chord - 2 * before - after) / h, (before + after - 2 * chord) / h**2
@@ -102,7 +105,9 @@ def lowpass_of(lowpass: object) -> LowPass | None:
 
 
 def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
-    """Raise `ValueError` for numbers whose cubes overflow, and for times that do not increase."""
+    """Raise `ValueError` for numbers that are NaN or whose cubes overflow, and for times that do
+    not increase.
+    """
     if not np.isfinite(values).all() or np.abs(values).max(initial=0.0) > _LARGEST:
         raise ValueError(f"values: wanted finite numbers up to {_LARGEST:g}, got NaN or more")
     if not (np.isfinite(t).all() and np.abs(t).max(initial=0.0) <= _LARGEST):
@@ -112,17 +117,24 @@ def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
 
 
 def _end_slopes(gaps: Array, steps: Array, after_gap: Array, is_last: Array) -> tuple[Array, Array]:
-    """Return du/dt, of the input u, at the begin and at the end of each interval between samples.
+    """Return two arrays (n, k): the slope du/dt of the input u at the begin, and at the end, of
+    each of n intervals between samples.
 
-    The slopes are those of the parabola through three samples, and of a straight line next to a
-    gap. **Arguments:** `gaps` (n,) the lengths of the intervals; `steps` (n, k) the changes of u
-    over them; `after_gap` (n,) true for a gap; `is_last` (n,) true for the padding after the last
-    sample.
+    A slope is computed from the parabola through three neighbouring samples, or from the straight
+    line through two samples next to a gap (a hole in the log).
+
+    **Arguments:**
+
+    - `gaps`: (n,) the lengths of the intervals, s.
+    - `steps`: (n, k) the changes of u over the intervals.
+    - `after_gap`: (n,) true for an interval that is a gap.
+    - `is_last`: (n,) true for the padding after the last sample.
     """
     h, chord = gaps[:, None], steps / gaps[:, None]
     apart = (after_gap[1:] | after_gap[:-1])[:, None]
     bend = jnp.where(apart, 0.0, jnp.diff(chord, axis=0) / (h[1:] + h[:-1]))
-    # The last interval of a record has no next interval: take the parabola before it.
+    # The last interval of a record has no next interval. The parabola at its begin is used at its
+    # end, too.
     bend = jnp.where(is_last[1:, None], jnp.roll(bend, 1, axis=0), bend)
     begin = jnp.concatenate([bend[:1] * h[:1], bend * h[1:]]) if bend.shape[0] else 0.0 * chord
     end = jnp.concatenate([bend * h[:-1], bend[-1:] * h[-1:]]) if bend.shape[0] else 0.0 * chord
@@ -130,10 +142,11 @@ def _end_slopes(gaps: Array, steps: Array, after_gap: Array, is_last: Array) -> 
 
 
 def _first_derivatives(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
-    """Return three derivatives, at the first sample, of the cubic through the first four samples.
+    """Return the first, second and third derivative, (1, k) each, of the cubic through the first
+    four samples, at the first sample.
 
-    **Arguments:** `gaps` (n,) the lengths of the intervals; `chord` (n, k) the mean slope in each
-    interval.
+    **Arguments:** `gaps` (n,) the lengths of the intervals between samples, s; `chord` (n, k) the
+    mean slope in each interval.
     """
     a, b = gaps[0], gaps[0] + gaps[1]
     one = (chord[1] - chord[0]) / b
@@ -145,9 +158,12 @@ def _first_derivatives(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
 def _particular_solution(
     order: int, w: Array, u: Array, du: tuple[ArrayLike, ArrayLike, ArrayLike]
 ) -> Array:
-    """Return the cubic that solves the filter's equation: y, and ẏ/w for a filter of order 2.
+    """Return the particular solution of the filter's equation that is a cubic in time: y, and ẏ/w
+    for a filter of order 2, along a new last axis.
 
-    The input is a cubic with the value u and the three derivatives `du` at the time of the result.
+    **Arguments:** `order` the order of the filter; `w` its angular frequency, rad/s; `u` the value
+    of the input, a cubic in time, at the time of the result; `du` the first three time derivatives
+    of the input at this time.
     """
     # With x = (d/dt)/w: 1/(1 + x) = 1 − x + x² − x³ …, 1/(1 + √2 x + x²) = 1 − √2 x + x² + 0 x³ …
     if order == 1:
@@ -157,9 +173,11 @@ def _particular_solution(
 
 
 def _propagator(order: int, w: Array, h: Array) -> Array:
-    """Return the matrix that carries a difference from the particular solution over a time h.
+    """Return the matrix of the homogeneous solution: multiplied by the difference of the filter's
+    state from the particular solution, it gives this difference after a time h.
 
-    **Arguments:** `order` of the filter; `w` its angular frequency, rad/s; `h` s.
+    **Arguments:** `order` the order of the filter; `w` its angular frequency, rad/s; `h` the time,
+    s.
     """
     if order == 1:
         return jnp.exp(-w * h)[None, None]
@@ -176,12 +194,17 @@ def _filter_samples(
     gaps: Array,
     after_gap: Array,
 ) -> Array:
-    """Return the filtered samples, solved from interval to interval.
+    """Return the filtered samples (n + 1, k), computed in a scan over the n intervals between
+    samples.
 
-    **Arguments:** `begin` the first state; `y0`, `y1` the particular solutions at the begin and at
-    the end of each interval; `propagator` a function from the length of an interval to the matrix
-    of `_propagator`; `gaps` the lengths of the intervals; `after_gap` true for an interval that is
-    a gap, after which the state is the particular solution of the next interval.
+    **Arguments:**
+
+    - `begin`: the state of the filter at the first sample.
+    - `y0`, `y1`: the particular solutions at the begin and at the end of each interval.
+    - `propagator`: given the length of an interval, it returns the matrix of `_propagator`.
+    - `gaps`: (n,) the lengths of the intervals, s.
+    - `after_gap`: (n,) true for an interval that is a gap (a hole in the log); after a gap the
+      state is the particular solution at the begin of the next interval.
     """
 
     def step(state: Array, row: tuple[Array, ...]) -> tuple[Array, Array]:

@@ -13,22 +13,22 @@ from rigidjax.motion.manifold import minus_small
 
 _FEELS = {Spin: HasSpin, Attitude: HasAttitude, Rigid: HasPose}
 _SIZES = {Spin: (3, 3), Attitude: (7, 6), Rigid: (13, 12)}
-# Each part of the state but the first begins at this index of a reading.
+# A reading is split at these indices into the parts of the state, such as q and Ω.
 _CUTS = {Spin: (), Attitude: (4,), Rigid: (3, 6, 10)}
 
 
 class StateSensor(AbstractSensor):
     """Measure a whole state as a row of numbers: (3,) Ω, (7,) q, Ω, or (13,) x, v, q, Ω.
 
-    The error is the change from the predicted state to the measured state, as `motion.manifold`
-    counts it: three numbers for each part of the state; for q they are a rotation vector (body
-    frame, rad).
+    The error is the difference of the measured state from the predicted state, as in
+    `motion.manifold`: it has three numbers for each part of the state. For q the three numbers are
+    a rotation vector (body frame, rad).
 
     **Arguments:**
 
     - `kind`: the class of the state, `Spin`, `Attitude` or `Rigid`.
     - `noise`: (k,) the standard deviations of the k numbers of the error.
-    - `nominal`: whether `noise` holds no more than units, and the size of the errors is estimated.
+    - `nominal`: whether `noise` holds only units for the errors, whose size is then estimated.
 
     >>> StateSensor(rj.Attitude, jnp.ones(6), False).reading_shape
     (7,)
@@ -51,7 +51,9 @@ class StateSensor(AbstractSensor):
 
     @property
     def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Return the protocol of the smallest state with all the parts that the sensor reads."""
+        """Return the protocol (such as `HasPose`) of the smallest state with all parts that the
+        sensor reads.
+        """
         return _FEELS[self.kind]
 
     def error(self, motion: SensorInput, reading: Array) -> Float[Array, " k"]:

@@ -17,14 +17,15 @@ def _tolerance_value(value: NumbersLike | None) -> Scalar | None:
 
 
 class Tolerance(eqx.Module):
-    """Hold the errors that a sensor of vectors may have, as its data sheet or a calibration says.
+    """Hold the standard deviations of the errors that a sensor of vectors may have, from its data
+    sheet or a calibration.
 
-    The residuals of a free motion do not show such an error: the readings look like the motion of
-    another body. A fit does not estimate these errors but considers them: it adds their effect on
-    each fitted number to the covariance of the number (Schmidt 1966; Bierman, Factorization Methods
-    for Discrete Sequential Estimation (1977), ch. VIII). If a `Free` moves one of these numbers of
-    the sensor, the fit estimates the error; the tolerance is then its prior, unless the `Free` has
-    a prior of its own.
+    The residuals of a free motion do not show such an error: the readings with the error look like
+    the motion of another body. A fit does not estimate these errors but considers them: it adds
+    their effect on each fitted number to the covariance of the number (Schmidt 1966; Bierman,
+    Factorization Methods for Discrete Sequential Estimation (1977), ch. VIII). If the scale, skew,
+    bias or clock offset of the sensor is a `Free`, the fit estimates this error; the tolerance is
+    then the prior of the `Free`, unless the `Free` has its own prior.
 
     **Arguments**, each a standard deviation, or `None` for an error that is not considered:
 

@@ -17,7 +17,11 @@ from rigidjax.rotation.linalg3 import apply, cross
 
 
 class VectorSensor(ClockedSensor):
-    """Define a sensor that reads a vector v in its axes: `scale · S exp(−mounting) v + bias`."""
+    """Define a sensor that reads a vector v in its own axes: `scale · S exp(−mounting) v + bias`.
+
+    The matrix S is 1 for orthogonal axes (see `skew` in `Gyro`), and exp makes a rotation from a
+    rotation vector.
+    """
 
     noise: Vec3 | None = eqx.field(converter=base.deviations_field(), default=None)
     _: dataclasses.KW_ONLY
@@ -51,23 +55,25 @@ class VectorSensor(ClockedSensor):
 class Gyro(VectorSensor):
     """Measure the body rate with a rate gyro: `scale · S exp(−mounting) Ω + bias + G f`, rad/s.
 
-    **Arguments**, `None` unless the sensor has them; a `Free` can move a number that is given:
+    **Arguments**, each `None` by default, for a sensor without this error or property; a fit can
+    estimate a number that is not `None` (see `Free`):
 
     - `noise`: the standard deviation of a reading, rad/s, one number or (3,); `None` estimates it
       from the residuals.
     - `bias`: (3,) rad/s.
     - `scale`: (3,) the scale of each channel.
-    - `mounting`: (3,) the rotation vector from the body's axes to the sensor's, rad.
-    - `skew`: (3,) (a, b, c), for axes that are not orthogonal: the shares of y in the x axis, of z
-      in x, and of z in y, `S = [[1, a, b], [0, 1, c], [0, 0, 1]]`.
+    - `mounting`: (3,) the rotation vector from the body's axes to the sensor's axes, rad.
+    - `skew`: (3,) (a, b, c), for axes that are not orthogonal: the x channel reads a share a of y
+      and a share b of z, and the y channel reads a share c of z, `S = [[1, a, b], [0, 1, c], [0, 0,
+      1]]`.
     - `limit`: the full scale, rad/s, one number or (3,). A reading at full scale counts as "at
       least that much". `None` finds the full scale from the readings.
     - `offset`: s; the reading at t belongs to t + offset.
     - `jitter`: the standard deviation of the time stamps, s, or `"estimated"`. The errors of time
-      stamps are independent. An error of a time stamp changes the reading along the time derivative
-      of the prediction; this is taken to first order, for motions that turn little within the
-      jitter.
-    - `lowpass`: the `LowPass` that the readings passed.
+      stamps are independent. The effect of an error of a time stamp on the reading is taken as the
+      error times the time derivative of the prediction, which is right for motions that turn little
+      within the jitter.
+    - `lowpass`: the `LowPass` filter through which the readings passed.
     - `tolerance`: a `Tolerance` for scale, axes, bias and clock.
     - `g_sensitivity`: G (3, 3), rad/s per m/s², the effect on each channel of the specific force f
       at the gyro, in the body's axes.
@@ -112,7 +118,7 @@ def specific_force(motion: SensorInput, place: Vec3, gravity: Vec3 | None) -> Ve
 
     It is `Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)`, with r the vector to the `place` from the reference
     point of the state, a the acceleration of this point, and g the `gravity`; without gravity it is
-    the terms of r alone.
+    only the terms with r.
     """
     state, rate = motion.state, motion.rate
     r = motion.lever(place)
@@ -128,7 +134,8 @@ class Accelerometer(VectorSensor):
 
     `f = Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)` in the body frame (notes, eq 88, seen from the body),
     with r the lever arm from the centre of mass, or from the fixed point of a body on a pivot, and
-    a the acceleration of this point. A body in free fall has a = g, and only the terms of r remain.
+    a the acceleration of this point. A body in free fall has a = g, so that only the terms with r
+    remain.
 
     **Arguments:**
 
@@ -160,7 +167,7 @@ class Accelerometer(VectorSensor):
 class Magnetometer(VectorSensor):
     """Measure a known magnetic field with a magnetometer: `scale · S exp(−mounting) Rᵀ b + bias`.
 
-    For a direction without a strength use `Direction`.
+    For a sensor that measures only the direction of the field use `Direction`.
 
     **Arguments:**
 

@@ -19,10 +19,10 @@ from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.identify.sensors.vectors import VectorSensor
 from rigidjax.identify.uncertainty.covariance import Linearisation
 
-# A report states the effect of these errors for a sensor of unknown tolerance: 1 % of scale, and 1°
-# between axes.
+# A report states the effect of errors of this size for a sensor of unknown tolerance: an error of
+# the scale of 1 %, and of the angle between two axes of 1°.
 USUAL = {"scale": 0.01, "cross_axis": float(np.radians(1.0))}
-# Each tolerance belongs to a member of a sensor, which this table gives.
+# This maps the name of a tolerance to the name of the sensor's member that it limits.
 MEMBERS = {tolerance: member for member, tolerance in TOLERANCES.items()}
 _OFF_DIAGONAL = [(i, j) for i in range(3) for j in range(3) if i != j]
 
@@ -32,12 +32,12 @@ class Consideration(eqx.Module):
 
     **Fields:**
 
-    - `sensor`: the number of the sensor.
+    - `sensor`: the index of the sensor.
     - `kind`: the name of the error, a field of `Tolerance`.
     - `deviation`: the standard deviation of the error.
-    - `shifts`: (n, c) the changes of the n free numbers by an error of one standard deviation in
-      each of its c independent components: three scales, six pairs of axes, three biases, or one
-      clock.
+    - `shifts`: (n, c) the changes of the n free numbers if one of the c independent components of
+      the error is one standard deviation. The components are three scales, six pairs of axes, three
+      biases, or one clock offset.
 
     >>> t = jnp.linspace(0.0, 2.0, 41)
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
@@ -61,7 +61,8 @@ def considerations(
     """Return the considered errors of all sensors: errors with a tolerance that no `Free` moves.
 
     **Arguments:** `model`, `linear` and `noise`, the model, its linearisation and the noise of its
-    sensors; `covariance` (n, n) the covariance for white errors, within the determined directions.
+    sensors; `covariance` (n, n) the covariance for white errors, within the directions (of the n
+    numbers) that the data determine.
     """
     out = []
     for index, sensor in enumerate(model.records.sensors):
@@ -70,7 +71,8 @@ def considerations(
             width = getattr(tolerance, kind, None)
             if width is None or slot_of(model, index, member) is not None:
                 continue
-            # Recordings may give one sensor several tolerances: the largest of them counts.
+            # The tolerance of one sensor may differ between recordings. The largest tolerance is
+            # used.
             deviation = float(np.max(np.asarray(width)))
             shifts = deviation * shifts_of(model, linear, noise, covariance, index, kind)
             out.append(Consideration(index, kind, deviation, shifts))
@@ -78,7 +80,9 @@ def considerations(
 
 
 def slot_of(model: Model, index: int, member: str) -> Slot | None:
-    """Return the slot that moves the `member` of the sensor number `index`; `None` if none does."""
+    """Return the slot that moves the `member` of the sensor with the `index`; `None` if no slot
+    does.
+    """
     for slot in model.slots:
         path = tuple(getattr(key, "name", getattr(key, "idx", None)) for key in slot.path)
         if path == ("sensors", index, member):
@@ -94,11 +98,12 @@ def shifts_of(
     index: int,
     kind: str,
 ) -> Float[np.ndarray, "n ways"]:
-    """Return the changes (n, c) of the n free numbers by unit errors of a sensor, of one `kind`.
+    """Return the changes (n, c) of the n free numbers if a sensor has unit errors of one `kind`.
 
-    An error of c components moves the readings of the sensor number `index` by D, (R, T, k, c), and
-    thereby the least-squares answer by `−H⁻¹ Jᵀ W D`, with H⁻¹ the `covariance`, J the derivatives
-    and W the weights of the readings.
+    An error with c components changes the readings of the sensor with the `index` by D, (R, T, k,
+    c). It changes the least-squares solution by `−H⁻¹ Jᵀ W D`, where H⁻¹ is the `covariance`, J
+    holds the derivatives of the errors with respect to the free numbers, and W the weights of the
+    readings.
     """
     direction = _directions(model, linear, index, kind)
     jitter_error = model.records.readings[index].jitter_error
@@ -115,9 +120,10 @@ def shifts_of(
 def _directions(
     model: Model, linear: Linearisation, index: int, kind: str
 ) -> Float[np.ndarray, "records times 3 ways"]:
-    """Return the changes (R, T, 3, c) of the readings of a sensor by unit errors of one `kind`.
+    """Return the changes (R, T, 3, c) of the readings of a sensor if it has unit errors of one
+    `kind`.
 
-    The sensor has the number `index`; c is the number of components of the error.
+    The sensor has the index `index`; c is the number of components of the error.
     """
     reading = model.records.readings[index]
     shown = np.asarray(reading.values) - linear.raw[index]
@@ -135,12 +141,14 @@ def _directions(
 def slope_in_time(
     model: Model, prediction: Float[np.ndarray, "records times k"]
 ) -> Float[np.ndarray, "records times k"]:
-    """Return the time derivative of the predictions of a sensor, zero after a recording's end."""
+    """Return the time derivative (R, T, k) of the predictions of a sensor; zero after the end of a
+    recording.
+    """
     t, counts = np.asarray(model.records.t)[..., None], np.asarray(model.counts)
     gap = np.diff(t, axis=1)
     slope = np.diff(prediction, axis=1) / np.where(gap > 0, gap, 1.0)
-    # Take the slope of the parabola through three samples, as in numpy.gradient: the mean slope in
-    # each gap is weighted by the length of the other gap.
+    # The slope is that of the parabola through three samples, as in numpy.gradient: the mean slope
+    # in each of two intervals is weighted by the length of the other interval.
     before, after = gap[:, :-1], gap[:, 1:]
     whole = np.where(before + after > 0, before + after, 1.0)
     middle = (after * slope[:, :-1] + before * slope[:, 1:]) / whole
@@ -154,7 +162,7 @@ def slope_in_time(
 def stacked_shifts(parts: tuple[Consideration, ...], size: int) -> Float[np.ndarray, "n ways"]:
     """Return the shifts of the n = `size` free numbers by all considered errors, in columns.
 
-    The matrix is a root of the covariance that these errors add.
+    The matrix S is a root of the covariance that these errors add, which is S Sᵀ.
     """
     return np.concatenate([np.zeros((size, 0)), *(part.shifts for part in parts)], axis=1)
 
@@ -184,11 +192,12 @@ def unit_moves(
     covariance: np.ndarray,
     slopes: Float[np.ndarray, "quantities n"],
 ) -> list[tuple[int, dict[str, Float[np.ndarray, " quantities"]]]]:
-    """Return how far `USUAL` errors of each sensor without a tolerance would move quantities.
+    """Return how far errors of the size `USUAL` of each sensor without a tolerance would change
+    quantities.
 
-    The quantities have the derivatives `slopes`. For each sensor without a tolerance the result
-    holds the number of the sensor and, by kind of error, the largest change of each quantity by one
-    component of the error.
+    The quantities have the derivatives `slopes` with respect to the n free numbers. For each sensor
+    without a tolerance the result holds two things: the index of the sensor; and, for each kind of
+    error, the largest change of each quantity that one component of the error makes.
     """
     out = []
     for index, sensor in enumerate(model.records.sensors):

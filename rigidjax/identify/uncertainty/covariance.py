@@ -21,29 +21,33 @@ from rigidjax.identify.model.terms import (
     with_jacobian,
 )
 
-# A direction is undetermined if its singular value is below this share of the largest one.
+# A direction of the free numbers is undetermined if its singular value is below this fraction of
+# the largest singular value.
 BLIND = 1e-8
-# Columns of the Jacobian are scaled to length one, except columns shorter than this share of the
+# Columns of the Jacobian are scaled to length one, except columns shorter than this fraction of the
 # longest column, which may be round-off.
 WEAKEST = 1e-6
 
 
 class Linearisation(eqx.Module):
-    """Hold the errors of a model at one point, and their derivatives by its n free numbers.
+    """Hold the errors of a model at one point, and the derivatives of the errors with respect to
+    the n free numbers.
 
-    **Fields**, the first six for each sensor, of R recordings, T times and k components:
+    **Fields**; each of the first six holds one array for each sensor, for R recordings, T times and
+    k components:
 
     - `raw`: (R, T, k) the errors in the unit of the sensor.
-    - `raw_slopes`: (R, T, k, m) the derivatives of `raw` by the m numbers of each recording.
-    - `errors`, `slopes`: the errors and their derivatives, whitened.
+    - `raw_slopes`: (R, T, k, m) the derivatives of `raw` with respect to the m numbers of each
+      recording.
+    - `errors`, `slopes`: the errors and their derivatives in standard deviations (`terms.whiten`).
     - `weights`: (R, T) the weights of the robust loss.
     - `mask`: (R, T, k) true if an error has a weight and its reading is below full scale.
-    - `places`: (R, m) the places of each recording's numbers among all n.
-    - `prior_residuals`: (n,) the free numbers over the deviations of their priors.
-    - `prior_weights`: (n,) one over the deviations of the priors, zero for a number without a
-      prior.
-    - `extra`, `extra_slopes`: (j,) all residuals but those of readings and of these priors, and (j,
-      n) their derivatives.
+    - `places`: (R, m) the indices of the numbers of each recording among all n numbers.
+    - `prior_residuals`: (n,) the free numbers divided by the standard deviations of their priors.
+    - `prior_weights`: (n,) one over the standard deviations of the priors, zero for a number
+      without a prior.
+    - `extra`, `extra_slopes`: (j,) all further residuals, such as those of a prior of the body, and
+      (j, n) the derivatives of these residuals.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model(), starts=1, max_steps=2)
     >>> [slopes.shape for slopes in result.linear.slopes]  # 17 times, 3 components, 8 free numbers
@@ -75,7 +79,7 @@ class Linearisation(eqx.Module):
 
     @property
     def slope(self) -> np.ndarray:
-        """Return the gradient (n,) of the misfit by the free numbers."""
+        """Return the gradient (n,) of the misfit with respect to the free numbers."""
         readings = self.to_all_numbers(self.scores).sum(axis=0)
         priors = self.prior_weights * self.prior_residuals
         return readings + priors + self.extra @ self.extra_slopes
@@ -95,7 +99,9 @@ class Linearisation(eqx.Module):
 
     @property
     def information(self) -> tuple[np.ndarray, ...]:
-        """Return the information (R, m, m) of each sensor on the numbers of each recording."""
+        """Return, for each sensor, the information matrices JᵀWJ (R, m, m) of the numbers of each
+        recording.
+        """
         return tuple(rows.swapaxes(1, 2) @ rows for rows in self.rows)
 
     def squared_change(self, step: np.ndarray) -> float:
@@ -112,8 +118,9 @@ class Linearisation(eqx.Module):
         return wide[:, :-1]
 
     def blocks(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the `covariance` (R, m, m) of each recording's numbers; zero unless it is
-        finite.
+        """Return the blocks (R, m, m) of a `covariance` (n, n) for the numbers of each recording.
+
+        The blocks are zero unless the covariance is finite.
         """
         known = covariance if np.isfinite(covariance).all() else np.zeros_like(covariance)
         wide = np.pad(known, (0, 1))
@@ -121,7 +128,9 @@ class Linearisation(eqx.Module):
 
     @property
     def scores(self) -> np.ndarray:
-        """Return the part (R, m) of each recording in the gradient of the misfit."""
+        """Return the gradient (R, m) of the misfit of each recording with respect to its
+        numbers.
+        """
         total: Any = sum(
             ((error * weight[..., None]).reshape(len(error), 1, -1) @ _flatten_rows(slope))[:, 0]
             for error, slope, weight in zip(self.errors, self.slopes, self.weights, strict=True)
@@ -136,9 +145,10 @@ def _flatten_rows(slopes: np.ndarray) -> np.ndarray:
 
 @eqx.filter_jit
 def _linearise_parts(model: Model, x: Array, noise: Noise, blocks: Blocks) -> PyTree[Array]:
-    """Return the parts of `linearise`, computed by one compiled program.
+    """Return three parts of a `Linearisation`, computed by one compiled program.
 
-    They are those of the readings, the places of the recordings' numbers, and those of the other
+    The parts are: the whitened errors of the readings, their derivatives and weights; the places of
+    the recordings' numbers; and the residuals, weights and derivatives of priors and further
     residuals.
     """
     errors, slopes = blocks
@@ -162,8 +172,8 @@ def linearise(
     - `model`, `noise`: the model, and the noise of its sensors.
     - `x`: (n,) the free numbers.
     - `blocks`: the errors and derivatives at x, as `terms.errors_and_jacobians` returns them.
-    - `thickened`: if a body is flat at x, the point with a thicker body at which derivatives are
-      taken, and the `blocks` at that point.
+    - `thickened`: if a body is flat at x, a point with a thicker body, at which the derivatives are
+      computed, and the `blocks` at that point.
     """
     (errors, slopes, weights), places, others = jax.tree.map(
         np.asarray, _linearise_parts(model, x, noise, blocks)
@@ -185,12 +195,14 @@ class Root(eqx.Module):
     **Fields:**
 
     - `size`: (n,) the factor by which each number is multiplied for the other fields.
-    - `lift`: (n, s) the change of all numbers with the s numbers that recordings share.
+    - `lift`: (n, s) the derivatives of all numbers, at their best values for given shared numbers,
+      with respect to the s numbers that recordings share.
     - `core`: (s, r) a root of the covariance of the shared numbers.
-    - `own`: for each recording the places (k,) of the numbers that it alone has, a root (k, j) of
-      the covariance of these numbers for known shared numbers, and the rows (p, k + s) of the
-      priors of both.
-    - `ties`: (q, s) the rows of priors of shared numbers alone.
+    - `own`: for each recording three things: the places (k,) of the numbers that it alone has; a
+      root (k, j) of the covariance of these own numbers for known shared numbers; and the
+      derivatives (p, k + s) of the residuals of priors with respect to the own and the shared
+      numbers.
+    - `ties`: (q, s) the derivatives of the residuals of priors that depend on shared numbers only.
     - `null`: (i, n) orthonormal directions that are not determined.
     """
 
@@ -210,7 +222,7 @@ class Root(eqx.Module):
         **Arguments:**
 
         - `rows`: (R, q, m) rows for the m numbers of each recording.
-        - `places`: (R, m) the places of these numbers among all n.
+        - `places`: (R, m) the indices of these numbers among all n numbers.
         - `middle`: (R, q, q) the matrix between the rows of each recording.
         """
         wide, lift = (np.concatenate([x, 0 * x[:1]]) for x in (1.0 / self.size, self.lift))
@@ -234,7 +246,9 @@ class Root(eqx.Module):
 
     @property
     def covariance(self) -> np.ndarray:
-        """Return the covariance `H⁻¹` (n, n) within the directions that are determined."""
+        """Return the covariance `H⁻¹` (n, n) for white errors, within the directions that are
+        determined.
+        """
         half = self.lift @ self.core
         out = half @ half.T
         for mine, root, _ in self.own:
@@ -242,7 +256,9 @@ class Root(eqx.Module):
         return self._in_units(out)
 
     def _in_units(self, covariance: np.ndarray) -> np.ndarray:
-        """Return a covariance in the units of the numbers, without undetermined directions."""
+        """Return a `covariance` (n, n) of the scaled numbers converted to the units of the numbers,
+        with undetermined directions projected out.
+        """
         if len(self.null):
             covariance = covariance - self.null.T @ (self.null @ covariance)
             covariance = covariance - (covariance @ self.null.T) @ self.null
@@ -263,7 +279,8 @@ class Covariance(eqx.Module):
     - `covariance`: (n, n), with an infinite variance for a number that the data do not determine.
     - `determined`: (n, n) the covariance within the determined directions.
     - `kind`: the method of the covariance, in words.
-    - `singular_values`: (n,) of the weighted Jacobian with columns of length one.
+    - `singular_values`: (n,) the singular values of the weighted Jacobian with columns of length
+      one.
     - `null_directions`: (k, n) the directions that are not determined.
     - `root`: a root of the covariance for white errors; `None` if the motion is not finite.
     """
@@ -282,7 +299,7 @@ def white_covariance(linear: Linearisation) -> Covariance:
     J holds the derivatives of all residuals, W their weights. Directions with singular values below
     1e-8 of the largest one are not determined. The numbers that one recording alone has are
     eliminated first, recording by recording (Schur complement); the singular values are those of
-    these blocks and of the rest.
+    the eliminated blocks, and of the remaining matrix of the shared numbers.
     """
     n, dense = linear.size, linear.dense
     if not (np.isfinite(dense).all() and np.isfinite(linear.extra_slopes).all()):
@@ -290,8 +307,8 @@ def white_covariance(linear: Linearisation) -> Covariance:
         return Covariance(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)), None)
     triangles, owner = np.linalg.qr(dense, mode="r"), _owners(linear)
     shared = np.flatnonzero(owner < 0)
-    # Scale columns to order one: a bias in rad/s must not look undetermined next to a moment. The
-    # least size keeps round-off from being scaled up.
+    # Columns are scaled to order one, so that a bias in rad/s does not look undetermined next to a
+    # moment of inertia. The lower bound of the size keeps round-off from being scaled up.
     squares = np.bincount(linear.places.ravel(), np.sum(triangles**2, axis=1).ravel(), n + 1)[:n]
     size = np.sqrt(squares + linear.prior_weights**2 + np.sum(linear.extra_slopes**2, axis=0))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-150))
@@ -301,7 +318,7 @@ def white_covariance(linear: Linearisation) -> Covariance:
     lift[shared, np.arange(shared.size)] = 1.0
     ties = np.concatenate([np.diag(prior[shared]), extra[of < 0][:, shared]])
     # Recordings without numbers of their own, such as windows with known starts, have nothing to
-    # eliminate: a loop over a thousand of them took most of the time.
+    # eliminate: a loop over a thousand such recordings took most of the time.
     all_shared = ~np.isin(np.arange(len(triangles)), owner)
     no_own = np.zeros(0, int), np.zeros((0, 0)), np.zeros((0, shared.size))
     rest, own, values, null = (
@@ -350,14 +367,15 @@ def _rows_of_shared(
     selected: np.ndarray,
     shared: np.ndarray,
 ) -> np.ndarray:
-    """Return the triangular factor (q, s) of the rows of the selected recordings.
+    """Return the triangular factor (QR) of the derivatives of the selected recordings with respect
+    to the s shared numbers.
 
     **Arguments:**
 
     - `linear`: the linearisation of all recordings.
     - `triangles`: (R, q, m) for each recording the triangular factor of its weighted derivatives.
     - `size`: (n,) the factor by which each number is multiplied.
-    - `selected`: (R,) true for recordings whose errors change with shared numbers alone.
+    - `selected`: (R,) true for recordings whose errors depend on shared numbers only.
     - `shared`: (s,) the places of the shared numbers.
     """
     wide = np.zeros((int(selected.sum()), triangles.shape[1], linear.size + 1))
@@ -368,10 +386,11 @@ def _rows_of_shared(
 
 
 def _owners(linear: Linearisation) -> np.ndarray:
-    """Return for each number (n,) the recording that alone changes with it, −1 if several do.
+    """Return, for each number (n,), the index of the only recording that depends on the number; −1
+    if several recordings depend on it.
 
-    The result is −1, too, for numbers of several recordings that one of the other residuals ties
-    together.
+    The result is −1, too, for the own numbers of several recordings if one of the `extra` residuals
+    depends on more than one of them.
     """
     records, n = len(linear.places), linear.size
     owner, used = np.full(n + 1, -1), np.zeros((records, n + 1), bool)
@@ -386,11 +405,12 @@ def _owners(linear: Linearisation) -> np.ndarray:
 
 
 def _decompose(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the range of `rows` (q, k), whose columns are of order one, by singular values.
+    """Compute the range of `rows` (q, k), whose columns are of order one, by a singular value
+    decomposition.
 
-    Returns an orthonormal basis (q, r) of the range, a root (k, r) of the inverse of the Gram
-    matrix `rowsᵀ rows`, the directions (j, k) that the rows do not determine, and the singular
-    values.
+    It returns four things: an orthonormal basis (q, r) of the range; a root (k, r) of the inverse
+    of the Gram matrix `rowsᵀ rows`; the directions (j, k) that the rows do not determine; and the
+    singular values.
     """
     u, singular, directions = np.linalg.svd(rows, full_matrices=False)
     determined = singular > BLIND * singular.max(initial=1.0)
@@ -403,13 +423,15 @@ def covariance_of(
 ) -> Covariance:
     """Return the covariance for white errors, or the sandwich `H⁻¹ M H⁻¹` for correlated errors.
 
-    M is `Jᵀ C J` plus the information of priors, with C the covariance of the errors in time. In
-    each channel, the part of the variance that second differences show is white; the rest decays
-    exponentially. Fitted errors do not show the decay time well: each number gets the largest
-    variance over all times from two samples to half a record. Fitted errors are too small: `Jᵀ C J`
-    is multiplied by n/(n − p) for n independent errors and p free numbers. If there are many
-    recordings, the variance between recordings is taken where it is larger. Source: White 1980,
-    doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
+    M is `Jᵀ C J` plus the information of priors, where C is the covariance of the errors in time.
+    In each channel the second differences of the errors give the variance of a white part. The
+    remaining variance belongs to a part whose autocorrelation decays exponentially. The decay time
+    cannot be found well from the errors of a fit. Each number therefore gets the largest variance
+    over all decay times from two samples to half a record. The errors of a fit are smaller than the
+    true errors: `Jᵀ C J` is multiplied by n/(n − p) for n independent errors and p free numbers. If
+    there are many recordings, the scatter between recordings gives a second estimate of the
+    variance, and the larger estimate is used. Source: White 1980, doi:10.2307/1912934; Liang and
+    Zeger 1986, doi:10.1093/biomet/73.1.13.
 
     **Arguments:** `linear` the linearisation of the model; `times` the correlation times of its
     errors; `white` the covariance for white errors, computed unless given.
@@ -424,7 +446,9 @@ def covariance_of(
 
 
 def with_infinite_variance(null: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the covariance, infinite for each number that changes along directions of `null`."""
+    """Return the `covariance` with an infinite variance for each number that changes along a
+    direction of `null` (k, n).
+    """
     shown = covariance.copy()
     blind = np.abs(null).max(axis=0, initial=0.0) > 1e-6
     shown[blind, blind] = np.inf
@@ -432,9 +456,10 @@ def with_infinite_variance(null: np.ndarray, covariance: np.ndarray) -> np.ndarr
 
 
 def covariance_root(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a root (n, m) of the inverse of the `information` (n, n), and its null directions.
+    """Return two things: a root (n, m) of the inverse of the `information` (n, n); and its null
+    directions (k, n).
 
-    The null directions (k, n) are those that the information does not determine.
+    The null directions are the directions of the n numbers that the information does not determine.
     """
     size = np.sqrt(np.diag(information))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-150))
@@ -450,9 +475,9 @@ def distance_to_minimum(
 ) -> float:
     """Return the distance to the least misfit in standard deviations, `√(gᵀ(JᵀWJ)⁻¹g)`.
 
-    Here g is the gradient of the misfit, and (JᵀWJ)⁻¹ the covariance `white`; MINUIT ends a search
-    by this distance (James and Roos 1975, doi:10.1016/0010-4655(75)90039-9). Functions whose
-    derivatives (n,) are in `directions` stay constant.
+    Here g is the gradient of the misfit, and (JᵀWJ)⁻¹ the covariance `white`. MINUIT ends a search
+    if this distance is small (James and Roos 1975, doi:10.1016/0010-4655(75)90039-9). The minimum
+    is sought with fixed values of the functions whose derivatives (n,) are in `directions`.
     """
     covariance = white.determined
     for row in directions:
@@ -464,8 +489,8 @@ def distance_to_minimum(
 def _sandwich(linear: Linearisation, white: Covariance, times: "CorrelationTimes") -> np.ndarray:
     """Return the sandwich covariance of `covariance_of`, for errors that are not independent.
 
-    Products of derivatives are taken in orthonormal columns: otherwise round-off could make
-    variances negative.
+    The derivatives are first written in orthonormal columns (QR), since round-off in products of
+    the derivatives themselves could make variances negative.
     """
     columns, triangles = np.linalg.qr(linear.dense)
     longest = max(int(np.median((linear.weights[0] > 0).sum(axis=1))) // 2, 2)
@@ -477,10 +502,11 @@ def _sandwich(linear: Linearisation, white: Covariance, times: "CorrelationTimes
     meats = [grown * _meat(*channels, span) for span in spans]
     estimates = [root.sandwich(triangles, linear.places, meat) for meat in meats]
     if records > n // 2 and records > 5:
-        # The variance between many recordings needs no model of their errors.
+        # The scatter between many recordings gives the variance without a model of the errors.
         between = np.full((records, 1, 1), records / (records - 1))
         estimates.append(root.sandwich(linear.scores[:, None], linear.places, between))
-    # Scale the widest estimate up where another estimate, or the one for white errors, is wider.
+    # The estimate with the largest variances is scaled up for each number whose variance is larger
+    # in another estimate, or for white errors.
     all_ = np.stack([np.diag(white.determined), *(np.diag(c) for c in estimates)])
     least = np.maximum(all_[0], 1e-300)
     out = estimates[int(np.argmax((all_[1:] / least).mean(axis=1)))]
@@ -490,11 +516,12 @@ def _sandwich(linear: Linearisation, white: Covariance, times: "CorrelationTimes
 
 
 def _spectra(linear: Linearisation, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the spectra of the `columns` of all k channels, and the smooth shares of the errors.
+    """Return two arrays for all k channels: the spectra in time of the `columns`; and the smooth
+    share of the errors.
 
-    The spectra are real and imaginary parts (R, k, 2, T + 1, m) by frequency, multiplied by the
-    standard deviation of the errors of the channel. The smooth share (k, 1, 1) of a channel is the
-    result of `smooth_share`.
+    The spectra (R, k, 2, T + 1, m) hold real and imaginary parts at each frequency, multiplied by
+    the standard deviation of the errors of the channel. The smooth shares (k, 1, 1) are results of
+    `smooth_share`.
     """
     first, slopes, shares = 0, [], []
     for error, weight in zip(linear.errors, linear.weights, strict=True):
@@ -506,7 +533,8 @@ def _spectra(linear: Linearisation, columns: np.ndarray) -> tuple[np.ndarray, np
             variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
             slopes.append(np.sqrt(variance) * slope[..., channel, :])
             shares.append(smooth_share(e, weight > 0))
-    # Pad to twice the length: a convolution by FFT would otherwise wrap around.
+    # The columns are padded with zeros to twice the length, since a convolution by FFT would
+    # otherwise wrap around.
     size = 2 * slopes[0].shape[1]
     spectra = np.fft.rfft(np.stack(slopes, axis=1), size, axis=2)
     each = np.full(size // 2 + 1, 2.0 / size)
@@ -516,9 +544,10 @@ def _spectra(linear: Linearisation, columns: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _meat(spectra: np.ndarray, share: np.ndarray, time: float) -> np.ndarray:
-    """Return `Jᵀ C J` (R, m, m) for errors of which the part `share` decays over `time` samples.
+    """Return `Jᵀ C J` (R, m, m) for errors with an autocorrelated and a white part.
 
-    The rest of the errors is white; `spectra` and `share` are the results of `_spectra`.
+    The fraction `share` of the variance has an autocorrelation that decays over `time` samples; the
+    remaining variance is white. The arguments `spectra` and `share` are the results of `_spectra`.
     """
     size = 2 * spectra.shape[3] - 2
     lags = np.arange(size)
@@ -530,9 +559,10 @@ def _meat(spectra: np.ndarray, share: np.ndarray, time: float) -> np.ndarray:
 
 
 def smooth_share(e: np.ndarray, mask: np.ndarray) -> float:
-    """Return the share of the variance of errors e (R, T) that second differences do not show.
+    """Return the fraction of the variance of errors e (R, T) that is not white noise.
 
-    Only the errors where `mask` (R, T) is true are used.
+    The white noise is estimated from the second differences of the errors (`scatter`). Only the
+    errors where `mask` (R, T) is true are used.
     """
     rows = [x[kept] for x, kept in zip(e, mask, strict=True)]
     total = sum(float(row @ row) for row in rows) / max(sum(row.size for row in rows), 1)
@@ -540,7 +570,9 @@ def smooth_share(e: np.ndarray, mask: np.ndarray) -> float:
 
 
 def scatter(rows: list[np.ndarray]) -> float:
-    """Return the variance of white noise with second differences as large as those of `rows`."""
+    """Return the variance of white noise whose second differences have the mean square of the
+    second differences of `rows`.
+    """
     bends = np.concatenate([row[2:] - 2.0 * row[1:-1] + row[:-2] for row in rows])
     # The second difference of white noise has six times the variance of the noise.
     return float(np.mean(bends**2)) / 6.0 if bends.size else 0.0
@@ -588,10 +620,10 @@ def correlation_times(linear: Linearisation) -> CorrelationTimes:
 
 
 def _channel_time(e: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
-    """Return the autocorrelation time of errors e (R, T) in samples, and their first correlation.
+    """Return two numbers: the autocorrelation time of errors e (R, T) in samples; and the
+    correlation of neighbouring errors.
 
-    The first correlation is the one of neighbouring errors. Only the errors where `mask` (R, T) is
-    true are used.
+    Only the errors where `mask` (R, T) is true are used.
     """
     counts = mask.sum(axis=1, keepdims=True)
     mean = e.sum(axis=1, keepdims=True) / np.maximum(counts, 1)
@@ -600,7 +632,7 @@ def _channel_time(e: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
     if not variance > 0:
         return 1.0, 0.0
     lags = np.arange(1, max(2, int(np.max(np.nonzero(mask)[1], initial=0) + 1) // 3))
-    # Divide by the number of pairs at each lag, which is smaller than at lag zero.
+    # The sum at each lag is divided by its number of pairs, which is smaller than at lag zero.
     pairs, products = np.round(_lagged_products(mask)[lags]), _lagged_products(centred)[lags]
     rho = products / variance * (counts.sum() / np.maximum(pairs, 1))
     ends = (pairs < 10) | (rho < 2.0 / np.sqrt(max(counts.sum(), 1)))
@@ -610,7 +642,8 @@ def _channel_time(e: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
 
 
 def _lagged_products(x: np.ndarray) -> np.ndarray:
-    """Return for each lag the sum over rows of x (R, T) of the products with the shifted row.
+    """Return, for each lag l, the sum of x[r, i] x[r, i + l] over all rows r and times i of x (R,
+    T).
 
     The sums (T,) are computed by FFT.
     """

@@ -1,4 +1,4 @@
-"""Compute the degrees of freedom of the variances of a fit that estimates noise or widths."""
+"""Compute the degrees of freedom of the variances of a fit that estimates noise or spreads."""
 
 from typing import Any, cast
 
@@ -10,14 +10,15 @@ from rigidjax.identify.model.model import Model
 from rigidjax.identify.uncertainty.covariance import CorrelationTimes, Linearisation
 
 # With more degrees of freedom than this, a 95 % interval is at most 1.3 % wider than with
-# infinitely many.
+# infinitely many degrees of freedom.
 PLENTY = 100.0
 
 
 class Freedom(eqx.Module):
     """Hold the numbers from which the degrees of freedom of any variance of a fit are computed.
 
-    A width is the `spread` of a `Free`, by which recordings deviate from the shared value.
+    A width is the estimated `spread` of a `Free`: the standard deviation of the values of single
+    recordings about the shared value.
 
     **Fields:**
 
@@ -25,12 +26,12 @@ class Freedom(eqx.Module):
     - `places`: (R, m) the places, among the free numbers, of the m numbers of each recording.
     - `groups`: (R,) the group of each recording; the recordings of a group share their noise.
     - `blocks`: for each sensor, (R, m, m), the information in its readings.
-    - `left`: for each sensor, (G,), the number of its independent errors in each group, less the
-      free numbers that they determine; infinite for a given noise.
+    - `left`: for each sensor, (G,), the number of its independent errors in each group minus the
+      number of free numbers that these errors determine; infinite for a given noise.
     - `widths`: for each estimated width, the places of the deviations of recordings, the square of
       the width, and its degrees of freedom.
     - `considered`: (n, c) the shifts of the free numbers by considered errors, which have known
-      variances.
+      variances (`Consideration.shifts`).
     """
 
     covariance: np.ndarray
@@ -44,9 +45,10 @@ class Freedom(eqx.Module):
     def degrees(self, slope: np.ndarray) -> np.ndarray:
         """Return the degrees of freedom of the variances of functions with derivative `slope`.
 
-        The `slope` (…, n) is the derivative by the n free numbers. Considered errors add a known
-        variance: the degrees of freedom grow with the square of the whole variance over its
-        estimated part.
+        The `slope` (…, n) is the derivative of the functions with respect to the n free numbers.
+        Considered errors add a known variance. The degrees of freedom of the estimated variance are
+        therefore multiplied by the square of the ratio of the whole variance to the estimated
+        variance.
         """
         estimated = np.sum((slope @ self.covariance) * slope, axis=-1)
         known = np.sum((slope @ self.considered) ** 2, axis=-1)
@@ -54,12 +56,13 @@ class Freedom(eqx.Module):
         return np.asarray(self.estimated_degrees(slope) * grown)
 
     def estimated_degrees(self, slope: np.ndarray) -> np.ndarray:
-        """Return the degrees of freedom of the part of each variance that is estimated.
+        """Return the degrees of freedom of the estimated part of each variance.
 
-        They follow from the share of each noise and of each width in the variance (Satterthwaite
-        1946, doi:10.2307/3002019). If every noise has more than `PLENTY` degrees of freedom, the
-        shares of the noises are not computed: the smallest number of degrees is used for all
-        noises. The `slope` (…, n) is the derivative of the functions by the n free numbers.
+        The degrees follow from the share of each noise and of each width in the variance
+        (Satterthwaite 1946, doi:10.2307/3002019). If every noise has more than `PLENTY` degrees of
+        freedom, the shares of the noises are not computed: the smallest number of degrees is used
+        for all noises. The `slope` (…, n) is the derivative of the functions with respect to the n
+        free numbers.
         """
         along = slope @ self.covariance
         variance = np.maximum(np.sum(along * slope, axis=-1), 1e-300)
@@ -99,7 +102,7 @@ def freedom_of(
     """
     groups, left, blocks = np.asarray(model.noise_groups), [], linear.information
     if model.clusters is not None:
-        # The variances of a fit of windows come from the scatter between its stretches alone.
+        # The variances of a fit of windows come only from the scatter between stretches of windows.
         degrees = np.array([max(float(np.max(np.asarray(model.clusters))), 1.0)])
         none = np.zeros_like(groups)
         return Freedom(covariance, linear.places, none, blocks[:1], (degrees,), (), considered)
@@ -124,10 +127,11 @@ def freedom_of(
 def leverages(
     linear: Linearisation, information: tuple[np.ndarray, ...], covariance: np.ndarray
 ) -> list[np.ndarray]:
-    """Return how many free numbers the readings of each sensor determine, (R,) by recording.
+    """Return, for each sensor, how many free numbers its readings determine in each recording (R,).
 
-    **Arguments:** `linear` the linearisation of the model; `information` (R, m, m) for each sensor,
-    on the m numbers of each recording; `covariance` (n, n) of all free numbers.
+    **Arguments:** `linear` the linearisation of the model; `information` for each sensor the
+    information (R, m, m) in its readings on the m numbers of each recording; `covariance` (n, n)
+    the covariance of all free numbers.
     """
     known = linear.blocks(covariance)
     return [np.sum(block * known, axis=(1, 2)) for block in information]
@@ -136,8 +140,8 @@ def leverages(
 def quantile(level: float, freedom: np.ndarray | float) -> np.ndarray:
     """Return the half-width of an interval of probability `level`, in standard deviations.
 
-    It is the quantile of Student's distribution with `freedom` degrees of freedom, and of the
-    normal distribution for infinitely many. **Raises** `ValueError` for a `level` outside (0, 1).
+    It is a quantile of Student's distribution with `freedom` degrees of freedom, or of the normal
+    distribution if `freedom` is infinite. **Raises** `ValueError` for a `level` outside (0, 1).
     """
     level = _checks.fraction(level, "level", "a level between 0 and 1")
     from scipy.special import ndtri, stdtrit

@@ -12,8 +12,8 @@ from rigidjax.body.symmetric3 import swap_trace
 from rigidjax.identify.model.charts import AbstractBodyChart, as_list, chart_list, numbers_of
 from rigidjax.identify.model.model import Model, without_samples
 
-# Derivatives are taken at a body whose least second moment is at least this share of the sum of its
-# three second moments.
+# Derivatives are computed at a body whose smallest second moment is at least this fraction of the
+# sum of its three second moments.
 THIN = 1e-4
 # A one-sided bound of 95 % lies this many standard deviations away.
 ONE_SIDED = 1.645
@@ -24,11 +24,11 @@ class Limit(eqx.Module):
 
     **Fields:**
 
-    - `where`: the suffix of the names of the body's quantities.
-    - `flatness`: the flatness at the best point.
-    - `free`: the flatness at the minimum of the linear model, if it is smaller there; it may be
-      negative.
-    - `slope`: (n,) the derivative of the flatness by the n free numbers.
+    - `where`: the suffix that the names of this body's quantities have.
+    - `flatness`: the flatness at the best point of the fit.
+    - `free`: the flatness at the minimum of the linearised model if this is smaller than
+      `flatness`, else `flatness`; it may be negative.
+    - `slope`: (n,) the derivative of the flatness with respect to the n free numbers.
     """
 
     where: str
@@ -65,15 +65,17 @@ def interval_ends(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends (low, high) of an interval that stops at a flat body, in standard deviations.
 
-    The ends are counted from the best value of a number y. They follow from the likelihood ratio of
-    two normal numbers, y and the flatness z, which is not negative: `m²(y) = min over z ≥ 0 of
-    m²(y, z)`.
+    The ends are differences from the best value of a number y, divided by its standard deviation.
+    They follow from the likelihood ratio of two normally distributed numbers, y and the flatness z,
+    where z is not negative and m² is the squared Mahalanobis distance from the best point: `m²(y) =
+    min over z ≥ 0 of m²(y, z)`.
 
     **Arguments:**
 
     - `reach`: the quantile of the interval.
     - `correlation`: the correlation of the number y with the flatness z.
-    - `flatness`: the flatness at the minimum of the linear model, over its standard deviation.
+    - `flatness`: the flatness at the minimum of the linearised model, divided by its standard
+      deviation.
     """
     rho = np.clip(np.asarray(correlation), -1.0, 1.0)
     past = min(flatness, 0.0)
@@ -91,8 +93,8 @@ def interval_ends(
 def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
     """Return the free numbers x with each flat body made thicker; `None` if no body is flat.
 
-    The derivative of a chart is zero at a flat body. The information on the tensor itself is
-    regular there, and hardly differs between a flat body and a body as thin as this one.
+    The derivative of a chart is zero at a flat body. The information on the inertia tensor itself
+    is regular at a flat body, and is hardly different at the slightly thicker body.
     """
     thick = list(map(_thicken_chart, chart_list(model.chart), bodies_of(model, x)))
     if all(one is None for one in thick):
@@ -118,7 +120,7 @@ def _bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
 def _thicken_chart(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
     """Return the numbers, in the `chart`, of a thicker body; `None` for a body that is not flat.
 
-    The result is `None`, too, for a chart by a user, whose limit is not known.
+    The result is `None`, too, for a chart that a user wrote, whose limit is not known.
     """
     # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
     if isinstance(body, MassProperties):
@@ -153,7 +155,8 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
         if not _has_limit(chart):
             out.append(jnp.ones((), x.dtype))
             continue
-        # The last logarithms are those of three moments, or of the ratios of two to the third.
+        # The last logarithms belong to the three moments, or to the ratios of two moments to the
+        # third moment.
         logs = chart.logs(body)[-3:]
         logs = logs if logs.size == 3 else jnp.append(logs, 0.0)
         low, middle, high = jnp.sort(jnp.exp(logs - jnp.max(logs)))
@@ -170,8 +173,8 @@ def flat_limits(
     **Arguments:**
 
     - `model`: the model.
-    - `numbers`: the reported numbers and their derivatives, the flatness of each body last, as
-      `quantities.values_and_slopes` returns them.
+    - `numbers`: two arrays, as `quantities.values_and_slopes` returns them: the reported numbers,
+      with the flatness of each body at the end; and the derivatives of these numbers.
     - `step`: (n,) the step of the free numbers from the best point to the minimum of the linear
       model.
     - `names`: for each body the suffix of the names of its quantities.
@@ -186,7 +189,9 @@ def flat_limits(
 
 
 def why_unreal(body: PyTree) -> str | None:
-    """Return in words why no real body has the numbers of `body`; `None` for a real body."""
+    """Return in words why the numbers of `body` are physically impossible; `None` if they are
+    possible.
+    """
     try:
         if isinstance(body, MassProperties):
             MassProperties(body.mass, body.com, body.second_moment)
@@ -198,11 +203,11 @@ def why_unreal(body: PyTree) -> str | None:
 
 
 def unreal_bodies(charts: list[tuple[str, AbstractBodyChart]], bodies: list[Any]) -> list[str]:
-    """Return in words why bodies are not real, one line for each body that is not.
+    """Return one line of text for each body that is physically impossible, with the reason.
 
-    Only bodies in charts by users are checked: no other chart has points that are no real body.
-    **Arguments:** `charts` the name and the chart of each body; `bodies` the bodies in the same
-    order.
+    Only bodies of charts that a user wrote are checked, since all points of the charts of this
+    package are possible bodies. **Arguments:** `charts` the name and the chart of each body;
+    `bodies` the bodies in the same order.
     """
     ours = AbstractBodyChart.__module__
     theirs = [

@@ -14,9 +14,10 @@ from rigidjax.identify.model.terms import with_jacobian
 from rigidjax.identify.uncertainty import flat_limit
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
-# A positive number that is not known to this factor gets the interval from 0 to infinity.
+# If one end of the interval of a positive number differs from its value by more than this factor,
+# the interval goes from 0 to infinity.
 FARTHEST = 1e3
-# A correlation that is nearer to one than this counts as one.
+# A correlation whose magnitude differs from one by less than this counts as ±1.
 ROUND_OFF = 1e-13
 
 
@@ -26,10 +27,10 @@ class Quantity(eqx.Module):
     **Fields:**
 
     - `name`, `value`, `unit`: the name, the value and the unit of the number.
-    - `deviation`: its standard deviation, in the same unit.
-    - `positive`: whether it is positive. Its errors are then those of its logarithm: `deviation` is
-      the value times the standard deviation of the logarithm, and an interval reaches farther up
-      than down.
+    - `deviation`: the standard deviation of the number, in the same unit.
+    - `positive`: whether the number is always positive. Its logarithm then has normal errors:
+      `deviation` is the value times the standard deviation of the logarithm, and an interval
+      reaches farther up than down.
     - `cuts`: for each body the correlation of the number with the body's flatness, and the flatness
       in standard deviations; intervals end where a body would be flat.
     - `most`: the largest value that any body can have.
@@ -53,10 +54,10 @@ class Quantity(eqx.Module):
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Return the low and the high end of the interval of a probability `level`.
 
-        The interval of a positive number is that of its logarithm. An interval ends where the body
-        would be flat. The ends are 0 and `most`, infinity by default, for a positive number that is
-        not known to a factor of 1e3. **Arguments:** `level` the probability that the interval holds
-        the true value. **Raises** `ValueError` for a level outside (0, 1).
+        The interval of a positive number is computed for its logarithm. An interval ends where the
+        body would be flat. The ends are 0 and `most`, infinity by default, for a positive number
+        whose uncertainty is more than a factor of 1e3. **Arguments:** `level` the probability that
+        the interval holds the true value. **Raises** `ValueError` for a level outside (0, 1).
         """
         reach = float(quantile(level, self.freedom))
         wide = reported_deviation(self)
@@ -69,7 +70,9 @@ class Quantity(eqx.Module):
 
 
 def reported_deviation(quantity: Quantity) -> float:
-    """Return the standard deviation of a quantity; for a positive one, that of its logarithm."""
+    """Return the standard deviation of a quantity, or of its logarithm if the quantity is
+    positive.
+    """
     if not quantity.positive:
         return quantity.deviation
     return quantity.deviation / quantity.value if quantity.value else np.inf
@@ -78,8 +81,9 @@ def reported_deviation(quantity: Quantity) -> float:
 def cut_ends(reach: np.ndarray | float, cuts: Sequence[tuple[Any, float]]) -> tuple[Any, Any]:
     """Return the ends (low, high) of an interval in standard deviations, cut at each limit.
 
-    **Arguments:** `reach` the half-width of the interval without limits; `cuts` for each limit the
-    correlation with its flatness, and the flatness in standard deviations.
+    **Arguments:** `reach` the half-width of the interval without limits; `cuts` for each limit (a
+    flat body) two numbers: the correlation of the quantity with the flatness of the body; and the
+    flatness in standard deviations.
     """
     low: Any = -reach
     high: Any = reach
@@ -90,7 +94,9 @@ def cut_ends(reach: np.ndarray | float, cuts: Sequence[tuple[Any, float]]) -> tu
 
 
 def labels(model: Model) -> list[tuple[str, str, bool]]:
-    """Return name, unit and whether positive of each quantity of `quantity_vector`, in order."""
+    """Return three things for each quantity of `quantity_vector`, in the same order: its name; its
+    unit; and whether it is positive.
+    """
     out = []
     for name, chart in charts_by_suffix(model):
         out += [(f"{log}{name}", chart.unit, True) for log in chart.log_names]
@@ -109,7 +115,7 @@ def labels(model: Model) -> list[tuple[str, str, bool]]:
 
 
 def reports_starts(model: Model) -> bool:
-    """Return whether initial states are reported: not those of windows, which are many."""
+    """Return whether initial states are reported; the many initial states of windows are not."""
     return model.clusters is None
 
 
@@ -209,7 +215,8 @@ def quantities(
     deviations = standard_deviations(slope, covariance, null)
     cuts = cuts_of(slope, covariance, deviations, limits)
     freedom = np.broadcast_to(freedom, numbers[0].shape)
-    # A quantity that changes with no free number, such as a known one, is not determined.
+    # A quantity that does not depend on any free number, such as a known quantity, gets no
+    # deviation (NaN).
     deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
     out = []
     for index, (name, unit, positive) in enumerate(names):
@@ -249,11 +256,11 @@ def cuts_of(
     deviations: np.ndarray,
     limits: tuple[flat_limit.Limit, ...],
 ) -> list[tuple[np.ndarray, float]]:
-    """Return the correlation of functions with the flatness of each body, and this flatness.
+    """Return, for each of the `limits` (flat bodies), two things: the correlations of functions
+    with the flatness of the body; and the flatness in standard deviations.
 
-    There is a pair for each of the `limits`, with the flatness in standard deviations. The
-    functions have the derivative `slope` and the standard deviations `deviations`; `covariance` and
-    `limits` are as for `quantities`.
+    The functions have the derivative `slope` and the standard deviations `deviations`; `covariance`
+    and `limits` are as for `quantities`.
     """
     out = []
     for limit in limits:
@@ -261,8 +268,8 @@ def cuts_of(
         if np.isfinite(wide) and wide > 0:
             with np.errstate(invalid="ignore", divide="ignore"):
                 rho = slope @ (covariance @ limit.slope) / (deviations * wide)
-            # The flatness itself has a correlation ρ of one but for round-off, which the square
-            # root √(1 − ρ²) would raise to 1e-8.
+            # The correlation ρ of the flatness with itself differs from one by round-off, and the
+            # square root √(1 − ρ²) would raise this round-off to 1e-8.
             rho = np.where(np.abs(rho) > 1.0 - ROUND_OFF, np.sign(rho), rho)
             out.append((np.where(np.isfinite(rho), rho, 0.0), limit.free / wide))
     return out
@@ -271,9 +278,10 @@ def cuts_of(
 def standard_deviations(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
     """Return the standard deviations of functions with derivative `slope` (…, n).
 
-    A deviation is infinite if the function changes along a direction of `null` (k, n). It is NaN if
-    its variance is negative or round-off, or if the function depends on a number whose correlation
-    with another number is beyond one. All intervals use these deviations.
+    The `slope` is with respect to the n free numbers. A deviation is infinite if the function
+    changes along a direction of `null` (k, n). It is NaN if the variance is negative or round-off,
+    or if the function depends on a free number whose correlation with another free number is larger
+    than one in magnitude. All intervals use these deviations.
     """
     if not np.isfinite(covariance).all():
         return np.full(slope.shape[:-1], np.nan)
@@ -283,8 +291,9 @@ def standard_deviations(slope: np.ndarray, covariance: np.ndarray, null: np.ndar
     unit = np.where(unit > 0, unit, 1.0)
     rows, scaled = (slope * unit).reshape(-1, unit.size), covariance / np.outer(unit, unit)
     beyond, out = np.abs(scaled).max(axis=0, initial=0.0) > 1.0 + 1e-6, np.zeros(len(rows))
-    # Take functions of the same few numbers together, such as the functions of one recording's
-    # state: an eigendecomposition of the whole covariance for each function would be slow.
+    # Functions that depend on the same few numbers, such as the functions of one recording's state,
+    # are computed together: an eigendecomposition of the whole covariance for each function would
+    # be slow.
     alike: dict[bytes, list[int]] = {}
     for index, row in enumerate(rows):
         alike.setdefault((row != 0).tobytes(), []).append(index)

@@ -1,9 +1,10 @@
-"""Compute the covariance of a fit of windows, leaving out one stretch at a time (jackknife).
+"""Compute the covariance of a fit of windows by a jackknife, which leaves out one stretch at a
+time.
 
-A stretch is a run of neighbouring windows. Windows are no independent draws: the errors of a model
-last longer than a window, and windows may overlap. Therefore a whole stretch is left out (Künsch
-1989, doi:10.1214/aos/1176347265). The fit without a stretch is one Gauss–Newton step from the best
-point (Miller 1974, doi:10.1093/biomet/61.1.1).
+A stretch is a run of neighbouring windows. Windows are not independent: the errors of a model last
+longer than a window, and windows may overlap. Therefore a whole stretch is left out (Künsch 1989,
+doi:10.1214/aos/1176347265). The fit without a stretch is one Gauss–Newton step from the best point
+(Miller 1974, doi:10.1093/biomet/61.1.1).
 """
 
 import dataclasses
@@ -21,8 +22,8 @@ from rigidjax.identify.uncertainty.covariance import (
 )
 from rigidjax.identify.uncertainty.quantities import labels
 
-# A number hangs on one stretch if this stretch makes more than the part HANGS of its variance. With
-# fewer stretches than FEWEST this is not tested.
+# A quantity hangs on one stretch if this stretch causes more than the fraction HANGS of the
+# variance of the quantity. With fewer stretches than FEWEST this is not tested.
 HANGS, FEWEST = 0.85, 6
 
 
@@ -32,9 +33,9 @@ class Stretches(eqx.Module):
     **Fields:**
 
     - `steps`: (C, s) the changes of the s shared numbers if each stretch is left out.
-    - `places`: (s,) the places of the shared numbers among all n.
-    - `null`: for each stretch, (k, n), the directions of the n numbers that the other stretches do
-      not show; these are all directions if there is only one stretch.
+    - `places`: (s,) the indices of the shared numbers among all n numbers.
+    - `null`: for each stretch, (k, n), the directions of the n numbers that all other stretches
+      together do not determine; if there is only one stretch, all directions.
     """
 
     steps: Float[np.ndarray, "stretches s"]
@@ -75,7 +76,8 @@ def stretches_of(model: Model, linear: Linearisation) -> Stretches | None:
         both = np.linalg.solve(inner, np.concatenate([sides, pull[..., None]], axis=2))
         gram = gram - sides.swapaxes(1, 2) @ both[..., :-1]
         slope = slope - np.einsum("rks,rk->rs", sides, both[..., -1])
-    # A number may differ between groups of windows; its column then has a place for each group.
+    # A number may have a value for each group of windows; its column then stands for another place
+    # in each group.
     places, columns = np.unique(linear.places[:, shared], return_inverse=True)
     columns = columns.reshape(len(gram), shared.size)
     grams, slopes = np.zeros((count, places.size, places.size)), np.zeros((count, places.size))
@@ -84,8 +86,9 @@ def stretches_of(model: Model, linear: Linearisation) -> Stretches | None:
     known = np.diag(linear.prior_weights[places] ** 2)
     steps, null = np.zeros_like(slopes), []
     for k in range(count):
-        # Add up the other stretches. To subtract this stretch from the sum of all would leave
-        # round-off in the directions that the others do not show.
+        # The matrices of the other stretches are added up. If the matrix of this stretch were
+        # subtracted from the sum of all, round-off would remain in the directions that the other
+        # stretches do not determine.
         rest = np.delete(grams, k, axis=0).sum(axis=0) + known
         blind = np.eye(places.size)
         if rest.any():
@@ -97,13 +100,15 @@ def stretches_of(model: Model, linear: Linearisation) -> Stretches | None:
 
 
 def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
-    """Return the covariance of the shared numbers by the scatter of their steps between stretches.
+    """Return the jackknife `Covariance`: the variances of the shared numbers come from the scatter
+    of their steps between stretches.
 
     The covariance `white`, for white errors, is kept for the numbers that one window alone has.
     """
     count, places = len(stretches.steps), stretches.places
     covariance = np.array(white.determined)
-    # The scatter of the shared numbers does not tell their covariance with the starts of windows.
+    # The scatter of the shared numbers gives no covariance with the initial states of windows,
+    # which is set to zero.
     covariance[places], covariance[:, places] = 0.0, 0.0
     square = (count - 1) / count * stretches.steps.T @ stretches.steps
     covariance[np.ix_(places, places)] = square
@@ -119,7 +124,8 @@ def remarks_on_stretches(
     numbers: tuple[np.ndarray, np.ndarray],
     white: Covariance,
 ) -> list[str]:
-    """Return a remark on each reported quantity that a single stretch decides.
+    """Return a remark on each reported quantity whose value or deviation depends on a single
+    stretch.
 
     **Arguments:**
 
@@ -157,7 +163,7 @@ def _changes_along(
 ) -> Bool[np.ndarray, " q"]:
     """Return whether each of q quantities changes along a direction of `null` (k, n).
 
-    The quantities have the derivatives `slopes` (q, n) by the n free numbers.
+    The quantities have the derivatives `slopes` (q, n) with respect to the n free numbers.
     """
     size = np.abs(slopes).max(axis=-1, initial=1e-300)
     return np.abs(slopes @ null.T).max(axis=-1, initial=0.0) > 1e-6 * size
