@@ -1,1 +1,1 @@
-"""Hold recordings: their times, readings and inputs, and what the first readings show."""
+"""Hold recordings (times, readings and inputs), and find initial states from the first readings."""

@@ -9,18 +9,20 @@ import numpy as np
 
 from rigidjax.identify.data.recording import Recording
 
-# A plateau has at least this number of readings in a row at the largest value.
+# Readings are cut off only if at least this number of readings in a row have the largest value.
 RUN = 3
-# A record with a larger share of its readings at the largest value is constant, not cut off.
+# A channel with a larger share of its readings at the largest value is taken as constant, not as
+# cut off.
 MOST = 0.7
 
 
 def full_scale_of(values: np.ndarray) -> float | None:
-    """Return the full scale of one channel (T,), or `None` unless its largest readings are cut off.
+    """Return the full scale of the readings `values` (T,) of one channel of a sensor.
 
-    They are cut off if more readings in a row are equal than at the top of a smooth wave. At such a
-    top 2 √(2d/a) readings are equal, where d is the last digit of the readings and a their second
-    difference.
+    The result is `None` unless the largest readings are cut off. Readings are cut off if more
+    readings in a row have the largest value than at the top of a smooth wave: there about 2 √(2d/a)
+    readings in a row are equal, where d is the last digit of the readings and a the typical second
+    difference of successive readings.
     """
     size = np.abs(values)
     top = float(size.max(initial=0.0))
@@ -39,8 +41,10 @@ def full_scale_of(values: np.ndarray) -> float | None:
 
 
 def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
-    """Return the recordings with the full scale as the `limit` of the sensors that have no limit
-    yet.
+    """Return the recordings with a `limit` for each sensor whose readings are cut off.
+
+    The limit is the full scale that the readings show. A sensor that has a `limit` already keeps
+    this limit.
     """
     out = list(recordings)
     for index in range(max(len(r.readings) for r in recordings)):
@@ -68,7 +72,11 @@ def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def describe_full_scale(readings: Sequence[Any]) -> list[str]:
-    """Describe the readings at full scale, in one sentence for each sensor that has some."""
+    """Describe the readings at full scale, in one sentence for each sensor.
+
+    `readings` holds a `Reading` for each sensor. A sensor without readings at full scale is left
+    out.
+    """
     out = []
     for reading in readings:
         count = (reading.host_mask[..., None] & ~reading.channel_mask).sum(axis=(0, 1))

@@ -23,10 +23,11 @@ class Reading(eqx.Module):
     - `sensor`: the sensor.
     - `values`: (T, …) the readings.
     - `mask`: (T,) true where there is a reading.
-    - `jitter_error`: (T, k) for a sensor with jitter: the error that a time stamp makes if it is
-      one standard deviation late, by the last fit; else `None`.
+    - `jitter_error`: (T, k) for a sensor with jitter, the error that a time stamp makes if it is
+      one standard deviation late, along the motion of the last fit; else `None`.
 
-    Inside a `Model` all arrays have a leading axis over recordings.
+    Here T is the number of times and k the number of components of an error. Inside a `Model` all
+    arrays have a leading axis over recordings.
 
     >>> record = Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]]))
     >>> record.readings[0].values.shape, record.readings[0].mask.tolist()
@@ -45,12 +46,15 @@ class Reading(eqx.Module):
 
     @property
     def host_mask(self) -> np.ndarray:
-        """Return the mask as a NumPy array, for work outside of `jit`."""
+        """Return `mask` as a NumPy array, for work outside of `jit`."""
         return np.asarray(self.mask)
 
     @property
     def channel_mask(self) -> np.ndarray:
-        """Return the mask (…, T, k) of the channels that were read and are not at full scale."""
+        """Return a mask (…, T, k), true for each channel that was read and is not at full scale.
+
+        T is the number of times and k the number of components of an error.
+        """
         mask = np.broadcast_to(
             self.host_mask[..., None], (*self.mask.shape, self.sensor.components)
         )
@@ -60,11 +64,11 @@ class Reading(eqx.Module):
         return mask & (np.abs(self.values) < np.asarray(limit)[..., None, :] * (1 - 1e-6))
 
     def with_jitter(self, jitter_error: Array, deviation: Array) -> "Reading":
-        """Return these readings with another `jitter_error`, and with jitter of another
-        `deviation`, s.
+        """Return these readings with a new `jitter_error`, and a sensor with a new jitter.
 
-        A search holds `jitter_error` constant. If it did not, errors would count less wherever a
-        motion changes quickly, and the search would prefer such motions.
+        `deviation`, s, is the standard deviation of the time stamps of the new sensor. A search
+        holds `jitter_error` constant: if the search changed `jitter_error`, errors would count less
+        wherever a motion changes quickly, and the search would prefer such motions.
         """
 
         def parts(reading: PyTree) -> Any:
@@ -74,7 +78,7 @@ class Reading(eqx.Module):
 
     @property
     def known_noise(self) -> bool:
-        """Return whether the size of the errors is known before the fit."""
+        """Return whether the noise of the sensor is given and its time stamps have no jitter."""
         return self.sensor.noise is not None and self.jitter_error is None
 
 
@@ -83,22 +87,25 @@ class Recording(eqx.Module):
 
     **Arguments:**
 
-    - `t`: (T,) increasing times, s. Sensors with times of their own share the union of these.
+    - `t`: (T,) increasing times, s. If sensors were read at different times, `t` is the union of
+      the times of all sensors.
     - `readings`: for each sensor a pair `(sensor, values)` or a triple `(sensor, values, mask)`:
       `values` (T, 3) for a `Gyro`, (T, 4) or (T, 3, 3) for an `AttitudeSensor`, as the sensor's
       `reading_shape` says; `mask` (T,) true where there is a reading (masked values may be NaN).
-    - `inputs`: what else was logged, by name: the speed of a wheel, the commands of motors. Each is
-      a function of time such as `rigidjax.torques.Series(times, speeds)`, or samples (T, …) at `t`,
-      each held until the next one. The torque of a `Model` reads an input by its name,
+    - `inputs`: a dict of name → input with what else was logged, such as the speed of a wheel or
+      the commands of motors. An input is a function of time such as
+      `rigidjax.torques.Series(times, speeds)`, or an array of samples (T, …) at the times `t`; each
+      sample is held until the next one. The torque of a `Model` reads an input by its name,
       `rigidjax.torques.Input("speed")`.
 
-    A time at which no sensor read anything is dropped. Of NumPy masked arrays a row of `values` or
-    `mask` with a masked entry is not read either, but keeps its time; `t` may not be masked.
+    A time at which no sensor was read is dropped, unless an input is sampled. A row of a NumPy
+    masked array (`values` or `mask`) with a masked entry counts as not read, but its time is kept
+    between the first and the last reading. `t` may not be masked.
 
-    **Raises:** `TypeError` for traced numbers (they decide which times are kept) and for anything
-    but a sensor; `ValueError` for times that do not increase, also after rounding to float32 (it
-    warns if this changes a step by a tenth), a wrong shape, an unmasked NaN (with its index), or a
-    quaternion that is not of unit length.
+    **Raises:** `TypeError` for traced numbers (known numbers decide which times are kept) and for
+    anything but a sensor; `ValueError` for times that do not increase, also after rounding to
+    float32, a wrong shape, an unmasked NaN (with its index), or a quaternion that is not of unit
+    length. It warns if rounding the times to float32 changes a step by more than a tenth.
 
     >>> Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]])).t.shape
     (2,)
@@ -137,15 +144,15 @@ class Recording(eqx.Module):
         read = np.any([mask for _, _, mask, _ in rows], axis=0)
         if read.sum() < 2:
             raise ValueError("Recording: wanted readings at two times at least; the rest is masked")
-        # The motion starts at the first reading: rows that are hidden before the first reading, or
-        # after the last one, do not keep their time.
+        # The motion starts at the first reading and ends at the last one: the times of rows that a
+        # masked array hides before the first reading or after the last one are dropped.
         within = np.maximum.accumulate(read) & np.maximum.accumulate(read[::-1])[::-1]
         used = read | (within & np.any([hidden for *_, hidden in rows], axis=0))
         if any(not callable(source) for source in self.inputs.values()):
             # Each sample is held until the next one, so that every time of a sampled input is
             # needed.
             used = np.ones(t.size, bool)
-        # This number is only for reports; a fit does not use it.
+        # The number of dropped times is only for reports; a fit does not use it.
         self.dropped = int((~used).sum())
         # A slice makes no copy of a long recording.
         kept = used if self.dropped else slice(None)
@@ -172,7 +179,7 @@ class Recording(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return how many numbers were read by all sensors."""
+        """Return the number of numbers that all sensors read, as `count_of` counts them."""
         return sum(count_of(reading) for reading in self.readings)
 
     @property
@@ -182,7 +189,10 @@ class Recording(eqx.Module):
 
 
 def recording_of(t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]) -> Recording:
-    """Return a recording with these fields, without checks; `readings` may have a leading axis."""
+    """Return a `Recording` with the fields `t`, `readings` and `inputs`, without checks.
+
+    The arrays may have a leading axis over recordings.
+    """
     record = object.__new__(Recording)
     parts = {"t": t, "readings": readings, "inputs": inputs, "dropped": 0}
     for name, part in parts.items():
@@ -191,19 +201,20 @@ def recording_of(t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]
 
 
 def readings_of(recording: Recording, kind: type) -> list[Any]:
-    """Return the readings of the sensors that are of the class `kind`."""
+    """Return the `Reading` of each sensor of the `recording` that is of the class `kind`."""
     return [reading for reading in recording.readings if isinstance(reading.sensor, kind)]
 
 
 def sources_of(recording: Recording) -> dict[str, Any]:
-    """Return the inputs as functions of time, where samples are held, one for each of the even
-    steps.
+    """Return the inputs of a `recording` as functions of time, in a dict of name → function.
+
+    The samples of an input are held constant over each step and need evenly spaced times.
     """
     t, out = recording.t, {}
     for name, source in recording.inputs.items():
         if not callable(source):
-            # The last sample belongs to the last time; windows have more samples than times, some
-            # of them before the start.
+            # The last sample belongs to the last time. The samples of a window may begin before its
+            # start: then there are more samples than times.
             steps = jnp.arange(t.size - len(source), t.size, dtype=t.dtype)
             source = Held(t[0] + (t[1] - t[0]) * steps, source)
         out[name] = source
@@ -211,15 +222,15 @@ def sources_of(recording: Recording) -> dict[str, Any]:
 
 
 def count_of(reading: Reading) -> int:
-    """Return how many numbers were read, which is the number of unmasked readings times the
-    components of an error.
-    """
+    """Return the number of unmasked readings times the number of components of an error."""
     return reading.sensor.components * int(reading.host_mask.sum())
 
 
 def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
-    """Return the inputs by name, functions of time unchanged and checked samples (T, …) as
-    arrays.
+    """Return the `inputs` as a dict of name → input, after checks.
+
+    An input that is a function of time is unchanged. Samples (T, …), one for each time in `t` (T,),
+    become an array.
     """
     _checks.require_instance(
         inputs, Mapping, "inputs", requirement="samples or functions of time by name"
@@ -241,9 +252,9 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
 
 
 def _require_digits(t: np.ndarray, dtype: np.dtype) -> None:
-    """Raise `ValueError` if rounding the times `t` to this `dtype` makes two of them equal.
+    """Raise `ValueError` if rounding the times `t` to the `dtype` makes a step zero.
 
-    It warns if rounding changes a step by more than a tenth.
+    The function warns if rounding changes a step by more than a tenth.
     """
     # Use NumPy: within a trace the numbers of a new JAX array are not known.
     steps, held = np.diff(t), np.diff(t.astype(dtype).astype(float))
@@ -262,7 +273,11 @@ def _require_digits(t: np.ndarray, dtype: np.dtype) -> None:
 def _checked_reading(
     t: np.ndarray, sensor: AbstractSensor, values: Any, mask: NumbersLike | None = None
 ) -> tuple[AbstractSensor, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the sensor, its checked values and mask, and the rows that a masked array hides."""
+    """Return the readings of a `sensor` at the times `t` (T,), after checks.
+
+    Four things are returned: the sensor; its readings (T, …); a mask (T,), true where there is a
+    reading; and a mask (T,) of the rows that a NumPy masked array hides.
+    """
     name = type(sensor).__name__
     if not isinstance(sensor, AbstractSensor):
         raise TypeError(f"Recording: wanted pairs (sensor, values), got {name} for a sensor")
@@ -306,7 +321,8 @@ def _checked_reading(
         )
     if not mask.any():
         raise ValueError(f"{name}: every reading is masked")
-    # Replace masked values by a valid reading: a NaN would reach derivatives, since 0 · NaN is NaN.
+    # Replace masked values by a valid reading: a NaN would make derivatives NaN, since 0 · NaN is
+    # NaN.
     if not mask.all():
         shaped = mask.reshape(-1, *(1 for _ in across))
         values = np.where(shaped, values, values[int(np.argmax(mask))])

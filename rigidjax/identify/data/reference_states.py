@@ -1,4 +1,7 @@
-"""Find the reference of the initial states of a fit from the first readings of each recording."""
+"""Find a reference state of each recording from its first readings.
+
+The free numbers of an initial state are changes of this reference state.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -26,19 +29,20 @@ from rigidjax.motion.manifold import names, plus
 from rigidjax.rotation import quaternion, so3
 from rigidjax.rotation.fitting import nearest_rotation
 
-# A rate is taken between two attitudes that differ by this turn, rad: it is large against noise,
-# but so small that the axis hardly moves.
+# A mean rate is computed between two attitudes that differ by a turn of about this angle, rad. The
+# angle is large against noise, but so small that the axis of rotation hardly moves.
 _TURN = 0.3
-# Directions do not determine an attitude if two singular values of Σ world bodyᵀ are below this
-# share of the largest.
+# Directions determine an attitude if the sum of the two smaller singular values of Σ world bodyᵀ
+# (the smallest with the sign of the determinant) is above this share of the largest one.
 _DETERMINED = 1e-3
 
 
 def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Return the times (n,), s, and the attitudes (n, 4), body → world, that the readings show.
 
-    They are those of an attitude sensor or, as by `rigidjax.so3.wahba`, of three markers or two
-    directions. Without such sensors n is 0.
+    The attitudes are the readings of an attitude sensor. Without such a sensor they are computed
+    from at least three markers or two directions, in the way of `rigidjax.so3.wahba`. If the
+    readings show no attitude, n is 0.
     """
     t = np.asarray(recording.t)
     for reading in readings_of(recording, AttitudeSensor):
@@ -76,20 +80,21 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 @jax.jit
 def _attitudes_of(sums: ArrayLike) -> Array:
-    """Return the attitudes (n, 4) that fit directions best, from the matrix Σ world bodyᵀ (3, 3) of
-    each of n times.
+    """Return the attitudes (n, 4) that best turn directions in the body into directions in the
+    world.
 
-    This is `so3.wahba` without its check: `equinox.error_if` always raises in a compiled function
-    that is called within `jax.ensure_compile_time_eval`, as the model calls this one.
+    `sums` (n, 3, 3) holds the sum Σ world bodyᵀ over the directions, at each of n times. This is
+    `so3.wahba` without its check: a `Model` calls this function within
+    `jax.ensure_compile_time_eval`, where `equinox.error_if` in a compiled function always raises.
     """
     return jax.vmap(lambda one: quaternion.from_matrix(nearest_rotation(one)))(sums)
 
 
 def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times (n,), s, and the body rates (n, 3), rad/s, of a gyro, or else of the turns
-    between attitudes.
+    """Return the times (n,), s, and the body rates (n, 3), rad/s, that the readings show.
 
-    If the readings show neither, n is 0.
+    The rates are the readings of a gyro. Without a gyro they are computed from the turns between
+    attitudes. If the readings show no rate, n is 0.
     """
     for reading in readings_of(recording, Gyro):
         return np.asarray(recording.t)[reading.host_mask], np.asarray(reading.values)[
@@ -99,9 +104,10 @@ def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (m,) and body rates (m, 3) between the attitudes q (n, 4) at the times t (n,).
+    """Return times (m,), s, and the mean body rates (m, 3), rad/s, between pairs of attitudes.
 
-    Each rate is the mean one over about `_TURN`, at the middle of its interval of time.
+    The quaternions q (n, 4) are the attitudes at the times t (n,), s. Each mean rate belongs to a
+    turn of about `_TURN`, and its time is the middle of the interval of the turn.
     """
     if t.size < 2:
         return np.zeros(0), np.zeros((0, 3))
@@ -117,10 +123,10 @@ def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarr
 
 @jax.jit
 def _rotation_vectors(p: ArrayLike, q: ArrayLike) -> Array:
-    """Return the shortest rotation vectors (n, 3), in body axes, from the quaternions p to the
-    quaternions q (n, 4).
+    """Return the shortest rotation vectors (n, 3), rad, that turn attitudes p into attitudes q.
 
-    The signs of the quaternions do not matter.
+    The attitudes p and q (n, 4) are quaternions, whose signs do not matter. The vectors are given
+    in body axes.
     """
 
     def turn(a: Array, b: Array) -> Array:
@@ -130,13 +136,18 @@ def _rotation_vectors(p: ArrayLike, q: ArrayLike) -> Array:
 
 
 class ReferenceStates(eqx.Module):
-    """Hold the reference state of a recording, from which the initial state of a fit is counted.
+    """Hold the reference state of a recording.
+
+    The free numbers of the initial state are changes of the reference state.
 
     **Fields:**
 
-    - `state`: a `Spin`, `Attitude` or `Rigid`.
+    - `state`: the reference state, a `Spin`, `Attitude` or `Rigid`.
     - `rate`: the typical body rate, rad/s.
-    - `units`: (n,) the size of each number of a change of the state: free numbers count in it.
+    - `units`: (n,) the unit of each free number of the initial state: the change of the state is
+      `units` times the free numbers.
+
+    For several recordings all arrays have a leading axis.
     """
 
     state: PyTree
@@ -144,21 +155,23 @@ class ReferenceStates(eqx.Module):
     units: Float[Array, "*records n"]
 
     def start_at(self, change: Float[Array, " n"]) -> PyTree:
-        """Return the initial state of one recording for the free numbers `change`.
+        """Return the initial state of one recording for the free numbers `change` (n,).
 
-        An empty `change` belongs to a known initial state, which is the reference.
+        If the initial state is known, `change` is empty, and the reference state is returned.
         """
         return plus(self.state, self.units * change) if change.size else self.state
 
 
 def reference_of(recordings: Sequence[Recording], state_type: type) -> ReferenceStates:
-    """Return the reference states, of the type `state_type`, from the first readings of
-    recordings.
+    """Return the reference states of the `recordings`, found from their first readings.
+
+    `state_type` is the type of the states: `Spin`, `Attitude` or `Rigid`. The body rate of each
+    reference state is zero.
     """
     turns = [[*attitudes(r)[1], np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
     places = [_first_position(r) for r in recordings]
     dtype = recordings[0].t.dtype
-    # Make arrays: with floats each recording would compile a program of its own.
+    # Use arrays: with Python floats a program would be compiled for each recording.
     x, v, length = (jnp.asarray(np.stack(part), dtype) for part in zip(*places, strict=True))
     q, still = jnp.asarray(np.stack(turns), dtype), jnp.zeros_like(x)
     states = {Spin: Spin(still), Attitude: Attitude(q, still), Rigid: Rigid(x, v, q, still)}
@@ -170,12 +183,12 @@ def reference_of(recordings: Sequence[Recording], state_type: type) -> Reference
 
 
 def _typical_rate(recording: Recording) -> float:
-    """Return a typical length of the body rate, rad/s, or 1 if the readings show none."""
+    """Return a typical length of the body rate, rad/s, or 1 if the readings show no rate."""
     _, w = rates(recording)
     if readings_of(recording, Gyro):
         return float(np.sqrt(np.mean(np.sum(w**2, axis=1)))) or 1.0
     rate = float(np.linalg.norm(w[0])) if len(w) else 0.0
-    # Without rates take the estimate of the first sensor that can make one.
+    # If there is no rate, take the estimate of the first sensor that can estimate a typical rate.
     for reading in recording.readings if rate == 0 else ():
         sensor: Any = reading.sensor
         if hasattr(sensor, "typical_rate"):
@@ -186,11 +199,11 @@ def _typical_rate(recording: Recording) -> float:
 
 
 def _first_position(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the first position, m, the first velocity, m/s, and a typical length, m, of a
-    recording.
+    """Return the first position of a recording.
 
-    They are those of the centre of mass, or of the origin of the body frame if only markers were
-    read.
+    Three things are returned: the first position (3,), m; the first velocity (3,), m/s; and a
+    typical length of the positions, m. Position and velocity belong to the centre of mass or, if
+    only markers were read, to the origin of the body frame.
     """
     t, when, x = np.asarray(recording.t), np.zeros(0), np.zeros((0, 3))
     positions, markers = readings_of(recording, Position), readings_of(recording, Marker)
@@ -210,16 +223,18 @@ def _first_position(recording: Recording) -> tuple[np.ndarray, np.ndarray, float
     else:
         v = _first_velocity(when, x)
     x = x if when.size else np.zeros((1, 3))
-    # The length is the largest distance from the mean place, or 1 if all places are the same.
+    # The typical length is the largest distance from the mean position, or 1 if all positions are
+    # the same.
     return x[0], v, float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
 
 
 def _places_by_markers(
     recording: Recording, markers: Sequence[Any]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (n,) and the places (n, 3) of the origin of the body, found from its markers.
+    """Return times (n,), s, and the positions (n, 3), m, of the origin of the body frame.
 
-    If the markers are never all read at once, the first one stands for all.
+    The positions are computed from the readings of the `markers`, at the times at which all markers
+    were read. If there is no such time, only the first marker is used.
     """
     mask = np.all([r.host_mask for r in markers], axis=0)
     if not mask.any():
@@ -235,19 +250,21 @@ def _places_by_markers(
 
 
 def _first_velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the slope (3,) of a line through the first of the places x (n, 3), or zero for one
-    place.
+    """Return the velocity (3,), m/s, at the start of positions x (n, 3), m, at times t (n,), s.
+
+    It is the slope of the straight line that fits the first positions (at most five) best, or zero
+    for fewer than two positions.
     """
     few = slice(0, max(2, min(5, t.size)))
     return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
 
 
 def _places_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Return the places x (n, 3) at the distances d = `lengths` (n, k) from k stations.
+    """Return the positions x (n, 3) whose distances from k stations are `lengths` (n, k).
 
-    The equations `|x|² − 2 s·x + |s|² = d²` are linear in x once their mean over the stations s is
-    subtracted. A component of x that they do not determine is taken from the centre of the
-    stations.
+    `stations` (k, 3) holds the positions s of the stations. The equations `|x|² − 2 s·x + |s|² =
+    d²`, where d is a distance, become linear in x if their mean over all stations is subtracted. A
+    component of x that the linear equations do not determine is that of the centre of the stations.
     """
     centre = stations.mean(axis=0)
     s = stations - centre
@@ -259,10 +276,10 @@ def _places_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 def first_rates(
     records: Recording, counts: Int[Array | np.ndarray, " records"]
 ) -> Float[Array, "records 3"]:
-    """Return the `first_rate` of each of several recordings with a leading axis, or zero if they
-    are traced.
+    """Return the first body rate (R, 3), rad/s, of each of R recordings, as `first_rate` finds it.
 
-    The rates that a gyro reads are returned for traced recordings as well.
+    `records` holds the recordings with a leading axis, and `counts` (R,) the number of times of
+    each recording without padding. The rates are zero for traced recordings without a gyro.
     """
     for reading in readings_of(records, Gyro):
         xp: Any = np if _checks.is_known(reading) else jnp
@@ -275,8 +292,6 @@ def first_rates(
 
 
 def first_rate(recording: Recording) -> np.ndarray:
-    """Return the first body rate (3,), rad/s, that `rates` finds, or zero if the readings show
-    none.
-    """
+    """Return the first body rate (3,), rad/s, that `rates` finds, or zero if it finds no rate."""
     _, w = rates(recording)
     return w[0] if len(w) else np.zeros(3)

@@ -1,4 +1,4 @@
-"""Join several recordings in one tree with a leading axis, so that one program fits them all."""
+"""Join several recordings in one tree with a leading axis, so that one program fits all of them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,16 +15,17 @@ from rigidjax.motion.torques import Linear, Series
 
 
 def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
-    """Return the recordings as one recording with a leading axis, and the number of times of each.
+    """Return the recordings as one `Recording` with a leading axis, and the number of times of each
+    recording.
 
-    Shorter recordings are padded with masked readings at their last time, and their tables of time
-    with the last value.
+    Shorter recordings are padded with masked readings at their last time. Shorter tables of time
+    (the `Linear` and `Series` in inputs and sensors) are padded with their last value.
     """
     counts = np.array([r.t.shape[0] for r in recordings], np.int32)
     rows = max(_count_rows(recording, 0) for recording in recordings)
     alike = [pad_recording(r, int(counts.max()), rows) for r in recordings]
-    # An input may contain objects that are no numbers, such as functions: they must be the same for
-    # all recordings.
+    # An input may contain objects that are not numbers, such as functions. Such objects must be the
+    # same for all recordings.
     numbers, others = zip(*(eqx.partition(r, _is_number) for r in alike), strict=True)
     shapes = [[np.shape(x) for x in jax.tree.leaves(r)] for r in numbers]
     for index, other in enumerate(others):
@@ -38,15 +39,15 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
 
 
 def _is_number(leaf: PyTree) -> bool:
-    """Return whether a leaf is an array or a Python float, which may be stacked."""
+    """Return whether a `leaf` of a tree is an array or a Python float, which `stack` may stack."""
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | complex)
 
 
 def pad_to_few_lengths(model: PyTree) -> Any:
     """Return the model with its recordings padded by masked readings to one of few lengths.
 
-    There are four such lengths in an octave, so that few programs are compiled. Windows are all of
-    one length already, and stay unchanged.
+    Between a length and its double there are about four such lengths, so that few programs are
+    compiled. A model of windows stays unchanged: all windows have one length already.
     """
     records = model.records
     if model.clusters is not None:
@@ -58,8 +59,9 @@ def pad_to_few_lengths(model: PyTree) -> Any:
 
 
 def _count_rows(recording: Recording, axis: int) -> int:
-    """Return the number of rows of the longest table of time in the inputs and sensors, or 0
-    without a table.
+    """Return the number of rows of the longest table of time in the inputs and sensors.
+
+    The result is 0 if the `recording` has no table. The rows of a table are along `axis`.
     """
     parts = recording.inputs, recording.sensors
     tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))
@@ -67,8 +69,10 @@ def _count_rows(recording: Recording, axis: int) -> int:
 
 
 def _padded_length(count: int) -> int:
-    """Return the least number that is not below `count` among multiples of 16, of which there are
-    about four in an octave.
+    """Return the padded length of a recording with `count` times.
+
+    It is the least allowed length that is not below `count`. The allowed lengths are powers of
+    2^(1/4), rounded up to multiples of 16.
     """
     if not count:
         return 0
@@ -79,14 +83,17 @@ def _padded_length(count: int) -> int:
 
 def _stack_leaves(*leaves: PyTree) -> Any:
     """Return the leaves stacked along a new first axis."""
-    # Use NumPy if the numbers are known: JAX would compile a program for each shape.
+    # Use NumPy if the numbers are not traced: JAX would compile a program for each shape.
     if _checks.is_known(leaves):
         return _constant_array(np.stack([np.asarray(leaf) for leaf in leaves]))
     return jnp.stack(leaves)
 
 
 def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "*rows"]) -> PyTree:
-    """Return the tree of arrays at one `index` of their leading axis, or at several."""
+    """Return the tree `records` with each array picked at `index` of its leading axis.
+
+    `index` is one index, a slice, or an array of indices. Leaves that are not arrays are unchanged.
+    """
 
     def pick(leaf: PyTree) -> Any:
         if not eqx.is_array(leaf):
@@ -98,7 +105,7 @@ def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "
 
 
 def _constant_array(array: np.ndarray | np.generic) -> Array:
-    """Return a JAX array whose numbers stay known within a trace as well."""
+    """Return a JAX array with the numbers of `array`, which is not traced even within `jit`."""
     with jax.ensure_compile_time_eval():
         return jnp.asarray(array)
 
@@ -106,7 +113,11 @@ def _constant_array(array: np.ndarray | np.generic) -> Array:
 def recordings_on_host(
     records: Recording, counts: Int[ArrayLike, " records"]
 ) -> tuple[Recording, ...]:
-    """Return the recordings one by one with NumPy arrays, so that work on them compiles nothing."""
+    """Return a tuple of single recordings with NumPy arrays, so that work on them compiles nothing.
+
+    `records` holds the recordings with a leading axis, and `counts` (R,) the number of times of
+    each recording without padding.
+    """
     known = jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, records)
     return tuple(
         take_rows(jax.tree.map(lambda x, i=i: x[i] if isinstance(x, np.ndarray) else x, known), n)
@@ -115,9 +126,10 @@ def recordings_on_host(
 
 
 def take_rows(recording: Recording, end: int, begin: int = 0, axis: int = 0) -> Recording:
-    """Return the rows of a recording from `begin` to before `end`.
+    """Return a recording with the times and readings of indices `begin` to `end` − 1.
 
-    Times are along `axis`: 0 for one recording, 1 for several with a leading axis.
+    Times are along `axis`, which is 0 for one recording, and 1 for several recordings with a
+    leading axis.
     """
     if recording.t.shape[axis] == end - begin:
         return recording
@@ -138,19 +150,20 @@ def take_rows(recording: Recording, end: int, begin: int = 0, axis: int = 0) -> 
 
 
 def _is_table(node: PyTree) -> bool:
-    """Return whether a node of a tree is a table of time."""
+    """Return whether a `node` of a tree is a table of time, a `Linear` or a `Series`."""
     return isinstance(node, Linear | Series)
 
 
 def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0) -> Recording:
     """Return the recording padded to `count` times, with its tables of time padded to `rows` rows.
 
-    The padding is masked readings at the last time, and the last value of tables. Times are along
-    `axis`: 0 for one recording, 1 for several with a leading axis.
+    Masked readings are added at the last time, and the last value of a table of time is repeated.
+    Times are along `axis`, which is 0 for one recording, and 1 for several recordings with a
+    leading axis.
     """
     missing = count - recording.t.shape[axis]
-    # Pad the sensors as well as the inputs: sensors that read a moving object hold tables of time,
-    # too.
+    # Pad the tables in sensors as well as in inputs: a sensor that observes a moving object holds a
+    # table of time, too.
     inputs, sensors = jax.tree.map(
         lambda node: _pad_table(node, rows, axis) if _is_table(node) else node,
         (recording.inputs, recording.sensors),
@@ -181,7 +194,10 @@ def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0
 
 
 def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
-    """Return a table of time with `rows` rows, its last value repeated after its last time."""
+    """Return a table of time padded to `rows` rows along `axis`.
+
+    The last value of the table is repeated after its last time.
+    """
     missing = rows - table.values.shape[axis]
     if missing <= 0:
         return table
@@ -198,10 +214,11 @@ def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
 def _repeat_last(
     values: ArrayLike, count: int, axis: int, fill: float | bool | None = None
 ) -> Array:
-    """Return `values` with their last entry along `axis`, or the number `fill`, added `count` times
-    at the end.
+    """Return `values` with `count` entries added at the end of `axis`.
+
+    Each added entry is the last entry or, if `fill` is given, the number `fill`.
     """
-    # Use NumPy where the numbers are known: JAX would compile a program for each shape.
+    # Use NumPy if the numbers are not traced: JAX would compile a program for each shape.
     xp: Any = np if _checks.is_known(values) else jnp
     array = xp.asarray(values)
     edge = array[(slice(None),) * axis + (slice(-1, None),)]

@@ -1,7 +1,8 @@
-"""Make many short open-loop runs from measured starts, to identify driven machines.
+"""Make windows of measured states, to identify driven machines by many short predictions.
 
-A record of measured states is cut into windows. The model runs open-loop from the start of each
-window, driven by the recorded inputs, and is compared with the measured states at every step.
+A record of measured states is cut into windows. From the measured state at the start of each window
+the model predicts the states that follow, driven by the recorded inputs but without further
+measurements (open-loop). The predictions are compared with the measured states at every step.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,17 +25,18 @@ from rigidjax.motion.torques.inputs import delays_of
 
 
 class Horizons(NamedTuple):
-    """Hold the open-loop errors of a model by horizon, which is the number of steps that the model
-    predicts ahead.
+    """Hold the errors of open-loop predictions, as functions of the horizon.
 
-    Errors are given by kind: `x` m, `v` m/s, `q` rad, `omega` rad/s.
+    The horizon is the number of steps from the measured start of a window to the predicted state.
+    Each field but `steps` is a dict of kind → array, where the kinds are the parts of the state:
+    `x` (m), `v` (m/s), `q` (rad) and `omega` (rad/s).
 
     **Fields:**
 
-    - `steps`: (L,) the horizons.
-    - `mean_absolute`: by kind, (L,) the mean absolute value of a component.
-    - `mean_norm`: by kind, (L,) the mean length of the vector.
-    - `rms`: by kind, (L,) the root of the mean squared length.
+    - `steps`: (L,) the horizons 1 to L.
+    - `mean_absolute`: for each kind, (L,) the mean absolute value of a component of the error.
+    - `mean_norm`: for each kind, (L,) the mean length of the error vector.
+    - `rms`: for each kind, (L,) the root of the mean squared length of the error vector.
 
     >>> t = np.arange(6.0)
     >>> spin = rj.Spin(np.stack([t, 0 * t, 0 * t], 1))
@@ -50,8 +52,10 @@ class Horizons(NamedTuple):
 
 
 def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"]) -> Horizons:
-    """Return the means over all windows of the `errors` of states, where `starts` has the type of
-    the states.
+    """Return the mean `errors` over all windows, as functions of the horizon.
+
+    `errors` holds an error vector for each window and step. `starts` is a tree of states of the
+    same type, which names the parts of an error vector.
     """
     by_kind = parts_by_name(jax.tree.map(lambda leaf: leaf[0], starts), errors)
     absolute = {k: np.asarray(jnp.mean(jnp.abs(v), (0, 2))) for k, v in by_kind.items()}
@@ -63,25 +67,28 @@ def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"])
 
 @jax.jit
 def held_errors(starts: HasSpin, measured: HasSpin) -> Float[Array, "windows steps n"]:
-    """Return the errors of a prediction that stays at each start, compared with the `measured`
-    states.
+    """Return the errors of a prediction that the state stays constant in each window.
+
+    `starts` holds the state at the start of each window, and `measured` the states that follow.
     """
     return jax.vmap(jax.vmap(minus_small, (None, 0)))(starts, measured)
 
 
 class Windows(eqx.Module):
-    """Hold the windows of a record: short runs of one length, each from a measured start.
+    """Hold the N windows of a record: parts of L steps, each of which begins at a measured state.
 
-    `windows` cuts a record into windows; `Windows.join` joins those of several records.
+    The function `windows` cuts a record into windows; `Windows.join` joins the windows of several
+    records.
 
     **Fields:**
 
     - `step`: s, the time between two samples.
-    - `starts`: N states, the starts.
+    - `starts`: the states at the starts of the windows, with a leading axis (N,).
     - `wanted`: the L measured states that follow each start, with leading axes (N, L).
-    - `inputs`: by name, (N, before + L, *k). Without a delay row before + i is held in step i.
-    - `before`: the number of rows before the start.
-    - `noise`, `start_deviation`: by kind, the arguments `noise` and `starts` of `windows`.
+    - `inputs`: a dict of name → samples (N, before + L, *k). In step i after the start (i = 0, 1,
+      …) an input without a delay has the value in row before + i.
+    - `before`: the number of samples of each input before the start of a window.
+    - `noise`, `start_deviation`: the arguments `noise` and `starts` of `windows`.
 
     >>> cut = windows(np.arange(6.0), Spin(np.ones((6, 3))), length=2, stride=2)
     >>> cut.count, cut.length, cut.wanted.omega.shape
@@ -108,9 +115,10 @@ class Windows(eqx.Module):
 
     @property
     def scales(self) -> Float[Array, " m"]:
-        """Return the unit (m,) in which each number of an error is counted.
+        """Return the scale (m,) of each of the m components of an error of the state.
 
-        It is the `noise`, else the rms error of a prediction that holds the start.
+        The scale is the `noise` if this is given. Otherwise it is the root mean square error, for
+        each part of the state, of a prediction that the state stays constant in each window.
         """
         if self.noise is not None:
             return jnp.asarray(np.repeat([self.noise[kind] for kind in names(self.starts)], 3))
@@ -119,10 +127,10 @@ class Windows(eqx.Module):
         return jnp.asarray(np.repeat(np.where(each == 0, 1.0, each), 3))
 
     def records(self) -> Recording:
-        """Return the windows as recordings with a leading axis, read by one sensor of the whole
-        state.
+        """Return the windows as recordings with a leading axis.
 
-        The first time of each window is its start, at which nothing is read.
+        Each recording has one sensor, which reads the whole state. The first time of a recording is
+        the start of the window, at which the reading is masked.
         """
         kind, scales = type(self.starts), np.asarray(self.scales)
         steps = np.arange(self.length + 1, dtype=self.wanted.omega.dtype)
@@ -145,14 +153,18 @@ class Windows(eqx.Module):
         return recording_of(jnp.asarray(t), (reading,), inputs)
 
     def held_horizons(self) -> Horizons:
-        """Return the errors of a prediction that stays at each start, which a model must beat."""
+        """Return the errors of a prediction that the state stays constant in each window.
+
+        A model must have smaller errors to be of use.
+        """
         return average_by_horizon(self.starts, held_errors(self.starts, self.wanted))
 
     @staticmethod
     def join(*parts: "Windows") -> "Windows":
         """Join the windows of several records, all of one step and one length, in one `Windows`.
 
-        **Raises:** `ValueError` for none, or for steps, lengths or inputs that differ.
+        **Raises:** `ValueError` without an argument, or if the steps, lengths, types of state,
+        inputs, numbers of samples before the start, or deviations of the arguments differ.
         """
         if not parts:
             raise ValueError("Windows.join: wanted at least one Windows")
@@ -194,25 +206,26 @@ def windows(
     noise: Mapping[str, float] | None = None,
     starts: Mapping[str, float] | None = None,
 ) -> Windows:
-    """Return the windows of `length` steps of a record of measured states, one at every `stride`
-    samples.
+    """Return the windows of `length` steps of a record of measured states.
+
+    A window starts at every `stride`-th sample of the record.
 
     **Arguments:**
 
-    - `t`: (T,) s, evenly spaced but for gaps. No window reaches across a gap, nor do the samples
-      before it.
+    - `t`: (T,) s, evenly spaced times. Some samples may be missing; no window, and none of the
+      `before` samples of a window, reaches across a missing sample.
     - `states`: a `Spin`, `Attitude` or `Rigid` with a leading axis (T,).
-    - `inputs`: by name, (T, *k) samples, each held until the next one, for the
-      `rigidjax.torques.Input`s of a torque.
+    - `inputs`: a dict of name → samples (T, *k), for each `rigidjax.torques.Input` of a torque.
+      Each sample is held until the next one.
     - `length`: the number of steps of a window.
     - `stride`: the number of samples from one start to the next.
     - `before`: the number of input samples kept before each start, for a torque that delays inputs
-      (`rigidjax.torques.Delayed`) or has states of its own, such as `Lagged`. These states follow
-      the inputs up to the start, while the body is held at the start.
-    - `noise`: by kind, the standard deviation of a component of the measured states; `None` for an
-      unknown one.
-    - `starts`: by kind, the standard deviation of a component of the start, infinite for a free
-      one; `None` takes the measured starts as exact. It needs `noise`.
+      (`rigidjax.torques.Delayed`) or has states of its own, such as `Lagged`. The states of the
+      torque follow the inputs up to the start, while the body is held at the start.
+    - `noise`: a dict of kind → standard deviation of a component of the measured states, where the
+      kinds are the fields of the state, such as `q` and `omega`; `None` if the noise is unknown.
+    - `starts`: a dict of kind → standard deviation of a component of the measured start, infinite
+      for a start that is free; `None` takes the measured starts as exact. It needs `noise`.
 
     **Raises:** `ValueError` for shapes that do not agree, NaN, uneven times, or a record without a
     window of this length; `TypeError` for other states.
@@ -272,7 +285,11 @@ def windows(
 def _checked_by_kind(
     numbers: object, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
 ) -> dict[str, float]:
-    """Return the numbers of a mapping whose keys are `kinds`, after `check` of each number."""
+    """Return a dict of kind → number from the mapping `numbers`, after checks.
+
+    The keys of `numbers` must be `kinds`. Each number is passed through `check`, which is given the
+    number and its name in an error.
+    """
     by_kind = _checks.require_instance(numbers, Mapping, name, requirement="numbers by kind")
     if set(by_kind) != set(kinds):
         raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(by_kind)}")
@@ -280,7 +297,10 @@ def _checked_by_kind(
 
 
 def _start_deviation(value: object, name: str) -> float:
-    """Return the deviation of a start, and raise `ValueError` unless it is positive or infinite."""
+    """Return the standard deviation of a start as a float.
+
+    A `ValueError`, which calls the deviation `name`, is raised unless it is positive or infinite.
+    """
     number = _checks.known_float(value, name)
     if not number > 0:
         raise ValueError(
@@ -291,7 +311,10 @@ def _start_deviation(value: object, name: str) -> float:
 
 
 def _require_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) -> None:
-    """Raise `ValueError` unless states and inputs are finite, with one row for each time."""
+    """Raise `ValueError` unless `states` and `inputs` have a row of finite numbers for each time.
+
+    A `ValueError` is raised for quaternions that are not of unit length as well.
+    """
     rows = dict(zip(names(states), jax.tree.leaves(states), strict=True))
     rows |= {f"inputs[{k!r}]": v for k, v in inputs.items()}
     for name, value in rows.items():
@@ -316,7 +339,10 @@ def _require_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) 
 
 
 def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the time between samples, s, and a mask (T − 1,) of the steps that are no gaps."""
+    """Return the time between two samples, s, and a mask (T − 1,) of the intervals of this length.
+
+    An interval between successive `times` (T,) at which the mask is false has missing samples.
+    """
     gaps = np.diff(times)
     h = float(np.median(gaps))
     even = np.abs(gaps - h) <= 1e-3 * h
@@ -331,7 +357,10 @@ def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def require_windows(windows: PyTree) -> None:
-    """Raise `TypeError` or `ValueError` unless `windows` are several windows of finite numbers."""
+    """Raise an error unless `windows` is a `Windows` of finite states.
+
+    A `TypeError` is raised for another class, a `ValueError` for wrong shapes, NaN and infinity.
+    """
     _checks.require_instance(
         windows, Windows, "windows", requirement="what identify.windows returns"
     )
@@ -345,14 +374,13 @@ def require_windows(windows: PyTree) -> None:
 
 
 def mistakes_of_delays(law: PyTree, history: float, length: float) -> list[str]:
-    """Describe each delay with which a torque `law` reads an input outside of the samples of a
-    window.
+    """Describe each delay with which a torque reads an input outside of the samples of a window.
 
     **Arguments:**
 
     - `law`: the torque.
-    - `history`: s, for how long before a window its inputs are known.
-    - `length`: s, of a window.
+    - `history`: s, the time before the start of a window for which inputs are known.
+    - `length`: s, the duration of a window.
     """
     out = []
     for name, delay in delays_of(law):
@@ -373,11 +401,15 @@ def mistakes_of_delays(law: PyTree, history: float, length: float) -> list[str]:
 def starts_of_windows(
     windows: Windows, stretches: int
 ) -> tuple[ReferenceStates, Float[Array, "windows m"] | None, Int[Array, " windows"]]:
-    """Return the starts as reference states, their weights, and the index of the stretch of each
-    window.
+    """Return the starts of windows, their weights, and the stretch to which each window belongs.
 
-    A weight is the unit of a start's free number over its deviation, and `None` for known starts.
-    The windows are divided into at most `stretches` stretches of neighbours.
+    Three things are returned:
+
+    - The starts as `ReferenceStates`.
+    - The weights (N, m) of the m free numbers of each start, or `None` if the starts are known. A
+      weight is the unit of a free number over the standard deviation of the start.
+    - The index (N,) of the stretch of each window. The windows, in their order, are divided into at
+      most `stretches` stretches of neighbouring windows.
     """
     count, scales = windows.count, np.asarray(windows.scales)
     dtype = windows.wanted.omega.dtype

@@ -1,4 +1,4 @@
-"""Run the extended Kalman filter on the manifold, in square-root form, from a first belief."""
+"""Run an extended Kalman filter, in square-root form, whose state contains an attitude."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -35,18 +35,20 @@ from rigidjax.motion.manifold import names, plus
 
 
 class Belief(eqx.Module):
-    """Hold an estimate of the state at a time, and a root S of the covariance `S Sᵀ` of its errors.
+    """Hold an estimate of the state at a time, and a root S of the covariance `S Sᵀ` of the errors
+    of the estimate.
 
-    `first_belief` makes the first one; in the result of `filter` all fields have a leading time
-    axis.
+    `first_belief` makes the belief before the first reading. In the result of `filter` all fields
+    have a leading time axis.
 
     **Fields:**
 
-    - `t`: s.
-    - `x`: the `ExtendedState` state.
-    - `root`: S (n, n). Its rows are the errors of Ω for a `Spin`; of δθ (body frame, rad) and Ω for
-      an `Attitude`; of x, v, δθ and Ω for a `Rigid`; then three for each `CorrelatedTorque`, then
-      those of the walks.
+    - `t`: the time, s.
+    - `x`: the estimated state, an `ExtendedState`.
+    - `root`: S (n, n). The rows belong to the errors of the state in this order: for a `Spin` the
+      body rate Ω; for an `Attitude` a small turn δθ (body frame, rad) and Ω; for a `Rigid` the
+      position x, the velocity v, δθ and Ω; then three rows for each `CorrelatedTorque`, and the
+      rows of the walks.
     """
 
     t: Float[Array, "*times"]
@@ -70,12 +72,12 @@ class Belief(eqx.Module):
 
     @property
     def covariance(self) -> Float[Array, "*times n n"]:
-        """Return the covariance of the errors."""
+        """Return the covariance `S Sᵀ` of the errors of the estimate."""
         return self.root @ jnp.swapaxes(self.root, -1, -2)
 
     @property
     def deviation(self) -> Float[Array, "*times n"]:
-        """Return the standard deviations of the errors."""
+        """Return the standard deviations of the errors of the estimate."""
         return jnp.sqrt(jnp.sum(self.root**2, axis=-1))
 
 
@@ -97,15 +99,19 @@ def first_belief(
     **Arguments:**
 
     - `model`: a `Model` of one recording.
-    - `x`: (n,) its free numbers, such as `fit(model).x`. With `None` the body must be known, and
-      the initial state is the one that the first readings show.
-    - `state`: the initial state, a `Spin`, `Attitude` or `Rigid`; `None` takes that of x.
-    - `rate`: the standard deviation of Ω, rad/s, one number or three, zero if it is known.
-    - `attitude`: likewise, rad, for an `Attitude` or a `Rigid`.
-    - `position`, `velocity`: likewise, m and m/s, for a `Rigid`.
+    - `x`: (n,) the free numbers of the model, such as `fit(model).x`. With `None` the body must be
+      known, and the initial state is the state that the first readings show.
+    - `state`: the initial state, a `Spin`, `Attitude` or `Rigid`; `None` takes the initial state
+      that x represents.
+    - `rate`: the standard deviation of the initial body rate Ω, rad/s, one number or three; zero if
+      the rate is known.
+    - `attitude`: the standard deviation of the initial attitude, rad, in the same form, for an
+      `Attitude` or a `Rigid`.
+    - `position`, `velocity`: the standard deviations of the initial position, m, and velocity, m/s,
+      in the same form, for a `Rigid`.
 
     **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing or below zero,
-    and for neither x nor `state` if the readings show no initial attitude.
+    and if neither x nor `state` is given and the readings show no initial attitude.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> body = rj.identify.Known(rj.Inertia.from_principal(1.0, 2.0, 2.5))
@@ -141,9 +147,16 @@ def belief_at(
     scene: Scene,
     drifts: Sequence[Drift],
 ) -> Belief:
-    """Return the belief in a state with the standard `deviations`, in the dtype of the state.
+    """Return the `Belief` at the time t whose errors are independent, in the dtype of the `state`.
 
-    The rest of the belief comes from the scene: its correlated torques, and its `drifts`.
+    **Arguments:**
+
+    - `t`: the time, s.
+    - `state`: the estimated state.
+    - `deviations`: (k,) the standard deviations of the errors of the state.
+    - `scene`: the scene, with the correlated torques, which begin at zero with their stationary
+      deviation.
+    - `drifts`: the walks, which begin at their values in the scene.
     """
     dtype = state.omega.dtype
     coloured = coloured_parts(scene.process)
@@ -157,7 +170,10 @@ def belief_at(
 
 
 def _require_shown_attitude(recording: Recording, state: HasSpin | None) -> None:
-    """Raise an error if the state has an attitude that the readings do not show."""
+    """Raise an error if the `state` has an attitude that the readings of `recording` do not show.
+
+    A `TypeError` is raised for a traced recording, and a `ValueError` if no attitude is shown.
+    """
     if not _checks.is_known(recording):
         raise TypeError("state: wanted a state; a traced recording shows none")
     if isinstance(state, HasAttitude) and not len(attitudes(recording)[1]):
@@ -168,9 +184,11 @@ def _require_shown_attitude(recording: Recording, state: HasSpin | None) -> None
 
 
 def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recording]:
-    """Return the scene of a model's only recording at the free numbers x, and the recording.
+    """Return the scene of the only recording of a `model`, and the recording.
 
-    The torque of the scene reads the inputs of the recording.
+    A scene holds the body, torque, process, sensors and initial state at the free numbers x (n,).
+    With `None` for x the body must be known. The torque of the scene reads the inputs of the
+    recording.
     """
     require_one(model)
     if model.count != 1:
@@ -192,7 +210,10 @@ def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recordi
 
 @eqx.filter_jit
 def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
-    """Return the scene of the first recording, with its inputs bound to the torque."""
+    """Return the scene of the first recording of a `model` at the free numbers x.
+
+    The torque of the scene reads the inputs of the recording.
+    """
     row = model.index.rows(x)[0]
     record, reference, body_index = stacking.pick_records(
         (model.records, model.reference, model.body_indices), 0
@@ -202,14 +223,16 @@ def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
 
 
 class Grid(NamedTuple):
-    """Hold the times of the steps of a filter: those of the recording, and some between them.
+    """Hold the times at which the steps of a filter end.
+
+    These are the T times of the recording, and times between them if the intervals are long.
 
     **Fields:**
 
-    - `t`: (N,) s.
-    - `source`: (N,) the row of the recording at or after each time.
-    - `real`: (N,) whether the time is that of the row, so that its readings count.
-    - `rows`: (T,) the index in `t` of each row of the recording.
+    - `t`: (N,) the times, s.
+    - `source`: (N,) for each time, the index of the first time of the recording at or after it.
+    - `real`: (N,) for each time, whether it is a time of the recording, so that readings count.
+    - `rows`: (T,) the index in `t` of each time of the recording.
     """
 
     t: Float[Array, " n"]
@@ -218,10 +241,11 @@ class Grid(NamedTuple):
     rows: Int[Array, " t"]
 
     def at_rows(self, values: PyTree[Array]) -> PyTree[Array]:
-        """Return the `values` at the times of the recording, picked from those at all times of the
-        grid.
+        """Return the entries of `values` at the times of the recording.
+
+        The arrays in `values` have a leading axis over all times of the grid.
         """
-        # If there are no other times, picking all values would only copy them.
+        # If the grid has no other times, indexing would only copy the arrays.
         same = self.rows.size == self.t.size
         return values if same else jax.tree.map(lambda leaf: leaf[self.rows], values)
 
@@ -229,7 +253,11 @@ class Grid(NamedTuple):
 def grid_of(
     process: Process | None, recording: Recording, belief: Belief, substeps: int | None
 ) -> Grid:
-    """Return the times of the steps from the time of the `belief` to the end of the recording."""
+    """Return the `Grid` of the steps from the time of the `belief` to the end of the `recording`.
+
+    `substeps` is the number of steps from one time to the next; `None` chooses this number by the
+    body rate and by the correlation times of the `process`.
+    """
     xp = _checks.namespace((recording.t, belief.t))
     t, t0 = xp.asarray(recording.t), xp.asarray(belief.t)
     if xp is np:
@@ -251,8 +279,14 @@ def grid_of(
 class FilterInput(NamedTuple):
     """Hold the checked arguments of a filter, which `checked_input` makes.
 
-    **Fields:** `scene` with its torque bound to inputs; `drifts` of the model; `recording`; `first`
-    the belief before it; `grid` the times of the steps.
+    **Fields:**
+
+    - `scene`: the body, torque, process, sensors and initial state. The torque reads the inputs of
+      the recording.
+    - `drifts`: the walks of the model.
+    - `recording`: the readings.
+    - `first`: the belief before the first reading.
+    - `grid`: the times of the steps.
     """
 
     scene: Scene
@@ -262,8 +296,8 @@ class FilterInput(NamedTuple):
     grid: Grid
 
 
-# A filter is lost if, for LOST_AFTER seconds and for LOST_READINGS readings in a row, no reading
-# was within LOST_BEYOND standard deviations of its prediction.
+# A filter is lost if, for at least LOST_AFTER seconds and LOST_READINGS readings of a sensor in a
+# row, no reading was within LOST_BEYOND standard deviations of its prediction.
 LOST_AFTER, LOST_READINGS, LOST_BEYOND = 1.0, 3, 6.0
 WORDS = (
     "followed",
@@ -278,10 +312,11 @@ class Filtered(eqx.Module):
     **Fields:**
 
     - `belief`: a `Belief` at each time of the recording, after its readings.
-    - `readings`: for each sensor `ReadNumbers`: `innovation`, `variance` and `mask`, (T, k).
-    - `log_likelihood`: of all readings.
-    - `status`: 0 followed, 1 lost, 2 stopped; `words` is the same in words.
-    - `lost_at`: s, NaN unless the filter was lost.
+    - `readings`: a `ReadNumbers` for each sensor, with `innovation`, `variance` and `mask`, (T, k).
+    - `log_likelihood`: the logarithm of the density of all readings.
+    - `status`: 0 if the filter followed the readings, 1 if it was lost, 2 if an estimate is not
+      finite. `words` describes the status.
+    - `lost_at`: the time at which the filter was lost, s; NaN if it was not lost.
     """
 
     belief: Belief
@@ -307,10 +342,10 @@ class Filtered(eqx.Module):
 
     @property
     def nis(self) -> tuple[Float[Array, " times"], ...]:
-        """Return the normalised innovations squared of each sensor at each time.
+        """Return the sum of the normalised squared innovations of each sensor at each time.
 
-        If the model is right they follow χ², with as many degrees of freedom as numbers were read
-        (Bar-Shalom, Li and Kirubarajan, Estimation (2001), §5.4).
+        If the model is right, the sum follows the χ² distribution, with as many degrees of freedom
+        as components were read (Bar-Shalom, Li and Kirubarajan, Estimation (2001), §5.4).
         """
         return tuple(
             jnp.sum(jnp.where(r.mask, r.innovation**2 / r.variance, 0), -1) for r in self.readings
@@ -327,22 +362,23 @@ def filter(
 ) -> Filtered:
     """Return attitude, rate, unknown torque and sensor errors from the readings up to each time.
 
-    This is the multiplicative extended Kalman filter: the estimate is a state on the group, its
-    error a rotation vector and other numbers (Lefferts, Markley and Shuster 1982,
-    doi:10.2514/3.56190). Between readings the estimate and its covariance follow the equations of
-    motion, by the classical method of order 4. The covariance is kept as a root, which Potter's
-    formula updates for each number read.
+    This is the multiplicative extended Kalman filter: the attitude is estimated as a quaternion,
+    and its error is a rotation vector (Lefferts, Markley and Shuster 1982, doi:10.2514/3.56190).
+    Between readings the estimate and its covariance follow the equations of motion, integrated by
+    the classical Runge–Kutta method of order 4. A root of the covariance is stored, and Potter's
+    formula updates this root for each component read.
 
     **Arguments:**
 
     - `model`: a `Model` of one recording, whose sensors have their noise. Masked readings and
       channels at full scale are left out; a sensor's `offset` is allowed for.
-    - `belief`: the belief before the first reading, of `first_belief`.
-    - `x`: (n,) the free numbers of the model, such as `fit(model).x`: body, torques and sensors are
-      those of the scene at x. `None` for a model whose body is known.
-    - `substeps`: the number of fixed steps from one time to the next; `None` chooses them by the
-      rate if the numbers are known, else one.
-    - `throw`: `False` raises no error for what happens during the run; look at `status`.
+    - `belief`: the belief before the first reading, such as `first_belief` returns.
+    - `x`: (n,) the free numbers of the model, such as `fit(model).x`, which give the body, the
+      torques and the sensors. `None` for a model whose body is known.
+    - `substeps`: the number of fixed steps from one time to the next; `None` chooses this number by
+      the body rate, and takes 1 if the numbers are traced.
+    - `throw`: whether to raise an error if the filter is lost or an estimate is not finite; with
+      `False` look at `status`.
 
     **Returns** `belief`, `readings`, `log_likelihood`, `status` and `lost_at` (`Filtered`). It may
     be jitted, differentiated, and batched over `belief`, `x`, and readings that `equinox.tree_at`
@@ -364,7 +400,7 @@ def filter(
 
 
 def raise_if_lost(run: Any) -> Any:
-    """Return the run of a filter, and raise `ValueError` if it was lost or stopped."""
+    """Return the result `run` of a filter, or raise an error if the filter was lost or stopped."""
     status = run.status
     at = f" (at {float(run.lost_at):g} s)" if _checks.is_known(run.lost_at) else ""
     advice = (
@@ -383,9 +419,10 @@ def log_likelihood(
 ) -> Scalar:
     """Return the logarithm of the density of all readings, with the unknown torques integrated out.
 
-    It is `Σ log N(ν; 0, s)` over innovations ν of variance s (Schweppe 1965,
-    doi:10.1109/TIT.1965.1053737). Maximise it over moments, the density of a torque, a noise, or an
-    initial state: it is differentiable in forward and reverse mode.
+    The result is `Σ log N(ν; 0, s)` over the innovations ν, where N(ν; 0, s) is the normal density
+    with mean 0 and variance s (Schweppe 1965, doi:10.1109/TIT.1965.1053737). It can be maximised
+    over moments, the spectral density of a torque, a noise or an initial state, and is
+    differentiable in forward and reverse mode.
 
     **Arguments:** `model`, `belief`, `x`, `substeps` as for `filter`. **Raises** the errors of
     `filter`.
@@ -408,20 +445,19 @@ def step(
     mask: Sequence[Any] | None = None,
     x: Float[Array, " n"] | None = None,
 ) -> Belief:
-    """Return the belief at the time t after the readings at t, to run a filter while the body
-    moves.
+    """Return the belief after the readings at the time t, to run a filter while the body moves.
 
-    It makes one step of the classical method of order 4: the body may turn only little from one
-    reading to the next.
+    One step of the classical Runge–Kutta method of order 4 leads from the belief to the time t: the
+    body may turn only little from one reading to the next.
 
     **Arguments:**
 
     - `model`: a `Model` of one recording. Its body, torque and sensors are used, its readings not.
     - `belief`: the result of `first_belief` or of the last `step`.
-    - `t`: s, not before the time of the belief.
-    - `readings`: one of each sensor, in the order of the recording.
-    - `mask`: a truth value for each sensor; false if there is no reading, and its number does not
-      count. `None` for all true.
+    - `t`: the time of the readings, s, not before the time of the belief.
+    - `readings`: one reading of each sensor, in the order of the recording.
+    - `mask`: a truth value for each sensor, false if the sensor has no reading at t (then the value
+      in `readings` is not used). `None` if all sensors have one.
     - `x`: (n,) the free numbers of the model; `None` for a model whose body is known.
 
     **Returns** the `Belief` at t. **Raises:** `ValueError` for a t before the belief, another
@@ -464,7 +500,7 @@ def step(
 
 @eqx.filter_jit
 def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) -> Belief:
-    """Return the belief after one step, computed in one program."""
+    """Return the `belief` after one step and the readings in `stop`, in one compiled program."""
     # Replace missing readings by a unit vector: derivatives at a zero quaternion are NaN.
     units = (jnp.eye(1, v.size, dtype=v.dtype).reshape(v.shape) for v in stop.values)
     values = tuple(map(jnp.where, stop.masks, stop.values, units))
@@ -476,7 +512,10 @@ def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) 
 def _predict_and_update(
     dynamics: Dynamics, belief: Belief, stop: Stops
 ) -> tuple[Belief, ReadNumbers]:
-    """Return the belief at a stop after its readings, and the numbers that were read."""
+    """Return the belief after one step to the time in `stop` and the readings at this time.
+
+    The second result is the `ReadNumbers` of all sensors at this time.
+    """
     dtype = belief.root.dtype
     # Subtract times before they are rounded to the dtype of the state: after a thousand seconds the
     # seven digits of float32 are too few.
@@ -494,10 +533,11 @@ def _predict_and_update(
 def scan_filter(
     run: FilterInput, keep: Callable[[Belief, ReadNumbers], PyTree[Array]]
 ) -> tuple[Dynamics, Stops, PyTree[Array]]:
-    """Run the filter over all stops by `lax.scan`.
+    """Run the filter over all times of its grid by `lax.scan`.
 
-    It returns the equations of the filter, the stops, and the results of `keep(belief, read)` at
-    each stop.
+    Three things are returned: the equations of the filter; the times with their readings, as
+    `Stops`; and the results of `keep(belief, read)` at each time, stacked. `keep` is given the
+    `Belief` after the readings and the `ReadNumbers` at a time.
     """
     scene, drifts, recording, first, grid = run
     dtype = first.root.dtype
@@ -510,7 +550,7 @@ def scan_filter(
         belief, read = _predict_and_update(dynamics, belief, stop)
         return belief, keep(belief, read)
 
-    # Let a reverse pass compute each step again: to store a step takes some thousand numbers.
+    # Let a reverse pass compute each step again: storing one step would take some thousand numbers.
     body = jax.checkpoint(body)  # pyright: ignore[reportPrivateImportUsage]
     return dynamics, stops, lax.scan(body, first, stops)[1]
 
@@ -532,8 +572,10 @@ def _log_likelihood(run: FilterInput) -> Scalar:
 
 
 def status_of(beliefs: Belief, reads: tuple[ReadNumbers, ...], t0: Array) -> tuple[Array, Array]:
-    """Return the status of a run that starts at `t0`, and the time at which it was lost, else
-    NaN.
+    """Return the status of a run of a filter, and the time at which the filter was lost, else NaN.
+
+    `beliefs` and `reads` are the results at the times of the recording, and `t0`, s, is the time of
+    the first belief. The status is 0, 1 or 2, as in `Filtered`.
     """
     t, times = beliefs.t, jnp.arange(beliefs.t.shape[0])
     lost = jnp.zeros(t.shape, bool)

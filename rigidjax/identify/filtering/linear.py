@@ -1,4 +1,4 @@
-"""Compute the Kalman filter and smoother of any linear model with normal noise, in square-root
+"""Compute the Kalman filter and the smoother of a linear model with normal noise, in square-root
 form.
 """
 
@@ -20,24 +20,24 @@ Parameter = Float[ArrayLike, "..."] | Numbers
 
 
 class LinearModel(eqx.Module):
-    """Hold a linear model, `x' = F x + d + G u` and `y = H x + c + r v`, where x' is the state
-    after a step.
+    """Hold a linear model of a state x and its readings y, with normal noise.
 
-    The vectors u and v are normal, with independent entries of unit variance.
+    A step leads from x to `F x + d + G u`, and the readings are `y = H x + c + r v`. The vectors u
+    and v are normal, with independent entries of unit variance.
 
     **Arguments:**
 
     - `transition`: F (n, n).
-    - `noise`: G (n, m), a root of the covariance that a step adds.
+    - `noise`: G (n, m), a root of the covariance `G Gᵀ` that a step adds.
     - `matrix`: H (k, n).
-    - `deviation`: r (k,), of the noise of each number read.
+    - `deviation`: r (k,), the standard deviation of the noise of each number read.
     - `push`: d (n,), or `None` for zero.
     - `offset`: c (k,), or `None` for zero.
 
-    Each may have a leading axis: F, G and d over the T − 1 steps between T times, H, r and c over
-    the times. Make correlated noise independent first: divide y, H and c by the Cholesky factor of
-    its covariance. **Raises:** `ValueError` for shapes that do not fit, and for a deviation that is
-    not positive.
+    Each array may have a leading axis: F, G and d over the T − 1 steps between T times; H, r and c
+    over the T times. The noise of the readings must be independent: if it is correlated, multiply
+    y, H and c by the inverse of the Cholesky factor of its covariance first. **Raises:**
+    `ValueError` for shapes that do not fit, and for a deviation that is not positive.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
     >>> walk.size
@@ -101,16 +101,18 @@ class LinearModel(eqx.Module):
 
 
 class LinearEstimate(eqx.Module):
-    """Hold the means of a state at each time, and roots of its covariances.
+    """Hold the estimated state of a `LinearModel` at each time, and its covariance.
 
     **Fields:**
 
-    - `mean`: (T, n).
-    - `root`: (T, n, n).
-    - `innovation`, `variance`: (T, k) of each number read, given the numbers read before it.
-    - `log_likelihood`: of all numbers read.
-    - `kicks`: (T − 1, m) the means of the noise u, of a smoother; else `None`.
-    - `kick_covariance`: (T − 1, m, m) their covariances, of a smoother; else `None`.
+    - `mean`: (T, n) the mean of the state at each time.
+    - `root`: (T, n, n) a root S of the covariance `S Sᵀ` of the state at each time.
+    - `innovation`: (T, k) each number read minus its prediction from the numbers read before it.
+    - `variance`: (T, k) the variance of each innovation.
+    - `log_likelihood`: the logarithm of the density of all numbers read.
+    - `kicks`: for a smoother, (T − 1, m) the mean of the noise u of each step; else `None`.
+    - `kick_covariance`: for a smoother, (T − 1, m, m) the covariance of the noise u of each step;
+      else `None`.
     """
 
     mean: Float[Array, "times n"]
@@ -123,17 +125,17 @@ class LinearEstimate(eqx.Module):
 
     @property
     def covariance(self) -> Float[Array, "times n n"]:
-        """Return the covariances."""
+        """Return the covariance `S Sᵀ` of the state at each time, with the roots S in `root`."""
         return self.root @ jnp.swapaxes(self.root, -1, -2)
 
     @property
     def deviation(self) -> Float[Array, "times n"]:
-        """Return the standard deviations."""
+        """Return the standard deviation of each entry of the state at each time."""
         return jnp.sqrt(jnp.sum(self.root**2, -1))
 
 
-# Each part of a model has this number of axes. A part that changes from step to step, or from time
-# to time, has one more.
+# An array of a model has this number of axes, or one more if it changes from step to step or from
+# time to time. The arrays in _STEPS belong to the steps, all other arrays to the times.
 _STEPS = {"transition": 2, "noise": 2, "push": 1}
 _AXES = _STEPS | {"matrix": 2, "deviation": 1, "offset": 1}
 Parts = dict[str, Any]
@@ -154,13 +156,14 @@ def linear_filter(
     **Arguments:**
 
     - `model`: a `LinearModel`.
-    - `readings`: y (T, k).
-    - `mean`: (n,) the mean of the state at the first time, before its reading.
-    - `root`: (n, n) a root of its covariance.
-    - `mask`: (T, k) true for the numbers that count; `None` for all.
+    - `readings`: y (T, k), k numbers at each of T times.
+    - `mean`: (n,) the mean of the state at the first time, before the first readings.
+    - `root`: (n, n) a root S of the covariance `S Sᵀ` of the state at the first time.
+    - `mask`: (T, k) true for the numbers that count; `None` if all numbers count.
 
-    **Returns** `mean`, `root`, `innovation`, `variance` and `log_likelihood` (`LinearEstimate`).
-    **Raises:** `ValueError` for shapes that do not fit, and for NaN that is not masked.
+    **Returns** a `LinearEstimate` with `mean`, `root`, `innovation`, `variance` and
+    `log_likelihood`. **Raises:** `ValueError` for shapes that do not fit, and for NaN that is not
+    masked.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
     >>> estimate = linear_filter(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
@@ -173,13 +176,15 @@ def linear_filter(
 def linear_smooth(
     model: LinearModel, readings: Readings, mean: Mean, root: Root, mask: Mask = None
 ) -> LinearEstimate:
-    """Return the state at each time, and the noise of each step, from all readings.
+    """Return the state of a `LinearModel` at each time, and the noise of each step, from all
+    readings.
 
-    It is the smoother of Rauch, Tung and Striebel (1965, doi:10.2514/3.3166) on roots of the
-    covariances.
+    The method is the smoother of Rauch, Tung and Striebel (1965, doi:10.2514/3.3166), which here
+    uses roots of the covariances.
 
-    **Arguments**, **returns** and **raises** as `linear_filter`, with `kicks`, the noise u of each
-    step, and `kick_covariance`.
+    The **arguments** and the errors **raised** are those of `linear_filter`. The function
+    **returns** a `LinearEstimate` that also holds `kicks`, the noise u of each step, and
+    `kick_covariance`.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
     >>> estimate = linear_smooth(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
@@ -192,7 +197,10 @@ def linear_smooth(
 def _checked_parts(
     model: LinearModel, readings: Readings, mean: Mean, root: Root, mask: Mask
 ) -> tuple[Parts, Array, Array, Array, Array]:
-    """Return the parts of the model, and the other arguments, as checked arrays."""
+    """Return the arguments of `linear_filter` as checked arrays.
+
+    The `model` is returned as a dict of field name → array. Masked readings are replaced by zero.
+    """
     _checks.require_instance(model, LinearModel, "model")
     n, k = model.size, model.deviation.shape[-1]
     readings = _checks.array_of_rows(readings, (k,), "readings")
@@ -220,7 +228,10 @@ def _checked_parts(
 
 
 def _time_varying(parts: Parts) -> Parts:
-    """Return the parts that change from step to step, or from time to time."""
+    """Return the entries of `parts` that have a leading axis, over the steps or over the times.
+
+    `parts` is a dict of field name → array of a `LinearModel`.
+    """
     return {n: part for n, part in parts.items() if part is not None and part.ndim > _AXES[n]}
 
 
@@ -230,8 +241,8 @@ def linear_estimate(
 ) -> LinearEstimate:
     """Return the estimate of the Kalman filter or, with `smooth`, of the smoother.
 
-    `parts` are the fields of a `LinearModel` by name; the other arguments are those of
-    `linear_filter`.
+    `parts` is a dict of field name → array of a `LinearModel`; all other arguments are those of
+    `linear_filter`, checked.
     """
     steps = {name: part for name, part in _time_varying(parts).items() if name in _STEPS}
     times = {name: part for name, part in _time_varying(parts).items() if name not in _STEPS}
@@ -270,10 +281,17 @@ def linear_estimate(
 
 
 class Joint(NamedTuple):
-    """Hold the values of a forward step that the backward pass needs, which `joint_roots` makes.
+    """Hold the matrices of one forward step that the backward pass of a smoother needs.
 
-    **Fields:** `predicted` a root of the covariance of the predicted state; `gain` of the smoother;
-    `rest` a root of the covariance before the step, given the state after it.
+    `joint_roots` makes a `Joint`.
+
+    **Fields:**
+
+    - `predicted`: a root of the covariance of the predicted state after the step.
+    - `gain`: the gain of the smoother, from a change of the state after the step to the change of
+      the state before it.
+    - `rest`: a root of the covariance of the state before the step, if the state after the step is
+      known.
     """
 
     predicted: Float[Array, "n n"]
@@ -284,8 +302,8 @@ class Joint(NamedTuple):
 def joint_roots(transition: Array, noise: Array, root: Array) -> Joint:
     """Return the `Joint` of a step from the triangular root of `[[F S, G], [S, 0]]`.
 
-    F is the `transition`, G the `noise`, S the `root` before the step (Park and Kailath 1995,
-    doi:10.1080/00207179508921582).
+    F (n, n) is the `transition`, G (n, m) the `noise`, and S (n, n) the `root` of the covariance
+    before the step (Park and Kailath 1995, doi:10.1080/00207179508921582).
     """
     n, m = noise.shape
     upper = jnp.concatenate([roots.matrix_product(transition, root), noise], 1)
@@ -299,19 +317,23 @@ def joint_roots(transition: Array, noise: Array, root: Array) -> Joint:
 def backward_pass(
     joint: Joint, mean: Array, predicted: Array, noise: Array, last: tuple[Array, Array]
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the smoothed means and roots, and the means and covariances of the noise of all steps.
+    """Return the smoothed states and the noise of each step, by a pass back over all steps.
 
-    It is the backward pass of Rauch, Tung and Striebel (1965). The covariance (m, m) of the unit
+    Four things are returned: the smoothed means (T, n); roots (T, n, n) of the smoothed
+    covariances; the means (T − 1, m) of the unit noise of each step; and the covariances
+    (T − 1, m, m) of this noise.
+
+    The method is the backward pass of Rauch, Tung and Striebel (1965). The covariance of the unit
     noise of a step is `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ` with `Z = L⁻¹ G`, where L is the predicted
     root and S the smoothed root after the step.
 
     **Arguments:**
 
-    - `joint`: of all steps.
-    - `mean`: (T − 1, n) the filtered means before each step.
-    - `predicted`: (T − 1, n) the predicted means after it.
-    - `noise`: G, of all steps or of each.
-    - `last`: mean and root at the last time.
+    - `joint`: the results of `joint_roots` for all steps, stacked.
+    - `mean`: (T − 1, n) the filtered mean before each step.
+    - `predicted`: (T − 1, n) the predicted mean after each step.
+    - `noise`: G (n, m) for all steps, or (T − 1, n, m) with one G for each step.
+    - `last`: the filtered mean (n,) and root (n, n) at the last time.
     """
 
     def noise_estimate(

@@ -1,5 +1,6 @@
-"""Compute with covariances P by their roots S, because round-off cannot make `P = S Sᵀ`
-indefinite.
+"""Compute with roots S of covariances `P = S Sᵀ`.
+
+A root is used because round-off cannot make the product `S Sᵀ` indefinite.
 """
 
 import math
@@ -13,12 +14,13 @@ from rigidjax._types import Scalar, ScalarLike
 
 
 def triangular_root(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
-    """Return the lower triangular root L of `a aᵀ` whose diagonal has no negative entry.
+    """Return the lower triangular matrix L with `L Lᵀ = a aᵀ` and no negative diagonal entry.
 
-    It is computed by the modified Gram–Schmidt process on the rows, whose triangular factor is as
-    good as Householder's (Björck 1967, doi:10.1007/BF01934122). A row that depends on earlier rows,
-    to a few units of round-off, gets a zero on the diagonal with zero derivatives; those of
-    `jnp.linalg.qr` are NaN. A state that is known without error has such rows.
+    L is computed by the modified Gram–Schmidt process on the rows of a (n, m), whose triangular
+    factor is as accurate as that of Householder's method (Björck 1967, doi:10.1007/BF01934122). If
+    a row depends linearly on earlier rows, to a few units of round-off, its diagonal entry is zero
+    with zero derivatives; the derivatives of `jnp.linalg.qr` would be NaN. A state that is known
+    without error has such rows.
     """
     n = a.shape[0]
     below = jnp.arange(n)
@@ -38,7 +40,8 @@ def predicted_root(
 ) -> Float[Array, "k k"]:
     """Return the triangular root of the predicted covariance, `F P Fᵀ + G Gᵀ`.
 
-    F is the `transition`, G the `noise`, and P the covariance of this `root`.
+    F (k, n) is the `transition`, G (k, m) the `noise`, and `P = S Sᵀ` the covariance with the root
+    S (n, n), the argument `root`.
     """
     return triangular_root(jnp.concatenate([matrix_product(transition, root), noise], 1))
 
@@ -59,11 +62,11 @@ class Update(NamedTuple):
 
     **Fields:**
 
-    - `step`: (n,) the new mean of the errors.
-    - `root`: (n, n) the new root of their covariance.
-    - `innovation`: ν, each number read minus its prediction from all numbers read before.
-    - `variance`: s of ν. A masked number has the innovation 0 and the variance 1, and so does not
-      count.
+    - `step`: (n,) the new mean of the errors of the estimate.
+    - `root`: (n, n) the new root of the covariance of the errors.
+    - `innovation`: (k,) ν, each number read minus its prediction from all numbers read before.
+    - `variance`: (k,) s, the variance of each ν. A masked number has the innovation 0 and the
+      variance 1, and so does not count.
     """
 
     step: Float[Array, " n"]
@@ -80,13 +83,21 @@ def update(
     variance: Float[Array, " k"],
     mask: Bool[Array, " k"],
 ) -> Update:
-    """Return the mean and the root of errors e after k numbers `error = h · e + noise`, taken one
-    after the other.
+    """Return the estimate of a vector e (n,) of errors after k numbers `h · e + noise` were read.
 
-    Potter's formula holds for a row h of `matrix` and the `variance` r of its noise:
-    `s = |Sᵀh|² + r`, `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh` (Battin, Astronautical Guidance
-    (1964), §9.6; Bierman, Factorization Methods (1977), §II.4). `step` is the mean of e and `root`
-    the S before the update. Numbers for which `mask` is false do not count.
+    The numbers are taken one after another by Potter's formula, `s = |v|² + r`,
+    `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh` (Battin, Astronautical Guidance (1964), §9.6;
+    Bierman, Factorization Methods (1977), §II.4). Here S is the root of the covariance of e, and s
+    the variance of the innovation.
+
+    **Arguments:**
+
+    - `step`: (n,) the mean of e before the update.
+    - `root`: (n, n) S before the update.
+    - `matrix`: (k, n) the rows h.
+    - `error`: (k,) the numbers read.
+    - `variance`: (k,) the variance r of the noise of each number.
+    - `mask`: (k,) false for a number that does not count.
     """
 
     def absorb(state: tuple[Array, Array], number: tuple) -> tuple[Any, Any]:
@@ -106,10 +117,11 @@ def update(
 
 
 class Terms(NamedTuple):
-    """Hold the terms of a log-density in which each number read is normal, given the earlier ones.
+    """Hold the terms of a log-density in which each number read is normal, given the numbers read
+    before it.
 
-    **Fields:** `error` of each number in standard deviations; `log_variance` the logarithm of 2π
-    times its variance; both are zero for masked numbers.
+    **Fields:** `error` is the error of each number over its standard deviation; `log_variance` is
+    the logarithm of 2π times the variance of each number. Masked numbers have zeros in both fields.
     """
 
     error: Float[Array, "*n"]
@@ -122,16 +134,18 @@ class Terms(NamedTuple):
 
 
 def innovation_terms(innovation: Array, variance: Array, mask: Array) -> Terms:
-    """Return the terms of innovations with these variances, which are zero where `mask` is
-    false.
+    """Return the `Terms` of innovations with the variances `variance`.
+
+    The terms are zero where `mask` is false.
     """
     error = jnp.where(mask, innovation * lax.rsqrt(variance), 0)
     return Terms(error, jnp.where(mask, jnp.log(2 * math.pi * variance), 0))
 
 
 def divide(lower: Float[Array, "n n"], rhs: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """Return `lower⁻¹ rhs` by forward substitution, where a row is zero if the diagonal entry of
-    `lower` is.
+    """Return `lower⁻¹ rhs` by forward substitution, where `lower` is a lower triangular matrix.
+
+    Where a diagonal entry of `lower` is zero, the row of the result is zero.
     """
 
     def forward_substitution_step(rhs: Array, k: Array) -> tuple[Array, Array]:
@@ -144,6 +158,9 @@ def divide(lower: Float[Array, "n n"], rhs: Float[Array, "n m"]) -> Float[Array,
 
 
 def divide_right(numerator: Float[Array, "m n"], lower: Float[Array, "n n"]) -> Float[Array, "m n"]:
-    """Return `numerator lower⁻¹`, where a column is zero if the diagonal entry of `lower` is."""
+    """Return `numerator lower⁻¹`, where `lower` is a lower triangular matrix.
+
+    Where a diagonal entry of `lower` is zero, the column of the result is zero.
+    """
     turned = divide(lower[::-1, ::-1].T, numerator[:, ::-1].T)
     return turned.T[:, ::-1]

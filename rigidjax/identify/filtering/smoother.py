@@ -29,8 +29,9 @@ from rigidjax.motion.manifold import minus, plus
 class Push(NamedTuple):
     """Hold the estimate of a white torque, averaged over the step that ends at each time.
 
-    **Fields:** `mean` and `deviation` (N, 3) N m, body frame. The deviation is large for short
-    steps, since white noise has no value at one time.
+    **Fields:** `mean` (N, 3) is the mean and `deviation` (N, 3) the standard deviation of the
+    averaged torque, N m, body frame. The deviation is large for short steps, since white noise has
+    no value at one time.
     """
 
     mean: Float[Array, "stops 3"]
@@ -42,15 +43,18 @@ class Smoothed(eqx.Module):
 
     **Fields:**
 
-    - `belief`: a `Belief` at each of N stops: the times of the recording and, where these are far
-      apart, some between.
-    - `rows`: (T,) the indices of the recorded times among the stops.
-    - `pushes`: a `Push` for each `RandomTorque`; a `CorrelatedTorque` is in `belief.torques`.
-    - `readings`: `ReadNumbers` (N, k) for each sensor, of the last linearisation.
-    - `log_likelihood`: of all readings, by Laplace's method about this motion.
-    - `change`: the largest change by the last iteration, in standard deviations.
-    - `iterations`: their number.
-    - `status`, `lost_at`: those of the `Filtered` from which the iteration starts.
+    - `belief`: a `Belief` at each of N stops. The stops are the T times of the recording and, if
+      the intervals between these times are long, some times between them.
+    - `rows`: (T,) the index among the stops of each time of the recording.
+    - `pushes`: a `Push` for each `RandomTorque`; the estimate of a `CorrelatedTorque` is in
+      `belief.torques`.
+    - `readings`: for each sensor the `ReadNumbers` (N, k) of the last linearisation.
+    - `log_likelihood`: the logarithm of the density of all readings, by Laplace's method about the
+      most probable motion.
+    - `change`: the largest change of a number in the last iteration, in standard deviations.
+    - `iterations`: the number of iterations.
+    - `status`, `lost_at`: the status of the run of `filter` from which the iteration starts, and
+      the time, s, at which it was lost, as in `Filtered`. The status is 2 if the smoother fails.
     """
 
     belief: Belief
@@ -91,10 +95,11 @@ def smooth(
 ) -> Smoothed:
     """Return attitude, rate, unknown torque and sensor errors from all readings.
 
-    They are those of the motion of largest posterior density, found by the Gauss–Newton method.
-    Each iteration linearises dynamics and sensors about the last motion, the first one about the
-    motion of `filter`. It solves the linear problem exactly, by a Kalman filter and the pass back
-    of Rauch, Tung and Striebel (Bell 1994, doi:10.1137/0804035).
+    The result is the motion of largest posterior density, found by the Gauss–Newton method. Each
+    iteration linearises dynamics and sensors about the motion of the last iteration, and the first
+    iteration about the motion that `filter` returns. An iteration solves the linear problem exactly
+    by a Kalman filter and the backward pass of Rauch, Tung and Striebel (Bell 1994,
+    doi:10.1137/0804035).
 
     **Arguments:** `model`, `belief`, `x`, `substeps` and `throw` of `filter`, and
 
@@ -145,8 +150,8 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
         return *out, count + 1
 
     still = jnp.zeros((stops.t.shape[0], dynamics.kicks), first.root.dtype)
-    # Start the loop from a blank estimate: a first iteration before the loop would be compiled as
-    # well.
+    # Start the loop from an estimate of zeros: a first iteration before the loop would compile the
+    # iteration a second time.
     blank = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
         jax.eval_shape(lambda: _iterate(dynamics, first, stops, path, still)[1]),
@@ -173,16 +178,28 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
 def _iterate(
     dynamics: Dynamics, belief: Belief, stops: Stops, path: ExtendedState, kicks: Array
 ) -> tuple[ExtendedState, LinearEstimate, Scalar]:
-    """Return the states after one iteration, which linearises about the states `path` and the
-    `kicks` between them and solves exactly.
+    """Return the result of one iteration of `smooth`, which solves a linearised problem exactly.
 
-    It returns the new states, the estimate of their changes, and the largest change in standard
-    deviations.
+    Three things are returned: the new states; the estimate of the changes of the states; and the
+    largest change, in standard deviations.
+
+    **Arguments:**
+
+    - `dynamics`: the equations of the filter.
+    - `belief`: the belief before the first reading.
+    - `stops`: the N times with their readings.
+    - `path`: the N + 1 states about which the problem is linearised, at the time of the `belief`
+      and at the stops.
+    - `kicks`: (N, m) the noise of the steps between the states of `path`.
     """
     dtype = belief.root.dtype
 
     def linearise(row: tuple) -> tuple:
-        """Return the step to a stop, and the readings at the stop, linearised about the path."""
+        """Return the linearised step to a stop, and the linearised readings at the stop.
+
+        A `row` holds the time before the step, the stop, the states of `path` before and after the
+        step, and the noise of the step.
+        """
         t0, stop, x, y, kick = row
         after, grown, noise = dynamics.predict(
             t0.astype(dtype), (stop.t - t0).astype(dtype), x, kick

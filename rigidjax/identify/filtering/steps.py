@@ -1,6 +1,4 @@
-"""Compute the equations of the state that a filter follows, and random motions under these
-equations.
-"""
+"""Compute one step of a filter, and draw motions under a random torque."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -47,9 +45,14 @@ from rigidjax.solve.tableaus import KUTTA4
 class ExtendedState(eqx.Module):
     """Hold the state that a filter follows.
 
-    **Fields:** `motion` a `Spin`, `Attitude` or `Rigid`; `torques` the value (3,) of each
-    `CorrelatedTorque`, N m, body frame; `walks` the value of each `Walk`. Errors of the state are
-    changes of these in this order, as `motion.manifold` counts them.
+    **Fields:**
+
+    - `motion`: a `Spin`, `Attitude` or `Rigid`.
+    - `torques`: the value (3,) of each `CorrelatedTorque`, N m, body frame.
+    - `walks`: the value of each `Walk`.
+
+    An error of the state is a vector: the changes of motion, torques and walks, in this order, as
+    in `motion.manifold`.
     """
 
     motion: Any
@@ -81,17 +84,20 @@ def require_sensors(sensors: Sequence[AbstractSensor]) -> None:
 
 
 class Dynamics(eqx.Module):
-    """Hold the equations of a filter, for one dtype and type of state, which `dynamics_of` makes.
+    """Hold the equations of a filter, for one dtype and one type of state.
+
+    `dynamics_of` makes a `Dynamics`.
 
     **Fields:**
 
-    - `scene`: its body is that of the equations of motion.
-    - `field`: the equations of motion under the known torque.
-    - `inverse`: of the inertia tensor.
-    - `white`: the root of the density of each `RandomTorque`.
-    - `coloured`: the root of the density of each `CorrelatedTorque`, and its correlation time, s.
-    - `drifts`: the root of the density of each walk.
-    - `paths`: the path of each walk's numbers in the scene.
+    - `scene`: the scene, with the body in the form that the equations of motion need.
+    - `field`: the equations of motion under the known torque, a function of time, state and `None`.
+    - `inverse`: (3, 3) the inverse of the inertia tensor.
+    - `white`: the square root of the spectral density of each `RandomTorque`.
+    - `coloured`: for each `CorrelatedTorque`, the square root of its spectral density and its
+      correlation time, s.
+    - `drifts`: the square root of the spectral density of each walk.
+    - `paths`: for each walk, the path of its numbers in the tree of the scene.
     """
 
     scene: Scene
@@ -103,17 +109,20 @@ class Dynamics(eqx.Module):
     paths: tuple[tuple[Any, ...], ...] = eqx.field(static=True)
 
     def sensors_at(self, walks: Sequence[Array]) -> tuple[AbstractSensor, ...]:
-        """Return the sensors of the scene with the values `walks` of their drifting numbers."""
+        """Return the sensors of the scene with `walks` as the values of their drifting numbers."""
         return with_leaves(self.scene, self.paths, walks).sensors
 
     @property
     def kicks(self) -> int:
-        """Return how many unit normal numbers drive one step of motion and torques."""
+        """Return the number of unit normal numbers that make the noise of one step of motion and
+        torques.
+        """
         return 6 * (len(self.white) + len(self.coloured))
 
     def with_torques(self, change: PyTree, torques: Sequence[Array]) -> PyTree:
-        """Return the rate of change of a motion, `change`, with the effect of these `torques`
-        added.
+        """Return the rate of change of a motion under additional `torques` (3,), body frame.
+
+        `change` is the rate of change without the additional torques.
         """
         if not torques:
             return change
@@ -121,12 +130,13 @@ class Dynamics(eqx.Module):
         return eqx.tree_at(lambda s: s.omega, change, spin)
 
     def advance(self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array) -> ExtendedState:
-        """Return the state a time `h` after x, driven by the unit normal numbers `kicks`.
+        """Return the state at the time t + h, for the state x at the time t.
 
-        White noise within the step is replaced by its first two Legendre polynomials,
-        `√(density/h) (k₀ + √3 (1 − 2s/h) k₁)` at a time s after the start. For a body at rest they
-        give rate and angle their exact joint covariance (Foster, Lyons and Oberhauser 2020,
-        doi:10.1137/19M1261912). The step is one of the classical method of order 4.
+        The unit normal numbers `kicks` make the noise: each white noise is replaced by
+        `√(density/h) (k₀ + √3 (1 − 2s/h) k₁)` at a time s after t, where k₀ and k₁ (3,) are kicks.
+        These are the first two terms of its expansion in Legendre polynomials. For a body at rest
+        rate and angle get their exact joint covariance (Foster, Lyons and Oberhauser 2020,
+        doi:10.1137/19M1261912). The step is one of the classical Runge–Kutta method of order 4.
         """
         safe = jnp.where(h > 0, h, 1)
         pairs = kicks.reshape(-1, 2, 3) * roots.inverse_root(h)
@@ -153,11 +163,11 @@ class Dynamics(eqx.Module):
     def predict(
         self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array | None = None
     ) -> tuple[ExtendedState, Float[Array, "n n"], Float[Array, "n m"]]:
-        """Return the state a time `h` after x, and the matrices F and G of its errors.
+        """Return the state at the time t + h, for the state x at the time t, and two matrices.
 
-        F (n, n) carries the errors of x over the step; G (n, m) is a root of the covariance that
-        the noise adds, the drifts of walks in its last columns. Both are linearised about `kicks`,
-        zero for `None`.
+        The matrix F (n, n) maps errors of x to errors of the new state. The matrix G (n, m) is a
+        root of the covariance that the noise of the step adds; its last columns belong to the
+        walks. F and G are the derivatives at the noise `kicks`, which is zero for `None`.
         """
         kicks = jnp.zeros(self.kicks, x.motion.omega.dtype) if kicks is None else kicks
         after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
@@ -180,9 +190,9 @@ class Dynamics(eqx.Module):
 
 
 def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: ExtendedState) -> Dynamics:
-    """Return the equations of a filter, from a scene whose torque reads no `Input`.
+    """Return the equations of a filter for a `scene` whose torque reads no `Input`.
 
-    The state `x` gives their dtype and the type of the state.
+    `drifts` are the walks of the model. The equations have the dtype and the type of the state x.
     """
     dtype = x.motion.omega.dtype
     body: Any = body_of_equations(in_precision(scene.body, dtype), type(x.motion))
@@ -201,24 +211,30 @@ def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: ExtendedState) -> Dyna
 
 
 def white_parts(process: Process | None) -> tuple[RandomTorque, ...]:
-    """Return the parts of an unknown torque that are white."""
+    """Return the torques of a `process` that are white noise."""
     return tuple(part for part in parts_of(process) if isinstance(part, RandomTorque))
 
 
 def coloured_parts(process: Process | None) -> tuple[CorrelatedTorque, ...]:
-    """Return the parts of an unknown torque that are states of a filter."""
+    """Return the torques of a `process` that are correlated in time.
+
+    A filter estimates such torques as states.
+    """
     return tuple(part for part in parts_of(process) if isinstance(part, CorrelatedTorque))
 
 
 def moved_root(
     x: ExtendedState, e: Float[Array, " n"], root: Float[Array, "n m"], *, inverse: bool = False
 ) -> Float[Array, "n m"]:
-    """Return the root of the errors about the state `x ⊕ e`, which is x changed by e, from the
-    `root` of the errors about x.
+    """Return the root of a covariance of errors, for errors about another state.
 
-    Errors δ of a turn e become `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, here to second order in e
-    (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848). With `inverse` the root is multiplied
-    by `J_r(e)⁻¹`, to third order, which is the derivative of `log(exp(e) exp(δ))` by δ.
+    `root` belongs to errors about the state x. The result belongs to errors about the state x
+    changed by the vector e (n,). Only errors of a turn differ: an error e + δ about x is the error
+    `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ` about the new state, where J_r is the right Jacobian, here
+    to second order in e (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848).
+
+    With `inverse` the root is multiplied by `J_r(e)⁻¹`, to third order, which is the derivative of
+    `log(exp(e) exp(δ))` with respect to δ.
     """
     first, second = (0.5, 1 / 12) if inverse else (-0.5, 1 / 6)
     across = jax.vmap(cross, (None, 1), 1)
@@ -231,9 +247,10 @@ def moved_root(
 
 
 class Stops(NamedTuple):
-    """Hold the times of the steps of a filter, s, and the readings at these times.
+    """Hold the times at which the steps of a filter end, and the readings at these times.
 
-    **Fields:** `t`; `values` and `masks` of each sensor. A step takes one row of each.
+    **Fields:** `t` holds the times, s; `values` the readings of each sensor; `masks`, for each
+    sensor, whether it has a reading. One step uses one row of each array.
     """
 
     t: Array
@@ -244,10 +261,12 @@ class Stops(NamedTuple):
 def linearise_readings(
     dynamics: Dynamics, stop: Stops, x: ExtendedState
 ) -> tuple[Float[Array, "k n"], Float[Array, " k"], Float[Array, " k"], Bool[Array, " k"]]:
-    """Return all k numbers read at one time, linearised about the state x.
+    """Return the readings of all sensors at one time, linearised about the state x.
 
-    It returns the derivatives (k, n) of their predictions, their errors (k,), the standard
-    deviations of the errors, and a mask of the numbers that were read.
+    Four things are returned, for all k components of the errors of the sensors: the derivatives
+    (k, n) of the predictions with respect to the n components of an error of x; the errors (k,),
+    reading minus prediction; their standard deviations (k,); and a mask (k,), true for a component
+    that was read. `stop` holds the time and the readings.
     """
     dtype = x.motion.omega.dtype
     t = stop.t.astype(dtype)
@@ -281,10 +300,10 @@ def linearise_readings(
 
 
 class ReadNumbers(NamedTuple):
-    """Hold the numbers that a filter read of one sensor.
+    """Hold the numbers that a filter read from one sensor, compared with their predictions.
 
-    **Fields:** `innovation` each number minus its prediction from all numbers read before;
-    `variance` of the innovation; `mask` whether the number was read.
+    **Fields:** `innovation` is each number minus its prediction from all numbers read before;
+    `variance` is the variance of each innovation; `mask` is true for a number that was read.
     """
 
     innovation: Float[Array, "*times k"]
@@ -295,7 +314,10 @@ class ReadNumbers(NamedTuple):
 def split_by_sensor(
     sensors: Sequence[AbstractSensor], numbers: ReadNumbers
 ) -> tuple[ReadNumbers, ...]:
-    """Return one `ReadNumbers` for each sensor, from the `numbers` of all sensors in a row."""
+    """Return a `ReadNumbers` for each sensor.
+
+    The last axis of the arrays in `numbers` holds the components of all sensors one after another.
+    """
     ends = np.cumsum([sensor.components for sensor in sensors])[:-1]
     return tuple(
         ReadNumbers(*own) for own in zip(*(jnp.split(a, ends, -1) for a in numbers), strict=True)
@@ -315,8 +337,9 @@ def steps_of(
 ) -> np.ndarray:
     """Return the number of fixed steps from each of the times `ts` to the next.
 
-    It is `substeps` if this is given. Otherwise it follows from the body rate, of the `state` and
-    of gyros, and from the correlation times of the process; it is one if these numbers are traced.
+    The number is `substeps` if this is given. Otherwise it follows from the body rate (the larger
+    one of the rate in `state` and the rates that gyros read) and from the correlation times of the
+    `process`. It is one if these numbers are traced.
     """
     if substeps is not None:
         return np.full(ts.shape[0] - 1, _checks.integer(substeps, "substeps", 1))
@@ -336,8 +359,8 @@ def steps_of(
 class Sampled(eqx.Module):
     """Hold the result of `sample`.
 
-    **Fields:** `t` (T,) s; `states` with a leading time axis; `torques` the value (T, 3) of each
-    `CorrelatedTorque`, N m, body frame.
+    **Fields:** `t` (T,) holds the times, s; `states` the states at these times, with a leading time
+    axis; `torques` the value (T, 3) of each `CorrelatedTorque`, N m, body frame.
     """
 
     t: Float[Array, " times"]
@@ -357,21 +380,22 @@ def sample(
 ) -> Sampled:
     """Draw one motion that a random torque could make.
 
-    Each step draws the integral and the first moment of the white noise, and follows the equations
-    of motion under the polynomial with these moments by the classical method of order 4. The whole
-    is of order 1.5, and exact for a body at rest (Foster, Lyons and Oberhauser 2020,
-    doi:10.1137/19M1261912). A `CorrelatedTorque` starts from its stationary distribution.
+    For each step the integral and the first moment of the white noise are drawn. The equations of
+    motion are then integrated under the linear function of time with this integral and moment, by
+    one step of the classical Runge–Kutta method of order 4. The whole method is of order 1.5, and
+    exact for a body at rest (Foster, Lyons and Oberhauser 2020, doi:10.1137/19M1261912). A
+    `CorrelatedTorque` starts from its stationary distribution.
 
     **Arguments:**
 
-    - `key`: of `jax.random`.
+    - `key`: a key of `jax.random`.
     - `body`: an `Inertia`, or `MassProperties` for a `Rigid` state.
     - `state0`: a `Spin`, `Attitude` or `Rigid`, the state at the first time.
     - `ts`: (T,) increasing times, s.
     - `process`: the random torque, a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of them.
     - `torque`: the known torque, or `None`.
-    - `substeps`: the number of fixed steps between two times; `None` chooses them by the rate if it
-      is known, else one.
+    - `substeps`: the number of fixed steps between two times; `None` chooses this number by the
+      initial body rate and the correlation times, and takes 1 if these are traced.
 
     **Returns** `t`, `states` and `torques` at these times (`Sampled`). **Raises** `ValueError` for
     times that do not increase.

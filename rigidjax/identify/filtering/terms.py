@@ -39,11 +39,16 @@ def terms_of_recording(
 ) -> Terms:
     """Return the terms of the log-density of the readings of one recording.
 
-    Readings are normal about the motion. If a torque or a sensor error is unknown, the filter
-    integrates it out, and readings are normal about the predictions of the filter.
+    The readings are normal about the motion. If the model has an unknown torque or a walk, a Kalman
+    filter integrates it out, and the readings are normal about the predictions of the filter.
 
-    **Arguments:** `row` the free numbers of the recording; `record`, `reference` and `body_index`
-    its readings, its reference state and the index of its body.
+    **Arguments:**
+
+    - `model`: the model.
+    - `row`: the free numbers of the recording.
+    - `record`: the recording.
+    - `reference`: the reference state of the recording.
+    - `body_index`: the index of the body of the recording.
     """
     scene = scene_from_row(model, row, record, reference, body_index)
     if scene.process is None and not model.walks:
@@ -60,7 +65,10 @@ def terms_of_recording(
 
 
 def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
-    """Return the terms of one recording whose readings are normal about the motion of a scene."""
+    """Return the terms of the log-density of one recording without a random torque or a walk.
+
+    The readings in `record` are independent and normal about the motion of the `scene`.
+    """
     errors = errors_of_scene(model, scene, record)
     scaled, log_variance = [], []
     for reading, sensor, error in zip(record.readings, scene.sensors, errors, strict=True):
@@ -70,7 +78,7 @@ def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
             reading.values, reading.mask, error, noise, limit, reading.jitter_error
         )
         scaled.append(one)
-        # A channel at its limit counts by a probability, which has no logarithm of a variance.
+        # A channel at full scale contributes a probability, and so no logarithm of a variance.
         mask = reading.mask[:, None] & ~full
         logs = jnp.log(2 * math.pi * noise**2)[None]
         log_variance.append(jnp.where(mask, logs if wider is None else logs + wider, 0))
@@ -80,26 +88,29 @@ def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
 
 
 def reading_terms(model: Model, x: Float[Array, " n"]) -> Terms:
-    """Return the terms (R, N) of the log-density of all readings of a model, for R recordings at
-    the free numbers x.
+    """Return the terms (R, N) of the log-density of all readings of a `model`.
 
-    Derivatives by x are computed recording by recording, in forward mode.
+    R is the number of recordings, N the number of terms of each recording, and x (n,) holds the
+    free numbers. Derivatives with respect to x are computed for one recording after another, in
+    forward mode.
     """
     return by_recording(model.index.rows(x), model, terms_of_recording)
 
 
 def log_density(model: Model, x: Float[Array, " n"]) -> Scalar:
-    """Return the logarithm of the density of all readings, with the priors, at the free numbers x
-    of a model.
+    """Return the logarithm of the posterior density of a `model` at its free numbers x, up to a
+    constant.
+
+    It is the logarithm of the density of all readings plus the logarithms of the priors.
     """
     return reading_terms(model, x).log_density - 0.5 * jnp.sum(prior_residuals(model, x) ** 2)
 
 
 class Curvature(NamedTuple):
-    """Hold the second-order model of a posterior at a point.
+    """Hold a quadratic approximation of minus the logarithm of a posterior density, at a point.
 
-    **Fields:** `cost`, minus the logarithm of its density; `gram`, Fisher's information; `slope`,
-    the gradient of the cost.
+    **Fields:** `cost` is minus the logarithm of the density; `gram` (n, n) is Fisher's information;
+    `slope` (n,) is the gradient of the cost.
     """
 
     cost: Scalar
@@ -108,14 +119,15 @@ class Curvature(NamedTuple):
 
 
 def curvature(model: Model, x: Float[Array, " n"]) -> Curvature:
-    """Return the cost, gradient and Fisher's information of the posterior at x.
+    """Return the cost, gradient and Fisher's information of a posterior density at x (n,).
 
-    The free numbers move the variances of normal errors, too. The information is that of the priors
-    plus `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta and Mehra 1974,
+    The free numbers x change the variances of the readings, too. The information is that of the
+    priors plus `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ`, where the sum is over the innovations ν of
+    variance s, and ∂ is the gradient with respect to x (Gupta and Mehra 1974,
     doi:10.1109/TAC.1974.1100714, for the filter).
     """
     value, slopes = errors_and_jacobians(model, x, terms_of_recording)
-    # The term dν/√s follows from the derivative of ν/√s, by d(ν/√s) = dν/√s − ½ ν/√s d(log s).
+    # Compute dν/√s from the derivative of ν/√s, by d(ν/√s) = dν/√s − ½ ν/√s d(log s).
     moved = slopes.error + 0.5 * value.error[..., None] * slopes.log_variance
     both = jnp.concatenate([moved, 0.5**0.5 * slopes.log_variance], axis=1)
     places, size = model.index.places, model.size

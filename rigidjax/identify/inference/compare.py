@@ -22,16 +22,16 @@ from rigidjax.identify.search.stages import errors_and_slopes
 
 
 class Comparison(eqx.Module):
-    """Hold the comparison of one of several models of the same data with the best of them.
+    """Hold the comparison of a model with the best one of several models of the same data.
 
     **Fields:**
 
-    - `name`: of the model.
-    - `free`: how many free numbers it has.
+    - `name`: the name of the model.
+    - `free`: the number of free numbers of the model.
     - `rms`: the root mean square error of each sensor.
-    - `correlation`: the samples over which its errors are autocorrelated.
-    - `information`: its Bayesian information criterion minus that of the best model: 0 for the
-      best; 10 and more is strong evidence against the model.
+    - `correlation`: the number of samples over which the errors of the model are autocorrelated.
+    - `information`: the Bayesian information criterion of the model minus the criterion of the best
+      model. It is 0 for the best model; 10 and more is strong evidence against the model.
     """
 
     name: str
@@ -44,14 +44,14 @@ class Comparison(eqx.Module):
 def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     """Compare models of the same data by Schwarz's criterion, and return the best model first.
 
-    The criterion is `N log s² + p log N` for p free numbers (Schwarz 1978,
-    doi:10.1214/aos/1176344136). s² is the mean square error of a sensor, and its first term is
-    added up over sensors; N is the number of independent readings: the number read over the
-    smallest of the models' autocorrelation times.
+    The criterion is `Σ Nₛ log s² + p log N` for p free numbers (Schwarz 1978,
+    doi:10.1214/aos/1176344136). The sum is over the sensors; s² is the mean square error of a
+    sensor, and Nₛ its number of independent readings: the number of components read, over the
+    smallest autocorrelation time (in samples) of all models. N is the sum of Nₛ over the sensors.
 
-    **Arguments:** `fits` a dict of name → `Fit`, all of the same readings. **Returns** `name`,
-    `free`, `rms`, `correlation` and `information` of each model (`Comparison`). **Raises**
-    `ValueError` for no fits, or for fits of different readings.
+    **Arguments:** `fits` is a dict of name → `Fit`, with fits of the same readings. **Returns** for
+    each model a `Comparison` with `name`, `free`, `rms`, `correlation` and `information`.
+    **Raises** `ValueError` for no fits, or for fits of different readings.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> best = compare({"one": result, "the same again": result})[0]
@@ -87,10 +87,11 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 
 
 def _log_squares(fit: Fit) -> np.ndarray:
-    """Return the logarithm of each sensor's mean square error.
+    """Return the logarithm of the mean square error of each sensor of a `fit`.
 
-    For a sensor with jitter it is the logarithm for white errors that are as likely as the errors
-    of the sensor.
+    For a sensor with jitter the errors are first made independent, with the variance of the noise,
+    and the mean logarithm of the factor by which jitter increases their variance is added. The
+    result belongs to white errors with the same likelihood.
     """
     out, model = 2.0 * np.log(np.maximum(fit.rms, 1e-300)), fit.model
     errors, _ = errors_and_slopes(model, fit.x)
@@ -110,16 +111,17 @@ def _log_squares(fit: Fit) -> np.ndarray:
 def cross_validate(
     build: Callable[[Sequence[Recording]], Model], recordings: Sequence[Recording], **options: Any
 ) -> tuple[tuple[float, ...], ...]:
-    """Return the errors of each recording under a body fitted to all other recordings.
+    """Return the errors with which the fit of all other recordings predicts each recording.
 
-    The body and all shared numbers come from the other recordings. A fit to the recording that is
-    left out moves only its initial state and the `Free`s with a value for each recording.
+    Each recording is left out once. The body, and all numbers that recordings share, are fitted to
+    the other recordings and then held fixed. A second fit, to the recording that was left out,
+    changes only its initial state and the `Free`s with a value for each recording.
 
     **Arguments:**
 
-    - `build`: a function from a sequence of recordings to a `Model`.
-    - `recordings`: two or more.
-    - `options`: for `fit`.
+    - `build`: a function that is given a sequence of recordings and returns a `Model`.
+    - `recordings`: a sequence of two or more recordings.
+    - `options`: keyword arguments of `fit`.
 
     **Returns** for each recording the root mean square error of each sensor. The model with the
     smallest errors predicts best. **Raises** `ValueError` for fewer than two recordings.
@@ -146,7 +148,9 @@ def cross_validate(
 
 
 def _with_shared(model: Model, of_others: Fit) -> Model:
-    """Return the model with the body and the shared numbers of the fit `of_others`, which are then
+    """Return a `model` of one recording with known body and known shared numbers.
+
+    The body, and the numbers that recordings share, get the values of the fit `of_others` and are
     no longer free.
     """
     x = model.start()

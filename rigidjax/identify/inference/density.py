@@ -1,4 +1,4 @@
-"""Compute the posterior density of a fitted model in unconstrained numbers, for any sampler."""
+"""Compute the posterior density of a fitted model, as a function of unconstrained numbers."""
 
 import dataclasses
 import math
@@ -32,8 +32,8 @@ from rigidjax.identify.model.terms import Noise, scene_template
 from rigidjax.identify.uncertainty.covariance import white_covariance
 from rigidjax.motion.torques.composite import parts_of
 
-# This is the advice for a density with a process: a fit without this torque may end far from the
-# body.
+# This advice is added to an error if the density has a process (an unknown random torque): a fit
+# without this torque may end far from the true body.
 _GUESS = (
     ", or begin from a first guess, fit(model, starts=1, max_steps=1): the torque may be too "
     "strong for a fit without it"
@@ -44,42 +44,43 @@ class LogDensity(eqx.Module):
     """Compute the logarithm of the posterior density of a fitted model, as a function of one vector
     x.
 
-    Call it with x (n,), real numbers without bounds. These are the free numbers of the fitted model
-    and, as additional shared `Free`s, the logarithms of factors: of each noise that the fit
-    estimates, and of each number of the process. `unpack(x)` returns the body, the states and the
-    values that x represents.
+    Call the object with x (n,), real numbers without bounds. The entries of x are the free numbers
+    of the fitted model and the logarithms of additional factors: one factor for each noise that the
+    fit estimates, and one for each number of the process. `unpack(x)` returns the body, the states
+    and the values that x represents.
 
-    With a process or `Walk`s the filter integrates the unknown torque and the drifts out. Without
-    them the readings are independent and normal about the motion. If errors are autocorrelated,
-    this density is too narrow: keep fewer readings, or give a process. The jitter of a sensor is
-    that of the fit. The priors are those of the model (of its `Free`s, or an `Entropic` one); the
-    prior of all other numbers is flat in x.
+    If there is a process (a random torque) or a `Walk`, a Kalman filter integrates the unknown
+    torque and the drifts out. Otherwise the readings are independent and normal about the motion;
+    if their errors are autocorrelated, the density is then too narrow: keep fewer readings, or give
+    a process. The jitter of a sensor has the value of the fit. The priors are the priors of the
+    model (of its `Free`s, or an `Entropic` prior); the prior of all other numbers is flat in x.
 
     **Arguments:**
 
     - `fit`: a result of `identify.fit`. With a process a first guess is enough,
       `fit(model, starts=1, max_steps=1)`.
-    - `process`: a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of them; `None` takes that of the
-      model.
-    - `deviation`: the standard deviation of the normal prior of the logarithms of the densities and
-      times of the process, about their values in the process; `None` for a known process. If only
-      ratios of moments are determined, as by a gyro alone, the density of a torque scales with the
-      square of a moment: compare `density / moment**2`, and give the process in the unit of inertia
-      of the fit (`fit.body`).
+    - `process`: a `RandomTorque`, a `CorrelatedTorque` or a `Sum` of such torques; `None` takes the
+      process of the model.
+    - `deviation`: the standard deviation of the normal prior of the logarithms of all numbers of
+      the process (spectral densities and correlation times), about the values in `process`; `None`
+      for a known process. If only ratios of moments are determined, as by a gyro alone, the
+      spectral density of a torque scales with the square of a moment: compare
+      `density / moment**2`, and give the process in the unit of inertia of the fit (`fit.body`).
 
     **Fields:**
 
-    - `model`: the fitted model with the additional `Free`s.
+    - `model`: the fitted model with the additional factors as `Free`s.
     - `x0`: (n,) the x of the fit.
-    - `covariance`: (n, n) of x by Laplace's method, for the start and the mass matrix of a sampler.
-      If errors are autocorrelated it is smaller than that of the fit.
+    - `covariance`: (n, n) the covariance of x by Laplace's method, for the start and the mass
+      matrix of a sampler. If errors are autocorrelated, it is smaller than the covariance of the
+      fit.
 
-    **Raises:** `ValueError` for a robust loss, which is no density, and for directions that neither
-    data nor a prior determine.
+    **Raises:** `ValueError` for a robust loss, which belongs to no density, and for directions of x
+    that neither the data nor a prior determines.
 
     For numpyro: `numpyro.infer.MCMC(NUTS(potential_fn=lambda x: -density(x)), …)`; for blackjax:
-    `blackjax.nuts(density, …)`, or `identify.posterior`. Gradients are computed recording by
-    recording in forward mode, also under `jax.grad`. Compile the density by
+    `blackjax.nuts(density, …)`, or `identify.posterior`. Gradients are computed for one recording
+    after another in forward mode, also under `jax.grad`. Compile the density by
     `equinox.filter_jit(density)`.
 
     >>> record, chart = rj.datasets.toutatis.recording(), rj.identify.PrincipalRatios()
@@ -146,10 +147,10 @@ class LogDensity(eqx.Module):
         return log_density(self.model, _checks.array_of_shape(x, self.x0.shape, "x"))
 
     def unpack(self, x: Float[Array, " n"]) -> Unpacked:
-        """Return the quantities that x (n,) represents.
+        """Return what the vector x (n,) represents, as an `Unpacked`.
 
-        These are the body, the initial states, the values of the `Free`s, the noise (R, k) of each
-        sensor, and the process.
+        It holds the body, the initial states, the values of the `Free`s, the noise of each sensor
+        (standard deviations (R, k) for R recordings and k components), and the process.
         """
         x = _checks.array_of_shape(x, self.x0.shape, "x")
         scenes, point = scenes_of(self.model, x), unpack_numbers(self.model, x)
@@ -162,8 +163,10 @@ class LogDensity(eqx.Module):
 def map_draws(
     function: Callable[[Unpacked], Any], density: LogDensity, x: Float[Array, "m n"]
 ) -> Any:
-    """Return `function(point)` of each draw in x (m, n), in one program for all densities of one
-    form.
+    """Return `function(point)` for each of m draws x (m, n), where `point` is what the draw
+    represents.
+
+    The program is compiled once for all densities with the same structure and shapes.
     """
     return jax.vmap(lambda one: function(density.unpack(one)))(x)
 
@@ -172,7 +175,8 @@ def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
     """Return the slots of the factors of unknown noises, and the variances of the logarithms of
     these factors.
 
-    There is a slot for each sensor without noise, with a factor for each group of recordings.
+    A slot holds the description of a `Free` in a model. There is a slot for each sensor whose noise
+    is not given, with one factor for each group of recordings that share their noise.
     """
     groups, slots, variances = np.asarray(model.noise_groups), [], []
     for index, reading in enumerate(model.records.readings):
@@ -189,14 +193,15 @@ def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
 
 
 def _process_slots(process: Process | None, prior: Array) -> list[Slot]:
-    """Return the slots of the factors of all numbers of a process.
+    """Return a slot for the factor of each number of a `process`.
 
-    The prior of the logarithm of each factor has the standard deviation `prior`.
+    A slot holds the description of a `Free` in a model. The prior of the logarithm of each factor
+    is normal, with mean zero and standard deviation `prior`.
     """
     scene, slots = Scene(None, None, process, (), None), []
     several, number = len(parts_of(process)) > 1, -1
     for path, leaf in jax.tree.leaves_with_path(scene):
-        # The first number of each part of a process is its density: it begins a new part.
+        # The first number of each torque in a process is its density: count the torques by it.
         number += path[-1].name == "density"
         name = f"{path[-1].name} {number}" if several else path[-1].name
         slots.append(_factor(path, name, (1,) * jnp.ndim(leaf), "", (), None, prior))
@@ -212,15 +217,26 @@ def _factor(
     groups: Array | None,
     prior: Array | None = None,
 ) -> Slot:
-    """Return the slot of a factor of the leaf at `path`, whose step is the logarithm of the
-    factor.
+    """Return the slot of a factor of one leaf of a scene; the free number is its logarithm.
+
+    **Arguments:**
+
+    - `path`: the path of the leaf in the scene.
+    - `name`, `unit`: the name of the factor in reports, and the unit of the leaf.
+    - `shape`: the shape of the factor.
+    - `labels`, `groups`: the names of the groups of recordings with a factor each, and the index of
+      the group of each recording; `()` and `None` for a factor that all recordings share.
+    - `prior`: the standard deviation of the prior of the logarithm, or `None` for a flat prior.
     """
     one = jnp.ones(())
     return Slot(path, name, unit, False, True, shape, labels, groups, one, prior, None)
 
 
 def _path_of(model: Model, where: Callable[[Scene], Any]) -> tuple[Any, ...]:
-    """Return the path of the leaf of a scene that `where` picks, even if this leaf is `None`."""
+    """Return the path, in the tree of a scene of the `model`, of the leaf that `where` picks.
+
+    The leaf may be `None`.
+    """
     scene = scene_template(model, model.records)
     marked = eqx.tree_at(where, scene, 0.0, is_leaf=lambda node: node is None)
     pairs = jax.tree.leaves_with_path(eqx.tree_at(where, marked, _MARK))
@@ -233,10 +249,16 @@ _MARK = object()
 def _with_slots(
     model: Model, noises: Noise, process: Process | None, slots: list[Slot]
 ) -> tuple[Model, np.ndarray]:
-    """Return the model with these noises, this process and additional shared slots, and the places
-    of its old numbers.
+    """Return a model with additional free numbers, and the new indices of its old free numbers.
 
-    The places (n,) are those of the old free numbers among the new ones.
+    **Arguments:**
+
+    - `model`: the old model with n free numbers.
+    - `noises`: the standard deviations of the errors of each sensor, which the new model gets.
+    - `process`: the process of the new model.
+    - `slots`: the slots of the additional free numbers, which all recordings share.
+
+    **Returns** the new model, and the index (n,) of each old free number among the new ones.
     """
     bodies = places_of(model.chart, model.body_indices, model.count)
     kinds = model.index.start.shape[1] // 3
@@ -262,16 +284,19 @@ def _with_slots(
 
 
 def _covariance_of_white_errors(fit: Fit, follows_the_motion: bool) -> np.ndarray:
-    """Return the covariance of a fit for white errors, where the density assumes white errors.
+    """Return the covariance (n, n) of a `fit` without the parts that a posterior density lacks.
 
-    Without a process (`follows_the_motion`) the density assumes white errors about the motion.
+    The density takes errors as white. Therefore a covariance that allows for considered sensor
+    errors is replaced by the covariance for white errors. A sandwich covariance is replaced if it
+    is singular, or if `follows_the_motion` is true: the density then has no process and no walk,
+    and readings are normal about the motion.
     """
     covariance = np.asarray(fit.covariance)
     if fit.considered and fit.linear is not None:
         covariance = white_covariance(fit.linear).covariance
     elif fit.covariance_kind.startswith("sandwich"):
-        # The sandwich covariance of a fit is wider than a density of white errors. For many
-        # recordings it may be singular as well: it then gives a search no scale.
+        # The sandwich covariance of a fit is larger than the covariance of a density with white
+        # errors. For many recordings it may be singular as well, and is then no scale for a search.
         size = np.sqrt(np.diagonal(covariance))
         definite = np.linalg.eigvalsh(covariance / np.outer(size, size)).min() > 1e-10
         if (follows_the_motion or not definite) and fit.linear is not None:

@@ -1,4 +1,4 @@
-"""Compute the uncertainty to expect of a planned motion, and find the best motion."""
+"""Compute the uncertainty to expect from a planned recording, and find the best initial rate."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -26,14 +26,14 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
 
     **Arguments:**
 
-    - `model`: its recordings give the times and the sensors, with known noise; the readings do not
-      matter.
-    - `x`: (n,) the free numbers of the planned motion, as `Model.start` returns them.
+    - `model`: a model whose recordings hold the planned times and the sensors, with known noise;
+      the values of the readings do not matter.
+    - `x`: (n,) the free numbers of the planned motion, such as `Model.start` returns.
 
-    **Returns** the quantities of `Fit.quantities` (`name`, `value`, `deviation` in the same
-    `unit`). Their standard deviations are those of the Cramér–Rao bound, infinite for a quantity
-    that the motion does not show. **Raises:** `ValueError` for a sensor whose noise is not given,
-    or numbers that are not finite.
+    **Returns** the same quantities as `Fit.quantities` (`name`, `value`, and `deviation` in the
+    same `unit`). The standard deviations are the least that an unbiased estimate can have (the
+    Cramér–Rao bound), and infinite for a quantity that the motion does not determine. **Raises:**
+    `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
 
     >>> model = rj.datasets.toutatis.model()
     >>> plan = model.start(rj.Inertia.from_principal(3.1, 3.2, 1.0))
@@ -54,14 +54,13 @@ def expected_quantities(model: Model, x: Float[Array, " n"]) -> tuple[Quantity, 
 
 
 def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """Return Fisher's information (n, n) of the free numbers, which is `Jᵀ Σ⁻¹ J` of the
-    predictions.
+    """Return Fisher's information matrix `Jᵀ Σ⁻¹ J` (n, n) of the free numbers x.
 
-    J are the derivatives of the predictions by x, Σ is the covariance of the noise. The result is
-    differentiable in x, for a design by gradients.
+    J holds the derivatives of all predictions with respect to x, and Σ is the covariance of the
+    noise. The result is differentiable with respect to x, for a design by gradients.
 
-    **Arguments:** `model` with known noises; `x` (n,) the free numbers of the motion. **Raises**
-    `ValueError` for a sensor without noise.
+    **Arguments:** `model` is a model whose sensors have known noise; `x` (n,) holds the free
+    numbers of the motion. **Raises** `ValueError` for a sensor without noise.
 
     >>> model = rj.datasets.toutatis.model()
     >>> fisher(model, model.start()).shape
@@ -87,7 +86,10 @@ def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
 
 
 def _require_noise(model: Model, x: Float[Array, " n"]) -> None:
-    """Raise `ValueError` for a sensor whose noise or jitter is not known."""
+    """Raise `ValueError` if a sensor of the `model` has unknown noise or jitter to be estimated.
+
+    It is also raised unless x is a vector of the free numbers of the `model`.
+    """
     require_numbers(model, x)
     for sensor in model.records.sensors:
         if sensor.noise is None:
@@ -99,7 +101,7 @@ def _require_noise(model: Model, x: Float[Array, " n"]) -> None:
 
 
 def _require_known(model: Model, motion: PyTree) -> None:
-    """Raise `TypeError` if the model or the motion has traced numbers."""
+    """Raise `TypeError` if the `model` or the tree `motion` has traced numbers."""
     if not _checks.is_known((model, motion)):
         raise TypeError(
             "model, x, body, omega: wanted known numbers, got traced ones; call it outside of "
@@ -114,21 +116,21 @@ def best_first_rate(
     *,
     max_steps: int = 60,
 ) -> tuple[Vec3, tuple[Quantity, ...]]:
-    """Return the initial rate, with the length of `omega`, that determines the body best.
+    """Return the initial body rate, of the same length as `omega`, that determines the body best.
 
-    Its direction minimises the mean logarithm of the standard deviations of the free numbers of the
-    body (D-optimality; all other numbers are free as well). The method BFGS of optimistix finds a
-    minimum near `omega`: try several directions.
+    The direction of the rate minimises the mean logarithm of the standard deviations of the free
+    numbers of the body (D-optimality), where all other numbers are free as well. The BFGS method of
+    optimistix finds a minimum near the direction of `omega`: try several directions.
 
     **Arguments:**
 
-    - `model`, `body`: as for `Model.start`.
-    - `omega`: (3,) rad/s, body frame: the direction from which the search starts, and the length of
-      the rate, that is how fast the body can be thrown.
+    - `model`, `body`: the planned recordings and the expected body, as for `Model.start`.
+    - `omega`: (3,) rad/s, body frame. Its direction is the start of the search, and its length is
+      the length of the result: how fast the body can be thrown.
     - `max_steps`: the largest number of steps of the search.
 
-    **Returns** the rate (3,), and the result of `expected_quantities` for it. **Raises:** as
-    `fisher`.
+    **Returns** the rate (3,), and the result of `expected_quantities` for this rate. **Raises** the
+    errors of `fisher`.
     """
     require_one(model)
     max_steps = _checks.integer(max_steps, "max_steps", 1)
@@ -143,8 +145,11 @@ def best_first_rate(
 
 @eqx.filter_jit
 def _best_direction(model: Model, body: PyTree, start: Array, size: Array, max_steps: int) -> Array:
-    """Return the direction (3,) near `start` with the least uncertainty, for a rate of length
-    `size`.
+    """Return the direction (3,) of the initial rate at which `_log_uncertainty` is smallest.
+
+    **Arguments:** `model` and `body` are as for `best_first_rate`; `start` (3,) is the unit vector
+    from which the search starts, `size` the length of the rate in rad/s, and `max_steps` the
+    largest number of steps.
     """
     minimise: Any = optx.minimise
     out = minimise(
@@ -160,16 +165,17 @@ def _best_direction(model: Model, body: PyTree, start: Array, size: Array, max_s
 
 
 def _log_uncertainty(direction: Array, args: tuple[Model, PyTree, Array]) -> Scalar:
-    """Return the mean logarithm of the standard deviations of the body's n numbers for one
-    direction of the rate.
+    """Return a measure of the uncertainty of the body for one `direction` (3,) of the initial rate.
 
-    It is ½ log det of their covariance over n. A penalty keeps the length of `direction` near 1.
+    The measure is ½ log det C / n, where C (n, n) is the covariance of the n free numbers of the
+    body. A penalty is added that keeps the length of `direction` near 1. `args` holds the model,
+    the body and the length of the rate.
     """
     model, body, size = args
     length = jnp.sqrt(jnp.sum(direction**2))
     information = fisher(model, model.start(body, size * direction / length))
     n = model.index.bodies
-    # Schur's complement is the information on the body if the other numbers are free as well.
+    # The information on the body, if the other numbers are free as well, is a Schur complement.
     mine, across, rest = information[:n, :n], information[:n, n:], information[n:, n:]
     scale = jnp.sqrt(jnp.diagonal(rest))
     rest = rest / (scale[:, None] * scale[None, :]) + 1e-12 * jnp.eye(rest.shape[0])

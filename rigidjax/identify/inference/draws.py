@@ -1,9 +1,8 @@
-"""Find the maximum of a posterior density with weighted draws, and draw by samplers of other
-libraries.
+"""Find the maximum of a posterior density, and draw from the density for intervals.
 
-Draws are needed because intervals from the information at the maximum are too narrow on short
-records: such intervals fix the density of a torque at its most probable value, which is below its
-mean.
+Draws are needed because intervals from Fisher's information at the maximum are too narrow for short
+records: such intervals hold the spectral density of a torque fixed at its most probable value,
+which is below its mean.
 """
 
 from collections.abc import Callable
@@ -29,34 +28,36 @@ from rigidjax.identify.search.stages import is_order_one
 from rigidjax.identify.uncertainty.quantities import interval_about
 from rigidjax.motion.torques.composite import parts_of
 
-# A sampler is a function from a key, a log-density of z, and a first z (n,) to draws (samples, n).
+# A sampler is a function. It is given a key, a log-density (a function of a vector z) and a first z
+# (n,), and returns draws of z (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 
-# These are arguments of `_checks.import_library`: the module, the extra that installs it, the
-# function.
+# These arguments of `_checks.import_library` are the module, the extra of rigidjax that installs
+# the module, and the function that needs the module.
 _BLACKJAX = ("blackjax", "posterior", "posterior")
 
-# The first mass matrix has this weight, in draws. It counts, because Laplace's method made it.
+# The first mass matrix of a sampler counts like an estimate from this number of draws, because it
+# is the good one of Laplace's method.
 _FIRST_WEIGHT = 50.0
 
-# From this number of recordings on a gradient keeps a core busy: gradients of four chains at once
-# then take as long as one after another.
+# With at least this number of recordings one gradient keeps a core busy: the gradients of four
+# chains then take as long together as one after another.
 _FULL = 8
 
 
 class Nuts(eqx.Module):
-    """Draw by the no-U-turn sampler of blackjax, with a warm-up that adapts its step and its mass
-    matrix.
+    """Draw by the no-U-turn sampler of blackjax.
 
-    It needs blackjax: `pip install rigidjax[posterior]`. Source: Hoffman and Gelman 2014, JMLR
-    15:1593.
+    A warm-up adapts the step and the mass matrix of the sampler. The class needs blackjax:
+    `pip install rigidjax[posterior]`. Source: Hoffman and Gelman 2014, JMLR 15:1593.
 
     **Arguments:**
 
     - `samples`: the number of draws of each chain.
-    - `warmup`: the number of draws before them, which are thrown away.
-    - `acceptance`: the mean acceptance probability of the points of a trajectory, which sets the
-      step. 0.8 is careful; 0.65 takes half as many gradients if the density is nearly normal.
+    - `warmup`: the number of draws of the warm-up, which are thrown away.
+    - `acceptance`: the mean acceptance probability of the points of a trajectory, to which the
+      warm-up adapts the step. 0.8 is careful; 0.65 takes half as many gradients if the density is
+      nearly normal.
 
     **Raises:** `ValueError` for numbers below 1 and an `acceptance` that is not between 0 and 1.
 
@@ -74,11 +75,14 @@ class Nuts(eqx.Module):
         _checks.fraction(self.acceptance, "acceptance")
 
     def __call__(self, key: PRNGKeyArray, density: Callable[[Array], Array], start: Array) -> Array:
-        """Return the draws (samples, n) of one chain that begins at `start` (n,)."""
+        """Return the draws (samples, n) of one chain that begins at `start` (n,).
+
+        `density` is the log-density as a function of a vector (n,), and `key` a random key.
+        """
         blackjax = _checks.import_library(*_BLACKJAX)
         adaptation = blackjax.adaptation
-        # Do the warm-up of `blackjax.window_adaptation` in one loop with the draws. In a loop of
-        # its own it would compile the density once more, which takes longer than the draws.
+        # Do the warm-up of `blackjax.window_adaptation` and the draws in one loop. A separate loop
+        # for the warm-up would compile the density once more, which takes longer than the draws.
         begin, tune, settle = adaptation.step_size.dual_averaging_adaptation(self.acceptance)
         metric = adaptation.mass_matrix.mass_matrix_adaptation(True, _FIRST_WEIGHT)
         metric_begin, metric_add, metric_end = metric
@@ -128,12 +132,13 @@ class Posterior(eqx.Module):
 
     **Fields:**
 
-    - `density`: the `LogDensity`.
-    - `x`: (chains, samples, n) the draws of its argument.
+    - `density`: the `LogDensity` from which x was drawn.
+    - `x`: (chains, samples, n) the draws of the argument x of the density.
 
-    `points` are the bodies, states and values of the draws, `map(function)` any function of them.
-    `rhat` (n,) is below 1.01 if the chains agree, `ess` (n,) is the number of independent draws
-    (Gelman et al., Bayesian Data Analysis (2013), §11.4, 11.5).
+    `points` holds the body, the states and the values of each draw, and `map(function)` applies a
+    function to each draw. `rhat` (n,) is below 1.01 if the chains agree, and `ess` (n,) is the
+    number of independent draws that the draws of each entry of x are worth (Gelman et al., Bayesian
+    Data Analysis (2013), §11.4, 11.5).
     """
 
     density: LogDensity
@@ -141,28 +146,31 @@ class Posterior(eqx.Module):
 
     @property
     def rhat(self) -> Float[Array, " n"]:
-        """Return the potential scale reduction of the chains, which is near 1 if they agree
-        (blackjax).
+        """Return the potential scale reduction (n,) of the entries of x, by blackjax.
+
+        It is near 1 if the chains agree.
         """
         return _checks.import_library(*_BLACKJAX).diagnostics.potential_scale_reduction(self.x)
 
     @property
     def ess(self) -> Float[Array, " n"]:
-        """Return the effective number of independent draws (blackjax)."""
+        """Return the effective number (n,) of independent draws of each entry of x, by blackjax."""
         return _checks.import_library(*_BLACKJAX).diagnostics.effective_sample_size(self.x)
 
     @property
     def points(self) -> Unpacked:
-        """Return the bodies, states and values of the draws, with the axes of chains and samples
-        first.
+        """Return the body, states and values of all draws, as one `Unpacked`.
+
+        Its arrays have two leading axes, for the chains and the samples.
         """
         return self.map(_identity)
 
     def map(self, function: Callable[[Unpacked], Any]) -> Any:
-        """Return `function(point)` of each draw, with leading axes of chains and samples.
+        """Return `function(point)` for each draw, with leading axes for the chains and the samples.
 
-        An example is `drawn.map(lambda point: point.body.moments)`. **Raises** `TypeError` if
-        `function` is not a function.
+        `point` is an `Unpacked` with the body, states and values of the draw. An example is
+        `drawn.map(lambda point: point.body.moments)`. **Raises** `TypeError` if `function` is not a
+        function.
         """
         _checks.require_function(
             function, "function", "of `Unpacked`, such as lambda point: point.body"
@@ -171,9 +179,11 @@ class Posterior(eqx.Module):
         return jax.tree.map(lambda leaf: leaf.reshape(*self.x.shape[:2], *leaf.shape[1:]), rows)
 
     def to_arviz(self) -> Any:
-        """Return the draws as an object of ArviZ, with body, values, initial states and process.
+        """Return the draws as an object of ArviZ.
 
-        **Raises:** `ImportError` without arviz, which needs Python 3.12.
+        Its variables are the inertia tensors, the values of the `Free`s, the initial body rates and
+        the spectral densities of the process. **Raises** `ImportError` without arviz, which needs
+        Python 3.12.
         """
         arviz = _checks.import_library("arviz", "posterior", "to_arviz (Python 3.12)")
         points = self.points
@@ -190,25 +200,29 @@ class Posterior(eqx.Module):
 
 
 def _identity(point: Unpacked) -> Unpacked:
-    """Return the point unchanged, by one function for all calls so that none compiles again."""
+    """Return the `point` unchanged.
+
+    A module-level function is the same object in all calls, so that JAX compiles only once.
+    """
     return point
 
 
 def posterior(
     density: LogDensity, key: PRNGKeyArray, *, sampler: Sampler | None = None, chains: int = 4
 ) -> Posterior:
-    """Draw body, initial states, all `Free`s, noise and process from their density, given all
-    readings.
+    """Draw from the posterior density of a body, its initial states, all `Free`s, the noise and the
+    process.
 
     **Arguments:**
 
     - `density`: a `LogDensity`.
-    - `key`: of `jax.random`.
-    - `sampler`: a function of a key, a log-density and a first vector to draws (samples, n);
-      `Nuts()` unless given. The vectors are scaled: by Laplace's method their covariance is the
-      identity. The first one is drawn from this distribution, at half the width.
-    - `chains`: their number. They run together under `vmap`, or one after another for eight
-      recordings and more.
+    - `key`: a key of `jax.random`.
+    - `sampler`: a function that is given a key, a log-density and a first vector (n,), and returns
+      draws (samples, n); `Nuts()` by default. The vectors are shifted and scaled so that Laplace's
+      method gives them the mean 0 and the identity as covariance. The first vector is normal, with
+      half of this standard deviation.
+    - `chains`: the number of chains. The chains run together under `vmap`, or one after another for
+      eight recordings and more.
 
     **Returns** a `Posterior`. **Raises** `ImportError` if blackjax is missing.
 
@@ -236,10 +250,11 @@ def posterior(
 
 @eqx.filter_jit
 def _draw(density: LogDensity, root: Array, keys: Array, sampler: Sampler) -> Array:
-    """Return the draws (chains, samples, n) of one chain for each of the `keys`, computed in one
-    program.
+    """Return the draws (chains, samples, n) of one chain for each of the `keys`.
 
-    A chain draws the vector z, with `x = x0 + root z`.
+    All chains are computed in one compiled program. The `sampler` draws the vector z (n,) with
+    `x = x0 + root z`, where x0 is the start of the `density` and `root` (n, n) a root of the
+    covariance of x.
     """
 
     def to_numbers(z: Array) -> Array:
@@ -250,19 +265,20 @@ def _draw(density: LogDensity, root: Array, keys: Array, sampler: Sampler) -> Ar
         start = 0.5 * jax.random.normal(first, density.x0.shape, density.x0.dtype)
         return jax.vmap(to_numbers)(sampler(later, lambda z: density(to_numbers(z)), start))
 
-    # Chains that run together wait for the longest trajectory among them in each step.
+    # Chains that run together wait, in each step, for the chain with the longest trajectory.
     if density.model.count >= _FULL:
         return lax.map(chain, keys)
     return jax.vmap(chain)(keys)
 
 
-# The search ends at a step of _SMALL standard deviations, and starts with the damping _DAMPING.
+# The search for the maximum ends if a step is shorter than _SMALL standard deviations of each
+# number. The damping of its Levenberg–Marquardt steps starts at _DAMPING.
 _SMALL, _DAMPING = 1e-3, 1e-2
-# Draws come from Student's t distribution with _FREEDOM degrees of freedom, _WIDER times as wide as
-# Laplace's normal distribution: of a narrow distribution a few draws in the tails would get all the
-# weight.
+# Draws come from Student's t distribution with _FREEDOM degrees of freedom and a scale of _WIDER
+# times that of Laplace's normal distribution. With a narrower distribution a few draws in the tails
+# would get all the weight.
 _FREEDOM, _WIDER = 6.0, 1.2
-# At least this number of independent draws gives the ends of an interval.
+# An interval is computed from the draws if they are worth at least this number of independent ones.
 _LEAST = 100.0
 
 
@@ -272,12 +288,12 @@ class Refit(eqx.Module):
     **Fields:**
 
     - `density`: the `LogDensity`.
-    - `x`: (n,) the point at which it is largest.
-    - `log_density`: at x.
-    - `covariance`: (n, n) of x, the inverse of Fisher's information at x.
-    - `converged`: whether the search converged.
-    - `draws`, `weights`: (m, n) and (m,); together they represent the posterior density. The
-      weights add up to 1.
+    - `x`: (n,) the point at which the density is largest.
+    - `log_density`: the logarithm of the density at x.
+    - `covariance`: (n, n) the covariance of x, which is the inverse of Fisher's information at x.
+    - `converged`: whether the search converged and all weights are finite.
+    - `draws`: (m, n) draws of x, which represent the posterior density together with their weights.
+    - `weights`: (m,) the weights of the draws, which add up to 1.
 
     `effective_count` is the number of independent draws that the weighted draws are worth.
     """
@@ -297,26 +313,30 @@ class Refit(eqx.Module):
 
     @property
     def effective_count(self) -> Scalar:
-        """Return the number of independent draws that the weighted draws are worth, 1/Σw² for
-        weights w.
+        """Return the number of independent draws that the weighted draws are worth.
 
-        Source: Kish, Survey Sampling (1965).
+        It is 1/Σw² for the weights w. Source: Kish, Survey Sampling (1965).
         """
         return 1.0 / jnp.sum(self.weights**2)
 
     def interval_of(
         self, function: Callable[[Unpacked], Any], level: float = 0.95
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the interval (low, high), with equal tails, of a function of the posterior.
+        """Return the interval (low, high), with equal tails, of a function of the drawn quantities.
 
-        It is computed from the weighted draws. If these are worth fewer than 100 independent ones
-        (`effective_count`), it is computed from the covariance and the derivative of the function,
-        which must then be differentiable: take the logarithm of a positive quantity. Such an
-        interval is too narrow on short records.
+        The interval is computed from the weighted draws. If the draws are worth fewer than 100
+        independent draws (`effective_count`), the interval is computed from the covariance and the
+        derivative of the function, which must then be differentiable: take the logarithm of a
+        positive quantity. An interval from the covariance is too narrow for short records.
 
-        **Arguments:** `function` from `Unpacked` to an array; `level` the probability
-        that the interval holds the true value. **Raises** `ValueError` for a level outside (0, 1),
-        and if too few draws are independent and the search did not converge either.
+        **Arguments:**
+
+        - `function`: a function that is given an `Unpacked` (the body, the states and the values of
+          a draw) and returns an array.
+        - `level`: the probability that the interval holds the true value.
+
+        **Raises** `ValueError` for a level outside (0, 1), and if too few draws are independent and
+        the search did not converge either.
         """
         level = _checks.fraction(level, "level", "a probability between 0 and 1")
         _checks.require_function(function, "function", "of `Unpacked` to an array")
@@ -350,29 +370,29 @@ class Refit(eqx.Module):
 def refit(
     density: LogDensity, *, max_steps: int = 200, draws: int = 1000, key: PRNGKeyArray | None = None
 ) -> Refit:
-    """Find the maximum of a posterior density, and draw around it for intervals.
+    """Find the maximum of a posterior density, and draw around the maximum for intervals.
 
-    It is a fit that allows for an unknown torque, the process of the model:
-    `refit(LogDensity(fit))` finds the body, the initial states, all `Free`s and the density of the
-    torque, starting from `fit`. The search is Fisher's scoring: Levenberg–Marquardt steps with the
-    expected information of the innovations as the normal matrix (Gupta and Mehra 1974,
-    doi:10.1109/TAC.1974.1100714).
+    The function is a fit that allows for an unknown torque (the process of the model):
+    `refit(LogDensity(fit))` finds the body, the initial states, all `Free`s and the spectral
+    density of the torque, starting from the result `fit`. The search is Fisher's scoring:
+    Levenberg–Marquardt steps with the expected information of the innovations as the normal matrix
+    (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714).
 
-    The draws come from a wide Student's t distribution about the maximum; their weight is the
-    density over that of the t distribution (importance sampling: Geweke 1989,
-    doi:10.2307/1913710). For more than some dozen numbers such draws are worth little
-    (`effective_count`). Intervals then come from the information, which is good enough if each
-    recording is long; or draw by `identify.posterior`, from any density.
+    The draws come from a wide Student's t distribution about the maximum. The weight of a draw is
+    proportional to the posterior density over the density of the t distribution (importance
+    sampling: Geweke 1989, doi:10.2307/1913710). For more than a few dozen free numbers such draws
+    are worth few independent draws (`effective_count`). Intervals then come from the covariance,
+    which is good enough if each recording is long; `identify.posterior` draws from any density.
 
     **Arguments:**
 
     - `density`: a `LogDensity`.
     - `max_steps`: the largest number of steps of the search.
     - `draws`: the number of draws.
-    - `key`: of `jax.random` for the draws; without a key they are the same at each call.
+    - `key`: a key of `jax.random` for the draws; without a key the draws are the same at each call.
 
-    **Returns** a `Refit`. Its `converged` is false if the search ended early, or if some
-    combination of the numbers changes neither readings nor priors; `weights` are then NaN.
+    **Returns** a `Refit`. Its `converged` is false if the search ended early, or if some change of
+    the free numbers changes neither readings nor priors; in the second case `weights` are NaN.
 
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
@@ -395,7 +415,7 @@ def refit(
 
 @eqx.filter_jit
 def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: int) -> Refit:
-    """Return the result of `refit` with `count` draws, computed in one program."""
+    """Return the result of `refit` with `count` draws, computed in one compiled program."""
 
     def evaluate(x: Array) -> tuple[None, Array, NormalMatrix, Array]:
         cost, gram, slope = curvature(density.model, x)
@@ -412,8 +432,10 @@ def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: in
 def _weighted_draws(
     density: LogDensity, mode: Array, covariance: Array, key: PRNGKeyArray, count: int
 ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-    """Return `count` draws of Student's t distribution about the maximum `mode`, and their
-    weights.
+    """Return draws (m, n) from Student's t distribution, and the weights (m,) of the draws.
+
+    The distribution has its maximum at `mode` (n,), the maximum of the posterior `density`, and the
+    shape of `covariance` (n, n). `count` is m. With their weights the draws represent the density.
     """
     size, kind = mode.size, mode.dtype
     normal, square = jax.random.split(key)

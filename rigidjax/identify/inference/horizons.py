@@ -1,5 +1,6 @@
-"""Compute the errors of a fitted model on windows, by the number of steps that it predicts
-ahead.
+"""Compute the prediction errors of a fitted model on windows, as functions of the horizon.
+
+The horizon is the number of steps from the measured start of a window to the predicted state.
 """
 
 import equinox as eqx
@@ -23,15 +24,21 @@ from rigidjax.identify.model.terms import all_errors
 
 
 def predict_windows(fit: Fit, windows: Windows) -> Horizons:
-    """Return the open-loop errors of a fitted model on windows, at every horizon.
+    """Return the open-loop prediction errors of a fitted model, as functions of the horizon.
 
-    The model runs from the measured start of each window with the fitted body and shared numbers.
+    The horizon is the number of steps from the measured start of a window to the predicted state.
+    The model predicts from the measured start of each window, with the fitted body and the fitted
+    numbers that all windows share.
 
-    **Arguments:** `fit` of a `Model` of windows; `windows` the same ones, or others with the same
-    kind of state and inputs. **Returns** `steps`, and by kind `mean_absolute`, `mean_norm` and
-    `rms` (`Horizons`); a good model has smaller errors than `windows.held_horizons()`. **Raises:**
-    `TypeError` for a fit of other recordings than windows, `ValueError` for a `Free` with a value
-    for each window and for missing inputs.
+    **Arguments:**
+
+    - `fit`: the fit of a `Model` of windows.
+    - `windows`: the windows of the fit, or other windows with the same kind of state and inputs.
+
+    **Returns** a `Horizons` with `steps`, `mean_absolute`, `mean_norm` and `rms`. A good model has
+    smaller errors than `windows.held_horizons()`. **Raises:** `TypeError` for a fit of other
+    recordings than windows, `ValueError` for a `Free` with a value for each window and for missing
+    inputs.
 
     >>> t = np.linspace(0.0, 1.0, 11)
     >>> spin = rj.Spin(np.stack([0 * t, 0 * t, np.exp(-0.5 * t)], 1))
@@ -63,8 +70,10 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
 def _on_windows(
     model: Model, x: Float[Array, " n"], windows: Windows
 ) -> tuple[Model, Float[Array, " m"]]:
-    """Return the model of these windows with known starts, and the shared free numbers of this
-    model.
+    """Return the fitted `model` with other `windows` as its recordings, and its free numbers.
+
+    The starts of the windows are taken as known. The free numbers of the new model are the numbers
+    in x (n,) that all windows share.
     """
     reference, _, clusters = starts_of_windows(windows, 1)
     body_indices = None
@@ -86,5 +95,5 @@ def _on_windows(
 
 @eqx.filter_jit
 def _errors_by_sensor(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors of all sensors, computed in one program."""
+    """Return the errors of all sensors at the free numbers x, computed in one compiled program."""
     return all_errors(model, x)

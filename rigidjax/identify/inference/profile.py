@@ -1,4 +1,4 @@
-"""Compute profile intervals: the range of a quantity in which the best misfit grows little."""
+"""Compute profile intervals, in which the least misfit for each value of a quantity stays small."""
 
 import functools
 from collections.abc import Callable
@@ -16,16 +16,21 @@ from rigidjax.identify.search.stages import Attempt, Task, cost_of, polish
 from rigidjax.identify.uncertainty import quantities
 from rigidjax.identify.uncertainty.degrees_of_freedom import quantile
 
-# A pull has this width, in standard deviations of the quantity: a narrower one slows the search
-# down.
+# The residual of a `Pull` has this standard deviation, in units of the standard deviation of the
+# quantity. A smaller one would slow the search down.
 PULL = 0.3
 
 
 class Pull(AbstractPull):
-    """Hold a residual that pulls a reported quantity to a target.
+    """Hold an additional residual, by which a fit pulls a reported quantity towards a target.
 
-    **Fields:** `index` the number of the quantity; `target`; `width` the standard deviation of the
-    residual.
+    The residual is (value − `target`) / `width`.
+
+    **Fields:**
+
+    - `index`: the index of the quantity among all reported quantities.
+    - `target`: the value to which the quantity is pulled (for a positive quantity, its logarithm).
+    - `width`: the standard deviation of value − `target`.
     """
 
     index: Int[Array, ""]
@@ -40,21 +45,23 @@ class Pull(AbstractPull):
 def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     """Return the profile interval (low, high) of one reported quantity.
 
-    The quantity is held at other values, and all other numbers are fitted again. At the ends of the
-    interval, twice the misfit has grown by the squared quantile t², multiplied by the number of
-    samples over which errors are autocorrelated. This interval is better than that of
-    `fit.interval()` if the misfit is not quadratic, as for a weakly determined quantity or one near
-    a boundary. Source: Raue et al. 2009, doi:10.1093/bioinformatics/btp358.
+    The quantity is moved to other values, and all other numbers are fitted again at each value. The
+    interval ends where twice the misfit has grown by t² times the number of samples over which
+    errors are autocorrelated. Here t is the quantile of Student's distribution for the `level`.
+    The profile interval is better than the interval of `fit.interval()` if the misfit is not a
+    quadratic function, as for a quantity that is weakly determined or near a boundary. Source: Raue
+    et al. 2009, doi:10.1093/bioinformatics/btp358.
 
     **Arguments:**
 
     - `fit`: a result of `identify.fit`.
-    - `name`: of the quantity, as in `fit.interval()`.
+    - `name`: the name of the quantity, as in `fit.interval()`.
     - `level`: the probability that the interval holds the true value.
 
-    **Returns** the interval. An end is infinite, or 0 for a positive quantity, if the misfit does
-    not grow enough within a factor of 1e3 (or 1e3 times the value). **Raises:** `ValueError` for a
-    name that is not reported, and for a level outside (0, 1).
+    **Returns** the interval. If the misfit does not grow enough, the upper end is infinite, and the
+    lower end is −infinity, or 0 for a positive quantity. The search for an end stops at a factor of
+    1e3 for a positive quantity, and at a change of 1e3 times the value for another quantity.
+    **Raises:** `ValueError` for a name that is not reported, and for a level outside (0, 1).
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> low, high = profile(result, "Ix/Iz")
@@ -82,9 +89,9 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
 
         @functools.cache
         def pull_to(steps: float, side: float = side) -> tuple[float, float]:
-            # The pull is weak, and so the quantity ends between the target and its best value. That
-            # is no error: the point has the least misfit of all points with its value of the
-            # quantity.
+            # The pull is weak: after the fit the quantity lies between its best value and the
+            # target. This makes no error, because the fitted point has the least misfit of all
+            # points with the same value of the quantity.
             nonlocal point
             size = middle + side * steps * deviation, PULL * deviation
             target, width = (jnp.asarray(x, kind) for x in size)
@@ -107,11 +114,17 @@ _value = eqx.filter_jit(quantities.quantity_vector)
 def _interval_end(
     pull_to: Callable[[float], tuple[float, float]], reach: float, largest: float, side: float
 ) -> float:
-    """Return the value of the quantity at which the misfit has grown by the amount that ends the
-    interval.
+    """Return one end of a profile interval, or infinity if the search finds no end.
 
-    **Arguments:** `pull_to` a function from the distance of the target to the excess of the misfit
-    and the value; `reach` the first distance; `largest` the last one; `side` the sign of infinity.
+    **Arguments:**
+
+    - `pull_to`: a function that fits the model with the quantity pulled towards a target. Given the
+      distance of the target from the best value, in standard deviations, it returns two numbers:
+      the growth of the misfit minus the growth at the end of an interval, and the value of the
+      quantity (its logarithm, if the quantity is positive).
+    - `reach`: the first distance to try.
+    - `largest`: the distance at which the search is given up.
+    - `side`: −1 for the lower end of the interval, 1 for the upper end.
     """
     from scipy.optimize import brentq
 
