@@ -1,3 +1,3 @@
-"""Run the command line: `command` runs it, `spec` makes a model of its options, `logs` reads
-logs.
+"""Run the command line: `command` runs a command, `spec` makes a model from the options, `logs`
+reads logs.
 """

@@ -24,10 +24,11 @@ from rigidjax.cli.logs.layouts import imu_columns_of
 from rigidjax.cli.logs.units import TIME_UNITS, unit_in
 from rigidjax.workprecision import command as workprecision
 
-# The demo takes these options as well; the others describe how to read logs.
+# The demo takes only these options; all other options describe how to read logs, and the demo reads
+# no log.
 _OF_DEMO = ("starts", "checkpoint", "figure", "report", "json", "no_cache")
-# Each of these options names a file to write: no two may be the same file, nor may one be a log
-# that is read.
+# Each of these options names a file to write. Two options must not name the same file, and none may
+# name a log that is read.
 _OUTPUTS = ("checkpoint", "figure", "report", "json", "csv", "keep")
 
 
@@ -37,22 +38,24 @@ def main(arguments: list[str] | None = None) -> int:
     The code is 0 for success, 1 for a fit that cannot be trusted, 2 for bad input or a file that
     could not be written, and 130 for an interrupt.
 
-    **Arguments:** `arguments` of the command line; `None` takes those of this process. Only with
-    `None` does the process belong to this command: its compiled programs are then kept for the next
-    run, unless `--no-cache` is given.
+    **Arguments:** `arguments` of the command line; `None` takes the arguments of this process. With
+    `None` the process belongs to this command, so that compiled programs are kept for the next run,
+    unless `--no-cache` is given.
     """
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help()
         return 0
-    # A library must not change this setting; but this is a program, and the setting is its own.
+    # A library must not change this setting of JAX. Here it may be changed, since this is a program
+    # of its own.
     jax.config.update("jax_enable_x64", True)
     if options.command == "identify" and options.demo == bool(options.logs):
         parser.error("identify: give either log FILES or --demo")
     _check_files(options, parser)
     if arguments is None:
-        # Escape characters of a file name that the terminal cannot show: they would end the run.
+        # Characters of a file name that the terminal cannot show are escaped, since they would
+        # raise an error that ends the run.
         for stream in (sys.stdout, sys.stderr):
             stream.reconfigure(errors="backslashreplace")  # pyright: ignore
         sys.unraisablehook = _raise_interrupt_again
@@ -64,13 +67,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _raise_interrupt_again(dropped: "sys.UnraisableHookArgs") -> None:
-    """Raise a Ctrl-C again that Python dropped, as it does in JAX's callback of the garbage
-    collector.
+    """Raise a Ctrl-C (`KeyboardInterrupt`) again if Python dropped it, as in JAX's callback of the
+    garbage collector.
 
     `dropped` holds the exception as `sys.unraisablehook` gets it.
     """
     if dropped.exc_type is KeyboardInterrupt:
-        # Raise it from another thread, a moment later: within this hook it would be dropped again.
+        # Another thread raises the interrupt a moment later: within this hook it would be dropped
+        # again.
         threading.Timer(0.05, _thread.interrupt_main).start()
     else:
         sys.__unraisablehook__(dropped)
@@ -98,13 +102,13 @@ def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, owns_proc
 
 
 def _check_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Check the files that the options name, and end the program with a message if one could not be
-    written after the fit.
+    """Check the output files that the options name, and end the program with a message if a file
+    could not be written after the fit.
     """
     figure = options.figure
     if figure is not None and figure.name and not figure.suffix.strip("."):
-        # Matplotlib adds this ending to a name without one: add it here, so that the message names
-        # the right file.
+        # Matplotlib adds the ending `.png` to a name without an ending. The ending is added here,
+        # so that messages name the right file.
         options.figure = figure.with_name(figure.name.rstrip(".") + ".png")
     if figure is not None and not _matplotlib():
         parser.error("--figure: needs matplotlib: pip install 'rigidjax[view]'")
@@ -134,8 +138,8 @@ def _keep_compiled_programs() -> None:
     Programs of `workprecision` are not kept: it measures how long they take to compile.
     """
     if jax.__version_info__ < (0, 12):
-        # Hide the messages of XLA, which reports two of its own flags as errors for each program
-        # that it loads, in a line of 2.6 kB.
+        # Messages of XLA are hidden: for each program that it loads, XLA reports two of its own
+        # flags as errors, in a line of 2.6 kB.
         jax.config.update("jax_logging_level", "CRITICAL")
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
@@ -143,8 +147,9 @@ def _keep_compiled_programs() -> None:
         folder = _cache_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         held = folder.stat()
-        # Programs in the folder are run: make sure that nobody else can have put them there. On
-        # Windows the folder of a user belongs to the user already.
+        # Compiled programs in the folder are run. The folder must therefore be writable by this
+        # user alone, so that nobody else can put a program there. On Windows the folder of a user
+        # belongs to the user already.
         if hasattr(os, "getuid"):
             if held.st_uid != os.getuid() or held.st_mode & 0o022:
                 words = "is not yours alone: it is not used, and starts are slower; delete it"
@@ -152,7 +157,8 @@ def _keep_compiled_programs() -> None:
                 return
             folder.chmod(0o700)
     except (OSError, RuntimeError):
-        # Without a home that can be written to, the only loss is a slower start.
+        # If the home folder cannot be written to, compiled programs are not kept; only the next
+        # start is slower.
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -170,7 +176,7 @@ def _cache_folder() -> Path:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Read the command line, with error messages that contain no control characters from names."""
+    """Read the command line; its error messages contain no control characters of file names."""
 
     def error(self, message: str) -> NoReturn:
         """Print the message with its control characters escaped, and end the program with exit code
@@ -180,7 +186,8 @@ class _Parser(argparse.ArgumentParser):
 
 
 _FLAG: dict[str, Any] = {"action": "store_true"}
-# These are the options of `identify`, as `argparse` takes them.
+# These are the options of the command `identify`, each with the arguments of
+# `argparse.ArgumentParser.add_argument`.
 OPTIONS: dict[str, dict[str, Any]] = {
     "logs": dict(metavar="FILE", nargs="*", help="logs of one body"),
     "--demo": _FLAG | dict(help="the tumbling of 4179 Toutatis"),
@@ -307,8 +314,8 @@ def _channels_of_options(options: argparse.Namespace, rates: Sequence[str]) -> l
 def _read_logs(
     options: argparse.Namespace,
 ) -> tuple[list[spec.Channel], list[rj.identify.Recording], rj.identify.Model]:
-    """Return the sensors of the first log, the recordings of all logs, and the model that the
-    options describe.
+    """Return three things: the sensors of the first log; the recordings of all logs; and the model
+    that the options describe.
     """
     if options.columns and options.time:
         raise LogError("--time: not together with --columns, whose first name is the time column")
@@ -427,10 +434,11 @@ def _write(
 ) -> int:
     """Write the outputs that the options ask for, and return the exit code.
 
-    An output that fails is reported, and the others are still written.
+    An output that fails is reported, and all other outputs are still written.
 
-    **Arguments:** `fit`; `options`; `title` of the report; `files_read` the files that were read;
-    `names` of the recordings; `units` of rates and times; `more_rows` rows of further quantities.
+    **Arguments:** `fit` the result of the fit; `options` the options of the command line; `title`
+    the title of the report; `files_read` the files that were read; `names` the names of the
+    recordings; `units` the units of rates and times; `more_rows` rows of further quantities.
     """
     report, figure = rj.identify.report, options.figure
     if options.demo and figure is None and _matplotlib():
@@ -471,7 +479,7 @@ def _write(
 
 
 def _figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str]) -> list[Any]:
-    """Return the figures of a report, without those whose drawing fails."""
+    """Return the figures of a report, without the figures whose drawing raises an error."""
     figures, plot = [], functools.partial(rj.plot.fit, fit, **units)
     logs = [functools.partial(plot, index=i, title=name) for i, name in enumerate(names[:12])]
     time_unit = units.get("time_unit", "s")
@@ -486,7 +494,7 @@ def _figures(fit: rj.identify.Fit, names: list[str], units: dict[str, str]) -> l
 
 
 def _matplotlib() -> bool:
-    """Return whether matplotlib can draw figures, and choose its backend without windows."""
+    """Return whether matplotlib is installed, and choose its backend without windows."""
     try:
         import matplotlib
     except ModuleNotFoundError:
@@ -501,8 +509,8 @@ def _print_line(line: str) -> None:
     try:
         print(_checks.escape_controls(line), flush=True)
     except OSError:
-        # The reader of the output has stopped, as `head` does, or a disk is full. Go on without
-        # output: the files are still to be written.
+        # The program that reads the output has ended, as `head` does, or a disk is full. The run
+        # goes on without printing, since its files must still be written.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

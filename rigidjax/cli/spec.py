@@ -1,4 +1,4 @@
-"""Make the recordings and the model that the words of the command line describe."""
+"""Make the recordings and the model that the options of the command line describe."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -27,7 +27,8 @@ from rigidjax.motion.torques import Damping, Flywheel, Input, Series, Sum, Wheel
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation import euler
 
-# Each word names a chart of the body, which is made from the typical size of a moment, kg m².
+# Each word of the option `--model` names a function that returns a chart of the body, given the
+# typical size of a moment of inertia, kg m².
 MODELS: dict[str, Callable[[float], charts.AbstractBodyChart]] = {
     "ratios": lambda _: charts.Ratios(),
     "principal-ratios": lambda _: charts.PrincipalRatios(),
@@ -35,8 +36,8 @@ MODELS: dict[str, Callable[[float], charts.AbstractBodyChart]] = {
     "principal": charts.Principal,
 }
 LOSSES = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}
-# These are the units of each kind of sensor, the usual one first; "euler" stands for all sequences
-# of angles.
+# These are the allowed units of each kind of sensor, the default unit first; "euler" stands for
+# Euler angles of any sequence.
 SENSOR_UNITS = {
     "gyro": ("rad/s", "deg/s", "rpm"),
     "accelerometer": ("m/s2", "g"),
@@ -50,9 +51,14 @@ _WHEEL_UNITS = ("rad/s", "rpm")
 class Channel(eqx.Module):
     """Hold one sensor of a log.
 
-    **Fields:** `kind` of the sensor; `columns` the names of its columns; `unit` of the readings,
-    where `None` takes the unit in the names of the columns, or else the usual unit; `noise` of each
-    axis and full scale `limit`, both in this unit, or `None`.
+    **Fields:**
+
+    - `kind`: the kind of the sensor.
+    - `columns`: the names of its columns in the log.
+    - `unit`: the unit of the readings; `None` takes the unit in the names of the columns or,
+      without one, the usual unit.
+    - `noise`: the standard deviation of each axis, in this unit, or `None`.
+    - `limit`: the full scale, in this unit, or `None`.
     """
 
     kind: str
@@ -65,7 +71,9 @@ class Channel(eqx.Module):
 class WheelColumn(eqx.Module):
     """Hold the description of a wheel whose speed was logged.
 
-    **Fields:** `column` of the speed; `unit` as in `Channel`; `inertia`, kg m²; `axis` (3,).
+    **Fields:** `column` the name of the column of the speed; `unit` the unit of the speed, as in
+    `Channel`; `inertia` the moment of inertia about the axis, kg m²; `axis` (3,) the axis in the
+    body frame.
     """
 
     column: str
@@ -79,7 +87,7 @@ def parse_channel(text: str) -> Channel:
 
     An example is `gyro=wx,wy,wz:deg/s:0.1`. KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y,
     z) or `euler-ZXZ` (any sequence; body → world); NOISE is one number or three, one for each axis,
-    as in `0.1,0.1,0.2`. **Raises** `LogError` in words.
+    as in `0.1,0.1,0.2`. **Raises** `LogError`, a readable error, for any other text.
     """
     kind, _, rest = text.partition("=")
     names, *more = rest.split(":")
@@ -106,13 +114,13 @@ def parse_channel(text: str) -> Channel:
 
 
 def _units_of_kind(kind: str) -> tuple[str, ...]:
-    """Return the units of a kind of sensor, or an empty tuple for a word that is no kind."""
+    """Return the allowed units of a kind of sensor, or an empty tuple for an unknown kind."""
     key = "euler" if kind.startswith("euler-") else kind
     return () if kind == "euler" else SENSOR_UNITS.get(key, ())
 
 
 def broadcast_noise(noise: Sequence[float], place: str) -> tuple[float, ...]:
-    """Return the noise of three axes, made from one positive number or from three.
+    """Return the noise of three axes, from one positive number or three.
 
     It raises `LogError` for other numbers; the message begins with `place`.
     """
@@ -126,8 +134,9 @@ def broadcast_noise(noise: Sequence[float], place: str) -> tuple[float, ...]:
 def parse_wheel(text: str) -> WheelColumn:
     """Return the wheel that is written as `COLUMN:INERTIA[:AXIS[:UNIT]]`.
 
-    An example is `flywheel:5.2e-7:z:rad/s`. INERTIA is in kg m² about its axis, AXIS `x`, `y` or
-    `z` of the body. **Raises** `LogError`.
+    An example is `flywheel:5.2e-7:z:rad/s`. INERTIA is the moment of inertia about the wheel's
+    axis, kg m²; AXIS is the body axis `x`, `y` or `z` along which this axis lies. **Raises**
+    `LogError` for any other text.
     """
     name, *more = text.split(":")
     axis = more[1] if len(more) > 1 else "z"
@@ -155,34 +164,38 @@ def read_log(
 ) -> Recording:
     """Return the recording in a file, with the sensors that `channels` describe.
 
-    Its times are counted from the first time stamp of the log. An empty cell is a gap.
+    Times of the recording are since the first time stamp of the log. A row with an empty cell of a
+    sensor has no reading of this sensor.
 
     **Arguments:**
 
-    - `path`: of the file.
+    - `path`: the path of the file.
     - `channels`: the sensors.
     - `time`: the name of the time column.
-    - `time_unit`: its unit; `None` takes the one in its name, else s.
+    - `time_unit`: the unit of the time column; `None` takes the unit in the name of the column or,
+      without one, the usual unit of such a log (s for text).
     - `window`: (from, to), s from the first time stamp, or `None` for all.
-    - `wheels`: whose speeds become inputs of the recording, by the names of `input_names`.
+    - `wheels`: the wheels; their speeds become inputs of the recording, by the names of
+      `input_names`.
     - `free`: some of `bias`, `drag`, `delay`; for `bias` the sensors get a bias, which a fit can
-      move.
+      estimate.
     - `flight`: as in `read_table`.
 
-    It **warns** as `read_table`, of rows that are left out because their times do not increase, and
-    of times that are plainly in another unit. **Raises** `LogError` as `read_table`, and for rates
-    that are all zero.
+    It **warns** as `read_table` does, and also of rows that are left out because their times do not
+    increase, and of times that are plainly in another unit. **Raises** `LogError` as `read_table`,
+    and for rates that are all zero.
     """
     unit = unit_of_time(path, time, time_unit)
-    # Read each column once: two wheels may have their speeds in the same column.
+    # Each column is read once, since two wheels may have their speeds in the same column.
     turning = dict.fromkeys(w.column for w in wheels)
     names = [time, *(c for one in channels for c in one.columns), *turning]
     table = read_table(path, names, flight=flight)
-    # Count from the first stamp: as seconds since 1970, or nanoseconds, times have few digits left
-    # for a step.
+    # Times are taken since the first stamp: in seconds or nanoseconds since 1970 they would have
+    # few digits left for the steps.
     t = (table[time] - _first_time(table[time])) * UNITS[unit]
     kept = rows_to_use(path, t, time, window)
-    # If all rows are kept use a slice, which makes no copy of a large log.
+    # A slice is used if all rows are kept, since indexing with a slice makes no copy of a large
+    # log.
     kept = slice(None) if kept.size == t.size else kept
     readings, rate = [], 0.0
     for one in channels:
@@ -196,7 +209,7 @@ def read_log(
         readings.append((sensor, values[kept], mask[kept]))
     remark_on_step(path, t[kept], unit, rate)
     inputs = _logged_speeds(path, t, table, wheels)
-    # Free the memory of a large log before the recording copies its columns.
+    # The memory of a large log is freed before the recording copies its columns.
     del table
     try:
         return Recording(t[kept], *readings, inputs=inputs)
@@ -205,14 +218,14 @@ def read_log(
 
 
 def _first_time(t: np.ndarray) -> float:
-    """Return the first time that is not missing, or zero if all are missing."""
+    """Return the first time that is not missing (NaN), or zero if all times are missing."""
     finite = np.isfinite(t)
     return float(t[np.argmax(finite)]) if finite.any() else 0.0
 
 
 def unit_of_channel(path: str | Path, channel: Channel) -> str:
-    """Return the unit of a channel: its own unit, else the one in the names of its columns, else
-    the usual one.
+    """Return the unit of a channel: its stated unit, else the unit in the names of its columns,
+    else the usual unit of such columns.
     """
     allowed = _units_of_kind(channel.kind)
     usual = usual_unit(path, channel.columns[0]) or allowed[0]
@@ -220,8 +233,8 @@ def unit_of_channel(path: str | Path, channel: Channel) -> str:
 
 
 def unit_of_time(path: str | Path, column: str, stated_unit: str | None) -> str:
-    """Return the unit of times: the `stated_unit`, else the one in the name of the `column`, else
-    the usual one.
+    """Return the unit of times: the `stated_unit`, else the unit in the name of the `column`, else
+    the usual unit of such a column.
     """
     usual = usual_unit(path, column) or "s"
     return unit_of([column], stated_unit, usual, TIME_UNITS, str(path))
@@ -248,8 +261,8 @@ def _sensor_and_readings(
 ) -> tuple[AbstractSensor, np.ndarray]:
     """Return the sensor that a channel describes, and its readings.
 
-    **Arguments:** `channel`; `values` of its columns, in SI; `factor` from the unit of the channel
-    to SI; `bias` whether the sensor gets a bias.
+    **Arguments:** `channel` the channel; `values` (T, columns) the values of its columns, in SI;
+    `factor` the factor from the unit of the channel to SI; `bias` whether the sensor gets a bias.
     """
     zero = [0.0, 0.0, 0.0] if bias else None
     noise = None if channel.noise is None else factor * np.array(channel.noise)
@@ -275,9 +288,11 @@ def input_names(wheels: Sequence[WheelColumn]) -> list[str]:
 
 
 def _evenly_spaced(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return an evenly spaced series of samples (n,), in which missing rows are interpolated.
+    """Return two arrays, the times and values of an evenly spaced series in which missing rows are
+    interpolated.
 
-    Times that are not even to a thousandth of a step are returned unchanged.
+    If a time differs from an even spacing by more than a thousandth of a step, the times t and the
+    `values` are returned unchanged.
     """
     step = np.median(np.diff(t)) if t.size > 1 else np.nan
     place = (t - t[:1]) / step
@@ -297,7 +312,8 @@ def _logged_speeds(
 ) -> dict[str, Series]:
     """Return the logged speed of each wheel, rad/s, by the name of its input."""
     speeds = {}
-    # Keep speeds outside of the window as well: a delayed speed is from before a reading.
+    # Speeds outside of the window are kept as well, since a delayed speed is from a time before the
+    # reading.
     kept = mask_of_increasing(t) if wheels else slice(None)
     for name, one in zip(input_names(wheels), wheels, strict=True):
         unit = unit_of([one.column], one.unit, _WHEEL_UNITS[0], _WHEEL_UNITS, str(path))
@@ -339,13 +355,13 @@ def model_of(
 
     **Arguments:**
 
-    - `recordings`: of one body.
-    - `chart`: one of `MODELS`, the word of the option `--model`.
-    - `typical`: the typical size of a moment, kg m².
+    - `recordings`: the recordings of one body.
+    - `chart`: a key of `MODELS`, which is the word of the option `--model`.
+    - `typical`: the typical size of a moment of inertia, kg m².
     - `wheels`, `free`: as for `read_log`.
-    - `loss`: one of `LOSSES`.
+    - `loss`: a key of `LOSSES`.
 
-    **Raises** `LogError` for another word.
+    **Raises** `LogError` for another word as `chart` or `loss`.
     """
     if chart not in MODELS:
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {chart!r}")
@@ -364,7 +380,8 @@ def model_of(
 def _declared_free_numbers(
     sensors: Sequence[AbstractSensor], wheels: Sequence[str], typical: float, free: Sequence[str]
 ) -> list[Free]:
-    """Return the `Free`s of the sensors and of the torque that `_torque_of_wheels` returns.
+    """Return the `Free` of each free number of the sensors, and of the torque that
+    `_torque_of_wheels` returns.
 
     `wheels` are the names of the inputs of the wheels.
     """

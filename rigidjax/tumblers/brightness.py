@@ -53,7 +53,7 @@ def ellipsoid(
         unit_direction(sun, "sun").astype(a.dtype),
         unit_direction(observer, "observer").astype(a.dtype),
     )
-    # Scale the axes by a power of two: their fourth power could overflow.
+    # The axes are scaled by a power of two, since their fourth powers could overflow.
     size = exponent_of(a)
     a = times_power_of_two(a, -size)
     return times_power_of_two(law.of_ellipsoid(jnp.diag(a * a), s, o), 2 * size)
@@ -70,8 +70,9 @@ def mesh(
     visible faces.
 
     For a body that is not convex it is the brightness without shadows. It is differentiable in the
-    vertices and directions; a face at the edge of the light has the derivative of a dark face.
-    Source: Kaasalainen and Torppa 2001, Icarus 153:24, doi:10.1006/icar.2001.6673.
+    vertices and directions; a face that the light (or the line of sight) just grazes has the
+    derivative of a dark face, which is zero. Source: Kaasalainen and Torppa 2001, Icarus 153:24,
+    doi:10.1006/icar.2001.6673.
 
     **Arguments:**
 
@@ -97,7 +98,8 @@ def mesh(
     to_sun, to_observer = (double * s[None, :]).sum(axis=1), (double * o[None, :]).sum(axis=1)
     size = (double * double).sum(axis=1)
     bright = (to_sun > 0) & (to_observer > 0) & (size > 0)
-    # Give dark faces harmless numbers: the root of a size of zero would make derivatives NaN.
+    # Dark faces get the length one, since the square root of a size of zero would make derivatives
+    # NaN.
     length = jnp.sqrt(jnp.where(bright, size, 1.0))
     cosines = (jnp.where(bright, one, length) / length for one in (to_sun, to_observer))
     return jnp.where(bright, 0.5 * length * law.per_area(*cosines), 0.0).sum()

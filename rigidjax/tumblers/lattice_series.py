@@ -1,8 +1,9 @@
 """Compute χ² of Fourier series in two frequencies for very many pairs of frequencies, from a table
-of sums.
+of sums over the readings.
 
-The normal equations of a series contain nothing but sums over the times, at multiples of the two
-frequencies. These sums are interpolated in a table: a pair then costs no loop over the readings.
+The normal equations of a series contain only sums over the times, at sums of multiples of the two
+frequencies. These sums are interpolated in a table, so that χ² of a pair of frequencies needs no
+loop over the readings.
 """
 
 import functools
@@ -17,12 +18,12 @@ from jaxtyping import Array, Complex, Float
 # The highest multiple of the first frequency is two, since a squared brightness is of second order
 # in directions.
 FIRST = 2
-# The table has DENSE entries in a frequency of 1/span, of which NEAR are used in an interpolation.
-# Times are scaled to an interval of length one, and the error is below 1e-8 of the sum of the
-# weights.
+# The span is the time from the first to the last reading. The table has DENSE entries for each
+# frequency interval of 1/span. Each interpolation uses the NEAR nearest entries, and its error is
+# below 1e-8 of the sum of the weights.
 DENSE, NEAR = 16, 8
-# Tables have a multiple of ROWS entries, and pairs come FEW or MANY at a time, so that few programs
-# are compiled. A program computes BATCH pairs at once.
+# The number of entries of a table is a multiple of ROWS, and pairs are padded to FEW or a multiple
+# of MANY, so that few programs are compiled. A program computes BATCH pairs in parallel.
 ROWS, BATCH, FEW, MANY = 4096, 32, 256, 2048
 # At most SIDES side peaks of the spectral window are used, of at least HIGH times the height of the
 # main peak.
@@ -32,8 +33,9 @@ SIDES, HIGH = 2, 0.3
 class Sums(NamedTuple):
     """Hold the table of sums over times at the frequencies f = −4/DENSE, −3/DENSE, … in 1/span.
 
-    **Fields:** `window` Σ w² exp 2πi f x; `data` Σ w z exp 2πi f x; `total` Σ z². Here x are times
-    over the span, less ½, z are values over their noise, and w is one over the noise.
+    **Fields:** `window` Σ w² exp 2πi f x; `data` Σ w z exp 2πi f x; `total` Σ z². Here x is the
+    time of a reading divided by the span, minus ½; z is its value divided by its noise; and w is
+    one over the noise.
     """
 
     window: Complex[Array, " f"]
@@ -44,7 +46,8 @@ class Sums(NamedTuple):
 def sum_table(light: tuple[Array, ...], highest: float) -> Sums:
     """Return the table of sums up to the frequency `highest`, 1/span.
 
-    `light` holds the times over the span, the values over their noise, and one over the noise.
+    `light` holds three arrays (T,): the times divided by the span; the values divided by their
+    noise; and one over the noise.
     """
     size = math.ceil(highest * DENSE) + 2 * NEAR
     grid = (np.arange(-(-size // ROWS) * ROWS) - NEAR // 2) / DENSE
@@ -70,8 +73,8 @@ def _table(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
 
 
 def _interpolate(table: Array, f: Array) -> Array:
-    """Return the sums at the frequencies f, by Lagrange's polynomial through the nearest entries of
-    `table`.
+    """Return the sums at the frequencies f, 1/span, from the polynomial (Lagrange) through the
+    nearest entries of the `table`.
     """
     place = jnp.abs(f) * DENSE
     first = jnp.floor(place)
@@ -103,7 +106,8 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
         """Return the sums (2 first + 1, 2 second + 1) at all multiples of both frequencies of a
         pair.
         """
-        # Interpolate half of the sums: those at opposite frequencies are conjugates.
+        # Only half of the sums are interpolated, since sums at opposite frequencies are complex
+        # conjugates.
         m, n = np.arange(first + 1.0), np.arange(-second, second + 1.0)
         f = jnp.asarray(m[:, None]) * pair[0] + jnp.asarray(n[None, :]) * pair[1]
         half = _interpolate(values, f)
@@ -113,7 +117,8 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
         window = rows(table.window, pair, 2 * FIRST, 2 * order)
         side = jnp.conj(rows(table.data, pair, FIRST, order).ravel())
         gram = window[dj, dk]
-        # Keep the matrix definite if the times do not distinguish two columns.
+        # The small diagonal keeps the matrix definite if two columns are equal at all times of the
+        # readings.
         gram = gram + 1e-7 * window[2 * FIRST, 2 * order] * jnp.eye(js.size, dtype=gram.dtype)
         factor = jax.scipy.linalg.cho_factor(gram, lower=True)
         c = jax.scipy.linalg.cho_solve(factor, side)
@@ -123,8 +128,8 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
 
 
 def least_squares_remainder(rows: Array, z: Array) -> tuple[Float[Array, ""], Float[Array, " k"]]:
-    """Return the least value of `|z − cᵀ rows|²` for rows (k, T), and the coefficients c (k,) of
-    this value.
+    """Return two things: the smallest value of `|z − cᵀ rows|²` over c, for `rows` (k, T) and z
+    (T,); and the coefficients c (k,) there.
     """
     gram, side = rows @ rows.T, rows @ z
     gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(side.size, dtype=z.dtype)
@@ -133,8 +138,8 @@ def least_squares_remainder(rows: Array, z: Array) -> tuple[Float[Array, ""], Fl
 
 
 def pad_rows(rows: np.ndarray) -> np.ndarray:
-    """Return `rows` followed by copies of the first row, up to one of few lengths, so that few
-    programs are compiled.
+    """Return `rows` padded with copies of its first row to the length `FEW` or a multiple of
+    `MANY`, so that few programs are compiled.
     """
     size = FEW if len(rows) <= FEW else -(-len(rows) // MANY) * MANY
     return np.concatenate([rows, np.repeat(rows[:1], size - len(rows), axis=0)])
@@ -153,11 +158,12 @@ def lattice_chi2(table: Sums, pairs: np.ndarray, order: int) -> np.ndarray:
 def side_peaks(table: Sums, highest: float) -> np.ndarray:
     """Return the positions of the highest side peaks of the spectral window, in 1/span.
 
-    A line that is moved by such a position gives nearly the same readings.
+    A spectral line whose frequency is shifted by such a position gives nearly the same readings.
     """
     size = math.ceil(highest * DENSE)
     window = np.abs(np.asarray(table.window))[NEAR // 2 : NEAR // 2 + size]
-    # A side peak is away from the main one, and is the highest entry within 1/span on both sides.
+    # A side peak is at least 2/span away from the main peak, and is the highest entry within 1/span
+    # on both sides.
     inner = range(2 * DENSE, size - DENSE)
     peaks = [k for k in inner if window[k] == window[k - DENSE : k + DENSE + 1].max()]
     peaks = sorted((k for k in peaks if window[k] > HIGH * window[0]), key=lambda k: -window[k])

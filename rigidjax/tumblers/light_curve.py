@@ -35,16 +35,19 @@ from rigidjax.tumblers.search import MAGNITUDE, noise_of, relative_flux, search_
 from rigidjax.tumblers.sensor import Brightness, bisector
 from rigidjax.tumblers.two_frequencies import TwoFrequencies, two_frequencies
 
-# Two motions count as the same if both periods and both ratios of moments differ relatively by less
-# than SAME, or by less than REACH standard deviations.
+# Two motions count as the same if their rotation periods, precession periods and two ratios of
+# moments have relative differences below the four numbers of SAME, or below REACH standard
+# deviations.
 SAME, REACH = np.array([1e-3, 1e-3, 0.05, 0.05]), 5.0
-# A rival motion explains the data nearly as well if its log-likelihood is lower by less than this
-# number.
+# A second motion explains the data nearly as well as the best motion if its log-likelihood is lower
+# by less than this number.
 MARGIN = 10.0
-# A real body is brighter or fainter than its ellipsoid by this standard deviation.
+# The brightness of a real body differs from that of an ellipsoid by this relative standard
+# deviation.
 SHAPE = 0.04
-# A χ² is rejected if it is above its mean by this number of standard deviations. A fit alone
-# accepts five, but the errors of a wrong alias may be hardly larger than the noise.
+# A χ² is rejected if it is above its mean by this number of standard deviations. `fit` accepts five
+# standard deviations, but the errors of a wrong motion of a light curve may be hardly larger than
+# the noise.
 CONTENT = 3.0
 # At least LEAST pairs of frequencies are tried. Further pairs are tried only if their χ² exceeds
 # that of the best pair by less than ABOVE.
@@ -61,8 +64,8 @@ class Alias(eqx.Module):
     - `rotation`: the body period, s (`rigidjax.exact.body_period`).
     - `precession`: the mean precession period, s (`rigidjax.exact.precession_period`).
     - `mode`: `"long"` or `"short"`, the axis about which the momentum circulates in the body.
-    - `ratios`: (2,) the two smaller moments over the largest.
-    - `explains`: whether it explains the data nearly as well as the best motion.
+    - `ratios`: (2,) the two smaller moments of inertia divided by the largest.
+    - `explains`: whether this motion explains the data nearly as well as the best motion.
     """
 
     x: Float[Array, " n"]
@@ -86,11 +89,11 @@ class LightCurve(eqx.Module):
 
     **Fields:**
 
-    - `fit`: of the best motion; its covariance allows for a body that is no ellipsoid.
+    - `fit`: the fit of the best motion; its covariance allows for a body that is not an ellipsoid.
     - `aliases`: all motions that were found, in the order of their misfits.
     - `deviations`: (4,) the relative standard deviations of rotation, precession and the two ratios
       of the best motion.
-    - `pairs`: the pairs of frequencies.
+    - `pairs`: the pairs of frequencies that `two_frequencies` found.
     - `search`, `explanation`: the two answers, as for a `Fit`. The search is `not alone` also if
       another alias explains the data nearly as well; the model `leaves a part` also if χ² is three
       standard deviations above its mean for the given noise.
@@ -135,21 +138,21 @@ def fit_light_curve(
 
     `two_frequencies` finds pairs of frequencies in the squared flux. Each pair is taken as the
     frequency of precession and twice the frequency of rotation, in long- and short-axis mode
-    (Kaasalainen 2001), over a grid of bodies and phases. From the best of these starts a few steps
-    of a fit with the sensor itself follow; the best ends are then continued to convergence. The
-    result lists all motions found. The brightness has symmetries: half turns of the world (see
-    `Brightness`), and half turns of the body about its axes. Motions that differ by one of them
-    have the same periods, moments and mode, and count as one.
+    (Kaasalainen 2001), over a grid of bodies and phases. A fit with the full model of the sensor
+    takes a few steps from each of the best starts. The best results are then continued to
+    convergence. The result lists all motions that were found. The brightness has symmetries: half
+    turns of the world (see `Brightness`), and half turns of the body about its axes. Motions that
+    differ by such a half turn have the same periods, moments and mode, and count as one motion.
 
-    The intervals allow for a real shape by consider parameters (Tapley, Schutz and Born 2004,
-    Statistical Orbit Determination, ch. 6). The brightness has a factor 1 + n·S n, where n is the
-    direction half way between sun and observer, body frame, and the entries of S are independent
-    with a standard deviation of 4 %.
+    The intervals allow for a shape that is not an ellipsoid by consider parameters (Tapley, Schutz
+    and Born 2004, Statistical Orbit Determination, ch. 6). The brightness is multiplied by 1 + n·S
+    n, where n (3,) is the direction half way between sun and observer in the body frame, and the
+    entries of the matrix S (3, 3) are independent with a standard deviation of 4 %.
 
     **Arguments:**
 
-    - `model`: of one recording with one `Brightness` sensor and no torque; let a `Free` move the
-      `level` of the sensor unless it is known.
+    - `model`: a model of one recording with one `Brightness` sensor and no torque; make the `level`
+      of the sensor a `Free` unless the level is known.
     - `shortest`: the shortest period of a line in the spectrum, s; `None` for four times the median
       distance of the samples.
     - `count`: the largest number of pairs of frequencies. If more pairs fit, the search has
@@ -181,7 +184,7 @@ def fit_light_curve(
     say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
     best = fit(whole, starts=1, initial=aliases[0].x, tolerance=tolerance)
     result = _result(best, aliases, pairs, used >= count)
-    # Return the readings as they were given, without the padding of the search.
+    # The result has the readings without the padding that the search added.
     own = eqx.tree_at(lambda m: m.slots, model, best.model.slots)
     linear = best.linear and best.linear.first_times(model.records.t.shape[1])
     return eqx.tree_at(lambda one: (one.fit.model, one.fit.linear), result, (own, linear))
@@ -213,11 +216,11 @@ def _only_reading(model: Model) -> Reading:
 
 @eqx.filter_jit
 def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Array]:
-    """Return the logarithms (4,) of both periods and both ratios of moments, and the number h²/2T
-    over the middle moment.
+    """Return two things: the logarithms (4,) of the rotation period, the precession period and the
+    two ratios of moments; and h²/2T divided by the middle moment.
 
-    Here h is the momentum and T the kinetic energy. If the last number is below 1, the motion is in
-    the long-axis mode.
+    Here h is the angular momentum and T the kinetic energy. If the second result is below 1, the
+    motion is in the long-axis mode.
     """
     body: Any = model.bodies(x)
     inertia = Inertia(tensor_of(body))
@@ -230,8 +233,8 @@ def _periods_and_ratios(x: Float[Array, " n"], model: Model) -> tuple[Array, Arr
 
 @eqx.filter_jit
 def _period_derivatives(x: Float[Array, " n"], model: Model) -> Float[Array, "4 n"]:
-    """Return the derivatives of the logarithms of both periods and both ratios with respect to the
-    free numbers x.
+    """Return the derivatives (4, n), with respect to the free numbers x, of the logarithms of the
+    rotation period, the precession period and the two ratios of moments.
     """
     return jax.jacfwd(lambda x: _periods_and_ratios(x, model)[0])(x)
 
@@ -246,7 +249,9 @@ def _alias(model: Model, x: Array, cost: float) -> Alias:
 
 
 def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
-    """Return the different motions among the `ends` of a search, in the order of their misfits."""
+    """Return the different motions among the results `ends` of searches, in the order of their
+    misfits.
+    """
     out: list[Alias] = []
     for end in sorted(ends, key=lambda one: float(one.cost)):
         if not np.isfinite(float(end.cost)):
@@ -263,8 +268,8 @@ def _aliases(model: Model, ends: list[Attempt]) -> list[Alias]:
 
 
 def _is_same_motion(a: Alias, b: Alias, tolerance: np.ndarray) -> bool:
-    """Return whether two motions have the same mode, and logarithms that differ by less than
-    `tolerance`.
+    """Return whether two motions have the same mode, and periods and ratios of moments whose
+    logarithms differ by less than `tolerance` (4,).
     """
     one, other = (np.log([m.rotation, m.precession, *m.ratios]) for m in (a, b))
     return a.mode == b.mode and bool((np.abs(one - other) < tolerance).all())
@@ -286,7 +291,7 @@ def _bisectors(x: Float[Array, " n"], model: Model) -> Float[Array, "times 3"]:
 
 
 def _allow_for_shape(best: Fit) -> Fit:
-    """Return the fit `best` with a covariance that allows for a body that is no ellipsoid."""
+    """Return the fit `best` with a covariance that allows for a body that is not an ellipsoid."""
     linear: Any = best.linear
     reading, weight = stacking.pick_records(best.model.records.readings[0], 0), linear.weights[0][0]
     flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
@@ -331,11 +336,11 @@ def _result(
     )
     # A search that stopped on its way to the best motion does not count as a rival.
     near = np.fmax(SAME, REACH * own)
-    # Compare the costs of the search, which all have the same noise; the fit may have estimated
-    # another.
+    # The costs of the search are compared, since they all have the same noise; the fit may have
+    # estimated another noise.
     first = _alias(best.model, best.x, aliases[0].cost)
     others = [alias for alias in aliases if not _is_same_motion(alias, first, near)]
-    # A difference of misfits counts for less if the errors are larger than the noise, or
+    # The margin between misfits is wider if the errors are larger than the noise, or
     # autocorrelated.
     count = int(best.model.records.readings[0].host_mask.sum())
     margin = MARGIN * max(1.0, 2.0 * first.cost / count) * max(best.correlation, 1.0)
@@ -350,7 +355,7 @@ def _result(
         search = Answer(NOT_ALONE, (f"{who} the light curve nearly as well",))
     elif is_incomplete and best.ok:
         search = Answer(NOT_ENDED, ("more pairs of frequencies fit than were tried",))
-    # Do not test χ² under a robust loss, where outliers dominate it.
+    # χ² is not tested under a robust loss, since outliers dominate χ².
     above = best.chi2 - best.dof if best.model.loss is None else 0.0
     if search == Answer(FOUND) and best.ok and above > CONTENT * np.sqrt(2.0 * best.dof):
         why = "another motion that was not found, or more noise than given"

@@ -10,7 +10,7 @@ from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax.plot.style import COLOURS, TIMES, axes_of_shape, escape_formulas, unit_factor
 
-# The colour map runs from the first cycle to the last.
+# The colour of a point shows its cycle, from the first to the last, in this colour map.
 _MAP = "viridis"
 
 
@@ -25,12 +25,12 @@ def light_curve(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """Draw a light curve against time, and below it one picture for each period with which it is
-    folded.
+    """Draw a light curve against time, and below it one more picture for each period: the light
+    curve folded with the period.
 
-    The light curve of a body that turns about a principal axis is one curve if it is folded with
-    its period. That of a tumbler is a band, since a second period moves the curve from cycle to
-    cycle; the colour shows the cycle.
+    The folded light curve of a body that turns about a principal axis is a single curve. The folded
+    light curve of a tumbler is a band, since a second period changes the curve from cycle to cycle.
+    The colour of a point shows its cycle.
 
     **Arguments:**
 
@@ -41,8 +41,9 @@ def light_curve(
       `values - fit.residuals[0][:, 0]`, or `None`.
     - `quantity`: `mag` (bright is up) or `flux`.
     - `time_unit`: `s`, `min`, `h` or `day`.
-    - `title`: of the picture.
-    - `ax`: one axes and one more for each period, or `None` for new ones.
+    - `title`: the title of the picture.
+    - `ax`: matplotlib axes, one for the light curve and one for each period, or `None` for new
+      axes.
 
     **Returns** the axes (1 + periods,). **Raises** as `rigidjax.plot`.
 
@@ -69,16 +70,16 @@ def light_curve(
     label = "magnitude" if quantity == "mag" else "flux"
     ax[0].plot(t / seconds, read, ".", color=COLOURS[6], ms=3, label="read")
     if predicted is not None:
-        # Draw no line over a gap, in which the brightness is not known.
+        # No line is drawn over a gap, in which the brightness is not known.
         wide = np.append(np.diff(t) > 10 * np.median(np.diff(t)), False)
         line = np.where(wide, np.nan, predicted)
         ax[0].plot(t / seconds, line, color=COLOURS[1], lw=1.0, label="motion")
-        # Put the legend beside the picture: inside it would cover data.
+        # The legend is beside the picture, since inside it would cover data.
         ax[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     ax[0].set(xlabel=f"time, {time_unit}", ylabel=label)
     for one, period in zip(ax[1:], folds, strict=True):
         turns = (t - t[0]) / period
-        # Draw two periods: the second shows that end and start join.
+        # Two periods are drawn: the second period shows that the end of the first joins its start.
         both, cycle = np.concatenate([turns % 1.0, turns % 1.0 + 1.0]), np.tile(turns // 1.0, 2)
         if predicted is not None:
             one.plot(both, np.tile(predicted, 2), ".", color=COLOURS[1], ms=1.5, alpha=0.6)

@@ -1,9 +1,11 @@
 """Compute how a surface scatters light, for a piece of surface and for a whole ellipsoid.
 
-The map `r = A u` with |u| = 1 turns the unit sphere into an ellipsoid. Let s and o be the
-directions to sun and observer, `p = A⁻¹ s` and `q = A⁻¹ o`. Then `μ₀ dA = det A (p·u) du`, and the
-lit and visible part becomes the lune between p and q. The result depends only on |p|, |q| and p·q,
-that is on the tensor A² and not on its axes: a sphere is not singular.
+The map `r = A u`, with a symmetric matrix A and |u| = 1, turns the unit sphere into an ellipsoid.
+Let s and o be the unit vectors to sun and observer, `p = A⁻¹ s` and `q = A⁻¹ o`. Then `μ₀ dA = det
+A (p·u) du`, where μ₀ is the cosine of the angle of incidence, and the lit and visible part of the
+ellipsoid is the lune of the sphere in which p·u and q·u are positive. The result depends only on
+|p|, |q| and p·q. These numbers depend on the tensor A² but not on the choice of its principal axes,
+so that the formulas are regular for a sphere.
 """
 
 import abc
@@ -20,7 +22,8 @@ from rigidjax._types import Mat3, Numbers, Scalar, Vec3, Vec3Like
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.rotation.linalg3 import apply, cofactors, cross, determinant, dot
 
-# For arguments below _SMALL the function of Lommel and Seeliger's law is a series of _TERMS terms.
+# For arguments below _SMALL the function `_excess` of the law of Lommel and Seeliger is computed by
+# a series of _TERMS terms.
 _SMALL, _TERMS = 0.1, 16
 # Each of the two integrals of Lambert's law has this number of Gauss–Legendre points.
 _POINTS = 32
@@ -42,8 +45,8 @@ class AbstractScattering(eqx.Module):
 
     @abc.abstractmethod
     def per_area(self, incidence: Faces, emission: Faces) -> Faces:
-        """Return the brightness over the area of a piece of surface, from the cosines of its angles
-        of `incidence` and `emission`.
+        """Return the brightness of a piece of surface divided by its area, from the cosines of its
+        angles of `incidence` and `emission`.
 
         Both cosines are positive.
         """
@@ -52,7 +55,8 @@ class AbstractScattering(eqx.Module):
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
         """Return the brightness, m², of the ellipsoid `r·shape⁻¹r = 1`.
 
-        The directions `sun` and `observer` are of length one.
+        The tensor `shape` (3, 3), m², has the squared semi-axes as eigenvalues. The directions
+        `sun` and `observer` (3,) are of length one.
         """
 
 
@@ -78,11 +82,11 @@ class Geometric(AbstractScattering):
 class LommelSeeliger(AbstractScattering):
     """Describe single scattering, `2 μ₀ μ/(μ₀ + μ)`, as by the dark surfaces of asteroids.
 
-    An ellipsoid has `π (|p||q| + p·q)/(|p| + |q|) [1 − (1 − z²) artanh(z)/z]/z²` with
-    `z = |p + q|/(|p| + |q|)`, p and q (see the module) times the product of the semi-axes. It is a
-    form of the result of Muinonen and Lumme 2015, A&A 584:A23, doi:10.1051/0004-6361/201526456,
-    that keeps its digits at any phase. Near zero phase φ the brightness changes as φ² ln φ: the
-    second derivative by a direction is −∞ at zero phase, but the computed value is finite,
+    An ellipsoid has `π (|p||q| + p·q)/(|p| + |q|) [1 − (1 − z²) artanh(z)/z]/z²` with `z = |p +
+    q|/(|p| + |q|)`, p and q (see the module) times the product of the semi-axes. It is a form of
+    the result of Muinonen and Lumme 2015, A&A 584:A23, doi:10.1051/0004-6361/201526456, that keeps
+    its digits at any phase. Near zero phase φ the brightness changes as φ² ln φ: the second
+    derivative with respect to a direction is −∞ at zero phase, but the computed value is finite,
     and wrong.
 
     >>> float(LommelSeeliger().per_area(jnp.asarray(0.5), jnp.asarray(0.5)))
@@ -116,8 +120,8 @@ class Lambert(AbstractScattering):
 
 
 def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
-    """Return the law `scattering`, or Lommel and Seeliger's for `None`; raise `TypeError` for other
-    objects.
+    """Return the law `scattering`, or the law of Lommel and Seeliger for `None`; raise `TypeError`
+    for other objects.
     """
     if scattering is None:
         return LommelSeeliger()
@@ -135,13 +139,15 @@ def unit_direction(value: Vec3Like | Numbers, name: str) -> Vec3:
     v = _checks.require_finite(_checks.array_of_shape(value, (3,), name), name)
     words = f"{name}: wanted a direction, got a vector of length zero"
     v = _checks.error_if(v, ~(jnp.abs(v) > 0).any(), words)
-    # Scale the vector by a power of two: the square of a distance of 1e200 m would overflow.
+    # The vector is scaled by a power of two, since the square of a distance of 1e200 m would
+    # overflow.
     v = times_power_of_two(v, -exponent_of(v))
     return v / jnp.sqrt(dot(v, v))
 
 
 def _lommel_seeliger_numbers(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
-    """Return |p|, |q|, |p||q| + p·q, z² and 1 − z², the numbers of `LommelSeeliger`.
+    """Return five numbers, as defined in the docstring of `LommelSeeliger`: |p|, |q|, |p||q| + p·q,
+    z² and 1 − z².
 
     Here p and q are multiplied by the product of the semi-axes.
     """
@@ -149,8 +155,9 @@ def _lommel_seeliger_numbers(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Sc
     of_sun, turned = apply(minors, sun), cross(sun, observer)
     pq = dot(observer, of_sun)
     p, q = _root_or_zero(dot(sun, of_sun)), _root_or_zero(dot(observer, apply(minors, observer)))
-    # The smaller one of |p||q| ± p·q comes from |p × q|², which is computed without a subtraction:
-    # it keeps its digits at zero phase, and opposite to it.
+    # The smaller of the two numbers |p||q| ± p·q is |p × q|² divided by the larger number. Since |p
+    # × q|² is computed without a subtraction, the smaller number keeps its digits at zero phase and
+    # at a phase of 180°.
     across = dot(turned, apply(shape, turned)) * determinant(shape)
     same_side = pq > 0
     large = p * q + jnp.where(same_side, pq, -pq)
@@ -163,7 +170,7 @@ def _lommel_seeliger_numbers(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Sc
 def _excess(w: Array, complement: Array) -> Array:
     """Return `(artanh(√w)/√w − 1)/w`, which is 1/3 at w = 0; `complement` is 1 − w.
 
-    Both numbers may be complex.
+    The two arguments may be complex.
     """
     near = jnp.abs(w) < _SMALL
     few = jnp.where(near, w, 0.0)
@@ -173,8 +180,9 @@ def _excess(w: Array, complement: Array) -> Array:
     far = jnp.where(near, 0.5, w)
     z = jnp.sqrt(far)
     lone = jnp.abs(complement) > 0
-    # At zero phase `complement` is 0, and the result is multiplied by it: take 0 for the limit of x
-    # ln x. The derivative is right as well, since `complement` has a minimum there.
+    # At zero phase `complement` is 0, and the result is multiplied by `complement`. The logarithm
+    # is set to 0 here, since x ln x tends to 0. The derivative is right as well, since `complement`
+    # has a minimum at zero phase.
     logarithm = jnp.where(lone, jnp.log(jnp.where(lone, complement, 1.0)), 0.0)
     return jnp.where(near, series, ((jnp.log1p(z) - 0.5 * logarithm) / z - 1.0) / far)
 
@@ -183,11 +191,12 @@ def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
     """Return `∫ μ₀ μ dA` over the lit and visible part of the ellipsoid with the tensor E =
     `shape`.
 
-    It is an integral over normals n, with dA = det E/(n·En)² dn. Over the whole lit part, with μ <
-    0 on its hidden part, the integral is `sun·T observer`, where
-    `T = π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 to ∞ (both are one Gaussian integral).
-    Therefore `B(sun, observer) = sun·T observer + B(sun, −observer)`, where B is the integral over
-    the lit and visible part, and only the integral over the smaller of the two lunes is computed.
+    The integral is computed over the unit normals n of the surface, with dA = det E/(n·En)² dn.
+    Over the whole lit part, where μ < 0 on the part that the observer does not see, the integral is
+    `sun·T observer`, where `T = π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 to ∞ (the
+    integrals over n and over τ are two forms of one Gaussian integral). Therefore `B(sun, observer)
+    = sun·T observer + B(sun, −observer)`, where B is the integral over the lit and visible part,
+    and only the integral over the smaller of the two lunes is computed.
     """
     minors = cofactors(shape)
     total, of_sun = shape[0, 0] + shape[1, 1] + shape[2, 2], apply(minors, sun)
@@ -195,8 +204,8 @@ def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
     x, w = np.polynomial.legendre.leggauss(_POINTS)
     tangent, w = np.tan(0.25 * np.pi * (1.0 + x)), 0.25 * np.pi * w
     tangent, w = (jnp.asarray(v, size.dtype) for v in (tangent, w * (1.0 + tangent**2)))
-    # The middle point of the integration has a τ² between the squares of the least and the largest
-    # semi-axis.
+    # The middle point of the integration over τ has a τ² between the squares of the smallest and
+    # the largest semi-axis.
     middle = jax.lax.stop_gradient(jnp.sqrt(total * size / second))
     square, both = middle * tangent * tangent, dot(sun, observer)
     top = total * both - dot(observer, apply(shape, sun)) + square * both
@@ -214,7 +223,8 @@ def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scal
     """
     pole = cross(sun, observer)
     sine, apart = _root_or_zero(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
-    # If sun and observer are nearly in line, any pole across them will do.
+    # If the directions to sun and observer are nearly parallel or opposite, any pole orthogonal to
+    # them can be used.
     least = jnp.eye(3, dtype=pole.dtype)[jnp.argmin(jnp.abs(sun))]
     pole = jnp.where(apart, pole, cross(sun, least))
     pole = pole / jnp.sqrt(dot(pole, pole))
@@ -222,8 +232,8 @@ def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scal
     width = jnp.arctan2(jnp.where(apart, sine, 0.0), -dot(sun, observer))
     e_edge, e_pole, turned = apply(shape, edge), apply(shape, pole), apply(minors, edge)
     d0, d1, d2 = dot(sun, apply(minors, sun)), -dot(sun, turned), dot(edge, turned)
-    # The integrand has a peak at the minimum of d, like that of an elliptic integral. In the
-    # variable after two of Landen's transformations this peak is gone.
+    # The integrand has a peak at the minimum of d, as in an elliptic integral. After two Landen
+    # transformations of the variable this peak is gone.
     m0, m1, m2 = (jax.lax.stop_gradient(d) for d in (d0, d1, d2))
     mean, far = 0.5 * (m0 + m2), jnp.sqrt(0.25 * (m0 - m2) ** 2 + m1 * m1)
     first = 0.5 * jnp.arctan2(2.0 * m1, m0 - m2)
@@ -243,8 +253,8 @@ def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scal
         angle = 0.5 * (angle + jnp.arcsin(s))
     angle = angle + first
     c, s = jnp.cos(angle), jnp.sin(angle)
-    # With a = c edge + s sun, `along` is a·Ea, `tilt` is a·E pole, and d is the determinant of E on
-    # the plane of a and the pole.
+    # With the unit vector a = c edge + s sun, `along` is a·Ea, `tilt` is a·E pole, and d is the
+    # determinant of E restricted to the plane of a and the pole.
     mixed = 2.0 * c * dot(sun, e_edge) + s * dot(sun, apply(shape, sun))
     along = c * c * dot(edge, e_edge) + s * mixed
     tilt = c * dot(edge, e_pole) + s * dot(sun, e_pole)
@@ -259,8 +269,9 @@ def _lune_integral(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scal
 
 
 def _root_or_zero(x: Scalar) -> Scalar:
-    """Return √x, with the derivative 0 at x = 0, where an ellipsoid without thickness is seen edge
-    on.
+    """Return √x, with the derivative 0 at x = 0.
+
+    The argument is zero if an ellipsoid without thickness is seen edge on.
     """
     is_positive = x > 0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)

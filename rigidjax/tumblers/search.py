@@ -1,5 +1,5 @@
-"""Find the motions of a tumbler that have given pairs of frequencies, by starts on a grid and a
-search.
+"""Find the motions of a tumbler that have given pairs of frequencies, by least-squares searches
+from starts on a grid.
 """
 
 from typing import Any
@@ -23,20 +23,20 @@ from rigidjax.tumblers import starts
 from rigidjax.tumblers.sensor import bisector
 from rigidjax.tumblers.two_frequencies import pad_light
 
-# The search makes STEPS steps from all starts, FIRST of which are in one program; then it makes
-# MORE steps from the SECOND best ones.
+# The search takes STEPS steps from each start, where one run of a program computes FIRST starts.
+# Then it takes MORE steps from each of the SECOND best results.
 FIRST, STEPS, SECOND, MORE = 96, 12, 24, 60
-# Finite differences by the free numbers, which are of order one, have this step.
+# Finite differences with respect to the free numbers, which are of order one, have this step.
 DIFFERENCE = 1e-6
-# A flux whose magnitude changes by one changes its logarithm by this number.
+# The natural logarithm of a flux changes by this number if its magnitude changes by one.
 MAGNITUDE = 0.4 * np.log(10.0)
 
 
 def relative_flux(
     model: Model, reading: Reading
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return the times since the first one, s, the fluxes relative to their median, and the noise
-    of these fluxes.
+    """Return three arrays (T,): the times since the first time, s; the fluxes divided by their
+    median; and the noise of these relative fluxes.
 
     The noise is `None` if it is not known.
     """
@@ -62,8 +62,7 @@ def starts_of(
     noise: np.ndarray | None,
     pairs: np.ndarray,
 ) -> list[Array]:
-    """Return the best starting points, each of the free numbers (n,), over all pairs of
-    frequencies.
+    """Return the best starting points over all pairs of frequencies, each as free numbers (n,).
 
     **Arguments:** `model` and its only `reading`; `t` (T,) s; `squares` (T,) the squared fluxes;
     `noise` their standard deviations or `None`; `pairs` (P, 2), 1/s.
@@ -81,8 +80,8 @@ def starts_of(
     for pair in pairs:
         for mode in starts.MODES:
             candidates = starts.candidates(pair, mode, light, middle, areas, 3)
-            # Take the best body of each mode of each pair first: a grid alone cannot decide between
-            # modes and pairs.
+            # The best body of each mode of each pair comes first, since the misfits on a grid
+            # cannot decide between modes and pairs.
             best_of += candidates[: len(starts.ABOUT)]
             others += candidates[len(starts.ABOUT) :]
     chunks = max(1, -(-len(best_of) // FIRST))
@@ -97,15 +96,16 @@ def starts_of(
 def _free_numbers_of_candidate(
     model: Model, candidate: starts.Candidate, turn: np.ndarray
 ) -> Array:
-    """Return the free numbers (n,) of a candidate; the rotation `turn` leads from principal to body
-    axes.
+    """Return the free numbers (n,) of a candidate motion; the matrix `turn` (3, 3) rotates
+    principal axes to body axes.
     """
     moments = turn @ np.diag(candidate.moments) @ turn.T
     start = model.start(Inertia(jnp.asarray(moments)))
     reference = model.reference
     step = _rotation_vector(jnp.asarray(candidate.q), jnp.asarray(turn), reference.state.q[0])
     spin = jnp.asarray(turn @ candidate.omega) / reference.rate[0]
-    # The free numbers of an initial `Attitude` are the turn from the reference, and the rate.
+    # The free numbers of an initial `Attitude` are the rotation vector from the reference attitude,
+    # and the rate in units of the typical rate.
     return start.at[model.index.start[0]].set(jnp.concatenate([step, spin]))
 
 
@@ -124,8 +124,8 @@ def _rotation_vector(q: Array, turn: Array, reference: Array) -> Array:
 def noise_of(reading: Reading, flux: np.ndarray, scatter: float) -> tuple[Float[Array, "1 1"], ...]:
     """Return the noise (1, 1) of the readings in the unit of the sensor.
 
-    If the noise is not known, it follows from the `scatter` of the squared `flux` about a Fourier
-    series.
+    If the noise is not known, it is computed from the `scatter`, the standard deviation of the
+    squared `flux` about its best Fourier series.
     """
     sensor: Any = reading.sensor
     if sensor.noise is not None:
@@ -136,12 +136,12 @@ def noise_of(reading: Reading, flux: np.ndarray, scatter: float) -> tuple[Float[
 
 
 def search_from(model: Model, starts: list[Array], noise: Noise, tolerance: float) -> list[Attempt]:
-    """Return the ends of the searches that go on from the best starts, after a few steps from all
-    starts.
+    """Return the results of the searches: a few steps from all starts, then more steps from the
+    best of the points that were reached.
     """
     points, costs = [], []
     for first in range(0, len(starts), FIRST):
-        # Repeat starts up to a whole chunk: all chunks then use one program.
+        # Starts are repeated to fill the last chunk, so that all chunks use one program.
         chunk = [starts[first + k % len(starts[first:])] for k in range(FIRST)]
         stacked = _with_best_level(jnp.stack(chunk), model)
         settings = Settings(tolerance, CAREFUL, STEPS)
@@ -170,10 +170,10 @@ def _search_from_starts(
     settings: Settings,
     count: np.ndarray | np.generic | Array,
 ) -> Attempt:
-    """Return the ends of the searches from the first `count` starts, computed one after another.
+    """Return the results of the searches from the first `count` starts, computed one after another.
 
-    The slopes are finite differences, because derivatives of the closed form take a hundred times
-    as long.
+    The derivatives are finite differences, because exact derivatives of the closed-form motion take
+    a hundred times as long.
     """
 
     def search_from_start(numbered_start: tuple[Array, Array]) -> Attempt:
@@ -199,8 +199,8 @@ def _search_from_starts(
 
 @eqx.filter_jit
 def _with_best_level(starts: Float[Array, "starts n"], model: Model) -> Float[Array, "starts n"]:
-    """Return the `starts`, each with the level of brightness that fits it best; unchanged if the
-    level is not free.
+    """Return the `starts`, each with its best-fitting level of brightness; they are unchanged if
+    the level is not free.
     """
     scene = scene_template(model, model.records)
     path = leaf_at(lambda s: s.sensors[0].level, scene, "level", "the sensor")[0]

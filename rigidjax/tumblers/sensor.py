@@ -1,4 +1,4 @@
-"""Predict the brightness of a body, whose readings are a light curve, as a sensor of a fit."""
+"""Define a sensor of the brightness of a body, whose readings are a light curve."""
 
 import math
 from collections.abc import Callable
@@ -24,18 +24,19 @@ UNITS = ("flux", "mag")
 
 
 class Brightness(AbstractSensor):
-    """Measure the brightness of an ellipsoid that the sun lights; the readings are a light curve.
+    """Measure the brightness of an ellipsoid in sunlight; the readings are a light curve.
 
     A flux is `level · B/(π (abc)^⅔)`, a magnitude `level − 2.5 log₁₀(B/(π (abc)^⅔))`, with B the
     result of `rj.tumblers.brightness.ellipsoid` for the semi-axes a, b, c. The level is therefore
-    the brightness of a sphere of the same volume at zero phase, and only the ratios of the
-    semi-axes count. Readings (T,) are reduced to unit distances.
+    the brightness of a sphere of the same volume at zero phase, and the prediction depends only on
+    the ratios of the semi-axes. Readings (T,) are reduced to unit distances.
 
-    The brightness does not change with some turns of the world, and so does not determine them. For
-    fixed directions these are the half turns about `sun × observer` and, except for `Geometric`,
-    about the sum and the difference of the two directions. A `fit` assumes an ellipsoid;
-    `fit_light_curve` allows for other shapes. Source: as `rigidjax.tumblers.brightness`; for
-    tumblers Kaasalainen 2001, A&A 376:302, doi:10.1051/0004-6361:20010935.
+    Some rotations of the attitude in the world do not change the brightness, so that a light curve
+    does not determine them. For fixed directions such rotations are the half turns about `sun ×
+    observer` and, except for `Geometric`, about the sum and the difference of the two directions. A
+    `fit` assumes an ellipsoid; `fit_light_curve` allows for other shapes. Source: as
+    `rigidjax.tumblers.brightness`; for tumblers Kaasalainen 2001, A&A 376:302,
+    doi:10.1051/0004-6361:20010935.
 
     **Arguments:**
 
@@ -46,10 +47,11 @@ class Brightness(AbstractSensor):
       `rj.tumblers.brightness`.
     - `noise`: the standard deviation of a reading, in its unit; `None` to estimate it.
     - `unit`: of a reading, `"flux"` or `"mag"`.
-    - `level`: the flux or magnitude of the sphere; `None` for 1 or 0. It is seldom known: let a
-      `Free` move it.
-    - `semi_axes`: (3,) along the body's axes; `None` for those of the uniform ellipsoid with the
-      body's motion (√λ_k of its second moment 𝔖).
+    - `level`: the flux (1 for `None`) or magnitude (0 for `None`) of the sphere. It is seldom
+      known: make the level a `Free`.
+    - `semi_axes`: (3,) along the body's axes; `None` for the semi-axes of the uniform ellipsoid
+      that has the body's ratios of moments, which are proportional to √λ_k of the second moments
+      λ_k of the body.
     - `offset`: s, as for `Gyro`.
 
     **Raises** `ValueError` for a direction of length zero, a noise or semi-axis that is not
@@ -110,7 +112,7 @@ class Brightness(AbstractSensor):
         return (reading - self.predict(motion))[None]
 
     def predict(self, motion: SensorInput) -> Scalar:
-        """Return the reading without noise that belongs to a state."""
+        """Return the predicted reading, without noise, for the state in `motion`."""
         shape = motion.body.second_moment
         if self.semi_axes is not None:
             shape = jnp.diag(self.semi_axes * self.semi_axes)
@@ -123,16 +125,16 @@ class Brightness(AbstractSensor):
         relative = area / (math.pi * jnp.cbrt(determinant(shape)))
         if self.unit == "flux":
             return self.level * relative
-        # A body that hides its lit side has an infinite magnitude: bound it by one that is fainter
-        # than any reading.
+        # A body whose lit side is hidden has an infinite magnitude. It is bounded by a magnitude
+        # that is fainter than any reading.
         visible = relative > 1e-12
         return self.level - 2.5 / math.log(10.0) * jnp.log(jnp.where(visible, relative, 1e-12))
 
     def typical_rate(self, t: np.ndarray, values: np.ndarray) -> float:
-        """Return a rough rate of the body, rad/s, which is half the strongest frequency of the
-        first 1000 readings.
+        """Return a rough rate of the body, rad/s: half of the angular frequency of the strongest
+        line in the first 1000 readings.
 
-        It is half, because an ellipsoid shows two maxima in a turn.
+        The factor is one half, because the brightness of an ellipsoid has two maxima in a turn.
         """
         t, values = t[:1000], values[:1000]
         if t.size < 10 or np.ptp(values) == 0:
@@ -145,8 +147,8 @@ class Brightness(AbstractSensor):
         return 0.5 * float(turns[np.argmax(power)])
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return which of the `values` are fluxes far below zero, a mask (T,), and a message that
-        says why they are wrong.
+        """Return two things: a mask (T,) of the `values` that are fluxes far below zero; and a
+        message with the reason.
         """
         noise = np.std(values) if self.noise is None else np.asarray(self.noise)[0]
         wrong = values < 0 if self.unit == "flux" else np.zeros(values.shape, bool)

@@ -1,11 +1,12 @@
 """Find possible motions that have two given frequencies of a light curve, on a grid of bodies.
 
 The squared brightness F² of an ellipsoid is nearly a quadratic form of the direction n half way
-between sun and observer: `F² ∝ Σ_k M_k (n·r_k)²`, with r_k the body's axes in the world and
-`M = (bc)², (ca)², (ab)²` for the semi-axes a, b, c (exactly at zero phase, for projected areas).
-For a given body, energy and phase F² is therefore linear in the six numbers of n nᵀ in a frame
-along the angular momentum. Least squares finds the direction of the momentum, the initial angle and
-the level at once; the grid covers the shape of the body and the phase of its rotation.
+between sun and observer: `F² ∝ Σ_k M_k (n·r_k)²`, with r_k the body's axes in the world and `M =
+(bc)², (ca)², (ab)²` for the semi-axes a, b, c (exactly at zero phase, for projected areas). For a
+given body, energy and phase of the rotation F² is therefore linear in the six numbers of the matrix
+n nᵀ, written in a frame whose z axis is along the angular momentum. A linear least-squares fit
+finds the direction of the momentum, the initial angle about the momentum and the level of
+brightness together. The grid covers the shape of the body and the phase of its rotation.
 """
 
 import math
@@ -24,10 +25,11 @@ from rigidjax.rotation import quaternion
 from rigidjax.rotation.kernels import product4
 from rigidjax.tumblers.lattice_series import least_squares_remainder
 
-# The grid has these ratios b/a and c/b of the semi-axes, and PHASES phases in half a rotation.
+# The grid has the ratios b/a of the semi-axes in MIDDLE, the ratios c/b in SHORT, and PHASES phases
+# in half a rotation.
 MIDDLE, SHORT, PHASES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9), (0.5, 0.65, 0.8, 0.93), 12
-# These turns about the direction n are tried with each start, because they hardly change the
-# brightness.
+# Each start is tried with these additional rotations about the direction n, rad, because they
+# hardly change the brightness.
 ABOUT = (0.0, math.pi / 3, 2 * math.pi / 3)
 MODES = ("long", "short")
 
@@ -35,8 +37,9 @@ MODES = ("long", "short")
 class Candidate(NamedTuple):
     """Hold a starting motion of the search.
 
-    **Fields:** `moments` (3,) over the largest one; `q` and `omega` the initial attitude and rate
-    of the principal axes; `misfit` χ² of the motion.
+    **Fields:** `moments` (3,) the principal moments divided by the largest moment; `q` (4,) the
+    initial attitude of the principal axes; `omega` (3,) the initial rate along these axes, rad/s;
+    `misfit` χ² of the motion.
     """
 
     moments: np.ndarray
@@ -60,10 +63,11 @@ def candidates(
 
     - `pair`: the frequencies of the mean precession and of twice the rotation, 1/s.
     - `mode`: "long" or "short", the axis about which the momentum circulates.
-    - `light`: times since the first one, squared fluxes, and one over their noise.
-    - `bisector`: (3,) n, world frame.
-    - `areas`: (3,) M of a known ellipsoid, or `None`.
-    - `count`: the number of bodies.
+    - `light`: three arrays (T,): the times since the first time, s; the squared fluxes; and one
+      over the noise of the squared fluxes.
+    - `bisector`: (3,) the direction n half way between sun and observer, world frame.
+    - `areas`: (3,) the numbers M (see the module) of a known ellipsoid, or `None`.
+    - `count`: the number of bodies of the grid for which motions are returned.
     """
     b, ratio = np.meshgrid(MIDDLE, SHORT, indexing="ij")
     semi_axes = np.stack([np.ones(b.size), b.ravel(), (b * ratio).ravel()], axis=1)
@@ -77,7 +81,7 @@ def candidates(
     arrays = jnp.asarray(moments), jnp.asarray(forms), jnp.asarray(pair), *light
     motions = _grid(jnp.asarray(mode == "long"), *arrays)
     misfits, sides, q, omega = (np.asarray(v) for v in motions)
-    # Take the best phase of each body.
+    # The best phase is taken for each body.
     phase, least = misfits.argmin(axis=1), misfits.min(axis=1)
     out = []
     for k in np.argsort(least)[:count]:
@@ -115,11 +119,10 @@ def _shortest_turn(u: Any, v: Any, xp: ModuleType) -> Any:
 
 
 def _rate_from_energy(moments: Array, d: Array) -> Float[Array, "3"]:
-    """Return the rate (3,) with the momentum h = 1 and `h²/2T = d`, without a part along the middle
-    axis.
+    """Return the rate (3,) with the angular momentum h = 1 and `h²/2T = d`, whose component along
+    the middle axis is zero.
 
-    T is the kinetic energy. The `moments` are ascending, and the rate has parts along the first and
-    the last axis.
+    T is the kinetic energy. The `moments` (3,) are ascending.
     """
     a, _, c = (1.0 / moments[k] for k in range(3))
     x = jnp.clip((1.0 / d - c) / (a - c), 0.0, 1.0)
@@ -127,8 +130,8 @@ def _rate_from_energy(moments: Array, d: Array) -> Float[Array, "3"]:
 
 
 def _rate_of_ratio(moments: Array, ratio: Array, long_axis: Array) -> tuple[Array, Array, Array]:
-    """Return a rate whose precession period over its rotation period is `ratio`, its precession
-    period, and whether there is such a rate.
+    """Return three things: a rate (3,) of a motion whose precession period divided by its rotation
+    period is `ratio`; its precession period; and whether there is such a rate.
 
     The rate is sought in the mode of the long axis if `long_axis` is true, else of the short axis.
     Bisection finds the energy.
@@ -147,8 +150,8 @@ def _rate_of_ratio(moments: Array, ratio: Array, long_axis: Array) -> tuple[Arra
     kind = moments.dtype
     zero = jnp.zeros((), kind)
     ends = jnp.asarray(1e-4, kind), jnp.asarray(1.0 - 1e-7, kind)
-    # Carry the results of the last trial along: computed after the loop, they would be compiled
-    # again.
+    # The loop carries the results of the last trial. If they were computed after the loop, their
+    # code would be compiled a second time.
     state = (*ends, jnp.zeros_like(moments), zero, zero)
     _, _, omega, precession, quotient = jax.lax.fori_loop(0, 33, bisect, state)
     return omega, precession, jnp.abs(quotient - 1.0) < 1e-3
@@ -164,11 +167,12 @@ def _grid(
     squares: Array,
     weights: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the misfits (S, phases), n nᵀ times the level (S, phases, 6), the attitudes and the
-    rates of S bodies.
+    """Return four arrays for S bodies and all phases: the misfits (S, phases); the six numbers of n
+    nᵀ times the level (S, phases, 6); the initial attitudes; and the initial rates.
 
-    `moments` and `forms` (S, 3) are those of the bodies; `t`, `squares` and `weights` are the light
-    curve.
+    The arguments `moments` and `forms` (S, 3) hold the moments and the numbers M of each body (see
+    the module). The light curve is `t`, `squares` and `weights`, the three arrays `light` of
+    `candidates`.
     """
     ratio = 0.5 * pair[1] / pair[0]
 
@@ -177,8 +181,8 @@ def _grid(
         omega, precession, exists = _rate_of_ratio(body, ratio, long_axis)
         omega = omega * (precession * pair[0])
         h = body * omega
-        # Turn the momentum to the z axis of the world. It is not opposite to z, because no part of
-        # it is negative.
+        # The attitude q turns the angular momentum to the z axis of the world. The momentum is not
+        # opposite to z, because none of its components is negative.
         q = _shortest_turn(h / jnp.sqrt(jnp.sum(h * h)), jnp.eye(3, dtype=h.dtype)[2], jnp)
         motion = exact.FreeBody(Inertia(jnp.diag(body)), Attitude(q, omega))
 
@@ -195,8 +199,8 @@ def _grid(
                 twice = (2 * entry(0, 1), 2 * entry(0, 2), 2 * entry(1, 2))
                 return jnp.stack([entry(0, 0), entry(1, 1), entry(2, 2), *twice])
 
-            # Compute the first state together with the others: alone it would be compiled once
-            # more.
+            # The first state is computed together with all other states. Computed alone, it would
+            # need a second compilation.
             states: Any = jax.vmap(motion)(since + jnp.concatenate([jnp.zeros(1, t.dtype), t]))
             rows = jax.vmap(row)(states.q[1:]).T * weights[None, :]
             misfit, n = least_squares_remainder(rows, squares * weights)

@@ -1,4 +1,4 @@
-"""Find the two frequencies of a light curve, those whose Fourier series fits best."""
+"""Find pairs of frequencies whose Fourier series fit a light curve best."""
 
 import math
 
@@ -20,8 +20,9 @@ from rigidjax.tumblers.lattice_series import (
     sum_table,
 )
 
-# A pair must explain one of the LINES strongest lines; the first frequency is on a grid with the
-# step STEP, 1/span.
+# A line is a peak of the spectrum. One of the LINES strongest lines must be a combination of the
+# two frequencies of a pair. The first frequency is on a grid with the step STEP, 1/span, where the
+# span is the time from the first to the last reading.
 LINES, STEP = 3, 0.1
 # The largest second frequency of the search is SECOND times the highest of these lines.
 SECOND = 1.5
@@ -29,13 +30,13 @@ SECOND = 1.5
 TRIED = 2
 # Squares of numbers above LARGEST may overflow; the spectrum of more than MOST lines takes hours.
 LARGEST, MOST = 1e100, 1e5
-# Times are padded to a multiple of BLOCK, so that few programs are compiled.
+# The number of times is padded to a multiple of BLOCK, so that few programs are compiled.
 BLOCK = 256
-# Pairs nearer than this distance, in 1/span, count as one.
+# Two pairs count as the same if both frequencies differ by less than this, in 1/span.
 NEAR = 0.25
 # The aliases of the SEEDS best pairs are tried, in at most ROUNDS rounds.
 SEEDS, ROUNDS = 16, 3
-# These are the pair (0, 0) and its eight neighbours, in steps.
+# These are the offsets, in steps, of a pair (0, 0) and of its eight neighbours on a square grid.
 AROUND = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
 
 
@@ -46,7 +47,7 @@ class TwoFrequencies(eqx.Module):
 
     - `frequencies`: (n, 2) the pairs, 1/s.
     - `misfits`: (n,) χ² of the series of each pair.
-    - `dof`: their degrees of freedom.
+    - `dof`: the degrees of freedom of each χ².
     - `scatter`: the standard deviation of the residuals of the best pair, in the values' unit.
     - `lines`: (m,) the strongest lines of the spectrum, 1/s.
 
@@ -77,11 +78,12 @@ def two_frequencies(
 
     The multiples j go from −2 to 2, k from −`order` to `order`. One of the three strongest lines of
     the spectrum must be j f₁ + k f₂: all pairs with this property are tried on a grid, and the best
-    ones are refined. Then the aliases of the best pairs are tried. In an alias, one frequency or
-    both are moved by a side peak of the spectral window (readings at night have side peaks at one
-    and two a day) or by half of it; or one frequency is halved or doubled; or f₂ is moved by f₁.
-    Several pairs give the same set of lines. All pairs that fit are returned: only a fit of the
-    motion decides between them.
+    ones are refined. Then the aliases of the best pairs are tried. An alias of a pair differs from
+    the pair in one of three ways. One frequency or both are shifted by a side peak of the spectral
+    window, or by half of the frequency of a side peak (readings at night have side peaks at one and
+    two cycles a day). Or one frequency is halved or doubled. Or f₁ is added to f₂ or subtracted
+    from f₂. Several pairs give the same set of lines. All pairs that fit are returned, since only a
+    fit of the motion can decide between the pairs.
 
     **Arguments:**
 
@@ -139,8 +141,8 @@ def two_frequencies(
     light = pad_light((t - t[0]) / span, y / sigma, 1.0 / sigma)
     lines = strongest_lines(light, span / least, 2 * LINES)
     highest = SECOND * float(lines[:LINES].max())
-    # The table holds all multiples of a pair, and the steps of the refinement beyond the highest
-    # frequency.
+    # The table covers all combinations of multiples of the two frequencies of a pair, also after
+    # the refinement has moved a pair beyond the highest frequency.
     table = sum_table(light, 2 * (FIRST + order) * (highest + 1.0))
     pairs, misfits = _scan_pairs(table, lines, order)
     pairs, misfits = refine_pairs(
@@ -178,8 +180,11 @@ def strongest_lines(light: tuple[Array, Array, Array], highest: float, count: in
 
 @jax.jit
 def _strongest_line(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Array, Array]:
-    """Return the frequency of the strongest line of a `grid`, and the curve of this line with a
-    constant.
+    """Return two things: the frequency of the `grid` whose sinusoid plus a constant fits best; and
+    the fitted sinusoid plus constant at the times x.
+
+    The arguments x, z and w (T,) are the times divided by the span, the values divided by their
+    noise, and one over the noise.
     """
     x, z, w = jnp.asarray(x), jnp.asarray(z), jnp.asarray(w)
 
@@ -195,7 +200,9 @@ def _strongest_line(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tu
 
 
 def _scan_pairs(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return all pairs on a grid that give one of the `lines`, and the misfits of these pairs."""
+    """Return two things: all pairs (P, 2) on a grid that have one of the strongest `lines`; and the
+    misfits (P,) of these pairs.
+    """
     highest = float(lines[:LINES].max())
     grid = np.arange(0.5, 0.8 * highest + 0.5, STEP)
     whole = np.arange(0.5, SECOND * highest, STEP)
@@ -214,8 +221,8 @@ def _scan_pairs(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray,
 def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
     """Return the pairs (M, 2) that may fit the same readings as the `pairs` (P, 2) do.
 
-    Their frequencies are moved by the side peaks `peaks` or by half of them, or halved, doubled or
-    combined.
+    The frequencies of the result are shifted by a side peak of `peaks` or by half of a side peak,
+    or are halved, doubled or combined.
     """
     moves = np.unique(np.concatenate([[0.0], *((p, -p, p / 2, -p / 2) for p in peaks)]))
     first, second = pairs.T[:, :, None]
@@ -232,8 +239,10 @@ def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
 def with_aliases(
     table: Sums, pairs: np.ndarray, misfits: np.ndarray, highest: float, order: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the `pairs` together with aliases of the best of them, found in rounds until none is
-    better.
+    """Return two things: the `pairs` together with aliases of the best pairs; and the misfits of
+    all of these.
+
+    Aliases are sought in rounds until no alias is better than the best pair.
     """
     peaks = side_peaks(table, highest)
     for _ in range(ROUNDS):
@@ -265,10 +274,10 @@ def distinct_pairs(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[i
 
 
 def refine_pairs(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pairs and their misfits after each pair moved from neighbour to neighbour down to
-    a minimum.
+    """Return two things: the pairs after a descent to a minimum of the misfit; and their misfits.
 
-    The steps become shorter whenever no neighbour is lower.
+    Each pair moves to the best of its neighbours on a square grid. The grid becomes finer whenever
+    no neighbour has a lower misfit.
     """
     size = np.full(len(pairs), 0.08)
     least = np.full(len(pairs), np.inf)

@@ -9,14 +9,18 @@ from rigidjax.cli.logs.columns import Columns
 
 
 def read_npz(path: Path, columns: Sequence[str]) -> Columns:
-    """Return the names of all arrays in a `.npz` file, and the arrays that `columns` name."""
-    # Open the file here: NumPy does not close a file that it opened and cannot read.
+    """Return two things: the names of all arrays in a `.npz` file; and a dict of the arrays that
+    `columns` name.
+    """
+    # The file is opened here, since NumPy does not close a file that it opened and cannot read.
     with path.open("rb") as raw, np.load(raw) as file:
         return file.files, {name: file[name] for name in columns if name in file.files}
 
 
 def read_mat(path: Path, columns: Sequence[str]) -> Columns:
-    """Return the names of all arrays in a `.mat` file, and the arrays that `columns` name."""
+    """Return two things: the names of all arrays in a `.mat` file; and a dict of the arrays that
+    `columns` name.
+    """
     from scipy.io import loadmat, whosmat
 
     with path.open("rb") as raw:

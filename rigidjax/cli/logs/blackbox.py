@@ -1,9 +1,10 @@
 """Read Blackbox logs of flight controllers; orangebox (an extra) decodes the fields of their
 frames.
 
-A P frame holds differences from the frames before it, down to an I frame, which stands alone. The
+A log is a sequence of frames, each of which begins with a letter for its kind. An I frame can be
+decoded alone. A P frame holds differences from the frames before it, back to the last I frame. The
 library orangebox returns P frames even if their I frame is missing. The order of frames is
-therefore checked here, as the flight controllers' own decoder does.
+therefore checked here, in the way of the flight controllers' own decoder.
 """
 
 import math
@@ -20,10 +21,11 @@ from rigidjax import _checks
 from rigidjax.cli.logs.columns import Columns
 from rigidjax.cli.logs.errors import LogError, warn
 
-# These are the bounds of the flight controllers' own decoder: of a frame in bytes, and of jumps of
-# the iteration and of the time, µs. Both counters have 32 bits.
+# The first three numbers are bounds of the flight controllers' own decoder: the longest frame in
+# bytes, and the largest jumps of the iteration and of the time, µs, between two frames. The
+# counters of iteration and time have 32 bits, so that they start again at _WRAP.
 _LONGEST_FRAME, _ITERATION_JUMP, _TIME_JUMP, _WRAP = 256, 5_000, 10_000_000, 2**32
-# Each kind of event is followed by this number of integers of variable length.
+# This maps each kind of event to the number of integers of variable length that follow the kind.
 _EVENT_NUMBERS = {0: 1, 14: 2, 15: 1, 30: 2}
 _RESUME, _ADJUSTMENT, _LOG_END = 14, 13, 255
 _END_MARK = b"End of log\0"
@@ -31,14 +33,14 @@ _ERASED = re.compile(rb"[\xff\0]*\Z")
 
 
 def read_blackbox(path: Path, columns: Sequence[str], flight: int | None = None) -> Columns:
-    """Return the names of all fields in one flight of a Blackbox log, and the fields that `columns`
-    name.
+    """Return two things: the names of all fields in one flight of a Blackbox log; and a dict of the
+    fields that `columns` name.
 
     Rates are in deg/s and accelerations in g, by the scales in the header, as in the flight
     controllers' own viewer; other fields are as logged. A log without its end mark is read to the
-    end of the file. P frames before the first I frame, and frames from a damaged one to the next I
-    frame, are left out with a warning. **Raises** `LogError` if there are several flights and none
-    is chosen.
+    end of the file. P frames before the first I frame, and all frames from a damaged frame to the
+    next I frame, are left out with a warning. **Raises** `LogError` if there are several flights
+    and `flight` is `None`.
     """
     library = _checks.import_library("orangebox.reader", "blackbox", str(path))
     pointers = library.Reader(str(path)).log_pointers
@@ -91,8 +93,8 @@ class _Bytes:
 class _Flight:
     """Hold one flight: its header, and its frames in the order of the log.
 
-    **Fields**, among others: `names` of all fields; `count` the number of I and P frames met so
-    far; `left_out` the number of those that were left out.
+    **Fields**, among others: `names` of all fields; `count` the number of I and P frames that were
+    read so far; `left_out` the number of I and P frames that were left out.
     """
 
     def __init__(self, reader: Any, data: bytes):
@@ -121,9 +123,9 @@ class _Flight:
     def frames(self) -> Iterator[tuple[int, Mapping[str, float]]]:
         """Yield the group, and the fields by name, of each frame that can be decoded.
 
-        The group counts the I frames; an I frame itself, which depends on no other frame, has the
-        group -1. Fields of slow and GPS frames have the values of the last such frame, NaN before
-        the first.
+        The group of a P frame is the number of its I frame. The I frame itself, which depends on no
+        other frame, has the group -1. Fields of slow and GPS frames have the values of the last
+        such frame, and are NaN before the first such frame.
         """
         order, lost = self.order, 0
         stream, others = _Bytes(self.data, self._header_size()), dict.fromkeys(self.others, np.nan)
@@ -131,8 +133,8 @@ class _Flight:
             kind = self.kinds.get(next(stream))
             begin = stream.place
             if kind is None or (kind != self.kind.EVENT and kind not in self.fields):
-                # These bytes are a frame that lost its letter. Erased memory at the end of a log
-                # does not count as a frame.
+                # These bytes belong to a frame whose first byte, the letter of its kind, is
+                # damaged. Erased memory at the end of a log does not count as a frame.
                 lost, order.is_valid = lost + order.is_valid, False
                 continue
             is_main = kind in (self.kind.INTRA, self.kind.INTER)
@@ -152,8 +154,8 @@ class _Flight:
                 values = ()
             size = stream.place - begin
             if not values or size > _LONGEST_FRAME or not self._is_frame_next(stream.place):
-                # The decoder may have read the letter of the next frame: begin again after the
-                # letter of this frame.
+                # The decoder may have read beyond the letter of the next frame. Reading begins
+                # again after the letter of this frame.
                 stream.place, order.is_valid = begin, False
                 self.left_out += is_main
             elif not is_main:
@@ -173,11 +175,11 @@ class _Flight:
         return self.context.last_iter + 1 + self.context.count_skipped_frames()
 
     def _is_frame_next(self, place: int) -> bool:
-        """Return whether there is a frame at `place`, a P frame without its letter, or the end of
-        the data.
+        """Return whether one of three things is at `place`: a frame; a P frame whose first byte
+        (its letter P) is damaged; or the end of the data.
 
-        If there is none of these, the frame before is probably damaged: it has too few bytes or too
-        many. Erased memory counts as an end.
+        Otherwise the frame before `place` is probably damaged, and has too few bytes or too many.
+        Erased memory counts as the end of the data.
         """
         if place == len(self.data) or self.data[place] in self.kinds:
             return True
@@ -234,8 +236,8 @@ class _Order:
 
     - `groups`: the number of groups.
     - `incomplete`: the groups with too few frames.
-    - `time`: of the last frame, µs, without the jumps of a clock of 32 bits.
-    - `is_valid`: whether all frames since the last I frame were whole.
+    - `time`: the time of the last frame, µs, without the jumps of a counter of 32 bits.
+    - `is_valid`: whether no frame since the last I frame was damaged or missing.
     """
 
     def __init__(self):
@@ -251,10 +253,10 @@ class _Order:
         self.is_resumed = True
 
     def accepts(self, values: Sequence[int], is_key: bool, expected: int) -> bool:
-        """Return whether a frame continues the last one, and make it the last one if it does.
+        """Return whether a frame continues the last frame; if it does, store it as the last frame.
 
-        **Arguments:** `values` its iteration and time; `is_key` whether it is an I frame;
-        `expected` the iteration that it must have.
+        **Arguments:** `values` the iteration and the time of the frame; `is_key` whether it is an I
+        frame; `expected` the iteration that it should have.
         """
         if is_key:
             if self.is_valid and not self.is_resumed and self._lacks_frames(values, expected):
@@ -264,15 +266,16 @@ class _Order:
             self.is_valid = self.is_valid and _continues(self.last, values)
         if self.is_valid:
             if is_key:
-                # Count from the last I frame: a wrong time of a P frame must not move later groups.
+                # Time is measured from the last I frame, since a wrong time of a P frame must not
+                # shift later groups.
                 elapsed = (values[1] - self.key_time) % _WRAP
                 self.key_time = self.key_time + elapsed if self.groups else values[1]
                 self.groups += 1
             self.time = self.key_time + (values[1] - self.key_time) % _WRAP
             self.last = values
         if is_key:
-            # If two I frames do not continue each other, either may be damaged: compare the next I
-            # frame with the later one.
+            # If two successive I frames do not fit together, either may be damaged. The next I
+            # frame is compared with the later of the two.
             self.last_key, self.is_resumed = values, False
         return self.is_valid
 
@@ -287,8 +290,8 @@ class _Order:
     def incomplete_groups(self) -> list[int]:
         """Return the groups from which frames are missing.
 
-        If frames are missing from half of all groups, it returns no group: the interval of frames
-        in the header is then not that of the log.
+        If frames are missing from half of all groups or more, it returns no group: the interval
+        between frames in the header is then not the interval in the log.
         """
         return self.incomplete if 2 * len(self.incomplete) < self.groups else []
 
@@ -320,7 +323,7 @@ def _scales(headers: Mapping[str, Any]) -> dict[str, float]:
     factors = {}
     if "gyro_scale" in headers:
         value = headers["gyro_scale"]
-        # The header has the bits of a float, which the parser takes for an integer.
+        # The header holds the bits of a 32-bit float, which the parser reads as an integer.
         scale = struct.unpack("f", struct.pack("I", value))[0] if isinstance(value, int) else value
         baseflight = "baseflight" in str(headers.get("Firmware type", "")).lower()
         factors["gyroADC"] = scale * (1e6 * 180 / math.pi if baseflight else 1.0)

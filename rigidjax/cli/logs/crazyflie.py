@@ -1,4 +1,6 @@
-"""Read the Crazyflie's µSD log, which no library reads but whose header describes it."""
+"""Read the Crazyflie's µSD log, for which there is no library; the header of a log describes its
+format.
+"""
 
 import struct
 from array import array
@@ -13,10 +15,10 @@ FIRST_BYTE = 0xBC
 
 
 def read_crazyflie(path: Path, columns: Sequence[str]) -> Columns:
-    """Return the names of all variables of a Crazyflie's µSD log (`gyro.x`) and the wanted ones,
-    with their `timestamp`, µs.
+    """Return two things: the names of all variables of a Crazyflie's µSD log, such as `gyro.x`, and
+    of their `timestamp`, µs; and a dict of the wanted variables.
 
-    A log holds several events, each with variables of its own: the event with most of the wanted
+    A log holds several events, each with its own variables. The event that has most of the wanted
     names is read. Source: the description of the format in the documentation of the firmware, "µSD
     card deck", versions 1 and 2.
     """

@@ -1,5 +1,5 @@
-"""Define the error for a log that cannot be read, and the warning for a log that is not read
-whole.
+"""Define the error for a log that cannot be read, and the warning for a log of which a part is left
+out.
 """
 
 import warnings
@@ -14,7 +14,9 @@ class LogError(ValueError):
     """
 
     def __str__(self) -> str:
-        """Return the message without control characters: a name may contain those of a terminal."""
+        """Return the message with control characters escaped, since a name may contain commands of
+        a terminal.
+        """
         return _checks.escape_controls(super().__str__())
 
 

@@ -1,4 +1,4 @@
-"""Find the columns of time and rates that a log is known to have."""
+"""Find the columns of time and rates in a log, from its format or from the units in its names."""
 
 import contextlib
 import re
@@ -13,8 +13,8 @@ from rigidjax.cli.logs.units import TIME_UNITS, unit_in
 class ImuColumns(NamedTuple):
     """Hold the columns of time and rates of a log.
 
-    **Fields:** `columns` the names of the time and of the three rates; `unit` of the rates;
-    `time_unit`.
+    **Fields:** `columns` the names of the columns of the time and of the three rates; `unit` the
+    unit of the rates; `time_unit` the unit of the time.
     """
 
     columns: tuple[str, str, str, str]
@@ -25,7 +25,8 @@ class ImuColumns(NamedTuple):
 USUAL = ImuColumns(("t", "wx", "wy", "wz"), "rad/s", "s")
 
 
-# Fields in binary logs have these units; their names hold no units.
+# Fields in binary logs, by the ending of the file, have these units, which their names do not
+# contain.
 _UNITS = {
     ".bbl": {"time": "us", "gyroADC": "deg/s", "accSmooth": "g"},
     ".ulg": {"timestamp": "us"},
@@ -43,11 +44,12 @@ def usual_unit(path: str | Path, name: str) -> str | None:
 def imu_columns_of(path: str | Path) -> ImuColumns:
     """Return the columns of time and rates of a log, or `USUAL` if they are not known.
 
-    The columns of a text are known by the units in their names, as phyphox writes them in any
-    language.
+    The columns of a text are found by the units in their names, which phyphox writes in the same
+    way in all languages.
     """
     path = Path(path)
-    # Suppress errors here: the reader of the log raises them with better words.
+    # Errors are suppressed here, since the reader of the log raises them later with better
+    # messages.
     with contextlib.suppress(Exception):
         if kind_of(path) in BINARY:
             return _imu_columns_of_binary(path) or USUAL
@@ -57,7 +59,8 @@ def imu_columns_of(path: str | Path) -> ImuColumns:
 
 
 def _columns_by_name(names: list[str]) -> ImuColumns | None:
-    """Return the one time and the three rates, about x, y and z, that have units in their names.
+    """Return the columns of the time and of the three rates, about x, y and z, whose names contain
+    their units.
 
     It returns `None` unless there is exactly one time and one rate about each axis.
     """

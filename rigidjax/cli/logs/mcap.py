@@ -13,11 +13,11 @@ from rigidjax.cli.logs.columns import Columns
 
 
 def read_mcap(path: Path, columns: Sequence[str]) -> Columns:
-    """Return the names of all fields of JSON and ROS 2 messages, such as `/imu.angular_velocity.x`,
-    and the wanted fields.
+    """Return two things: the names of all fields of JSON and ROS 2 messages, such as
+    `/imu.angular_velocity.x`; and a dict of the wanted fields.
 
-    The times `topic.log_time` and `topic.stamp` (the latter of the header of a message) are in s
-    from the first message of the file.
+    The fields `topic.log_time` and `topic.stamp` (from the header of a message) are times in s
+    since the first message of the file.
     """
     make_reader = _checks.import_library("mcap.reader", "mcap", str(path)).make_reader
     ros = _checks.import_library("mcap_ros2.decoder", "mcap", str(path)).DecoderFactory
@@ -28,7 +28,7 @@ def read_mcap(path: Path, columns: Sequence[str]) -> Columns:
         reader = make_reader(file, decoder_factories=[_Json(), ros()])
         for number, (_, channel, message, content) in enumerate(reader.iter_decoded_messages()):
             if not columns and number == _ENOUGH:
-                # Only names are wanted, and every topic has been met by now.
+                # Only names are wanted, and every topic has had a message by now.
                 break
             first = message.log_time if first is None else first
             fields = {"log_time": 1e-9 * (message.log_time - first)} | dict(_numbers_in(content))
@@ -43,12 +43,12 @@ def read_mcap(path: Path, columns: Sequence[str]) -> Columns:
     return list(names), {name: np.frombuffer(a, float) for name, a in arrays.items() if len(a)}
 
 
-# Among this number of messages every topic has at least one.
+# It is assumed that every topic has at least one message among the first _ENOUGH messages.
 _ENOUGH = 2000
 
 
 class _Json:
-    """Provide the decoder of messages in JSON, by the interface of mcap."""
+    """Provide the decoder of messages in JSON, with the interface that the library mcap needs."""
 
     def decoder_for(self, encoding: str, schema: object) -> Callable[[bytes], Any] | None:
         """Return the decoder of an encoding, or `None` for another encoding than JSON."""
@@ -56,7 +56,9 @@ class _Json:
 
 
 def _numbers_in(content: object, name: str = "") -> Iterator[tuple[str, float]]:
-    """Yield the numbers in a message, each after the name of its place, such as `.gyro.x`."""
+    """Yield a pair for each number in a message: the name of its place, such as `.gyro.x`; and it
+    as a float.
+    """
     if isinstance(content, bool | int | float | np.number):
         yield name, float(content)
     elif isinstance(content, list | tuple | np.ndarray):

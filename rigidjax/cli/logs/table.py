@@ -36,23 +36,25 @@ def read_table(
     A log is one of these:
 
     - Text with a header, which may be packed (`.gz`), in UTF-8, UTF-16 or Windows's code page 1252.
-      Cells are separated by commas, semicolons or tabs: the sign that splits the header into most
-      names. Decimals have a point or, between semicolons and tabs, a comma. Lines that begin with
-      `#` may stand above the header; the last of them may be the header itself, as in files of
-      `numpy.savetxt`. Text is read line by line; it needs memory for up to three times its numbers.
+      Cells are separated by commas, semicolons or tabs: the sign that splits the header into the
+      largest number of names. Decimals have a point or, between semicolons and tabs, a comma. Lines
+      that begin with `#` may stand above the header; the last such line may be the header itself,
+      as in files of `numpy.savetxt`. Text is read line by line; it needs memory for up to three
+      times its numbers.
     - `.npz`, `.mat` (MATLAB up to v7), or a Crazyflie's µSD log (without ending, or `.usd`).
-    - With the extra of that name: `blackbox` (`.bbl`, `.bfl`), `ulog` of PX4 (`.ulg`), `mcap` (JSON
-      and ROS 2).
+    - With the extra of the same name (`pip install 'rigidjax[blackbox]'`): `blackbox` (`.bbl`,
+      `.bfl`), `ulog` of PX4 (`.ulg`), `mcap` (JSON and ROS 2).
 
     **Arguments:**
 
-    - `path`: of the file.
-    - `columns`: the names of the wanted columns; others are ignored.
-    - `flight`: the number of the flight in a Blackbox log, from 1; `None` for the only one.
+    - `path`: the path of the file.
+    - `columns`: the names of the wanted columns; all other columns are ignored.
+    - `flight`: the number of the flight in a Blackbox log, from 1; `None` if the log has only one
+      flight.
 
     **Returns** name → (T,) numbers in the units of the log, NaN for an empty cell. It **warns** of
-    frames of a Blackbox log that are left out: those before the first I frame, and those from a
-    damaged frame to the next I frame.
+    frames of a Blackbox log that are left out: all frames before the first I frame, and all frames
+    from a damaged frame to the next I frame.
 
     **Raises:** `ValueError`, in one line that names file, line and column, for a file that is
     missing, cut or of another kind; for a column that is missing, there twice, or wanted twice; for
@@ -83,7 +85,7 @@ def read_table(
     if path.suffix.lower() == ".gz" and kind_of(path.with_suffix("")) in _READERS:
         raise LogError(f"{path}: only text is read while it is packed; unpack it first: gunzip")
     try:
-        # Read line by line: only the numbers of a large file then stay in memory.
+        # The file is read line by line, so that only the numbers of a large file stay in memory.
         with text.open_text(path) as file:
             return text.read_columns(path, file, columns)
     except (OSError, EOFError, UnicodeError, zlib.error, csv.Error) as error:
@@ -92,7 +94,9 @@ def read_table(
 
 
 def kind_of(path: Path) -> str:
-    """Return the ending of a log in small letters, `.usd` for a Crazyflie's log without ending."""
+    """Return the ending of the name of a log in small letters; `.usd` for a Crazyflie's log without
+    an ending.
+    """
     if path.suffix or not path.is_file():
         return path.suffix.lower()
     with path.open("rb") as file:
@@ -100,7 +104,7 @@ def kind_of(path: Path) -> str:
 
 
 def _require_one_flight(path: Path, flight: int | None) -> None:
-    """Raise `LogError` if a `flight` is chosen in a log that is not one of Blackbox."""
+    """Raise `LogError` if a `flight` is chosen and the log is not a Blackbox log."""
     if flight is not None:
         raise LogError(f"{path}: flight {flight}: only a Blackbox log (.bbl, .bfl) has flights")
 

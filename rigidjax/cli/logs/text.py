@@ -1,4 +1,4 @@
-"""Read logs in text, a header line and then numbers, with errors that name file, line and
+"""Read text logs, which are a header line and lines of numbers; errors name the file, line and
 column.
 """
 
@@ -22,8 +22,8 @@ SEPARATORS = ",;\t"
 
 
 def open_text(path: Path) -> io.TextIOWrapper:
-    """Return a log in text as an open file, packed (`.gz`) or not, with the encoding that its first
-    bytes show.
+    """Return a text log as an open file, whether it is packed (`.gz`) or not; its encoding is found
+    from its first bytes.
     """
     packed = path.suffix.lower() == ".gz"
     raw: Any = gzip.open(path, "rb") if packed else path.open("rb")
@@ -37,8 +37,8 @@ def open_text(path: Path) -> io.TextIOWrapper:
 def _encoding(begin: bytes) -> str:
     """Return the encoding of a text, found from its first bytes `begin`.
 
-    A byte-order mark, or zeros between the letters, show UTF-16. Otherwise it is UTF-8 if the bytes
-    are valid in UTF-8, else Windows's code page 1252.
+    The encoding is UTF-16 if there is a byte-order mark, or if there are zeros between the letters.
+    Otherwise the encoding is UTF-8 if the bytes are valid in UTF-8, else Windows's code page 1252.
     """
     if begin[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return "utf-16"
@@ -47,7 +47,7 @@ def _encoding(begin: bytes) -> str:
     try:
         codecs.getincrementaldecoder("utf-8")().decode(begin)
     except UnicodeDecodeError:
-        # Bytes that are no letter in this code page either raise an error when they are read.
+        # Bytes that are not a valid character in this code page raise an error when they are read.
         return "cp1252"
     return "utf-8-sig"
 
@@ -55,8 +55,8 @@ def _encoding(begin: bytes) -> str:
 class Header(NamedTuple):
     """Hold the header of a text.
 
-    **Fields:** `names` of the columns; `separator` of cells; `line` the number of its line; `after`
-    the lines that were read after it.
+    **Fields:** `names` the names of the columns; `separator` the separator of cells; `line` the
+    number of the header's line; `after` the lines that were read after the header.
     """
 
     names: list[str]
@@ -80,14 +80,16 @@ def read_header(file: io.TextIOBase) -> Header:
     return Header(names, separator, line, [])
 
 
-# The longest header that is read has the length that `csv` allows for a cell: a file may be one
-# endless line.
+# A header is read up to this length, which is the longest cell that `csv` allows, since a file may
+# be one endless line.
 _LONGEST = 131_072
 _NUMBER = re.compile(r"[-+.\d][-+.\deE]*")
 
 
 def _split_names(first: str) -> tuple[list[str], str]:
-    """Return the names in a line, and their separator, which is the one that gives most names."""
+    """Return two things: the names in a line; and their separator, the sign that gives the most
+    names.
+    """
     separator = max(SEPARATORS, key=first.count)
     return [name.strip() for name in next(csv.reader([first], delimiter=separator), [])], separator
 
@@ -152,7 +154,8 @@ class _NumberReader:
             plain = self._with_point(cell)
         elif "." in cell:
             self.decimal = "."
-        # Python reads more than logs may write: refuse 1_000, and the digits of other alphabets.
+        # Python accepts more than a log may contain: 1_000, and digits of other alphabets, are
+        # refused.
         try:
             value = float(plain if plain.isascii() and "_" not in plain else "")
         except ValueError:

@@ -8,7 +8,7 @@ import numpy as np
 from rigidjax.cli.logs.errors import LogError, warn
 from rigidjax.cli.logs.units import TIME_UNITS, UNITS
 
-# This number of rows in succession with bad times means that the clock was set.
+# This number of successive rows with bad times means that the clock was set back.
 _RESTART = 5
 # A log must have at least this number of rows.
 _FEWEST = 4
@@ -16,7 +16,7 @@ _FEWEST = 4
 # second range is doubtful.
 _USUAL_STEPS = (1e-5, 1.0)
 _ODD_STEPS = (1e-7, 1e3)
-# A gap of more steps than this means that the clock was set, or that the logger was off.
+# A gap longer than this many median steps means that the clock was set, or that the logger was off.
 _GAP = 1e5
 
 
@@ -31,8 +31,8 @@ def mask_of_increasing(t: np.ndarray) -> np.ndarray:
     """
     if (np.diff(t) > 0).all() and np.isfinite(t).all():
         return np.ones(t.shape, bool)
-    # For each length, `ends` has the least last time of an increasing subsequence of that length,
-    # and `rows` has the row of that time.
+    # For each length, `ends` has the smallest last time of all increasing subsequences of this
+    # length, and `rows` has the row of this time.
     ends: list[float] = []
     rows: list[int] = []
     before = np.full(t.shape, -1)
@@ -55,17 +55,17 @@ def mask_of_increasing(t: np.ndarray) -> np.ndarray:
 def rows_to_use(
     path: str | Path, t: np.ndarray, name: str, window: tuple[float, float] | None
 ) -> np.ndarray:
-    """Return the indices of the rows to use, those in the window whose times increase.
+    """Return the indices of the rows to use, which are the rows in the window whose times increase.
 
     **Arguments:**
 
-    - `path`, `name`: of the file and the time column, for messages.
-    - `t`: (T,) s, from the first time stamp.
+    - `path`, `name`: the path of the file and the name of the time column, for messages.
+    - `t`: (T,) the times since the first time stamp, s.
     - `window`: (from, to), s from the first time stamp, or `None` for all rows.
 
     It **warns** of rows in the window that are left out because their time is repeated, backward or
-    missing. **Raises** `LogError` for fewer than four rows, for times of which half do not
-    increase, and for a clock that was set back.
+    missing. **Raises** `LogError` for fewer than four rows, if half of the times do not increase,
+    and for a clock that was set back.
     """
     if window is not None and not window[0] < window[1]:
         raise LogError(f"{path}: window: wanted FROM below TO, got {window[0]:g} {window[1]:g}")
@@ -106,14 +106,14 @@ def rows_to_use(
 def _require_one_clock(
     path: str | Path, t: np.ndarray, name: str, rows: np.ndarray, keep: np.ndarray
 ) -> None:
-    """Raise `LogError` if the bad times are a second increasing series, that is if the clock was
-    set back.
+    """Raise `LogError` if the times of rows that are not kept form a second increasing series,
+    since the clock was set back in this case.
     """
     bad = np.flatnonzero(~keep)
     for run in np.split(bad, np.flatnonzero(np.diff(bad) > 1) + 1):
         if run.size >= _RESTART and (np.diff(t[rows[run]]) > 0).all():
             # The bad rows are either the end of the first series or the beginning of the second
-            # one.
+            # series.
             first, after = run[0], run[-1] + 1
             row = rows[first if first and t[rows[first]] <= t[rows[first - 1]] else after]
             raise LogError(
@@ -125,8 +125,8 @@ def _require_one_clock(
 def remark_on_step(path: str | Path, t: np.ndarray, unit: str, rate: float) -> None:
     """Warn of a long gap in the times, and of times that are plainly not in their unit.
 
-    **Arguments:** `path` for the message; `t` (T,) s; `unit` in which the times were read; `rate` a
-    typical body rate, rad/s, or zero without a gyro.
+    **Arguments:** `path` the path of the file, for the message; `t` (T,) the times, s; `unit` the
+    unit in which the times were read; `rate` a typical body rate, rad/s, or zero without a gyro.
     """
     steps = np.diff(t)
     step = float(np.median(steps))

@@ -8,13 +8,14 @@ from rigidjax.cli.logs.columns import Columns
 
 
 def read_ulog(path: Path, columns: Sequence[str]) -> Columns:
-    """Return the names of all fields of PX4's ULog as `topic.field`, such as
-    `sensor_combined.gyro_rad[0]`, and the wanted fields.
+    """Return two things: the names of all fields of PX4's ULog as `topic.field`, such as
+    `sensor_combined.gyro_rad[0]`; and a dict of the wanted fields.
 
     The fields of a second instance of a topic are `topic#1.field`; times are in µs.
     """
     reader, arrays = _checks.import_library("pyulog", "ulog", str(path)).ULog, {}
-    # Open the file here: the library does not close a file that it opened and cannot read.
+    # The file is opened here, since the library does not close a file that it opened and cannot
+    # read.
     with path.open("rb") as file:
         topics = reader(file).data_list
     for data in topics:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from rigidjax.cli.logs.errors import LogError, warn
 
-# A value in a unit is multiplied by this factor to give SI.
+# The product of a value in a unit and this factor is the value in SI units.
 UNITS = {
     "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "mm": 1e-3, "m/s2": 1.0, "g": 9.80665,
     "1": 1.0, "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180,
@@ -32,7 +32,8 @@ _IN_BRACKETS = re.compile(r"[(\[]([^()\[\]]*)[)\]]\s*$")
 # This pattern finds words in brackets that are meant as a unit; other words in brackets are an axis
 # or an index.
 _UNKNOWN = re.compile(r"[/°]|dps|lsb|count|raw", re.IGNORECASE)
-# These characters have several spellings.
+# This table replaces characters that have several spellings by one spelling, and removes signs of
+# powers and products.
 _SIGNS = str.maketrans({
     "²": "2", "⁻": "-", "−": "-", "¹": "1", "µ": "u", "μ": "u", "º": "°", "^": None, "*": None,
     "·": None, "⋅": None, ".": None, " ": None,
@@ -42,8 +43,8 @@ _SIGNS = str.maketrans({
 def unit_in(name: str, allowed: Sequence[str]) -> str | None:
     """Return the unit at the end of the name of a column, or `None`.
 
-    In brackets it may be any of `UNITS`. Without brackets, after a blank, a comma or an underscore,
-    it must be one of `allowed`. A power may be written with `^`, `**` or raised digits.
+    A unit in brackets may be any of `UNITS`. A unit without brackets, after a blank, a comma or an
+    underscore, must be one of `allowed`. A power may be written with `^`, `**` or raised digits.
 
     >>> unit_in("Gyroscope x (°/s)", ["rad/s"]), unit_in("wx_deg/s", ["deg/s"]), unit_in("wx", [])
     ('deg/s', 'deg/s', None)
@@ -57,8 +58,9 @@ def unit_in(name: str, allowed: Sequence[str]) -> str | None:
 
 
 def _usual_spelling(word: str) -> str:
-    """Return a unit in the spelling of `_SPELLINGS`, except a capital G, which means gauss and
-    stays unchanged.
+    """Return a unit in the spelling of `_SPELLINGS`.
+
+    A capital G stays unchanged, since it means gauss.
     """
     return word.translate(_SIGNS).lower() if word.strip() != "G" else word
 
@@ -70,19 +72,19 @@ def unit_of(
     allowed: Sequence[str],
     place: str,
 ) -> str:
-    """Return the unit of columns, which is the one that their names or the user state, else the
-    usual one.
+    """Return the unit of columns, which is the unit that the user or the names of the columns
+    state, else the usual unit.
 
     **Arguments:**
 
-    - `names`: of the columns.
+    - `names`: the names of the columns.
     - `stated_unit`: the unit that the user states, or `None`.
-    - `usual_unit`: the unit if neither names nor user state one.
+    - `usual_unit`: the unit of the columns if neither the names nor the user state a unit.
     - `allowed`: the units that such a column may have.
     - `place`: the first words of messages.
 
     **Raises** `LogError` if names and user, or two names, state different units, or if a name
-    states a unit that is not allowed. It **warns** of a unit in brackets that it does not know.
+    states a unit that is not allowed. It **warns** of an unknown unit in brackets.
     """
     in_names = {name: unit for name in names if (unit := unit_in(name, allowed))}
     for name, unit in in_names.items():
@@ -94,7 +96,7 @@ def unit_of(
                 f"{place}: column {name!r} is in {unit} by its name, and {stated_unit} is stated: "
                 "which one? state the same unit, or none"
             )
-    # Keep one column for each unit, to name it in the message.
+    # One column is kept for each unit, so that the message can name it.
     columns = {unit: name for name, unit in in_names.items()}
     if len(columns) > 1:
         (one, first), (other, second) = list(columns.items())[:2]

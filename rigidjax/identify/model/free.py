@@ -118,7 +118,7 @@ class Slot(eqx.Module):
       recordings.
     - `prior`, `spread`: the standard deviations `prior` and `spread` of the `Free`, in units of
       `scale`, or `None`.
-    - `estimated`: whether the spread is estimated.
+    - `estimated`: whether the fit estimates the `spread`.
     - `column`: the index of the first step in the row of a recording.
     - `shared`: (groups, *shape) the indices of the shared steps among all free numbers.
     - `own`: (R, *shape) the indices of the own step of each recording, or of its deviation from the
@@ -190,7 +190,7 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
         here = f"Free {item.name!r}"
         path, value = leaf_at(item.where, scene, here, "it")
         if any(slot.path == path for slot in slots):
-            raise ValueError(f"{here}: another Free moves the same numbers")
+            raise ValueError(f"{here}: another Free already frees the same numbers")
         if any(slot.name == item.name for slot in slots):
             raise ValueError(f"{here}: another Free has this name; give each its own")
         if item.positive and not (np.asarray(value) > 0).all():

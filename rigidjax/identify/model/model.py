@@ -141,8 +141,8 @@ class Model(eqx.Module):
       each recording (`True`), one for each body (`"body"`), or one for all recordings with the same
       label (a sequence of labels, one for each recording).
 
-    The model finds channels that were cut off at full scale. A reading at full scale counts as "at
-    least that much", as with a sensor's `limit`.
+    The model finds channels that were cut off at full scale. A reading at full scale then says only
+    that the true value is at least this large, as with a sensor's `limit`.
 
     The motion starts at the first time of each recording. The state of the motion is the smallest
     type of state that sensors and torque need: `Spin`, `Attitude` or `Rigid`. **Raises:**

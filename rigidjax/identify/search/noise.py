@@ -122,14 +122,13 @@ def median_of_chi2(size: int) -> tuple[float, float]:
 def _shares_left(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[np.ndarray]:
     """Return, for each sensor, the shares (groups,) of the squared errors that remain after a fit.
 
-    The share of a group is one minus the leverage of the fitted numbers on a reading, and at least
-    0.1.
+    The share of a group is one minus the mean leverage of its errors, and at least 0.1.
     """
     groups, readings = np.asarray(model.noise_groups), model.records.readings
     sizes = [np.bincount(groups, one.channel_mask.sum(axis=(1, 2))) for one in readings]
     held = model.prior, model.pull, *((slot.prior, slot.spread) for slot in model.slots)
     if len(readings) * sizes[0].size == 1 and not jax.tree.leaves(held):
-        # Without priors, and with a single noise, the sum of the leverages is the number of fitted
+        # Without priors, and with a single noise, the sum of all leverages is the number of fitted
         # numbers.
         taken = [np.array([x.size])]
     else:

@@ -91,9 +91,10 @@ def tensor_and_margin(matrix: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, 
     """Return two things: the components (6,) of an inertia tensor by least squares; and a margin,
     which is positive if a body can have this tensor.
 
-    The components solve `matrix @ components = rhs`, with `matrix` (n, 6) and `rhs` (n,). If `rhs`
-    is zero, the tensor has the trace one. The margin is the smallest eigenvalue of the tensor's
-    matrix of second moments divided by the largest eigenvalue in magnitude.
+    The components solve `matrix @ components = rhs` in the least-squares sense, with `matrix` (n,
+    6) and `rhs` (n,). If `rhs` is zero, the tensor has the trace one. The margin is the smallest
+    eigenvalue of the tensor's matrix of second moments divided by the largest eigenvalue in
+    magnitude.
     """
     if np.abs(rhs).max() > 0:
         components = np.linalg.lstsq(matrix, rhs, rcond=None)[0]

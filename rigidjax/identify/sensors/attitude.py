@@ -226,7 +226,7 @@ class Position(ClockedSensor):
 
     **Arguments:**
 
-    - `noise`: m, one number or (3,), `None` to estimate it.
+    - `noise`: the standard deviation, m, one number or (3,), `None` estimates the noise.
     - `bias`: (3,) m, world frame, or `None`.
     - `offset`, `jitter`: s, as for `Gyro`.
 
@@ -254,7 +254,7 @@ class Velocity(ClockedSensor):
 
     **Arguments:**
 
-    - `noise`: m/s, one number or (3,), `None` to estimate it.
+    - `noise`: the standard deviation, m/s, one number or (3,), `None` estimates the noise.
     - `place`: (3,) the point, m, in the frame of the `MassProperties`; r is the vector from the
       centre of mass to this point. `None` for the centre of mass.
     - `mounting`: (3,) the rotation vector from the body's axes to the sensor's, rad, for a sensor
@@ -298,7 +298,7 @@ class Range(ClockedSensor):
     **Arguments:**
 
     - `station`: s (3,) m, world frame.
-    - `noise`: m, `None` to estimate it.
+    - `noise`: the standard deviation, m, `None` estimates the noise.
     - `place`: (3,) the point, m, in the frame of the `MassProperties`; `None` for the centre of
       mass.
     - `bias`: m, or `None`.

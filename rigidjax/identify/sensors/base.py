@@ -62,7 +62,7 @@ class AbstractSensor(eqx.Module):
     - `reading_shape`: the shape of one reading.
     - `feels`: the state that the sensor needs, `HasSpin`, `HasAttitude` or `HasPose`.
     - `components`, `unit`: the number k of components of an error, and the unit of an error.
-    - `noise`: (k,) the standard deviation of each component, or `None` to estimate it.
+    - `noise`: (k,) the standard deviation of each component, or `None` estimates the noise.
 
     Optional members:
 

@@ -66,8 +66,8 @@ class Gyro(VectorSensor):
     - `skew`: (3,) (a, b, c), for axes that are not orthogonal: the x channel reads a share a of y
       and a share b of z, and the y channel reads a share c of z, `S = [[1, a, b], [0, 1, c], [0, 0,
       1]]`.
-    - `limit`: the full scale, rad/s, one number or (3,). A reading at full scale counts as "at
-      least that much". `None` finds the full scale from the readings.
+    - `limit`: the full scale, rad/s, one number or (3,). A reading at full scale says only that the
+      true value is at least this large. `None` finds the full scale from the readings.
     - `offset`: s; the reading at t belongs to t + offset.
     - `jitter`: the standard deviation of the time stamps, s, or `"estimated"`. The errors of time
       stamps are independent. The effect of an error of a time stamp on the reading is taken as the
@@ -139,7 +139,7 @@ class Accelerometer(VectorSensor):
 
     **Arguments:**
 
-    - `noise`: m/s², one number or (3,), `None` to estimate it.
+    - `noise`: the standard deviation, m/s², one number or (3,), `None` estimates the noise.
     - `place`: (3,) the sensor's place, m, body frame: from the reference point of the `Inertia`, or
       in the frame of the `MassProperties`.
     - `gravity`: (3,) m/s², world frame; `None` for a body in free fall (`Spin`, `Attitude`). A body
@@ -171,7 +171,7 @@ class Magnetometer(VectorSensor):
 
     **Arguments:**
 
-    - `noise`: in the field's unit, one number or (3,), `None` to estimate it.
+    - `noise`: in the field's unit, one number or (3,), `None` estimates the noise.
     - `field`: (3,) b, world frame, any unit.
     - `bias`: (3,) the body's own magnetism, in the field's unit.
     - `scale`, `mounting`, `skew`, `limit`, `offset`, `jitter`, `lowpass`, `tolerance`: as for

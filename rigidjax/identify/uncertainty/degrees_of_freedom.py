@@ -15,7 +15,8 @@ PLENTY = 100.0
 
 
 class Freedom(eqx.Module):
-    """Hold the numbers from which the degrees of freedom of any variance of a fit are computed.
+    """Hold the numbers from which the degrees of freedom of the variance of any function of the
+    free numbers are computed.
 
     A width is the estimated `spread` of a `Free`: the standard deviation of the values of single
     recordings about the shared value.

@@ -163,7 +163,9 @@ def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
 
 
 def value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Return the reported quantities with the flatness of each body, and all their derivatives."""
+    """Return two arrays at x: the reported quantities, with the flatness of each body at the end;
+    and their derivatives with respect to the free numbers x.
+    """
     return _value_and_slope(without_samples(model), x)
 
 
@@ -181,9 +183,10 @@ def _value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]
 def values_and_slopes(
     model: Model, x: Float[Array, " n"], derivative_point: Float[Array, " n"] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the reported quantities with the flatness of each body, and all their derivatives.
+    """Return two arrays: the reported quantities, with the flatness of each body at the end; and
+    their derivatives with respect to the free numbers.
 
-    The derivatives are taken at x or, if a body is flat at x, at the point `derivative_point`.
+    The derivatives are computed at x or, if a body is flat at x, at the point `derivative_point`.
     """
     values, slopes = (np.asarray(part) for part in value_and_slope(model, x))
     if derivative_point is not None:
@@ -204,7 +207,7 @@ def quantities(
     **Arguments:**
 
     - `model`: the model.
-    - `numbers`: the values and the derivatives, as `values_and_slopes` returns them.
+    - `numbers`: the two arrays that `values_and_slopes` returns: the values; and their derivatives.
     - `covariance`: (n, n) the covariance of the free numbers within the determined directions.
     - `null`: (k, n) the directions that are not determined.
     - `limits`: the flat bodies at which intervals end.
@@ -240,7 +243,8 @@ def interval_about(
     reach: np.ndarray | float,
     limits: tuple[flat_limit.Limit, ...] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the interval (low, high) of functions with this `value` and derivative `slope`.
+    """Return the interval (low, high) of functions with the values `value` and the derivatives
+    `slope` with respect to the free numbers.
 
     **Arguments:** `reach` the half-width in standard deviations; `covariance`, `null` and `limits`
     as for `quantities`.
