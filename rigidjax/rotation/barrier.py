@@ -109,15 +109,9 @@ def compiled_as_one_kernel(function: Function) -> Function:
 def batch_as(tree: PyTree, args: PyTree) -> Any:
     """Return `tree` with every leaf batched if any leaf of `args` is batched.
 
-<<<<<<< HEAD
     This repeats what the batching rule of `compiled_as_one_kernel` returns. Under `jit`, JAX takes
-    the axes of a batch from the function and the values from the rule for its derivative. Where the
-    two differ, arrays have wrong shapes, and no error is raised.
-=======
-    This repeats what the batching rule of `one_kernel` returns. Under `jit`, JAX takes the axes of
-    a batch from the function, and the values from the rule for the derivative. If the function and
-    the rule batch differently, arrays have wrong shapes, and no error is raised.
->>>>>>> 7f657a78 (Words of rotation: nouns for pronouns, whole sentences)
+    the axes of a batch from the function, and the values from the rule for the derivative. If the
+    function and the rule batch differently, arrays have wrong shapes, and no error is raised.
     """
     return _broadcast(tree, args)
 
