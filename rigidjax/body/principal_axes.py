@@ -1,7 +1,7 @@
 """Compute principal moments and axes, and functions of a symmetric matrix, with finite derivatives.
 
-The derivative of `eigh` divides by differences of eigenvalues: it is NaN for a sphere and for every
-symmetric top, and in JAX also for distinct moments above 1e16 kg m² (jax#669).
+The derivative of `eigh` divides by differences of eigenvalues: the derivative is NaN for a sphere
+and for every symmetric top, and in JAX also for distinct moments above 1e16 kg m² (jax#669).
 """
 
 import itertools
