@@ -1,4 +1,6 @@
-"""Make `dir` list the public names of a module, and answer a wrong name with the nearest ones."""
+"""Make `dir` list the public names of a module, and answer a wrong name with the nearest public
+names.
+"""
 
 import difflib
 import functools

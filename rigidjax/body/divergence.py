@@ -32,7 +32,7 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     _checks.require_single(body, MassProperties, "body")
     _checks.require_single(reference, MassProperties, "reference")
     ratio = body.mass / reference.mass
-    # By Cholesky factors: cofactors lose twice as many digits for a long, thin body.
+    # Cholesky factors are used, since cofactors lose twice as many digits for a long, thin body.
     root = jnp.linalg.cholesky(reference.second_moment / reference.mass)
     whiten = partial(solve_triangular, root, lower=True)
     overlap = whiten(whiten(body.second_moment / body.mass).T)

@@ -1,8 +1,8 @@
 """Compute the kinetic energy and angular momentum of a turning body, and its ellipsoids.
 
-The notes write the energy of rotation in three forms. Printed eqs 61–65 lack the factor ½ of eqs 57
-and 73–75; here all have it and agree. `kinetic_energy` of `Inertia.from_second_moment(jnp.diag(λ))`
-is eqs 73–75, in principal axes.
+The notes write the energy of rotation in three forms. The printed eqs 61–65 lack the factor ½ of
+eqs 57 and 73–75; in this module all three forms have the factor and agree. `kinetic_energy` of
+`Inertia.from_second_moment(jnp.diag(λ))` is eqs 73–75, in principal axes.
 """
 
 from typing import Literal
@@ -139,13 +139,15 @@ def ellipsoid(
 
     - `"energy"`: `½ Ω·IΩ = T`, semi-axes `√(2T/I_k)` rad/s; `size` T ≥ 0, J;
     - `"momentum"`: `|IΩ| = h`, semi-axes `h/I_k` rad/s; `size` h ≥ 0, kg m²/s;
-    - `"mass"`: the uniform solid ellipsoid with the mass, centre and 𝔖 of the body, semi-axes
-      `√(5 λ_k/m)`, m, of `MassProperties`, without a `size`. It moves exactly as the body does.
+    - `"mass"`: the uniform solid ellipsoid with the mass, centre and 𝔖 of the body, semi-axes `√(5
+      λ_k/m)`, m, of `MassProperties`, without a `size`. This ellipsoid moves exactly as the body
+      does.
 
     **Returns** `(semi_axes, q)`: (3,) in the order of ascending moments (`"mass"`: ascending), and
     (4,) the rotation principal axes → body axes. In free motion Ω stays on the intersection of the
-    first two (Poinsot; Landau and Lifshitz, Mechanics, § 37). **Raises:** `ValueError` for a zero
-    moment or a negative number; `TypeError` for a `size` that is missing or not wanted.
+    ellipsoids of energy and momentum (Poinsot; Landau and Lifshitz, Mechanics, § 37). **Raises:**
+    `ValueError` for a zero moment or a negative number; `TypeError` for a `size` that is missing or
+    not wanted.
 
     >>> ellipsoid(Inertia.from_principal(1.0, 2.0, 2.0), "energy", 4.0)[0]
     Array([2.82842712, 2.        , 2.        ], dtype=float64)

@@ -71,10 +71,10 @@ class Inertia(eqx.Module):
     def from_tensor(tensor: Matrix) -> "Inertia":
         """Return the body with this inertia tensor.
 
-        **Arguments:** `tensor` (3, 3), kg m², body frame, about the point it turns about. Plates,
-        rods and points (zero second moments) are bodies. **Raises:** `ValueError` (`equinox` error
-        under `jit`) if it is not symmetric to a few units of round-off, has a negative moment, or
-        breaks `I1 + I2 ≥ I3`.
+        **Arguments:** `tensor` (3, 3), kg m², body frame, about the point that the body turns
+        about. Plates, rods and points (zero second moments) are bodies. **Raises:** `ValueError`
+        (`equinox` error under `jit`) if the tensor is not symmetric to a few units of round-off,
+        has a negative moment, or breaks `I1 + I2 ≥ I3`.
 
         >>> Inertia.from_tensor([[2.0, 0.1, 0], [0.1, 2, 0], [0, 0, 3]]).tensor.shape
         (3, 3)
@@ -97,9 +97,9 @@ class Inertia(eqx.Module):
     def from_second_moment(second_moment: Matrix) -> "Inertia":
         """Return the body with this second moment: `I = Tr(𝔖) 1 − 𝔖` (notes, eqs 60, 76–78).
 
-        **Arguments:** `second_moment` (3, 3) 𝔖 = ∫ r rᵀ dm, kg m², body frame, about the point it
-        turns about. **Raises:** `ValueError` (`equinox` error under `jit`) if it is not symmetric
-        and positive semi-definite to a few units of round-off.
+        **Arguments:** `second_moment` (3, 3) 𝔖 = ∫ r rᵀ dm, kg m², body frame, about the point that
+        the body turns about. **Raises:** `ValueError` (`equinox` error under `jit`) if the matrix
+        is not symmetric and positive semi-definite to a few units of round-off.
 
         >>> Inertia.from_second_moment(jnp.diag(jnp.array([2.0, 1.0, 0.0]))).moments
         Array([1., 2., 3.], dtype=float64)
@@ -180,7 +180,7 @@ class MassProperties(eqx.Module):
 
     **Arguments:** `mass` m, kg; `com` (3,) centre of mass c, m, body frame (from the body's
     origin); `second_moment` (3, 3) 𝔖 **about the centre of mass**, kg m², body axes (notes, eq 60).
-    Known values are checked; for traced ones call `checked`.
+    Known values are checked; for traced values call `check`.
 
     **Raises:** `ValueError` for a mass that is not positive, a centre of mass that is not finite, a
     second moment that is not symmetric and positive semi-definite.
@@ -207,7 +207,8 @@ class MassProperties(eqx.Module):
         _checks.require_same_batch(mass=(mass, 0), com=(com, 1), second_moment=(s, 2))
         dtype = jnp.result_type(mass, com, s)
         mass = _checks.check_if_known(validation.require_real_mass, mass.astype(dtype))
-        # A traced mass that is not positive makes the body NaN: an error needs `checked`.
+        # A traced mass that is not positive makes the body NaN; the method `check` raises an error
+        # instead.
         self.mass = mass if _checks.is_known(mass) else jnp.where(mass > 0, mass, jnp.nan)
         self.com = _checks.check_if_known(_checks.require_finite, com.astype(dtype), "com")
         self.second_moment = _checks.check_if_known(
@@ -334,8 +335,8 @@ def with_tensor(body: OneBody, tensor: Mat3) -> OneBody:
 def _add_mass(body, mass, com, second_moment):
     total = body.mass + mass
     d = com - body.com
-    # Start at the centre of the heavier part: a light and distant part moves it little, so that
-    # no digit is lost.
+    # Start at the centre of the heavier part: a light and distant part moves this centre little, so
+    # that no digit is lost.
     heavy = body.mass >= mass
     moved = jnp.where(heavy, mass, -body.mass) / total * d
     both = body.second_moment + second_moment + (body.mass * (mass / total)) * outer(d, d)

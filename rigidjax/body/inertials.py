@@ -14,7 +14,7 @@ from rigidjax.body.inertia import MassProperties
 from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.rotation import euler, quaternion
 
-# The tolerance of the triangle inequality, since files are rounded.
+# The tolerance of the triangle inequality: numbers in files are rounded.
 ROUNDED = 1e-6
 _KEYS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
@@ -24,14 +24,14 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
 
     URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`, `inertia`. MuJoCo: `<inertial>` with
     `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`; an inertia that MuJoCo would compute from
-    geometry is not read, nor are files that are included.
+    geometry is not read, and included files are not read.
 
     **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in order.
 
-    It **warns** of each body that is left out: one without mass, with an invalid number, with an
-    orientation in another form, with an inertia of no real body. It also warns of settings by which
-    MuJoCo changes the masses that are written in the file. **Raises** `ValueError`, with file and
-    body, where no body is left, and for a file that is missing or of another format.
+    It **warns** of each body that is left out: a body without mass, with an invalid number, with an
+    orientation in another form, or with an inertia that no real body has. It also warns of settings
+    by which MuJoCo changes the masses that are written in the file. **Raises** `ValueError`, with
+    file and body, where no body is left, and for a file that is missing or of another format.
 
     >>> read_inertials("missing.urdf")
     Traceback (most recent call last):
@@ -90,7 +90,7 @@ def _settings_warnings(root: Tree.Element) -> list[str]:
 
 
 def _is_one_of(value: str, words: Sequence[str]) -> bool:
-    """Return whether an attribute has one of these values, as a word or as a number."""
+    """Return whether the attribute `value` is one of `words`, as a word or as a number."""
     try:
         return float(value) in map(float, words)
     except ValueError:
@@ -100,10 +100,11 @@ def _is_one_of(value: str, words: Sequence[str]) -> bool:
 def write_inertials(
     path: str | Path, bodies: Mapping[str, MassProperties], source: str | Path
 ) -> None:
-    """Copy a URDF or MuJoCo XML file with `bodies` instead of its inertials.
+    """Copy a URDF or MuJoCo XML file, with the inertials of `bodies` instead of the inertials in
+    the file.
 
     **Arguments:** `path` of the new file; `bodies` name → `MassProperties`, in the frames of the
-    file's links or bodies; `source` the file to copy; its other content does not change.
+    file's links or bodies; `source` the file to copy; the rest of the file does not change.
     **Raises:** `ValueError` as `read_inertials`, and for a name that is not in the file.
 
     >>> write_inertials("new.urdf", {}, "old.urdf")
@@ -154,7 +155,7 @@ def _body_from_urdf(inertial: Tree.Element) -> MassProperties:
     if mass is None or inertia is None:
         raise ValueError("wanted a <mass> and an <inertia>")
     place = _read_numbers(origin, "xyz", 3, [0.0] * 3)
-    # Fixed axes: roll about x, then pitch about y, then yaw about z.
+    # The turns are about fixed axes: roll about x, then pitch about y, then yaw about z.
     turn = euler.to_matrix(_read_numbers(origin, "rpy", 3, [0.0] * 3), "xyz")
     diagonal = [_read_numbers(inertia, key, 1)[0] for key in _KEYS[:3]]
     others = [_read_numbers(inertia, key, 1, [0.0])[0] for key in _KEYS[3:]]

@@ -3,7 +3,8 @@
 The solid is a signed sum of tetrahedra from one inner point to each face. Over a tetrahedron with
 corners 0, a, b, c the integrals of 1, r and r rᵀ are polynomials of a, b, c, so that the result is
 exact to round-off and differentiable in the vertices. The mesh is first shifted to its centroid:
-far from the origin a sum about the origin would subtract numbers of size (distance)⁵.
+far from the origin, a sum about the origin would subtract numbers that grow as the fifth power of
+the distance.
 """
 
 import os
@@ -98,16 +99,18 @@ def mesh_file(
 
 
 def _tetrahedra(corners: Array, faces: Array) -> tuple[Array, list[Array]]:
-    """Return six times the volume (m,) of the tetrahedra from the origin to the faces, and their
-    three corners.
+    """Return two things: six times the volumes (m,) of the tetrahedra from the origin to the faces;
+    and the three corners of each face, as three arrays (m, 3).
     """
     a, b, c = rows = [corners[faces[:, k]] for k in range(3)]
     return (a * jnp.cross(b, c)).sum(axis=1), rows
 
 
 def _require_outward(volume, corners, faces):
-    """Return the volume; refuse one that is negative (inside out) or zero to round-off."""
-    # A mesh is flat to round-off if its thickness is the last digit of its length.
+    """Return the `volume`; refuse a negative volume (a mesh that is inside out) and a volume that
+    is zero to round-off.
+    """
+    # A mesh is flat to round-off if the thickness is as small as the last digit of the length.
     a, b, c = (jax.lax.stop_gradient(corners[faces[:, k]]) for k in range(3))
     longest = jnp.ptp(corners, axis=0).max()
     area = 0.5 * jnp.sqrt((jnp.cross(b - a, c - a) ** 2).sum(axis=1)).sum()

@@ -1,9 +1,9 @@
 """Convert unconstrained numbers to real bodies, and back.
 
 The second moment is the square of a symmetric matrix, 𝔖 ∝ (1 + V)² with V trace-free. Every vector
-is then a real body, and an optimiser needs no constraint. Plates and rods are ordinary points:
-their root has a zero eigenvalue. If 1 + V has a negative eigenvalue, another vector without one has
-the same body; `pack` returns that vector.
+is then a real body, and an optimiser needs no constraint. Plates and rods are ordinary points: for
+them 1 + V has a zero eigenvalue. If 1 + V has a negative eigenvalue, another vector, without a
+negative eigenvalue, describes the same body; `pack` returns this other vector.
 """
 
 from collections.abc import Callable
@@ -45,9 +45,9 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
 
 
 def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
-    """Return the body that ten unconstrained numbers describe; any ten numbers do.
+    """Return the body that ten unconstrained numbers describe; any ten numbers describe a body.
 
-    **Arguments:** `vector` (10,) as `pack` returns them. The exponents α and α + ρ beyond the range
+    **Arguments:** `vector` (10,) as `pack` returns it. The exponents α and α + ρ beyond the range
     of the dtype (330 in float64, 31 in float32) are replaced by numbers that grow logarithmically:
     a step of an optimiser that is much too long gives a large body, not an infinite one.
 
@@ -85,8 +85,8 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
 
 
 def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
-    """Return five unconstrained numbers that describe a second moment up to its scale: what free
-    motion determines.
+    """Return five unconstrained numbers that describe a second moment up to a factor, as free
+    motion determines it.
 
     **Arguments:** `second_moment` (3, 3) 𝔖, positive semi-definite, any units. **Returns** (5,)
     `(d1, d2, s12, s23, s13)`: the root √𝔖 scaled to trace 3 is `1 + V`, where V is symmetric with
@@ -147,16 +147,17 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
 def flat_bend(
     shape: Float[ArrayLike, "5"] | Numbers, slope: Float[ArrayLike, "5"] | Numbers
 ) -> Float[Array, "3 5"]:
-    """Return rows b (3, 5) such that the chart's curvature adds Σ b bᵀ to the second derivative of
-    a misfit.
+    """Return three rows b (3, 5); the sum of b bᵀ over the rows is what the curvature of the
+    coordinates `shape` adds to the second derivative of a misfit.
 
     Near a flat body the least second moment is a square, λ = a², where a is the least eigenvalue of
     the root A = 1 + V and n is its axis. Products of first derivatives do not contain the curvature
-    `d²λ = 2 |dA n|²`. The misfit's derivative by λ is the part along n nᵀ of its derivative by A.
-    The rows are zero for a body that is not flat, and for a misfit that does not decrease towards λ
-    < 0.
+    `d²λ = 2 |dA n|²`. The derivative of the misfit with respect to λ follows from the component
+    along n nᵀ of the derivative with respect to A. The rows are zero for a body that is not flat,
+    and for a misfit that does not decrease towards λ < 0.
 
-    **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the misfit's derivative by it.
+    **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the derivative of the misfit with
+    respect to `shape`.
 
     >>> plate = pack_shape(jnp.diag(jnp.array([4.0, 4.0, 1e-12])))
     >>> flat_bend(plate, -1e-6 * jnp.ones(5)).shape
@@ -165,15 +166,15 @@ def flat_bend(
     shape = _checks.array_of_shape(shape, (5,), "shape")
     slope = _checks.array_of_shape(slope, (5,), "slope")
     root = _root_of_trace_three(shape)
-    # The columns of a flat body's adjugate are along n: this is cheaper than eigenvectors, in every
-    # step of a fit.
+    # For a flat body the columns of the adjugate of A are along n: in every step of a fit, this is
+    # cheaper than eigenvectors.
     rows = root[0], root[1], root[2]
     adjugate = jnp.stack([cross(rows[k - 2], rows[k - 1]) for k in range(3)])
     longest = adjugate[jnp.argmax(jnp.abs(jnp.diagonal(adjugate)))]
     n = longest / jnp.sqrt(jnp.sum(longest * longest) + jnp.finfo(root.dtype).tiny)
     a = n @ apply(root, n)
     d1, d2, s12, s23, s13 = slope
-    # The misfit does not depend on the size of A: its derivative along A is zero.
+    # The misfit does not depend on the size of A: the derivative of the misfit along A is zero.
     trace = -(shape @ slope)
     d3 = (trace - d1 - d2) / 3.0
     pull = from_components(d1 + d3, d2 + d3, d3, 0.5 * s12, 0.5 * s13, 0.5 * s23)
@@ -190,22 +191,27 @@ def flat_bend(
 
 
 def _square_over_trace(v: Float[Array, "5"]) -> Mat3:
-    """Return (1 + V)² over its trace."""
+    """Return the matrix (1 + V)² divided by the trace of (1 + V)²; the five numbers v are the
+    entries of V, as in `pack_shape`.
+    """
     root = _root_of_trace_three(v)
-    # The root is scaled first: after a far too long step of an optimiser its squares overflow.
+    # The root is scaled first: after a step of an optimiser that is much too long, squares of the
+    # entries would overflow.
     root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
     square = product(root, root)
     return square / (square[0, 0] + square[1, 1] + square[2, 2])
 
 
 def _root_of_trace_three(shape: Float[Array, "5"]) -> Mat3:
-    """Return the root 1 + V of a second moment; its trace is 3."""
+    """Return the symmetric root 1 + V, with trace 3, that the five numbers `shape` describe."""
     d1, d2, s12, s23, s13 = shape
     return from_components(1.0 + d1, 1.0 + d2, 1.0 - d1 - d2, s12, s13, s23)
 
 
 def _log_scale_and_stretch(s: Mat3) -> Float[Array, "6"]:
-    """Return (ρ, d1, d2, s12, s23, s13) of 𝔖 = 3 e^{2ρ} (1 + V)² / Tr (1 + V)²."""
+    """Return the six numbers (ρ, d1, d2, s12, s23, s13) of a second moment s = 3 e^{2ρ} (1 + V)² /
+    Tr (1 + V)².
+    """
     total = _refuse_point(s[0, 0] + s[1, 1] + s[2, 2])
     root = _square_root(_quotient(require_real_second_moment(s), total))
     v = 3.0 * root / (root[0, 0] + root[1, 1] + root[2, 2]) - jnp.eye(3, dtype=s.dtype)
@@ -244,8 +250,10 @@ def _quotient(part: Array, total: Scalar) -> Array:
 
 
 def _bend_exponent(exponent: Array, bend: Callable[[Array], Array] = jnp.log1p) -> Array:
-    """Return the exponent, bent beyond the range of the dtype: `log1p` to a logarithm, `expm1`
-    back.
+    """Return the exponent, changed only beyond the range of the dtype: there `bend` is applied to
+    the excess over the limit.
+
+    With `log1p` the excess is compressed to a logarithm; `expm1` is the inverse.
     """
     limit = 31.0 if exponent.dtype == jnp.float32 else 330.0
     beyond = jnp.maximum(jnp.abs(exponent) - limit, 0.0)

@@ -20,8 +20,8 @@ def points(
     """Return the body made of point masses: `𝔖 = Σ m (r − c)(r − c)ᵀ` (notes, eq 60).
 
     **Arguments:** `masses` (n,) kg, none negative; `positions` (n, 3) m, body frame, at any
-    distance from the origin: they are shifted to the centre first. **Raises:** `ValueError` for a
-    negative mass.
+    distance from the origin: the positions are shifted first, so that no digit is lost. **Raises:**
+    `ValueError` for a negative mass.
 
     >>> points([1.0, 1.0], [[1.0, 0, 0], [-1.0, 0, 0]]).inertia.moments
     Array([0., 2., 2.], dtype=float64)
@@ -42,10 +42,10 @@ def voxels(
 ) -> MassProperties:
     """Return the body whose density is given on the cells of a box, constant in each cell.
 
-    The result is exact for this density: each cell adds `m h²/12` of its own. **Arguments:**
-    `density` (nx, ny, nz) kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, m;
-    `corner` (3,) of cell [0, 0, 0] with the smallest x, y, z, m, body frame. **Raises:**
-    `ValueError` for a negative density.
+    The result is exact for this density: the second moment of each cell about the centre of the
+    cell, `m h²/12`, is included. **Arguments:** `density` (nx, ny, nz) kg/m³, none negative,
+    indexed x, y, z; `spacing` (3,) edges of a cell, m; `corner` (3,) of cell [0, 0, 0] with the
+    smallest x, y, z, m, body frame. **Raises:** `ValueError` for a negative density.
 
     >>> voxels(jnp.ones((1, 2, 3)), [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]).com
     Array([0.5, 1. , 1.5], dtype=float64)
@@ -107,9 +107,7 @@ def quadrature(
 
 
 def sum_masses(masses: Float[Array, "n"], positions: Float[Array, "n 3"]) -> MassProperties:
-    """Return the mass, centre and second moment of points; the masses are not checked one by
-    one.
-    """
+    """Return the body made of point masses; the single masses are not checked, only the sums."""
     # Positions are taken from the first point: far from the origin the sums would lose digits.
     start = jax.lax.stop_gradient(positions[0])
     from_start = positions - start[None, :]

@@ -1,7 +1,7 @@
 """Compute principal moments and axes, and functions of a symmetric matrix, with finite derivatives.
 
-The derivative of `eigh` divides by differences of eigenvalues: it is NaN for a sphere and for every
-symmetric top, and in JAX also for distinct moments above 1e16 kg m² (jax#669).
+The derivative of `eigh` divides by differences of eigenvalues: the derivative is NaN for a sphere
+and for every symmetric top, and in JAX also for distinct moments above 1e16 kg m² (jax#669).
 """
 
 import itertools
@@ -17,12 +17,15 @@ from rigidjax.body import validation
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.body.symmetric3 import product
 
-# Moments closer than this many units of round-off of the largest count as equal.
+# Two moments are treated as equal if they differ by less than this many units of round-off of the
+# largest moment.
 _EQUAL = 64.0
-# Convergence is quadratic: double precision needs four or five sweeps.
+# The number of Jacobi sweeps. Convergence is quadratic: double precision needs four or five sweeps.
 _SWEEPS = 6
-# Eigenvalues within this fraction of the largest are handled by an integral, not a quotient.
+# If eigenvalues differ by less than this fraction of the largest eigenvalue, a divided difference
+# is computed by an integral, not by a quotient.
 _CLOSE = 1.0 / 32.0
+# The nodes and weights of Gauss–Legendre quadrature with eight points on [0, 1].
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 # Divided differences do not depend on the order of their arguments: they are computed for the
@@ -45,8 +48,8 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
     The derivative is exact if the moments differ. Moments that are equal to round-off have one
     eigenspace: their derivatives are the diagonal entries of the change of the tensor, and the axes
     do not turn inside the eigenspace. This is right for every function of the eigenspaces that is
-    symmetric in the moments. How axes mix inside an eigenspace, no finite derivative of an axis can
-    describe. For a smooth function of the whole matrix, such as a square root, use
+    symmetric in the moments. No finite derivative of an axis can describe how axes mix inside an
+    eigenspace. For a smooth function of the whole matrix, such as a square root, use
     `rigidjax.body.matrix_function`; to solve, use the matrix itself. Source: notes, eqs 71–72;
     first-order perturbation theory, Kato 1966, II.2.
 
@@ -65,11 +68,11 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
 def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
     """Return the ascending eigenvalues and a right-handed matrix of eigenvectors, as columns.
 
-    They are found by cyclic Jacobi rotations (Golub and Van Loan 2013, section 8.5). In a batch
-    these are eight times as fast as LAPACK's `eigh`, and accurate for the small moment of a slender
-    body along the axes.
+    The method is cyclic Jacobi rotations (Golub and Van Loan 2013, section 8.5). In a batch it is
+    eight times as fast as LAPACK's `eigh`, and it is accurate for the small moment of a slender
+    body that lies along one of the coordinate axes.
     """
-    # A power of two, so that scaling costs no digit.
+    # The matrix is scaled by a power of two, which costs no digit.
     exponent = exponent_of(a)
     b = times_power_of_two(0.5 * (a + a.T), -exponent)
     one, nil = jnp.ones((), a.dtype), jnp.zeros((), a.dtype)
@@ -114,7 +117,9 @@ def _sweep(_, state):
 
 
 def _sort_ascending(values, axes):
-    """Sort by exchanges; each exchange reverses one axis, so that they stay right-handed."""
+    """Sort the eigenvalues and axes by exchanges; each exchange also reverses one axis, so that the
+    axes stay right-handed.
+    """
     values, axes = list(values), list(axes)
     for i, j in ((0, 1), (1, 2), (0, 1)):
         a, b, wrong = values[i], values[j], values[i] > values[j]
@@ -126,7 +131,9 @@ def _sort_ascending(values, axes):
 
 
 def _choose_nearest_signs(axes) -> Mat3:
-    """Reverse two axes, or none, so that the trace is largest."""
+    """Return the matrix with the `axes` as columns, after two axes, or none, are reversed so that
+    the trace is largest.
+    """
     d0, d1, d2 = axes[0][0], axes[1][1], axes[2][2]
     traces = jnp.stack([d0 + d1 + d2, d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1])
     signs = jnp.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], traces.dtype)
@@ -134,7 +141,10 @@ def _choose_nearest_signs(axes) -> Mat3:
 
 
 def _quaternion_near_identity(m: Mat3) -> Quat:
-    """Return the quaternion of a rotation matrix with trace ≥ 0: no branch is needed."""
+    """Return the quaternion of a rotation matrix m with trace ≥ 0.
+
+    For such a matrix one formula is enough.
+    """
     w = 0.5 * jnp.sqrt(1.0 + m[0, 0] + m[1, 1] + m[2, 2])
     f = 0.25 / w
     return jnp.stack([w, f * (m[2, 1] - m[1, 2]), f * (m[0, 2] - m[2, 0]), f * (m[1, 0] - m[0, 1])])
@@ -147,8 +157,8 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     Its first and second derivatives are correct for every body, also for a sphere and a symmetric
     top, whose principal axes have no derivatives; third derivatives are not available. With fixed
     axes and the change `E = Rᵀ dA R`, `f(Λ + E)_ij = f(λ_i) δ_ij + f[λ_i, λ_j] E_ij + Σ_k f[λ_i,
-    λ_k, λ_j] E_ik E_kj + …`; its divided differences are smooth at equal eigenvalues (Daleckii and
-    Krein 1965; Higham 2008, "Functions of Matrices", section 3.2).
+    λ_k, λ_j] E_ik E_kj + …`; the divided differences f[…] are smooth at equal eigenvalues (Daleckii
+    and Krein 1965; Higham 2008, "Functions of Matrices", section 3.2).
 
     **Arguments:** `function` f, scalar → scalar, written in `jax.numpy`, smooth on the spectrum; it
     may depend on differentiated values; `tensor` (3, 3) symmetric, I or 𝔖, any units. **Returns**
@@ -159,8 +169,9 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     """
     a = validation.check_symmetric(_checks.array_of_shape(tensor, (3, 3), "tensor"), "tensor")
     _checks.require_function(function, "function", "number → number, written in jax.numpy")
-    # The unit is a power of two near the largest entry: no product leaves the dtype's range. It is
-    # one power smaller, since for the largest number of the dtype the next power is infinite.
+    # The unit is a power of two near the largest entry, so that no product leaves the range of the
+    # dtype. The exponent is reduced by one, because the power of two above the largest number of
+    # the dtype is infinite.
     unit = times_power_of_two(jnp.ones((), a.dtype), exponent_of(a) - 1)
     a = 0.5 * (a + a.T) / unit
 
@@ -182,8 +193,10 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
 
 
 def _divided_difference(f, x, y, close):
-    """Return the divided difference f[x, y], x ≤ y: the mean of f' between x and y
-    (Hermite–Genocchi if they are close).
+    """Return the divided difference f[x, y] = (f(y) − f(x))/(y − x) of a function f, for x ≤ y.
+
+    If y − x is at most the length `close`, the result is the mean of f' between x and y
+    (Hermite–Genocchi), by quadrature.
     """
     near = y - x <= close
     end = jnp.where(near, y, x)
@@ -193,8 +206,11 @@ def _divided_difference(f, x, y, close):
 
 
 def _second_divided_difference(f, x, y, z, close):
-    """Return the divided difference f[x, y, z], x ≤ y ≤ z: an integral of f'' over the triangle of
-    the three.
+    """Return the second divided difference f[x, y, z] = (f[y, z] − f[x, y])/(z − x) of a function
+    f, for x ≤ y ≤ z.
+
+    If z − x is at most the length `close`, the result is the integral of f'' over all weighted
+    means of x, y and z (Hermite–Genocchi), by quadrature.
     """
     near = z - x <= close
     middle, end = jnp.where(near, y, x), jnp.where(near, z, x)

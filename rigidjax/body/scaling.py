@@ -1,7 +1,8 @@
 """Scale by powers of two, which loses no digit.
 
-Not `jnp.ldexp(x, n)`: before jax 0.12 its derivative by x is 1 instead of 2ⁿ at x = 0 (as in every
-off-diagonal entry of a diagonal tensor), loses digits at large |n|, and is infinite at n = 1023.
+`jnp.ldexp(x, n)` is not used: before jax 0.12 its derivative with respect to x is 1 instead of 2ⁿ
+at x = 0 (as in every off-diagonal entry of a diagonal tensor), loses digits at large |n|, and is
+infinite at n = 1023.
 """
 
 import jax
@@ -19,7 +20,8 @@ def times_power_of_two(x: Float[Array, "..."], n: Int[Array, ""]) -> Float[Array
     normal number.
     """
     half = n // 2
-    # Without the barrier XLA would multiply both powers first where it knows n, and overflow.
+    # Without the barrier, XLA would first multiply the two powers where it knows n, and the product
+    # would overflow.
     both = _power_of_two(half, x.dtype), _power_of_two(n - half, x.dtype)
     first, second = jax.lax.optimization_barrier(both)
     return x * first * second

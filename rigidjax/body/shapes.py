@@ -1,9 +1,9 @@
 """Give mass properties of solids, shells, plates and rods in closed form.
 
-Each function takes the mass and then the dimensions, and is differentiable in all of them. It
-raises `ValueError` for a mass ≤ 0 or a negative length. Every shape has its **centre of mass at the
-origin** and its axis of symmetry, if it has one, along z. Place it with `.rotate` and `.shift`,
-join bodies with `+`, cut away with `-`. For a density use `rigidjax.volumes`:
+Each function takes the mass and then the dimensions, and is differentiable with respect to all
+arguments. It raises `ValueError` for a mass ≤ 0 or a negative length. Every shape has its **centre
+of mass at the origin** and its axis of symmetry, if it has one, along z. Place it with `.rotate`
+and `.shift`, join bodies with `+`, cut away with `-`. For a density use `rigidjax.volumes`:
 `box(density * volumes.box(size), size)`.
 
 The formulas give the second moment 𝔖 = ∫ r rᵀ dm (notes, eq 60), diagonal in these axes; the
@@ -63,7 +63,8 @@ def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> Mas
     Array([2., 2., 2.], dtype=float64)
     """
     r, R = _require_nested(inner, outer)
-    # Homogeneous of degree 2: in u = r/R nothing overflows, and thin shells lose no digit.
+    # The formula is homogeneous of degree 2: written in u = r/R nothing overflows, and thin shells
+    # lose no digit.
     u = r / R
     ratio = (1.0 + u * (1.0 + u * (1.0 + u * (1.0 + u)))) / (1.0 + u * (1.0 + u))
     return _body_at_centre(mass, _axisymmetric_diagonal(R * R * ratio / 5.0, R * R * ratio / 5.0))
@@ -126,7 +127,7 @@ def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassPro
 def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
     """Return a solid cone along z. `𝔖 = m diag(3r²/20, 3r²/20, 3h²/80)`.
 
-    **Arguments:** `mass` kg; `radius` of the base, `height` m. Its centre of mass, at the origin,
+    **Arguments:** `mass` kg; `radius` of the base, `height` m. The centre of mass, at the origin,
     is `height/4` above the base.
 
     >>> cone(80.0, 1.0, 2.0).inertia.moments

@@ -21,7 +21,7 @@ def inverse(a: Mat3) -> Mat3:
     The matrix is divided by its trace first: 1e-20 or 1e37 kg m² neither underflow nor overflow. A
     zero moment gives infinities; `Inertia.invertible` raises an error for it.
     """
-    # All entries by one split: each entry taken by an index would be a kernel.
+    # All entries come from one split: an entry taken by an index would be a kernel of its own.
     xx, _, _, _, yy, _, _, _, zz = entries(a)
     scale = xx + yy + zz
     unit = a / scale
@@ -57,7 +57,8 @@ def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
     return a[:, None] * b[None, :]
 
 
-# Compiled as one program: outside of a trace each operation would be a program.
+# The function is compiled as one program: outside of a trace, each operation would be a program of
+# its own.
 @jax.jit
 def swap_trace(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Return `Tr(A) 1 − A` without the cancellation: `[A22 + A33, −A12, …]` (notes, eqs 76–78)."""
@@ -72,6 +73,6 @@ def swap_trace_back(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]
 
 
 def _negate(a: Array, diagonal: Array) -> Array:
-    """Return −A with this `diagonal` instead of its own."""
+    """Return −A, in which the diagonal entries are replaced by `diagonal`."""
     eye = jnp.broadcast_to(jnp.eye(3, dtype=bool), a.shape)
     return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)

@@ -1,4 +1,4 @@
-"""Check that some body has these numbers; say what is wrong if none has.
+"""Check that a real body can have the given mass and inertia; say what is wrong if none can.
 
 Each check returns its argument and refuses numbers that no real body has: known values with a plain
 exception that shows the numbers, traced values with `equinox.error_if`, without the numbers. A few
@@ -20,7 +20,8 @@ from rigidjax._types import Quat, Quaternion
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.validation import require_near_unit, tolerance
 
-# The tolerance in units of round-off of the largest entry. A product R I Rᵀ is off by about ten.
+# The tolerance, in units of round-off of the largest entry. A product R I Rᵀ has an error of about
+# ten such units.
 _FORGIVEN = 64.0
 
 
@@ -38,8 +39,8 @@ def require_real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*b
 def require_real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
     """Refuse principal moments, in any order, that no real body has."""
     if not _checks.is_known(moments) and _checks.is_known(plain := lax.stop_gradient(moments)):
-        # The numbers are known and only differentiated: one check by NumPy instead of twenty
-        # programs.
+        # The numbers are known, and are traced only to be differentiated: check them once by NumPy,
+        # instead of by twenty compiled programs.
         require_real_moments(plain)
         return moments
     moments = _checks.require_finite(moments, "principal moments")
@@ -70,7 +71,8 @@ def require_single_body(
     requirement: str = "",
     hint: str = "",
 ) -> Any:
-    """Return `value` if it is one body of one of `kinds` and some mass has its numbers.
+    """Return `value` if it is one body of one of `kinds`, and if a real body can have these
+    numbers.
 
     Known numbers that no real body has are refused; a traced body with such numbers becomes NaN. A
     moment may be zero: a function that divides by the moments calls `check_body`.
@@ -82,8 +84,8 @@ def require_single_body(
 
 
 def check_symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
-    """Return a symmetric matrix; refuse a known one that is not symmetric, and make a traced one
-    NaN.
+    """Return a symmetric matrix; refuse a known matrix that is not symmetric, and make such a
+    traced matrix NaN.
     """
     if _checks.is_known(a):
         return _require_symmetric(a, name)
@@ -98,16 +100,17 @@ def check_body(
     *,
     allow_thin: bool = False,
 ) -> Any:
-    """Return `body` if some mass has these numbers and, unless `allow_thin`, no moment is zero.
+    """Return `body` if a real body can have the inertia `tensor` and the `mass`, and if no moment
+    is zero.
 
-    `mass` may be `None`. Other numbers are refused if they are known, or if `throw` is true; else
-    the traced body becomes NaN.
+    `mass` may be `None`; if `allow_thin`, moments may be zero. Other numbers raise an error if they
+    are known, or if `throw` is true; else the traced body becomes NaN.
     """
     tensor = _checks.numeric_array(tensor, "inertia tensor")
     is_known = _checks.is_known((tensor, mass))
     if not is_known and _checks.is_known(plain := lax.stop_gradient((tensor, mass))):
-        # The numbers are known and only differentiated: one check by NumPy instead of thirty
-        # programs.
+        # The numbers are known, and are traced only to be differentiated: check them once by NumPy,
+        # instead of by thirty compiled programs.
         faults = _faults(np, plain[0], allow_thin)
         if not any(f.any() for f in faults) and (mass is None or (np.asarray(plain[1]) > 0).all()):
             return body
@@ -133,9 +136,10 @@ def check_body(
 
 
 def first_impossible_row(tensors: Float[Array, "n 3 3"]) -> Any:
-    """Return the index of the first of these known tensors that no body has, −1 if all are real.
+    """Return the index of the first of the known `tensors` that no body has, or −1 if there is
+    none.
 
-    A tensor with a NaN is skipped: in a batch of bodies it gets a status of its own.
+    A tensor with a NaN is skipped: in a batch of bodies such a body gets another status.
     """
     return _checks.first_bad_row(_are_impossible, tensors)
 
@@ -161,10 +165,11 @@ _THIN = (
 
 
 def _faults(xp: ModuleType, tensor: Array | np.ndarray, allow_thin: bool) -> tuple[Any, Any, Any]:
-    """Return three answers: is a moment zero or NaN, has no mass these moments, is I ≠ Iᵀ.
+    """Return three answers: whether a moment is zero or NaN; whether no real body has these
+    moments; and whether I ≠ Iᵀ.
 
-    The first is never true if `allow_thin`. Whether a mass has these moments is judged by the
-    minors of its second moment 𝔖, in units of the trace.
+    The first answer is never true if `allow_thin`. The second answer comes from the minors of the
+    second moment 𝔖, in units of the trace.
     """
     slack = _round_off_bound(tensor)
     # The nine entries are split by one operation: NumPy needs a tenth of the time of nine slices.
@@ -186,7 +191,7 @@ def _faults(xp: ModuleType, tensor: Array | np.ndarray, allow_thin: bool) -> tup
     whole = sx * minors[2] - sy * squares[1] - sz * squares[0] - product
     broken = trace < 0
     for minor in (sx, sy, sz, *minors, whole):
-        # If an entry is NaN the others are not scaled, so that their minors mean nothing.
+        # If an entry is NaN, the other entries are not scaled, so that the minors mean nothing.
         broken = broken | (some & (minor < -slack))
     if allow_thin:
         return broken & False, broken, skew
@@ -196,14 +201,14 @@ def _faults(xp: ModuleType, tensor: Array | np.ndarray, allow_thin: bool) -> tup
 
 
 def is_real(tensor: Float[Array, "*batch 3 3"]) -> Bool[Array, "*batch"]:
-    """Return whether some mass has this inertia tensor, kg m², with no moment of zero."""
+    """Return whether a real body can have the inertia `tensor`, kg m², and no moment is zero."""
     flat, broken, skew = _faults(jnp, lax.stop_gradient(tensor), allow_thin=False)
     return ~(flat | broken | skew)
 
 
 def attitude_quaternion(q: Quaternion) -> Quat:
-    """Return a unit quaternion (w, x, y, z), normalised if it is off by round-off; refuse any
-    other.
+    """Return a unit quaternion (w, x, y, z), normalised if its length is wrong by round-off; refuse
+    any other quaternion.
     """
     q = _checks.finite_array(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
     return quaternion.normalise(require_near_unit(q, "q", tolerance(q.dtype)))
@@ -231,7 +236,9 @@ def _moments_of_a_body(value, moments):
 
 
 def _asymmetry(a):
-    """Return the largest difference A − Aᵀ, and whether it exceeds round-off."""
+    """Return two things: the largest entry of |A − Aᵀ|, for the matrix A = a; and whether this
+    entry exceeds round-off.
+    """
     difference = abs(_without_derivatives(a) - _without_derivatives(a).swapaxes(-1, -2)).max(
         axis=(-1, -2)
     )

@@ -239,8 +239,8 @@ def _integral_at_any_amplitude(
 ) -> Any:
     """Return I_jkl for `orders` = (j, k, l) at any amplitude φ = `phi`.
 
-    The complete integral gives the part of the whole half turns; the sine and cosine of the
-    remainder give the rest.
+    The complete integral gives the contribution of the whole half turns; the sine and cosine of the
+    remainder give the contribution of the remainder.
     """
     turns, remainder = half_turns(phi)
     n1 = jnp.ones_like(m1) if n1 is None else n1

@@ -100,8 +100,8 @@ def field_of(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
     """Return two things: the vector field inside a term, and the direction of time, 1 or −1, with
     which diffrax wraps the term.
     """
-    # Read attributes of the wrapped term: its methods `vf` and `contr`, the only ones that diffrax
-    # promises, return numbers and not the inertia.
+    # Read attributes of the wrapped term: diffrax promises only the methods `vf` and `contr`, which
+    # return numbers and not the inertia.
     term = getattr(terms, "term", terms)
     return getattr(term, "vector_field", None), getattr(terms, "direction", 1)
 

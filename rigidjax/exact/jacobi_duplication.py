@@ -187,7 +187,8 @@ def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
     # The equality c₁ = w/(2(a₀ + b₀)) is exact; `ratio` is c_n²/w and `c` is c_n.
     c = w / (2.0 * (a + b))
     ratio = w / (4.0 * (a + b) ** 2)
-    # Use a loop: eleven steps written out take as long to compile as the rest of the motion.
+    # Use a loop: eleven steps written out would take as long to compile as everything else in the
+    # motion.
     point, half, one = jnp.sqrt(1.0 + mu / big), jnp.full_like(a, 0.5), jnp.ones_like(a)
     start = (a, b, c, ratio, half, point, one, one)
     a, *_, total, _, _, sum_parts = jax.lax.fori_loop(

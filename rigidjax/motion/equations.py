@@ -108,8 +108,8 @@ class EulerEquations(eqx.Module):
         _checks.require_single(inertia, Inertia, "inertia", hint=_HINT)
         if torque is not None:
             require_law(torque)
-        # Traced numbers are checked when a motion is computed: an optimiser may try numbers that no
-        # body has during a fit.
+        # Traced numbers are checked when a motion is computed: during a fit an optimiser may try
+        # numbers that no body has.
         self.inertia = inertia.require_invertible() if _checks.is_known(inertia.tensor) else inertia
         # The inverse is computed once per solve: a division inside the vector field costs 25 times
         # as much as the rest of the field.

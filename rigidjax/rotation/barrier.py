@@ -21,9 +21,10 @@ _DROPPED = jax.__version_info__ < (0, 11)
 
 
 def platform() -> str:
-    """Return the kind of device that computes, such as "cpu": of `jax.default_device`, if set.
+    """Return the kind of device that computes, such as "cpu".
 
-    `jax.default_backend` does not look at it.
+    This is the kind of `jax.default_device`, if it is set: `jax.default_backend` ignores this
+    setting.
     """
     device: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     if device is None:
@@ -36,7 +37,8 @@ def barrier(tree: Tree) -> Tree:
 
     This is `lax.optimization_barrier`, or `compute_once` where XLA drops barriers.
 
-    On a GPU each barrier ends a kernel, which costs more than what is computed twice.
+    On a GPU each barrier would end a kernel, which costs more than computing some numbers twice; no
+    barrier is set there.
     """
     if platform() != "cpu" or not any(isinstance(a, Tracer) for a in jax.tree.leaves(tree)):
         return tree
@@ -50,21 +52,22 @@ def compute_once(x: Array) -> Array:
     """Return the number `x` unchanged, such that XLA on CPU computes it once, here and in the
     gradient.
 
-    The number is divided by one (by 2 if it is NaN). XLA on CPU computes a quotient once; it
-    repeats anything cheaper, with all its inputs, for every component.
+    The number is divided by one (by 2 if it is NaN). XLA on CPU computes a quotient once; XLA
+    repeats any cheaper operation, with all inputs of the operation, for every component.
     """
     return x / jnp.where(x == x, 1, 2)
 
 
 def compiled_as_one_kernel(function: Function) -> Function:
-    """Return `function`, of trees of arrays, compiled as one kernel where it is not batched.
+    """Return a function of trees of arrays that computes `function`, compiled as one kernel where
+    no argument is batched.
 
     Many small kernels for one body take long to compile; XLA on CPU makes one kernel of a loop with
-    a small state. So `function` runs in a loop of one turn. XLA knows neither the number of turns
-    nor that the arguments stay the same, so it moves nothing out of the loop. Batches and
-    derivatives use `function` itself.
+    a small state. Therefore `function` runs in a loop with one iteration. XLA knows neither the
+    number of iterations nor that the arguments stay the same, and so XLA moves nothing out of the
+    loop. Batches and derivatives use `function` itself, without the loop.
     """
-    # Traced once for all the uses below.
+    # `function` is traced once for all the uses below.
     plain = jax.jit(function, inline=True)
 
     @jax.custom_jvp
@@ -88,7 +91,8 @@ def compiled_as_one_kernel(function: Function) -> Function:
     def _call_batched(size: int, batched: PyTree, *args: PyTree) -> Any:
         del size
         axes = jax.tree.map(lambda b: 0 if b else None, tuple(batched))
-        # JAX before 0.12 asks for this where only tangents are batched, too, and then nothing is.
+        # JAX before 0.12 calls this rule also where only tangents are batched; no argument is
+        # batched then.
         is_batched = any(jax.tree.leaves(batched))
         out = jax.vmap(plain, axes)(*args) if is_batched else plain(*args)
         return out, jax.tree.map(lambda _: is_batched, out)
@@ -106,8 +110,8 @@ def batch_as(tree: PyTree, args: PyTree) -> Any:
     """Return `tree` with every leaf batched if any leaf of `args` is batched.
 
     This repeats what the batching rule of `compiled_as_one_kernel` returns. Under `jit`, JAX takes
-    the axes of a batch from the function and the values from the rule for its derivative. Where the
-    two differ, arrays have wrong shapes, and no error is raised.
+    the axes of a batch from the function, and the values from the rule for the derivative. If the
+    function and the rule batch differently, arrays have wrong shapes, and no error is raised.
     """
     return _broadcast(tree, args)
 

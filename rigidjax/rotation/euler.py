@@ -1,15 +1,17 @@
 """Convert Euler angles in all 24 sequences; the default is 3-1-3, "ZXZ", as in the notes.
 
-A sequence is three letters; the angles have its order, and all are active, in radians. **Capitals
-are intrinsic**: each turn is about the moved axis, and M = R_1(a) R_2(b) R_3(c) (notes, eqs 12,
-27–31). **Lower case is extrinsic**: each turn is about a fixed axis of the world, and M = R_3(c)
-R_2(b) R_1(a). SciPy uses the same letters. **Raises:** `ValueError` for an unknown sequence.
+A sequence is three letters, and the angles are in the order of the letters; all turns are active,
+and all angles in radians. **Capitals are intrinsic**: each turn is about the moved axis, and M =
+R_1(a) R_2(b) R_3(c) (notes, eqs 12, 27–31). **Lower case is extrinsic**: each turn is about a fixed
+axis of the world, and M = R_3(c) R_2(b) R_1(a). SciPy uses the same letters. **Raises:**
+`ValueError` for an unknown sequence.
 
 **The singular case** ("gimbal lock") is a middle angle of 0 or π if the first and the last letter
 agree, and of ±π/2 if all three differ. Only the sum or the difference of the outer angles is then
-defined. If the sine or cosine that vanishes there is below 4 units of round-off, **the last angle
-listed is 0**, and so is its rate; the matrix is still right. Derivatives are then finite: they are
-those of the other two angles at a fixed middle angle. `is_singular` tests for the case.
+defined. If the sine or cosine that vanishes in this case is below 4 units of round-off, **the last
+angle listed is 0**, and the rate of this angle is 0; the matrix is still right. Derivatives are
+then finite: they are the derivatives of the other two angles at a fixed middle angle. `is_singular`
+tests for the singular case.
 """
 
 import warnings
@@ -91,14 +93,16 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     if symmetric:
         z = handed * z
     else:
-        # A quarter turn about the middle axis makes the last axis the first (all times √2).
+        # A quarter turn about the middle axis takes the last axis into the first; all four numbers
+        # are multiplied by √2.
         w, x, y, z = w + handed * y, x + z, w - handed * y, x - z
     flat, up = y * y + z * z, w * w + x * x
     tiny = (2 * jnp.finfo(q.dtype).eps) ** 2 * (flat + up)
     low, high = flat <= tiny, up <= tiny
     half_sum = jnp.arctan2(jnp.where(high, 0, x), jnp.where(high, 1, w))
     half_difference = jnp.arctan2(jnp.where(low, 0, z), jnp.where(low, 1, y))
-    # The last angle listed is 0: the third of the intrinsic turns, or the first if reversed.
+    # In the singular case the last angle listed is 0: the third of the intrinsic turns, or the
+    # first turn if the order is reversed.
     sign = -1 if reverse else 1
     half_difference = jnp.where(low, sign * half_sum, half_difference)
     half_sum = jnp.where(high, sign * half_difference, half_sum)
@@ -170,7 +174,8 @@ def omega_to_rates(
         omega = apply(to_matrix(angles, sequence).T, omega)
     first, second, third = _turning_axes(axes, _reverse_if(angles, reverse))
     reach, singular = _singularity(angles[1], axes)
-    # `second` is normal to the other two; `aside` completes it and `third` to a frame.
+    # `second` is normal to `first` and `third`; `aside`, `second` and `third` are an orthonormal
+    # frame.
     aside, along = cross(third, second), dot(first, third)
     a = dot(aside, omega) / jnp.where(singular, 1, reach)
     a = jnp.where(singular, 0 if reverse else along * dot(third, omega), a)
@@ -231,8 +236,8 @@ def _wrap(angle: Scalar) -> Scalar:
 
 
 def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3, Vec3]:
-    """Return the axes of the three turns in the body frame: what a unit rate of each angle adds to
-    Ω.
+    """Return the axes of the three turns in the body frame: each axis is what a unit rate of the
+    angle adds to Ω.
     """
     _, j, k = axes
     first, second, third = (jnp.eye(3, dtype=angles[0].dtype)[axis] for axis in axes)
@@ -242,7 +247,9 @@ def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3
 
 
 def _singularity(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
-    """Return the product first · (third × second) of the axes, and whether it is 0 to round-off."""
+    """Return two things: the product first · (third × second) of the three axes; and whether this
+    product is 0 to round-off.
+    """
     i, j, k = axes
     size = jnp.sin(middle) if i == k else -_handedness(i, j) * jnp.cos(middle)
     return size, jnp.abs(size) < 4 * jnp.finfo(middle.dtype).eps

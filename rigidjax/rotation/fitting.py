@@ -2,8 +2,8 @@
 
 Singular values and eigenvectors are not used: their derivatives are NaN at every rotation, where
 all three singular values are 1. The best rotation R of a 3×3 matrix B, with the largest Tr(RᵀB),
-has the derivative dR = R hat(x), (Tr(S) 1 − S) x = 2 vee(Rᵀ dB), S = sym(RᵀB). It is regular if R
-is unique.
+has the derivative dR = R hat(x), where x solves (Tr(S) 1 − S) x = 2 vee(Rᵀ dB) with S = sym(RᵀB).
+The derivative is regular if R is unique.
 """
 
 from functools import partial
@@ -36,7 +36,8 @@ from rigidjax.rotation.validation import (
     require_unit_quaternion,
 )
 
-# The least weight, relative to the largest, of the first estimate in Wahba's problem.
+# In the first estimate of Wahba's problem, no positive weight is below this fraction of the largest
+# weight.
 _LIGHT = 1e-3
 
 
@@ -56,7 +57,8 @@ def project(matrix: Mat3Like) -> Mat3:
         _checks.require_finite(matrix, "matrix")
         require_direction(matrix.reshape(9), "matrix")
         size = np.max(np.abs(np.asarray(matrix)))
-        # For the matrix over its largest entry: its own determinant may overflow.
+        # The determinant is that of the matrix divided by its largest entry: without the division
+        # the determinant may overflow.
         det = np.linalg.det(np.asarray(matrix) / size)
         if det <= 0:
             words = f"left-handed frame or singular, det = {det:.3g}; no rotation is nearest"
@@ -72,9 +74,9 @@ def wahba(
     """Return the rotation M, body → world, that minimises Σ w_i |world_i − M body_i|² (Wahba 1965).
 
     **Arguments:** `body`, `world` (n, 3), n ≥ 2: the same directions in both frames, any units;
-    `weights` (n,), not negative, 1 if not given; they may differ by 1e13 (1e5 in float32). The
-    method solves the quartic of Markley 1993 (FOAM, J. Astronaut. Sci. 41, 261), then takes Newton
-    steps on the group.
+    `weights` (n,), not negative, 1 if not given; the ratio of two weights may be up to 1e13 (1e5 in
+    float32). The method solves the quartic of Markley 1993 (FOAM, J. Astronaut. Sci. 41, 261), then
+    takes Newton steps on the group.
 
     **Raises:** an error, also under `jit`, if the directions do not determine the rotation: fewer
     than two, or all parallel (to 5e-4 rad in float64, 4° in float32, where half the digits would be
@@ -91,7 +93,8 @@ def wahba(
     w, world, body = (scale_to_order_one(x) for x in (w, world, body))
     words = "wahba: these directions do not fix the attitude; two that are not parallel are needed"
     heavy, those, these = lax.stop_gradient((w, world, body))
-    # In one sum a light direction would lose its digits beside a heavy one.
+    # In one sum, a direction of small weight would lose its digits beside a direction of large
+    # weight.
     closer = jnp.where(heavy > 0, jnp.maximum(heavy, _LIGHT * jnp.max(heavy)), 0)
     try:
         best = nearest_rotation(_weighted_sum(closer, those, these))
@@ -102,7 +105,8 @@ def wahba(
             best = _newton_step(best, w, world, body)
     except ValueError:
         raise ValueError(words) from None
-    # (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det b: 0 where a turn is free.
+    # The determinant `firmness` is (σ1 + σ2)(σ2 + σ3)(σ3 + σ1) with the singular values σ of b,
+    # where σ3 has the sign of det b. It is 0 where the directions leave one turn free.
     eps = float(jnp.finfo(w.dtype).eps)
     loose, seen, one = jnp.zeros((), bool), jnp.sign(heavy), jnp.eye(3, dtype=w.dtype)
     # The first two rows test the directions of each frame alone, without weights, at the identity:
@@ -127,11 +131,12 @@ def _weighted_sum(
 def _newton_step(
     best: Mat3, w: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
 ) -> Mat3:
-    """Return the rotation after a Newton step from `best` towards the largest Σ w_i world_i · M
+    """Return the rotation M after one Newton step from `best` towards the largest Σ w_i world_i · M
     body_i.
 
-    The moment of each direction is computed from the small difference of the two vectors. So the
-    rounding of a direction with a large weight does not turn the body about it.
+    The moment of each direction is computed from the small difference of the two vectors `world_i`
+    and `M body_i`. The rounding of a direction with a large weight then does not turn the body
+    about this direction.
     """
     moved = (best[None] * body[:, None, :]).sum(-1)
     lengths = [jnp.sqrt((x * x).sum(-1)) for x in lax.stop_gradient((moved, world))]
@@ -142,12 +147,13 @@ def _newton_step(
 
 
 def align(a: Vec3Like, b: Vec3Like) -> Mat3:
-    """Return the smallest rotation that takes the direction of a into that of b.
+    """Return the smallest rotation that turns the direction of a into the direction of b.
 
     **Arguments:** `a`, `b` (3,), in one frame, any lengths. **Returns:** (3, 3), R a ∥ b. If a and
-    b are opposite to round-off it is half a turn about a normal to a, as near as possible to the
-    basis vector along which a is smallest. The quaternion is (½|m|, a × m/|m|) with m = a + b,
-    which keeps its digits near that case. **Raises:** `ValueError` for known zero or NaN.
+    b are opposite to round-off, the rotation is half a turn about a normal to a, as near as
+    possible to the basis vector along which a is smallest. For unit vectors a and b the quaternion
+    is (½|m|, a × m/|m|) with m = a + b; this form keeps its digits if a and b are nearly opposite.
+    **Raises:** `ValueError` for known zero or NaN.
 
     >>> align(jnp.array([1.0, 0, 0]), jnp.array([0, 2.0, 0])).round(12)[:, 0].tolist()
     [0.0, 1.0, 0.0]
@@ -157,7 +163,8 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
     middle = a + b
     n2, normal = dot(middle, middle), cross(a, middle)
-    # Both lengths are 1 to round-off only: the rest of m may lie along a.
+    # The lengths of a and b are 1 only to round-off: if a and b are opposite, what is left of m may
+    # lie along a.
     least = 2 * float(jnp.finfo(a.dtype).eps)
     opposite = (n2 < 1) & (dot(normal, normal) <= least * least)
     length = jnp.sqrt(jnp.where(opposite, 1, n2))
@@ -171,10 +178,11 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
 def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | None = None) -> Mat3:
     """Return the Karcher mean: the rotation that minimises Σ w_i |angle to R_i|².
 
-    **Arguments:** `matrices` (n, 3, 3) rotations within a quarter turn of the mean: it is then
-    unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative. **Returns:**
-    (3, 3). Its first and second derivatives come from the last two Newton steps alone. **Raises:**
-    as `so3.check` for known matrices; `ValueError` for weights that are negative or all zero.
+    **Arguments:** `matrices` (n, 3, 3) rotations within a quarter turn of the mean: the mean is
+    then unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative.
+    **Returns:** (3, 3). Its first and second derivatives come from the last two Newton steps alone.
+    **Raises:** as `so3.check` for known matrices; `ValueError` for weights that are negative or all
+    zero.
 
     >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -225,14 +233,14 @@ def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
 def scale_to_order_one(x: Array) -> Array:
     """Return the array multiplied by a power of two that brings its largest entry near 1.
 
-    It serves formulas of ratios, in which the scale cancels: no product overflows.
+    Formulas of ratios, in which the scale cancels, use this function: no product then overflows.
     """
     return power_of_two_scale(jnp.max(jnp.abs(x))) * x
 
 
 def checked_weights(weights: ArrayLike | None, rows: Array, description: str) -> Array:
-    """Return one weight for each row of `rows`, 1 where `weights` is `None`; known weights must
-    have a positive sum.
+    """Return one weight for each row of `rows`: `weights`, or ones if `weights` is `None`; known
+    weights must have a positive sum.
     """
     if rows.shape[0] == 0:
         raise ValueError(f"{description}: wanted at least one row, got none")
@@ -247,8 +255,9 @@ def checked_weights(weights: ArrayLike | None, rows: Array, description: str) ->
 
 
 def _quartic(b: Mat3) -> tuple[Scalar, Scalar]:
-    """Return λ, the sum of the singular values (signed by the determinant), and ζ, of a matrix `b`
-    of Frobenius norm 1 (Markley 1993).
+    """Return two numbers of a matrix `b` of Frobenius norm 1 (Markley 1993): λ, the sum of the
+    singular values, in which the smallest has the sign of the determinant; and ζ = ½ (λ² − 1) λ −
+    det b.
     """
     det, adjugate = determinant(b), cofactors(b)
     flat = 4 * (adjugate * adjugate).sum()
@@ -279,7 +288,8 @@ def nearest_rotation(b: Mat3) -> Mat3:
     kappa = 0.5 * (root * root - 1)
     rough = ((kappa + 1) * b + root * cofactors(b) - product(b, product(b.T, b))) / zeta
     q = matrix_to_quaternion(rough)
-    # The root of the quartic may have half its digits; Newton steps on the group correct that.
+    # The root of the quartic may have only half its digits; Newton steps on the group then give all
+    # digits.
     for _ in range(3):
         r = quaternion.to_matrix(q)
         turn = solve(_curvature(r, b), 2 * vee(product(r.T, b)))

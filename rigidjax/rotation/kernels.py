@@ -22,7 +22,8 @@ from rigidjax.rotation.linalg3 import (
 )
 from rigidjax.rotation.stumpff import arctan_ratio, inverse_kernel, stumpff
 
-# Inlined in whatever is being traced, so that XLA and `jax.grad` see no boundary.
+# The compiled functions are inlined in whatever is being traced, so that XLA and `jax.grad` see no
+# boundary.
 _compiled = partial(jax.jit, inline=True)
 
 
@@ -50,7 +51,9 @@ def vector_to_matrix(v: Vec3) -> Mat3:
 
 @_compiled
 def matrix_to_quaternion(m: Mat3) -> Quat:
-    """Return the canonical unit quaternion q of a rotation matrix, by the largest row of 4 q qᵀ."""
+    """Return the canonical unit quaternion q of a rotation matrix m, computed from the largest row
+    of 4 q qᵀ.
+    """
     a, b, c, d, e, f, g, h, i = entries(m)
     w, x, y, z = 1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i
     wx, wy, wz, xy, yz, zx = h - f, c - g, d - b, b + d, f + h, c + g
@@ -66,7 +69,7 @@ def matrix_to_quaternion(m: Mat3) -> Quat:
 
 @jax.custom_jvp
 def _log(q: Quat) -> Vec3:
-    """Return the shortest rotation vector of q, the same for −q."""
+    """Return the shortest rotation vector of the quaternion q, which is also that of −q."""
     w, x, y, z = parts = components(power_of_two_scale(*components(q)) * q)
     n2 = x * x + y * y + z * z
     # With n² = x² + y² + z², the tangent of θ/2 is n/|w|, of θ/4 n/a, of θ/8 n times `inverse`:
@@ -117,7 +120,7 @@ def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar | float) -> Mat3:
 
 
 def left_jacobian_inverse(v: Vec3) -> Mat3:
-    """Return the matrix 1 − ½ hat v + g (hat v)², with g of `inverse_kernel`."""
+    """Return the matrix 1 − ½ hat v + g (hat v)², where g is `inverse_kernel(|v|²)`."""
     t = square(parts := components(v))
     return hat_polynomial(parts, jnp.full_like(t, -0.5), inverse_kernel(t))
 

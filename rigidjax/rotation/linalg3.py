@@ -1,9 +1,9 @@
 """Compute with vectors and 3×3 matrices, written on components.
 
-`@` on 3×3 matrices is slow in gradients on CPU and runs in TF32 on some GPUs; these functions avoid
-both. Range: the products in a formula (of two entries in `cross`, `dot`, `product` and `apply`, of
-three in `determinant`, of four in `solve`) must be finite. Entries from 1e-75 to 1e75 are always in
-range (float32: 1e-9 to 1e9).
+`@` on 3×3 matrices is slow in gradients on CPU and runs in TF32 on some GPUs; the functions of this
+module avoid `@`. Range: the products in a formula (of two entries in `cross`, `dot`, `product` and
+`apply`, of three in `determinant`, of four in `solve`) must be finite. Entries from 1e-75 to 1e75
+are always in range (float32: 1e-9 to 1e9).
 """
 
 import functools
@@ -53,8 +53,8 @@ def dot_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
 
 
 def square(v: Sequence[Scalar]) -> Scalar:
-    """Return the squared length of a triple of scalars, computed once since costly functions take
-    it.
+    """Return the squared length of a triple of scalars; it is computed once, because costly
+    functions use the result.
     """
     return compute_once(dot_components(v, v))
 
@@ -62,8 +62,9 @@ def square(v: Sequence[Scalar]) -> Scalar:
 def power_of_two_scale(*parts: Scalar) -> Scalar:
     """Return a power of two that brings the largest of some scalars near 1, with derivative zero.
 
-    It serves formulas that do not depend on the length of their argument. The argument multiplied
-    by this power of two keeps all its digits, and its squares do not overflow.
+    Formulas that do not depend on the length of an argument use this function. The argument
+    multiplied by the power of two keeps all digits, and the squares of its components do not
+    overflow.
     """
     sizes = [jnp.abs(lax.stop_gradient(part)) for part in parts]
     info = jnp.finfo(sizes[0].dtype)

@@ -1,9 +1,9 @@
 """Convert modified Rodrigues parameters σ = n tan(θ/4), and their shadow set.
 
-Three numbers without a sine, regular up to a full turn, where σ is infinite. σ and its shadow
-−σ/|σ|² are the same rotation; a switch at |σ| = 1 keeps θ ≤ π. Source: Schaub & Junkins, 2018,
-Analytical Mechanics of Space Systems, sec. 3.5.2. Range: any σ; with rates, both up to 1e75
-(float32: 1e9).
+The parameters are three numbers, found without a sine and regular up to a full turn, where σ is
+infinite. σ and its shadow −σ/|σ|² are the same rotation; a switch at |σ| = 1 keeps θ ≤ π. Source:
+Schaub & Junkins, 2018, Analytical Mechanics of Space Systems, sec. 3.5.2. Range: any σ; in
+functions of rates, σ and the rates up to 1e75 (float32: 1e9).
 """
 
 import jax.numpy as jnp

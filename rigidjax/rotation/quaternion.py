@@ -1,15 +1,16 @@
 """Compute with unit quaternions (w, x, y, z), scalar first: q turns body vectors into world
 vectors.
 
-q and −q are the same rotation. `log`, and every error computed with it, gives the same bits for
-both. The maps take one quaternion and do not normalise it, so that they cost little in a vector
-field; `check` is for data from outside. Maps refuse known values, not traced ones.
+q and −q are the same rotation. `log`, and every error computed with `log`, gives the same bits for
+q and −q. The functions of this module take one quaternion and do not normalise it, so that they
+cost little in a vector field; `check` is for data from outside. The functions check only known
+values, not traced values.
 
 Range: functions of a quaternion or axis of any length (`normalise`, `log`, `angle`, `about_axis`)
 take lengths from 1e-307 to 1e308 (float32: 1e-37 to 1e38). An angle beyond 1/ε, 4.5e15 rad
-(float32: 8.4e6), has no correct digit: `exp` and the functions that use it refuse it. A traced one
-gives an arbitrary rotation, and NaN beyond 1e150 (1e18). Vectors and rates beside a unit quaternion
-may have components up to 1e307 (1e37).
+(float32: 8.4e6), has no correct digit: `exp` and the functions that use `exp` refuse such an angle.
+A traced angle beyond 1/ε gives an arbitrary rotation, and NaN beyond 1e150 (1e18). Vectors and
+rates beside a unit quaternion may have components up to 1e307 (1e37).
 """
 
 from collections.abc import Sequence
@@ -138,10 +139,10 @@ def check(
 ) -> Float[Array, "*batch 4"]:
     """Normalise a quaternion from outside, or refuse it.
 
-    **Arguments:** `q` (..., 4), scalar first, or a `Rotation` of SciPy; `name` its name in
-    messages. **Returns:** the quaternion, with length 1 to round-off. **Raises:** `ValueError`
-    (under `jit` `equinox.error_if`) for NaN, zero, and a length off by more than 1e-6 (float32:
-    1e-3).
+    **Arguments:** `q` (..., 4), scalar first, or a `Rotation` of SciPy; `name` the name of the
+    argument in messages. **Returns:** the quaternion, with length 1 to round-off. **Raises:**
+    `ValueError` (under `jit` `equinox.error_if`) for NaN, zero, and a length off by more than 1e-6
+    (float32: 1e-3).
 
     >>> check(jnp.array([1.0, 0.0, 0.0, 1e-9])).tolist()[0]
     1.0
@@ -177,7 +178,7 @@ def to_xyzw(q: QuatLike) -> Float[Array, "4"]:
 def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
     """Return the rotation by an angle about an axis (notes, eqs 17, 18).
 
-    **Arguments:** `axis` (3,) of any length; `angle` rad, right-handed about it. **Raises:**
+    **Arguments:** `axis` (3,) of any length; `angle` rad, right-handed about `axis`. **Raises:**
     `ValueError` for an axis of zero, for NaN, and for an angle as `exp`.
 
     >>> about_axis(jnp.array([0.0, 0.0, 2.0]), jnp.pi).round(12).tolist()
@@ -260,7 +261,7 @@ def normalise(q: QuatLike) -> Quat:
 
 
 def canonical(q: QuatLike) -> Quat:
-    """Return that one of `q` (4,) and −q whose first nonzero component is positive.
+    """Return `q` (4,) or −q: the one whose first nonzero component is positive.
 
     >>> canonical(jnp.array([-1.0, 0.0, 0.0, 0.0])).tolist()
     [1.0, -0.0, -0.0, -0.0]
@@ -272,9 +273,9 @@ def canonical(q: QuatLike) -> Quat:
 def angle(q: QuatLike) -> Scalar:
     """Return the angle of a rotation, rad, in [0, π]; q and −q give the same bits.
 
-    **Arguments:** `q` (4,) of any length. The angle is 2 atan2(|q_v|, |q_w|). At the identity it
-    has no derivative: 0 is returned, the shortest subgradient. **Raises:** `ValueError` for zero or
-    NaN.
+    **Arguments:** `q` (4,) of any length. The angle is 2 atan2(|q_v|, |q_w|). At the identity the
+    angle has no derivative: the derivative 0 is returned, the shortest subgradient. **Raises:**
+    `ValueError` for zero or NaN.
 
     >>> round(float(angle(exp(jnp.array([0.0, 1e-9, 0.0]))) * 1e9), 9)
     1.0
@@ -282,7 +283,8 @@ def angle(q: QuatLike) -> Scalar:
     q = require_direction(_checks.array_of_shape(q, (4,), "q", hint=_HINT), "q")
     w, *u = components(power_of_two_scale(*components(q)) * q)
     n2 = dot_components(u, u)
-    # At the identity atan2 and the root get ones, not zeros: their derivative would be 0/0 = NaN.
+    # At the identity the arguments of atan2 and of the root are replaced by ones: at zero the
+    # derivative would be 0/0 = NaN.
     there = n2 != 0
     half = jnp.arctan2(jnp.sqrt(jnp.where(there, n2, 1)), jnp.abs(w))
     return jnp.where(there, 2 * half, 0)
@@ -304,8 +306,8 @@ def from_matrix(matrix: Mat3Like) -> Quat:
 
     **Arguments:** `matrix` (3, 3) rotation, body → world. **Returns:** (4,) with w ≥ 0: the largest
     of the four rows of 4 q qᵀ, normalised (Shepperd 1978, doi:10.2514/3.55767b). No case loses
-    digits; the derivative uses that row only. **Raises:** as `so3.check` for known values; nothing
-    is checked inside `jit`, `grad` and `vmap`.
+    digits; the derivative uses the largest row only. **Raises:** as `so3.check` for known values;
+    nothing is checked inside `jit`, `grad` and `vmap`.
 
     >>> from_matrix(jnp.diag(jnp.array([-1.0, -1.0, 1.0]))).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -318,7 +320,8 @@ def _rotate_by(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
     """Return the vector y turned by the quaternion (w, u): y + 2 (w u×y + u×(u×y))."""
     across = cross_components(u, y)
     again = cross_components(u, across)
-    # Each component is computed once: else the torque repeats all of them for each of its own.
+    # Each component is computed once: otherwise XLA would compute all three again for each
+    # component of a torque.
     return jnp.stack(barrier([y[i] + 2 * (w * across[i] + again[i]) for i in range(3)]))
 
 

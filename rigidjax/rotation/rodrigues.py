@@ -1,9 +1,9 @@
 """Convert Rodrigues (Gibbs, Cayley) parameters g = n tan(θ/2).
 
-Rational in both directions, and without a double cover. They are infinite at a half turn, for which
-`is_singular` tests. M = (1 + hat g)(1 − hat g)⁻¹ is Cayley's transform. Source: Schaub & Junkins,
-2018, Analytical Mechanics of Space Systems, sec. 3.5.1. Range: any g; with rates, both up to 1e75
-(float32: 1e9).
+The conversions to and from a rotation matrix are rational, and a rotation has only one g. The
+parameters are infinite at a half turn, for which `is_singular` tests. M = (1 + hat g)(1 − hat g)⁻¹
+is Cayley's transform. Source: Schaub & Junkins, 2018, Analytical Mechanics of Space Systems, sec.
+3.5.1. Range: any g; in functions of rates, g and the rates up to 1e75 (float32: 1e9).
 """
 
 import jax.numpy as jnp
@@ -44,7 +44,7 @@ def to_quaternion(g: Vec3Like) -> Quat:
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
-    """Return the parameters of a rotation `matrix` (3, 3), unchecked; infinite at a half turn.
+    """Return the parameters of a rotation `matrix` (3, 3), unchecked; g is infinite at a half turn.
 
     >>> from_matrix(jnp.eye(3)).tolist()
     [0.0, 0.0, 0.0]

@@ -53,9 +53,9 @@ def exp(v: Vec3Like) -> Mat3:
 def log(matrix: Mat3Like) -> Vec3:
     """Return the shortest rotation vector of a rotation matrix, rad, |v| ≤ π.
 
-    **Arguments:** `matrix` (3, 3) rotation. **Returns:** (3,), by the quaternion: correct to
-    round-off, with its derivatives, from 0 to π. At a half turn the first nonzero component is
-    positive. **Raises:** as `check` for known values.
+    **Arguments:** `matrix` (3, 3) rotation. **Returns:** (3,), computed by the quaternion of the
+    matrix; values and derivatives are correct to round-off from 0 to π. At a half turn the first
+    nonzero component is positive. **Raises:** as `check` for known values.
 
     >>> bool(abs(log(exp(jnp.array([0.1, 0.2, 0.3]))) - jnp.array([0.1, 0.2, 0.3])).max() < 1e-15)
     True
@@ -64,8 +64,8 @@ def log(matrix: Mat3Like) -> Vec3:
 
 
 def left_jacobian(v: Vec3Like) -> Mat3:
-    """Return J_l with exp(v + dv) = exp(J_l dv) exp(v) to first order: the turn by dv in the world
-    frame.
+    """Return the left Jacobian J_l, with exp(v + dv) = exp(J_l dv) exp(v) to first order: J_l dv is
+    the small turn in the world frame.
 
     **Arguments:** `v` (3,) rotation vector, rad. J_l = 1 + B hat v + C (hat v)², C = (θ − sin θ)/θ³
     (Chirikjian 2012, doi:10.1007/978-0-8176-4944-9; Solà 2018, eq 145). **Raises:** as `exp`.
@@ -79,8 +79,8 @@ def left_jacobian(v: Vec3Like) -> Mat3:
 
 
 def right_jacobian(v: Vec3Like) -> Mat3:
-    """Return J_r with exp(v + dv) = exp(v) exp(J_r dv) to first order, of `v` (3,), rad; J_r =
-    J_l(v)ᵀ (Solà 2018, eq 143).
+    """Return the right Jacobian J_r of `v` (3,), rad, with exp(v + dv) = exp(v) exp(J_r dv) to
+    first order; J_r = J_l(v)ᵀ (Solà 2018, eq 143).
 
     >>> right_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -113,10 +113,11 @@ def right_jacobian_inverse(v: Vec3Like) -> Mat3:
 def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
     """Return the angle of the rotation from a to b, rad, in [0, π].
 
-    **Arguments:** `a`, `b` (3, 3) rotations. Computed by atan2 of the quaternion of aᵀb, it is
-    right from 1e-12 to π (arccos of the trace is useless below 1e-8). At a = b it has no
-    derivative: 0 is returned, the shortest subgradient. For a loss take |log(aᵀb)|², which is
-    smooth. **Raises:** `ValueError` for NaN, and for matrices far from a rotation.
+    **Arguments:** `a`, `b` (3, 3) rotations. The angle is computed by atan2 of the quaternion of
+    aᵀb, and is right from 1e-12 to π (arccos of the trace is useless below 1e-8). At a = b the
+    angle has no derivative: the derivative 0 is returned, the shortest subgradient. For a loss take
+    |log(aᵀb)|², which is smooth. **Raises:** `ValueError` for NaN, and for matrices far from a
+    rotation.
 
     >>> round(float(distance(jnp.eye(3), exp(jnp.array([0.0, 3e-9, 0.0]))) * 1e9), 9)
     3.0
@@ -137,7 +138,7 @@ def _relative_rotation(a: Mat3, b: Mat3) -> Mat3:
 def about_axis(axis: Vec3Like, angle: ScalarLike) -> Mat3:
     """Return the rotation exp(γ J_y) by an angle γ about an axis y (notes, eqs 17, 18).
 
-    **Arguments:** `axis` (3,) of any length; `angle` rad, right-handed about it. **Raises:** as
+    **Arguments:** `axis` (3,) of any length; `angle` rad, right-handed about `axis`. **Raises:** as
     `quaternion.about_axis`.
 
     >>> about_axis(jnp.array([0.0, 0.0, 2.0]), jnp.pi / 2).round(12)[0].tolist()
@@ -255,11 +256,11 @@ def uniform(key: PRNGKeyArray, dtype: DTypeLike = float) -> Mat3:
 def check(
     matrix: Float[ArrayLike, "*batch 3 3"], *, name: str = "matrix"
 ) -> Float[Array, "*batch 3 3"]:
-    """Return a matrix from outside unchanged if it is a rotation; refuse any other.
+    """Return a matrix from outside unchanged if it is a rotation; refuse any other matrix.
 
-    **Arguments:** `matrix` (..., 3, 3); `name` its name in messages. **Raises:** `ValueError`
-    (under `jit` `equinox.error_if`) for NaN, a left-handed frame (det < 0), and |MᵀM − 1| above
-    1e-6 (float32: 1e-3). `project` gives the nearest rotation.
+    **Arguments:** `matrix` (..., 3, 3); `name` the name of the matrix in messages. **Raises:**
+    `ValueError` (under `jit` `equinox.error_if`) for NaN, a left-handed frame (det < 0), and |MᵀM −
+    1| above 1e-6 (float32: 1e-3). `project` gives the nearest rotation.
 
     >>> check(jnp.eye(3)).shape
     (3, 3)

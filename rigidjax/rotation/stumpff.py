@@ -80,14 +80,14 @@ def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
     remainder = jnp.clip(remainder, -2.0, 2.0)
     value = _polynomial(k, jnp.where(far, remainder * remainder, t), limit)
     value = value * jnp.where(far, remainder, 1) if k else value
-    # The sign enters by a division, not a product: XLA on CPU computes a quotient once, but repeats
-    # a polynomial for each use.
+    # The value is divided by the sign, not multiplied: XLA on CPU computes a quotient once, but
+    # repeats a polynomial for each use.
     sign = parity(turns)
     return value / jnp.where(far, sign * theta if k else sign, 1)
 
 
 def half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Return n and r with angle = nπ + r, |r| ≤ π/2; the tangent of r is that of the angle."""
+    """Return n and r with angle = nπ + r, |r| ≤ π/2; in derivatives n is constant."""
     turns = jax.lax.stop_gradient(jnp.round(angle * (1 / math.pi)))
     # Cody & Waite 1980: n × head and n × middle are exact, so that r keeps the digits of the angle.
     head, middle, tail = _PI_PARTS[np.dtype(angle.dtype)]
@@ -108,7 +108,9 @@ def _polynomial(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, ".
 
 
 def _horner(coefficients: list[float], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the polynomial of x with these coefficients, the constant first (Horner's scheme)."""
+    """Return the polynomial of x with the given `coefficients`, of which the constant is the first
+    (Horner's scheme).
+    """
     value = jnp.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         value = value * x + coefficient

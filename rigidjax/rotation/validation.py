@@ -1,7 +1,8 @@
-"""Check input: matrices and quaternions that are no rotation are refused.
+"""Check input: refuse matrices and quaternions that are no rotation.
 
-The maps do not check traced values: the checks make a batch of 1e5 logarithms five times slower.
-`so3.check` and `quaternion.check` do, inside and outside of `jit`; call them on data from outside.
+The functions of `quaternion` and `so3` do not check traced values: the checks would make a batch of
+1e5 logarithms five times slower. `so3.check` and `quaternion.check` check all values, inside and
+outside of `jit`; call these functions on data from outside.
 """
 
 import jax.numpy as jnp
@@ -50,18 +51,18 @@ def require_turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
 
 
 def _largest_component(v: Float[Array, "*n"]) -> float:
-    # The result is NaN if an entry is. It is one call of NumPy only, because it runs before every
-    # map that is called outside of `jit`.
+    # The result is NaN if an entry is NaN. The function makes one call of NumPy only, because it
+    # runs before every conversion that is called outside of `jit`.
     return float(np.abs(np.asarray(v)).max())
 
 
 def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
-    """Refuse any matrix but a rotation, with the determinant or the error in the message."""
+    """Refuse any matrix but a rotation; the message shows the determinant or the error."""
     m = _checks.require_finite(m, name)
     known = _checks.is_known(m)
     xp, values = (np, np.asarray(m)) if known else (jnp, m)
     rows = [values[..., i, :] for i in range(3)]
-    # Entries of 1e200 are refused as any others, without NumPy's warning.
+    # Entries of 1e200 are refused like other wrong entries, without a warning of NumPy.
     with np.errstate(over="ignore", invalid="ignore"):
         det = (rows[0] * xp.cross(rows[1], rows[2])).sum(-1)
         gram = (values[..., :, :, None] * values[..., :, None, :]).sum(-3)
@@ -77,7 +78,7 @@ def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[A
 
 
 def require_near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"]:
-    """Refuse a known quaternion whose length is not 1 to `limit`."""
+    """Refuse a known quaternion whose length differs from 1 by more than `limit`."""
     if _checks.is_known(q):
         length = float(np.linalg.norm(np.asarray(q, float)))
         words = f"{name}: wanted a unit quaternion (w, x, y, z), got one of length {length:.6g}"
@@ -87,9 +88,12 @@ def require_near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Ar
 
 
 def require_unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
-    """Return a quaternion scaled to length 1 if its length is nearly 1; refuse any other."""
+    """Return a quaternion scaled to length 1 if its length is nearly 1; refuse any other
+    quaternion.
+    """
     q = _checks.require_finite(q, name)
-    # Under `jit` JAX traces what is computed from known numbers, too; NumPy does not.
+    # Use NumPy for known numbers: under `jit`, JAX would trace what is computed from known numbers,
+    # too.
     xp = _checks.namespace(q)
     with np.errstate(over="ignore"):
         length = xp.sqrt((xp.asarray(q) ** 2).sum(-1, keepdims=True))

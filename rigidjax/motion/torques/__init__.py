@@ -1,4 +1,4 @@
-"""Provide torques and forces. Each declares the smallest state that it acts on."""
+"""Provide torques and forces, each of which declares the smallest state that it acts on."""
 
 from rigidjax._names import show
 from rigidjax.motion.torques.base import AbstractTorque as AbstractTorque, Wrench as Wrench

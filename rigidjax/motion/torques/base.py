@@ -28,7 +28,8 @@ from rigidjax.motion.torques.states import FrozenLaw, require_frozen
 
 
 class Wrench(eqx.Module):
-    """Hold a force on the centre of mass and a torque about it: the value of a force model.
+    """Hold a force on the centre of mass and a torque about the centre of mass: the value of a
+    force model.
 
     **Arguments:** `force` (3,) N, **world** frame; `torque` (3,) N m, **body** frame, about the
     centre of mass; none by default.
@@ -56,18 +57,17 @@ class AbstractTorque(eqx.Module):
 
     Optional members. `rate_free`: the torque does not depend on the body rate, and
     `rigidjax.solvers.Splitting4` and others can be used. For `rigidjax.conserved`: a method
-    `energy(t, state, body)`, J, if it has a potential; `steady`: it does not depend on time; `axis`
-    (3,), world frame, about which it has no torque; a method `internal_momentum(t)` (3,), N m s,
-    body frame, the momentum inside a body on which no external torque acts. `jump_times` (n,), s:
-    the torque jumps or has a kink there.
+    `energy(t, state, body)`, J, if the torque has a potential; `steady`, true if the torque does
+    not depend on time; `axis` (3,), world frame, along which the torque has no component; a method
+    `internal_momentum(t)` (3,), N m s, body frame, the momentum inside a body on which no external
+    torque acts. `jump_times` (n,), s: the times at which the torque jumps or has a kink.
 
     **States of its own** (a motor's speed, a wheel, a bias that drifts): give the torque `state0`,
-    a tree of arrays or a method `(t, state, body)` that returns one, and a method
-    `rate(t, own, state, body)`, their derivative. The torque is then called as
-    `(t, state, body, own)`. `simulate` (`sol.own`), `batch.rollout`, `batch.simulate`
-    and `identify.fit` integrate them with the body's state. A function of
-    time inside a torque may have states, too (`Lagged`); it is called as `(t, own)`. No base class
-    is needed:
+    a tree of arrays or a method `(t, state, body)` that returns one, and a method `rate(t, own,
+    state, body)`, the derivative of these states. The torque is then called as `(t, state, body,
+    own)`. `simulate` (`sol.own`), `batch.rollout`, `batch.simulate` and `identify.fit` integrate
+    the states of the torque with the body's state. A function of time inside a torque may have
+    states, too (`Lagged`); it is called as `(t, own)`. No base class is needed:
 
     >>> import equinox as eqx
     >>> class Fading(eqx.Module):
@@ -89,7 +89,7 @@ class AbstractTorque(eqx.Module):
 
 
 class AbstractForce(eqx.Module):
-    """Define a force on a `Rigid` with `MassProperties`: as `AbstractTorque`, but it returns a
+    """Define a force on a `Rigid` with `MassProperties`: like `AbstractTorque`, but the value is a
     `Wrench`.
     """
 
@@ -174,8 +174,8 @@ def require_state_type(torque: Torque, state: object) -> None:
 
 
 def require_scene(law: Torque | None, state: object, body: object) -> None:
-    """Raise an error unless the arguments are a torque or `None`, a state that it can act on, and a
-    body.
+    """Raise an error unless the arguments are a torque or `None`, a state that the torque can act
+    on, and a body.
     """
     _checks.require_single(state, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid")
     if law is not None:
@@ -186,8 +186,8 @@ def require_scene(law: Torque | None, state: object, body: object) -> None:
 
 
 def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
-    """Return the torque's value (3,), N m, body frame. **Raises:** `TypeError` for a force, which
-    needs a `Rigid`.
+    """Return the value of the torque (3,), N m, body frame. **Raises:** `TypeError` for a force,
+    which needs a `Rigid`.
     """
     force, value = force_and_torque(torque, t, state, body)
     if force is not None:
@@ -201,14 +201,15 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
 def force_and_torque(
     law: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> tuple[Vec3 | None, Vec3]:
-    """Return the force on the centre of mass (N, world frame, or `None`), and the torque about it
-    (N m, body frame).
+    """Return two things: the force on the centre of mass (N, world frame, or `None`); and the
+    torque about the centre of mass (N m, body frame).
     """
     require_scene(law, state, body)
     dtype = state.omega.dtype
     t = _checks.array_of_shape(t, (), "t").astype(dtype)
     name = f"torque {getattr(law, 'law_name', type(law).__name__)}"
-    # A table in float64 must not lift a float32 solve, nor stop it under strict promotion.
+    # A table in float64 must not turn a float32 solve into a float64 solve, nor stop the solve
+    # under strict promotion.
     try:
         result = in_precision(law, dtype)(t, state, in_precision(body, dtype))
     except AttributeError as wrong:
@@ -217,8 +218,8 @@ def force_and_torque(
             raise
         hint = "; a subclass of AbstractTorque declares the state that it reads by feels"
         raise TypeError(told + hint) from wrong
-    # The test is not by class: torques of moving frames return forces of a class of their own,
-    # since they do not import this module.
+    # The test is not by class: torques of moving frames do not import this module, and return
+    # forces of another class.
     if hasattr(result, "force"):
         return result.force.astype(dtype), result.torque.astype(dtype)
     value = _checks.array_of_shape(result, (3,), name, hint="body-frame N m")
@@ -234,8 +235,8 @@ _HIGHER = {
 
 
 def missing_state_message(caller: str, error: AttributeError) -> str | None:
-    """Return the message for a user's function that read a part which its state lacks; `None` for
-    any other error.
+    """Return the message for the `error` of a user's function that read a part which the state
+    lacks; return `None` for any other error.
     """
     if error.name not in _HIGHER or not isinstance(error.obj, HasSpin):
         return None
@@ -245,8 +246,8 @@ def missing_state_message(caller: str, error: AttributeError) -> str | None:
 
 
 def require_one_law(law: Torque) -> None:
-    """Raise `ValueError` for a field whose shape is not that of one torque, such as a batch made by
-    `jax.vmap`.
+    """Raise `ValueError` if a field of the torque `law` has the shape of many torques, such as in a
+    batch made by `jax.vmap`.
     """
     if not type(law).__module__.startswith(__package__ or ""):
         return
@@ -272,7 +273,9 @@ def in_precision(tree: PyTree, dtype: DTypeLike) -> Any:
 
 
 def vector_at(source: PyTree, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:
-    """Return `source`, a constant vector, or its value at `t` if it is a function of time."""
+    """Return `source`, if it is a constant vector, or the value of `source` at `t`, if it is a
+    function of time.
+    """
     return _checks.array_of_shape(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
@@ -299,8 +302,8 @@ def constant_or_callable(source: object, name: str, size: int = 3) -> Any:
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:
-    """Return the times at which a torque or a function of time jumps, s; empty if there are
-    none.
+    """Return the times at which a torque or a function of time jumps, s; an empty array if there
+    are no jumps.
     """
     times = getattr(source, "jump_times", None)
     return jnp.zeros(0) if times is None else times
@@ -348,7 +351,7 @@ def broadcast_to_each(value: NumbersLike, count: int, name: str) -> Array:
 
 
 def length_or_zero(v: Vec3) -> Scalar:
-    """Return |v|, with derivative 0 at v = 0, as a factor of |v| v."""
+    """Return |v|, with the derivative 0 at v = 0; this is right for |v| as a factor in |v| v."""
     v = _checks.array_of_shape(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

@@ -57,7 +57,8 @@ class Chebyshev(eqx.Module):
         place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
         i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 1)
         x = 2 * (place - i.astype(place.dtype)) - 1
-        # Without the barrier XLA on CPU reads the table again for every number computed from it.
+        # Without the barrier, XLA on CPU reads the table again for every number that is computed
+        # from the row.
         x, row = barrier((x, self.coefficients[i]))
         value, before = jnp.zeros_like(row[:, 0]), jnp.zeros_like(row[:, 0])
         for n in range(terms - 1, 0, -1):

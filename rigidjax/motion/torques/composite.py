@@ -20,7 +20,7 @@ from rigidjax.rotation.linalg3 import apply, components, cross, dot, solve
 
 
 class Sum(eqx.Module):
-    """Add several torques and forces; the sum needs the largest state of its parts.
+    """Add several torques and forces; the sum needs the largest of the states that the parts need.
 
     **Arguments:** `*parts` torques, forces, your own callables. **Raises:** `TypeError` for a part
     that cannot be called; `ValueError` for an empty sum.
@@ -86,17 +86,19 @@ class ChangingInertia(eqx.Module):
     **Arguments:** `inertia` kg m², body frame, about the point that the body turns about (the
     centre of mass of a `Rigid`): a function of time, t → (3, 3), such as `Linear(times, tensors)`,
     or a Module with `feels` (as torques have) of `(t, state, body)`, such as `Tide`. `simulate`
-    integrates the momentum under a function of time: where it jumps, `jnp.where(t < t1, I0, I1)`,
-    the momentum stays. Elsewhere (`rigidjax.batch.rollout`), and of a Module with `feels`, the
-    derivative along the motion is taken, which has no jumps. A tensor that no body has (not
-    symmetric, or with moments that are not positive or break the triangle inequality) becomes NaN,
-    which ends the run. `torque` all other torques, or `None`: give them here, not beside it in a
-    `Sum`, because their τ acts on I, and they get the body with I.
+    integrates the momentum under a function of time: where the inertia jumps, as in `jnp.where(t <
+    t1, I0, I1)`, the momentum does not change. Elsewhere (`rigidjax.batch.rollout`), and of a
+    Module with `feels`, the derivative along the motion is taken, which has no jumps. A tensor that
+    no body has (not symmetric, or with moments that are not positive or break the triangle
+    inequality) becomes NaN, which ends the run. `torque` all other torques, or `None`: give all
+    other torques here, not in a `Sum` with this object, because they act on the body with the
+    inertia I.
 
     A function of time replaces the inertia of the body given to `simulate`. Parts that move inside
-    must have no momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend
-    in a straight line from the centre; else add their momentum as a `Flywheel` to `torque`. Ejected
-    fuel carries its share of İΩ away: then add İΩ to `torque`.
+    must have no momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend in a straight
+    line from the centre; otherwise add the momentum of the moving parts as a `Flywheel` to
+    `torque`. Ejected fuel carries momentum away, at the rate İΩ for its part of İ: in this case add
+    İΩ to `torque`.
 
     Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; the momentum `R I(t) Ω` is conserved
     without τ.
@@ -147,7 +149,7 @@ class ChangingInertia(eqx.Module):
             now = tensor_or_nan(self.tensor(t, here, body).astype(omega.dtype))
             return apply(now, omega), now
 
-        # Ω̇ is not known yet, but d(IΩ)/dt is linear in it: one linearisation, evaluated along four
+        # Ω̇ is not known yet, but d(IΩ)/dt is linear in Ω̇: one linearisation, evaluated along four
         # directions (t with q, and each e_i of Ω), gives a linear system for Ω̇.
         (held, now), along = jax.linearize(momentum, t, q, omega)
         still, first = jnp.zeros((1, 3), omega.dtype), jnp.eye(4, 1, dtype=omega.dtype)
@@ -159,7 +161,8 @@ class ChangingInertia(eqx.Module):
         if self.torque is not None:
             force, torque = base.force_and_torque(self.torque, t, state, with_tensor(body, now))
             turning = turning + torque
-        # The equations of the body use its own inertia: return the torque that gives them this Ω̇.
+        # The equations of motion use the inertia of the body, not I: return the torque with which
+        # they give this Ω̇.
         fixed = tensor_of(body)
         slope = solve(slopes[1:].T, turning)
         torque = apply(fixed, slope) - cross(apply(fixed, omega), omega)

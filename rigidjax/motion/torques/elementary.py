@@ -35,8 +35,8 @@ class InSpace(base.AbstractTimeTorque):
     """Apply a torque given in the world frame: `τ = Rᵀ τ_w`.
 
     **Arguments:** `torque` τ_w, N m, world frame: (3,), or a callable Module of time, t → (3,),
-    such as `Linear(times, values)`. A constant τ_w adds τ_w t to the angular momentum; the part of
-    the momentum across τ_w is conserved.
+    such as `Linear(times, values)`. A constant τ_w adds τ_w t to the angular momentum; the
+    component of the momentum normal to τ_w is conserved.
 
     >>> turned = rj.Attitude([0.0, 1.0, 0.0, 0.0], [0.0, 0, 0])  # half a turn about x
     >>> InSpace([0.0, 0.0, 1.0])(0.0, turned, None).tolist()  # in body axes
@@ -82,7 +82,7 @@ class QuadraticDamping(_AbstractRateTorque):
 
     **Arguments:** `coefficient` (3,) c along the body axes, N m s²/rad². A rate about a principal
     axis decays as Ω0/(1 + c Ω0 t/I) (Newton, Principia, Book II, Section II). At Ω = 0 the first
-    derivative is zero, and a second does not exist.
+    derivative is zero, and a second derivative does not exist.
 
     >>> QuadraticDamping([0.1, 0.1, 0.1]).coefficient.shape
     (3,)

@@ -50,9 +50,10 @@ class UniformGravity(base.AbstractForce):
 class CentralGravity(base.AbstractForce):
     """Attract a body of some size to a centre at the world's origin.
 
-    `U = −μ m/r − (μ/2r³)(Tr I − 3 r̂·I_w r̂)` (MacCullagh's formula), `I_w = R I Rᵀ`, with its
-    force and its torque: the energy and the momentum about the origin are conserved. **Arguments:**
-    `mu` μ = G M, m³/s². Source: Hughes, Spacecraft Attitude Dynamics, §8.1.
+    `U = −μ m/r − (μ/2r³)(Tr I − 3 r̂·I_w r̂)` (MacCullagh's formula), `I_w = R I Rᵀ`. The force and
+    the torque of this potential act on the body: the energy and the angular momentum about the
+    origin are conserved. **Arguments:** `mu` μ = G M, m³/s². Source: Hughes, Spacecraft Attitude
+    Dynamics, §8.1.
 
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], 1e-9 * jnp.eye(3))
     >>> state = rj.Rigid([2.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
@@ -72,14 +73,16 @@ class CentralGravity(base.AbstractForce):
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         r, up, pull, trace = _seen_from_centre(state, body.inertia.tensor)
         strength, along = self.mu / r / r, dot(up, pull)
-        # The force is −∂U/∂x in body axes: a part along r̂, and a part along I r̂.
+        # The force is −∂U/∂x in body axes: the sum of a vector along r̂ and a vector along I r̂.
         radial = -strength * (body.mass + 1.5 * (trace - 5 * along) / r / r)
         force = radial * up - 3 * strength / r / r * pull
         return base.Wrench(quaternion.rotate(state.q, force), cross(3 * strength / r * up, pull))
 
 
 def _seen_from_centre(state: HasPose, tensor: Mat3) -> tuple[Scalar, Vec3, Vec3, Scalar]:
-    """Return r, r̂ in body axes, I r̂, and Tr I."""
+    """Return four things: the distance r from the origin; the unit vector r̂ in body axes; I r̂;
+    and Tr I.
+    """
     r = jnp.sqrt(dot(state.x, state.x))
     up = quaternion.rotate_inverse(state.q, state.x / r)
     return r, up, apply(tensor, up), tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
@@ -90,9 +93,9 @@ class Drag(base.AbstractForce):
 
     **Arguments:** `coefficient` k = ½ ρ C_d A, kg/m; `centre` (3,) c, the point where the drag
     acts, m, body frame, from the centre of mass (`τ = c × RᵀF`); `wind` (3,) the fluid's velocity,
-    m/s, world frame. The body's rotation does not enter u; for its drag take `Damping` or
-    `QuadraticDamping`. At u = 0 the first derivative is zero, and a second does not exist. Source:
-    Newton, Principia, Book II, Section II.
+    m/s, world frame. The rotation of the body does not enter u; for the drag on the rotation take
+    `Damping` or `QuadraticDamping`. At u = 0 the first derivative is zero, and a second derivative
+    does not exist. Source: Newton, Principia, Book II, Section II.
 
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([0.0, 0, 0], [3.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
@@ -167,7 +170,8 @@ class Rotors(base.AbstractForce):
         n = base.vector_at(self.speeds, t, "speeds", self.spins.shape[0]).astype(self.spins.dtype)
         square = n * n
         lift, twist = self.thrust * square, self.spins * self.drag * square
-        # The sum is written out rotor by rotor: they are few, and in a batch array sums are slow.
+        # The sum is written out rotor by rotor: there are few rotors, and in a batch array sums are
+        # slow.
         force, torque = jnp.zeros(3, lift.dtype), jnp.zeros(3, lift.dtype)
         for i in range(self.spins.shape[0]):
             along = self.directions[i]
@@ -180,13 +184,13 @@ class BodyDrag(base.AbstractForce):
     """Apply drag along the body's axes: `F = −R (a ∘ u + b ∘ |u| u)`, `τ = c × RᵀF`, `u = Rᵀ (v −
     wind)`.
 
-    **Arguments:** `linear` a (3,) kg/s, such as that of rotors in a cross-flow; `quadratic` b (3,)
-    kg/m, with |u| u computed axis by axis; `centre` c (3,), the point where the drag acts, m, body
-    frame, from the centre of mass; `wind` (3,) the air's velocity, m/s, world frame. For a sphere
-    see `Drag`.
+    **Arguments:** `linear` a (3,) kg/s, such as the drag of rotors in a cross-flow; `quadratic` b
+    (3,) kg/m, with |u| u computed axis by axis; `centre` c (3,), the point where the drag acts, m,
+    body frame, from the centre of mass; `wind` (3,) the air's velocity, m/s, world frame. For a
+    sphere see `Drag`.
 
     Source: Faessler, Franchi and Scaramuzza 2018, eq 5, doi:10.1109/LRA.2017.2776353, for the
-    linear part; Hoerner 1965, Fluid-Dynamic Drag, for the other.
+    linear part; Hoerner 1965, Fluid-Dynamic Drag, for the quadratic part.
 
     >>> fast = rj.Rigid([0.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
     >>> BodyDrag([1.0, 1, 1], [0.5, 0, 0])(0.0, fast, rj.shapes.sphere(1.0, 1.0)).force.tolist()

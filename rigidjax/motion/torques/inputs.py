@@ -1,4 +1,6 @@
-"""Name inputs of a torque, set in a loop or as functions of time; delay and lag them."""
+"""Name inputs of a torque, which are set in a loop or as functions of time; delay and lag functions
+of time.
+"""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeVar
@@ -21,8 +23,8 @@ Law = TypeVar("Law")
 class Input(eqx.Module):
     """Name an input of a torque, which the loop sets: see `rollout(…, inputs=…)`.
 
-    **Arguments:** `name` its key among the inputs. A torque calls the input with the time; `bind`
-    gives it a value.
+    **Arguments:** `name` the key of the input among all inputs. A torque calls the input with the
+    time; `bind` gives the input a value.
 
     >>> law = bind(Input("speed"), {"speed": jnp.array([3.0])})
     >>> law(0.0)
@@ -55,11 +57,12 @@ class Delayed(eqx.Module):
     **Arguments:** `source` a function of time such as `Held(times, values)`, or `Input("u")`;
     `delay` s, one number, which may be free in a fit; negative for an earlier time.
 
-    Its `jump_times` move with the delay. `simulate` ends steps there: its derivative by the delay
-    is correct although the source jumps. `rigidjax.batch.rollout` and `identify.fit`, for inputs
-    that are samples, hold them through a step; a delayed sample changes inside the step, which is
-    split in two there, and the result is exact as well. The first sample also holds before its
-    time, the last sample after it. `Linear` and `Series` can be delayed anywhere.
+    The `jump_times` move with the delay. `simulate` ends steps at these times: the derivative with
+    respect to the delay is correct although the source jumps. `rigidjax.batch.rollout` and
+    `identify.fit` hold sampled inputs constant over each step; a delayed sample changes inside a
+    step, and so the step is split in two at the change, and the result is exact as well. The first
+    sample also holds before its time, the last sample after it. `Linear` and `Series` can be
+    delayed anywhere.
 
     **Raises:** `TypeError` for a source that has states (delay its input: `Lagged(Delayed(u, d),
     T)`); `ValueError` for a delay as long as the record.
@@ -93,7 +96,9 @@ class Delayed(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times, s, at which the value jumps: the source's times plus the delay."""
+        """Return the times, s, at which the value jumps: the jump times of the source plus the
+        delay.
+        """
         times = jumps_of(self.source)
         return times + self.delay.astype(times.dtype)
 
@@ -104,8 +109,9 @@ class Delayed(eqx.Module):
 class Lagged(eqx.Module):
     """Apply a lag of first order, such as a motor's: `T dy/dt = u(t) − y`, whose value is y.
 
-    The lag has a state of its own, integrated with the body's (see `AbstractTorque`). It replaces a
-    function of time: `Rotors(…, speeds=Lagged(Input("speeds"), 0.05))`.
+    The lag has a state of its own, which is integrated with the state of the body (see
+    `AbstractTorque`). A `Lagged` can replace any function of time: `Rotors(…,
+    speeds=Lagged(Input("speeds"), 0.05))`.
 
     **Arguments:** `source` u, a function of time such as `Held(times, values)`, or `Input("u")`;
     `time` T, s, > 0: one number, or one for each channel, which may be free in a fit; `start` y at
@@ -133,7 +139,7 @@ class Lagged(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times, s, at which the source jumps: the value has a kink there."""
+        """Return the times, s, at which the source jumps: at these times the value has a kink."""
         return jumps_of(self.source)
 
     def state0(self, t: ScalarLike, state: PyTree, body: Body) -> Array:
@@ -152,8 +158,8 @@ class Lagged(eqx.Module):
 
 
 def require_no_jumps(source: PyTree, name: str) -> None:
-    """Raise `TypeError` for held samples, which a torque with their derivative cannot use: it loses
-    the jumps.
+    """Raise `TypeError` for held samples: a torque that uses the derivative of its source would
+    lose the jumps.
 
     An `Input` is checked when it has a value: `bind` may give it a smooth function of time.
     """
@@ -180,8 +186,8 @@ def _checked_channels(value: NumbersLike, name: str) -> Array:
 
 
 class InputRow(NamedTuple):
-    """Hold the inputs in (a part of) a step: `values` by name, and `delayed` of each `Delayed`
-    input.
+    """Hold the inputs during a step, or a part of a step: `values` by name, and in `delayed` the
+    value of each `Delayed` input.
     """
 
     values: Mapping[str, Any]
@@ -189,7 +195,7 @@ class InputRow(NamedTuple):
 
 
 def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
-    """Return the torque with values instead of its `Input`s.
+    """Return the torque with values in place of each `Input`.
 
     **Arguments:** `law` a torque, a force, or a tree of them; `inputs` by name an array, which is
     constant, or a function of time such as `Held(times, values)`; `None` changes nothing.
@@ -226,7 +232,9 @@ def _is_delayed(node: PyTree) -> bool:
 
 
 def delays_of(law: PyTree) -> list[tuple[str, Array]]:
-    """Return the name and the delay of each delayed input, in their order in the torque."""
+    """Return the name and the delay of each delayed input, in the order of these inputs in the
+    torque.
+    """
     nodes = jax.tree.leaves(law, is_leaf=_is_delayed)
     return [(node.source.name, node.delay) for node in nodes if _is_delayed(node)]
 
@@ -238,8 +246,8 @@ def inputs_of(law: PyTree) -> list[str]:
 
 
 def require_inputs(law: PyTree, inputs: object) -> Mapping[str, Any]:
-    """Return `inputs` as a mapping, empty for `None`. **Raises:** `ValueError` unless they are
-    exactly those that the torque reads.
+    """Return `inputs` as a mapping, empty for `None`. **Raises:** `ValueError` unless the names are
+    exactly the names that the torque reads.
     """
     read, mapping = inputs_of(law), {} if inputs is None else inputs
     if not isinstance(mapping, Mapping):

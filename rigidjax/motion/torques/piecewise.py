@@ -60,8 +60,8 @@ class Held(_Table):
 
     **Arguments:** `times` (n,) s, increasing; `values` (n, *k), where row i holds from time i on,
     and the first row also before its time. Both may be traced. The value jumps at `times`: a torque
-    that reads it passes its `jump_times` on, and adaptive steps end there. For fixed steps give the
-    samples to `rigidjax.batch.rollout` as `inputs`. **Raises:** as `Linear`.
+    that reads the value has these `jump_times`, too, and adaptive steps end at these times. For
+    fixed steps give the samples to `rigidjax.batch.rollout` as `inputs`. **Raises:** as `Linear`.
 
     >>> Held([0.0, 1.0, 2.0], [[5.0], [6.0], [7.0]])(1.5)
     Array([6.], dtype=float64)
@@ -109,15 +109,15 @@ class Tabulated(AbstractTorque):
 
 
 class Pulses(AbstractTorque):
-    """Apply a torque in constant pieces, such as thruster firings; it is zero before and after
-    them.
+    """Apply a torque in constant pieces, such as thruster firings; it is zero before the first edge
+    and after the last.
 
     **Arguments:** `edges` (n + 1,) s, increasing; `torques` (n, 3) N m, body frame: row i acts from
     edge i until edge i + 1. One pulse: `Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]])`. **Raises:**
     `ValueError` for another number of edges, edges that do not increase, NaN.
 
-    The torque at a time has no derivative by the edges. A motion has one if the solver ends its
-    steps at `jump_times`. `impulse` is exact.
+    The torque at a time has no derivative with respect to the edges. A motion has this derivative
+    if the solver ends steps at `jump_times`. `impulse` is exact.
 
     >>> Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]]).impulse
     Array([0. , 0. , 1.5], dtype=float64)
@@ -149,7 +149,7 @@ class Pulses(AbstractTorque):
 
 
 def _row_index(times: Float[Array, " n"], t: Scalar) -> Any:
-    """Return the index of the last row whose time is not after t. At a jump this is the piece that
+    """Return the index of the last row whose time is not after t: at a jump, this is the row that
     begins.
     """
     # For a short table a comparison with all rows stays inside the solver's one kernel; a binary
@@ -159,7 +159,7 @@ def _row_index(times: Float[Array, " n"], t: Scalar) -> Any:
 
 
 def _interpolate_line(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar) -> Array:
-    """Return the value at `t` of the straight line between the rows around it."""
+    """Return the value at `t` of the straight line between the rows before and after `t`."""
     i = jnp.clip(_row_index(times, t), 0, times.shape[0] - 2)
     part = (t - times[i]) / (times[i + 1] - times[i])
     return rows[i] + part * (rows[i + 1] - rows[i])

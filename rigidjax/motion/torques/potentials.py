@@ -48,7 +48,7 @@ class HeavyTop(base.AbstractTorque):
 
     @property
     def axis(self) -> Vec3:
-        """Return gravity, world frame: there is no torque about it."""
+        """Return gravity, world frame: the torque has no component along gravity."""
         return self.gravity
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
@@ -70,15 +70,16 @@ class GravityGradient(base.AbstractTimeTorque):
     Rᵀr/r`.
 
     **Arguments:** `mu` μ = G M of the point mass, m³/s²; `position` r (3,) m, world frame, from the
-    body to it (without `harmonics` the sign does not matter): constant, or a callable Module of
-    time, t → (3,), for an orbit; `harmonics` the body's gravity of higher degree n in body axes: an
-    array (2n + 1,) for each n = 3, 4, …, kg mⁿ, its mass times Rⁿ times the Stokes coefficients
-    (Cn0, Cn1, Sn1, Cn2, Sn2, …), not normalised, for a radius R. For several masses take a `Sum`.
+    body to the point mass (without `harmonics` the sign does not matter): constant, or a callable
+    Module of time, t → (3,), for an orbit; `harmonics` the body's gravity of higher degree n in
+    body axes: an array (2n + 1,) for each n = 3, 4, …, kg mⁿ, the mass of the body times Rⁿ times
+    the Stokes coefficients (Cn0, Cn1, Sn1, Cn2, Sn2, …), not normalised, for a radius R. For
+    several masses take a `Sum`.
 
-    Hₙ is the solid harmonic `Σ rⁿ Pₙₘ (C cos mλ + S sin mλ)` of degree n. The potential is
-    `U = (μ/2r³)(3 u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`, MacCullagh's formula and its next terms; it
-    does not change the orbit itself. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein,
-    Poole and Safko, Classical Mechanics, eq 5.86; Montenbruck and Gill, Satellite Orbits, §3.2.
+    Hₙ is the solid harmonic `Σ rⁿ Pₙₘ (C cos mλ + S sin mλ)` of degree n. The potential is `U =
+    (μ/2r³)(3 u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`, MacCullagh's formula and its next terms; the torque
+    does not change the orbit. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein, Poole
+    and Safko, Classical Mechanics, eq 5.86; Montenbruck and Gill, Satellite Orbits, §3.2.
 
     >>> law, body = GravityGradient(1.0, [1.0, 1.0, 0.0]), rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
@@ -106,7 +107,9 @@ class GravityGradient(base.AbstractTimeTorque):
 
     @property
     def axis(self) -> Vec3 | None:
-        """Return the position, world frame, if it is constant: there is no torque about it."""
+        """Return the position, world frame, if it is constant: the torque has no component along
+        the position.
+        """
         source: Any = self.position
         return None if callable(source) else source
 
@@ -130,8 +133,8 @@ class GravityGradient(base.AbstractTimeTorque):
         return cross(u, pull)
 
     def _point_mass_in_body(self, t, state):
-        """Return the direction of the point mass in body axes, μ/r³, and (μ/rⁿ⁺¹) ∇Hₙ of each
-        degree.
+        """Return three things: the direction of the point mass in body axes; μ/r³; and (μ/rⁿ⁺¹) ∇Hₙ
+        for each degree n.
         """
         r = base.vector_at(self.position, t, "position")
         distance = jnp.sqrt(dot(r, r))
@@ -203,7 +206,9 @@ class MagneticDipole(base.AbstractTimeTorque):
 
     @property
     def axis(self) -> Vec3 | None:
-        """Return the field, world frame, if it is constant: there is no torque about it."""
+        """Return the field, world frame, if it is constant: the torque has no component along the
+        field.
+        """
         source: Any = self.field
         return None if callable(source) else source
 
@@ -222,8 +227,8 @@ class FromPotential(base.AbstractTorque):
     """Apply the torque of any potential `U(q)` of the attitude, by differentiation.
 
     **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world. The
-    torque about body axis i is `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about it.
-    Source: Landau and Lifshitz, Mechanics, §34.
+    torque about body axis i is `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about this
+    axis. Source: Landau and Lifshitz, Mechanics, §34.
 
     >>> class Spring(eqx.Module):
     ...     k: Array

@@ -22,8 +22,8 @@ Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
 class Series(eqx.Module):
     """Interpolate evenly spaced samples by a cubic spline; it is constant beyond the ends.
 
-    A division finds the interval of a time, so that the spline costs little in a solver; its
-    derivative is continuous, so that a step may pass over a sample.
+    A division finds the interval of a time, so that the spline costs little in a solver; the
+    derivative of the spline is continuous, so that a step may pass over a sample.
 
     **Arguments:** `times` (n,) s, evenly spaced to 1e-6 of a step and the round-off of times such
     as 1.7e9 s; `values` (n,) or (n, k). Both may be traced: a spline can be made under `jit`,
@@ -69,12 +69,14 @@ class Series(eqx.Module):
         """Return the value at `t` (s), () or (k,)."""
         n = self.values.shape[0]
         place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
-        # `jnp.where`, not `jnp.clip`: at an end itself clip has half the derivative.
+        # `jnp.where` is used, not `jnp.clip`: exactly at an end, `jnp.clip` has half the
+        # derivative.
         place = jnp.where(place < 0.0, 0.0, jnp.where(place > n - 1.0, n - 1.0, place))
         i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, n - 2)
         s = place - i.astype(place.dtype)
         rows = self.values[i], self.values[i + 1], self.slopes[i], self.slopes[i + 1]
-        # Without the barrier XLA on CPU reads the table again for every number computed from it.
+        # Without the barrier, XLA on CPU reads the table again for every number that is computed
+        # from the rows.
         s, (left, right, out, into) = barrier((s, rows))
         # Cubic Hermite form, from the left value.
         bend = 3.0 * (right - left) - 2.0 * out - into
@@ -94,8 +96,8 @@ def _known_numbers(value: NumbersLike, name: str) -> Any:
 def _slopes_at_samples(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
     """Return the change per step at each sample, s_i.
 
-    It solves s₋ + 4 s + s₊ = 3 (v₊ − v₋) for the neighbours − and + of each sample; at the ends the
-    condition is "not a knot".
+    The changes solve s₋ + 4 s + s₊ = 3 (v₊ − v₋), where − and + are the neighbours of each sample
+    and v the values; at the ends the condition is "not a knot".
     """
     n = values.shape[0]
     v = values.reshape(n, -1)

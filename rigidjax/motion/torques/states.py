@@ -1,8 +1,9 @@
-"""Handle torques and functions of time with states of their own, integrated with the body's.
+"""Handle torques and functions of time with states of their own, which are integrated with the
+state of the body.
 
-Such a torque has `state0`, its initial states, and `rate`, their derivative; its states are its
-last argument. `freeze` inserts the states: for the rest of the library the result is a plain
-torque.
+Such a torque has `state0`, the initial states, and `rate`, the derivative of the states; the states
+are the last argument of the torque. `freeze` inserts the states: for the rest of the library the
+result is a plain torque.
 """
 
 from collections.abc import Callable
@@ -33,7 +34,8 @@ class FrozenLaw(eqx.Module):
         return self.law(*args, self.own[0])
 
     def __getattr__(self, name: str) -> Any:
-        # The torque's members (`feels`, `jump_times`, …), except those of its states.
+        # The members of the torque (`feels`, `jump_times`, …) are handed on, except the members
+        # that belong to states.
         if name.startswith("_") or name in ("law", "own", "state0", "rate"):
             raise AttributeError(name)
         attribute = getattr(self.law, name)
@@ -61,9 +63,11 @@ def require_stateless(law: PyTree, user: str) -> None:
 
 
 def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
-    """Return the torque with its states inserted, so that it can be called without them.
+    """Return the torque `law` with the states `own` inserted, so that it can be called as a torque
+    without states.
 
-    `own` has the states of each part that has some, in their order in `law`, inner parts first.
+    `own` holds the states of each part of `law` that has states, in the order of these parts in
+    `law`, inner parts first.
     """
     queue = list(own)
     if not queue and not has_states(law):
@@ -119,7 +123,7 @@ def rates_of_own_states(
 
 
 def require_frozen(law: PyTree) -> None:
-    """Raise `TypeError` for a torque with states that is called without them."""
+    """Raise `TypeError` for a torque with states that is called without the states."""
     if has_own_states(law):
         words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate and "
         words += "identify.fit integrate them; elsewhere call it with its states last"
@@ -127,7 +131,9 @@ def require_frozen(law: PyTree) -> None:
 
 
 def _insert_states(tree: PyTree, own_of: Callable[[Any], Any]) -> Any:
-    """Return the tree with all states inserted; `own_of(node)` gives them, inner parts first."""
+    """Return the tree with all states inserted; `own_of(node)` returns the states of a node and is
+    called for inner nodes first.
+    """
 
     def is_leaf(node: PyTree) -> bool:
         return node is not tree and _holds_states(node)

@@ -20,7 +20,7 @@ from rigidjax.motion.torques.inputs import require_no_jumps
 from rigidjax.motion.torques.states import has_states
 from rigidjax.rotation.linalg3 import cross
 
-# The motor's torque falls to zero near a wheel's top speed.
+# The torque of a motor falls to zero over this fraction of the top speed of the wheel.
 _FADE = 0.05
 
 
@@ -31,9 +31,9 @@ class Flywheel(base.AbstractTimeTorque):
     constant speed, or a callable Module of time, t → (3,), such as `Linear(times, values)`, but not
     a function that jumps (`Held`, samples of an `Input`), because dh/dt acts on the body.
 
-    The body's `Inertia` must fit h. If it includes the wheels as locked, h is their momentum
-    relative to the body. If the wheels' axial moments are subtracted (I − Σ J a aᵀ), h is their
-    whole axial momentum, and dh/dt is the torque of the motors.
+    The body's `Inertia` must fit h. If the inertia includes the wheels as locked, h is the momentum
+    of the wheels relative to the body. If the axial moments of the wheels are subtracted (I − Σ J a
+    aᵀ), h is the whole axial momentum of the wheels, and dh/dt is the torque of the motors.
 
     The momentum in space, `R (IΩ + h)`, is conserved; so is the energy `½ Ω·IΩ` if h is constant.
     Source: Zhukovsky 1885, Volterra 1898; Hughes, Spacecraft Attitude Dynamics, chs. 3, 6.
@@ -83,18 +83,18 @@ class ReactionWheels(base.AbstractTorque):
     - `feedback`: a function `(t, state, speeds) → (R,)`, N m, added to `motor`; or `None`.
     - `max_torque` N m, `max_speed` rad/s, each one number, (R,), or `None` for no limit. The
       motors' torque is limited to `max_torque`. A torque that would bring a wheel beyond
-      `max_speed` decreases to zero over the last 5 % below it, as 6 x⁵ − 15 x⁴ + 10 x³: derivatives
-      of runs that reach it are then accurate to their tolerance (along a straight line: to 1e-4 at
-      `rtol=1e-9`).
+      `max_speed` decreases to zero over the last 5 % below `max_speed`, as 6 x⁵ − 15 x⁴ + 10 x³:
+      derivatives of runs that reach `max_speed` are then accurate to the tolerance of the run
+      (along a straight line: to 1e-4 at `rtol=1e-9`).
     - `viscous` c, N m s/rad, and `coulomb` d, N m, of the bearings, each one number, (R,), or
       `None`: the friction `−c s − d tanh(s/s₀)`; `turn_over` s₀, rad/s: Coulomb friction changes
       its sign smoothly over this speed, for derivatives and long steps.
 
     The states are the wheels' whole axial momenta `h = J (s + a·Ω)`; u is the torque of motor and
-    bearing on a wheel. The body's inertia is **without** J a aᵀ: `without_wheels` subtracts them
-    from an inertia with the wheels locked. The equations are exact for balanced wheels, symmetric
-    about their axes. `R (IΩ + Σ h a)` is conserved for any motor torque; `½ Ω·IΩ + Σ h²/2J` changes
-    by `Σ u s`.
+    bearing on a wheel. The body's inertia is **without** J a aᵀ: `without_wheels` subtracts these
+    terms from an inertia with the wheels locked. The equations are exact for balanced wheels,
+    symmetric about their axes. `R (IΩ + Σ h a)` is conserved for any motor torque; `½ Ω·IΩ + Σ
+    h²/2J` changes by `Σ u s`.
 
     Source: Markley and Crassidis 2014, Fundamentals of Spacecraft Attitude Determination and
     Control, §3.3.5, doi:10.1007/978-1-4939-0802-8; friction: §4.8 there, after Bialke 1998, with
@@ -156,7 +156,7 @@ class ReactionWheels(base.AbstractTorque):
 
     @property
     def steady(self) -> bool:
-        """Return whether the wheels' momenta are constant: then the energy is conserved."""
+        """Return whether the momenta of the wheels are constant: the energy is then conserved."""
         parts = (self.motor, self.feedback, self.viscous, self.coulomb)
         return all(part is None for part in parts)
 
@@ -224,7 +224,8 @@ class ReactionWheels(base.AbstractTorque):
         return cross(self._along(own), state.omega) - self._along(self.torques_of(t, own, state))
 
     def _along(self, numbers: Array) -> Vec3:
-        # The sum is written out wheel by wheel: they are few, and in a batch array sums are slow.
+        # The sum is written out wheel by wheel: there are few wheels, and in a batch array sums are
+        # slow.
         total = jnp.zeros(3, numbers.dtype)
         for i in range(self.axes.shape[0]):
             total = total + numbers[i] * self.axes[i]
@@ -232,8 +233,8 @@ class ReactionWheels(base.AbstractTorque):
 
 
 def _smooth_step(x: Array) -> Array:
-    """Return a smooth step from 0 at x = 0 to 1 at x = 1, whose first two derivatives vanish at
-    both.
+    """Return a smooth step from 0 at x = 0 to 1 at x = 1, whose first two derivatives vanish at x =
+    0 and at x = 1.
     """
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))
 
