@@ -90,7 +90,9 @@ class Film(eqx.Module):
 def _to_mp4(gif: bytes, path: Path) -> None:
     program = shutil.which("ffmpeg")
     if program is None:
-        raise FileNotFoundError("save: a film in .mp4 needs the program ffmpeg; .gif needs nothing")
+        raise FileNotFoundError(
+            "save: a film in .mp4 needs the program ffmpeg; a .gif needs no other program"
+        )
     # The video format needs an even width and height in px.
     even = "scale=trunc(iw/2)*2:trunc(ih/2)*2"
     options = ["-vf", even, "-pix_fmt", "yuv420p", "-movflags", "faststart"]
