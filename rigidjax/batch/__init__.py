@@ -1,17 +1,18 @@
 """Simulate many bodies on one device, on several devices or on several hosts.
 
-    rollout     fixed steps; returns the last states, every k-th state, or a value reduced from them
+    rollout     fixed steps; returns the last states, every k-th state, or a reduced value
     simulate    closed form, adaptive steps, or `Steps`; returns a status for each body
     distributed several processes: `connect`, `share`, `gather`, `total`
 
 Bodies are divided along their first axis among processes (`distributed.share`), then among the
 devices of each process (`devices="all"`), then into chunks, which a device computes one after
 another. Numbers that all bodies share are copied to every device. `distributed.total` adds the sums
-that each process has computed, such as those of a fit or of `reduce=`. Each process writes its own
+that each process has computed, such as the sums of a fit or of `reduce=`. Each process writes its
+own
 states (`distributed.save`), or `distributed.gather` sends all states to every process. Shuffle
 bodies with adaptive steps before `share`, so that no process gets all of the slow ones. When one
-process ends, the others end within `patience` seconds; `distributed.recover` reads the shares that
-were written until then.
+process ends early, every other process ends within `patience` seconds (an argument of
+`distributed.connect`); `distributed.recover` reads the shares that had been written before.
 """
 
 from rigidjax._names import show

@@ -1,6 +1,6 @@
-"""Share the bodies among several hosts, of which each computes its own; only results are sent.
+"""Share bodies among several processes: each process computes its share, and only results are sent.
 
-A share has the same results, to the last bit, as if one process had computed all bodies.
+The results of a share are equal, to the last bit, to those of one process that computes all bodies.
 """
 
 import os
@@ -20,7 +20,7 @@ from rigidjax._names import show
 
 
 def connect(address: str, processes: int, process: int, *, patience: int = 20) -> None:
-    """Connect this process with the others; call it before any other function of JAX.
+    """Connect this process with the other processes of a run, before any other call of JAX.
 
     **Arguments:**
 
@@ -48,12 +48,13 @@ def connect(address: str, processes: int, process: int, *, patience: int = 20) -
 
 
 def share(tree: PyTree) -> PyTree:
-    """Return the rows of this process, ⌈N / processes⌉ or one fewer, of a tree of arrays.
+    """Return the share of this process, ⌈N / processes⌉ rows or one fewer, of each array of a tree.
 
     **Arguments:** `tree` of arrays with a leading axis of N bodies; leave out the numbers that all
     bodies share.
 
-    **Raises:** `ValueError` for fewer bodies than processes.
+    **Raises:** `TypeError` for a leaf without a leading axis; `ValueError` for arrays of different
+    length, and for fewer bodies than processes.
 
     >>> share(jnp.arange(5)).shape
     (5,)
@@ -73,22 +74,24 @@ def share(tree: PyTree) -> PyTree:
 
 
 def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyTree:
-    """Return the rows of all processes, in order, on every process.
+    """Return, on every process, the joined rows of all processes, in the order of the processes.
 
     **Arguments:** `tree` of arrays with the rows of this process, as from `share`; `checkpoint` a
     folder to which `save` first writes the rows of this process. **Returns** the tree with the rows
     of all processes, in host memory.
 
-    **Raises:** `TypeError` for traced arrays; `RuntimeError` if another process has ended. End this
-    process, too, in this case: the arrays of JAX cannot be used any more.
+    **Raises:** `TypeError` for traced arrays; `RuntimeError` if another process has ended. After
+    this
+    error end this process, too: its JAX arrays cannot be used any more.
 
     >>> gather(jnp.arange(3)).tolist()
     [0, 1, 2]
     """
 
     def rows_of_all(leaf: np.ndarray) -> np.ndarray:
-        # Shares differ by one row at most, but only arrays of one shape can be sent: each is filled
-        # to the longest share, and the fill is cut off after it was sent.
+        # Shares differ by one row at most, but only arrays of equal shape can be sent: each share
+        # is filled up to the length of the longest share, and the additional row is cut off
+        # afterwards.
         rows = np.asarray(leaf)
         counts = np.asarray(multihost_utils.process_allgather(jnp.asarray(rows.shape[0])))
         most = int(counts.max())
@@ -100,7 +103,8 @@ def gather(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> Py
 
 
 def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyTree:
-    """Return the sum of each array over all processes: the same bits on every process.
+    """Return the sum of each array of a tree over all processes, equal to the last bit on every
+    process.
 
     **Arguments:** `tree` of arrays, which have the same shapes on every process; `checkpoint` as
     for `gather`.
@@ -117,7 +121,7 @@ def total(tree: PyTree, checkpoint: str | os.PathLike[str] | None = None) -> PyT
 def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
     """Write the rows of this process, a `tree` of arrays, to `folder/share-<process>.npz`.
 
-    The file appears only when it is complete. **Returns** its path.
+    The file appears only when it is complete. **Returns** the path of the file.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -144,8 +148,8 @@ def save(tree: PyTree, folder: str | os.PathLike[str]) -> Path:
 def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
     """Return the trees that `save` wrote to `folder`, one for each process, in order.
 
-    **Arguments:** `like` a tree of the structure of those trees; its arrays are not read. `folder`
-    the folder given to `save`.
+    **Arguments:** `like` a tree with the structure of the saved trees; the values of its arrays are
+    not used; `folder` the folder given to `save`.
 
     **Raises:** `FileNotFoundError` for a folder without shares; `ValueError` for a file that `save`
     did not write, that is cut short, or that has another number of arrays than `like`.
@@ -167,7 +171,8 @@ def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
             with path.open("rb") as raw, np.load(raw) as file:
                 leaves = [file[f"leaf{i}"] for i in range(len(file.files))]
         except Exception as error:
-            # An empty file raises EOFError, one that is cut short BadZipFile or zlib.error.
+            # An empty file raises EOFError; a file that is cut short raises BadZipFile or
+            # zlib.error.
             raise ValueError(f"recover: {path} was not written by save, or is cut short") from error
         if len(leaves) != structure.num_leaves:
             raise ValueError(
@@ -178,7 +183,9 @@ def recover(like: PyTree, folder: str | os.PathLike[str]) -> list[PyTree]:
 
 
 def _copy_to_host(tree: PyTree, name: str) -> PyTree:
-    """Return the tree in host memory; refuse a traced tree, with the `name` of the function."""
+    """Return `tree` with NumPy arrays; raise `TypeError`, with the function's `name`, if it is
+    traced.
+    """
     if not _checks.is_known(tree):
         raise TypeError(
             f"{name}: wanted a tree of known arrays, got one that is traced; {name} sends arrays "
@@ -192,12 +199,15 @@ def _send_arrays(
     tree: PyTree,
     checkpoint: str | os.PathLike[str] | None,
 ) -> PyTree:
-    """Return `send(array)` for every array of the tree; first write the tree to `checkpoint`."""
+    """Return `send(array)` for every array of `tree`; before, write `tree` to the folder
+    `checkpoint`.
+    """
     if checkpoint is not None:
         try:
             save(tree, checkpoint)
         except OSError as error:
-            # A full disk is no reason to lose the rows: they can still be sent.
+            # A full disk is no reason to lose the rows: the rows can still be sent to the other
+            # processes.
             warnings.warn(
                 f"gather, total: the share of this process could not be written to {checkpoint} "
                 f"({error.strerror or error}); it is sent nevertheless",

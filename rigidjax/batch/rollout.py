@@ -1,4 +1,4 @@
-"""Simulate a batch with fixed steps, differentiably in both modes and in bounded memory."""
+"""Simulate many bodies with fixed steps, differentiably in forward and reverse mode."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, overload
@@ -28,12 +28,12 @@ from rigidjax.solve.steppers import stepper_of
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 Reduced = TypeVar("Reduced")
-# (carried value, time, state of one body) → next carried value.
+# The type of `reduce`: (carried value, time, state of one body) → next carried value.
 Reduce = Callable[[Any, Array, Any], Any]
-# By name, samples of each body (N, steps, *k), each held through a step.
+# The type of `inputs`: samples (N, steps, *k) by name; each sample is constant during its step.
 Inputs = Mapping[str, ArrayLike] | None
 Solver = AbstractExplicit | Magnus4 | AbstractSplitting | None
-# Bytes that reverse mode may keep of all chunks together.
+# The largest size, bytes, of the intermediate states that reverse mode stores for all chunks.
 _MOST_KEPT = 2**23
 
 
@@ -98,48 +98,62 @@ def rollout(
 
     **Arguments:**
 
-    - `bodies`: one `Inertia` (3, 3) for all, or one per body (N, 3, 3), kg m², body frame;
-      `MassProperties` likewise for `Rigid`.
+    - `bodies`: an `Inertia`, (3, 3) for all bodies or (N, 3, 3), one each, kg m², body frame;
+      likewise a `MassProperties` for `Rigid` states.
     - `states0`: `Spin`, `Attitude` or `Rigid` whose arrays have a leading axis N, at `t0`.
-    - `step_size` s, the same for all; `num_steps` a whole number, a constant of the program.
+    - `step_size`: s, equal for all bodies.
+    - `num_steps`: a Python `int`; another number compiles again.
     - `torque`: `None`, or any torque that `rigidjax.simulate` takes. All bodies share its arrays
       unless `torque_axes` says otherwise.
-    - `torque_axes`: which arrays of the torque have a leading axis N: `None` none, 0 all
-      (`jax.vmap` of its constructor makes such a torque), a function that picks them
-      (`lambda law: law.speed`, for a `Sum` `lambda law: law.parts[1]`, several in a tuple), or a
-      tree like the torque with 0 for those that have it and `None` for the others.
-    - `solver`: `None` takes `Magnus4` for a free attitude, or a torque that does not depend on the
-      attitude, and else `rigidjax.solvers.RungeKutta4`. It may be any explicit method of
-      `rigidjax.solvers`; the steps agree with those of `diffrax` to round-off. Runs of 10 000
-      steps or more add with compensation (the digits that an addition loses are carried to the
-      next), so that round-off grows as √n, not as n.
-    - `save_every`: `None` returns the last states only; k the states after k, 2k, … steps.
-    - `reduce`, `initial`: a function `(carried, t, state) → carried` of one body, called after
-      every `save_every` steps (one, by default), and the first carried value. No states are
-      kept then. Define the function once, best as a Module: each new function compiles again.
+    - `torque_axes`: which arrays of the torque have a leading axis N: `None` none; 0 all
+      (`jax.vmap` of the torque's constructor makes such a torque); a function that selects arrays
+      or parts of the torque (`lambda law: law.speed`, for a `Sum` `lambda law: law.parts[1]`,
+      several in a tuple); or a tree like the torque, with 0 for each array that has the axis N and
+      `None` for each array that has not.
+    - `solver`: `None` takes `Magnus4` for the attitude of a free body or under a torque that does
+      not
+      depend on the attitude, and `rigidjax.solvers.RungeKutta4` otherwise. Any explicit method of
+      `rigidjax.solvers` may be given; its steps agree with those of `diffrax` to round-off. Runs of
+      10 000 steps or more use compensated addition (the digits that one addition loses enter the
+      next addition), so that the round-off of n steps grows as √n, not as n.
+    - `save_every`: `None` returns the last states only; a number k returns the states after k, 2k,
+      … steps.
+    - `reduce`, `initial`: a function `(carried, t, state) → carried` of one body, which is called
+      after
+      every `save_every` steps (every step by default), and the first carried value. With `reduce`
+      only the last states are returned. Define the function once, best as a Module: each new
+      function compiles again.
     - `t0`: s, the time of the first step.
     - `inputs`: the inputs of the torque, by the names of its `rigidjax.torques.Input`s: arrays (N,
-      num_steps, *k) whose row i is held exactly through step i of that body, or, for a
-      `rigidjax.torques.Delayed` input, after its delay.
+      num_steps, *k). Row i of a body is constant during step i; a `rigidjax.torques.Delayed` input
+      is late by its delay.
     - `chunk`: the number of bodies computed at a time; `None` takes as many as fill the
-      first-level cache (64 in float64), and on a GPU all. It changes the last digits at most.
-    - `devices`: `None` for the default device, `"all"` for those of this process, or a sequence
-      of devices, which get equal shares of the bodies. It changes the last digits at most.
+      first-level cache (64 in float64) on CPU, and all bodies on a GPU. Another `chunk` changes the
+      last digits at most.
+    - `devices`: `None` for the default device, `"all"` for all devices of this process, or a
+      sequence of devices. The devices get equal shares of the bodies. Another choice changes the
+      last digits at most.
 
     **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
-    (N, num_steps // save_every); with `reduce` the pair (last states, carried). Under a torque with
-    states of its own they have `.motion` and `.own`.
+    (N, num_steps // save_every); with `reduce` the pair (last states, carried
+    value). Under a torque with states of its own the returned states have two fields: `.motion`, of
+    the type of `states0`, and `.own`, the states of the torque.
 
-    The memory needed is that of the inputs, of the results and of one chunk, also in reverse mode,
-    which takes five to ten times as long as the value. Derivatives are the exact derivatives of the
-    steps, in both modes. A body that becomes NaN changes no other body. For calls inside your own
+    The memory needed is that of the inputs, of the results and of one chunk, also in reverse mode.
+    A
+    reverse-mode gradient takes five to ten times as long as the value. In forward and reverse mode
+    the
+    derivatives are the exact derivatives of the discrete steps. A body that becomes NaN changes no
+    other body. For calls inside your own
     `jax.jit` see `compiler_options`.
 
     **Raises:** `TypeError` if bodies, states, torque and solver do not fit together; `ValueError`
     for shapes that do not agree, an input that is missing or that no torque reads, a step that is
     not positive, or a `save_every` that does not divide `num_steps`. Known numbers are checked too:
     `ValueError` for an inertia that no mass has, for a moment of zero, and for a quaternion that is
-    not unit. A traced inertia of this kind, or one of NaN, makes that body NaN and no other.
+    not unit. A traced inertia of this kind, or of NaN, makes the states of its body NaN and those
+    of no
+    other body.
 
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))
@@ -177,12 +191,13 @@ def _take_steps(
     constants: PyTree,
     numbers: tuple[PyTree, ...],
 ) -> PyTree:
-    """Return what `rollout` returns, from its arguments after they have been checked.
+    """Return what `rollout` returns, from its checked arguments.
 
     **Arguments:** `steps` the solver, the number of steps, the number of steps between two saved
     states, and whether states are saved; `division` the size of a chunk and the mesh of devices;
-    `constants` the leaves of the batch that are no arrays; `numbers` its shared arrays, those of
-    each body with their inputs, the first carried value, the step size and t0.
+    `constants` the leaves of the batch that are no arrays; `numbers` five
+    things: the arrays that all bodies share; the arrays with a row for each body, with the inputs;
+    the first carried value; the step size, s; and t0, s.
     """
     (solver, count, every, keep), (shared, per_body, initial, h, t0) = steps, numbers
 
@@ -195,7 +210,8 @@ def _take_steps(
         stepper = stepper_of(solver, field, state0, count)
 
         def advance(carry: PyTree, first: Array) -> tuple[PyTree, PyTree]:
-            # From one saved state, which is followed by the step `first`, to the next.
+            # This goes from one saved state, which is followed by the step number `first`, to the
+            # next saved state.
             y, carried = carry
             y = march_steps(stepper, h, t0, first, every, y, inputs)
             if reduce is not None:
@@ -216,7 +232,8 @@ def _take_steps(
 
     size = sum(leaf.size for leaf in jax.tree.leaves(per_body[0])) * h.dtype.itemsize
     if size * (count // every) * (every // piece_length(every) + 1) > _MOST_KEPT:
-        # A reverse pass then computes each chunk again, and keeps the states of one chunk only.
+        # With this the reverse pass computes each chunk again, and stores the states of one chunk
+        # only.
         step_body = jax.checkpoint(step_body)
     return map_bodies(step_body, (shared, initial, h, t0), per_body, *division)
 

@@ -1,4 +1,6 @@
-"""Map a function of one body over many: in shares for devices, in chunks that fit the cache."""
+"""Map a function of one body over many bodies, in shares for devices and in chunks for the
+cache.
+"""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -16,22 +18,23 @@ from rigidjax import _checks
 from rigidjax.rotation.barrier import platform
 
 AXIS = "bodies"
-# No device: JAX's default one.
+# The type of `devices`: `None` is JAX's default device.
 Devices = Literal["all"] | Sequence[jax.Device] | None
-# Bytes of an array with one number for each body of a chunk. The arrays of a step then stay in the
-# first-level cache, which holds 32 KB on many cores.
+# The size, bytes, of an array with one number for each body of a chunk. With this size the arrays
+# of a step stay in the first-level cache, which holds 32 KB on many cores.
 _ROW = 512
 # JAX takes this option of XLA only at the outermost jit, and it exists only on CPU.
 _WIDE = {"xla_cpu_prefer_vector_width": 512}
 
 
 def compiler_options() -> dict[str, Any]:
-    """Return options for `jax.jit(f, compiler_options=…)` around calls of `rigidjax.batch`.
+    """Return the best options for `jax.jit(f, compiler_options=…)` of an `f` that calls
+    `rigidjax.batch`.
 
     The options enable 512-bit vectors on CPU, which give 1.5 to 2 times the speed on cores with
-    AVX-512; on other backends there are none. `rollout` and `simulate` use them by themselves if
-    they are called outside of any transformation. JAX takes options only at the outermost `jit`: if
-    that is your own, give them there.
+    AVX-512; on other backends the result is empty. `rollout` and `simulate` use the options by
+    themselves if they are called outside of any transformation. JAX takes options only at the
+    outermost `jit`: if you wrap the call in a `jit` of your own, give the options there.
 
     >>> bool(jax.jit(lambda x: x + 1, compiler_options=compiler_options())(1.0) == 2)
     True
@@ -40,9 +43,10 @@ def compiler_options() -> dict[str, Any]:
 
 
 class CompiledFunction:
-    """Call a compiled function; it has the `compiler_options` if its last argument is known.
+    """Call a function under `jit`, with `compiler_options` if its last argument is known.
 
-    Where that argument is traced, the call stands within another `jit`, where JAX takes no options.
+    If the last argument is traced, the call stands within another `jit`, where JAX takes no
+    options.
     """
 
     def __init__(self, function: Callable[..., Any]):
@@ -51,7 +55,7 @@ class CompiledFunction:
 
     @functools.cached_property
     def _with_options(self) -> Callable[..., Any]:
-        # Made at the first call, since the question which backend there is starts the backend.
+        # This is made at the first call and not at import: `compiler_options` starts JAX's backend.
         options, jit = compiler_options(), cast(Any, eqx.filter_jit)
         return jit(self.function, compiler_options=options) if options else self._without_options
 
@@ -61,7 +65,9 @@ class CompiledFunction:
 
 
 def mesh_of(devices: Devices) -> Mesh | None:
-    """Return a mesh of one axis over `devices` (see `rollout`); `None` for the default device."""
+    """Return a mesh of one axis over `devices` (as in `rollout`), or `None` for the default
+    device.
+    """
     if devices is None:
         return None
     if devices == "all":
@@ -76,15 +82,15 @@ def mesh_of(devices: Devices) -> Mesh | None:
             f"devices: {foreign[0]} belongs to another process; each process computes its share of "
             "the bodies on its own devices (rigidjax.batch.distributed)"
         )
-    # Axes are Auto: with Explicit axes the types of arrays carry the sharding, which `lax.map` does
-    # not accept.
+    # The axis is `Auto`: with an `Explicit` axis the types of arrays contain the sharding, which
+    # `lax.map` does not accept.
     return Mesh(np.array(devices), (AXIS,), axis_types=(AxisType.Auto,))
 
 
 def chunk_of(chunk: int | None, dtype: np.dtype, count: int) -> int:
     """Return the number of bodies that are computed at a time, out of `count`.
 
-    This is `chunk`; for `None` as many as fill the cache on CPU, and all on other backends.
+    It is `chunk` if given; else as many as fill the cache on CPU, and all on other backends.
     """
     if chunk is None:
         small = _ROW // np.dtype(dtype).itemsize
@@ -101,10 +107,11 @@ def map_bodies(
     chunk: int,
     mesh: Mesh | None,
 ) -> PyTree:
-    """Return `function(shared, row)` for the row of each body, stacked along a new first axis.
+    """Return `function(shared, row)` of every body, stacked along a new first axis.
 
-    Arrays of `per_body` have a leading axis of bodies. `chunk` bodies are computed at a time on
-    each device of `mesh`. Devices exchange nothing.
+    **Arguments:** `shared` the arrays that all bodies share; `per_body` arrays with a leading axis
+    of bodies, of which `row` is one row; `chunk` the number of bodies that each device computes at
+    a time; `mesh` the devices, which exchange nothing, or `None` for the default device.
     """
     count = jax.tree.leaves(per_body)[0].shape[0]
     parts = 1 if mesh is None else mesh.devices.size
@@ -125,7 +132,7 @@ def map_bodies(
         return lax.map(call, rows, batch_size=chunk)
 
     def pad(a: Array) -> Array:
-        # The empty places repeat the last body.
+        # The rows that fill the last chunk repeat the last body.
         return a if room == count else jnp.concatenate([a, jnp.repeat(a[-1:], room - count, 0)])
 
     rows = jax.tree.map(pad, per_body)

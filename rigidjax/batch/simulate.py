@@ -1,4 +1,4 @@
-"""Compute the motion of many bodies by the closed form, fixed steps or adaptive steps."""
+"""Compute the motion of many bodies: by the closed form, by fixed steps or by adaptive steps."""
 
 from collections.abc import Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -32,8 +32,9 @@ State = TypeVar("State", Spin, Attitude, Rigid)
 class Steps(NamedTuple):
     """Describe fixed steps, which `simulate` takes instead of times.
 
-    **Fields:** `size` of a step, s; `number` of steps; `save_every`: k saves every k-th state,
-    `None` the last only; `t0` the time of the first step, s.
+    **Fields:** `size` of a step, s; `number` of steps; `save_every` a number k to save the states
+    after k, 2k, … steps, or `None` to save the last states only; `t0` the time of the initial
+    states, s.
 
     >>> Steps(0.01, 1000).number
     1000
@@ -46,17 +47,18 @@ class Steps(NamedTuple):
 
 
 class Batch(eqx.Module, Generic[State]):
-    """Hold the result of `simulate`.
+    """Hold the motion of many bodies, as `rigidjax.batch.simulate` returns it.
 
     **Fields:**
 
     - `ts` (T,): times, s.
     - `ys`: the states at these times, of the type of `states0`, with leading axes (N, T), in the
       order of the given bodies; NaN at times that a body did not reach.
-    - `result`: a `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `nonfinite_input` (no
-      body has these numbers), `max_steps_reached` or `dt_min_reached`.
+    - `result`: a `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `nonfinite_input` (an
+      impossible inertia or state), `max_steps_reached` or `dt_min_reached`.
     - `num_steps` (N,): the number of accepted and rejected steps, 0 for the closed form.
-    - `own`: a tuple of the states of the torques, with the axes of `ys`; `None` without such.
+    - `own`: a tuple of the states that the torques have, with the axes of `ys`; `None` if no torque
+      has a state.
 
     >>> bodies, omega = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0]))), jnp.ones((5, 3))
     >>> rj.batch.simulate(bodies, rj.Spin(omega), [0.0, 1.0]).ys.omega.shape
@@ -90,18 +92,19 @@ def simulate(
 
     **Arguments:**
 
-    - `bodies`, `states0`, `torque`, `torque_axes`, `chunk`, `devices`, and for `Steps` `inputs`: as
-      for `rigidjax.batch.rollout`.
-    - `ts_or_steps`: times (T,), s, increasing or decreasing, of which the first is that of
+    - `bodies`, `states0`, `torque`, `torque_axes`, `chunk`, `devices`, and `inputs` (with `Steps`
+      only): as for `rigidjax.batch.rollout`.
+    - `ts_or_steps`: times (T,), s, increasing or decreasing, which begin with the time of
       `states0`; or `Steps(size, number)` for fixed steps.
     - `solver`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
       under a torque, and the choice of `rollout` for `Steps`. With times any
-      `diffrax.AbstractSolver` may be given; the explicit ones of `rigidjax.solvers` run in a loop
-      of rigidjax, which is faster than that of diffrax.
+      `diffrax.AbstractSolver` may be given; the explicit methods of `rigidjax.solvers` run in a
+      loop of rigidjax, which is faster than the loop of diffrax.
     - `rtol`, `atol`, `max_steps`, `adjoint`: as for `rigidjax.simulate`.
 
-    Bodies of one chunk wait for the slowest of them, so each chunk gets bodies of similar initial
-    rates. Whatever happens to one body, the others get the same results to the last bit.
+    All bodies of a chunk wait for the slowest body of this chunk. Each chunk therefore gets bodies
+    with similar initial rates, which need similar numbers of steps. The results of a body do not
+    depend, to the last bit, on what happens to other bodies.
 
     **Returns** a `Batch`. A run that fails raises no error: look at `result`.
 
@@ -154,11 +157,12 @@ def _simulate_bodies(
     constants: PyTree,
     numbers: tuple[PyTree, PyTree, Array],
 ) -> tuple[Any, ...]:
-    """Return the fields of a `Batch` from `ys` on, by a run of adaptive steps for each body.
+    """Return four things for all bodies: `ys`, `result`, `num_steps` and `own` of a `Batch`.
 
-    **Arguments:** `options` those of `rigidjax.simulate`; `division` the size of a chunk and the
-    mesh of devices; `constants` the leaves of the batch that are no arrays; `numbers` its shared
-    arrays, those of each body, and the times.
+    **Arguments:** `options` keyword arguments of `rigidjax.simulate`, which runs for each body;
+    `division` the size of a chunk and the mesh of devices; `constants` the leaves of the batch that
+    are no arrays; `numbers` the arrays that all bodies share, the arrays with a row for each body,
+    and the times, s.
     """
     (shared, per_body, ts), (chunk, mesh) = numbers, division
 
@@ -172,7 +176,8 @@ def _simulate_bodies(
         return map_bodies(simulate_body, (shared, ts), per_body, chunk, mesh)
 
     def initial_speed(row: PyTree) -> Array:
-        # |Ω| + √|dΩ/dt| at the start, rad/s: the number of steps grows with it.
+        # This is |Ω| + √|dΩ/dt| at the start, rad/s, to sort by: the number of steps grows with
+        # this speed.
         body, state0, torque = one_body(shared, row, constants)
         y0 = with_own_states(body, state0, torque, ts[0])
         slope = motion_of(equations_of_motion(body, y0, torque)(ts[0], y0, None))
@@ -191,7 +196,9 @@ _compiled = CompiledFunction(_simulate_bodies)
 
 @eqx.filter_jit
 def _statuses(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
-    """Return the `result` of each body after fixed steps, from its states `ys`."""
+    """Return the `result` (N,) of each body after fixed steps: `successful`, or why its `ys` are
+    not finite.
+    """
 
     def status(row: PyTree, ys: PyTree) -> dfx.RESULTS:
         result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
@@ -200,26 +207,31 @@ def _statuses(batch: BodyBatch, ys: PyTree) -> dfx.RESULTS:
     return jax.vmap(status)(batch.per_body, ys)
 
 
-# XLA on CPU unrolls loops over bodies to 16 doubles or 32 floats, and the rest of a loop, which is
-# not unrolled, is rounded differently.
+# XLA on CPU computes loops over bodies in groups of 16 doubles or 32 floats; the bodies of an
+# incomplete last group are rounded differently. This is the size of a group of floats.
 _UNROLLED = 32
 
 
 def order_by_key(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:
-    """Return an order of bodies by `key` (N,), with NaN last, and the inverse of that order.
+    """Return two permutations (N,): an order of bodies, in which a chunk has similar keys; and its
+    inverse.
 
-    Chunks of bodies with similar keys go to the `parts` devices in turn. A body keeps its place
-    within a chunk whatever the keys of other bodies are, since rounding depends on the place.
+    **Arguments:** `key` (N,) a number of each body, NaN is the largest; `chunk` the number of
+    bodies of a chunk; `parts` the number of devices, to which consecutive chunks go one after
+    another. The place of a body within its chunk does not depend on the keys of other bodies, since
+    the rounding of its results depends on this place.
     """
     count = key.shape[0]
     chunk = min(chunk, -(-count // parts))
     size = -(-count // (chunk * parts)) * chunk
-    # The positions in the order that fall to the devices, `size` for each; the last may get fewer.
+    # `seats` are the positions in the order, sorted by chunk and then by device; each device has
+    # `size` of them, the last device may have fewer.
     seats = np.arange(size * parts).reshape(-1, parts, chunk).transpose(1, 0, 2).reshape(-1)
     seats = seats[seats < count]
     place = np.arange(count) % chunk
     place = place % _UNROLLED if chunk % _UNROLLED == 0 else place
-    # The bodies of each place are sorted by their keys among the positions with this place.
+    # Bodies with equal `place` are sorted by key and get, in this order, the positions with the
+    # same `place`.
     bodies = jnp.lexsort((key, jnp.asarray(place, jnp.int32)))
     order = jnp.zeros_like(bodies).at[np.lexsort((seats, place))].set(bodies)
     return order, jnp.zeros_like(order).at[order].set(jnp.arange(count, dtype=order.dtype))

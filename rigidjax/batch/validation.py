@@ -1,4 +1,4 @@
-"""Check a batch before anything runs: its shapes, types and known numbers."""
+"""Check the arguments of a batch, before anything runs: shapes, types and known numbers."""
 
 from collections.abc import Callable, Mapping
 from types import ModuleType
@@ -21,15 +21,21 @@ from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.rotation.validation import tolerance
 from rigidjax.solve import validation
 
-# Which arrays of a torque have a row for each body: 0, a function that picks them, or a tree of 0
-# and `None`.
+# The type of `torque_axes`, which says which arrays of a torque have a row for each body: 0 for
+# all, a function that selects the arrays, or a tree of 0 and `None`.
 TorqueAxes = int | Callable[[Any], Any] | PyTree
-# The index of the first wrong body, −1 if there is none, and the function that refuses this body.
+# A check is a pair: the index of the first wrong body, or −1; and a function that raises the error
+# for this body.
 Check = tuple[Any, Callable[[int], None]]
 
 
 class BodyBatch(NamedTuple):
-    """Hold a batch `(body, state0, torque)`, split into three trees with `None` elsewhere."""
+    """Hold a batch, the tree `(bodies, states0, torque)`, split into three trees.
+
+    `shared`, `per_body` and `constants` have `None` for each leaf that is in another of the three
+    trees. `num_bodies` is N, `dtype` the precision of the states, `checks` the checks of known
+    numbers, which `require` completes.
+    """
 
     shared: PyTree  # the arrays that all bodies share
     per_body: PyTree  # the arrays with a row for each body
@@ -41,8 +47,8 @@ class BodyBatch(NamedTuple):
     def require(self) -> None:
         """Raise an error for the first body with a known number that is wrong.
 
-        Call this after the computation was started: the device then checks the bodies while the
-        host prepares the rest, and neither waits for the other.
+        Call this after the computation has been started: the device then checks the bodies while
+        the host works on, and neither waits for the other.
         """
         for index, refuse in self.checks:
             if (i := int(index)) >= 0:
@@ -50,9 +56,11 @@ class BodyBatch(NamedTuple):
 
 
 def one_body(shared: PyTree, row: PyTree, constants: PyTree) -> tuple[Any, Any, Any]:
-    """Return one body, its state and its torque, from `row`, its part of `BodyBatch.per_body`.
+    """Return three things for one body: its inertia or mass properties; its initial state; and its
+    torque.
 
-    A state that is invalid becomes NaN.
+    **Arguments:** `shared` and `constants` of a `BodyBatch`; `row` the row of this body in
+    `per_body`. An invalid state becomes NaN.
     """
     body, state0, torque = eqx.combine(shared, row, constants)
     return body, project_to_group(validation.checked_start(state0, False)), torque
@@ -64,9 +72,10 @@ def check_batch(
     torque: Torque | None,
     torque_axes: TorqueAxes,
 ) -> BodyBatch:
-    """Return the batch of these arguments of `rollout`; refuse wrong types and shapes.
+    """Return the `BodyBatch` of these arguments of `rollout`; raise an error for wrong types and
+    shapes.
 
-    The numbers of many bodies are checked later, by its `require`.
+    Where the numbers are checked on the device, `BodyBatch.require` raises the error, later.
     """
     if not isinstance(states0, Spin | Attitude | Rigid):
         raise TypeError(
@@ -98,8 +107,8 @@ def check_batch(
             f"bodies: wanted one body (3, 3), or one for each of the {count} states, ({count}, 3, "
             f"3), got shape {tensor.shape}"
         )
-    # The tensors are checked before they get the precision of the states: in a higher precision the
-    # rounding of a flat body looks like an inertia that no mass has.
+    # The tensors are checked before they are cast to the precision of the states: in a higher
+    # precision the rounded inertia of a flat body looks like an inertia that no mass has.
     bodies, checks = _check_inertia(bodies)
     if isinstance(states0, HasAttitude):
         checks += _check_unit(states0.q)
@@ -114,14 +123,15 @@ def check_batch(
         _has_row_for_each_body(arrays[2], torque_axes, count),
     )
     per_body, shared = eqx.partition(arrays, axes)
-    # For an Inertia the shape of a row is enough, and to take the row costs as much as many steps.
+    # For an `Inertia` the shape of a row is enough for this check, and taking the row itself would
+    # cost as much time as many steps.
     shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
     row = (lambda a: a[0]) if isinstance(bodies, MassProperties) else shape
     validation.require_fit(*eqx.combine(shared, jax.tree.map(row, per_body), constants))
     validation.warn_of_scale(bodies, torque)
     batch = BodyBatch(shared, per_body, constants, count, dtype, tuple(checks))
     if all(isinstance(index, np.ndarray | np.integer) for index, _ in checks):
-        # Few bodies have been checked on the host: raise before anything is compiled.
+        # Few bodies are checked on the host, so that errors are raised before anything is compiled.
         batch.require()
     return batch
 
@@ -133,9 +143,10 @@ def inputs_of_bodies(
     count: int,
     h: Array,
 ) -> dict[str, Array] | None:
-    """Return the `inputs` of each body, by name (N, steps, *k), in the precision of the states.
+    """Return the `inputs` as arrays (N, count, *k) by name, in the precision of the states.
 
-    Refuse inputs that do not fit the torque, the bodies or the `count` steps of `h` seconds.
+    Raise `ValueError` for inputs that do not fit the torque, the bodies or the `count` steps of `h`
+    seconds. The result is `None` for a torque without inputs.
     """
     for name, delay in delays_of(torque):
         if _checks.is_known((delay, h)):
@@ -160,7 +171,9 @@ def inputs_of_bodies(
 
 
 def _has_row_for_each_body(torque: Torque | None, axes: TorqueAxes, count: int) -> PyTree:
-    """Return a tree of booleans: whether each array of the torque has a row for each body."""
+    """Return a tree of booleans like `torque`: true for an array with a row for each of `count`
+    bodies.
+    """
     if callable(axes) and not isinstance(axes, eqx.Module):
         prefix = _is_picked(torque, axes)
     else:
@@ -183,9 +196,10 @@ def _has_row_for_each_body(torque: Torque | None, axes: TorqueAxes, count: int) 
 
 
 def _is_picked(torque: Torque | None, pick: Callable[[Any], Any]) -> PyTree:
-    """Return a tree of booleans: whether `pick(torque)` contains each array of the torque.
+    """Return a tree of booleans like `torque`: true for an array that `pick(torque)` contains.
 
-    `pick` may return one array, a tuple of arrays, or a part of the torque, with all its arrays.
+    `pick` may return one array, a tuple of arrays, or a part of the torque, which means all arrays
+    of this part.
     """
     leaves, structure = jax.tree.flatten(torque)
     numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
@@ -202,14 +216,14 @@ def _is_picked(torque: Torque | None, pick: Callable[[Any], Any]) -> PyTree:
 
 
 def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
-    """Return the bodies and the check that finds the first whose inertia no mass has.
+    """Return two things: the bodies; and a list with the check for an inertia that no mass has.
 
-    Only known bodies can be refused. Traced ones with such an inertia become NaN.
+    For traced bodies the list is empty, and a body with such an inertia becomes NaN.
     """
     tensor = tensor_of(bodies)
     if not _checks.is_known(tensor):
         return validation.real_or_nan(bodies), []
-    # Within a trace, a known tensor would be traced once JAX has reshaped it.
+    # Under an outer trace the reshape of a known tensor would be traced without this context.
     with jax.ensure_compile_time_eval():
         tensors = tensor.reshape(-1, 3, 3)
 
@@ -223,7 +237,9 @@ def _check_inertia(bodies: Inertia | MassProperties) -> tuple[Any, list[Check]]:
 
 
 def _check_unit(q: Array) -> list[Check]:
-    """Return the check that finds the first known quaternion which is not unit."""
+    """Return a list with the check for a quaternion (N, 4) that is not unit; it is empty if `q` is
+    traced.
+    """
     if not _checks.is_known(q):
         return []
 
@@ -242,7 +258,9 @@ def _is_not_unit(xp: ModuleType, q: np.ndarray | Array) -> Any:
 
 
 def step_of(step_size: ScalarLike, num_steps: int, dtype: np.dtype) -> tuple[Array, int]:
-    """Return the step, s, and the number of steps, both checked."""
+    """Return the step, s, in the precision `dtype`, and the number of steps, after a check of
+    each.
+    """
     h = _checks.array_of_shape(step_size, (), "step_size").astype(dtype)
     if _checks.is_known(h) and not 0 < float(h) < np.inf:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Provide published recordings, ready to be fitted."""
+"""Provide published measurements and ephemerides, ready to be fitted."""
 
 from rigidjax._names import show
 from rigidjax.datasets import moon as moon, toutatis as toutatis

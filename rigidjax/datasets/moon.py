@@ -1,4 +1,4 @@
-"""Provide the Moon's place and attitude from JPL's ephemeris DE421, 1900 to 2199.
+"""Provide the position and attitude of the Moon, 1900 to 2199, from JPL's ephemeris DE421.
 
 W. M. Folkner, J. G. Williams, D. H. Boggs, "The planetary and lunar ephemeris DE421", IPN Progress
 Report 42-178 (2009). The numbers are read from the package `de421` (`pip install
@@ -30,23 +30,28 @@ from rigidjax.rotation.linalg3 import cross
 
 CITATION = "Folkner, Williams & Boggs 2009, IPN Progress Report 42-178"
 DAY = 86400.0
-# Only the units of mass depend on this constant; no motion does.
+# The gravitational constant, m³/(kg s²). Masses in kg depend on this value, but no motion does.
 _G = 6.6743e-11
-# Julian date of the start, and the blocks of 32 days.
+# The Julian date of the start of the ephemeris, the length of a block, days, and the number of
+# blocks.
 _FIRST, _BLOCK, _BLOCKS = 2414992.5, 32, 3426
-# The year at which DE421's constants give the Moon's and the core's motion: 28 June 1969.
+# The Julian year, 28 June 1969, at which DE421's constants give the motion of the Moon and its
+# core.
 EPOCH = 2000 + (2440400.5 - 2451545.0) / 365.25
 
 
 class Moon(eqx.Module):
-    """Hold some years of the ephemeris, as functions of the time in s from the first year.
+    """Hold some years of the ephemeris, as functions of the time, s, since the start of `first`.
 
-    **Arguments:** `first`, `last` year, such as 1970.0 and 1976.0: Julian years, 2000.0 is Julian
-    date 2451545.0. Tables begin and end at least ten days beyond them.
+    **Arguments:** `first`, `last` Julian years, such as 1970.0 and 1976.0; 2000.0 is the Julian
+    date
+    2451545.0. The tables begin at least ten days before `first` and end at least ten days after
+    `last`.
 
-    **Fields:** `earth`, `sun` Chebyshev tables of their places as seen from the Moon, m, ICRF;
-    `angles` of the 3-1-3 Euler angles (φ, θ, ψ), rad, body → ICRF; `constants` of DE421, by name,
-    in its units (au, day, km); `first`.
+    **Fields:** `earth`, `sun` Chebyshev tables of the positions of Earth and Sun relative to the
+    Moon, m, ICRF; `angles` a Chebyshev table of the 3-1-3 Euler angles (φ, θ, ψ) of the Moon, rad,
+    body → ICRF; `constants` the constants of DE421, by name, in the units of DE421 (au, day, km);
+    `first` the argument.
 
     **Raises:** `ModuleNotFoundError` without the package; `ValueError` for years outside of 1900
     to 2199, or not in order.
@@ -74,7 +79,9 @@ class Moon(eqx.Module):
             raise ValueError(f"Moon: wanted years in order in 1900 to 2199, got {first}, {last}")
 
         def table(name: str, step: int) -> np.ndarray:
-            """Return coefficients on intervals of `step` days."""
+            """Return the Chebyshev coefficients of the table `name`, on intervals of `step`
+            days.
+            """
             rows = np.load(Path(spec.origin or "").parent / f"jpl-{name}.npy", mmap_mode="r")
             a_block = len(rows) // _BLOCKS
             return _subdivide_polynomials(
@@ -83,7 +90,8 @@ class Moon(eqx.Module):
 
         numbers = np.load(Path(spec.origin).parent / "constants.npy")
         self.constants = {name.decode(): float(value) for name, value in numbers}
-        # The ephemeris has the Earth–Moon barycentre, and the Moon as seen from the Earth.
+        # The ephemeris gives the Earth–Moon barycentre and the Sun, and the Moon relative to the
+        # Earth.
         share = self.constants["EMRAT"] / (1 + self.constants["EMRAT"])
         moon, middle, sun = (1e3 * table(name, 4) for name in ("moon", "earthmoon", "sun"))
         sun = np.pad(sun, ((0, 0), (0, 0), (0, moon.shape[2] - sun.shape[2])))
@@ -94,7 +102,7 @@ class Moon(eqx.Module):
         self.first = first
 
     def attitude(self, t: ScalarLike) -> Attitude:
-        """Return the attitude and body rate at `t`, s."""
+        """Return the attitude and body rate of the Moon at the time `t`, s, since `first`."""
         t = jnp.asarray(t, float)
         angles, rates = jax.jvp(self.angles, (t,), (jnp.ones_like(t),))
         turned = jnp.remainder(angles, 2 * jnp.pi)
@@ -103,10 +111,12 @@ class Moon(eqx.Module):
     def body(
         self, beta: ScalarLike | None = None, gamma: ScalarLike | None = None, *, core: bool = False
     ) -> Inertia:
-        """Return the inertia, kg m², with DE421's J2, and β = (C − A)/B and γ = (B − A)/C.
+        """Return the inertia of the Moon, kg m², with the oblateness J2 of DE421.
 
-        `beta` and `gamma` are DE421's unless they are given. With `core` it is the inertia of the
-        mantle alone, which then turns under `torque(core=True)`.
+        **Arguments:** `beta` β = (C − A)/B and `gamma` γ = (B − A)/C, with the principal moments A
+        ≤
+        B ≤ C; by default the values of DE421. With `core` the result is the inertia of the mantle
+        alone, for use with `torque(core=True)`.
         """
         c = self.constants
         b = jnp.asarray(c["LBET"] if beta is None else beta)
@@ -117,20 +127,23 @@ class Moon(eqx.Module):
         return whole - self._core if core else whole
 
     def chart(self, *, core: bool = False) -> AbstractBodyChart:
-        """Return the chart of `body` for a fit: β and γ are free."""
+        """Return the chart of `body` for a fit, in which β and γ are the free parameters."""
         return _Shape(self, core)
 
     def torque(
         self, degree: int = 4, *, tide: bool = False, core: bool = False, figure: bool = False
     ) -> Any:
-        """Return the torque of Earth and Sun.
+        """Return the torque of Earth and Sun on the Moon.
 
-        **Arguments:** `degree` of the Moon's gravity in the Earth's field, 2 to 4; `tide` whether
+        **Arguments:** `degree` the highest degree of the Moon's gravity field that the Earth acts
+        on, 2 to
+        4; `tide` whether
         the Earth and the spin deform the Moon; `core` whether a liquid core turns in the mantle;
-        `figure` whether the Earth is oblate. DE421 gives the core's rate at `EPOCH`; the initial
-        rate, at `first`, is that of a core which the mantle of the ephemeris has carried along from
-        `EPOCH`. **Raises:** `ValueError` for a core in float32 (unless `first` is `EPOCH`): decades
-        in s have no digit within a minute.
+        `figure` whether the Earth is oblate. DE421 gives the
+        core's angular velocity at `EPOCH`; the initial value, at `first`, is integrated from
+        `EPOCH` with the mantle moving as in the ephemeris. **Raises:** `ValueError` for a core in
+        float32 (unless `first` is `EPOCH`): a time of decades, in s, has rounding errors of minutes
+        in float32.
         """
         c = self.constants
         rows = []
@@ -139,8 +152,9 @@ class Moon(eqx.Module):
             rows.append(self._mass * self._radius**n * jnp.array([-c[f"J{n}M"], *pairs]))
         earths = [(self._mu_earth, 0.0)]
         if figure:
-            # Two negative masses on the axis, at the radius of the equator, give the Earth's J2.
-            # The axis is that of the ICRF; precession turns the Earth's by 0.1° in 20 years.
+            # Two negative masses on the z axis, one Earth radius from the centre, give the Earth's
+            # J2. The z axis is that of the ICRF; precession turns the Earth's axis away from it by
+            # 0.1° in 20 years.
             few, radius = -0.5 * c["J2E"] * self._mu_earth, 1e3 * c["AE"]
             earths = [(self._mu_earth - 2 * few, 0.0), (few, radius), (few, -radius)]
         law: Any = Sum(
@@ -161,7 +175,9 @@ class Moon(eqx.Module):
 
     @property
     def _core(self) -> Inertia:
-        """Return the core's inertia: a fraction of the Moon's largest moment, flattened."""
+        """Return the inertia of the core: flattened, with a fraction of the Moon's largest
+        moment.
+        """
         c = self.constants
         share, flat = c["IFAC"] * self.body().tensor[2, 2], 1 - c["COBLAT"]
         return Inertia(share * jnp.diag(jnp.array([flat, flat, 1.0])))
@@ -186,7 +202,7 @@ class Moon(eqx.Module):
 
 
 class _Shape(AbstractBodyChart):
-    """Describe β and γ by the logarithms of their ratios to DE421's, in thousandths."""
+    """Describe β and γ by 1000 log(β/β*) and 1000 log(γ/γ*), where β* and γ* are DE421's values."""
 
     size: ClassVar[int] = 2
     log_names: ClassVar[tuple[str, ...]] = ("β", "γ")
@@ -211,9 +227,10 @@ class _Shape(AbstractBodyChart):
 
 
 class _Core(eqx.Module):
-    """Describe a liquid core in the mantle: friction at the boundary, and its flattening.
+    """Describe the torque on the mantle of the Moon, with a liquid core inside.
 
-    The state of this torque is the core's angular velocity (3,), rad/s, mantle frame. Source:
+    The core acts on the mantle by friction at the boundary and by the flattening of the boundary.
+    The state of this torque is the angular velocity of the core (3,), rad/s, mantle frame. Source:
     Folkner and others 2014 (DE430), section III; Williams and others 2001, Lunar rotational
     dissipation in solid body and molten core, JGR 106:27933.
     """
@@ -240,7 +257,9 @@ class _Core(eqx.Module):
 
 
 class _AlongEphemeris(eqx.Module):
-    """Evaluate the equation of a core's angular velocity in the mantle of the ephemeris."""
+    """Evaluate the time derivative of the core's angular velocity, with the mantle as in the
+    ephemeris.
+    """
 
     core: _Core
     moon: Moon
@@ -250,8 +269,9 @@ class _AlongEphemeris(eqx.Module):
 
 
 def _core_velocity_at(core: _Core, year: float) -> Float[Array, "3"]:
-    """Return the core's angular velocity at a `year`, rad/s, mantle frame, from `core.state0` at
-    `EPOCH`.
+    """Return the angular velocity (3,) of the core at a Julian `year`, rad/s, mantle frame.
+
+    It is integrated from `core.state0` at `EPOCH`.
     """
     if core.state0.dtype != jnp.float64:
         raise ValueError(
@@ -277,14 +297,15 @@ def _integrate_core(
 
 
 def _add_to_z(table: Chebyshev, z: float) -> Chebyshev:
-    """Return the table of places with z added to their third component."""
+    """Return the Chebyshev `table` of positions, with `z` added to the third component."""
     moved = table.coefficients.at[:, 2, 0].add(z)
     return eqx.tree_at(lambda t: t.coefficients, table, moved)
 
 
 def _subdivide_polynomials(rows: np.ndarray, parts: int) -> np.ndarray:
-    """Return polynomials (intervals, k, terms) on intervals shortened by `parts`, equal to those
-    given.
+    """Return the Chebyshev polynomials `rows` (intervals, k, terms) on shorter intervals.
+
+    Each interval is divided into `parts` equal intervals; the polynomials do not change.
     """
     count, k, terms = rows.shape
     if parts == 1:

@@ -1,4 +1,4 @@
-"""Provide the observations of the tumbling asteroid 4179 Toutatis, by radar in December 1992.
+"""Provide the radar observations of the tumbling asteroid 4179 Toutatis from December 1992.
 
 Published figures: Y. Takahashi, M. W. Busch, D. J. Scheeres, "Spin state and moment of inertia
 characterization of 4179 Toutatis", The Astronomical Journal 146:95 (2013), table 3,
@@ -53,15 +53,17 @@ OBSERVATIONS = (
     ("1992-12-17T06:49", 130.6, 76.1, 234.9, 12.6, 33.9, -94.0),
     ("1992-12-18T07:09", 91.6, 81.6, 142.4, -24.3, 29.6, -102.0),
 )
-# The first is the paper's own figure for a direction. The paper has no figure for the rates: the
-# second is twice their scatter about the fit.
+# ATTITUDE_NOISE_DEG is the paper's standard deviation of a direction. The paper has no standard
+# deviation of the rates: RATE_NOISE_DEG_A_DAY is twice the scatter of the rates about the fit.
 ATTITUDE_NOISE_DEG = 15.0
 RATE_NOISE_DEG_A_DAY = 10.0
 
 
 def recording() -> Recording:
-    """Return the 17 observations: times in s from the first, attitudes body → ecliptic, and body
-    rates.
+    """Return the 17 observations: times, attitudes and body rates.
+
+    The times are in s since the first observation, the attitudes map body axes to the ecliptic axes
+    of J2000, and the rates are in rad/s.
 
     >>> recording().t.shape
     (17,)
@@ -69,8 +71,8 @@ def recording() -> Recording:
     when = [datetime.fromisoformat(row[0]) for row in OBSERVATIONS]
     t = np.array([(moment - when[0]).total_seconds() for moment in when])
     angles = jnp.asarray(np.radians([row[1:4] for row in OBSERVATIONS]))
-    # The published angles take ecliptic to body coordinates: Mᵀ. The same three angles in the
-    # order of eq 31 of the notes make M, body → ecliptic.
+    # The matrix of the published angles takes ecliptic to body coordinates. The same three angles
+    # in the order of eq 31 of the notes give its transpose M, body → ecliptic.
     attitudes = [euler.to_quaternion(a, sequence="ZXZ") for a in angles]
     rates = np.radians([row[4:7] for row in OBSERVATIONS]) / DAY
     sensor = AttitudeSensor(np.radians(ATTITUDE_NOISE_DEG))
@@ -79,9 +81,9 @@ def recording() -> Recording:
 
 
 def model() -> Model:
-    """Return the model of a free motion with principal body axes and a robust loss.
+    """Return the model of a free body in principal axes, with a robust loss.
 
-    The loss counts outliers linearly.
+    The loss grows linearly with the size of an outlier, not quadratically.
 
     >>> model().chart.log_names
     ('Ix/Iz', 'Iy/Iz')
@@ -106,8 +108,10 @@ def _direction(body: Inertia, state: Attitude) -> Array:
 def rows(fit: Fit) -> list[Row]:
     """Return the periods and the direction of the angular momentum as rows for `report.table`.
 
-    **Arguments:** `fit` of `model()`. **Returns** rows (name, value, low, high, unit): days, and
-    degrees of ecliptic longitude and latitude (J2000), with 95 % intervals.
+    **Arguments:** `fit` of `model()`. **Returns** rows (name, value, low, high, unit), where low
+    and
+    high are the ends of the 95 % interval: two periods, days, and the ecliptic longitude and
+    latitude (J2000) of the angular momentum, degrees.
     """
 
     def rows_of_quantities(
@@ -116,7 +120,7 @@ def rows(fit: Fit) -> list[Row]:
         shown: Callable[[np.ndarray], np.ndarray],
     ) -> Any:
         bounds = fit.interval_of(lambda point: quantities(point.body, point.state0))
-        # A number that the data do not determine has an interval that ends at infinity.
+        # The interval of a quantity that the data do not determine may end at infinity.
         with np.errstate(over="ignore"):
             numbers = [shown(np.asarray(v)) for v in (quantities(fit.body, fit.state0), *bounds)]
         return zip(names, *numbers, strict=True)
@@ -131,12 +135,14 @@ def rows(fit: Fit) -> list[Row]:
 
 
 def rms_degrees(fit: Fit) -> float:
-    """Return the root mean square angle between observed and fitted attitudes of `fit`, degrees."""
+    """Return the root mean square, degrees, of the angles between observed and fitted attitudes."""
     return float(np.degrees(fit.rms[0]))
 
 
 def remarks(fit: Fit) -> str:
-    """Return sentences about the observations furthest from the `fit`, and about the noise."""
+    """Return sentences about the observations that are outliers of the `fit`, and about the
+    noise.
+    """
     lines = []
     scatter = rms_degrees(fit) / np.sqrt(3)
     if scatter < 0.5 * ATTITUDE_NOISE_DEG:

@@ -1,4 +1,4 @@
-"""Show a tumbling body as an animation: a film, or an interactive page."""
+"""Show a tumbling body as an animation: a GIF, or an interactive page."""
 
 import base64
 import html
@@ -27,17 +27,21 @@ from rigidjax.plot.style import (
     times_on_host,
 )
 
-# Corners of the cube, and its faces in pairs across x, y, z, seen from outside counter-clockwise.
+# CORNERS (8, 3) are the corners of the cube from −1 to 1. FACES has, for each face, the indices of
+# its four corners, counter-clockwise as seen from outside; the order is −x, +x, −y, +y, −z, +z.
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-# The colours of the faces: pale on the negative side of an axis.
+# SHADES (6, 3) are the colours of the faces, as red, green and blue from 0 to 1: pale on the
+# negative side of an axis.
 _FULL = np.array([[int(c[k : k + 2], 16) / 255 for k in (1, 3, 5)] for c in COLOURS[:3]])
 SHADES = np.stack([0.4 * _FULL + 0.6, _FULL], axis=1).reshape(6, 3)
 
 
 class Film(eqx.Module):
-    """Hold an animation in memory: a notebook shows it, `save` writes it (`data`, `kind`, `height`
-    px).
+    """Hold an animation in memory: a notebook shows the animation, `save` writes it to a file.
+
+    **Fields:** `data` the bytes of the file; `kind` `gif` or `html`; `height` of the picture in a
+    notebook, px.
 
     >>> Film(b"<p>hello</p>", "html", 100)._repr_html_()[:7]
     '<iframe'
@@ -51,10 +55,11 @@ class Film(eqx.Module):
         return f"Film({self.kind}, {len(self.data) // 1024} kB)"
 
     def save(self, path: str | Path) -> Path:
-        """Write the file, and **return** its path.
+        """Write the animation to a file, and **return** the path of the file.
 
-        **Arguments:** `path` that ends in `.gif` or `.html`, or `.mp4` if the program ffmpeg is
-        installed. A page of `player` is `.html` only. **Raises** `ValueError` for another suffix,
+        **Arguments:** `path` ends in `.gif` or `.html`, or in `.mp4` if the program ffmpeg is
+        installed; for the page of `player` it must end in `.html`. **Raises** `ValueError` for
+        another suffix,
         `FileNotFoundError` if ffmpeg is missing.
         """
         path = Path(path)
@@ -85,8 +90,10 @@ class Film(eqx.Module):
 def _to_mp4(gif: bytes, path: Path) -> None:
     program = shutil.which("ffmpeg")
     if program is None:
-        raise FileNotFoundError("save: a film in .mp4 needs the program ffmpeg; .gif needs nothing")
-    # The video format needs even sizes.
+        raise FileNotFoundError(
+            "save: a film in .mp4 needs the program ffmpeg; a .gif needs no other program"
+        )
+    # The video format needs an even width and height in px.
     even = "scale=trunc(iw/2)*2:trunc(ih/2)*2"
     options = ["-vf", even, "-pix_fmt", "yuv420p", "-movflags", "faststart"]
     run = [program, "-y", "-loglevel", "error", "-f", "gif", "-i", "-", *options, str(path)]
@@ -103,16 +110,18 @@ def tumble(
     size: int = 400,
     title: str = "",
 ) -> Film:
-    """Return a GIF of the body's box as it tumbles, with the path of its longest axis.
+    """Return a GIF of a box that tumbles as the body does, with the path of its longest axis.
 
-    The box is the uniform solid box with the 𝔖 of the body, which moves as the body does. Faces
-    across its principal axes are blue, orange and green, shortest axis first; faces on the negative
-    side are pale, to show a flip; the origin is fixed.
+    The box is solid and uniform, and has the second moment 𝔖 of the body (the integral of r rᵀ over
+    the mass), hence the same motion. The faces across the shortest, middle and longest axis are
+    blue, orange and green; the faces on the negative side of an axis are pale, so that a flip is
+    seen. The centre of the box is fixed.
 
-    **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, with less
-    than a quarter turn from one to the next; `seconds` of the film, by default the duration of the
-    motion, 20 at most; `fps` pictures a second; `size` px of a side; `title`. **Returns** a `Film`,
-    shown by a notebook; `.save(path)`. **Raises** `ValueError` for numbers that are not positive.
+    **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, with
+    less than a quarter turn between consecutive states; `seconds` the duration of the film, by
+    default that of the motion, but 20 at most; `fps` pictures a second; `size` the width and the
+    height, px; `title`. **Returns** a `Film`, which a notebook shows and `.save(path)` writes.
+    **Raises** `ValueError` if `seconds`, `fps` or `size` is not positive.
 
     >>> body = rj.shapes.box(1.0, [0.1, 0.2, 0.3])
     >>> sol = rj.simulate(body.inertia, rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 0.5, 1.0])
@@ -134,7 +143,8 @@ def tumble(
     figure = Figure(figsize=(3.6, 3.6), dpi=size / 3.6)
     canvas = FigureCanvasAgg(figure)
     ax: Any = figure.add_axes((0.0, 0.08, 0.86, 0.84), projection="3d")
-    # The path has every given state: from the states of the pictures alone it would be a zigzag.
+    # The path goes through every given state: with the states of the pictures alone it would be a
+    # zigzag.
     when, tips = np.asarray(ts, dtype=float), rotation_matrices(attitudes_on_host(states)) @ tip
     unit = ", m" if isinstance(body, MassProperties) else ""
     set_equal_scales(ax, reach, (f"x{unit}", f"y{unit}", f"z{unit}"))
@@ -150,8 +160,8 @@ def tumble(
         ax.set_title(escape_formulas(f"{title}  t = {moment:.3g} s".strip()), fontsize=10)
         canvas.draw()
         shots.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
-    # All pictures share one palette, or the grey of the panes flickers. It is made from a dozen of
-    # them, or colours are missing.
+    # All pictures share one palette: with a palette for each picture the grey background flickers.
+    # The palette is made from a dozen pictures: from a single picture it would lack colours.
     sample = shots[:: max(len(shots) // 12, 1)]
     joined = Image.fromarray(np.concatenate([np.asarray(shot) for shot in sample]))
     palette = joined.quantize(64)
@@ -165,7 +175,7 @@ def tumble(
 def _duration_and_count(
     ts: NumbersLike, seconds: float | int | None, fps: float | int
 ) -> tuple[float, int]:
-    """Return the seconds of a film, and its number of pictures."""
+    """Return two numbers: the duration of a film, s; and the number of pictures, at least 2."""
     if seconds is None:
         when = _checks.host_array(ts, "ts")
         seconds = min(abs(float(when[-1] - when[0])), 20.0) if when.ndim == 1 and when.size else 1.0
@@ -182,10 +192,10 @@ def player(
     fps: float | int = 20,
     height: int = 420,
 ) -> Film:
-    """Return a page that plays the motion in 3-D; you can turn and zoom it while it runs.
+    """Return a page that plays the motion in 3-D; you can turn and zoom the view while it plays.
 
-    The box is the uniform solid box with the 𝔖 of the body, the line is the path of its longest
-    axis. The page contains everything, also viser's program (0.8 MB): a notebook shows it without a
+    The box is that of `tumble`; the line is the path of its longest axis. The page contains
+    everything, also viser's program (0.8 MB): a notebook shows it without a
     network or a running kernel, and `.save("tumble.html")` writes it to a file. **Arguments:** as
     `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises** as `tumble`.
     """
@@ -199,7 +209,7 @@ def player(
         raise ModuleNotFoundError(words) from error
     import rich
 
-    # Viser records the commands to a server; no client has to connect to it.
+    # Viser records the commands that a server gets; no browser has to connect to the server.
     console = rich.get_console()
     was_quiet, console.quiet = console.quiet, True
     try:
@@ -240,14 +250,16 @@ def _record(
 def evenly_spaced_attitudes(
     ts: NumbersLike, states: PyTree, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return `count` evenly spaced times, and the attitudes (count, 4) at these times, along the
-    shorter arc.
+    """Return two arrays: `count` evenly spaced times; and the attitudes (count, 4) at these times.
+
+    Between two consecutive states the attitude is interpolated along the shorter arc.
     """
     q = attitudes_on_host(states)
     t = times_on_host(ts, q.shape[0])
     if t.size < 2:
         raise ValueError(f"ts: wanted at least two times, got {t.size}")
-    # q and −q are one attitude: choose signs so that neighbours are near.
+    # q and −q are the same attitude: signs are chosen so that consecutive quaternions are near each
+    # other.
     signs = np.where(np.einsum("ti,ti->t", q[1:], q[:-1]) < 0, -1.0, 1.0)
     q = q * np.concatenate([[1.0], np.cumprod(signs)])[:, None]
     when = np.linspace(t[0], t[-1], count)
@@ -256,8 +268,11 @@ def evenly_spaced_attitudes(
 
 
 def _box_and_tip(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the corners (8, 3) of the body's box, the end (3,) of its longest axis, and its half
-    diagonal.
+    """Return three things: the corners (8, 3) of the body's box; the end (3,) of the longest
+    half-axis;
+    and the half diagonal.
+
+    Corners and end are in body axes.
     """
     half, turn = box_of(body)
     longest = np.argmax(half)
@@ -266,10 +281,11 @@ def _box_and_tip(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray
 
 
 def box_of(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
-    """Return the half-lengths (3,) a of the uniform box with λ = m a²/3, and its axes (3, 3) in the
-    body.
+    """Return two arrays: the half-lengths a (3,) of the body's box; and the axes of the box (3, 3).
 
-    The half-lengths are in m for `MassProperties`; for an `Inertia` the longest is 1.
+    The uniform box of mass m has the second moments λ = m a²/3 of the body about its principal
+    axes. The columns of the second array are the axes of the box, in body axes. The half-lengths
+    are in m for `MassProperties`; for an `Inertia` they are scaled so that the longest is 1.
     """
     second, q = principal(body.second_moment)
     size = np.sqrt(np.maximum(np.asarray(second, dtype=float), 0.0))
@@ -279,7 +295,7 @@ def box_of(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
         size = size * np.sqrt(3 / float(body.mass))
     else:
         size = size / size.max()
-    # A plate or rod gets a little thickness, to be visible.
+    # A plate or a rod gets a little thickness, so that it is visible.
     return np.maximum(size, 0.02 * size.max()), rotation_matrices(np.asarray(q, dtype=float)[None])[
         0
     ]

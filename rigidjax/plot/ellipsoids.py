@@ -1,4 +1,4 @@
-"""Draw a body as the ellipsoid with the same motion, and its uncertainty by a fit."""
+"""Draw a body as an ellipsoid with the same motion, and the uncertainty of a fitted body."""
 
 from typing import Any
 
@@ -22,17 +22,18 @@ def inertia_ellipsoid(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """Draw the outline of a body's ellipsoid from three sides; for a fit with its uncertainty.
+    """Draw the outline of a body's ellipsoid from three sides, for a fit with the uncertainty.
 
-    The ellipsoid `r·𝔖⁻¹r = const` is long along the body's long axis and moves as the body does.
-    For `MassProperties` it is the uniform solid ellipsoid of equal mass, in m. An `Inertia` has no
-    size: the unit is then √Tr 𝔖 of the given body (of the best body of a fit). Thin lines are
-    bodies drawn from the fit's Gaussian: the data do not determine the shape where the lines
-    differ.
+    The ellipsoid `r·𝔖⁻¹r = const`, with the body's second moment 𝔖, is long along the body's long
+    axis and moves as the body does. For `MassProperties` it is the uniform solid ellipsoid of equal
+    mass, in m. An `Inertia` has no size: lengths are then in units of √Tr 𝔖 of the body (of the
+    best body of a fit). Thin lines are bodies sampled from the Gaussian approximation of the fit:
+    where the lines differ, the data do not determine the shape.
 
     **Arguments:** `body` an `Inertia`, a `MassProperties` or a `rigidjax.identify.Fit`; `truth` a
-    body to compare with, as a broken line; `samples` the number of thin lines; `title`; `ax` three
-    axes. **Returns** the axes (3,), planes xy, xz and yz of the body frame. **Raises** `ValueError`
+    body to compare with, as a broken line; `samples` the number of sampled bodies; `title`; `ax`
+    three axes. **Returns** the axes (3,), for the planes xy, xz and yz of the body frame.
+    **Raises** `ValueError`
     for a body without extension.
 
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
@@ -48,7 +49,7 @@ def inertia_ellipsoid(
         shapes["cloud"] = np.asarray(jax.vmap(_drawn_matrix)(drawn)) / size
     if truth is not None:
         other = np.asarray(_drawn_matrix(truth))
-        # Only the shape is compared if the scale is unknown.
+        # If one of the two bodies has no size, only the shapes are compared.
         own = solid and isinstance(truth, MassProperties)
         shapes["truth"] = other[None] / (1.0 if own else float(np.trace(other)))
     ax = axes_of_shape(ax, (3,), ncols=3, figsize=(10.5, 3.9))
@@ -61,8 +62,10 @@ def inertia_ellipsoid(
 
 
 def _body_and_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
-    """Return the body, and bodies drawn from the Gaussian of a fit (a leading axis), or `None` if
-    it is no fit.
+    """Return two things: the body; and `samples` bodies that are sampled from a fit.
+
+    The sampled bodies, from the Gaussian approximation of the fit, have a leading axis; without a
+    fit the second is `None`. `body` is an inertia, mass properties or a fit.
     """
     if isinstance(body, Inertia | MassProperties):
         return validation.require_single_body(body, (Inertia, MassProperties), "body"), None
@@ -74,15 +77,20 @@ def _body_and_samples(body: Any, samples: int) -> tuple[Inertia | MassProperties
         raise ValueError(f"inertia_ellipsoid: {words}")
     x = body.derivative_point
     values, vectors = np.linalg.eigh(np.asarray(body.determined_covariance))
-    # With a fixed seed one fit always gives one picture.
+    # The seed is fixed, so that the same fit always gives the same picture.
     steps = np.random.default_rng(0).standard_normal((samples, values.size))
     steps = jnp.asarray(steps * np.sqrt(np.maximum(values, 0.0)) @ vectors.T, x.dtype)
     return body.body, jax.vmap(lambda step: body.model.bodies(x + step))(steps)
 
 
 def _outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
-    """Draw the outlines of `body`, `cloud` and `truth`, each (n, 3, 3), on the three planes."""
-    # The outline reaches √A_ii along axis i. All three panels have one scale, for comparison.
+    """Draw outlines of ellipsoids r·A⁻¹r = 1 on the planes xy, xz and yz.
+
+    **Arguments:** `ax` (3,); `shapes` the matrices A (n, 3, 3) by name: `body`, and if given
+    `cloud` (sampled bodies) and `truth`; `unit` of length.
+    """
+    # The outline of r·A⁻¹r = 1 reaches √A_ii along axis i. All three panels have the same scale,
+    # for comparison.
     reaches = {name: np.sqrt(np.einsum("nii->ni", shape)) for name, shape in shapes.items()}
     reach = 1.1 * max(float(one.max()) for one in reaches.values())
     apart = np.abs(reaches.get("cloud", reaches["body"]) - reaches["body"]).max(initial=0.0)
@@ -104,15 +112,18 @@ def _outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
 
 
 def _drawn_matrix(body: Inertia | MassProperties) -> Any:
-    """Return the matrix whose ellipsoid r·A⁻¹r = 1 is drawn."""
+    """Return the matrix A (3, 3) whose ellipsoid r·A⁻¹r = 1 is drawn: 5𝔖/m, or 𝔖 without a mass
+    m.
+    """
     if isinstance(body, MassProperties):
         return body.second_moment * (5.0 / body.mass)
     return body.second_moment
 
 
 def _outline(shape: np.ndarray, i: int, j: int) -> np.ndarray:
-    """Return the silhouette of r·A⁻¹r = 1 on a coordinate plane: the ellipse of the 2 × 2 block of
-    A.
+    """Return points (2, 121) on the silhouette of r·A⁻¹r = 1, seen along a coordinate axis.
+
+    It is the ellipse of the 2 × 2 block of A = `shape` for the axes `i` and `j`.
     """
     values, vectors = np.linalg.eigh(shape[np.ix_((i, j), (i, j))])
     angle = np.linspace(0, 2 * np.pi, 121)

@@ -1,4 +1,4 @@
-"""Draw a fit beside its data."""
+"""Draw a fit together with its data."""
 
 from typing import Any
 
@@ -28,10 +28,12 @@ def fit(
     rate_unit: str = "rad/s",
     title: str = "",
 ) -> Any:
-    """Draw data and fit of each sensor above, and the residuals below.
+    """Draw, for each sensor, the data and the fit in the upper row and the residuals in the lower
+    row.
 
-    **Arguments:** `fit_result` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`
-    or `day`; `rate_unit` `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib figure.
+    **Arguments:** `fit_result` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit`
+    `s`, `min`, `h` or `day`; `rate_unit` `rad/s`, `deg/s`, `rpm` or `deg/day`; `title`. **Returns**
+    the matplotlib figure.
 
     >>> found = rj.identify.fit(rj.datasets.toutatis.model())
     >>> fit(found).axes[-1].get_xlabel()
@@ -61,8 +63,10 @@ def fit(
 def _fill_between_samples(
     fit_result: Any, record: Any, index: int
 ) -> tuple[np.ndarray, Any] | None:
-    """Return the times and states between sparse samples of a free body, for a smooth line; else
-    `None`.
+    """Return 800 times and the fitted states at these times, for a smooth line between the
+    readings.
+
+    The result is `None` under a torque or for more than 300 readings.
     """
     model, body, state0 = fit_result.model, fit_result.body, fit_result.state0
     if model.torque is not None or record.t.shape[0] > 300:
@@ -91,7 +95,7 @@ def _draw_sensor(
     scale, unit, line_t = 1.0, sensor.unit, t
     if sensor.reading_shape == (4,):
         read, scale = _long_axis(values), 180 / np.pi
-        # The prediction is the reading, turned back by its error.
+        # The prediction is the reading, turned back by the residual.
         back = jax.vmap(lambda q, e: quaternion.multiply(q, quaternion.exp(-e)))
         line = _long_axis(back(jnp.asarray(values), jnp.asarray(errors)))
         names = tuple(f"{axis} of body z" for axis in "xyz")

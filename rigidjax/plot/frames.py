@@ -1,4 +1,4 @@
-"""Draw one path in a moving frame and in an inertial frame."""
+"""Draw the path of a particle in a moving frame and in the inertial frame."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -33,10 +33,12 @@ def frames(
 ) -> Any:
     """Draw a path in the moving frame on the left, and in the inertial frame on the right.
 
-    **Arguments:** `frame` the `MovingFrame`, or a scene that has one as its `frame`; `ts` (T,);
+    **Arguments:** `frame` the `MovingFrame`, or a scene that has one as its `frame`; `ts` (T,) s;
     `inside` the path in the moving frame, a `Point` with a leading time axis
-    (`frame.from_inertial` makes it from a path in the inertial frame); `plane` two of `xyz`; `unit`
-    of length; `marks` places at rest in the frame, name → (3,); `title`; `ax` two axes. **Returns**
+    (`frame.from_inertial` makes it from a path in the inertial frame); `plane` the
+    two axes that are drawn, such as `xy`; `unit` of length, for the labels; `marks` positions (3,)
+    at
+    rest in the moving frame, by name; `title`; `ax` two axes. **Returns**
     the axes (2,).
 
     >>> turntable = rj.scenes.turntable(1.0)

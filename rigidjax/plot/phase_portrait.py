@@ -1,4 +1,4 @@
-"""Draw the phase portrait of a heavy symmetric top: tilt against its rate."""
+"""Draw the phase portrait of a heavy symmetric top: the tilt and its time derivative."""
 
 from typing import Any
 
@@ -25,17 +25,21 @@ def phase_portrait(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """Draw the tilt θ against θ̇ of a symmetric top, with the curves of equal energy around its
-    path.
+    """Draw the motion of a symmetric top in the (θ, θ̇) plane, θ the tilt, with curves of equal
+    energy.
 
-    `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ` with the momenta of the initial
-    state, p_φ about the vertical and p_ψ about the top's axis. The cross is steady precession,
-    which has the least energy. Source: Landau and Lifshitz, Mechanics, § 35, problem 1.
+    `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ` with I₁ the moment of inertia
+    across the axis, the mass m, gravity g, the distance l of the centre
+    of mass from the pivot, and two momenta of the initial state: p_φ about the vertical and p_ψ
+    about
+    the axis of the top. The cross marks steady precession, where the energy is least. Source:
+    Landau and Lifshitz, Mechanics, § 35, problem 1.
 
     **Arguments:** `inertia` about the pivot; `top` the weight and the centre of mass, which is on
     the axis of symmetry; `states` of one body with a leading time axis; `levels` the number of thin
-    curves; `title`; `ax`. **Returns** the axes. **Raises** `ValueError` without symmetry about the
-    axis through the centre of mass, and without weight.
+    curves; `title`; `ax`. **Returns** the axes. **Raises** `ValueError` for a
+    body that is not symmetric about the axis through the centre of mass, and for one without
+    weight.
 
     >>> body = rj.Inertia.from_principal(2.0, 2.0, 1.0)
     >>> top = rj.torques.HeavyTop(1.0, [0.0, 0, 1.0], [0, 0, -9.81])
@@ -70,7 +74,8 @@ def phase_portrait(
     reach = 1.6 * max(float(np.abs(rate[seen]).max(initial=0.0)), 0.2 * np.sqrt(weight / across))
     middle, half = 0.5 * (tilt.max() + tilt.min()), 0.5 * np.ptp(tilt)
     wide = max(1.8 * half, 0.15)
-    # The grid excludes 0 and π: the potential is infinite where the axis is upright or hangs.
+    # The grid excludes θ = 0 and θ = π, where the axis is vertical: the effective potential is
+    # infinite there.
     grid = np.linspace(max(middle - wide, 1e-3), min(middle + wide, np.pi - 1e-3), 400)
     rates = np.linspace(-reach, reach, 301)
     energy = 0.5 * across * rates[:, None] ** 2 + potential(grid)
@@ -95,7 +100,12 @@ def phase_portrait(
 def _symmetric_top(
     inertia: Inertia, top: HeavyTop
 ) -> tuple[float, float, np.ndarray, float, np.ndarray]:
-    """Return I₁, I₃, the body's axis (3,), m g l, and the upward direction (3,)."""
+    """Return five things: the moments of inertia I₁ across and I₃ about the axis of symmetry; that
+    axis
+    (3,), body frame; m g l; and the upward unit vector (3,), world frame.
+
+    Raise an error for a body without this symmetry or without weight.
+    """
     tensor = np.asarray(inertia.tensor, dtype=float)
     com, gravity = np.asarray(top.com, dtype=float), np.asarray(top.gravity, dtype=float)
     lever, pull = np.linalg.norm(com), np.linalg.norm(gravity)

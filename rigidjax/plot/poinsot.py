@@ -1,6 +1,4 @@
-"""Draw a motion on a sphere: body axes, and Poinsot's polhode in the body and herpolhode in
-space.
-"""
+"""Draw the paths of the body axes, and Poinsot's polhode and herpolhode."""
 
 from typing import Any
 
@@ -20,8 +18,8 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     """Draw the paths of the three body axes on the unit sphere, world frame.
 
     A dot marks the start, a triangle the end; the path behind the sphere is faint. **Arguments:**
-    `states` of one body with a leading time axis; `title`; `ax` your 3-D axes; set their view
-    before the call (`view_init`). **Returns** the axes.
+    `states` of one body with a leading time axis; `title`; `ax` your 3-D axes; set the viewing
+    direction (`view_init`) before the call. **Returns** the axes.
 
     >>> sol = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 3.0),
     ...                   rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 1.0, 2.0])
@@ -36,7 +34,7 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
         style.draw_around_ball(ax, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
         ax.plot(*path[:1].T, color=colour, marker="o", ms=6, ls="")
         ax.plot(*path[-1:].T, color=colour, marker="^", ms=7, ls="")
-    # The legend of the marks is grey: they belong to no axis.
+    # The marks in the legend are grey, since every body axis has such marks.
     for mark, name in (("o", "start"), ("^", "end")):
         ax.plot([], [], [], color="0.4", marker=mark, ms=6, ls="", label=name)
     style.set_equal_scales(ax, 1.0, ("x", "y", "z"))
@@ -53,17 +51,20 @@ def polhode(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """Draw the path of Π = IΩ on the intersection of the sphere |Π| = h and the ellipsoid ΣΠᵢ²/Iᵢ =
-    2T.
+    """Draw the path of the angular momentum Π = IΩ in the body.
 
-    The axes are the principal axes (ascending moments); the unit is h, the initial |Π|. Thin lines
-    are other energies at the same h; broken lines are the separatrix through the middle axis. Lines
-    behind the sphere are dotted (this motion) or faint (the others). Source: Landau and Lifshitz,
+    The path of a free body lies on the sphere |Π| = h and on the ellipsoid ΣΠᵢ²/Iᵢ = 2T, with the
+    principal moments Iᵢ and the kinetic energy T.
+
+    The coordinate axes are the principal axes, with the smallest moment first; the unit is h, the
+    initial |Π|. Thin lines are the paths of other energies at the same h; broken lines are the
+    separatrix through the middle axis. Behind the sphere the path of this motion is dotted, and all
+    other lines are faint. Source: Landau and Lifshitz,
     Mechanics, § 37.
 
     **Arguments:** `inertia`; `states` of one body with a leading time axis; `energies` the number
-    of thin lines; `title`; `ax` your 3-D axes. **Returns** the axes. **Raises** `ValueError` for a
-    body at rest or a zero moment.
+    of thin lines; `title`; `ax` your 3-D axes. **Returns** the axes. **Raises** `ValueError`
+    for a body at rest or with a zero moment of inertia.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Spin([0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])
@@ -87,17 +88,18 @@ def polhode(
     twice_energy = float(np.sum(pi[0] ** 2 / i))
 
     ax = style.solid_axes(ax)
-    # The drawing order is set here: matplotlib takes one depth for a whole surface, and would draw
-    # the sphere over the path.
+    # The drawing order is set here, since matplotlib gives a whole surface a single depth and would
+    # draw the sphere over the path.
     ax.computed_zorder = False
     style.draw_sphere(ax, COLOURS[5], 0.15)
     semi_axes = np.sqrt(twice_energy * i)
-    # The ellipsoid is drawn by meridians and parallels, so that its inside stays visible.
+    # The ellipsoid is drawn as meridians and parallels, so that the sphere inside it stays visible.
     how: dict[str, Any] = dict(color=COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
     ax.plot_wireframe(
         *(semi_axes[:, None, None] * style.sphere_grid()), rstride=4, cstride=6, **how
     )
-    # All energies are equal if all moments are equal: there are no lines to draw.
+    # If all moments are equal, the energy is constant on the sphere, and there are no lines to
+    # draw.
     if i[2] - i[0] > 1e-9 * i[2]:
         _draw_other_energies(ax, i, energies)
     how = dict(hidden_style={"ls": (0, (1, 1)), "lw": 1.8}, label="this motion", zorder=5)
@@ -116,12 +118,16 @@ def polhode(
 
 
 def _draw_other_energies(ax: Any, i: np.ndarray, energies: int) -> None:
-    """Draw curves of equal energy on the unit momentum sphere."""
+    """Draw curves of equal energy, and the separatrix, on the unit momentum sphere.
+
+    **Arguments:** `ax` 3-D axes; `i` (3,) ascending principal moments; `energies` the number of
+    curves without the separatrix.
+    """
     import contourpy
 
     def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
-        # The pole is along the axis of the middle moment: no family of loops goes round this axis,
-        # so that no curve is cut where the angle jumps.
+        # The pole of the coordinates is along the axis of the middle moment. No closed curve goes
+        # round this axis, so that no curve is cut where the longitude jumps by 2π.
         return style.sphere_points(around, down)[[1, 2, 0]]
 
     inverse = 1 / i
@@ -140,12 +146,16 @@ def _draw_other_energies(ax: Any, i: np.ndarray, energies: int) -> None:
 
 
 def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
-    """Draw the path of the world rate ω on the invariable plane, across the angular momentum.
+    """Draw the path of ω, the angular velocity in world axes, on the invariable plane.
 
-    The motion must be free: the part of ω along the momentum is then 2T/h and constant. The circles
-    are the least and the largest distance of this motion. **Arguments:** `inertia`; `states`
+    The invariable plane is perpendicular to the angular momentum. The motion must be free: the
+    component of ω along the angular momentum h is then constant, 2T/h with the kinetic energy T.
+    The
+    circles have the least and the largest distance of this path from the momentum as radius.
+    **Arguments:** `inertia`; `states`
     (`Attitude`) of one body with a leading time axis; `title`; `ax`. **Returns** the axes.
-    **Raises** `ValueError` for a body at rest, and a momentum that turned by more than 1e-3 rad.
+    **Raises** `ValueError` for a body at rest, and for an angular momentum whose
+    direction changes by more than 1e-3 rad.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], [0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])
@@ -166,7 +176,8 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
         raise ValueError(words + "a torque acts, and there is no invariable plane")
     first = omega[0] - (omega[0] @ up) * up
     if np.linalg.norm(first) < 1e-9 * np.linalg.norm(omega[0]):
-        # A spin about a principal axis: any direction across will do.
+        # The body spins about a principal axis: any direction perpendicular to the momentum serves
+        # as e₁.
         first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first = first / np.linalg.norm(first)
     path = np.stack([omega @ first, omega @ np.cross(up, first)], axis=-1)

@@ -1,4 +1,4 @@
-"""Draw residuals of a fit, and a comparison with white noise."""
+"""Draw the residuals of a fit, and compare them with white noise."""
 
 from typing import Any
 
@@ -13,20 +13,25 @@ from rigidjax.plot.style import (
     unit_factor,
 )
 
-# Frequencies of an uneven record, at most.
+# The largest number of frequencies for unevenly spaced times.
 _MOST = 2000
 
 
 def residuals(
     fit_result: Any, *, index: int = 0, time_unit: str = "s", title: str = "", ax: Any = None
 ) -> Any:
-    """Draw residuals of each sensor over its noise: in time, histogram, autocorrelation, spectrum.
+    """Draw four panels for each sensor: its residuals, their histogram, correlation and spectrum.
 
-    From left to right: the residuals, evenly within ±2 for a good fit (those beyond ±8 are
-    triangles at the edge); their histogram against the normal curve; the correlation of each
-    residual with a later one, which for white noise is inside the band ±2/√N; their power spectrum,
-    which is 1 at all frequencies for white noise of the given size (Welch's estimate; Lomb's for
-    uneven times). A line in the spectrum is a motion or a torque that the model lacks.
+    All panels show the residuals divided by their standard deviation, from left to right:
+
+    - the residuals against time, mostly within ±2 for a good fit; triangles at the border of
+      the panel stand for residuals beyond ±8;
+    - the histogram of the residuals, with the standard normal density;
+    - the autocorrelation of the residuals, which for white noise is mostly within the band ±2/√N,
+      with N the number of readings;
+    - the power spectrum of the residuals (Welch's estimate; Lomb's for unevenly spaced times),
+      which is 1 at all frequencies for white noise. A peak is a periodic motion or torque that the
+      model lacks.
 
     **Arguments:** `fit_result` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit`
     `s`, `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
@@ -55,8 +60,8 @@ def _draw_sensor_residuals(
     over_time, spread, memory, spectrum = row
     colours, names = COLOURS[: standardised.shape[1]], "xyz"[: standardised.shape[1]]
     everything = standardised[mask].ravel()
-    # One wild reading must not press all others into a line: readings beyond `reach` are drawn at
-    # the edge.
+    # With a scale that includes an outlier all other residuals would lie on a line: residuals
+    # beyond `reach` are drawn at the border of the panel.
     reach = float(np.clip(np.abs(everything).max(initial=0.0) * 1.1, 4.0, 8.0))
     beyond = int((np.abs(everything) > reach).sum())
     shown = np.where(np.abs(standardised[mask]) <= reach, standardised[mask], np.nan)
@@ -67,13 +72,15 @@ def _draw_sensor_residuals(
         for axis, (values, colour) in enumerate(zip(standardised[mask].T, colours, strict=True)):
             for side, mark in ((1, "^"), (-1, "v")):
                 where = t[mask][side * values > reach]
-                # Each axis has a row of its own: one reading is often wild on all axes.
+                # The triangles of each axis have a height of their own, since an outlier often
+                # concerns all three axes at the same time.
                 at = np.full(where.size, side * reach * (0.95 - 0.09 * axis))
                 over_time.plot(where, at, color=colour, marker=mark, ms=5, ls="")
         name = f"beyond ±{reach:.0f}"
         over_time.plot([], [], color="0.4", marker="^", ms=2.5, ls="", label=name)
     over_time.axhspan(-2, 2, color="0.9", zorder=0)
-    # Four names in a row are wider than the axes: two rows then, and room for them.
+    # A legend of four names in one row is wider than the panel: it gets two rows, and space above
+    # the data.
     columns, room = (2, 1.65) if beyond else (3, 1.35)
     over_time.legend(loc="upper right", ncols=columns, fontsize=8, markerscale=2, columnspacing=1)
     over_time.set_ylim(-reach, room * reach)
@@ -83,7 +90,8 @@ def _draw_sensor_residuals(
     low, high = (inside.min(), inside.max()) if inside.size else (-1.0, 1.0)
     middle, half = 0.5 * (low + high), max(0.5 * (high - low), 1e-3 * reach)
     count = int(np.clip(2 * np.sqrt(everything.size), 9, 41))
-    # The bins reach at least from `low` to `high`: rounding must not leave the last reading out.
+    # The bins reach at least from `low` to `high`, so that rounding cannot leave the largest
+    # residual out.
     bins = np.linspace(min(low, middle - half), max(high, middle + half), count)
     label = f"{beyond} beyond" if beyond else None
     weights = np.full(everything.size, 1 / (everything.size * (bins[1] - bins[0])))
@@ -107,8 +115,10 @@ def _draw_sensor_residuals(
 
 
 def power_spectrum(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frequencies and power (F,) of residuals over their noise: white noise has power
-    1.
+    """Return two arrays (F,): frequencies; and the power of `values` at these frequencies.
+
+    **Arguments:** `t` (T,) times; `values` (T,) residuals divided by their standard deviation.
+    White noise has the power 1 at all frequencies; for fewer than eight times F is 0.
     """
     from scipy.signal import lombscargle, welch
 
@@ -117,7 +127,7 @@ def power_spectrum(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
         return np.zeros(0), np.zeros(0)
     gap = float(np.median(gaps))
     if (np.abs(gaps - gap) <= 1e-3 * gap).all():
-        # Several segments reduce the noise of the estimate.
+        # The mean over several segments has less noise than the spectrum of the whole.
         segment = min(t.size, max(64, min(t.size // 4, 512)))
         frequencies, density = welch(values, 1 / gap, nperseg=segment)
         return frequencies[1:], density[1:] / (2 * gap)

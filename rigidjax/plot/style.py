@@ -1,4 +1,4 @@
-"""Share parts of all pictures: colours, axes, the import of matplotlib, checks of arguments."""
+"""Provide what all pictures share: colours, axes, the import of matplotlib, checks of arguments."""
 
 from typing import Any
 
@@ -18,8 +18,9 @@ RATES = {"rad/s": 1.0, "deg/s": 180 / np.pi, "rpm": 30 / np.pi, "deg/day": 86400
 
 
 def pyplot() -> Any:
-    """Return `matplotlib.pyplot`, imported now. **Raises:** `ModuleNotFoundError`, which names the
-    extra `view`.
+    """Return `matplotlib.pyplot`, which is imported at the call.
+
+    **Raises:** `ModuleNotFoundError` without matplotlib; the message names the extra `view`.
     """
     try:
         import matplotlib.pyplot as plt
@@ -30,9 +31,10 @@ def pyplot() -> Any:
 
 
 def unit_factor(unit: str, units: dict[str, float], name: str) -> float:
-    """Return the factor of a unit to or from SI; the error for another unit lists the known ones.
+    """Return `units[unit]`, the conversion factor of a unit; raise an error for an unknown unit.
 
-    `name` is that of the argument.
+    **Arguments:** `unit` such as `day`; `units` `TIMES` (seconds in the unit) or `RATES` (how many
+    of the unit are 1 rad/s); `name` the name of the caller's argument, for the error.
     """
     return units[_checks.require_option(unit, tuple(units), name)]
 
@@ -40,8 +42,10 @@ def unit_factor(unit: str, units: dict[str, float], name: str) -> float:
 def readings_of_fit(
     fit_result: Any, index: object
 ) -> tuple[Any, list[np.ndarray], list[np.ndarray]]:
-    """Return a recording of a fit, its residuals and their standard deviations; raise an error if
-    there is none.
+    """Return three things: a recording of a fit; its residuals, an array for each sensor; and the
+    standard deviations of the residuals, an array for each sensor.
+
+    Raise an error if `fit_result` is not one fit, or has no recording with this `index`.
     """
     if np.shape(getattr(fit_result, "chi2", 0.0)) != ():
         raise ValueError(
@@ -65,15 +69,16 @@ def readings_of_fit(
 
 
 def flat_axes(ax: Any, **options: Any) -> Any:
-    """Return `ax`, or the axes of a new figure for `None`."""
+    """Return `ax`, or new axes if `ax` is `None`; `options` are arguments of `pyplot.subplots`."""
     if ax is not None:
         return ax
     return pyplot().subplots(layout="constrained", **{"figsize": (6.4, 4.4), **options})[1]
 
 
 def solid_axes(ax: Any) -> Any:
-    """Return `ax` if it is 3-D, or new 3-D axes for `None`. **Raises:** `TypeError` for flat
-    axes.
+    """Return `ax`, or new 3-D axes if `ax` is `None`.
+
+    **Raises:** `TypeError` for axes that are not 3-D.
     """
     if ax is None:
         figure = pyplot().figure(layout="constrained", figsize=(6.0, 5.6))
@@ -84,9 +89,9 @@ def solid_axes(ax: Any) -> Any:
 
 
 def axes_of_shape(ax: Any, shape: tuple[int, ...], **options: Any) -> Any:
-    """Return `ax` if it has this shape, or new axes (`options` of `subplots`) for `None`.
+    """Return `ax` as an array of axes with this shape, or new axes if `ax` is `None`.
 
-    **Raises:** `ValueError` for another shape.
+    `options` are arguments of `pyplot.subplots`. **Raises:** `ValueError` for another shape.
     """
     if ax is None:
         ax = np.reshape(pyplot().subplots(layout="constrained", **options)[1], shape)
@@ -99,16 +104,18 @@ def axes_of_shape(ax: Any, shape: tuple[int, ...], **options: Any) -> Any:
 
 
 def legend_below(ax: Any, *entries: Any, down: float = 0.16) -> None:
-    """Draw the legend under the axes, by `down` of their height: inside it would lie on the
-    curves.
+    """Draw the legend below the axes, at a distance of `down` times the height of the axes.
+
+    Inside the axes the legend would cover the curves. `entries` are arguments of `ax.legend`.
     """
     place = dict(loc="upper center", bbox_to_anchor=(0.5, -down))
     ax.legend(*entries, **place, ncols=3, fontsize=8, frameon=False)
 
 
 def times_on_host(ts: object, count: int, name: str = "the states have") -> np.ndarray:
-    """Return the times (T,) as NumPy float64. **Raises:** `ValueError` unless there are as many
-    times as states.
+    """Return the times `ts` (T,) as NumPy float64.
+
+    **Raises:** `ValueError` unless T is `count`; the message continues "as `name` …".
     """
     t = _checks.host_array(ts, "ts")
     if t.shape != (count,):
@@ -117,8 +124,9 @@ def times_on_host(ts: object, count: int, name: str = "the states have") -> np.n
 
 
 def rows_on_host(values: object, width: int, name: str) -> np.ndarray:
-    """Return values of one body over time (T, width) as NumPy float64. **Raises:** `ValueError` for
-    another shape.
+    """Return `values` of one body over time (T, width) as NumPy float64.
+
+    **Raises:** `ValueError` for another shape, or if no value is finite.
     """
     out = _checks.host_array(values, name)
     if out.ndim != 2 or out.shape[1] != width:
@@ -130,8 +138,9 @@ def rows_on_host(values: object, width: int, name: str) -> np.ndarray:
 
 
 def attitudes_on_host(states: Any) -> np.ndarray:
-    """Return the quaternions (T, 4) of states. **Raises:** `TypeError` for states without an
-    attitude.
+    """Return the quaternions (T, 4) of `states` as NumPy float64.
+
+    **Raises:** `TypeError` for states without an attitude.
     """
     if not hasattr(states, "q"):
         got = type(states).__name__
@@ -140,13 +149,13 @@ def attitudes_on_host(states: Any) -> np.ndarray:
 
 
 def rotation_matrices(q: np.ndarray) -> np.ndarray:
-    """Return rotation matrices (T, 3, 3), body → world, of quaternions (T, 4), for pictures."""
+    """Return the rotation matrices (T, 3, 3), body → world, of the quaternions `q` (T, 4)."""
     unit = jnp.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
     return np.asarray(jax.vmap(quaternion.to_matrix)(unit), dtype=float)
 
 
 def sphere_points(longitude: np.ndarray, colatitude: np.ndarray) -> np.ndarray:
-    """Return places (3, …) on the unit sphere, by `longitude` and `colatitude`."""
+    """Return points (3, …) on the unit sphere from their `longitude` and `colatitude`, rad."""
     ring, height = np.sin(colatitude), np.cos(colatitude)
     return np.stack(np.broadcast_arrays(np.cos(longitude) * ring, np.sin(longitude) * ring, height))
 
@@ -159,7 +168,8 @@ def draw_around_ball(
     eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
     front, label = path @ eye > 0, style.pop("label", None)
     for seen, more in ((front, {"label": label}), (~front, hidden_style or {"alpha": 0.25})):
-        # Each part has one point more on both sides of the edge, so that no gap opens between them.
+        # The visible and the hidden part of the line overlap by one point, so that no gap opens
+        # between the two.
         wide = seen | np.roll(seen, 1) | np.roll(seen, -1)
         wide[0], wide[-1] = seen[0], seen[-1]
         line = np.where(wide[:, None], path, np.nan)
@@ -167,24 +177,26 @@ def draw_around_ball(
 
 
 def sphere_grid() -> np.ndarray:
-    """Return a grid (3, 49, 25) on the unit sphere."""
+    """Return a grid of points (3, 49, 25) on the unit sphere, by longitude and colatitude."""
     return sphere_points(np.linspace(0, 2 * np.pi, 49)[:, None], np.linspace(0, np.pi, 25))
 
 
 def draw_sphere(ax: Any, colour: str, alpha: float) -> None:
-    """Draw the unit sphere, translucent."""
+    """Draw the unit sphere as a translucent surface; `alpha` is its opacity, from 0 to 1."""
     ax.plot_surface(*sphere_grid(), color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1)
 
 
 def set_equal_scales(ax: Any, reach: float, labels: tuple[str, str, str]) -> None:
-    """Set equal scales on all three axes, few ticks, and names that do not run into the ticks."""
+    """Set equal scales, from −`reach` to `reach`, on all three axes, with few ticks and with
+    `labels`.
+    """
     from matplotlib.ticker import MaxNLocator
 
     ax.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
     ax.set_box_aspect((1, 1, 1))
     for axis, label in zip((ax.xaxis, ax.yaxis, ax.zaxis), labels, strict=True):
-        # The outer ticks are left out: at the corners of the cube their numbers would lie on the
-        # numbers of the next axis.
+        # The outer ticks are left out: at the corners of the cube the number at such a tick would
+        # cover a number of the next axis.
         axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="both"))
         axis.set_label_text(label)
         axis.labelpad = 4

@@ -1,4 +1,4 @@
-"""Draw attitude and body rate against time."""
+"""Draw the attitude and the body rate against time."""
 
 from typing import Any
 
@@ -27,8 +27,8 @@ def motion(
     """Draw the body rate against time, and above it the attitude if the states have one.
 
     **Arguments:** `ts` (T,) s; `states` of one body with a leading time axis, such as `sol.ys`;
-    `attitude` the form of the attitude: `quaternion` (w, x, y, z), `axes` (the height of each body
-    axis along world z) or `angles` (3-1-3, notes eq 31, deg); `time_unit` `s`, `min`, `h`, `day`;
+    `attitude` the form of the attitude: `quaternion` (w, x, y, z), `axes` (the world z component of
+    each body axis) or `angles` (3-1-3, notes eq 31, deg); `time_unit` `s`, `min`, `h`, `day`;
     `rate_unit` `rad/s`, `deg/s`, `rpm`, `deg/day`; `title`; `ax` two axes (one for a `Spin`).
     **Returns** the axes, (2,) or (1,).
 
@@ -55,7 +55,7 @@ def motion(
     for one in ax:
         one.margins(x=0)
         one.grid(alpha=0.3)
-        # The legend is beside the picture: inside it would cover a line.
+        # The legend is beside the axes: inside the axes it would cover a curve.
         one.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     if title:
         ax[0].set_title(escape_formulas(title))
@@ -79,8 +79,8 @@ def _draw_attitude(ax: Any, t: np.ndarray, q: np.ndarray, kind: str) -> None:
 
 def _angles_in_degrees(q: np.ndarray) -> np.ndarray:
     degrees = np.degrees(np.asarray(jax.vmap(euler.from_quaternion)(jnp.asarray(q))))
-    # Where an angle jumps from 180° to −180° there is a gap: a line across the whole picture would
-    # look like a motion.
+    # Where an angle jumps from 180° to −180° the curve is interrupted: a line across the whole
+    # picture would look like a motion.
     jump = np.abs(np.diff(degrees, axis=0)) > 180
     degrees[1:][jump] = np.nan
     return degrees

@@ -1,7 +1,7 @@
-"""Compare error and cost, of the value and of the gradient: the choice of a method for a scene.
+"""Compare the error and the cost of methods, for motions and gradients, to choose one for a scene.
 
-`measure(scene)` runs methods on a scene, `draw` makes the chart and marks the Pareto front,
-`choose` the short table. `python -m rigidjax workprecision` does all of it.
+`measure(scene)` runs methods on a scene, `draw` makes a chart with the Pareto front, and `choose`
+finds the quickest methods. `python -m rigidjax workprecision` does all three.
 """
 
 from rigidjax._names import show

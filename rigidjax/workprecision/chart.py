@@ -1,4 +1,4 @@
-"""Draw charts of error against time. matplotlib is imported only when a chart is asked for."""
+"""Draw charts of error and time. matplotlib is imported only when a chart is drawn."""
 
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
@@ -15,16 +15,16 @@ _COLOURS = {"ours": "tab20", "jax": "Set2", "peer": "Dark2"}
 
 
 def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
-    """Draw the error against time, log–log: values on the left, gradients on the right, with the
-    front marked.
+    """Draw the time against the error, log–log, for values and gradients, with the Pareto front.
 
-    Each scene has a row. Beside the time of a run a panel shows the time of a first answer
-    (compiling and one run), if it is known. Another panel shows the error of each value against the
-    tolerance or accuracy that was asked for. The grey band is the Pareto front of error and time,
-    peers included; its points are ringed. The coloured band is the front of the methods in JAX.
-    Error bars are quartiles of the time.
+    Each scene has a row of panels, from left to right: the time of a run; the time of a first
+    answer
+    (compilation and one run), if it is known; and the error of each value against the tolerance or
+    accuracy that was asked for. The grey band is the Pareto front of error and time of all methods;
+    rings mark the points on this front. The coloured band is the Pareto front of the methods in
+    JAX alone. Error bars are the quartiles of the time.
 
-    **Arguments:** `records` as measured; `title` of the whole.
+    **Arguments:** `records` as `measure` returns them; `title` of the figure.
 
     **Returns** a `matplotlib` figure.
 
@@ -70,15 +70,16 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
 
 
 def _errors_and_times(records: list[Measurement]) -> tuple[list[float], list[float]]:
-    """Return the errors and the times, ms."""
+    """Return two lists for the records: the errors, at least 1e-16; and the times, ms."""
     return [max(r.error, 1e-16) for r in records], [1e3 * r.time for r in records]
 
 
 def _curves(
     records: list[Measurement], labels: list[tuple[str, str]]
 ) -> Iterator[tuple[list, dict]]:
-    """Yield the records of each method, from the smallest setting on, with the style of its
-    line.
+    """Yield, for each method, its records by rising setting and the style of its curve.
+
+    **Arguments:** `records` of one scene; `labels` the label and the group of each method.
     """
     import matplotlib as mpl
 
@@ -136,7 +137,7 @@ def _draw_times(axis: "Axes", records: list[Measurement], labels: list[tuple[str
 
 def _style_axis(axis: "Axes") -> None:
     axis.set(xscale="log", yscale="log")
-    # Better is to the right and down.
+    # The error axis is reversed: a better method is further to the right and further down.
     axis.invert_xaxis()
     axis.grid(alpha=0.3, which="major")
     axis.legend(fontsize=6, ncols=3, loc="upper left", bbox_to_anchor=(0, -0.13), frameon=False)

@@ -22,7 +22,7 @@ from rigidjax.workprecision.standard_scenes import scenes
 
 STORED = Path("tests/workprecision/record.csv")
 QUICK = ("free-top", "heavy-top", "damped-gyrostat")
-# The methods of a quick run, each with the adjoints that it measures.
+# The methods of a quick run, and for each method the adjoints that are measured.
 SMALL = {
     "closed form": ("forward",),
     "simulate": ("forward",),
@@ -32,8 +32,8 @@ SMALL = {
     "diffrax Dopri8": ("forward",),
 }
 DRIFT = "long-drift"
-# Compiling gradients is most of a run: they are measured for these scenes, and for every scene that
-# is named on the command line.
+# Compiling gradients takes most of the time of a run: gradients are measured only for these scenes,
+# and for every scene that is named on the command line.
 GRADED = (*QUICK, "asymmetric-top", "gravity-gradient", "arenstorf")
 _FILE: dict[str, Any] = {"type": Path, "metavar": "FILE"}
 _FLAG: dict[str, Any] = {"action": "store_true"}
@@ -60,7 +60,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def add_subcommand(commands: argparse._SubParsersAction) -> None:
-    """Add the subcommand to an `argparse` parser's commands."""
+    """Add the subcommand `workprecision` to the subcommands of an `argparse` parser."""
     parser = commands.add_parser(
         "workprecision",
         help="error against cost of each method, of values and gradients",
@@ -75,7 +75,11 @@ def add_subcommand(commands: argparse._SubParsersAction) -> None:
 
 
 def run_subcommand(options: argparse.Namespace) -> int:
-    """Run the subcommand. **Returns** the exit code: 0 good, 1 something moved, 2 bad input."""
+    """Run the subcommand, and **return** the exit code.
+
+    The code is 0 for success, 1 if an error or a number of steps changed since the stored table,
+    and 2 for wrong options or files.
+    """
     try:
         known = [*scenes(), DRIFT]
         for name in options.scene:
@@ -138,8 +142,10 @@ def _measure(options: argparse.Namespace) -> list[Measurement]:
 
 
 def summary(records: Iterable[Measurement]) -> str:
-    """Return, scene by scene, the time to each wanted error, µs; * marks the front, + the front of
-    JAX alone.
+    """Return a text with the time, µs, in which each method reaches each wanted error, by scene.
+
+    A * marks the methods on the Pareto front of error and time; a + marks the methods on the front
+    of the methods in JAX alone.
     """
     records = list(records)
     lines: list[str] = []

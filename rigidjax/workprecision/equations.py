@@ -1,7 +1,8 @@
-"""Write the equations of the scenes in plain arithmetic: for peers and for references.
+"""Define the equations of the scenes in plain arithmetic, for other packages and for references.
 
-Written apart from the rest of the library, on numbers that may be floats, `mpmath` or `gmpy2`
-numbers, or a peer's symbols. `sin` and `cos` come in as arguments, everything else is + − × ÷.
+The equations are independent of the rest of the library. The numbers may be floats, `mpmath` or
+`gmpy2` numbers, or the symbols of another package; `sin`, `cos` and `sqrt` are arguments, and
+everything else is + − × ÷.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +19,9 @@ def heavy_top_torque(
     cos: Callable[[Number], Number],
     to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
-    """Return the torque `τ = c m × Rᵀg`; constants m c (3) and g (3)."""
+    """Return the torque `τ = m c × Rᵀg`; `constants` are m c (3), mass times centre, and gravity g
+    (3).
+    """
     cx, cy, cz, gx, gy, gz = constants
 
     def torque(t, q, w):
@@ -35,8 +38,10 @@ def gravity_gradient_torque(
     cos: Callable[[Number], Number],
     to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
-    """Return the torque `τ = 3n² r × I r`, r the direction of the planet on a circular orbit;
-    constants n.
+    """Return the torque `τ = 3n² r × I r` on a circular orbit about a planet.
+
+    r is the unit vector along the line to the planet, in body axes; `constants` is the orbital rate
+    n alone, and `inertia` has Ixx, Iyy, Izz, Ixy, Ixz, Iyz.
     """
     (n,) = constants
     ixx, iyy, izz, ixy, ixz, iyz = inertia
@@ -59,8 +64,9 @@ def gyrostat_torque(
     cos: Callable[[Number], Number],
     to_body: Callable[..., tuple[Number, Number, Number]],
 ) -> Torque:
-    """Return the torque `τ = h × Ω − c Ω` of a wheel at constant speed and damping; constants h
-    (3), c (3).
+    """Return the torque `τ = h × Ω − c Ω` of a wheel at constant speed, and of damping.
+
+    `constants` are the angular momentum h (3) of the wheel and the damping coefficients c (3).
     """
     hx, hy, hz, cx, cy, cz = constants
 
@@ -76,7 +82,7 @@ def gyrostat_torque(
 
 
 def to_body_axes(q, x, y, z):
-    """Return `Rᵀ(x, y, z)` for a unit quaternion q."""
+    """Return `Rᵀ(x, y, z)`, the vector in body axes, for a unit quaternion q of the matrix R."""
     a, b, c, d = q
     return (
         (1 - 2 * (c * c + d * d)) * x + 2 * (b * c + a * d) * y + 2 * (b * d - a * c) * z,
@@ -86,7 +92,10 @@ def to_body_axes(q, x, y, z):
 
 
 def body_rates(inertia: Sequence[Number], torque: Torque | None) -> Callable[[Number, Any], Any]:
-    """Return `(t, (q, Ω)) → (q', Ω')` for an inertia (Ixx, Iyy, Izz, Ixy, Ixz, Iyz), 7 numbers."""
+    """Return the vector field `(t, y) → dy/dt` of a body; y has 7 numbers, the quaternion q and Ω.
+
+    `inertia` has Ixx, Iyy, Izz, Ixy, Ixz, Iyz; `torque` is a function of t, q and Ω, or `None`.
+    """
     ixx, iyy, izz, ixy, ixz, iyz = inertia
     kxx, kyy, kzz = iyy * izz - iyz * iyz, ixx * izz - ixz * ixz, ixx * iyy - ixy * ixy
     kxy, kxz, kyz = ixz * iyz - ixy * izz, ixy * iyz - ixz * iyy, ixy * ixz - ixx * iyz
@@ -118,8 +127,10 @@ def body_rates(inertia: Sequence[Number], torque: Torque | None) -> Callable[[Nu
 def foucault_rates(
     constants: Sequence[Number], sqrt: Callable[[Number], Number]
 ) -> Callable[[Number, Any], Any]:
-    """Return the rates of a pendulum on the turning Earth, axes east, north, up; constants g, Ω
-    north, Ω up.
+    """Return the vector field `(t, y) → dy/dt` of a pendulum on the turning Earth.
+
+    y has 6 numbers, the position and velocity in the axes east, north, up; `constants` are g and
+    the components of Ω along north and up.
     """
     g, wn, wu = constants
 
@@ -139,7 +150,10 @@ def foucault_rates(
 def three_body_rates(
     constants: Sequence[Number], sqrt: Callable[[Number], Number]
 ) -> Callable[[Number, Any], Any]:
-    """Return the rates of the circular restricted problem in the turning frame; constants μ."""
+    """Return the vector field `(t, y) → dy/dt` of the circular restricted three-body problem.
+
+    y has 6 numbers, the position and velocity in the rotating frame; `constants` is μ alone.
+    """
     (mu,) = constants
     nu = 1 - mu
 

@@ -1,4 +1,4 @@
-"""Prepare the methods in JAX: ours and diffrax's solvers, on one field, each compiled once."""
+"""Prepare the methods in JAX, our methods and diffrax's solvers, each compiled once."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -24,15 +24,16 @@ FOUR = (200, 500, 1200, 3000, 8000, 20000, 60000)
 MOST = 400_000
 MODES = {"forward": jax.jacfwd, "reverse": jax.grad}
 
-# numbers, setting → the last state as a vector, steps
+# A flow is a function of the scene's numbers and of the setting; it returns the last state as a
+# vector, and the number of steps.
 Flow = Callable[[Any, Any], tuple[Any, Any]]
 Make = Callable[[BenchmarkScene], Flow | None]
 
 
 def compile_flow(scene: BenchmarkScene, flow: Flow) -> PreparedMethod:
-    """Return one compiled call for all settings.
+    """Return `flow` compiled for `scene`, once for all settings.
 
-    It is timed as a user would call it: only numbers go in.
+    Its arguments are numbers only, as in the call of a user.
     """
     numbers = scene.numbers
     start = time.perf_counter()
@@ -41,7 +42,7 @@ def compile_flow(scene: BenchmarkScene, flow: Flow) -> PreparedMethod:
     memory = ready.memory_analysis()
     held = float(memory.temp_size_in_bytes) if memory is not None else float("nan")
 
-    # Settings stay on the device: to move a number there takes as long as some runs.
+    # The settings are kept on the device: moving a number to the device takes as long as some runs.
     there: dict[float, Any] = {}
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -53,8 +54,10 @@ def compile_flow(scene: BenchmarkScene, flow: Flow) -> PreparedMethod:
 
 
 def flow_of(scene: BenchmarkScene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]) -> Flow:
-    """Return the flow of `run`, which takes a body, an initial state, both times and a setting to
-    states over time and a number of steps.
+    """Return the flow of `run` on a scene: a function of the scene's numbers and the setting.
+
+    `run(body, state0, ts, setting)` returns two things: the states at `ts`, which are the first and
+    the last time, s; and the number of steps.
     """
 
     def flow(numbers: Array, setting: Array) -> tuple[Any, Any]:
@@ -74,8 +77,10 @@ def _closed_form_flow(scene: BenchmarkScene) -> Flow | None:
 
 
 def _simulate_flow(scene: BenchmarkScene, accuracy: bool = False) -> Flow | None:
-    """Return the flow of `simulate` with its defaults, except for the tolerance, which is traced so
-    that one program does.
+    """Return the flow of `simulate` with its defaults, except for the tolerance.
+
+    The tolerance is traced, so that one compiled program serves all settings. With `accuracy` the
+    setting is the argument `accuracy` of `simulate`. The result is `None` without a torque.
     """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
@@ -88,7 +93,9 @@ def _simulate_flow(scene: BenchmarkScene, accuracy: bool = False) -> Flow | None
 
 
 def _adaptive_flow(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
-    """Return the flow of the loop in which `simulate` runs under a torque, in both modes."""
+    """Return the flow of the adaptive loop of `simulate`, differentiable in forward and reverse
+    mode.
+    """
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         field = equations_of_motion(body, start, scene.torque)
@@ -99,7 +106,7 @@ def _adaptive_flow(scene: BenchmarkScene, solver: AbstractExplicit) -> Flow:
 
 
 def fixed_steps_flow(scene: BenchmarkScene, solver: AbstractExplicit | AbstractSplitting) -> Flow:
-    """Return the flow of `solver` with a number of equal steps, which is the setting."""
+    """Return the flow of `solver` with equal steps; the setting is the number of steps."""
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         field, count = equations_of_motion(body, start, scene.torque), setting.astype(int)
@@ -111,7 +118,7 @@ def fixed_steps_flow(scene: BenchmarkScene, solver: AbstractExplicit | AbstractS
 def _flow_in_diffrax(
     scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
-    """Return the flow of our field and state in diffrax's loop."""
+    """Return the flow of our vector field and state, solved by `solver` in diffrax's own loop."""
 
     def run(body: Inertia, start: PyTree, ts: Array, setting: Array) -> tuple[Any, Any]:
         field = equations_of_motion(body, start, scene.torque)
@@ -123,8 +130,9 @@ def _flow_in_diffrax(
 def _handwritten_flow(
     scene: BenchmarkScene, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint | None = None
 ) -> Flow:
-    """Return the flow of a user's own code: equations written by hand, one array, constants
-    computed once.
+    """Return the flow of equations that a user would write by hand, solved by diffrax.
+
+    The state is one array, and the constants are computed once, before the run.
     """
     plain = scene.plain
     if plain is None:
@@ -166,8 +174,11 @@ def _solve_field(
 def _prepare(
     make: Make, take: Callable[..., Any] | None, scene: BenchmarkScene
 ) -> PreparedMethod | None:
-    """Return the flow prepared for a scene, or with `take` its gradient of the scene's scalar;
-    `None` if it cannot run.
+    """Return the flow of `make(scene)` compiled, or its gradient, or `None` if it cannot do the
+    scene.
+
+    `take`, `jax.grad` or `jax.jacfwd`, asks for the gradient of the scene's scalar (`loss`) with
+    respect to the scene's numbers.
     """
     flow = make(scene)
     if flow is None:
@@ -184,20 +195,20 @@ def _prepare(
     try:
         return compile_flow(scene, flow if take is None else slopes)
     except TypeError as refused:
-        # A splitting refuses a torque that depends on the rate: the scene is left out.
+        # A splitting method refuses a torque that depends on the rate: such a scene is left out.
         if "Splitting" in str(refused):
             return None
         raise
 
 
 def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> TimedMethod:
-    """Return any `diffrax` solver as a method, with a step controller, on equations written by
-    hand.
+    """Return a method for `measure` from any `diffrax` solver, with adaptive steps.
 
-    For a scene without such equations (`plain`) the solver runs on our vector field.
+    The solver runs on the handwritten equations of the scene (`plain`), or on our vector field for
+    a scene without such equations.
 
-    **Arguments:** `solver` with an error estimate; `gradients` whether its adjoints are measured,
-    too: `forward`, `checkpointed`, `backsolve`.
+    **Arguments:** `solver` with an error estimate; `gradients` whether gradients are
+    measured, too, by the adjoints `forward`, `checkpointed` and `backsolve` of diffrax.
 
     >>> diffrax_method(dfx.Heun()).name
     'diffrax Heun'
@@ -231,7 +242,7 @@ def _own_method(
 
 
 def methods_in_jax() -> list[TimedMethod]:
-    """Return our methods and diffrax's, in the order of the charts."""
+    """Return our methods and those of diffrax, in the order of the charts."""
     eight = solvers.DormandPrince8()
     equal = ((EIGHT, eight), (FOUR, solvers.RungeKutta4()))
     equal += ((EIGHT, solvers.Splitting4()), (EIGHT, solvers.Splitting6()))

@@ -1,4 +1,4 @@
-"""Measure methods prepared for a scene, timed in turn; and the drift of a very long run."""
+"""Measure the error and time of methods on a scene, and the drift of a very long run."""
 
 import dataclasses
 import time
@@ -31,14 +31,14 @@ from rigidjax.workprecision.scene import (
     state_errors,
 )
 
-# Runs longer than LONG, s, are timed three times; runs shorter than SHORT are timed three times as
-# often as the others.
+# Runs longer than LONG, s, are timed three times; runs shorter than SHORT, s, are timed three times
+# as often as runs between SHORT and LONG.
 LONG, SHORT = 0.5, 0.02
-# Short runs are repeated for at least BURST seconds at a stretch, and timed together.
+# One timing of a short run repeats the run for about BURST seconds, and takes the mean.
 BURST = 3e-3
 WRONG = 0.5
-# The run of `long_drift`: its number of steps, the moments of its body, the number of states that
-# are looked at, and the length of a step, s, by solver.
+# The run of `long_drift`: STEPS is the number of steps, BODY the principal moments, LOOKS the
+# number of states that are saved, and RUNS has, by name, the length of a step, s, and the solver.
 STEPS = 1_000_000
 BODY = (0.7, 1.2, 1.6)
 LOOKS = 101
@@ -68,18 +68,19 @@ def measure(
     rounds: int = 5,
     progress: Callable[[str], None] | None = None,
 ) -> list[Measurement]:
-    """Return the error and cost of each method at each of its settings, of the value and of its
-    gradient.
+    """Return the error and the cost of each method at each of its settings, for value and gradient.
 
-    All runs are in this process, in turn, round after round; compilation is timed separately. The
-    records omit methods that cannot do the scene, and runs with an error of more than half a radian
-    (or 100 %).
+    All runs are in this process. Each round times all runs, one after another; compilation is timed
+    separately. The records omit methods that cannot do the scene, and runs with an error of 0.5 or
+    more (rad, or relative).
 
-    **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more of them;
-    `gradients` whether gradients are measured, too; `thin` takes every `thin`-th setting; `rounds`
+    **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more methods;
+    `gradients` whether gradients are measured, too; `thin` a number k to use every k-th setting;
+    `rounds`
     the least number of timings of each run; `progress` is called with a line of text.
 
-    **Raises:** `TypeError` for something that is no `BenchmarkScene` or `TimedMethod`.
+    **Raises:** `TypeError` for a `scene` that is no `BenchmarkScene`, or a method that is no
+    `TimedMethod`.
     """
     made = 'standard ones are made by rj.workprecision.scenes()["heavy-top"]()'
     _checks.require_instance(
@@ -113,11 +114,10 @@ def measure(
 
 
 def compute_reference(scene: BenchmarkScene, gradients: bool = True) -> Reference:
-    """Return a reference for a scene without one: order 8 with fixed steps, compared with half as
-    many steps.
+    """Return a reference for a scene without one, from a method of order 8 with fixed steps.
 
-    The error of the reference is the difference of the two runs, at least a hundred units of
-    round-off.
+    The error of the reference is the difference from a run with half as many steps, but at least
+    100 times the machine epsilon.
     """
     counts = (4000, 2000)
     numbers, scale = scene.numbers, max(1.0, _turn(scene) / 50)
@@ -138,8 +138,9 @@ def compute_reference(scene: BenchmarkScene, gradients: bool = True) -> Referenc
 
 
 def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
-    """Return the scene in single precision; its reference is computed in double precision from the
-    rounded numbers.
+    """Return the scene in single precision.
+
+    The reference is computed in double precision from the numbers rounded to single precision.
     """
 
     def cast(scene: BenchmarkScene, dtype: DTypeLike) -> BenchmarkScene:
@@ -153,12 +154,15 @@ def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
     right = compute_reference(
         dataclasses.replace(cast(low, jnp.float64), reference=None), gradients
     )
-    # Without `plain`: the equations written by hand have constants in double precision.
+    # The scene loses `plain`: the handwritten equations have constants in double precision.
     return dataclasses.replace(low, name=f"{scene.name}, float32", reference=right, plain=None)
 
 
 def _turn(scene: BenchmarkScene) -> float:
-    """Return the rough angle turned in the scene, rad; for a point, which has none, 50."""
+    """Return a rough estimate of the angle that the body turns in the scene, rad, at least 50.
+
+    For a point the result is 50: numbers of equal steps are given for a run of 50 rad.
+    """
     return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
 
 
@@ -166,7 +170,7 @@ def _settings(scene: BenchmarkScene, method: TimedMethod, stride: int) -> list[f
     settings = list(method.settings)[::-1][::stride][::-1]
     if method.equal:
         return [float(round(s * _turn(scene) / 50)) for s in settings]
-    # A tolerance below ten units of round-off rejects every step.
+    # With a tolerance below about ten times the machine epsilon every step is rejected.
     least = 10 * float(jnp.finfo(scene.numbers.dtype).eps)
     return [float(s) for s in settings if s == 0 or s > least]
 
@@ -215,8 +219,9 @@ def _gradient_errors(
 
 
 def drifts(scene: BenchmarkScene, end: np.ndarray | Array) -> tuple[float, float]:
-    """Return the relative drift of energy and momentum (for a point the drift of its integral, and
-    NaN).
+    """Return two numbers: the relative drift of the energy; and the largest drift of a momentum.
+
+    For a point the two are the relative drift of its first conserved quantity, and NaN.
     """
     if scene.body is None:
         law: Any = scene_of_force(scene.torque)
@@ -242,8 +247,8 @@ def _time_jobs(jobs: list[_Job], rounds: int) -> None:
             first = job.times[0]
             if turn >= (3 if first > LONG else rounds if first > SHORT else 3 * rounds):
                 continue
-            # The first call finds the processor's caches full of the method before: a long program
-            # such as the closed form's takes fifteen times as long then.
+            # This call is not timed: it finds the caches of the processor filled by another method,
+            # and a long program such as that of the closed form then takes fifteen times as long.
             job.ready.run(job.record.setting)
             many = max(1, int(BURST / first))
             begin = time.perf_counter()
@@ -261,10 +266,12 @@ def long_drift(
     """Return the largest drift of energy and momentum over `steps` equal steps of an asymmetric
     heavy top.
 
-    There are two records for each method: of the first hundredth of the run, and of the whole run.
-    The drift is bounded if they agree; it grows with time if the second is a hundred times the
-    first. `setting` is the length of a step, s; `error` is the energy's (the motion forgets its
-    start long before the end).
+    Each method has two records: one for the first hundredth of the run, one for the whole run. The
+    drift is bounded if both drifts are about equal, and grows with time if the drift of the whole
+    run is a hundred times that of the first hundredth. In a record `setting` is the length of a
+    step, s, and `error` is the drift of the energy, since the motion forgets its start long before
+    the
+    end, where no reference is possible.
     """
     body = Inertia.from_principal(*BODY)
     start = Attitude([0.955336489125606, 0.29552020666133955, 0.0, 0.0], [0.4, 0.3, 1.2])

@@ -1,4 +1,4 @@
-"""Find the Pareto front, the time to an error, and the short table that follows from them."""
+"""Find the Pareto front of error and time, and the quickest method for an error."""
 
 import dataclasses
 import itertools
@@ -13,10 +13,10 @@ WANTED = (1e-4, 1e-7, 1e-10)
 
 
 def pareto_front(records: Iterable[Measurement]) -> list[Measurement]:
-    """Return the records of one scene and kind on the Pareto front of error and time.
+    """Return the records on the Pareto front of error and time, by falling error.
 
-    A record is compared with the curves of the others, log–log between their settings, not only
-    with the measured points. The records are returned by falling error.
+    All `records` are of one scene and one kind. A record is on the front if no method reaches its
+    error in less time; the time of a method is interpolated log–log between its settings.
     """
     records = [r for r in list_records(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
@@ -34,7 +34,9 @@ def pareto_front(records: Iterable[Measurement]) -> list[Measurement]:
 
 
 def first_answers(records: Iterable[Measurement]) -> list[Measurement]:
-    """Return the records with the time that a first answer takes: compiling and one run."""
+    """Return the records with their times increased by the time of compilation: the time of a first
+    answer.
+    """
     return [
         dataclasses.replace(r, time=r.time + c, time_low=r.time_low + c, time_high=r.time_high + c)
         for r in list_records(records)
@@ -43,15 +45,16 @@ def first_answers(records: Iterable[Measurement]) -> list[Measurement]:
 
 
 def time_to(records: Iterable[Measurement], error: float) -> float:
-    """Return the time, s, that the method of these records takes to an error, interpolated log–log
-    between its settings.
+    """Return the time, s, in which a method reaches an error, from its `records`.
 
-    This is the time of the coarsest setting if its error is already smaller, and NaN if no setting
-    reaches the error.
+    The time is interpolated log–log between the settings of the method. It is the time of the
+    quickest setting if the error of this setting is already smaller, and NaN if no setting reaches
+    the error.
     """
     error = _checks.positive_float(error, "error")
     rungs = sorted((r for r in list_records(records) if r.error == r.error), key=lambda r: r.time)
-    # Errors need not fall with every setting: only the least error up to a time counts.
+    # A slower setting may have a larger error: only records with a smaller error than all quicker
+    # records are used.
     least, seen = math.inf, []
     for record in rungs:
         if record.error < least:
@@ -69,12 +72,13 @@ def time_to(records: Iterable[Measurement], error: float) -> float:
 
 
 class Choice(NamedTuple):
-    """Hold a line of the table.
+    """Hold the quickest methods for one scene and one wanted error, a line of `table`.
 
-    **Fields:** for `scene` and the `wanted` error, the quickest `method` of ours and its `time`, s;
-    the way to the `gradient` at an equal relative error and its `gradient_time`; `default` and
-    `default_gradient`, times of `simulate` with its defaults; `peer`, `peer_time`: a method that is
-    quicker than ours, if there is one.
+    **Fields:** `scene`; `wanted` the error; `method` the quickest of our methods and `time`, s;
+    `gradient` our quickest method for a gradient with that relative error, and `gradient_time`, s;
+    `default` and `default_gradient`, the times of `simulate` with its defaults, s; `peer`,
+    `peer_time` a method outside rigidjax that is quicker than `method`, empty and NaN if there is
+    none.
 
     >>> Choice._fields[:2]
     ('scene', 'wanted')
@@ -93,10 +97,10 @@ class Choice(NamedTuple):
 
 
 def choose(records: Iterable[Measurement], wanted: Sequence[float] = WANTED) -> list[Choice]:
-    """Return, for each scene and wanted error, the quickest method of ours, and a quicker peer if
-    there is one.
+    """Return, for each scene and wanted error, our quickest method and any quicker method of
+    others.
 
-    **Arguments:** `records` as measured, of any scenes; `wanted` errors, rad.
+    **Arguments:** `records` of any scenes, as `measure` returns them; `wanted` errors, rad.
 
     >>> choose([])
     []
@@ -126,7 +130,9 @@ def _choice(records: list[Measurement], scene: str, error: float) -> Choice:
 
 
 def times_by_method(records: Iterable[Measurement], kind: str, error: float) -> dict[str, float]:
-    """Return the time to an error of each method that reaches it, label → s, the quickest first."""
+    """Return, by label, the time, s, of each method that reaches `error`, the quickest method
+    first.
+    """
     of = [r for r in records if r.kind == kind]
     times = {
         label: time_to([r for r in of if r.label == label], error)

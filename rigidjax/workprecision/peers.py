@@ -1,6 +1,4 @@
-"""Prepare peers that do not use JAX, as far as they are installed; list all methods that can be
-compared.
-"""
+"""Prepare methods of other packages, as far as these packages are installed, for a comparison."""
 
 import importlib
 import importlib.util
@@ -27,7 +25,7 @@ STEPS = (5e-2, 2e-2, 5e-3)
 
 
 def _rates(scene: BenchmarkScene, numbers: np.ndarray, **options: Any) -> Any:
-    """Return the plain equations of a scene on Python's floats."""
+    """Return the vector field of the handwritten equations of a scene, on Python's floats."""
     plain: Any = scene.plain
     return plain(tuple(map(float, numbers)), math.sin, math.cos, math.sqrt, **options)
 
@@ -41,17 +39,18 @@ def _has_weight(scene: BenchmarkScene) -> bool:
 
 
 def _is_in_double(scene: BenchmarkScene) -> bool:
-    # Importing gradsolve sets JAX to float64: it is refused for other scenes.
+    # Importing gradsolve sets JAX to float64: gradsolve is not used for scenes of another
+    # precision.
     return scene.plain is not None and scene.numbers.dtype == jnp.float64
 
 
 def _peer_decorator(
     module: str, can: Callable[[BenchmarkScene], bool] = _is_written_out
 ) -> Callable[[Any], Any]:
-    """Return a decorator that makes a method's `value` from `make(scene, numbers, start, module) →
-    run`.
+    """Return a decorator that makes the `value` of a `TimedMethod` from a function `make`.
 
-    The time to import `module` is not counted.
+    `make(scene, numbers, start, module)` returns the `run` of a `PreparedMethod`; its time counts
+    as compilation, but the time to import `module` does not.
     """
 
     def decorate(make: Callable[[BenchmarkScene, np.ndarray, np.ndarray, Any], Any]) -> Any:
@@ -108,8 +107,9 @@ def _numba(scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, numba:
 def _mujoco(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, mujoco: ModuleType
 ) -> Any:
-    """Return the run of a body on a ball joint by MuJoCo's own Runge–Kutta 4; tops and free bodies
-    only.
+    """Return the run of MuJoCo's own Runge–Kutta 4 for a body on a ball joint.
+
+    Only heavy tops and free bodies have the `notes` that this needs.
     """
     notes, body = scene.notes, scene.body
     assert notes is not None and body is not None
@@ -125,7 +125,7 @@ def _mujoco(
         f'fullinertia="{words(about[at] for at in PAIRS)}"/></body></worldbody></mujoco>'
     )
     data: Any = mujoco.MjData(model)
-    # Without this MuJoCo writes a file into the working folder where a step is too long.
+    # Without this MuJoCo writes a file into the working folder when a step is too long.
     mujoco.set_mju_user_warning(lambda message: None)
 
     def run(setting: float) -> tuple[Any, Any]:
@@ -150,8 +150,9 @@ def _system(scene: BenchmarkScene, hy: ModuleType, numbers: Sequence[Any]) -> An
 def _run_of_propagator(
     hy: ModuleType, end: float, start: np.ndarray, system: Any, **options: Any
 ) -> Any:
-    """Return the run tolerance → (state at the end, steps). Order and code depend on the tolerance:
-    each is compiled.
+    """Return a run: given a tolerance it returns the state at the end, and the number of steps.
+
+    heyoka's order and code depend on the tolerance, so that each tolerance is compiled.
     """
     made: dict[float, Any] = {}
 
@@ -178,8 +179,10 @@ def _taylor(scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, hy: M
 def _variational(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, hy: ModuleType
 ) -> Any:
-    """Return the run of the variational equations by initial state and inertia, contracted with the
-    scalar's gradient.
+    """Return the run of the gradient of the scene's scalar, by the variational equations.
+
+    These are the equations with respect to the initial state and the inertia; their solution is
+    multiplied by the gradient of the scalar with respect to the last state.
     """
     size = 6 if scene.body is not None else 0
     symbols = [hy.par[i] for i in range(size)] or list(numbers)
@@ -196,8 +199,8 @@ def _variational(
     def run(setting: float) -> tuple[Any, Any]:
         state, steps = end_of(setting)
         slope = np.asarray(pull(state[:n])) @ state[n:].reshape(n, -1)
-        # The derivative by the initial state is carried on to the numbers of the scene; then the
-        # derivative by the parameters is added.
+        # The derivative with respect to the initial state is converted to one with respect to the
+        # numbers of the scene; then the derivative with respect to the inertia is added.
         gradient = slope[:n] @ chain
         gradient[:size] += slope[n : n + size]
         return gradient, steps
@@ -206,8 +209,9 @@ def _variational(
 
 
 class _Ensemble:
-    """Present a scene to gradsolve as an ensemble of one; its parameters are the scene's
-    numbers.
+    """Present a scene to gradsolve as an ensemble of one member.
+
+    The parameters of the member are the numbers of the scene.
     """
 
     is_stiff, t0 = False, 0.0
@@ -215,7 +219,7 @@ class _Ensemble:
     def __init__(
         self, scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
     ):
-        # Otherwise NumPy records a single scene, a thousand times as slowly.
+        # Without this setting NumPy records a single scene, which takes a thousand times as long.
         os.environ.setdefault("GRADSOLVE_RECORDER", "jax")
         self.module, self.plain = module, scene.plain
         self.name, self.t1 = scene.name, scene.end
@@ -249,8 +253,9 @@ def _solve_and_record(
 def _replay(
     scene: BenchmarkScene, numbers: np.ndarray, start: np.ndarray, module: ModuleType
 ) -> Any:
-    """Return the run of the gradient through recorded steps; the recording is made once, and not
-    timed.
+    """Return the run of the gradient through recorded steps.
+
+    The recording is made once for each setting, and is not timed.
     """
     ensemble = _Ensemble(scene, numbers, start, module)
     made: dict[float, Any] = {}
@@ -276,7 +281,8 @@ def _replay(
 
 
 def methods_outside() -> list[TimedMethod]:
-    """Return the peers that can be imported here, of SciPy, numba, MuJoCo, heyoka and gradsolve.
+    """Return the methods of SciPy, numba, MuJoCo, heyoka and gradsolve, as far as they are
+    installed.
 
     heyoka.py's adaptive Taylor method: Biscani and Izzo 2021, doi:10.1093/mnras/stab1032.
     gradsolve's replay of the recorded steps of Verner's method of order 7: arXiv:2609.02876.
@@ -297,9 +303,10 @@ def methods_outside() -> list[TimedMethod]:
 
 
 def methods(group: str | None = None) -> list[TimedMethod]:
-    """Return the methods that can be compared here: ours, others in JAX, and the peers installed.
+    """Return the methods to compare: our methods, those of diffrax, and those of installed
+    packages.
 
-    **Arguments:** `group` `ours`, `jax` or `peer` for those alone.
+    **Arguments:** `group` `ours`, `jax` or `peer`, to return the methods of one group only.
 
     >>> [method.name for method in methods("ours")][:2]
     ['closed form', 'simulate']

@@ -1,4 +1,4 @@
-"""Store records of measurements, one line for each run; list changes from a stored table.
+"""Store records of measurements in tables, one line for each run, and compare two tables.
 
 Tables are compared by errors, steps, and ratios of times, never by absolute times.
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rigidjax import _checks
 
-# Errors at round-off vary from run to run: changes below FLOOR do not count.
+# Errors of the size of round-off vary between machines: an error below FLOOR is compared as FLOOR.
 FLOOR = 1e-13
 WORSE, STEPS, SLOWER = 3.0, 0.02, 2.0
 BASE = "diffrax Dopri8"
@@ -22,13 +22,17 @@ class Measurement:
     """Hold the errors and the cost of one method at one setting on one scene.
 
     **Fields:** `scene`, `method` names; `group` `ours`, `jax` or `peer`; `kind` `value` or
-    `gradient`; `adjoint` how a gradient was taken; `setting` the tolerance, or the number of equal
+    `gradient`; `adjoint` the way a gradient is computed; `setting` the tolerance, or the number of
+    equal
     steps; `error` of the attitude, an angle in rad (for a point the relative error of its
-    position), and for a gradient the relative error |g − g*|/|g*|; `error_rate` of Ω relative to
-    |Ω0| (for a point that of the velocity); `energy`, `momentum` the relative drift of the energy,
-    and the larger drift of the conserved momenta; `by_inertia`, `by_rate`, `by_attitude` the parts
-    of a gradient's error, each relative to its own part (for a point the last two are velocity and
-    position); `steps`; `time`, `time_low`, `time_high` median and quartiles, s; `compile` s;
+    position), and for a gradient the relative error |g − g*|/|g*|; `error_rate` the error of Ω
+    relative to |Ω0| (for a point the relative
+    error of the velocity); `energy`, `momentum` the relative drift of the energy,
+    and the larger drift of the conserved momenta; `by_inertia`, `by_rate`, `by_attitude` the
+    relative errors
+    of the gradient with respect to the inertia, the initial rate and the initial attitude (for a
+    point `by_rate` is for the velocity and `by_attitude` for the position); `steps`; `time`,
+    `time_low`, `time_high` median and quartiles, s; `compile` s;
     `memory` bytes of the compiled run's temporaries. A field that does not apply is NaN.
 
     >>> Measurement("free-top", "closed form", "ours", "value", "", 0.0, error=1e-15).time
@@ -57,7 +61,7 @@ class Measurement:
 
     @property
     def label(self) -> str:
-        """Return method and adjoint as one name."""
+        """Return the method and, for a gradient, the adjoint as one name."""
         return f"{self.method}, {self.adjoint}" if self.adjoint else self.method
 
 
@@ -65,7 +69,7 @@ _WORDS = ("scene", "method", "group", "kind", "adjoint")
 
 
 def list_records(records: Iterable[Measurement], name: str = "records") -> list[Measurement]:
-    """Return the records as a list. **Raises:** `TypeError` if something else is among them."""
+    """Return the records as a list. **Raises:** `TypeError` for anything else."""
     _checks.require_instance(records, Iterable, name, requirement="records")
     items = list(records)
     for record in items:
@@ -74,7 +78,7 @@ def list_records(records: Iterable[Measurement], name: str = "records") -> list[
 
 
 def write_csv(records: Iterable[Measurement], path: str | Path) -> None:
-    """Write records to a file, one line each under a header; NaN is left empty."""
+    """Write records to a CSV file, one line for each record, after a header; NaN is left empty."""
     with Path(path).open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(field.name for field in dataclasses.fields(Measurement))
@@ -84,8 +88,9 @@ def write_csv(records: Iterable[Measurement], path: str | Path) -> None:
 
 
 def read_csv(path: str | Path) -> list[Measurement]:
-    """Return the records of a file that `write_csv` wrote. **Raises:** `ValueError` for another
-    file.
+    """Return the records of a file that `write_csv` wrote.
+
+    **Raises:** `ValueError` for a file without the columns of a record.
     """
     with Path(path).open(newline="") as file:
         rows, names = (
@@ -105,13 +110,13 @@ def read_csv(path: str | Path) -> list[Measurement]:
 def differences(
     records: Iterable[Measurement], stored: Iterable[Measurement]
 ) -> tuple[list[str], list[str]]:
-    """Return sentences about the differences of two tables: (changed errors or steps, changed
-    times).
+    """Return two lists of sentences: about changed errors and steps; and about changed times.
 
-    Lines that both tables have are compared, without peers. A difference is an error more than
-    three times as large or as small, steps that changed by more than 2 %, or a median time, over
-    that of `diffrax Dopri8` on the same scene at common settings, that changed by more than a
-    factor of 2.
+    Lines of two tables are compared, those of peers left out: `records` are new, `stored` are old.
+    A change is reported if an error is more than three times as large or as small; if the number of
+    steps differs by more than 2 %; if a line of `stored` is missing; or if the ratio of a method's
+    median time to that of `diffrax Dopri8`, on the same scene at common settings, has changed by
+    more than a factor of 2.
     """
     records, stored = list_records(records), list_records(stored, "stored")
     now = {_key(r): r for r in records if r.group != "peer"}
@@ -138,8 +143,9 @@ def differences(
 
 
 def records_to_store(records: Iterable[Measurement]) -> list[Measurement]:
-    """Return the records of a stored table: no peers, and times as multiples of the median time of
-    `BASE`.
+    """Return the records without peers, with times as multiples of the median time of `BASE`.
+
+    The median is that of `BASE` on the same scene; compile times and memory become NaN.
     """
     records = [r for r in records if r.group != "peer"]
     middle = _median_times(records)
@@ -162,7 +168,7 @@ def _scene_and_label(record: Measurement) -> str:
 
 
 def _median_times(records: Iterable[Measurement]) -> dict[tuple[str, str, str], float]:
-    """Return the median time of each scene, kind and label."""
+    """Return the median time, s, of each (scene, kind, label), over its settings."""
     times: dict[tuple[str, str, str], list[float]] = {}
     for r in records:
         if r.time == r.time:
@@ -171,7 +177,10 @@ def _median_times(records: Iterable[Measurement]) -> dict[tuple[str, str, str], 
 
 
 def _ratios(table: dict, common: set) -> dict[tuple[str, str, str], float]:
-    """Return the median over common settings of each label's time, divided by that of `BASE`."""
+    """Return, by (scene, kind, label), the ratio of the median time to the median time of `BASE`.
+
+    The medians are over the records of `table` with a key in `common`.
+    """
     middle = _median_times(record for key, record in table.items() if key in common)
     return {
         label: spent / middle[label[0], "value", BASE]

@@ -20,17 +20,17 @@ from rigidjax.frames import Point
 from rigidjax.motion import Attitude
 from rigidjax.rotation import quaternion
 
-# Gradients are taken of the scalar a.R b + c.Ω/|Ω0| at the end, with directions that are not
-# special.
+# A, B and C are the directions a, b and c of the scalar a·R b + c·Ω/|Ω0| at the end, whose gradient
+# is compared. The directions are generic.
 A, B, C = (0.6, -0.48, 0.64), (0.36, 0.8, -0.48), (0.28, -0.5, 0.82)
 
 
 class Reference(NamedTuple):
-    """Hold the end of a scene, and the gradient of its scalar.
+    """Hold the correct last state of a scene, and the correct gradient of its scalar (`loss`).
 
-    **Fields:** `end` the state as one tuple; `error` of its largest number, as estimated by the
-    method that made it; `gradient` of the scene's scalar, empty if there is none, and
-    `gradient_error` of its largest number; `source` a sentence.
+    **Fields:** `end` the last state as one tuple; `error` the estimated error of its entries;
+    `gradient` of the scalar with respect to the scene's `numbers`, or empty; `gradient_error` the
+    estimated error of its entries; `source` a sentence about the method.
 
     >>> top = stored_answer("heavy top")
     >>> top is None or top.error < 1e-12
@@ -65,9 +65,9 @@ class BenchmarkScene(eqx.Module):
     **Fields:** `name`, `title` words; `body` an `Inertia`, `None` for a `Point`; `state0` an
     `Attitude` or a `Point`; `torque` as for `rigidjax.simulate`; `end` s, the run is from 0 to
     `end`; `plain` the equations of the scene without JAX, `plain(numbers, sin, cos, sqrt) → f(t,
-    y)`, for peers and references (`None`: peers are left out); `reference` the correct answer,
-    `None`: computed by our own method at small steps; `slow` whether only a full run uses it;
-    `notes` data for a peer beyond the equations.
+    y)`, for other packages and references, or `None` to leave other packages out; `reference` the
+    correct answer, or `None` to compute it by our own method with small steps; `slow` true to leave
+    the scene out unless it is named; `notes` data that MuJoCo needs beyond the equations.
 
     >>> from rigidjax import Attitude, Inertia, torques
     >>> scene = BenchmarkScene("mine", "my body", Inertia(jnp.eye(3)),
@@ -104,8 +104,9 @@ class BenchmarkScene(eqx.Module):
 
     @property
     def numbers(self) -> Float[Array, " parameters"]:
-        """Return the variables of gradients: Ixx Iyy Izz Ixy Ixz Iyz, Ω0, q0 (13), or x0, v0
-        (6).
+        """Return the numbers with respect to which gradients are taken.
+
+        They are Ixx, Iyy, Izz, Ixy, Ixz, Iyz, Ω0, q0 (13,), or for a point x0, v0 (6,).
         """
         if self.body is None:
             return jnp.concatenate([self.state0.x, self.state0.v])  # pyright: ignore
@@ -115,8 +116,10 @@ class BenchmarkScene(eqx.Module):
 
     @property
     def blocks(self) -> dict[str, slice]:
-        """Return the slices of `numbers`, by the name that a `Record` gives to the error of a
-        gradient by them.
+        """Return the slices of `numbers` for inertia, initial rate and initial attitude.
+
+        The keys are the fields of a `Measurement` that hold the error of a gradient with respect to
+        these numbers; for a point the slices are of position and velocity.
         """
         if self.body is None:
             return {"by_attitude": slice(0, 3), "by_rate": slice(3, 6)}
@@ -135,7 +138,10 @@ class BenchmarkScene(eqx.Module):
 
     @property
     def size(self) -> tuple[float, float]:
-        """Return the scales of errors of both halves of the state: 1 rad and |Ω0|, or lengths."""
+        """Return two scales of errors: 1 rad for the attitude and |Ω0| for the rate.
+
+        For a point: |x0| for the position, and for the velocity |v0|, at least |x0|/`end`.
+        """
         state: Any = self.state0
         if self.body is None:
             length = float(np.linalg.norm(state.x))
@@ -143,7 +149,7 @@ class BenchmarkScene(eqx.Module):
         return 1.0, float(np.linalg.norm(state.omega))
 
     def loss(self, end: Float[Array, " state"]) -> Float[Array, ""]:
-        """Return the scalar whose gradient is compared, from a state as one vector."""
+        """Return the scalar whose gradient is compared, from the last state as one vector `end`."""
         one, two = self.size
         a, b, c = (jnp.asarray(v, end.dtype) for v in (A, B, C))
         if self.body is None:
@@ -156,8 +162,9 @@ def state_errors(
     final_state: ArrayLike | Sequence[float],
     reference: ArrayLike | Sequence[float],
 ) -> tuple[float, float]:
-    """Return the errors of attitude (an angle, rad) and of Ω; for a point those of position and
-    velocity, all relative.
+    """Return two errors of a last state: of the attitude, an angle, rad; and of Ω relative to |Ω0|.
+
+    For a point: the errors of position and velocity relative to the scales of `scene.size`.
     """
     final_state, reference = np.asarray(final_state, float), np.asarray(reference, float)
     one, two = scene.size
@@ -176,9 +183,9 @@ def state_errors(
 class PreparedMethod(NamedTuple):
     """Hold a method prepared for a scene.
 
-    **Fields:** `run` setting → (the last state, or the gradient, as one vector; steps taken),
-    complete when it returns; `compile` s that making it took, `memory` bytes of temporaries, each
-    NaN where unknown.
+    **Fields:** `run` a function of the setting that returns two things, when the computation is
+    complete: the last state, or the gradient, as one vector; and the number of steps; `compile` the
+    time of preparation, s, and `memory` the bytes of temporary arrays, NaN if unknown.
 
     >>> prepared = PreparedMethod(lambda setting: ([0.0, 1.0], 1 / setting))
     >>> prepared.run(1e-2)[1], prepared.compile
@@ -195,9 +202,10 @@ class TimedMethod(NamedTuple):
 
     **Fields:** `name`; `group` `ours`, `jax` (anything else that runs in JAX) or `peer`; `settings`
     tolerances, or numbers of equal steps, from coarse to fine; `value` prepares the method for a
-    scene, and returns `None` for a scene that it cannot do; `gradients` adjoint → a function like
-    `value`, for the gradient of the scene's scalar by its `numbers`; `equal` whether settings are
-    numbers of steps for a run of 50 rad, to be scaled to the scene.
+    scene, and returns `None` for a scene that it cannot do; `gradients` has, by adjoint, functions
+    like `value` for the gradient of the scene's scalar with
+    respect to its `numbers`; `equal` whether the settings are numbers of equal steps for a run that
+    turns by 50 rad, which are scaled to the angle of the scene.
 
     >>> import numpy as np
     >>> prepared = PreparedMethod(lambda setting: (np.ones(7), 0))

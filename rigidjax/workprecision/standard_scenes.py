@@ -1,4 +1,4 @@
-"""Define the standard scenes."""
+"""Define the standard scenes of the comparison of methods."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -17,12 +17,13 @@ from rigidjax.motion.torques import Damping, Flywheel, GravityGradient, HeavyTop
 from rigidjax.workprecision import equations
 from rigidjax.workprecision.scene import BenchmarkScene, stored_answer
 
-# Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I, II.0.
+# μ, x0, v_y0 and the period of Arenstorf's orbit (Hairer, Nørsett and Wanner, Solving Ordinary
+# Differential Equations I, II.0).
 ARENSTORF = (0.012277471, 0.994, -2.00158510637908252240, 17.0652165601579625588917)
-# exp(0.3 x/2), as a quaternion.
+# The initial attitude of the bodies: the quaternion of a turn by 0.3 rad about x.
 TILTED = np.array([np.cos(0.15), np.sin(0.15), 0.0, 0.0])
 WEIGHT = (0.0, 0.0, -2.0)
-# Distance of the planet of `gravity-gradient`.
+# The distance of the planet in the scene `gravity-gradient`.
 RADIUS = 7.0
 
 # Bodies: title, principal moments, Ω0, end, equations, and their constants.
@@ -58,7 +59,9 @@ BODIES: dict[str, tuple[str, Any, Any, float, Any, Any]] = {
 
 
 class Circle(eqx.Module):
-    """Describe a place on a circular orbit in the plane x, y, at an angular rate, rad/s."""
+    """Compute the position (3,) on a circular orbit in the xy-plane; `rate` is the angular rate,
+    rad/s.
+    """
 
     radius: Float[Array, ""]
     rate: Float[Array, ""]
@@ -109,7 +112,7 @@ def _body_scene(
             torque = wrap(kind(numbers[:6], exact, sin, cos, wrap(equations.to_body_axes)))
         return wrap(equations.body_rates(numbers[:6], torque))
 
-    # MuJoCo can do scenes with weight alone, or without torque.
+    # MuJoCo can do scenes without torque, and scenes whose only torque is that of weight.
     com, gravity = (
         (constants[:3], constants[3:]) if kind is equations.heavy_top_torque else ((0.0,) * 3,) * 2
     )
@@ -166,8 +169,8 @@ def scenes() -> dict[str, Callable[[], BenchmarkScene]]:
     """Return the standard scenes: name → a function that makes the scene (in the default precision
     of JAX).
 
-    The drift over a million steps is not among them: `python -m rigidjax workprecision` measures
-    it.
+    The drift over a million steps is no standard scene: `python -m rigidjax workprecision
+    long-drift` measures this drift.
 
     >>> sorted(scenes())[:3]
     ['arenstorf', 'asymmetric-top', 'damped-gyrostat']
