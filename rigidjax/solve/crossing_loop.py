@@ -171,7 +171,7 @@ def locate(motion: Motion, search: Search, run: Path) -> Located:
 
 
 def _is_running(search: Search, run: Path, body: _Body) -> Array:
-    """Return for each body whether its search goes on: the run has not ended, and no zero is found.
+    """Return for each body whether its search goes on: the run is not over, and no zero is found.
     """
     ahead = (body.stop < run.stops.shape[0]) & (body.steps < search.max_steps)
     return ahead & (body.h > 0) & ~body.found

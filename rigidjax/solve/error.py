@@ -272,7 +272,7 @@ def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
 def solve_to(
     setup: DiffraxRun, state0: Any, ts: Array, accuracy: Array
 ) -> tuple[DiffraxRun, Any, Any]:
-    """Search for a tolerance at which the global error of a run is below `accuracy`.
+    """Find a tolerance at which the global error of a run is below `accuracy`, if there is one.
 
     Runs are tried at smaller and smaller tolerances. The error of each run is estimated by its
     distance to the next run, and scaled in proportion to the tolerance. **Returns** three things:
