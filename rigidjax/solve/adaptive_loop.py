@@ -234,7 +234,8 @@ def next_step(norm: Array, order: Any, h: Any) -> tuple[Array, Array]:
     this error. The limits of the next length are the defaults of `diffrax.PIDController`.
     """
     norm, h = lax.stop_gradient((norm, h))
-    # In a step that is too long, NaN means no more than infinity does: a shorter step is tried.
+    # NaN is treated as infinity, because it may come from a step that is too long: a shorter
+    # step is tried.
     norm = jnp.where(jnp.isnan(norm), jnp.inf, norm)
     factor = jnp.clip(_SAFETY * norm ** (-1 / order), _SMALLEST, _LARGEST)
     return norm < 1, h * factor.astype(jnp.result_type(h))
@@ -399,7 +400,8 @@ def _attempt(
     # Derivatives hold the lengths of steps constant, so that the error has no derivative.
     left, right, slopes = lax.stop_gradient((loop.y, y, there.slopes))
     error = error_estimate(method.tableau, method.sizes, h, slopes)
-    # In a step that is too long, NaN means no more than infinity does: a shorter step is tried.
+    # NaN is treated as infinity, because it may come from a step that is too long: a shorter
+    # step is tried.
     error = jnp.where(jnp.isfinite(error) & jnp.isfinite(right), error, jnp.inf)
     times = lax.stop_gradient((run.t0, run.stops[-1], loop.t, end))
     found = method.control(until is not None, (loop.state, times), (left, right, error))

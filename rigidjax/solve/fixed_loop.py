@@ -148,8 +148,7 @@ def delayed_rows(
 
 
 def first_row(law: Any, h: Array, inputs: Any) -> Any:
-    """Return the inputs of the torque `law` at the start of a run, in the form that `bind` takes.
-    """
+    """Return the inputs of the torque `law` at the start of a run, in the form for `bind`."""
     delays = delays_of(law)
     now = jax.tree.map(lambda a: a[0], inputs)
     if not delays:

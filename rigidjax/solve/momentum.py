@@ -64,8 +64,7 @@ class ByMomentum(eqx.Module):
         return self._with_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
 
     def leave(self, t: Any, y: Any) -> Any:
-        """Return the state `y` of the run at the time `t`, s, with Ω̃ replaced by the body rate Ω.
-        """
+        """Return the state `y` of the run at the time `t`, s, with Ω̃ replaced by Ω."""
         return self._with_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
 
     def _with_rate(self, y: Any, rate: Any, t: Any) -> Any:

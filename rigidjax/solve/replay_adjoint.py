@@ -138,9 +138,9 @@ class _Control(NamedTuple):
     """Hold a step controller and a progress meter, and call both after a step of one body."""
 
     static: Any  # controller, progress meter and `args`, without their arrays
-    arrays: Callable[[Arrays], Any]  # takes these arrays from the constants of the run
-    tree: Callable[[Array], Any]  # makes of the numbers of a state what the controller takes
-    order: Any  # of the error of a step
+    arrays: Callable[[Arrays], Any]  # selects these arrays from the constants of the run
+    tree: Callable[[Array], Any]  # makes the argument of the controller from a vector of numbers
+    order: Any  # the order of the error of a step
 
     def __call__(self, again: bool, constants: Arrays, given: Any, numbers: Any) -> Any:
         """Return the decision of the controller on an attempted step.
