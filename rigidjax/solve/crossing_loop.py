@@ -248,8 +248,7 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
 
 
 def _newton(body: _Body, low: _End, high: _End, here: _End) -> tuple[Array, Array, Array, Array]:
-    """Take one step of Newton's method for the zero between `low` and `high`, from the guess
-    `here`.
+    """Take one step of Newton's method from the guess `here`, between `low` and `high`.
 
     **Returns** four things: whether this step reaches the zero; whether the search has to end at
     `here` in any case, because no floating-point time lies between `low` and `high` or all guesses

@@ -1,12 +1,11 @@
 """Run equal steps on a GPU, several in one kernel, with a reverse mode written by hand.
 
-A kernel with a single step spends most of its time on reading and writing memory. With several
-steps in each iteration of the loop (unrolling), free bodies take three times as many steps a
-second. In reverse mode unrolling does not help, because a backward step has so many numbers that
-the time of a kernel grows in proportion to its length. JAX's transpose of a loop is unrolled as the
-loop itself, so the backward loop is written here by hand, with one step in each iteration. It
-stores states on two levels (see `in_pieces`). On a CPU neither the unrolling nor this backward loop
-saves time.
+A kernel with a single step mostly waits for its data. With several steps in each iteration of the
+loop (unrolling), free bodies take three times as many steps a second. In reverse mode unrolling
+does not help, because a backward step has so many numbers that the time of a kernel grows in
+proportion to its length. JAX's transpose of a loop is unrolled as the loop itself, so the backward
+loop is written here by hand, with one step in each iteration. It stores states on two levels (see
+`in_pieces`). On a CPU neither the unrolling nor this backward loop saves time.
 """
 
 import dataclasses
@@ -58,7 +57,7 @@ class _Program:
     def some(
         self, constants: Arrays, y: Arrays, first: Array, many: int, keep: bool = False
     ) -> tuple[Arrays, Any]:
-        """Return the state after `many` steps, beginning with step number `first` and the state
+        """Return the state after `many` steps, which begin with step number `first` and the state
         `y`.
 
         A second result is returned with it: the states at the starts of these steps if `keep` is

@@ -100,8 +100,7 @@ def states_of_run(
 def _over_bodies(
     method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> tuple[Method, Run, Layout, Arrays]:
-    """Return four things for arrays (n, *bodies): the method, the run, the layout and the
-    constants.
+    """Return the method, the run, the layout and the constants for arrays (n, *bodies).
 
     The last arrays in the given `constants` are the states of controller and progress meter at the
     start; they become a part of the run. The given `method` is for one body; its functions
@@ -130,9 +129,7 @@ def _over_bodies(
 def _forward(
     record: bool, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    """Return in a list the states at the saved times and the end of a run, and, if `record` is
-    true, its record.
-    """
+    """Return a list of the saved states, the end of a run and, if `record` is true, its record."""
     method, run, _, constants = _over_bodies(method, trees, layout, constants, each)
     kept = None
     if record or (run.between.shape[0] and layout.bodies):

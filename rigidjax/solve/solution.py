@@ -237,7 +237,7 @@ def _transition(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[
 
 @eqx.filter_jit
 def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, " times"]:
-    """Return the largest singular value of ∂y(t)/∂y(t₀), each array of y divided by its largest
+    """Return the largest singular value of ∂y(t)/∂y(t₀), with each array divided by its largest
     size.
     """
     start = jax.tree.map(lambda leaf: leaf[0], ys)

@@ -41,9 +41,7 @@ class TracedProgram(NamedTuple):
 
     @property
     def constants(self) -> Arrays:
-        """Return the JAX arrays that the function closes over; NumPy arrays stay inside the
-        program.
-        """
+        """Return the JAX arrays that the function closes over; NumPy arrays stay in its program."""
         return [c for c in self.closed.consts if eqx.is_array(c)]
 
     def consts(self, constants: Arrays) -> Arrays:

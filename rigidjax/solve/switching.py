@@ -99,8 +99,7 @@ class Node(NamedTuple):
 
 
 class Program(NamedTuple):
-    """Hold a function f(t, y, …) as a flat list of equations, whose values are identified by
-    integers.
+    """Hold a function f(t, y, …) as a flat list of equations; integers identify their values.
 
     Value 0 is the time t, and value 1 is the state y.
     """

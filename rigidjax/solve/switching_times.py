@@ -236,8 +236,7 @@ def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array
 def _bisect(
     watched: list[_Watched], edges: Any, elements: Any, bases: list[Array], levels: Any
 ) -> list[Array]:
-    """Return for each switch the times (k,) at which its elements change, found by halving
-    intervals.
+    """Find for each switch the times (k,) at which its elements change, by halving intervals.
 
     `bases` are the values of the elements before the change, and `levels` the sizes of the changes:
     an element has changed when its value differs from its base by at least its level. `edges` are
