@@ -78,8 +78,9 @@ class Run(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """Hold all that the loop over steps carries; after the last step it describes the end of the
-    run.
+    """Hold all that the loop over steps carries from step to step.
+
+    After the last step it describes the end of the run.
     """
 
     y: Array  # (n, *bodies) the state at the time t
@@ -128,16 +129,12 @@ def unpack(arrays: Arrays, like: LoopState) -> LoopState:
 
 
 def _kind(a: Array) -> Any:
-    """Return the dtype in which `pack` stores the array `a`: int32 if `a` is boolean, else its
-    dtype.
-    """
+    """Return the dtype in which `pack` stores `a`: int32 for a boolean array, else its dtype."""
     return jnp.dtype(jnp.int32) if a.dtype == bool else a.dtype
 
 
 def _group_by_dtype(tree: Any) -> dict[Any, Arrays]:
-    """Return the arrays of `tree` in lists, one list for each dtype that `_kind` returns for an
-    array.
-    """
+    """Return the arrays of `tree` in lists, one list for each dtype that `_kind` returns."""
     parts: dict[Any, Arrays] = {}
     for a in jax.tree.leaves(tree):
         parts.setdefault(_kind(a), []).append(a)
@@ -234,7 +231,8 @@ def next_step(norm: Array, order: Any, h: Any) -> tuple[Array, Array]:
     this error. The limits of the next length are the defaults of `diffrax.PIDController`.
     """
     norm, h = lax.stop_gradient((norm, h))
-    # In a step that is too long, NaN means no more than infinity does: a shorter step is tried.
+    # NaN is treated as infinity, because it may come from a step that is too long: a shorter
+    # step is tried.
     norm = jnp.where(jnp.isnan(norm), jnp.inf, norm)
     factor = jnp.clip(_SAFETY * norm ** (-1 / order), _SMALLEST, _LARGEST)
     return norm < 1, h * factor.astype(jnp.result_type(h))
@@ -250,8 +248,7 @@ def result_of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
 
 
 def per_body(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Map `function`, which takes arrays of one body, over the last axis if `run` has several
-    bodies.
+    """Map `function`, which takes arrays of one body, over all bodies in the last axis of a run.
 
     If `run` has one body, `function` is returned unchanged.
     """
@@ -399,7 +396,8 @@ def _attempt(
     # Derivatives hold the lengths of steps constant, so that the error has no derivative.
     left, right, slopes = lax.stop_gradient((loop.y, y, there.slopes))
     error = error_estimate(method.tableau, method.sizes, h, slopes)
-    # In a step that is too long, NaN means no more than infinity does: a shorter step is tried.
+    # NaN is treated as infinity, because it may come from a step that is too long: a shorter
+    # step is tried.
     error = jnp.where(jnp.isfinite(error) & jnp.isfinite(right), error, jnp.inf)
     times = lax.stop_gradient((run.t0, run.stops[-1], loop.t, end))
     found = method.control(until is not None, (loop.state, times), (left, right, error))
@@ -426,8 +424,7 @@ def _attempt(
 
 
 def _where(which: Any, new: Any, old: Any) -> Any:
-    """Return the arrays (…, *bodies) of `new` for bodies where `which` is true, else those of
-    `old`.
+    """Return the arrays (…, *bodies) of `new` for bodies with a true `which`, else those of `old`.
 
     If `which` is the constant `True`, the arrays of `new` are returned for all bodies, converted to
     the dtypes of `old`.
@@ -441,8 +438,8 @@ def _where(which: Any, new: Any, old: Any) -> Any:
 def record_segment(
     method: Method, constants: Arrays, run: Run, loop: LoopState, rows: Rows, until: Any
 ) -> tuple[LoopState, Rows, Array]:
-    """Return the loop state after a segment of steps, the recorded rows of the steps, and their
-    number.
+    """Return three things: the loop state after a segment of steps; its rows; the number of the
+    rows.
 
     A segment that is recorded for the first time (`until` is `None`) ends when `rows` is full or
     the run ends. A segment that is run again ends at the time `until`.

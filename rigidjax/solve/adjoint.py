@@ -38,8 +38,7 @@ from rigidjax.solve.runge_kutta import Step, stages
 
 
 class Smooth(NamedTuple):
-    """Hold the fields of a `Run` that have derivatives, or the tangents or cotangents of these
-    fields.
+    """Hold the fields of a `Run` that have derivatives, or their tangents or cotangents.
 
     The fields have the same names and shapes as in `Run`.
     """

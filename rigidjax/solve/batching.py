@@ -135,8 +135,7 @@ def _jvp(
     primals: tuple[PyTree, ...],
     tangents: tuple[PyTree, ...],
 ) -> tuple[Arrays, Arrays]:
-    """Return the result of a program and the tangent of the result, computed in one call of
-    `in_lanes`.
+    """Return the result of a program and its tangent, computed in one call of `in_lanes`.
 
     The first `number` of `primals` are the constants. `was` is the layout of the arrays; `linear`
     is as for `in_lanes`.

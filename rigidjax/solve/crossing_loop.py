@@ -110,17 +110,17 @@ class _Body(NamedTuple):
     t: Array
     y: Array
     h: Array  # the length of the next step
-    side: Array  # the side of zero that g is on: 1 above, −1 below, 0 if g was zero so far
+    side: Array  # the sign of g: 1 or −1; 0 if g has been zero since the start
     g: Array
     rate: Array  # dg/dt
     stop: Array  # the index of the next stop
-    refining: Array  # whether a zero is looked for within a step, between `low` and `high`
+    refining: Array  # whether a zero in a step is searched for, between `low` and `high`
     x: Array  # the offset of the next guess
     low: _End
     high: _End
     tries: Array  # the number of guesses for a zero, or of steps taken again because g turns
     steps: Array  # the number of passes
-    found: Array  # whether a zero has been found
+    found: Array  # whether a zero was found in this call of the loop
     jumped: Array  # whether g jumped over the zero found last
 
 
@@ -171,7 +171,7 @@ def locate(motion: Motion, search: Search, run: Path) -> Located:
 
 
 def _is_running(search: Search, run: Path, body: _Body) -> Array:
-    """Return for each body whether its search goes on: the run goes on, and no zero is found."""
+    """Return for each body whether its search goes on: before the end, and with no zero found."""
     ahead = (body.stop < run.stops.shape[0]) & (body.steps < search.max_steps)
     return ahead & (body.h > 0) & ~body.found
 
@@ -248,8 +248,7 @@ def _pass(motion: Motion, search: Search, run: Path, body: _Body) -> _Body:
 
 
 def _newton(body: _Body, low: _End, high: _End, here: _End) -> tuple[Array, Array, Array, Array]:
-    """Take one step of Newton's method for the zero between `low` and `high`, from the guess
-    `here`.
+    """Take one step of Newton's method from the guess `here`, between `low` and `high`.
 
     **Returns** four things: whether this step reaches the zero; whether the search has to end at
     `here` in any case, because no floating-point time lies between `low` and `high` or all guesses

@@ -264,8 +264,7 @@ _value = eqx.filter_jit(value)
 def solve_until(
     setup: ClosedFormRun | DiffraxRun, event: Event, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
-    """Return the three results of `solve` for a run up to the event, and the event's time and
-    state.
+    """Return the three results of `solve` up to the event, and the time and state of the event.
 
     The states at times after the event are NaN. If no event occurs, its time and state are NaN.
     """
@@ -296,11 +295,11 @@ def solve_until(
 
 
 def _with_derivatives(crossing: Any, jumps: Array, inputs: Any) -> Any:
-    """Return the arrays of `crossing`, but with NaN derivatives with respect to `inputs` in two
-    cases.
+    """Return the arrays of `crossing`, but with NaN derivatives in two cases.
 
-    The cases are: an array element that is NaN itself; and a crossing at which g jumps over zero,
-    which `jumps` marks. All other derivatives stay as they are.
+    The derivatives are with respect to `inputs`. The cases are: an array element that is NaN
+    itself; and a crossing at which g jumps over zero, which `jumps` marks. All other derivatives
+    stay as they are.
     """
 
     def lost(leaf: Array) -> Array:
@@ -336,9 +335,7 @@ def _solved(
 def _with_derivatives_of_scene(
     times: Array, states: Array, jumps: Array, *scene: Any
 ) -> tuple[Array, Array]:
-    """Return the `times` and `states` of the crossings; only their derivatives run the `scene`
-    again.
-    """
+    """Return the `times` and `states` of crossings; only derivatives run the `scene` again."""
     return times, states
 
 

@@ -272,7 +272,7 @@ def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
 def solve_to(
     setup: DiffraxRun, state0: Any, ts: Array, accuracy: Array
 ) -> tuple[DiffraxRun, Any, Any]:
-    """Search for a tolerance at which the global error of a run is below `accuracy`.
+    """Find a tolerance at which the global error of a run is below `accuracy`, if there is one.
 
     Runs are tried at smaller and smaller tolerances. The error of each run is estimated by its
     distance to the next run, and scaled in proportion to the tolerance. **Returns** three things:
@@ -296,9 +296,9 @@ def solve_to(
         off = jnp.nanmax(_largest(_distances(others, new[0]), _sizes(new[0]))[1:])
         wanted = before * still[3] / (_AIM * off)
         least = jnp.maximum(_FARTHEST * rtol, floor)
-        # The error of a run predicts the error of the next run in two cases not: if the error is so
-        # large that the run is lost; and if the steps are not limited by the tolerance, as in a run
-        # so short that it ends before the steps have grown to their full length.
+        # In two cases the error of a run does not predict the error of the next run: if the error
+        # is so large that the run is lost; and if the steps are not limited by the tolerance, as in
+        # a run so short that it ends before the steps have grown to their full length.
         count, counted = (a["num_accepted_steps"].astype(ts.dtype) for a in (new[1], stats))
         more = (before / rtol) ** (1 / setup.solver.tableau.order)
         sound = (off < _FORESEEN) & (count >= _FEW) & (count >= 0.75 * more * counted)
@@ -335,8 +335,7 @@ def _with_tolerance(setup: DiffraxRun, rtol: Any) -> DiffraxRun:
 
 
 def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
-    """Return one time for each part of a run: a time at which the law changes suddenly, or the
-    start.
+    """Return one time for each part of a run: that of a sudden change of the law, or the start.
 
     A run does not notice a pulse that is shorter than a step and that no stage hits. The law is
     therefore sampled in time, at one saved state for each part of the run. A sample is sudden if
@@ -545,9 +544,7 @@ def error_of(
 
 
 def _spread(changes: Array) -> Array:
-    """Return the variance over a run and its neighbours, whose differences from the run are
-    `changes`.
-    """
+    """Return the variance over a run and its neighbours, which differ from the run by `changes`."""
     mean = jnp.sum(changes, 0, keepdims=True) / (_NEIGHBOURS + 1)
     return (jnp.sum((changes - mean) ** 2, 0) + mean[0] ** 2) / _NEIGHBOURS
 

@@ -92,8 +92,7 @@ def first_rows(many: Any, one: Callable[..., Any], y: Any, rows: Any) -> Any:
 def step(
     stepper: AnyStepper, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None, before: int = 0
 ) -> Any:
-    """Return the state after step number `i` since the time `t0`; `y` is the state before this
-    step.
+    """Return the state after step number `i` since the time `t0`; `y` is the state before the step.
 
     `h` is the length of each step, s. `inputs` has one array for each named input of the torque;
     the step uses row `before + i` of each array.
@@ -128,8 +127,7 @@ def step(
 def delayed_rows(
     delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: Any, before: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Return where in step `i` each delayed input changes, and its values before and after the
-    change.
+    """Return where in step `i` each delayed input changes, and its values before and after.
 
     **Returns** three things: the places (m,) of the changes, from 0 at the start of the step to 1
     at its end; a list of the m values before the changes; and a list of the m values after them.
@@ -148,7 +146,7 @@ def delayed_rows(
 
 
 def first_row(law: Any, h: Array, inputs: Any) -> Any:
-    """Return the inputs of the torque `law` at the start of the first step, as for `bind`."""
+    """Return the inputs of the torque `law` at the start of a run, in the form for `bind`."""
     delays = delays_of(law)
     now = jax.tree.map(lambda a: a[0], inputs)
     if not delays:

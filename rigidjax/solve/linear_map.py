@@ -61,8 +61,7 @@ def _known_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any
 
 
 def nan_derivatives(tree: Any, inputs: Any) -> Any:
-    """Return `tree`, but with NaN derivatives with respect to `inputs` for numbers that are not
-    finite.
+    """Return `tree`, but numbers that are not finite get NaN derivatives with respect to `inputs`.
 
     Forward and reverse mode both give NaN. This is needed because a state that a run did not reach
     is set to NaN by `jnp.where`, whose derivative would be 0, which is wrong. If such a number is

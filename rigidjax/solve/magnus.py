@@ -1,7 +1,7 @@
 """Solve the rotation of a body by steps of order 4, for torques that do not read the attitude.
 
-A step takes four Runge–Kutta stages of the body rate alone. It then turns the body once, by the
-exponential of Magnus' series.
+Each step first computes the body rate by the four stages of a Runge–Kutta method. It then turns the
+body once, by the exponential of Magnus' series of the body rate.
 """
 
 from collections.abc import Callable
@@ -41,10 +41,11 @@ def change_and_turn(
     - `t`, `end`, `h`: the times at which the step begins and ends, s, and its length, s.
     - `p`: the momentum, or the body rate, at the time `t`.
 
-    The rotation vector of the step is `∫Ω dt + h²/12 Ω(t) × Ω(t+h)`. Simpson's rule gives the
-    integral; its value at the middle of the step is that of the cubic through `p` and its
-    derivative at both ends. Source: Magnus 1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas,
-    Nørsett and Zanna 2000, doi:10.1017/S0962492900002154, section 5.
+    The rotation vector of the step is `∫Ω dt + h²/12 Ω(t) × Ω(t+h)`. The integral is computed by
+    Simpson's rule. In this rule the rate at the middle of the step is computed from p there, by the
+    cubic polynomial that has the values of p and dp/dt at both ends of the step. Source: Magnus
+    1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas, Nørsett and Zanna 2000,
+    doi:10.1017/S0962492900002154, section 5.
     """
     change, first = change_and_slope(KUTTA4, slope, t, h, p, end)
     after = barrier(add(p, change))
@@ -59,8 +60,9 @@ def change_and_turn(
         for a, b, c, d in zip(left, between, right, cross(left, right), strict=True)
     )
     half = barrier(half)
-    # The series of cos a − 1 and sin a / a, where a is half the angle of the turn, may be short: a
-    # step that turns the body by more than a radian has no correct digits that they could lose.
+    # These are short power series of cos a − 1 and (sin a)/a, where a is half of the angle of the
+    # turn. They lose digits only if the step turns the body by more than a radian; then the method
+    # itself has no correct digits.
     x = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
     c = x * (-1 / 2 + x * (1 / 24 + x * (-1 / 720 + x * (1 / 40320))))
     s = 1.0 + x * (-1 / 6 + x * (1 / 120 + x * (-1 / 5040 + x * (1 / 362880))))
@@ -115,8 +117,8 @@ class Magnus4(dfx.AbstractSolver):
         start = split(y0)
         q, omega = start[:4], start[4:]
         way, h = (part.astype(y0.omega.dtype) for part in direction_and_length(terms, t0, t1))
-        # The law says that it does not read the attitude: it is given NaN in its place, which
-        # shows in the result if the law reads it all the same.
+        # The law has declared that it does not read the attitude. It gets NaN as the attitude, so
+        # that the result is NaN if the law reads the attitude nevertheless.
         nowhere = jnp.full_like(y0.q, jnp.nan)
 
         def slope(t: Any, omega: Triple) -> Triple:
@@ -144,8 +146,8 @@ class Magnus4(dfx.AbstractSolver):
 def require_attitude(name: str, field: Any, y0: PyTree, instead: str) -> AttitudeEquations:
     """Return `field` if it is `AttitudeEquations` and the state `y0` an `Attitude`.
 
-    Else raise `TypeError`: the message says that the solver `name` does not fit, and to use the
-    solver `instead`.
+    Else raise `TypeError`. The message says that the solver `name` does not fit, and names the
+    solver `instead` to use.
     """
     if isinstance(field, AttitudeEquations) and isinstance(y0, Attitude):
         return field

@@ -3,7 +3,8 @@
 The momentum p = I(t) Ω obeys `dp/dt = p × Ω + τ`, however the inertia I changes; Ω is the body rate
 and τ the torque. Where I jumps, p stays as it is and Ω jumps, and no derivative of I is needed. A
 state of the run has Ω̃ = I₀⁻¹ p in the place of Ω, where I₀ is the inertia of the body that
-`simulate` was given. Ω̃ is a rate, so that tolerances apply to it as to Ω.
+`simulate` was given. Ω̃ has the unit and size of a body rate, so that the tolerances for Ω also
+suit Ω̃.
 """
 
 from typing import Any
@@ -26,10 +27,10 @@ from rigidjax.rotation.linalg3 import apply, solve
 
 
 class _Changing(eqx.Module):
-    """Compute the derivative of a state of the run from the time and the state with its body rate.
+    """Compute the time derivative of a state of the run, in which Ω̃ replaces the body rate Ω.
 
-    A state of the run has Ω̃ in the place of the body rate Ω (see the module). `body` has the
-    inertia I₀, and `law` gives the inertia I at any time.
+    It is called with the time and the state in which the body rate is Ω. `body` has the inertia I₀,
+    and `law` gives the inertia I at any time. See the module for Ω̃.
     """
 
     body: Any
@@ -47,10 +48,10 @@ class _Changing(eqx.Module):
 
 
 class ByMomentum(eqx.Module):
-    """Compute the derivative of a state of the run by momentum, and convert states to and from it.
+    """Compute the time derivative of a state of the run, and convert between Ω and Ω̃.
 
-    A state of the run has Ω̃ = I₀⁻¹ p in the place of the body rate Ω (see the module). `enter`
-    replaces Ω by Ω̃, and `leave` replaces Ω̃ by Ω.
+    A state of the run has Ω̃ = I₀⁻¹ p in the place of the body rate Ω (see the module). The method
+    `enter` replaces Ω by Ω̃, and `leave` replaces Ω̃ by Ω.
     """
 
     field: Any  # a `_Changing`, or the `CoupledEquations` of one
@@ -59,15 +60,15 @@ class ByMomentum(eqx.Module):
         return self.field(t, self.leave(t, y))
 
     def enter(self, t: Any, y: Any) -> Any:
-        """Return the state of the run for the state `y` with its body rate, at the time `t`, s."""
+        """Return the state `y` at the time `t`, s, with the body rate Ω replaced by Ω̃."""
         return self._with_rate(y, lambda now, fixed, w: solve(fixed, apply(now, w)), t)
 
     def leave(self, t: Any, y: Any) -> Any:
-        """Return the state with its body rate for the state `y` of the run, at the time `t`, s."""
+        """Return the state `y` of the run at the time `t`, s, with Ω̃ replaced by Ω."""
         return self._with_rate(y, lambda now, fixed, w: solve(now, apply(fixed, w)), t)
 
     def _with_rate(self, y: Any, rate: Any, t: Any) -> Any:
-        """Return `y` with its rate w replaced by `rate(I(t), I₀, w)`."""
+        """Return the state `y` with its rate w, rad/s, replaced by `rate(I(t), I₀, w)`."""
         motion, own = motion_of(y), y.own if isinstance(y, Coupled) else ()
         dtype = motion.omega.dtype
         inner: Any = self.field.field if isinstance(self.field, CoupledEquations) else self.field
@@ -92,7 +93,7 @@ def by_momentum(body: Any, state0: Any, torque: Any) -> ByMomentum | None:
 
 def momentum_changes(torque: Any) -> ChangingInertia | None:
     """Return the `ChangingInertia` that is the whole of a torque, or `None` if there is none."""
-    # A scene of particles and `None` also come here, and are no torques.
+    # The argument may also be a scene of particles or `None`, which are no torques.
     parts = parts_of(torque) if isinstance(torque, ChangingInertia | Sum) else ()
     return parts[0] if len(parts) == 1 and isinstance(parts[0], ChangingInertia) else None
 
@@ -100,6 +101,6 @@ def momentum_changes(torque: Any) -> ChangingInertia | None:
 def with_body_rates(form: ByMomentum | None, ts: Array, ys: Any) -> Any:
     """Return the states `ys` of a run, saved at the times `ts` (T,), s, with their body rates.
 
-    `form` are the equations of the run, or `None` if its states have the body rate already.
+    `form` holds the equations of the run; it is `None` if the states already have the body rate.
     """
     return ys if form is None else jax.vmap(form.leave)(ts, ys)

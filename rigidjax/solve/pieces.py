@@ -1,10 +1,11 @@
-"""Run equal steps on a GPU, several in one kernel, with a reverse mode of two levels by hand.
+"""Run equal steps on a GPU, several in one kernel, with a reverse mode written by hand.
 
-A kernel of one step waits for its numbers. With several steps in a turn of the loop, free bodies
-take three times as many steps a second. A kernel of a step backward has too many numbers to gain
-from this: it takes longer in proportion to its length. JAX's transpose of a loop has as many steps
-in a turn as the loop itself, so the loop backward is written here by hand, with one step in a turn.
-On a CPU neither the longer kernel nor the loop backward gains anything.
+A kernel with a single step mostly waits for its data. With several steps in each iteration of the
+loop (unrolling), free bodies take three times as many steps a second. In reverse mode unrolling
+does not help, because a backward step has so many numbers that the time of a kernel grows in
+proportion to its length. JAX's transpose of a loop is unrolled as the loop itself, so the backward
+loop is written here by hand, with one step in each iteration. It stores states on two levels (see
+`in_pieces`). On a CPU neither the unrolling nor this backward loop saves time.
 """
 
 import dataclasses
@@ -23,7 +24,7 @@ from rigidjax.solve.batching import Arrays
 from rigidjax.solve.linear_map import linear_map
 from rigidjax.solve.stops import trace_program
 
-# About this many operations, and at most this many steps, are in a turn of the loop. Measured: a
+# An iteration of the loop has about `_LONG` operations, and at most `_MOST` steps. Measured: a
 # kernel twice as long takes four times as long to compile and is no faster; with a kernel half as
 # long the run takes a third longer.
 _LONG, _MOST = 2800, 8
@@ -32,8 +33,8 @@ _LONG, _MOST = 2800, 8
 def piece_length(count: int) -> int:
     """Return the number of steps in a piece of a run of `count` steps, about √count.
 
-    If there is a divisor of `count` from √count to 2√count, it is taken: then no steps are left
-    over after the pieces, and there is less to compile.
+    If `count` has a divisor between √count and 2√count, this divisor is returned: the pieces then
+    contain all steps, and there is no remainder to compile.
     """
     root = math.isqrt(count - 1) + 1
     near = [d for d in range(root, min(2 * root, count) + 1) if count % d == 0]
@@ -42,10 +43,11 @@ def piece_length(count: int) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class _Program:
-    """Run `count` steps of a program, forward and backward; `turn` of them are in a kernel.
+    """Run `count` steps of a program forward and backward.
 
-    `call(constants, y, i)` returns the state after the step of number `i` from the state `y`.
-    Constants and states are lists of arrays.
+    `call(constants, y, i)` returns the state after step number `i`, which begins with the state
+    `y`. Constants and states are lists of arrays. In forward direction `turn` steps are in one
+    iteration of the loop.
     """
 
     call: Callable[[Arrays, Arrays, Array], Arrays]
@@ -55,9 +57,11 @@ class _Program:
     def some(
         self, constants: Arrays, y: Arrays, first: Array, many: int, keep: bool = False
     ) -> tuple[Arrays, Any]:
-        """Return the state after the `many` steps from number `first` on, which begin at `y`.
+        """Return the state after `many` steps, which begin with step number `first` and the state
+        `y`.
 
-        With `keep` also return the states at the starts of all these steps, else `None`.
+        A second result is returned with it: the states at the starts of these steps if `keep` is
+        true, else `None`.
         """
 
         def one(y: Arrays, i: Array) -> tuple[Arrays, Any]:
@@ -66,10 +70,10 @@ class _Program:
         return lax.scan(one, y, first + jnp.arange(many, dtype=jnp.int32), unroll=self.turn)
 
     def forward(self, constants: Arrays, first: Array, y: Arrays) -> tuple[Arrays, Any]:
-        """Return the state after all steps from `y`, and the states from which `back` begins.
+        """Return the state after all steps from `y`, and the states that `back` needs.
 
-        These are the starts of the pieces, which have one length, in rows; and the start of the
-        steps that are left over after the pieces.
+        The states for `back` are a pair: the states at the starts of the pieces, in rows; and the
+        state at the start of the remaining steps after the last piece.
         """
         firsts, length, left = self.pieces(first)
 
@@ -85,10 +89,10 @@ class _Program:
     def back(
         self, constants: Arrays, moving: Sequence[bool], first: Array, starts: Any, bar: Arrays
     ) -> tuple[Arrays, Arrays]:
-        """Return the cotangents of the constants that are `moving`, and of the state at the start.
+        """Return the cotangents of the constants with derivatives, and of the state at the start.
 
-        `moving` says of each constant whether it has a derivative. `starts` are the states that
-        `forward` returned, and `bar` is the cotangent of the state at the end.
+        `moving` has one truth value for each constant: whether it has a derivative. `starts` are
+        the states that `forward` returned, and `bar` is the cotangent of the state at the end.
         """
         firsts, length, left = self.pieces(first)
         chosen = [c for c, m in zip(constants, moving, strict=True) if m]
@@ -118,8 +122,10 @@ class _Program:
         return lax.scan(whole, sums, (rows, firsts), reverse=True)[0]
 
     def pieces(self, first: Array) -> tuple[Array, int, int]:
-        """Return the number of the first step of each piece, the number of steps in a piece, and
-        the number of steps that are left over.
+        """Return how the steps are divided into pieces.
+
+        **Returns** three things: the index of the first step of each piece; the number of steps in
+        a piece; and the number of steps that remain after the last piece.
         """
         length = piece_length(self.count)
         many, left = divmod(self.count, length)
@@ -127,16 +133,17 @@ class _Program:
 
 
 def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: Any) -> Any:
-    """Return the state after `count` steps `y = step(y, i)` from the number i = `first` on.
+    """Return the state after `count` steps `y = step(y, i)`, beginning with i = `first`.
 
-    In reverse mode the states at the starts of about √count pieces are kept, and all states of one
-    piece at a time. Second derivatives are forward over reverse.
+    In reverse mode the run is divided into about √count pieces. The states at the starts of all
+    pieces are stored; the states within a piece are stored for one piece at a time. Second
+    derivatives are forward over reverse.
     """
     start, tree = jax.tree.flatten(y)
     one = trace_program(lambda y, i: jax.tree.leaves(step(tree.unflatten(y), i)), start, first)
     turn = min(max(_LONG // len(one.closed.jaxpr.eqns), 1), _MOST)
-    # The number of steps in a turn is a power of two, because the length of a piece is often a
-    # whole multiple of a power of two.
+    # The number of steps in an iteration is a power of two, because the length of a piece is often
+    # a multiple of a power of two.
     turn = 1 << (turn.bit_length() - 1)
     program, constants = _Program(one.call, count, turn), one.constants
     number = len(constants)
@@ -179,6 +186,6 @@ def in_pieces(step: Callable[[Any, Array], Any], first: Array, count: int, y: An
 
 
 def _with(all_: Sequence[Any], which: Sequence[bool], some: Sequence[Any]) -> list[Any]:
-    """Return the list `all_`, in which `some` replace, in order, the arrays `which` selects."""
+    """Return the list `all_` with the arrays that `which` selects replaced by `some`, in order."""
     rest = iter(some)
     return [next(rest) if w else a for a, w in zip(all_, which, strict=True)]

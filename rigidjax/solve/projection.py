@@ -1,4 +1,4 @@
-"""Wrap a solver of diffrax so that attitudes stay on the group."""
+"""Wrap a solver of diffrax so that attitudes stay unit quaternions."""
 
 from typing import Any
 
@@ -104,9 +104,10 @@ class Projected(dfx.AbstractWrappedSolver):
         solver_state: PyTree,
         made_jump: Bool[ArrayLike, ""],
     ) -> Any:
-        # A slope that the solver kept from the last step is the one before the projection. Also,
-        # diffrax computes this slope anew for all bodies of a batch as soon as one of them needs
-        # it. With `made_jump=True` it is computed in every step, whatever the other bodies do.
+        # Some solvers keep the slope at the end of a step for the next step. This slope belongs to
+        # the state before the quaternion was scaled. Also, if one body of a batch needs a new
+        # slope, diffrax computes it for all bodies, so that a body would depend on the others. With
+        # `made_jump=True` the slope is computed anew in every step.
         del made_jump
         y1, error, dense, state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, True

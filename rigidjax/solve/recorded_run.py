@@ -1,6 +1,6 @@
-"""Define a run as one function of its numbers, with derivatives in forward and reverse mode.
+"""Define a run as one function of its arrays, with derivatives in forward and reverse mode.
 
-The run is that of one body or, under `jax.vmap`, of a batch.
+The run is that of one body or, under `jax.vmap`, that of a batch of bodies.
 """
 
 from functools import partial
@@ -27,16 +27,16 @@ def states_of_run(
     """Return the states at the saved times (K, n), and the state of the loop at the end of the run.
 
     The saved times are the K times `run.between`. A state has n numbers; at a time that the run did
-    not reach they are NaN. The derivatives of these states and of the last state are with respect
-    to the constants that `smooth` selects and to the `Smooth` numbers of the run; they hold the
-    lengths of the steps constant.
+    not reach they are NaN. The states have derivatives with respect to two kinds of inputs: the
+    constants that `smooth` selects, and the fields of the run that `adjoint.Smooth` lists. The
+    derivatives hold the lengths of the steps constant.
 
     **Arguments:**
 
     - `method`, `run`: the parts and the numbers of the run of one body.
     - `smooth`: whether each of the `constants` has derivatives.
     - `constants`: the arrays that the field, the condition and the controller hold.
-    - `state`: the states of controller and progress meter at the start; bodies may share them.
+    - `state`: the states of controller and progress meter at the start, which bodies may share.
     """
     each, run_tree = jax.tree.flatten(run)
     first, state_tree = jax.tree.flatten(state)
@@ -44,9 +44,10 @@ def states_of_run(
     like = adaptive_loop.initial_loop_state(run._replace(state=state))
     shapes = jax.eval_shape(adaptive_loop.pack, like)
     trees = run_tree, state_tree
-    # `recorded` returns in a row: the states at the saved times; the end of the loop as `size`
-    # arrays; and the record, its starts as `size` arrays, its rows and its counts. `states` are the
-    # places of the arrays with derivatives in this row. `answer` returns the first `head` arrays.
+    # `recorded` returns a list of arrays: the states at the saved times; the loop state at the end,
+    # packed into `size` arrays; and the record, which is `size` arrays for its starts, one for its
+    # rows and one for its counts. `states` are the indices of those arrays in the list that have
+    # derivatives. `answer` returns only the first `head` arrays of the list.
     size = len(shapes)
     states, head = [0, 1, 1 + size, 1 + 2 * size], 1 + size
 
@@ -58,9 +59,9 @@ def states_of_run(
     recorded: Any = jax.custom_jvp(partial(mapped, partial(_forward, True), 0))
 
     def tangents_of(primals: Any, tangents: Any, pull: Any = None) -> tuple[Arrays, Arrays]:
-        """Return the arrays of `recorded`, and the tangents of those that hold states.
+        """Return the arrays of `recorded`, and the tangents of the arrays that hold states.
 
-        The tangents are transposed by `pull`; reverse mode is refused if it is `None`.
+        `pull` is the transpose of the tangents; if it is `None`, reverse mode raises an error.
         """
         # A number without a tangent needs no derivative.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
@@ -72,7 +73,8 @@ def states_of_run(
         given = [*primals, *found[head:]]
         if pull is None:
             return found, linear_map(push, refuse, given, along)
-        # Only the states at the saved times and at the end have a transpose.
+        # Of the arrays of `recorded`, only the states at the saved times and at the end have a
+        # transpose.
         back = partial(mapped, partial(pull, moving), 2)
         return found, linear_map(lambda *args: push(*args)[:2], back, given, along)
 
@@ -98,12 +100,12 @@ def states_of_run(
 def _over_bodies(
     method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> tuple[Method, Run, Layout, Arrays]:
-    """Return the method, the run, the layout and the constants, for arrays (n, *bodies).
+    """Return the method, the run, the layout and the constants for arrays (n, *bodies).
 
-    The last of the `constants` given are the states of controller and progress meter at the start:
-    they become a part of the run. The `method` given is that of one body, in which `halt` and
-    `control` take the constants, as `halt(constants, t, y)` and `control(again, constants, …)`; in
-    the method returned they hold the constants.
+    The last arrays in the given `constants` are the states of controller and progress meter at the
+    start; they become a part of the run. The given `method` is for one body; its functions
+    `halt(constants, t, y)` and `control(again, constants, …)` take the constants as an argument. In
+    the returned method these two functions already hold the constants.
     """
     run_tree, state_tree = trees
     run, count = run_tree.unflatten(each), len(constants) - state_tree.num_leaves
@@ -127,7 +129,7 @@ def _over_bodies(
 def _forward(
     record: bool, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    """Return the states at the saved times and the end of a run, with its record if `record`."""
+    """Return a list of the saved states, the end of a run and, if `record` is true, its record."""
     method, run, _, constants = _over_bodies(method, trees, layout, constants, each)
     kept = None
     if record or (run.between.shape[0] and layout.bodies):
@@ -139,19 +141,20 @@ def _forward(
     return [between, *adaptive_loop.pack(end), *jax.tree.leaves(kept if record else None)]
 
 
-# Two lists, which say of each of the constants and of each number of a run if it has a tangent.
+# Two lists of truth values: whether each constant has a tangent, and whether each array of a run
+# has a tangent.
 Moving = tuple[list[bool], list[bool]]
 
 
 def _moving_run(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> tuple[Method, Arrays, Run, Record, Arrays]:
-    """Return the method, constants, run and record of a run that is to be taken once more, and the
-    tangents or cotangents that are to be carried along.
+    """Return what is needed to differentiate a recorded run.
 
-    The constants are those that `moving` selects, one copy for each body; the field of the method
-    takes these alone. `each` holds in a row the numbers of the run, the arrays of its record, and
-    the tangents or cotangents.
+    **Returns** five things: the method; the constants; the run; its record; and the tangents or
+    cotangents. The returned constants are only the constants that `moving` selects, with one copy
+    for each body; the field of the returned method takes these constants alone. `each` is a list of
+    the arrays of the run, then those of its record, then the tangents or cotangents.
     """
     whole = trees[0].num_leaves
     one = method.field
@@ -177,7 +180,8 @@ def _push_forward(
 ) -> Arrays:
     """Return the tangents of the states of a recorded run.
 
-    `each` ends with the tangents of the constants and numbers that `moving` selects.
+    The last arrays in `each` are the tangents of the constants and of the arrays of the run that
+    `moving` selects.
     """
     method, chosen, run, record, along = _moving_run(moving, method, trees, layout, constants, each)
     rest = iter(along[len(chosen) :])
@@ -195,9 +199,10 @@ def _push_forward(
 def _pull_back(
     moving: Moving, method: Method, trees: Any, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    """Return the cotangents of the constants and numbers that `moving` selects.
+    """Return the cotangents of the constants and of the arrays of the run that `moving` selects.
 
-    `each` ends with the cotangents of the states at the saved times and at the end of the run.
+    The last two arrays in `each` are the cotangents of the states at the saved times, and of the
+    state at the end of the run.
     """
     method, chosen, run, record, bars = _moving_run(moving, method, trees, layout, constants, each)
     total, of_run = adjoint.cotangents(method, chosen, run, record, bars, any(moving[1][:3]))

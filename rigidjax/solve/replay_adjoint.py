@@ -22,15 +22,15 @@ from rigidjax.solve.recorded_run import states_of_run
 from rigidjax.solve.step_control import NORM, StandardController, Stopping, Watched
 from rigidjax.solve.stops import trace_program
 
-# These controllers do not look at `args`, so they get none: `args` may be large, and each body of a
-# batch would have a copy.
+# These controllers do not read `args`. They get `None`, because `args` may be large, and a batch
+# would need a copy of `args` for each body.
 _WITHOUT_ARGS = (
     dfx.PIDController, dfx.ClipStepSizeController, dfx.ConstantStepSize, dfx.StepTo,
     StandardController, Stopping, Watched,
 )  # fmt: skip
 
-# A step that would end within this many units of round-off of the end of a run ends there, as in
-# diffrax.
+# If a step would end within this many units of round-off before the end of the run, it is extended
+# to the end, as in diffrax.
 _SLIVER = 100
 
 
@@ -38,18 +38,18 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
     """Run `diffrax.diffeqsolve` on records of its steps, with derivatives in both modes.
 
     It runs any vector field under the explicit methods of `rigidjax.solvers`. The steps are those
-    that the controller asks for. Derivatives take the recorded steps once more, and hold their
-    lengths constant. `jax.grad`, `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over
-    reverse) work with respect to all numbers: those of the field and what it closes over, `args`,
-    the start, t0, t1, the saved times and the `jump_ts` of a `diffrax.ClipStepSizeController`.
-    Under `jax.vmap` a step has the bodies in the last axis of its arrays, which makes batches
-    several times faster on CPU.
+    that the controller asks for. Derivatives repeat the recorded steps, and hold the lengths of the
+    steps constant. `jax.grad`, `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over reverse)
+    work with respect to all inputs: the field and the arrays that it closes over, `args`, the
+    start, t0, t1, the saved times and the `jump_ts` of a `diffrax.ClipStepSizeController`. Under
+    `jax.vmap` the bodies are in the last axis of all arrays of a step, which makes batches several
+    times faster on CPU.
 
-    **Arguments:** `otherwise` is the adjoint that takes every other run: one with another solver,
-    `max_steps=None`, `SaveAt(dense=True)` or `SaveAt(steps=…)`; one with an event whose time is
-    sought (with a `root_finder`, a real number, or several conditions); and one with a state of
-    complex numbers or of several dtypes. A boolean event without a `root_finder` ends a run under
-    `ReplayAdjoint` itself.
+    **Arguments:** `otherwise` is the adjoint that is used instead for any run that `ReplayAdjoint`
+    cannot do: a run with another solver, `max_steps=None`, `SaveAt(dense=True)` or
+    `SaveAt(steps=…)`; a run with an event whose time is to be found (with a `root_finder`, a real
+    number, or several conditions); and a run whose state has complex numbers or several dtypes. A
+    boolean event without a `root_finder` ends a run under `ReplayAdjoint` itself.
 
     **Raises:** `TypeError` for `jax.grad` of a `jax.grad`: second derivatives are forward over
     reverse.
@@ -82,7 +82,8 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
             more = dict(args=args, event=event, init_state=init_state)
             return self.otherwise.loop(progress_meter=progress_meter, **how, **more, **rest)
         y0, tree = ravel_pytree(init_state.y)
-        # In a run backwards in time diffrax counts −t, so that the field changes its sign.
+        # In a run backwards in time diffrax uses −t as the time, so that the field changes its
+        # sign.
         way = jnp.where(jnp.asarray(terms.contr(t0, t1)) < 0, -1, 1).astype(y0.dtype)
         program = trace_program(
             lambda t, y: way * ravel_pytree(terms.vf(t, tree(y), args))[0].astype(y.dtype), t0, y0
@@ -99,8 +100,8 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
         arrays, arrays_tree = jax.tree.flatten(lax.stop_gradient(arrays))
         given = lambda constants: arrays_tree.unflatten(constants[len(constants) - len(arrays) :])  # noqa: E731
         constants = constants + arrays
-        # A controller that takes no `args` and has the default norm may see the numbers of a state
-        # in a row.
+        # A controller that takes no `args` and has the default norm may get the state as one
+        # vector.
         rows = plain and all(getattr(c, "norm", NORM) is NORM for c in controlled_by)
         method = Method(
             tableau=solver.tableau,
@@ -134,27 +135,31 @@ class ReplayAdjoint(dfx.AbstractAdjoint):
 
 
 class _Control(NamedTuple):
-    """Hold a step controller with its progress meter, and call it after a step of one body."""
+    """Hold a step controller and a progress meter, and call both after a step of one body."""
 
     static: Any  # controller, progress meter and `args`, without their arrays
-    arrays: Callable[[Arrays], Any]  # takes these arrays from the constants of the run
-    tree: Callable[[Array], Any]  # makes of the numbers of a state what the controller takes
-    order: Any  # of the error of a step
+    arrays: Callable[[Arrays], Any]  # selects these arrays from the constants of the run
+    tree: Callable[[Array], Any]  # makes the argument of the controller from a vector of numbers
+    order: Any  # the order of the error of a step
 
     def __call__(self, again: bool, constants: Arrays, given: Any, numbers: Any) -> Any:
-        """Return what the controller says of a step that was tried.
+        """Return the decision of the controller on an attempted step.
 
-        This is: whether it accepts the step, the time after the step, the end of the next step, the
-        new states of controller and progress meter, and the result of the run so far.
+        **Returns** five things: whether the step is accepted; the time after the attempt; the time
+        at which the next step is to end; the new states of controller and progress meter; and the
+        result of the run so far.
 
         **Arguments:**
 
-        - `again`: whether a derivative takes a step once more; then the meter shows no progress.
-        - `constants`: the constants of the run, of which `arrays` takes those of the controller.
-        - `given`: the states of controller and progress meter; and the times at which the run
-          begins and ends, and at which the step begins and ends.
-        - `numbers`: the numbers of the state before the step, of the state after it, and of its
-          error.
+        - `again`: whether a derivative repeats a recorded step; the progress meter then shows
+          nothing.
+        - `constants`: the constants of the run, from which `arrays` selects the arrays of the
+          controller.
+        - `given`: a pair. The first item is the states of controller and progress meter; the second
+          is four times: those at which the run begins and ends, and those at which the step begins
+          and ends.
+        - `numbers`: three vectors: the state before the step, the state after the step, and the
+          error of the step.
         """
         controller, meter, args = eqx.combine(self.arrays(constants), self.static)
         (control, progress), (t0, last, begin, end) = given
@@ -162,7 +167,8 @@ class _Control(NamedTuple):
         keep, t, following, _, control, result = controller.adapt_step_size(
             begin, end, *states, args, error, self.order, control
         )
-        # As in diffrax, the end of the run leaves no step of a few units of round-off.
+        # As in diffrax, a next step that would end just before the end of the run is extended to
+        # the end, so that no step of a few units of round-off is left.
         t = jnp.minimum(t, last)
         near = last - _SLIVER * jnp.finfo(t.dtype).eps * jnp.abs(last)
         following = jnp.where(keep & (following > near), last, following)
@@ -172,7 +178,7 @@ class _Control(NamedTuple):
 
 
 def _is_replayed(solver: Any, saveat: Any, event: Any, max_steps: Any, state: Any) -> bool:
-    """Return whether `ReplayAdjoint` records a run itself; if not, another adjoint takes it."""
+    """Return whether `ReplayAdjoint` itself does a run; if not, its `otherwise` does."""
     kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(state.y)}
     plain = isinstance(solver, AbstractExplicit) and max_steps is not None and not saveat.dense
     plain = plain and len(kinds) == 1 and jnp.issubdtype(min(kinds, key=str), jnp.floating)
@@ -199,12 +205,13 @@ def _nested_controllers(controller: Any) -> list[Any]:
 
 
 def _stops(controllers: list[Any], t0: Array, t1: Array) -> Array:
-    """Return in order the times at which a step ends because the field jumps; t1 is the last."""
+    """Return in increasing order the times at which the field jumps, followed by t1."""
     jumps = [c.stops for c in controllers if type(c) is Stopping]
     for c in controllers:
         if type(c) is dfx.ClipStepSizeController and c.jump_ts is not None:
             ts = c.jump_ts.astype(t0.dtype)
-            # A jump beyond t1 has no step that ends at it, and one at t0 is over: both become t0.
+            # No step ends at a jump after t1, and no step is needed to a jump at or before t0. Both
+            # are replaced by t0, so that the array keeps its length.
             jumps.append(jnp.sort(jnp.where((t0 < ts) & (ts <= t1), ts, t0)))
     if len(jumps) > 1:
         jumps = [jnp.sort(jnp.concatenate(jumps))]
@@ -221,7 +228,8 @@ def _final(
     numbers; `asked` are the saved times, and `ys` the states at them; `end` is the end of the loop.
     """
     t1 = run.stops[-1]
-    # Before its first step a run saves nothing, unless it is over at its start.
+    # Before its first accepted step a run saves nothing, unless the run has no step because t1 is
+    # not after t0.
     reached = (asked <= end.t) & ((end.t > run.t0) | (t1 <= run.t0))
     counts = [s.ts.shape[0] for s in _sub_save_ats(saveat) if s.ts is not None]
     parts = [jnp.split(a, np.cumsum(counts)[:-1]) for a in (reached, ys)]
@@ -239,8 +247,8 @@ def _final(
             states.append(end.y[None])
         ts, states, there = (jnp.concatenate(a) for a in (ts, states, there))
         if sub.ts is not None:
-            # Where the run has no state, `sub.fn` is called with the first one, at which it has a
-            # value; `masked` removes the result.
+            # At a saved time that the run did not reach, `sub.fn` is called with the state at the
+            # start, for which it has a finite value; `masked` removes the result.
             states = jnp.where(there[:, None], states, run.y0)
         out = jax.vmap(lambda t, y: sub.fn(t, tree(y), args))(ts, states)
         if sub.ts is None:

@@ -1,4 +1,4 @@
-"""Solve a run in one compiled piece, by the closed form or by one `diffrax.diffeqsolve`."""
+"""Solve a run in one compiled function, by the closed form or by one `diffrax.diffeqsolve`."""
 
 import dataclasses
 import warnings
@@ -75,8 +75,9 @@ class DiffraxRun(eqx.Module):
 
     @property
     def seeks_stops(self) -> bool:
-        """Return whether steps end where the law switches; the run is then in the time s = σt."""
-        # A splitting reads the members of the field, which has to be of a known class.
+        """Return whether steps end where the law switches; if so, the run uses the time s = σt."""
+        # A splitting reads attributes of the vector field, which therefore cannot be replaced by a
+        # traced program.
         return self.controller is None and not isinstance(self.solver, AbstractSplitting)
 
     @property
@@ -114,7 +115,9 @@ def equations_of_motion(
     state0: Spin | Attitude | Rigid | Point | Coupled,
     torque: Torque | AbstractScene | MovingFrame | None = None,
 ) -> Callable[..., Any]:
-    """Return the vector field of `body` for states of the type of `state0`, for `diffrax.ODETerm`.
+    """Return the vector field of a body as a function `f(t, y, args)`, for `diffrax.ODETerm`.
+
+    The states y have the type of `state0`.
 
     **Arguments:** `body`, `state0` and `torque` are those of `simulate`. Under a torque with states
     of its own `state0` is a `rigidjax.motion.coupled.Coupled`.
@@ -138,9 +141,9 @@ def equations_of_motion(
 
 
 def direction(times: Array) -> Int[Array, ""] | None:
-    """Return the sign of the change from the first to the last of the `times`.
+    """Return the direction of the `times` as an integer: 1 if they increase, −1 if they decrease.
 
-    It is `None` if it is known to be 1.
+    If the direction is known to be 1 before the run, the result is `None`.
     """
     ends = _checks.namespace(times).asarray(times)
     change = ends[-1] - ends[0]
@@ -153,11 +156,11 @@ def direction(times: Array) -> Int[Array, ""] | None:
 def in_forward_time(
     sign: Array | None, field: Callable[..., Any], condition: Any, ts: Array
 ) -> tuple[Callable[..., Any], Any, Array, list[Array]]:
-    """Return a vector field, a condition, saved times and jump times in the time s = σt.
+    """Convert a field, a condition, saved times and jump times from the time t to the time s = σt.
 
-    `sign` is σ, with which s increases, or `None` for 1; `condition` may be `None`. The field
-    returned takes as its third argument, in s, the stops of each of its parts that jump (see
-    `adaptive`).
+    `sign` is σ, 1 or −1 such that s increases along the run; `None` stands for 1. `condition` may
+    be `None`. The returned field takes a third argument: a list of stops, as times s, with one
+    array for each part of the field that jumps (see `adaptive`).
     """
     time = partial(_signed, sign)
 
@@ -173,9 +176,9 @@ def in_forward_time(
 def solve(
     setup: ClosedFormRun | DiffraxRun, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    """Return the states of a run at times `ts` (T,), s, the `Solution.stats`, and the result."""
-    # One `jit` encloses everything, because one operation outside of it costs as much as a hundred
-    # steps.
+    """Return three things: the states at `ts` (T,), s; the `Solution.stats`; and the result."""
+    # One `jit` encloses everything, because a single operation outside of `jit` takes as long as a
+    # hundred steps.
     state0 = given = project_to_group(state0)
     if isinstance(setup, ClosedFormRun):
         ys, stats, result = _free(setup, state0, ts)
@@ -230,7 +233,7 @@ def _integrated(
 
 
 def _signed(sign: Array | None, t: Array) -> Array:
-    """Return s = σt for a time t, or t = σs for a time s; σ is `sign`, or 1 if that is `None`."""
+    """Return σ times the time `t`, which converts t to s = σt and back; `sign` is σ (`None`: 1)."""
     return t if sign is None else sign.astype(t.dtype) * t
 
 
@@ -263,7 +266,7 @@ def _shortest_step_words(dtype: Any) -> str:
 
 
 def raise_unless_complete(ys: Any, result: dfx.RESULTS, torque: Any = None) -> Any:
-    """Return the states `ys`; raise an error in words if the run did not get to its end."""
+    """Return the states `ys`; raise an error with a readable message if the run ended early."""
     if momentum_changes(torque) is not None:
         ys = eqx.error_if(ys, result == NONFINITE, _INERTIA)
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
@@ -279,7 +282,7 @@ def raise_unless_complete(ys: Any, result: dfx.RESULTS, torque: Any = None) -> A
 
 
 def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) -> None:
-    """Warn if a law has switches in time at more times than steps can end at."""
+    """Warn if a law switches in time more often than there are stored stops for steps to end at."""
     missed = stats.get("switches_missed", False)
     if not _checks.is_known((missed, state0, ts)) or not np.any(np.asarray(missed)):
         return
@@ -290,26 +293,29 @@ def warn_of_missed(setup: Any, state0: Any, ts: Array, stats: dict[str, Any]) ->
     lines = [] if analysis is None else list(dict.fromkeys(s.line for s in analysis.switches))
     warnings.warn(
         f"simulate: a law switches by the time more than {MOST} times ({'; '.join(lines)}): steps "
-        "end at the first of them, and the derivative by the others is lost. Give the law "
-        "`jump_times`, all its jumps in s, or take torques.Held or Pulses for a table",
+        "end at the first of these times, and the derivative with respect to the other times is "
+        "lost. Give the law `jump_times`, all its jumps in s, or take torques.Held or Pulses for a "
+        "table",
         stacklevel=4,
     )
 
 
 @eqx.filter_jit
 def _end_of(setup: DiffraxRun, state0: Any, ts: Array) -> Any:
-    """Return time, state and length of the next step at the end of a run, and its step count."""
+    """Return the time and state at the end of a run, the length of the next step, and the step
+    count.
+    """
     state0 = with_own_states(setup.body, project_to_group(state0), setup.torque, ts[0])
     *_, stats, _, end = _integrated(setup, None, state0, ts)
     return *end, stats["num_steps"]
 
 
-# If the last step is shorter than this share of the mean step, the run is stuck at one place.
+# If the next step is shorter than this part of the mean step, the run makes no more progress.
 _STUCK = 1e-2
 
 
 def words_of_steps(setup: Any, state0: Any, ts: Array, error: RuntimeError) -> RuntimeError:
-    """Return an error like `error`; it says what the steps were spent on, if all were taken."""
+    """Return the `error`; if the run used up all steps, its message says at which time and why."""
     if _MANY_STEPS not in str(error) or not isinstance(setup, DiffraxRun):
         return error
     if not setup.is_replayed or not _checks.is_known((setup, state0, ts)):
@@ -354,7 +360,7 @@ def _free(setup: ClosedFormRun, state0: Any, ts: Array) -> tuple[Any, dict[str, 
 def raise_if_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
     """Return the states `ys` saved at `ts`; raise an error if the scene ended the run.
 
-    The message is in the words of the scene.
+    The message contains the sentence that `scene.end_words` returns.
     """
     ended, advice = stats["ended"], "; give throw=False to keep what came before it"
     if _checks.is_known(ended) and not np.any(np.asarray(ended)):

@@ -1,8 +1,9 @@
 """Compute a step of an explicit Runge–Kutta method, its tangent and its transpose.
 
-The stages are a loop, so that XLA compiles only one evaluation of the field and, for the gradient,
-one vector–Jacobian product of it. States are arrays (n, *bodies): the n numbers of a state are in
-the first axis. `*bodies` is one last axis in a batch of bodies, and no axis for one body.
+The stages are computed in a loop. XLA therefore compiles only one evaluation of the field and, for
+the gradient, one vector–Jacobian product of the field. States are arrays (n, *bodies): the n
+numbers of a state are in the first axis. `*bodies` is one last axis in a batch of bodies, and no
+axis for one body.
 """
 
 from collections.abc import Callable
@@ -26,7 +27,8 @@ class Step(NamedTuple):
 
     t: Array  # (*bodies), s
     h: Array  # (*bodies), s
-    # (*bodies), s: t + h but for the last digit; at a jump of the field the last moment before it.
+    # (*bodies), s: the end, equal to t + h but for rounding. If the step ends at a jump of the
+    # field, this is the last floating-point number before the time of the jump.
     end: Array
     y: Array  # (n, *bodies)
 
@@ -38,11 +40,11 @@ class Stages(NamedTuple):
     places: Array  # (n, s, *bodies) the states at which the field is evaluated
     slopes: Array  # (n, s, *bodies)
     end: Array  # (n, *bodies)
-    number: Any  # of the stages taken
+    number: Any  # the number of stages that were computed
 
 
 class Weights(NamedTuple):
-    """Hold a tableau as arrays over all s stages: those of a step, then those of dense output."""
+    """Hold a tableau as arrays over s stages: the stages of a step, then those for dense output."""
 
     a: Array  # (s, s)
     b: Array  # (s,)
@@ -71,7 +73,7 @@ def weights(tableau: Tableau, dtype: Any) -> Weights:
 
 
 def _sum(row: Array, slopes: Array) -> Array:
-    """Return Σ row_i k_i over axis 1 of the slopes k (n, s, …).
+    """Return Σ row_i k_i, summed over the stages i, the axis 1 of the `slopes` k (n, s, …).
 
     If there are fewer slopes than weights in `row`, the last weights are left out.
     """
@@ -82,10 +84,11 @@ def _sum(row: Array, slopes: Array) -> Array:
 def stages(
     tableau: Tableau, field: Field, constants: Arrays, step: Step, dense: Any = False
 ) -> Stages:
-    """Return all stages of a step, with those of dense output if `dense`.
+    """Compute all stages of a step, and, if `dense` is true, also the stages for dense output.
 
-    The state at the end is not projected onto the group. If `dense` is traced and false, the stages
-    of dense output are at the start of the step, and their slopes are 0.
+    The quaternion of the state at the end is not scaled to length 1. If `dense` is traced and
+    false, the arrays have places for the stages of dense output: the time and state in these places
+    are those at the start of the step, and the slopes are 0.
     """
     w = weights(tableau, step.y.dtype)
     count = w.plain if dense is False else w.c.size
@@ -99,8 +102,8 @@ def stages(
     empty = jnp.zeros((step.y.shape[0], count, *step.y.shape[1:]), step.y.dtype)
     times, places = jnp.zeros((count, *step.t.shape), step.t.dtype), empty
     if not isinstance(dense, bool):
-        # The field may have no value at zeros, so a stage that is left out is at the start of the
-        # step.
+        # The field may be infinite or NaN at a state of zeros. The places of stages that are left
+        # out therefore hold the time and state at the start of the step.
         times, places = times + step.t[None], places + step.y[:, None]
         number = jnp.where(dense, number, np.int32(w.plain))
     begun = (times, places, empty)
@@ -113,16 +116,17 @@ def _stage(
     w: Weights, field: Field, constants: Arrays, step: Step, i: Array, slopes: Array
 ) -> tuple[Array, Array, Array]:
     """Return the time, the state and the slope of stage i, from the `slopes` before it."""
-    # The time may have another precision than the state.
+    # The dtype of the time may differ from that of the state.
     y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _sum(w.a[i], slopes)
     t = jnp.where(w.last[i], step.end, step.t + w.c[i].astype(step.t.dtype) * step.h)
     return t, y, field(constants, t, y)
 
 
 def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
-    """Return the rows F0, F1, … (r, n) of dense output for `nested`, of a step of one body.
+    """Return the rows F0, F1, … (r, n) that `nested` takes, for dense output of a step of one body.
 
-    `slopes` are those of the stages of the step; the rows contain its length as a factor.
+    `slopes` (n, s) are the slopes at the stages of the step. The length of the step is already
+    multiplied into the rows.
     """
     w = weights(tableau, slopes.dtype)
     slopes = jnp.pad(slopes, ((0, 0), (0, w.c.size - w.plain)))
@@ -156,7 +160,8 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     `sizes` are the sizes of these arrays.
     """
     dtype, ones = slopes.dtype, [1] * (slopes.ndim - 2)
-    # All sums are one operation, because for one body each sum would be a kernel of its own.
+    # All sums over stages are computed in one operation, because for one body each separate sum
+    # would be a kernel of its own.
     rows = weights(tableau, dtype).errors[:, : slopes.shape[1]]
     found = jnp.sum(rows.reshape(len(rows), 1, -1, *ones) * slopes[None], 2)
     found = lift(h.astype(dtype), found) * found
@@ -165,7 +170,8 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     which = np.repeat(np.eye(len(sizes)), sizes, axis=1)
     which = jnp.asarray(which, dtype).reshape(*which.shape, *ones)
     high, low = jnp.sum(which[None] * (found * found)[:, None], 2)
-    # The smallest normal number prevents 0/0. Its root is smaller than any estimate of a real step.
+    # The smallest normal number is added to prevent 0/0. Its square root is smaller than the error
+    # estimate of any real step.
     ratio = jnp.sqrt(high / (high + 0.01 * low + float(jnp.finfo(dtype).tiny)))
     return found[0] * jnp.sum(which * ratio[:, None], 0)
 
@@ -176,9 +182,9 @@ def pull_back(
 ) -> tuple[Arrays, Array, Array, Array]:  # fmt: skip
     """Return the cotangents of the constants, and of the time, length and state of a step.
 
-    This is the transpose of a step with the stages `there`. `cotangent` (n, *bodies) is that of the
-    state at the end of the step, and `of_slopes` (n, s, *bodies) are those of all slopes, or
-    `None`.
+    This is the transpose of a step. `there` holds the stages of the step. `cotangent` (n, *bodies)
+    is the cotangent of the state at the end of the step, and `of_slopes` (n, s, *bodies) are the
+    cotangents of all slopes, or `None` if these are 0.
     """
     w, count = weights(tableau, step.y.dtype), there.slopes.shape[1]
     h, put = step.h.astype(step.y.dtype), lax.dynamic_update_index_in_dim
@@ -195,9 +201,9 @@ def pull_back(
 
     none = jnp.zeros_like(there.slopes)
     below, seeds = lax.fori_loop(np.int32(0), there.number, stage, (none, none))
-    # The cotangents of the constants do not wait for each other, so all stages are transposed at
-    # once. Each stage gets a copy of the constants, and the cotangents of the copies are summed
-    # last: otherwise each number is a kernel.
+    # The cotangents of the constants from different stages do not depend on each other, so that all
+    # stages are transposed at once. Each stage gets a copy of the constants, and the cotangents of
+    # the copies are summed at the end: otherwise XLA makes a kernel for each number.
     every = jax.vmap(lambda c, t, y: field(c, t, y), (0, 0, 1), 1)
     own = [jnp.broadcast_to(c, (count, *c.shape)) for c in constants]
     pull = jax.vjp(lambda c, t: every(c, t, there.places), own, there.times)[1]

@@ -1,8 +1,9 @@
-"""Evaluate each part of a torque that jumps on that side of its jumps on which a step lies.
+"""Evaluate each part of a torque on the correct side of its jumps in time.
 
-Two parts that jump at the same time have two stops, at which steps end, one a little after the
-other. Between the two stops the first part has its new value and the other part its old one, so
-that each jump has its own derivative.
+Steps end at stops, the times at which a part of the torque jumps. If two parts jump at the same
+time, two stops are made, one slightly after the other. In the short step between the two stops, the
+first part has its value after the jump, and the second part its value before the jump. The
+derivatives with respect to the two jump times are then separate.
 """
 
 from typing import Any
@@ -19,16 +20,17 @@ from rigidjax.motion.torques.piecewise import Held, Linear, Pulses, Tabulated
 from rigidjax.motion.torques.states import has_own_states
 from rigidjax.solve.switching import DECLARED
 
-# These laws of this package have jumps of their own; all others pass on the jumps of their parts.
+# These laws of this package have jumps of their own; all other laws only pass on the jumps of the
+# laws inside them.
 _OWN = (Held, Linear, Pulses, Tabulated, Delayed, Lagged)
 
 
 class Sided(eqx.Module):
-    """Evaluate a law on that side of its jumps on which a step lies.
+    """Evaluate a law on the correct side of its jumps in time.
 
-    `jumps` (n,), s, are the times at which the law jumps, and `stops` (n,), s, the times at which
-    steps end for them, at most some units of round-off away; `None` if the two are equal. `sign` is
-    the direction of time as for `in_forward_time`.
+    `jumps` (n,), s, are the times at which the law jumps. `stops` (n,), s, are the times at which
+    steps end for these jumps, at most some units of round-off later or earlier; `None` says that
+    the stops are equal to the jumps. `sign` is the direction of time as for `in_forward_time`.
     """
 
     law: Any
@@ -37,7 +39,7 @@ class Sided(eqx.Module):
     sign: Any
 
     def __getattr__(self, name: str) -> Any:
-        # All other members, such as `feels` or `rate_free`, are those of the law.
+        # All other attributes, such as `feels` or `rate_free`, are read from the law.
         if name.startswith("__") or name in ("law", "jumps", "stops", "sign"):
             raise AttributeError(name)
         return getattr(self.law, name)
@@ -53,16 +55,18 @@ class Sided(eqx.Module):
             return self.law(self.seen(t), *args)
 
     def seen(self, t: Any) -> Any:
-        """Return the time to call the law at: `t`, or the nearest time on the side of the step."""
+        """Return the time for calling the law: `t`, or the nearest time on the correct side."""
         if self.sign is None and self.stops is None:
             return t
         still = lax.stop_gradient(jnp.asarray(t))
         low = jnp.full_like(still, -jnp.inf)
         now = still
         if self.sign is not None:
-            # A law has its new value from the jump on, but a step back in time that begins at the
-            # jump needs the old value. The oldest supported JAX has no derivative of `nextafter`,
-            # not even inside `stop_gradient`, so `still` is stopped before.
+            # At the time of a jump a law has the value after the jump. A step backwards in time
+            # that begins at the jump needs the value before the jump, so that the time is moved
+            # back by one floating-point number. The oldest supported JAX has no derivative of
+            # `nextafter`, not even inside `stop_gradient`: `stop_gradient` is therefore applied to
+            # its argument.
             now = jnp.where(self.sign < 0, jnp.nextafter(still, low), still)
         if self.stops is not None:
             jumps, stops = (a.astype(still.dtype) for a in (self.jumps, self.stops))
@@ -93,10 +97,10 @@ def declared_jumps(field: Any) -> list[Array]:
 
 
 def on_sides(field: Any, sign: Any, sides: Any) -> Any:
-    """Return the field in which each part that declares jumps is a `Sided` law.
+    """Return the field with each part that declares jumps wrapped in a `Sided` law.
 
-    `sides` are the stops of each part that has jumps, in the order of `declared_jumps`, or `None`
-    if they are at the jumps themselves. `sign` is as for `Sided`.
+    `sides` is a list with the stops, s, of each part that has jumps, in the order of
+    `declared_jumps`; `None` says that the stops are equal to the jumps. `sign` is as for `Sided`.
     """
     stops = iter(sides or ())
 
@@ -105,8 +109,8 @@ def on_sides(field: Any, sign: Any, sides: Any) -> Any:
             return part
         jumps = jnp.asarray(jumps_of(part))
         own = next(stops, None) if jumps.shape[0] else None
-        # A law with states of its own has kinks but no jumps, and is found later by its class: it
-        # stays as it is.
+        # A law with states of its own has kinks but no jumps, and later code looks for its class.
+        # It is therefore not wrapped.
         return (
             part
             if has_own_states(part)

@@ -36,14 +36,16 @@ from rigidjax.solve.splitting import AbstractSplitting
 # A torque must accept the type of the state, so that type checkers refuse gravity on a `Spin`.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 
-# These are made once, because to build a Module costs as much as ten steps.
+# These two objects are made only once, because building a Module takes as long as ten steps.
 SOLVER = Projected(dfx.Dopri8())
 ADJOINT = dfx.RecursiveCheckpointAdjoint()
-# `ReplayAdjoint` can do all that these adjoints of diffrax can, and takes their place.
+# `ReplayAdjoint` can do all that these adjoints of diffrax can, and is used instead of each of
+# them.
 _EITHER_MODE = (type(None), dfx.ForwardMode, dfx.RecursiveCheckpointAdjoint)
-# A step that reverse mode runs again may round differently. Under tolerances so near to round-off
-# its length then differs, too, which changed a gradient by 2e-4 of it at 1e-13. Therefore the start
-# of every step is kept, except in long runs.
+# When reverse mode repeats a step, the step may be rounded differently. At a tolerance below
+# `_TIGHT`, close to round-off, the length of the step then differs, too: at a tolerance of 1e-13
+# this changed a gradient by 2e-4 of its value. With 4096 checkpoints the start of every step is
+# stored, except in longer runs.
 _TIGHT, _EVERY_STEP = 1e-10, dfx.RecursiveCheckpointAdjoint(checkpoints=4096)
 
 
@@ -196,22 +198,24 @@ def simulate(
 def _solver(solver: Any, adjoint: Any, event: Any, max_steps: int | None) -> Any:
     """Return the solver of a run, which keeps attitudes on the group.
 
-    For `None` it is the quickest solver under this adjoint, event and limit of steps.
+    If `solver` is `None`, the solver is the fastest for the given adjoint, event and largest number
+    of steps.
     """
     if solver is None:
-        # If forward mode alone is asked for, diffrax carries the tangents along with its run.
+        # If the user asks for forward mode alone, diffrax computes the tangents together with the
+        # run.
         forward = isinstance(adjoint, dfx.ForwardMode) and event is None
         return SOLVER if forward or max_steps is None else DormandPrince8()
-    # The solvers of this package project inside their one kernel; a second projection outside of it
-    # would break the kernel up.
+    # The solvers of this package scale the quaternion inside the kernel of a step. A second scaling
+    # outside would split this kernel.
     ours = isinstance(solver, AbstractExplicit | AbstractSplitting | Projected)
     return solver if ours else Projected(solver)
 
 
 def _adjoint(setup: DiffraxRun) -> dfx.AbstractAdjoint:
-    """Return the adjoint of a run: `ReplayAdjoint` if it can take the place of the one given.
+    """Return the adjoint of a run: `ReplayAdjoint` if it can replace the given adjoint.
 
-    Else it is the one given or, for `None`, one for reverse mode.
+    Otherwise return the given adjoint or, if none is given, an adjoint of diffrax for reverse mode.
     """
     explicit = isinstance(setup.solver, AbstractExplicit) and setup.max_steps is not None
     if explicit and isinstance(setup.adjoint, _EITHER_MODE):
@@ -224,7 +228,7 @@ def _adjoint(setup: DiffraxRun) -> dfx.AbstractAdjoint:
 
 
 def _accurate(setup: DiffraxRun, event: Any, state0: Any, times: Array, accuracy: Any) -> Solution:
-    """Return the solution, with its error, of a run whose tolerance gives the `accuracy`."""
+    """Return the solution of a run, with its error, at a tolerance that gives the `accuracy`."""
     found, run, tried = solve_to(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
     sol = _solution(found, event, state0, times, None if event is not None else run)
@@ -233,7 +237,7 @@ def _accurate(setup: DiffraxRun, event: Any, state0: Any, times: Array, accuracy
 
 
 def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None) -> Solution:
-    """Return the solution of a run; `run` is what `solve` returned, if that is known already."""
+    """Return the solution of a run; `run` holds the results of `solve` if these are known."""
     event_time = event_state = None
     try:
         if run is not None:

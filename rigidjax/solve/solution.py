@@ -1,4 +1,4 @@
-"""Hold the result of a run, and compute its drift, growth of errors and error when asked."""
+"""Hold the result of a run; its drift, growth of errors and error are computed when read."""
 
 import dataclasses
 import warnings
@@ -34,7 +34,7 @@ class Solution(eqx.Module, Generic[State]):
     - `ys`: the states at `ts`, of the type of `state0`, with a leading time axis; NaN at times that
       the run did not reach.
     - `stats`: a dict with `num_steps`, `num_accepted_steps` and `num_rejected_steps`; for a `Point`
-      also with `drift`, that of the conserved quantities of its scene.
+      also with `drift`, the relative drift of each conserved quantity of its scene.
     - `result`: a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
       `max_steps_reached`, `nonfinite`, `nonfinite_input` (no body has these numbers),
       `dt_min_reached` or `event_occurred`.
@@ -56,8 +56,9 @@ class Solution(eqx.Module, Generic[State]):
     stats: dict[str, Any]
     result: dfx.RESULTS
     _arrays: Any
-    # This is a tree and not a `PyTreeDef`: there the object by which Equinox marks what it leaves
-    # out is another object after `pickle`.
+    # This is a tree and not a `PyTreeDef`. A `PyTreeDef` would hold the object with which Equinox
+    # marks a part that is left out, and after `pickle` this is another object, which Equinox does
+    # not recognise.
     _rest: Any = eqx.field(static=True)
     event_time: Float[Array, ""] | None = None
     event_state: Any = None
@@ -96,12 +97,12 @@ class Solution(eqx.Module, Generic[State]):
         """Return the growth of a small error at the start, ‖∂y(t)/∂y(t₀)‖, at each time t of `ts`.
 
         The growth is computed when it is read, by forward mode, which takes about as many runs as
-        the state y has numbers. It has no unit: each of q, Ω, x and v is relative to its largest
-        size in the run, and the norm is the largest singular value.
+        the state y has numbers. The growth has no unit, because each of q, Ω, x and v is divided by
+        its largest size in the run. The norm ‖…‖ is the largest singular value.
 
-        The errors of the solver grow as much. Where `growth * rtol` exceeds 1, the states have no
-        correct digit, and gradients through them mean nothing: a `UserWarning` names the first such
-        time. End the run earlier then, or fit shorter recordings.
+        The errors of the solver grow by the same factor. If `growth * rtol` exceeds 1, the states
+        have no correct digit, and gradients through these states mean nothing: a `UserWarning`
+        names the first such time. In this case end the run earlier, or fit shorter recordings.
 
         Source: the largest finite-time Lyapunov exponent is the logarithm of the growth over t
         (Eckmann and Ruelle 1985, doi:10.1103/RevModPhys.57.617).
@@ -129,15 +130,15 @@ class Solution(eqx.Module, Generic[State]):
         """Return how far the states are from the exact motion of the given numbers, as an `Error`.
 
         The error is computed when it is read, by a second run with a fiftieth of the tolerances
-        (for fixed steps, with half of the step). If round-off may count, three more runs have
-        changed last digits of body, torque and start (in closed form, of the times). A
+        (for fixed steps, with half of the step). If round-off may matter, three more runs are done
+        with changed last digits of body, torque and start (in closed form, also of the times). A
         `UserWarning` names the time after which nothing is known, as in chaos.
 
         A torque that depends on the time is also sampled at 16 384 times, in each part of the run
-        at one saved state. Adaptive steps of the second run end at a pulse that is found so, and
-        which both runs might otherwise pass over. Three kinds of pulses are not seen: one between
-        two samples; one that the torque has at other states only; and, under fixed steps, one that
-        falls between their stages.
+        at one saved state. Adaptive steps of the second run end at a pulse that these samples show;
+        without this both runs might pass over the pulse. Three kinds of pulses are not seen: one
+        between two samples; one that the torque has at other states only; and, under fixed steps,
+        one that falls between their stages.
 
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.5, 1.0])
         >>> law = rj.torques.Damping([0.1, 0.1, 0.1])
@@ -199,7 +200,7 @@ def with_error(sol: Solution, error: Error, accuracy: Any) -> Solution:
 
 
 def _say(error: Error, most: Any, words: str) -> None:
-    """Warn with these words of the first time at which the relative error exceeds `most`."""
+    """Warn with `words` if the relative error exceeds `most`, and name the first such time."""
     if not _checks.is_known((error, most)) or not np.any(np.asarray(error.relative) > most):
         return
     i = int(np.argmax(np.asarray(error.relative) > most))
@@ -222,7 +223,7 @@ def _drift(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> dict[str, A
 
 @eqx.filter_jit
 def _transition(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, "times n n"]:
-    # This run raises no error, and forward mode goes through it.
+    # The run must not raise an error, and it must be differentiable in forward mode.
     plain = isinstance(setup, DiffraxRun) and not setup.is_replayed
     more = dict(adjoint=dfx.ForwardMode()) if plain else {}
     setup = dataclasses.replace(setup, throw=False, **more)
@@ -236,7 +237,9 @@ def _transition(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[
 
 @eqx.filter_jit
 def _growth(setup: ClosedFormRun | DiffraxRun, ts: Array, ys: Any) -> Float[Array, " times"]:
-    """Return the largest singular value of ∂y(t)/∂y(t₀), each part relative to its largest size."""
+    """Return the largest singular value of ∂y(t)/∂y(t₀), with each array divided by its largest
+    size.
+    """
     start = jax.tree.map(lambda leaf: leaf[0], ys)
     each = parts_by_name(start, jnp.ones(dimension(start), ts.dtype)).values()
     both = zip(each, jax.tree.leaves(ys), strict=True)

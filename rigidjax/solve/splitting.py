@@ -1,9 +1,10 @@
 """Solve the rotation of a body by splitting: exact free motion, and kicks of the momentum.
 
-`A` is the motion of the free body in closed form (`rigidjax.exact`). `B` is the kick
-`Π ← Π + c h τ(t, q)` of the momentum Π by the torque τ at a fixed attitude q, where h is the length
-of the step and c a weight. A step is `B(b1) A(a1) B(b2) … A(a1) B(b1)`: it is symmetric, and each
-of its parts is an exact Hamiltonian flow.
+A step is the sequence `B(b1) A(a1) B(b2) … A(a1) B(b1)`, which is the same from left to right as
+from right to left. `A(a)` is the motion of the free body in closed form (`rigidjax.exact`) during
+the time a h, where h is the length of the step. `B(b)` is a kick: it adds b h τ(t, q) to the
+momentum Π, where τ is the torque at the time t and the attitude q, while q stays fixed. Both A and
+B are exact flows of a Hamiltonian.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -40,7 +41,7 @@ from rigidjax.solve.tableaus import parse_numbers
 class Composition(NamedTuple):
     """Hold a symmetric composition `B(b1) A(a1) … B(b1)` by its order and weights.
 
-    `flows` are the weights of A, and `kicks` those of B.
+    `flows` are the weights a1, a2, … of A, and `kicks` the weights b1, b2, … of B (see the module).
     """
 
     order: int
@@ -51,7 +52,8 @@ class Composition(NamedTuple):
 def _symmetric(order: int, flows: tuple[float, ...], kicks: tuple[float, ...]) -> Composition:
     """Return the composition whose weights begin with `flows` and `kicks`.
 
-    The middle weights follow from the sums, which are 1; the others from the symmetry.
+    The middle weights follow because the `flows` sum up to 1 and the `kicks` sum up to 1. The last
+    weights follow from the symmetry.
     """
     if len(flows) < len(kicks):
         middle = 1 - 2 * sum(kicks)
@@ -64,9 +66,9 @@ def _symmetric(order: int, flows: tuple[float, ...], kicks: tuple[float, ...]) -
 
 # Strang 1968, doi:10.1137/0705041.
 STRANG = Composition(2, (1.0,), (0.5, 0.5))
-# Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, methods SRKN6b and SRKN11b. They are for
-# kicks B that commute with [B, [B, A]]. Here they do, because both change the momentum alone, and
-# by a function of the attitude alone.
+# Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, methods SRKN6b and SRKN11b. These methods
+# are for kicks B that commute with [B, [B, A]], where [·, ·] is the commutator. This holds here,
+# because B and [B, [B, A]] both change only the momentum, by a function of the attitude.
 SRKN6 = _symmetric(
     4,
     parse_numbers("0.245298957184271 0.604872665711080"),
@@ -86,7 +88,7 @@ SRKN11 = _symmetric(
 class Frame(NamedTuple):
     """Hold the principal axes of a body, and the inertia and its inverse along these axes.
 
-    The off-diagonal entries of both are zero, and carry the tangents.
+    In both matrices the off-diagonal entries are zero, but they have tangents that are not zero.
     """
 
     moments: Six  # the inertia, kg m²
@@ -97,7 +99,8 @@ class Frame(NamedTuple):
 def frame_of_tensor(tensor: Array) -> Frame:
     """Return the principal frame of an inertia `tensor` (3, 3), kg m²."""
     six, axes = principal_frame(tensor)
-    # The tensor is inverted relative to its trace, because the cube of 1e37 kg m² overflows.
+    # The tensor is divided by its trace before it is inverted, because the determinant of an
+    # inertia of 1e37 kg m² would overflow.
     size = six[0] + six[1] + six[2]
     unit: Six = tuple(i / size for i in six)
     scale = determinant(unit)
@@ -117,9 +120,9 @@ def rate_of_jvp(primals, tangents):
 
 
 class AbstractSplitting(dfx.AbstractSolver):
-    """Solve the rotation of a body by kicks and exact free flows, as a composition orders them.
+    """Solve the rotation of a body by a sequence of kicks and exact free motions.
 
-    Subclasses name the `composition`.
+    Each subclass sets the `composition`, which holds the weights of the sequence.
     """
 
     term_structure: ClassVar = dfx.ODETerm
@@ -152,8 +155,9 @@ class AbstractSplitting(dfx.AbstractSolver):
         field, way = field_of(terms)
         state, h = (y0.q, enter(solver_state, y0.omega)), jnp.asarray(t1 - t0) * way
         dq, dp = compose(self.composition, field, solver_state, jnp.asarray(t0) * way, h, state)
-        # Only the change of the momentum is converted to a rate. I⁻¹(IΩ) is Ω but for a rounding
-        # error, which is the same in each step and would add up.
+        # Only the change of the momentum is converted to a change of the body rate Ω. To convert
+        # the momentum itself would give I⁻¹(IΩ), which differs from Ω by a rounding error that is
+        # the same in each step and would add up.
         omega = y0.omega + leave(solver_state, dp)
         y1 = Attitude(quaternion.normalise(y0.q + dq), omega)
         dense = dict(y0=y0, coefficients=_dense_rows(terms, t0, t1, args, y0, y1))
@@ -167,9 +171,9 @@ class Splitting2(AbstractSplitting):
     """Solve the rotation to order 2 by half a kick, the exact free motion, and half a kick.
 
     This solver is for long runs with fixed steps, under torques that are small against the free
-    motion and depend on time and attitude, not on the body rate. The error of the energy stays
-    bounded, but not with an adaptive controller; there is no error estimate. The attitudes of dense
-    output are on the group, and have the order of the method.
+    motion and depend on time and attitude, not on the body rate. With fixed steps the error of the
+    energy stays bounded; with an adaptive controller it does not. There is no error estimate. The
+    attitudes of dense output are unit quaternions, and are as accurate as the order of the method.
 
     Source: Strang's splitting (1968), doi:10.1137/0705041, with the free flow of
     `rigidjax.exact.free_body`.
@@ -218,7 +222,7 @@ def frame_of(field: Any, y0: Any) -> Frame:
 
     Raise `TypeError` for any other field or state, and for a torque that reads the body rate.
     """
-    # Under a torque that reads the body rate a kick is no exact flow: the order would fall to 1.
+    # If the torque reads the body rate, a kick is no exact flow, and the order would fall to 1.
     torque = require_attitude("Splitting", field, y0, "DormandPrince8").euler.torque
     if sees_rate(torque):
         raise TypeError(
@@ -244,30 +248,34 @@ def compose(
 ) -> tuple[Array, Triple]:
     """Return the changes of the attitude q and of the momentum Π in one step.
 
-    `t` and `h` are the time at its start and its length, s. `state` is q and Π at its start; Π is
-    along the principal axes of `frame`. The changed q is not projected onto the group.
+    `t` is the time at the start of the step, and `h` the length of the step, s. `state` is the pair
+    of q and Π at the start; Π is along the principal axes of `frame`. The changed q is not scaled
+    to length 1.
     """
     dtype = state[0].dtype
 
     def kicked(t: Any, weight: Any, q: Array, change: Triple) -> Triple:
         if field.euler.torque is None:
             return change
-        # The torque says that it does not read the body rate: it is given NaN in its place.
+        # The torque has declared that it does not read the body rate, and gets NaN as the body
+        # rate.
         at = Attitude(q, jnp.full(3, jnp.nan, dtype))
         torque = components_along(
             frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia)
         )
         return add(change, tuple(weight * a for a in torque))
 
-    # The stages are a loop, not up to twelve copies, because the free flow takes long to compile.
+    # The stages are computed in a loop, because up to twelve copies of the free motion would take
+    # long to compile.
     def stage(carry: Any, weights: tuple[Array, Array]) -> tuple[Any, None]:
         t, dq, change = carry
         drift, kick = weights
         length = drift.astype(dtype)
         momentum = add(state[1], change)
         _, (w, x, y, z) = flow(frame.moments, momentum, length)
-        # The momentum along the axes of the body changes as these turn. Only this change is added,
-        # so that the momentum keeps its length to the last digit of the change.
+        # The components of the momentum along the body axes change, because the axes turn. Only the
+        # change is computed and added, so that the rounding error of |Π| is that of the change,
+        # which is small.
         change = add(change, change_by_inverse_rotation((w, x, y, z), momentum))
         turn = jnp.stack(
             [-(x * x + y * y + z * z) / (1 + w), *combine_columns(frame.axes, (x, y, z))]
@@ -291,7 +299,8 @@ def _dense_rows(
 ) -> Any:
     """Return the rows for `nested` of a quintic, which is dense output of order 6.
 
-    It has the values and the first and second derivatives of the motion at both ends of the step.
+    At both ends of the step the quintic has the state of the motion and its first and second time
+    derivatives.
     """
     way, length = direction_and_length(terms, t0, t1)
     h = way * length
@@ -304,8 +313,8 @@ def _dense_rows(
 
     (f0, s0), (f1, s1) = slopes(t0, y0), slopes(t1, y1)
 
-    # In a run backwards diffrax's time falls as t rises: first derivatives change their sign, which
-    # is that of `h`; second derivatives do not.
+    # In a run backwards in time diffrax uses −t as the time. The sign of first derivatives then
+    # changes, which the sign of `h` does; second derivatives keep their sign.
     def rows(a: Array, b: Array, k: Array, m: Array, u: Array, v: Array) -> Array:
         step = jnp.asarray(h, a.dtype)
         rise, second, third = cubic_rows(b - a, step, k, m)

@@ -21,7 +21,8 @@ from rigidjax.solve.adaptive_loop import (
     take,
 )
 
-# The default norm of an error, which is the same for a state and for its numbers in a row.
+# The default norm of an error. It has the same value for a state as for the vector of all its
+# numbers.
 NORM = dfx.PIDController(rtol=1.0, atol=1.0).norm
 
 
@@ -33,10 +34,10 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
     """Choose the length of each step by the error of the step before it.
 
     It is used inside `Watched`, which chooses the first step. The rule is that of Hairer, Nørsett
-    and Wanner (1993), II.4: the step after an accepted one may be shorter. `diffrax.PIDController`
-    never shortens the step after an accepted one: on Arenstorf's orbit at a tolerance of 1e-13 it
-    rejects 85 of 477 steps. This controller rejects 29 of 420 steps there, and the orbit closes
-    with a third of the error.
+    and Wanner (1993), II.4: after an accepted step, the next step may be shorter.
+    `diffrax.PIDController` never shortens the step after an accepted step: on Arenstorf's orbit at
+    a tolerance of 1e-13 it rejects 85 of 477 steps. On this orbit, which is periodic,
+    `StandardController` rejects 29 of 420 steps, and the error after one period is a third.
 
     **Arguments:** `rtol` and `atol` are the tolerances; `dtmax` is the longest step, or `None`.
 
@@ -133,28 +134,29 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         func: Callable[..., PyTree],
         error_order: RealLike | None,
     ) -> tuple[Any, Any]:
-        # The first step has no derivative, and neither has the test whether there is one: all that
-        # follows is computed without tangents.
+        # The length of the first step has no derivative. Everything below is therefore computed
+        # without tangents.
         arrays, rest = eqx.partition((terms, y0, dt0, args), eqx.is_array)
         terms, y0, dt0, args = eqx.combine(lax.stop_gradient(arrays), rest)
         begin, end = (lax.stop_gradient(jnp.asarray(t)) for t in (t0, t1))
         slope = func(terms, begin, y0, args)
-        # A solver without an order of its error is refused by the inner controller.
+        # If the solver has no error estimate, `error_order` is `None`, and the inner controller
+        # raises an error.
         if dt0 is None and error_order is not None:
-            # diffrax itself takes 0.01 for any field that it wraps with a direction of time, as
-            # `diffeqsolve` does with every field.
+            # The first step is chosen here, because diffrax itself takes 0.01 for every field that
+            # `diffeqsolve` has wrapped for the direction of time, that is for every field.
             h = self._first_step(y0, slope, error_order).astype(begin.dtype)
-            # After NaN or infinity h is not positive; the inner controller then gets 1 in the place
-            # of h.
+            # If the state or the slope is NaN or infinite, h > 0 is false; the inner controller
+            # then gets the length 1.
             sound = h > 0
             dt0 = jnp.where(sound, h, jnp.ones_like(h))
         else:
             sound = finite((y0, dt0, slope))
         first, inner = self.controller.init(terms, begin, end, y0, dt0, args, func, error_order)
-        # At t = 0 the round-off of t vanishes: there |t| is replaced by the round-off of the length
-        # of the run.
+        # Near t = 0 the round-off of t vanishes. The size of t is therefore taken to be at least
+        # `least`, the round-off of the length of the run.
         least = jnp.finfo(begin.dtype).eps * jnp.abs(end - begin)
-        # A step of length 0 would be accepted for ever, but a step of length NaN ends the run.
+        # Steps of length 0 would be accepted without end, but a step of length NaN ends the run.
         shortest = begin + self._unit(begin, least)
         first = jnp.where(sound, jnp.maximum(first, shortest), jnp.nan)
         return first.astype(begin.dtype), (inner, least)
@@ -162,18 +164,22 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     def _first_step(self, y: PyTree, slope: PyTree, order: RealLike) -> Array:
         """Return the first step from the state `y` and its derivative `slope`.
 
-        It is 0 or NaN if one of the two is not finite; `order` is that of the error of a step.
+        The result is 0 or NaN if the state or its derivative is not finite; `order` is the order of
+        the error of a step.
         """
         y, tree = ravel_pytree(y)
         scale = self.atol + self.rtol * jnp.abs(y)
-        # The default norm takes the numbers of a state in a row; any other takes the state itself.
+        # The default norm may be called with the vector of all numbers; any other norm is called
+        # with the state.
         of_state = (lambda numbers: numbers) if self.norm is NORM else tree
         both = (y, ravel_pytree(slope)[0])
         size, rate = (jnp.asarray(self.norm(of_state(a / scale))) for a in both)
         return starting_step(size, rate, order)
 
     def _unit(self, t: ArrayLike, least: ArrayLike) -> Array:
-        """Return the shortest step at the time `t`: some units of round-off of |t| or `least`."""
+        """Return the shortest step at the time `t`: 8 units of round-off of the larger of |t| and
+        `least`.
+        """
         return 8 * jnp.finfo(jnp.result_type(t)).eps * jnp.maximum(jnp.abs(t), least)
 
     def adapt_step_size(
@@ -193,8 +199,8 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         )
         unit = self._unit(left, least)
         stuck = ~keep & ~(right - left > unit)
-        # If NaN is in the shortest step that the times can tell apart, a shorter step might have
-        # none: the cause is then the length of the step.
+        # If even the shortest possible step has NaN, a still shorter step might have none. The
+        # reason given is then that no step is short enough.
         short = finite(y_error) | (t1 - t0 <= unit)
         why = dfx.RESULTS.where(short, dfx.RESULTS.dt_min_reached, NONFINITE)
         why = dfx.RESULTS.where(stuck & (result == dfx.RESULTS.successful), why, result)
@@ -204,12 +210,13 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
 class Stopping(dfx.AbstractAdaptiveStepSizeController):
     """Wrap an adaptive step controller so that steps end at the `stops`, where the field jumps.
 
-    A step ends at the last moment before a stop. The next step begins at the stop, and is at least
-    as long as the controller wanted the step before to be. (`diffrax.ClipStepSizeController` goes
-    on from the length of the step that was cut short: a stop then costs several short steps.)
+    A step that reaches a stop ends at the last floating-point number before the stop. The next step
+    begins at the stop. It is at least as long as the previous step would have been without the
+    stop. (`diffrax.ClipStepSizeController` continues with the length of the step that was cut
+    short, so that each stop costs several short steps.)
 
     **Arguments:** `controller` is any adaptive controller of diffrax; `stops` (J,) are times in
-    order.
+    increasing order.
 
     >>> Stopping(dfx.PIDController(rtol=1e-6, atol=1e-9), jnp.array([0.5])).rtol
     1e-06
@@ -255,9 +262,9 @@ class Stopping(dfx.AbstractAdaptiveStepSizeController):
         )
 
     def _stop_and_moment_before(self, index: Any) -> tuple[Any, Any]:
-        """Return the stop of this `index`, and the last moment before it.
+        """Return the stop with this `index`, and the last floating-point number before the stop.
 
-        Both are infinite for an index after the last stop.
+        If `index` is beyond the last stop, the two results are infinite.
         """
         none = jnp.full_like(self.stops[:1], jnp.inf)
         stop = take(jnp.concatenate([self.stops, none]), index)

@@ -1,9 +1,9 @@
 """Make the fixed step of a method for a body and a torque, in a form that a loop can call.
 
-The numbers of a state are carried one by one (see `components`), but torques are called on arrays.
-For a body that turns, the momentum Π = IΩ is carried instead of the body rate Ω, which makes each
-stage a third cheaper. The steps of a Runge–Kutta method are the same under a constant linear change
-of variables.
+The loop carries each number of a state as a scalar (see the module `components`); torques are
+called with arrays. For a body that turns, the loop carries the momentum Π = IΩ instead of the body
+rate Ω, which makes each stage a third cheaper. This does not change the results: a Runge–Kutta
+method gives the same steps after a constant linear change of variables.
 """
 
 from collections.abc import Callable
@@ -36,18 +36,18 @@ from rigidjax.solve.explicit import AbstractExplicit, RungeKutta4
 from rigidjax.solve.magnus import Magnus4, change_and_turn, require_blind
 from rigidjax.solve.splitting import AbstractSplitting
 
-# Runs of at least this many steps use `Carrying`, with which values take a tenth to a third longer.
-# Shorter runs lose too little to rounding to pay for it.
+# Runs of at least this many steps use `Carrying`, with which a run without derivatives takes a
+# tenth to a third longer. In shorter runs the rounding errors are too small to justify this.
 _MANY = 10_000
 
 
 class Stepper(NamedTuple):
-    """Hold the fixed steps of one body: the numbers y at the start, their change, and their state.
+    """Hold functions that take fixed steps of one body, on numbers y that stand for its state.
 
     A step goes from the time `t` to `end`, s, and has the length `h`, s.
     """
 
-    start: Any  # the numbers y at the start
+    start: Any  # the numbers y at the start, which stand for the state there
     change: Callable[[Any, Any, Any, Any, Any], Any]  # (t, end, h, y, inputs of the law or None)
     state: Callable[[Any], Any]  # the state that the numbers y stand for
     delays: tuple[tuple[str, Array], ...] = ()  # name and delay, s, of each delayed input
@@ -57,11 +57,12 @@ class Stepper(NamedTuple):
 
 
 class Carrying(NamedTuple):
-    """Hold the steps of the stepper `of`; each also adds what the last addition lost to rounding.
+    """Take the steps of the stepper `of` with compensated summation.
 
-    So round-off grows as √n with the number n of steps, not as n. The lost digits are carried along
-    with the numbers y, and have no derivative. Source: Kahan 1965, doi:10.1145/363707.363723;
-    Dekker 1971, doi:10.1007/BF01397083, for |change| ≤ |y|.
+    Each step computes the rounding error of the addition of the change to y, and the next step adds
+    this error to its change. The round-off of n steps then grows as √n, not as n. The rounding
+    error is carried along with the numbers y, and has no derivative. Source: Kahan 1965,
+    doi:10.1145/363707.363723; Dekker 1971, doi:10.1007/BF01397083, for |change| ≤ |y|.
     """
 
     of: Stepper
@@ -89,10 +90,10 @@ AnyStepper = Stepper | Carrying
 
 
 def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) -> AnyStepper:
-    """Return the stepper of a vector field under `solver` (`None`: the cheapest).
+    """Return the stepper of a vector field under `solver`; `None` stands for the cheapest solver.
 
-    `y0` is the state at the start. For a `count` of many steps, or one that is traced, the stepper
-    is a `Carrying`.
+    `y0` is the state at the start, and `count` the number of steps. If `count` is at least 10 000
+    or is traced, the stepper is a `Carrying`.
     """
     stepper = _stepper_of(solver, field, y0)._replace(delays=tuple(delays_of(field)))
     return Carrying(stepper) if not isinstance(count, int) or count >= _MANY else stepper
@@ -127,7 +128,9 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
 
 
 class _Turning(NamedTuple):
-    """Hold the inertia, its inverse as six numbers, and the torque, in the state's precision."""
+    """Hold the inertia, the six entries of its inverse, and the torque; the dtype is that of the
+    state.
+    """
 
     inertia: Inertia
     weights: Six
@@ -135,7 +138,7 @@ class _Turning(NamedTuple):
 
 
 def _turning(field: Any, y0: Any) -> _Turning | None:
-    """Return the parts of the field of a body that only turns; `None` for any other field."""
+    """Return inertia and torque from the field of a body that only turns; else `None`."""
     euler = field.euler if isinstance(field, AttitudeEquations) else field
     if not isinstance(euler, EulerEquations) or not isinstance(y0, Spin | Attitude):
         return None
@@ -147,8 +150,8 @@ def _turning(field: Any, y0: Any) -> _Turning | None:
 def _free(body: Inertia, state0: Attitude) -> Stepper:
     """Return the stepper of a free body, whose momentum is along the principal axes.
 
-    Derivatives hold these axes fixed; the off-diagonal entries of the inertia along them carry only
-    tangents.
+    Derivatives hold the principal axes fixed. The off-diagonal entries of the inertia along these
+    axes are zero, but they have tangents that are not zero.
     """
     frame = splitting.frame_of_tensor(body.tensor)
     weights, axes = frame.weights, frame.axes
@@ -176,7 +179,8 @@ def _free(body: Inertia, state0: Attitude) -> Stepper:
 def _free_slope(weights: Six, gaps: Triple, p: Triple) -> Triple:
     """Return dΠ/dt = Π × Ω for the momentum `p`, along the principal axes.
 
-    `weights` are the inverse of the inertia, and `gaps` the differences of its diagonal entries.
+    `weights` are the six entries of the inverse of the inertia. With its diagonal entries a, b and
+    c, `gaps` are the differences (c − b, a − c, b − a).
     """
     return gaps[0] * (p[1] * p[2]), gaps[1] * (p[2] * p[0]), gaps[2] * (p[0] * p[1])
 
@@ -205,7 +209,7 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
 
         def slope(t: Any, p: Triple) -> Triple:
             omega = barrier(rate(p))
-            # The torque gets a `Spin`, which has no attitude that it could read.
+            # The torque gets a `Spin`, a state without an attitude.
             value = evaluate(law, t, Spin(jnp.stack(omega)), body)
             return add(cross(p, omega), split(value))
 
@@ -231,8 +235,8 @@ def _explicit(
 
         def slope(t: Any, y: Atoms) -> Atoms:
             q, p = y[:many], y[many:]
-            # Attitude and momentum share this rate. Without the barrier each of the seven results
-            # computes it again.
+            # The derivatives of attitude and momentum both use this rate. Without the barrier each
+            # of the seven results would compute the rate again.
             omega = barrier(matvec(weights, p))
             pushed = cross(p, omega)
             if law is not None:
@@ -262,10 +266,10 @@ def _of_slope(solver: Any, slope_under: Any, start: Atoms, state: Any, like: Any
 
 
 def _to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
-    """Return the `change` of the numbers `y`, corrected so that it ends at a unit quaternion.
+    """Return the `change` of the numbers `y`, corrected so that y + change has a unit quaternion.
 
-    `like` is a state with the structure of `y`; without an attitude the change is returned as it
-    is.
+    `like` is a state with the structure of `y`. If this state has no attitude, `change` is returned
+    unchanged.
     """
     if not isinstance(motion_of(like), HasAttitude):
         return change
@@ -275,12 +279,13 @@ def _to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
         motion_of(join(part, like)).q for part in (jax.tree.map(jnp.add, y, change), change)
     )
     after, moved = components(after), components(moved)
-    # A rounding error of this length changes q along itself, so that it does not turn the body.
+    # A rounding error of the excess |q|² − 1 only changes the length of q and does not turn the
+    # body.
     excess = jnp.minimum(square4(after) - 1.0, 1.0)
     # 1 − 1/√(1 + e), with the excess e, is computed by a series, because on a GPU a root and a
     # quotient take a third of the time of a step. The error e⁴/4 of the series is below round-off
-    # for steps that turn the body by less than half a radian; after longer steps the next ones
-    # bring the length back to 1.
+    # for steps that turn the body by less than half a radian; after a longer step the following
+    # steps bring the length back to 1.
     less = barrier(excess * (0.5 - excess * (0.375 - 0.3125 * excess)))
     q = jnp.stack([d - less * a for d, a in zip(moved, after, strict=True)])
     return split(eqx.tree_at(lambda s: motion_of(s).q, join(change, like), q))
@@ -288,7 +293,8 @@ def _to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
 
 def _split(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
     """Return the stepper of a splitting."""
-    # No step converts Π to Ω = I⁻¹Π and back, so that |Π| drifts only by the round-off of the flow.
+    # No step converts the momentum Π to Ω = I⁻¹Π and back, so that |Π| drifts only by the round-off
+    # of the free motion.
     frame = splitting.frame_of(field, state0)
 
     def change(t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Find all times at which the steps of a field end: declared jumps, and switches in its trace."""
+"""Find all stops, times at which steps end: declared jumps, and switches of the traced field."""
 
 import warnings
 from collections.abc import Callable
@@ -23,12 +23,12 @@ from rigidjax.solve.switching_times import by_sides, separate_times, times_of
 
 
 def say_unseen(analysis: Analysis) -> None:
-    """Warn of each line of a law that may switch at times that cannot be searched for."""
+    """Warn for each line of a law that may switch at times that cannot be found before the run."""
     for line in dict.fromkeys(analysis.unseen):
         warnings.warn(
             f"simulate: a law may jump at a time that is not found before the run ({line}): steps "
-            "do not end there, and the derivative by that time is lost. Give the law `jump_times`, "
-            "its jumps in s, or end the run there and begin another",
+            "do not end there, and the derivative with respect to that time is lost. Give the law "
+            "`jump_times`, its jumps in s, or end the run there and begin another",
             stacklevel=2,
         )
 
@@ -41,7 +41,7 @@ class TracedProgram(NamedTuple):
 
     @property
     def constants(self) -> Arrays:
-        """Return the JAX arrays that the function holds; numbers of NumPy stay in its program."""
+        """Return the JAX arrays that the function closes over; NumPy arrays stay in its program."""
         return [c for c in self.closed.consts if eqx.is_array(c)]
 
     def consts(self, constants: Arrays) -> Arrays:
@@ -79,9 +79,9 @@ class ProgramWithStops(NamedTuple):
 
     field: Callable[..., Array]  # (constants, t, y)
     constants: Arrays
-    smooth: int  # the number of those constants, the first, that may have derivatives
+    smooth: int  # only the first `smooth` constants may have derivatives
     stops: Array  # (k,), s, in order
-    over: Array | None  # whether a part switches more often than there are places for
+    over: Array | None  # whether a part switches more often than the arrays can store
 
 
 def program_with_stops(
@@ -89,8 +89,9 @@ def program_with_stops(
 ) -> ProgramWithStops:
     """Return the field `function(t, y, *sides)` with all its stops between the times a and b, s.
 
-    `declared` are the jump times, s, of each part of the field that declares some. If more than one
-    part does, each of them gets its stops, s, as one of `sides`.
+    `declared` is a list with the jump times, s, of each part of the field that declares jumps. If
+    there are several such parts, the function gets as `sides` one array for each part: the stops,
+    s, for the jumps of the part.
     """
     declared = [times.astype(a.dtype) for times in declared if times.size]
     likes = declared if len(declared) > 1 else []
@@ -125,5 +126,5 @@ def program_with_stops(
 
 
 def _split(whole: Array, like: list[Array]) -> list[Array]:
-    """Return the parts of an array, as many and as long as those of `like`."""
+    """Return an array split along its first axis into parts as long as the arrays in `like`."""
     return list(jnp.split(whole, np.cumsum([a.shape[0] for a in like])[:-1]))

@@ -1,16 +1,17 @@
-"""Find in the traced program of a vector field where it switches at times that no state decides.
+"""Find the equations of a traced vector field that switch at times independent of the state.
 
 A law that a user writes, such as `jnp.where(t < self.te, push, 0.0)`, declares no `jump_times`, but
-the program of the field holds its comparison. If the comparison depends on the time and on no
-state, the times at which it changes are found before the run by halving, however short a firing is:
-a comparison of straight lines in time, or of a value that only rises or only falls, changes once.
-The steps of the run end at these times. In the run the comparison is replaced by the side of these
-stops on which a step is. So no rounding decides it, and two comparisons that change at the same
-time each have their own side.
+the traced program of the field contains its comparison. If the comparison depends on the time but
+not on the state, the times at which its result changes are found before the run, by halving
+intervals. This also finds a very short firing, because the comparison of two linear functions of
+time, or of a function that only rises or only falls with a constant, changes only once. The steps
+of the run end at these times, called stops. During the run the comparison is not evaluated: its
+result is chosen by the stops that the step has passed. The result therefore does not depend on
+rounding, and two comparisons that change at the same time are treated separately.
 
-The gap of a comparison is the difference of its operands. It depends on the time t and on the
-constants p of the field, and the derivative of a switching time is that of the implicit function
-`gap(p, t) = 0`.
+The gap of a comparison is the difference of its two operands. It is a function of the time t and of
+the constants p of the field. The equation `gap(p, t) = 0` defines the switching time as an implicit
+function of p, and gives its derivatives.
 """
 
 import os
@@ -33,23 +34,27 @@ from rigidjax.solve.batching import Arrays
 DECLARED = "rigidjax_declared_jumps"
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 
-# Primitives whose result changes where the first operand meets the second; and primitives whose
-# result changes where the first operand (for `rem` its quotient by the second) meets another whole
-# number. `sign`, which changes where its operand meets zero, is in `_jumps`.
+# `COMPARISONS`: primitives whose result changes when the first operand becomes equal to the second.
+# `_LEVELS`: primitives whose result changes when the first operand (for `rem` the quotient of the
+# two operands) passes a whole number. `sign`, which changes when its operand passes zero, is in
+# `_jumps`.
 COMPARISONS = {"lt", "le", "gt", "ge", "lt_to", "le_to"}
 _LEVELS = {"floor", "ceil", "round", "convert_element_type", "rem"}
-# Primitives whose result has a kink where an operand meets another one or, for `abs`, zero.
+# Primitives whose result has a kink when two operands become equal or, for `abs`, when the operand
+# passes zero.
 KINKS = {"max", "min", "abs", "clamp"}
-# Primitives that choose by a comparison of elements; primitives of which nothing is known; and
-# primitives whose result varies between its jumps.
+# `_CHOICES`: primitives that compare the elements of an array. `_OPAQUE`: primitives whose content
+# cannot be read. `_SAWS`: primitives whose result is not constant between its jumps (as a saw
+# tooth).
 _CHOICES = {"argmax", "argmin", "sort", "top_k", "bitcast_convert_type", "nextafter"}
 _OPAQUE = {"pure_callback", "io_callback", "custom_call", "ffi_call"}
 _SAWS = {"rem", "atan2", "sort", "top_k", "nextafter"}
-# Calls whose body becomes a part of the flat program; and calls that stay whole in it, but in whose
-# body switches are searched for.
+# `_CALLS`: calls whose body is written out in the flat program. `_WHOLE`: calls that stay one
+# equation of the flat program; switches are still searched for in their bodies.
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2"}
 _WHOLE = {"cond", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
-# Primitives that are linear in all operands together; and those that are linear in either of two.
+# `_LINEAR`: primitives that are linear in all operands together. `_PRODUCTS`: primitives that are
+# linear in each of two operands alone.
 _LINEAR = {
     "add", "sub", "add_any", "neg", "copy", "copy_p", "broadcast_in_dim", "reshape", "squeeze",
     "slice", "transpose", "rev", "concatenate", "reduce_sum", "cumsum", "expand_dims",
@@ -61,20 +66,21 @@ _MONOTONE = {
     "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "tanh", "logistic", "erf", "sinh",
     "asinh", "atan",
 }  # fmt: skip
-# How a value depends on the time: not at all; in constant pieces, which change only where another
-# value changes; as a straight line; by rising only or falling only; or in any other way.
+# How a value depends on the time. `CONSTANT`: not at all. `PIECES`: it is constant except for
+# jumps, at which another value jumps, too. `STRAIGHT`: it is a linear function of the time.
+# `MONOTONE`: it only rises or only falls. `BENT`: in any other way.
 CONSTANT, PIECES, STRAIGHT, MONOTONE, BENT = range(5)
 
-MOST = 64  # the most times at which one law, or one rounding, can change
-_FEW = 32  # a comparison of more elements than this is taken for a table
-_FEW_KINKS = 3  # more kinks than this in one operation cost more steps than they save
-NEAR = 16  # places between the points of a grid at which a bent switch is searched for
+MOST = 64  # the largest number of switching times of one law, or of one `floor`, `round`, …
+_FEW = 32  # a comparison of more elements than this is treated as a table, not a switch
+_FEW_KINKS = 3  # steps do not end at the kinks of an operation that has more kinks than this
+NEAR = 16  # the number of places between grid points where a bent switch is searched for
 
 
 class Node(NamedTuple):
-    """Hold an equation of a flat program, in which each value has a number.
+    """Hold an equation of a flat program, in which each value is identified by an integer.
 
-    The inputs of the equation are such numbers or literals, and its outputs are such numbers.
+    The inputs of the equation are such integers or literals, and its outputs are such integers.
     """
 
     primitive: Any
@@ -82,18 +88,18 @@ class Node(NamedTuple):
     inputs: list[Any]
     outputs: list[int]
     kinds: list[Any]  # the dtype of each input
-    shapes: list[Any]  # of the outputs
+    shapes: list[Any]  # the shape and dtype of each output
     source: Any
     declared: bool  # whether it belongs to a part that declares its jumps
 
     @property
     def name(self) -> str:
-        """Return the name of the primitive; a call of `searchsorted` has the function's name."""
+        """Return the name of the primitive; for a call of `searchsorted` this name."""
         return _name(self)
 
 
 class Program(NamedTuple):
-    """Hold a function f(t, y, …) as a flat list of equations, whose values have numbers.
+    """Hold a function f(t, y, …) as a flat list of equations; integers identify their values.
 
     Value 0 is the time t, and value 1 is the state y.
     """
@@ -106,7 +112,7 @@ class Program(NamedTuple):
 
 
 class Switch(NamedTuple):
-    """Hold an equation whose result jumps, or has a kink, at times that no state decides."""
+    """Hold an equation whose result jumps, or has a kink, at times independent of the state."""
 
     node: Node
     degree: int  # how the operands depend on the time: `STRAIGHT`, …
@@ -115,17 +121,17 @@ class Switch(NamedTuple):
 
     @property
     def most(self) -> int:
-        """Return the largest number of changes of an element that only rises or only falls."""
+        """Return how often an element can change at most if its operand only rises or falls."""
         return MOST if self.node.name in _LEVELS else 1
 
     @property
     def places(self) -> int:
-        """Return the number of changes that are searched for."""
+        """Return the number of changes that the search for switching times can store."""
         return MOST + 2 * NEAR if self.degree == BENT else self.size * self.most
 
     @property
     def exact(self) -> bool:
-        """Return whether no element can change more often than is searched for."""
+        """Return whether no element can change more often than the search can store."""
         return self.degree < BENT and self.most == 1
 
     @property
@@ -135,11 +141,12 @@ class Switch(NamedTuple):
 
 
 class Analysis(NamedTuple):
-    """Hold the switches of a program, with the lines whose switches cannot be found."""
+    """Hold the switches of a program, and the lines of code whose switches cannot be found."""
 
     program: Program
     switches: list[Switch]
-    # Kinks that are too many for a step to end at each; they serve the search for bent switches.
+    # Kinks that are so many that no steps end at them; their times only help in the search for bent
+    # switches.
     kinks: list[Switch]
     by_state: list[str]  # the lines that switch by the state
     unseen: list[str]  # the lines that may switch at times that cannot be searched for
@@ -169,7 +176,7 @@ def _is_float(kind: Any) -> bool:
 
 
 def _jumps(name: str, params: dict[str, Any], kinds: list[Any]) -> bool:
-    """Return whether the result of an equation may jump where its real operands do not."""
+    """Return whether the result of an equation may jump when its real operands do not jump."""
     if not kinds or not _is_float(kinds[0]):
         return False
     if name == "convert_element_type":
@@ -178,12 +185,12 @@ def _jumps(name: str, params: dict[str, Any], kinds: list[Any]) -> bool:
 
 
 def _bends(name: str, kinds: list[Any]) -> bool:
-    """Return whether the result of an equation has a kink where its real operands have none."""
+    """Return whether the result of an equation may have a kink when its operands have none."""
     return bool(kinds) and _is_float(kinds[-1]) and name in KINKS
 
 
 def _any_switch(jaxpr: Any, bent: bool = False) -> bool:
-    """Return whether a program, or one within it, may jump or, if `bent` is true, has a kink."""
+    """Return whether a program, or one inside it, may jump or, if `bent` is true, have a kink."""
     for eqn in jaxpr.eqns:
         name, kinds = _name(eqn), _kinds(eqn)
         if _jumps(name, eqn.params, kinds) or (bent and _bends(name, kinds)) or name in _OPAQUE:
@@ -194,7 +201,7 @@ def _any_switch(jaxpr: Any, bent: bool = False) -> bool:
 
 
 def flatten(closed: ClosedJaxpr) -> Program:
-    """Return a traced function as one flat list of equations, with those in the bodies of calls."""
+    """Return a traced function as one flat list of equations, including the bodies of calls."""
     numbers, nodes, inner = count(), [], {}
 
     def enter(jaxpr: Any, consts: Any, inputs: list[Any], declared: bool) -> list[Any]:
@@ -233,7 +240,10 @@ def flatten(closed: ClosedJaxpr) -> Program:
 
 
 def degree_of(node: Node, operands: list[int]) -> int:
-    """Return how the result of an equation depends on the time, from how its operands do."""
+    """Return how the result of an equation depends on the time: `CONSTANT`, `PIECES`, … or `BENT`.
+
+    `operands` says the same of each operand.
+    """
     timed, name = [d for d in operands if d != CONSTANT], node.name
     if not timed:
         return CONSTANT
@@ -260,7 +270,7 @@ def degree_of(node: Node, operands: list[int]) -> int:
 def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
     """Return the switches of a traced field f(t, y, …), or `None` if it has nothing that switches.
 
-    A switch is found by the program alone; its times are found by `switching_times`.
+    This function looks only at the equations; the module `switching_times` finds the times.
     """
     if not _any_switch(closed.jaxpr, bent=True):
         return None
@@ -275,7 +285,7 @@ def analysis_of(closed: ClosedJaxpr) -> Analysis | None:
         degrees.update(dict.fromkeys(node.outputs, degree_of(node, operands)))
         if stateful:
             of_state.update(node.outputs)
-        # A value that is constant between the times of other switches has no times of its own.
+        # A value that is constant between the times of other switches needs no search of its own.
         timed = max(operands, default=CONSTANT) > PIECES
         if not (timed or stateful) or node.declared or not _may_switch(node) or _is_ours(node):
             continue
@@ -317,7 +327,7 @@ def _may_hide_switches(node: Node) -> bool:
 
 
 def _switch_of(program: Program, node: Node, operands: list[int], jumps: bool) -> Switch:
-    """Return an equation as a `Switch`; `operands` are the degrees of its operands."""
+    """Return an equation as a `Switch`; `operands` says how each operand depends on the time."""
     name = node.name
     compared = operands[: 1 if name in _LEVELS - {"rem"} else 3]
     timed = [d for d in compared if d != CONSTANT]
@@ -327,7 +337,8 @@ def _switch_of(program: Program, node: Node, operands: list[int], jumps: bool) -
     shape = node.shapes[0].shape
     size = int(np.prod(shape)) * (2 if name == "clamp" else 1)
     if name == "searchsorted":
-        # A search for one time among edges is a switch; one for many times is taken for a table.
+        # A search for one time among sorted edges is a switch. A search for many times is treated
+        # as a table, which is no switch.
         size = _edges(program, node) if shape == () else _FEW + 1
     return Switch(node, max(timed) if steady else BENT, size, jumps)
 
@@ -341,11 +352,12 @@ def _edges(program: Program, node: Node) -> int:
 def evaluator(
     program: Program, wanted: list[Any], replaced: dict[int, Any] | None = None
 ) -> Callable[..., list[Any]]:
-    """Return a function (constants, *inputs) → the `wanted` values of a program.
+    """Return a function of (constants, *inputs) that returns the `wanted` values of a program.
 
-    It evaluates only the equations that these values need. `replaced` holds an object for the
-    outputs of some equations, by number: its `value(read, inputs)` takes the place of the equation,
-    and its `reads` are the inputs that it needs.
+    The function evaluates only the equations that these values need. `replaced` is a dict; its keys
+    are the integers of outputs whose equations are replaced, and its values are objects with two
+    members: `value(read, inputs)` returns the output, and `reads` lists the inputs of the equation
+    that it needs.
     """
     replaced = replaced or {}
     needed, nodes = {i for i in wanted if not isinstance(i, Literal)}, []

@@ -1,9 +1,10 @@
 """Locate the times at which a traced field switches, and evaluate the field between them.
 
-A switch that only rises or only falls in time changes once: its time is found by halving the
-interval between the ends of the run. A bent switch, which does neither, is searched for on a grid,
-and between two points of the grid where its gap (see `switching`) comes closest to zero. The
-derivative of a time is that of the implicit function `gap(p, t) = 0` of the constants p.
+If the gap of a switch (see the module `switching`) only rises or only falls in time, the switch
+changes once, and its time is found by halving the interval from the start to the end of the run.
+Any other switch is called bent. Its changes are searched for on a grid of times, and also between
+grid points where the gap comes closest to zero. The equation `gap(p, t) = 0` defines each time as
+an implicit function of the constants p of the field, and gives its derivatives.
 """
 
 from collections.abc import Callable
@@ -31,14 +32,14 @@ from rigidjax.solve.switching import (
 )
 
 _HALVINGS = {"float64": 62, "float32": 36}
-_GRID = 4096  # points of the grid on which a bent switch is searched for
+_GRID = 4096  # the number of points of the grid on which a bent switch is searched for
 
 
 def _gap(switch: Switch, x: Any, *rest: Any) -> Any:
-    """Return the gap of each element of a switch.
+    """Return the gap (see the module `switching`) of each element of a switch.
 
-    The gap is zero, or a whole number, where the element changes. `x` and `rest` are the operands
-    of the equation, and its result.
+    An element changes when its gap passes zero or, for functions such as `floor`, a whole number.
+    `x` is the first operand of the equation; `rest` are the other operands and the result.
     """
     name = switch.node.name
     if name == "clamp":
@@ -53,7 +54,7 @@ def _gap(switch: Switch, x: Any, *rest: Any) -> Any:
 def _value(switch: Switch, x: Any, *rest: Any) -> Any:
     """Return the value of each element of a switch, which is constant between its changes.
 
-    `x` and `rest` are the operands of the equation, and its result.
+    `x` is the first operand of the equation; `rest` are the other operands and the result.
     """
     name = switch.node.name
     if name in KINKS | {"searchsorted"}:
@@ -62,9 +63,9 @@ def _value(switch: Switch, x: Any, *rest: Any) -> Any:
 
 
 class Times(NamedTuple):
-    """Hold the times at which the switches of a field may change, one for each of k places.
+    """Hold the times at which the switches of a field may change, in k places.
 
-    A place is for one change of one element of one switch.
+    Each place stores one change of one element of one switch.
     """
 
     times: Array  # (k,) s, with derivatives; the end of the run at a place where nothing changes
@@ -76,7 +77,7 @@ class Times(NamedTuple):
 
 
 class _Watched(NamedTuple):
-    """Hold a switch of a program with its constants, to evaluate its elements at any time."""
+    """Evaluate the elements of a switch of a program at any time; it holds the constants."""
 
     program: Program
     switch: Switch
@@ -84,7 +85,7 @@ class _Watched(NamedTuple):
 
     @property
     def still(self) -> "_Watched":
-        """Return this switch without derivatives with respect to the constants."""
+        """Return this object with its constants held fixed in derivatives."""
         return self._replace(constants=lax.stop_gradient(self.constants))
 
     def operands(self, t: Array) -> list[Any]:
@@ -112,14 +113,16 @@ class _Watched(NamedTuple):
         return jax.vmap(lambda t, i: of(t)[i])(t, element)
 
 
-# The times, elements and changes at the places of a switch, and whether it has more changes.
+# The times, elements and changes at the places of a switch, and whether the switch has more changes
+# than places.
 _Places = tuple[Array, Array, Array, Array]
 
 
 def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times:
     """Find the times after a and until b, s, at which the switches of a field change."""
     start, end = lax.stop_gradient((a, b))
-    # A switch that changes within some round-off of the start is taken to have changed before it.
+    # If a switch changes within 8 units of round-off after the start, it is treated as if it had
+    # changed before the start.
     start = start + 8 * jnp.finfo(a.dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end - start))
     watched = [_Watched(analysis.program, s, constants) for s in analysis.switches]
     others = [_Watched(analysis.program, s, constants) for s in analysis.kinks]
@@ -144,7 +147,7 @@ def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times
 
 
 def _of_steady(watched: list[_Watched], start: Array, end: Array) -> list[_Places]:
-    """Find the changes of the switches that only rise or only fall."""
+    """Find the changes of the switches whose gaps only rise or only fall in time."""
     starts, rises, elements, levels = [], [], [], []
     for one in watched:
         element, level = (np.ravel(a) for a in np.mgrid[: one.switch.size, 1 : one.switch.most + 1])
@@ -165,7 +168,7 @@ def _of_steady(watched: list[_Watched], start: Array, end: Array) -> list[_Place
 
 
 def _of_bent(one: _Watched, start: Array, end: Array, known: list[Array]) -> _Places:
-    """Find the changes of a bent switch on a grid with the `known` times of other switches."""
+    """Find the changes of a bent switch on a grid; it includes `known` times of other switches."""
     before = jnp.concatenate(known) if known else jnp.zeros(0, start.dtype)
     low, high, element, over = _cells(one.still, start, end, lax.stop_gradient(before))
     base = one.still.values(low, element)
@@ -175,7 +178,8 @@ def _of_bent(one: _Watched, start: Array, end: Array, known: list[Array]) -> _Pl
     there = value != base
     t, moves = _differentiable_times(one, jnp.where(there, t, end), element, there)
     if known:
-        # Where the switch changes because an operand jumps, its time is that of the jump.
+        # If the switch changes because an operand jumps, the time of the change is the time of the
+        # jump.
         near, still = jnp.argmin(jnp.abs(before[None] - t[:, None]), 1), lax.stop_gradient(t)
         same = jnp.abs(before[near] - still) <= 8 * jnp.finfo(t.dtype).eps * jnp.abs(still)
         t = jnp.where(there & ~moves & same, before[near], t)
@@ -183,9 +187,10 @@ def _of_bent(one: _Watched, start: Array, end: Array, known: list[Array]) -> _Pl
 
 
 def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array, ...]:
-    """Return the ends of k intervals in which an element changes at most once, and the elements.
+    """Return k intervals of time, in each of which one element of a switch changes at most once.
 
-    Also return whether there are more changes than intervals for them.
+    **Returns** four things: the starts (k,) of the intervals; their ends (k,); the element for each
+    interval; and whether there are more changes than intervals.
     """
     size, dtype = one.switch.size, start.dtype
     grid = start + (end - start) * jnp.linspace(0.0, 1.0, max(256, _GRID // size), dtype=dtype)
@@ -231,10 +236,11 @@ def _cells(one: _Watched, start: Array, end: Array, known: Array) -> tuple[Array
 def _bisect(
     watched: list[_Watched], edges: Any, elements: Any, bases: list[Array], levels: Any
 ) -> list[Array]:
-    """Return, for each switch, the times (k,) at which its elements leave their `bases`.
+    """Find for each switch the times (k,) at which its elements change, by halving intervals.
 
-    An element leaves its base when it first differs from the base by its level. The times are found
-    by halving the intervals between the `edges`.
+    `bases` are the values of the elements before the change, and `levels` the sizes of the changes:
+    an element has changed when its value differs from its base by at least its level. `edges` are
+    the starts and ends of the intervals, and `elements` the indices of the elements.
     """
 
     def half(_: Any, edges: Any) -> Any:
@@ -257,14 +263,16 @@ def _bisect(
 def _differentiable_times(
     one: _Watched, t: Array, element: Any, there: Array
 ) -> tuple[Array, Array]:
-    """Return the times `t` with the derivatives of implicit functions, and whether each has them.
+    """Return the times `t` with their derivatives, and for each time whether it has derivatives.
 
-    `there` says of each time whether the `element` does change then.
+    Each time is an implicit function of the constants of the field. `there` says for each time
+    whether the `element` does change at that time.
     """
     degree = one.switch.degree
     still, moves, slope, here = lax.stop_gradient(t), there, jnp.zeros_like(t), jnp.zeros_like(t)
     t = still
-    # Each step of Newton's method here changes no value, and adds one order of derivatives.
+    # Each of these steps of Newton's method leaves the values of `t` as they are, and makes
+    # derivatives of one more order correct.
     for _ in range(1 if degree == STRAIGHT else 2):
         gaps = lambda t: one.gaps(t, element)  # noqa: E731
         here, slope = jax.jvp(gaps, (t,), (jnp.ones_like(t),))
@@ -272,7 +280,8 @@ def _differentiable_times(
         rise = here - lax.stop_gradient(here)
         t = t - jnp.where(moves, rise / jnp.where(moves, slope, 1), 0)
     if degree == BENT:
-        # Where an operand jumps, its gap has no zero, and the time is no implicit function of it.
+        # If the switch changes because an operand jumps, the gap jumps over zero, and the time is
+        # no implicit function given by the gap.
         beside = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
         step, eps = jnp.abs(slope) * (still - beside), jnp.finfo(t.dtype).eps
         jump = jnp.abs(here - one.gaps(beside, element))
@@ -281,11 +290,11 @@ def _differentiable_times(
 
 
 class _Side(NamedTuple):
-    """Compute an equation's result from the stops that a step has passed, and not by comparing."""
+    """Compute the result of a comparison from the stops that a step has passed."""
 
     switch: Switch
-    number: int  # of the switch
-    places: slice  # of the switch in `Times`
+    number: int  # the index of the switch in the analysis
+    places: slice  # the places of the switch in `Times`
 
     @property
     def reads(self) -> list[Any]:
@@ -295,7 +304,8 @@ class _Side(NamedTuple):
     def value(self, read: Callable[[Any], Any], inputs: tuple[Any, ...]) -> Any:
         """Return the result at the time `inputs[0]`, s.
 
-        `inputs[-1]` is a pair of the stops and the `Times`; `read` returns the value of an input.
+        `inputs[-1]` is a pair of the stops, s, and the `Times`; `read` returns the value of an
+        input of the equation.
         """
         node, (stops, found) = self.switch.node, inputs[-1]
         past = inputs[0] >= stops[self.places]
@@ -336,16 +346,17 @@ def by_sides(analysis: Analysis) -> Callable[..., Array]:
 
 
 def separate_times(times: Array, a: Array, b: Array) -> tuple[Array, Array]:
-    """Return the stops from a to b in order, and the stop of each of the `times` (k,), s.
+    """Return two things: the stops from a to b in order, and the stop for each of the `times` (k,),
+    s.
 
-    The stops of equal times are moved apart: two jumps at the same time have a very short step
-    between them, so that each has its own derivative.
+    If two times are equal, their stops are moved apart by some units of round-off. Two jumps at the
+    same time then have a very short step between them, so that each jump has its own derivative.
     """
     inside = (times > a) & (times < b)
     t = jnp.where(inside, times, jnp.where(times <= a, a, b))
     still, last = lax.stop_gradient((t, b))
     count = np.arange(t.shape[0])
-    # To compare few times with each other is quicker than to sort them.
+    # For so few times, comparing all pairs is faster than sorting.
     earlier = still[None] < still[:, None]
     earlier = earlier | ((still[None] == still[:, None]) & (count[None] < count[:, None]))
     rank = jnp.sum(earlier, 1)

@@ -39,7 +39,7 @@ class Tableau(NamedTuple):
 
 
 def _rows(text: str) -> tuple[Row, ...]:
-    """Return the rows of a table of `stage:weight`, with a semicolon between two rows."""
+    """Return the rows of a table of `stage:weight` pairs; a semicolon separates two rows."""
     rows = [row.split() for row in text.split(";")]
     return tuple({int(i): float(w) for i, w in (part.split(":") for part in row)} for row in rows)
 
@@ -50,7 +50,7 @@ def parse_numbers(text: str) -> tuple[float, ...]:
 
 
 def _sparse(row: np.ndarray) -> Row:
-    """Return the weights of a row that are not zero, by their stages."""
+    """Return the weights of a row that are not zero as a dict `{stage: weight}`."""
     return {i: float(w) for i, w in enumerate(row) if w != 0}
 
 

@@ -25,9 +25,9 @@ from rigidjax.rotation.validation import tolerance
 def checked_scene(
     body: Any, state0: Any, ts: Any, torque: Any, throw: bool
 ) -> tuple[Any, Any, Array]:
-    """Return the body, start and times of a run, checked; start and times have one dtype.
+    """Check the body, start and times of a run, and return them with start and times in one dtype.
 
-    With `throw=False` bad traced numbers become NaN and raise no error.
+    With `throw=False` invalid traced numbers become NaN and raise no error.
     """
     ts = checked_times(ts, throw)
     state0 = checked_start(state0, throw)
@@ -78,9 +78,9 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
 
 
 def _require_one_frame(torque: Any) -> None:
-    """Raise `TypeError` for a law that needs the absolute body rate in a moving frame.
+    """Raise `TypeError` if a law that needs the absolute body rate is used in a moving frame.
 
-    There the rate of a state is relative to the frame.
+    In a moving frame the body rate of a state is relative to the frame.
     """
 
     def within(law: Any) -> list[Any]:
@@ -110,7 +110,7 @@ def one_dtype(tree: Any, name: str) -> Any:
 
 
 def warn_of_scale(body: Any, torque: Any) -> None:
-    """Warn of a torque on a body whose scale is arbitrary, unless the torque has the same scale."""
+    """Warn of a torque on a body of arbitrary scale, unless the torque scales with the inertia."""
     relative = isinstance(body, Inertia) and body.scale is not None
     alike = isinstance(torque, GravityGradient) and not torque.harmonics
     if relative and torque is not None and not alike:
@@ -122,9 +122,10 @@ def warn_of_scale(body: Any, torque: Any) -> None:
 
 
 def _advice_for_bare_numbers(numbers: Any, moves: bool = False) -> str:
-    """Return the advice, for a message, to one who gave bare numbers in the place of a body.
+    """Return advice, for a message, to a user who gave bare numbers in the place of a body.
 
-    `moves` says that the body moves as well as turns. For anything but numbers there is none.
+    `moves` says whether the body moves as well as turns. If `numbers` is not an array or list, the
+    advice is empty.
     """
     if not isinstance(numbers, (list, tuple, np.ndarray, jax.Array)):
         return ""
@@ -135,9 +136,9 @@ def _advice_for_bare_numbers(numbers: Any, moves: bool = False) -> str:
 
 
 def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
-    """Return the body; if it is traced and no real body, its numbers are NaN.
+    """Return the body; the numbers of a traced body that no real body can have become NaN.
 
-    With `throw` it raises an error instead.
+    If `throw` is true, such a body raises an error instead.
     """
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
@@ -156,7 +157,7 @@ def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     rtol, atol = (u if g is None else g for u, g in zip(usual, (rtol, atol), strict=True))
     if not _checks.is_known((rtol, atol)):
         return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
-    # These are floats of Python, because those of NumPy would lift a float32 run to float64.
+    # The tolerances are Python floats, because NumPy floats would promote a float32 run to float64.
     rtol, atol = _checks.known_float(rtol, "rtol"), _checks.known_float(atol, "atol")
     if not 0 < rtol < np.inf or not 0 <= atol < np.inf:
         raise ValueError(f"simulate: wanted rtol > 0 and atol >= 0, got rtol={rtol}, atol={atol}")
@@ -177,7 +178,7 @@ def checked_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
 def checked_times(ts: Any, throw: bool) -> Array:
     """Return `ts` as an array of times that increase, or that decrease, throughout.
 
-    Others raise an error; with `throw=False` they become NaN if they are traced.
+    Other times raise an error; if they are traced and `throw` is false, they become NaN instead.
     """
     if isinstance(ts, (Spin, Attitude, Rigid, Point)):
         raise TypeError(f"ts: wanted times, got {type(ts).__name__}; the state comes before them")
@@ -213,8 +214,8 @@ def checked_times(ts: Any, throw: bool) -> Array:
 def checked_first_step(dt0: Any, times: Array) -> Array:
     """Return the length of the step `dt0` in the precision of `times`.
 
-    Raise `ValueError` if it is known and is no step: zero, not finite, too short for the precision,
-    or negative in a run forwards in time.
+    If the value of `dt0` is known, raise `ValueError` if it is zero, not finite, too short for the
+    precision, or negative in a run forwards in time.
     """
     step = _checks.array_of_shape(dt0, (), "dt0").astype(times.dtype)
     known = _checks.is_known(times)
@@ -240,7 +241,8 @@ def checked_first_step(dt0: Any, times: Array) -> Array:
 def checked_start(state0: Any, throw: bool) -> Any:
     """Return `state0`, checked to be of one body and finite, and to have a unit quaternion.
 
-    A bad one raises an error; with `throw=False` a traced quaternion that is not unit becomes NaN.
+    An invalid state raises an error. With `throw=False` a traced quaternion whose length is not 1
+    becomes NaN instead.
     """
     wanted = "Spin, Attitude or Rigid, or Point without a body"
     _checks.require_single(state0, (Spin, Attitude, Rigid, Point), "state0", requirement=wanted)
@@ -269,8 +271,8 @@ def checked_start(state0: Any, throw: bool) -> Any:
 def _guard(value: Array, bad: Any, message: str, throw: bool) -> Array:
     """Return the `value`, or raise an error with the `message` if it is `bad`.
 
-    With `throw=False` a traced bad value becomes NaN instead: one bad body in a batch must not end
-    the run of the others.
+    With `throw=False` a traced bad value becomes NaN instead, because one bad body in a batch must
+    not end the runs of the other bodies.
     """
     if throw or _checks.is_known(bad):
         return _checks.error_if(value, bad, message)
