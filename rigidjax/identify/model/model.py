@@ -545,7 +545,7 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
     return out
 
 
-def starting_values(model: Model) -> list[Float[Array, "records *shape"]]:
+def starting_values(model: Model) -> list[Float[Array, "records ..."]]:
     """Return, for each slot, its starting values (R, *shape) in the R recordings."""
     leaves, out = dict(jax.tree.leaves_with_path(scene_template(model, model.records))), []
     for slot in model.slots:

@@ -40,7 +40,7 @@ class Stretches(eqx.Module):
 
     steps: Float[np.ndarray, "stretches s"]
     places: Int[np.ndarray, " s"]
-    null: tuple[Float[np.ndarray, "k n"], ...]
+    null: tuple[Float[np.ndarray, "_ n"], ...]
 
     @property
     def hidden_directions(self) -> Float[np.ndarray, "k n"]:
