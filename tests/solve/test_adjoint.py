@@ -32,7 +32,7 @@ class Wheel(eqx.Module):
 
 
 def scenes(p):
-    """Laws with all numbers that they can have a derivative by."""
+    """Laws with all numbers with respect to which they can be differentiated."""
     top = rj.torques.HeavyTop(1.0 + p[0], jnp.array([0.0, 0.1, 0.4]) + p[1], [0.0, 0.0, -9.81])
     pulses = rj.torques.Pulses(EDGES + p[:3], [[0.5, 0.0, 1.0], [0.0, -2.0, 0.3]])
     wheel = Wheel(jnp.array([0.3, 0.1, -0.2]) + p[:3], jnp.array([2, 0, 1]))

@@ -48,7 +48,7 @@ class Flywheel(base.AbstractTimeTorque):
     def __init__(self, momentum: object):
         self.momentum = base.constant_or_callable(momentum, "momentum")
         if has_states(momentum):
-            words = "wanted a momentum whose derivative by time is known, got one with states"
+            words = "wanted a momentum whose derivative with respect to time is known, got one with states"
             raise TypeError(f"Flywheel: {words}; see ReactionWheels")
         require_no_jumps(momentum, "momentum")
 
