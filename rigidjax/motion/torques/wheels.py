@@ -48,8 +48,10 @@ class Flywheel(base.AbstractTimeTorque):
     def __init__(self, momentum: object):
         self.momentum = base.constant_or_callable(momentum, "momentum")
         if has_states(momentum):
-            words = "wanted a momentum whose derivative with respect to time is known, got one with states"
-            raise TypeError(f"Flywheel: {words}; see ReactionWheels")
+            raise TypeError(
+                "Flywheel: wanted a momentum whose derivative with respect to time is known, got "
+                "one with states; see ReactionWheels"
+            )
         require_no_jumps(momentum, "momentum")
 
     def internal_momentum(self, t: ScalarLike) -> Vec3:
