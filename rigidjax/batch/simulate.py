@@ -224,8 +224,9 @@ def order_by_key(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:
     count = key.shape[0]
     chunk = min(chunk, -(-count // parts))
     size = -(-count // (chunk * parts)) * chunk
-    # `seats` are the positions in the order, sorted by chunk and then by device; each device has
-    # `size` of them, the last device may have fewer.
+    # `seats` are the places of the sorted bodies in the array for the devices: first chunk 0 of
+    # every device, then chunk 1 of every device, and so on. A device has `size` places, the last
+    # device may have fewer.
     seats = np.arange(size * parts).reshape(-1, parts, chunk).transpose(1, 0, 2).reshape(-1)
     seats = seats[seats < count]
     place = np.arange(count) % chunk

@@ -135,7 +135,10 @@ def rows(fit: Fit) -> list[Row]:
 
 
 def rms_degrees(fit: Fit) -> float:
-    """Return the root mean square, degrees, of the angles between observed and fitted attitudes."""
+    """Return the root mean square of the angles between observed and fitted attitudes, degrees.
+
+    `fit` is the fit of the observations.
+    """
     return float(np.degrees(fit.rms[0]))
 
 

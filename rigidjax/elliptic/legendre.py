@@ -237,10 +237,10 @@ def _second_kind(s: Array, c2: Array, delta2: Array, m1: Array) -> Any:
 def _integral_at_any_amplitude(
     orders: tuple[int, int, int], phi: Array, m1: Array, n1: Array | None = None
 ) -> Any:
-    """Return I_jkl for `orders` = (j, k, l) at any amplitude φ = `phi`.
+    """Return the integral I_jkl for `orders` = (j, k, l) from 0 to any amplitude φ = `phi`.
 
-    The complete integral gives the contribution of the whole half turns; the sine and cosine of the
-    remainder give the contribution of the remainder.
+    The module defines I_jkl; `m1` is 1 − m, and `n1` is 1 − n. Let φ be n π + r. The complete
+    integral gives the part of n π, and the sine and cosine of r give the part of r.
     """
     turns, remainder = half_turns(phi)
     n1 = jnp.ones_like(m1) if n1 is None else n1

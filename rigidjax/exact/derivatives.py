@@ -373,11 +373,11 @@ def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
 
 
 def _second_order(body: Differences, inputs, change):
-    """Return two things: the change of the derivatives that `_first_order` returns, and the change
-    of G, from `sigma_form`, where the motion is a function of the whole inertia tensor.
+    """Return two changes to first order: of the derivatives that `_first_order` returns, and of G.
 
-    `body` holds the matrix K. `inputs` is the result of `derivative_variables`, and `change` is the
-    change of these variables.
+    G = ∫ Π Πᵀ dt is that of `sigma_form`. The motion is taken as a function of the whole inertia
+    tensor. `body` holds the matrix K, `inputs` is the result of `derivative_variables`, and
+    `change` is the change of these variables.
     """
 
     def of_inputs(x):

@@ -126,8 +126,10 @@ _MORE = 10
 
 
 def sigma_near_zero(u: Scalar, v: Invariants) -> Sigma:
-    """Return σ, T and Y at a tiny time u, from the series of T = √(1 − x) to second order in the
-    matrix x = σ² (E − E₂₂ 1).
+    """Return σ, T and Y, which the module defines, at a tiny time `u`.
+
+    T = √(1 − X) is taken from its series to second order in the matrix X = σ² (E − E₂₂ 1), where E
+    is the matrix of the invariants `v`.
     """
     uu, zero = u * u, jnp.zeros_like(u)
     c1 = (v.p + v.q) * uu

@@ -45,7 +45,7 @@ class Coordinates(eqx.Module):
 class LagrangeEquations(eqx.Module):
     """Evaluate Lagrange's equations of a Lagrangian and of forces as a vector field.
 
-    `equations_of_motion` makes this Module and describes its fields.
+    `equations_of_motion` makes this Module and describes its fields `lagrangian` and `force`.
 
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
     >>> round(float(pendulum.energy(Coordinates([0.0], [2.0]))), 6)  # ½ v² − 9.81 cos q

@@ -134,9 +134,9 @@ def _newton_step(
     """Return the rotation M after one Newton step from `best` towards the largest Σ w_i world_i · M
     body_i.
 
-    The moment of each direction is computed from the small difference of the two vectors `world_i`
-    and `M body_i`. The rounding of a direction with a large weight then does not turn the body
-    about this direction.
+    The cross product of `world_i` and `M body_i` is computed from the small difference of the two
+    vectors, so that its rounding error is small, too. Otherwise the rounding of a direction with a
+    large weight would turn the body about this direction.
     """
     moved = (best[None] * body[:, None, :]).sum(-1)
     lengths = [jnp.sqrt((x * x).sum(-1)) for x in lax.stop_gradient((moved, world))]

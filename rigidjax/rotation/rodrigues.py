@@ -63,8 +63,9 @@ def to_matrix(g: Vec3Like) -> Mat3:
 
 
 def is_singular(q: QuatLike) -> Bool[Array, ""]:
-    """Return whether `q` (4,) unit is a half turn to 4 units of round-off, where g has no correct
-    digit.
+    """Return whether the unit quaternion `q` (4,) is a half turn, to 4 units of round-off.
+
+    The Rodrigues vector g of a half turn has no correct digit.
 
     >>> bool(is_singular(jnp.array([0.0, 0.0, 0.0, 1.0])))
     True

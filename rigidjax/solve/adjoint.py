@@ -220,7 +220,8 @@ def _segment_of_record(
     # The steps of the last segment are in the record, so that it takes no step here.
     until = jnp.where(again, lax.stop_gradient(after.t), -jnp.inf)
     end, rows, count = record_segment(method, constants, run, loop, record.rows, until)
-    # If there are more steps than rows, the derivative would be wrong: it is set to NaN.
+    # If the segment takes more steps than the record has rows for, some are missing and the
+    # derivative would be wrong: it is set to NaN.
     short = jnp.where(jnp.any(is_running(method, run, end, until)), jnp.nan, 0.0)
     rows = rows.at[:, HEAD:].add(short.astype(rows.dtype))
     count = jnp.where(again, count, filled)

@@ -309,12 +309,13 @@ def _hidden_zero(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array
 
 
 def _first_guess(side: Array, low: _End, high: _End) -> Array:
-    """Return the offset of the first guess for a zero of g between `low` and `high`.
+    """Return the first guess for a zero of g between `low` and `high`.
 
-    The guess is x(0), where x(g) is the cubic polynomial in g that has the offsets and the slopes
-    dx/dg at `low` and `high`. The guess is the middle of the interval if g moves away from zero at
-    `low` or towards zero at `high`, or if x(0) lies outside of the interval. `side` is the sign of
-    g at `low`.
+    The guess is a time x since the start of the step; g is the condition that is zero at a
+    crossing. The guess is x(0), where x(g) is the cubic polynomial in g that has the times and the
+    slopes dx/dg at `low` and `high`. The guess is the middle of the interval if g moves away from
+    zero at `low` or towards zero at `high`, or if x(0) lies outside of the interval. `side` is the
+    sign of g at `low`.
     """
     steady = (side * low.rate < 0) & (side * high.rate < 0)
     rise = jnp.where(steady, high.g - low.g, 1)

@@ -532,7 +532,10 @@ def _push(sizes: list[int], y: Array) -> Array:
 def _condition_and_round_off(
     section: Section, constants: Arrays, s: Array, y: Array
 ) -> tuple[Array, ...]:
-    """Return g, dg/ds and dy/ds at the time `s` and the state `y`, and the round-off of g."""
+    """Return g, dg/ds and dy/ds at the time `s` and the state `y`, and the round-off of g.
+
+    g is the condition of the `section`, which is zero at a crossing.
+    """
     of_g = lambda s, y: section.rates(constants, s, y)[0]  # noqa: E731
     noise = jax.jvp(of_g, (s, y), (s, _push(section.sizes, y)))[1]
     blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)

@@ -53,12 +53,12 @@ _LOST = 0.5
 # An array smaller than this does not matter. It is the ratio of the default `atol` to the default
 # `rtol`.
 _SMALL = 1e-3
-# The errors of single steps grow along a motion in the same way as rounding errors do. If the
-# errors of the steps are much larger from the beginning, round-off can be neglected. It is
-# therefore not measured if both the tolerance is above `_COARSE` roundings, and the error of the
-# steps is above `_ABOVE` times the sum of the roundings without growth. The steps inside a function
-# given to `error_of` are not known; there the error of the steps has to be above `_PLAIN`
-# roundings. A rounding is the relative rounding error of the dtype.
+# One rounding is the relative rounding error of the dtype. Errors of steps and rounding errors grow
+# alike along a motion, so that round-off can be neglected if the errors of the steps are much
+# larger from the beginning. Round-off is therefore not measured if the tolerance is above `_COARSE`
+# roundings, and if the error of the steps is above `_ABOVE` times the round-off of all steps as it
+# would be without growth. For a function given to `error_of`, whose steps are not known, the second
+# limit is `_PLAIN` roundings.
 _ABOVE, _PLAIN, _COARSE = 300.0, 1e6, 1e5
 # The search for a tolerance multiplies the tolerance by at least `_FARTHEST` from one run to the
 # next. It aims at the wanted accuracy divided by `_AIM`, because errors are proportional to the
@@ -142,7 +142,10 @@ class Error(eqx.Module):
 
     @property
     def _relative(self) -> Array:
-        """Return the largest error of any name, divided by its scale, also where it is `lost`."""
+        """Return the largest of the errors of all parts of a state, each divided by its scale.
+
+        Errors that are `lost`, which means too large to add up, are returned as they are.
+        """
         return _largest(jax.tree.map(jnp.hypot, self.steps, self.round_off), self.sizes)
 
 

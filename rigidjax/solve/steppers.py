@@ -256,7 +256,7 @@ def _explicit(
 def _of_slope(solver: Any, slope_under: Any, start: Atoms, state: Any, like: Any) -> Stepper:
     """Return the stepper of an explicit method for the slope `slope_under(inputs)(t, y)`.
 
-    `like` is a state with the structure of the numbers y.
+    `like` is an example of y: a tree with the structure, the shapes and the dtypes of y.
     """
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:

@@ -147,7 +147,10 @@ def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times
 
 
 def _of_steady(watched: list[_Watched], start: Array, end: Array) -> list[_Places]:
-    """Find the changes of the switches whose gaps only rise or only fall in time."""
+    """Return the times between `start` and `end` at which switches change whose gap is monotonic.
+
+    The gap of a switch is the function of time whose sign the switch tests.
+    """
     starts, rises, elements, levels = [], [], [], []
     for one in watched:
         element, level = (np.ravel(a) for a in np.mgrid[: one.switch.size, 1 : one.switch.most + 1])

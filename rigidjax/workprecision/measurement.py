@@ -161,7 +161,8 @@ def to_float32(scene: BenchmarkScene, gradients: bool = True) -> BenchmarkScene:
 def _turn(scene: BenchmarkScene) -> float:
     """Return a rough estimate of the angle that the body turns in the scene, rad, at least 50.
 
-    For a point the result is 50: numbers of equal steps are given for a run of 50 rad.
+    For a point, which has no attitude, the result is 50: the counts of steps of a fixed length are
+    stated for a turn of 50 rad.
     """
     return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
 

@@ -178,15 +178,16 @@ def _combination_of_row(
     values: np.ndarray,
     switch: bool,
 ) -> Combination:
-    """Return the `Combination` that a row of the reduced echelon form describes.
+    """Return the `Combination` that a row of the reduced echelon form of all directions describes.
 
     **Arguments:**
 
-    - `row`: (M,) the change of each of M numbers over the size of the number.
+    - `row`: (M,) for each of the M free numbers, its change divided by the size of the number.
     - `names`: the name and unit of each number, and whether its change is relative.
     - `size`: (M,) the size of each number.
     - `values`: (M,) the value of each number.
-    - `switch`: whether readings do change along the combination, because a torque switches.
+    - `switch`: whether the readings change along the combination after all, although their
+      derivative is zero, because a torque switches at other times.
     """
     order = np.flatnonzero(row)
     # Scale the row so that its largest entry is a hundredth, and so that the first number rises.

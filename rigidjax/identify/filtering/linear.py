@@ -182,9 +182,9 @@ def linear_smooth(
     The method is the smoother of Rauch, Tung and Striebel (1965, doi:10.2514/3.3166), which here
     uses roots of the covariances.
 
-    The **arguments** and the errors **raised** are those of `linear_filter`. The function
-    **returns** a `LinearEstimate` that also holds `kicks`, the noise u of each step, and
-    `kick_covariance`.
+    The arguments `model`, `readings`, `mean`, `root` and `mask` and the errors raised are as for
+    `linear_filter`. The function **returns** a `LinearEstimate` that also holds `kicks`, the noise
+    u of each step, and `kick_covariance`.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
     >>> estimate = linear_smooth(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))

@@ -89,9 +89,9 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 def _log_squares(fit: Fit) -> np.ndarray:
     """Return the logarithm of the mean square error of each sensor of a `fit`.
 
-    For a sensor with jitter the errors are first made independent, with the variance of the noise,
-    and the mean logarithm of the factor by which jitter increases their variance is added. The
-    result belongs to white errors with the same likelihood.
+    Jitter of time stamps correlates the errors of a sensor. Such errors are first whitened, so that
+    they have the variance of the noise alone; then the mean logarithm of the factor by which jitter
+    raises their variance is added. White errors with this mean square have the same likelihood.
     """
     out, model = 2.0 * np.log(np.maximum(fit.rms, 1e-300)), fit.model
     errors, _ = errors_and_slopes(model, fit.x)

@@ -116,7 +116,7 @@ class FixedSteps(AbstractIntegrator):
 
 
 def _tolerance_field(name: str) -> Callable[[ScalarLike], Array]:
-    """Return a function that converts the value of the field `name` to an array.
+    """Return the converter of the dataclass field `name`, a tolerance: from a number to an array.
 
     A compiled program takes an array as an argument, so that another value needs no new
     compilation.

@@ -160,9 +160,10 @@ def slope_in_time(
 
 
 def stacked_shifts(parts: tuple[Consideration, ...], size: int) -> Float[np.ndarray, "n ways"]:
-    """Return the shifts of the n = `size` free numbers by all considered errors, in columns.
+    """Return the matrix S, whose columns are the shifts of the n = `size` free numbers by one
+    standard deviation of each considered error.
 
-    The matrix S is a root of the covariance that these errors add, which is S Sᵀ.
+    S Sᵀ is the covariance that the considered errors add.
     """
     return np.concatenate([np.zeros((size, 0)), *(part.shifts for part in parts)], axis=1)
 

@@ -48,7 +48,7 @@ class Linear(_Table):
     """
 
     def __call__(self, t: ScalarLike) -> Array:
-        """Return the value at `t` (s), (*k)."""
+        """Return the value at the time `t`, s; its shape (*k) is that of a row of `values`."""
         t = jnp.asarray(t, self.times.dtype)
         return _interpolate_line(
             self.times, self.values, jnp.clip(t, self.times[0], self.times[-1])
@@ -68,7 +68,7 @@ class Held(_Table):
     """
 
     def __call__(self, t: ScalarLike) -> Array:
-        """Return the value at `t` (s), (*k)."""
+        """Return the value at the time `t`, s; its shape (*k) is that of a row of `values`."""
         i = _row_index(self.times, jnp.asarray(t, self.times.dtype))
         return self.values[jnp.clip(i, 0, self.times.shape[0] - 1)]
 
@@ -168,10 +168,11 @@ def _interpolate_line(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: 
 def _checked_rows(
     name: str, times: NumbersLike, other: str, values: NumbersLike, extra: int | None = None
 ) -> tuple[Array, Array]:
-    """Return the times and rows after checks.
+    """Return `times` and `values` as checked arrays; a row of `values` belongs to a time.
 
-    `extra` is the number of times beyond the number of rows, of 3 numbers each; with `None` both
-    numbers are equal and rows may have any shape.
+    If `extra` is a number, each row has the shape (3,), and there are `extra` more times than rows.
+    If it is `None`, there are as many times as rows, and rows may have any shape. The texts `name`
+    and `other` name the two arguments in messages.
     """
     edges, rows = _checks.array_of_rows(times, (), name), _checks.numeric_array(values, other)
     count = edges.shape[0]

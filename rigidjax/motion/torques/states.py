@@ -131,8 +131,10 @@ def require_frozen(law: PyTree) -> None:
 
 
 def _insert_states(tree: PyTree, own_of: Callable[[Any], Any]) -> Any:
-    """Return the tree with all states inserted; `own_of(node)` returns the states of a node and is
-    called for inner nodes first.
+    """Return `tree` in which each torque with states of its own holds their values.
+
+    `own_of(torque)` returns the states of one torque. It is called for a torque inside another
+    torque before the other torque.
     """
 
     def is_leaf(node: PyTree) -> bool:
