@@ -20,7 +20,7 @@ from rigidjax.motion.torques import bind
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.fixed_loop import first_row, march_steps
+from rigidjax.solve.fixed_loop import inputs_at_start, march_steps
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.pieces import piece_length
 from rigidjax.solve.splitting import AbstractSplitting
@@ -205,7 +205,7 @@ def _take_steps(
         shared, initial, h, t0 = numbers
         own, inputs = row
         body, state0, torque = one_body(shared, own, constants)
-        state0 = with_own_states(body, state0, bind(torque, first_row(torque, h, inputs)), t0)
+        state0 = with_own_states(body, state0, bind(torque, inputs_at_start(torque, h, inputs)), t0)
         field = equations_of_motion(body, state0, torque)
         stepper = stepper_of(solver, field, state0, count)
 

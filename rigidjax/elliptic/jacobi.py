@@ -32,7 +32,7 @@ from rigidjax.elliptic.arguments import (
 )
 from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, sncndn_near_one
 from rigidjax.elliptic.legendre import complete_integral, integral, mean_iterates
-from rigidjax.rotation.stumpff import half_turns, parity
+from rigidjax.rotation.stumpff import parity, split_half_turns
 
 # If cn and dn are below this number, integrals over sd² depend on the ratio of cn and dn only, with
 # a relative error of about the square of this number.
@@ -206,5 +206,5 @@ def _reduce_argument(u: Array, m1: Array) -> tuple[Any, Any, list[tuple[Any, Any
     the angle πr/(2K); and the iterates of the arithmetic and geometric means of 1 and √m1.
     """
     rows = mean_iterates(jnp.where(m1 == 0, 1, m1))
-    turns, angle = half_turns(u * rows[-1][0])
+    turns, angle = split_half_turns(u * rows[-1][0])
     return jnp.where(m1 == 0, 0, turns), angle, rows

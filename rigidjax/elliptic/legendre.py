@@ -23,7 +23,7 @@ from jaxtyping import Array, PyTree
 from rigidjax.elliptic.arguments import Real, RealOrArray, complement_pair, to_common_dtype
 from rigidjax.elliptic.carlson import rd, rf
 from rigidjax.elliptic.carlson_r import r_integral
-from rigidjax.rotation.stumpff import half_turns
+from rigidjax.rotation.stumpff import split_half_turns
 
 # After this number of steps the means a and b agree to √eps, for b/a down to the square root of the
 # least number of the dtype.
@@ -242,7 +242,7 @@ def _integral_at_any_amplitude(
     The module defines I_jkl; `m1` is 1 − m, and `n1` is 1 − n. Let φ be n π + r. The complete
     integral gives the part of n π, and the sine and cosine of r give the part of r.
     """
-    turns, remainder = half_turns(phi)
+    turns, remainder = split_half_turns(phi)
     n1 = jnp.ones_like(m1) if n1 is None else n1
     part = integral(orders, jnp.sin(remainder), jnp.cos(remainder), m1, n1)
     # Within the first half turn the complete integral is not needed, and it may be infinite.

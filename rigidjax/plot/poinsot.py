@@ -27,7 +27,7 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     'z'
     """
     m = style.rotation_matrices(style.attitudes_on_host(states))
-    ax = style.solid_axes(ax)
+    ax = style.axes_3d_or_new(ax)
     style.draw_sphere(ax, "0.8", 0.12)
     for axis, colour in enumerate(COLOURS[:3]):
         path = m[:, :, axis]
@@ -87,7 +87,7 @@ def polhode(
     pi = pi / size
     twice_energy = float(np.sum(pi[0] ** 2 / i))
 
-    ax = style.solid_axes(ax)
+    ax = style.axes_3d_or_new(ax)
     # The drawing order is set here, since matplotlib gives a whole surface a single depth and would
     # draw the sphere over the path.
     ax.computed_zorder = False

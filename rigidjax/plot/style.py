@@ -75,7 +75,7 @@ def flat_axes(ax: Any, **options: Any) -> Any:
     return pyplot().subplots(layout="constrained", **{"figsize": (6.4, 4.4), **options})[1]
 
 
-def solid_axes(ax: Any) -> Any:
+def axes_3d_or_new(ax: Any) -> Any:
     """Return `ax`, or new 3-D axes if `ax` is `None`.
 
     **Raises:** `TypeError` for axes that are not 3-D.

@@ -75,7 +75,7 @@ def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
     limit = (math.pi / 2) ** 2
     far = t > limit
     theta = jnp.sqrt(jnp.where(far, t, 1))
-    turns, remainder = half_turns(theta)
+    turns, remainder = split_half_turns(theta)
     # A θ beyond 1/ε has no correct digit; its remainder must stay in the range of the polynomials.
     remainder = jnp.clip(remainder, -2.0, 2.0)
     value = _polynomial(k, jnp.where(far, remainder * remainder, t), limit)
@@ -86,7 +86,7 @@ def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
     return value / jnp.where(far, sign * theta if k else sign, 1)
 
 
-def half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+def split_half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Return n and r with angle = nπ + r, |r| ≤ π/2; in derivatives n is constant."""
     turns = jax.lax.stop_gradient(jnp.round(angle * (1 / math.pi)))
     # Cody & Waite 1980: n × head and n × middle are exact, so that r keeps the digits of the angle.

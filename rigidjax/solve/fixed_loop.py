@@ -145,7 +145,7 @@ def delayed_rows(
     return jnp.stack(parts), early, late
 
 
-def first_row(law: Any, h: Array, inputs: Any) -> Any:
+def inputs_at_start(law: Any, h: Array, inputs: Any) -> Any:
     """Return the inputs of the torque `law` at the start of a run, in the form for `bind`."""
     delays = delays_of(law)
     now = jax.tree.map(lambda a: a[0], inputs)

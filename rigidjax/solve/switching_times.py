@@ -127,12 +127,12 @@ def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times
     watched = [_Watched(analysis.program, s, constants) for s in analysis.switches]
     others = [_Watched(analysis.program, s, constants) for s in analysis.kinks]
     steady = [one for one in watched + others if one.switch.degree <= MONOTONE]
-    found = _of_steady(steady, start, end)
+    found = _switchings_of_monotonic(steady, start, end)
     known = [places[0] for places in found]
     parts: list[_Places] = []
     for one in watched:
         if one.switch.degree == BENT:
-            parts.append(_of_bent(one, start, end, known))
+            parts.append(_switchings_of_bent(one, start, end, known))
             known.append(parts[-1][0])
         else:
             parts.append(found.pop(0))
@@ -146,7 +146,7 @@ def times_of(analysis: Analysis, constants: Arrays, a: Array, b: Array) -> Times
     return Times(jnp.where(t < end, t, b), element, change, first, outputs, over)
 
 
-def _of_steady(watched: list[_Watched], start: Array, end: Array) -> list[_Places]:
+def _switchings_of_monotonic(watched: list[_Watched], start: Array, end: Array) -> list[_Places]:
     """Return the times between `start` and `end` at which switches change whose gap is monotonic.
 
     The gap of a switch is the function of time whose sign the switch tests.
@@ -170,8 +170,11 @@ def _of_steady(watched: list[_Watched], start: Array, end: Array) -> list[_Place
     return parts
 
 
-def _of_bent(one: _Watched, start: Array, end: Array, known: list[Array]) -> _Places:
-    """Find the changes of a bent switch on a grid; it includes `known` times of other switches."""
+def _switchings_of_bent(one: _Watched, start: Array, end: Array, known: list[Array]) -> _Places:
+    """Return the times at which a switch changes whose gap may rise and fall, found on a grid.
+
+    The grid includes the `known` times at which other switches change.
+    """
     before = jnp.concatenate(known) if known else jnp.zeros(0, start.dtype)
     low, high, element, over = _cells(one.still, start, end, lax.stop_gradient(before))
     base = one.still.values(low, element)

@@ -20,7 +20,7 @@ from rigidjax.identify.answer.answers import (
     NOT_ENDED,
     Answer,
 )
-from rigidjax.identify.answer.causes import clock_cause
+from rigidjax.identify.answer.causes import time_stamp_cause
 from rigidjax.identify.answer.result import Fit, Start
 from rigidjax.identify.data.recording import Reading
 from rigidjax.identify.model.model import Model, describe_delays
@@ -106,7 +106,7 @@ def goodness(
         root = np.sqrt(weight)[..., None]
         slope = linear.slopes[index] * root[..., None]
         white = left <= tiny or _is_white(e * root, mask, slope, own, has_noise)
-        has_clock_error = left > tiny and clock_cause(model, noise, linear, index) is not None
+        has_clock_error = left > tiny and time_stamp_cause(model, noise, linear, index) is not None
         # Errors that are no larger than the given noise, and errors that are small beside the
         # readings, cannot hide a missing part of the model.
         small = has_noise or left <= QUARTER * varies + tiny

@@ -191,7 +191,7 @@ def causes(
     out = []
     for index in indices:
         sensor: Any = model.records.readings[index].sensor
-        cause = clock_cause(model, noise, linear, index)
+        cause = time_stamp_cause(model, noise, linear, index)
         if cause is None and _is_vector_error(sensor):
             rows = _candidate_causes(model, x, noise, linear, index)
             given = model, noise, linear, index, free
@@ -203,7 +203,7 @@ def causes(
     return tuple(out)
 
 
-def clock_cause(model: Model, noise: Noise, linear: Linearisation, index: int) -> Cause | None:
+def time_stamp_cause(model: Model, noise: Noise, linear: Linearisation, index: int) -> Cause | None:
     """Return the cause "clock" if the time stamps of a sensor scatter by more than its jitter.
 
     Otherwise the result is `None`. A late time stamp makes an error along dy/dt, the derivative of

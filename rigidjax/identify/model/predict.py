@@ -29,7 +29,7 @@ from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
 from rigidjax.solve.components import split
 from rigidjax.solve.equal_steps import advance, roll_steps
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.fixed_loop import first_row, first_rows, step
+from rigidjax.solve.fixed_loop import first_rows, inputs_at_start, step
 from rigidjax.solve.steppers import cheapest, stepper_of
 from rigidjax.solve.tableaus import KUTTA4
 
@@ -226,7 +226,9 @@ class HeldSteps(AbstractIntegrator):
         """
         count, size = ts.shape[0] - 1, (ts[1] - ts[0]).astype(state0.omega.dtype)
         before = max((len(rows) - ts.shape[0] for rows in inputs.values()), default=0)
-        start = with_own_states(body, state0, bind(torque, first_row(torque, size, inputs)), 0.0)
+        start = with_own_states(
+            body, state0, bind(torque, inputs_at_start(torque, size, inputs)), 0.0
+        )
         field = equations_of_motion(body, start, torque)
         stepper = stepper_of(roll_steps(cheapest(field)), field, start)
 

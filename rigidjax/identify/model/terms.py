@@ -78,7 +78,7 @@ def torque_of_scene(scene: Scene, record: Recording) -> Torque | None:
     return bind(scene.torque, sources_of(record))
 
 
-def errors_of_recording(
+def errors_in_sensor_units(
     model: "Model",
     row: Row,
     record: Recording,
@@ -104,8 +104,9 @@ def errors_of_recording(
 def errors_of_scene(
     model: "Model", scene: Scene, record: Recording, delay: Array | None = None
 ) -> tuple[Array, ...]:
-    """Return the same errors (T, k) of each sensor as `errors_of_recording`, for a given scene of
-    the recording.
+    """Return the errors (T, k) of each sensor in its unit, for a given scene of the recording.
+
+    The errors are those of `errors_in_sensor_units`.
     """
     states, torque = motion_of_scene(model, scene, record)
     assert scene.body is not None and scene.start is not None
@@ -145,7 +146,7 @@ def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
 
     Derivatives with respect to x are computed recording by recording, in forward mode.
     """
-    return by_recording(model.index.rows(x), model, errors_of_recording)
+    return by_recording(model.index.rows(x), model, errors_in_sensor_units)
 
 
 @eqx.filter_custom_jvp
@@ -181,7 +182,7 @@ def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree
 
 
 def errors_and_jacobians(
-    model: "Model", x: Float[Array, " n"], function: Callable[..., PyTree] = errors_of_recording
+    model: "Model", x: Float[Array, " n"], function: Callable[..., PyTree] = errors_in_sensor_units
 ) -> tuple[Any, Any]:
     """Return two things: `function` of every recording (R, …); and its derivatives (R, …, m) with
     respect to the free numbers.
@@ -221,7 +222,7 @@ def delay_derivatives(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Arra
     def derivative_of_recording(row: Row, *rest: PyTree) -> Any:
         now = jnp.zeros((), model.records.t.dtype)
         return jax.jvp(
-            lambda s: errors_of_recording(model, row, *rest, delay=s), (now,), (now + 1,)
+            lambda s: errors_in_sensor_units(model, row, *rest, delay=s), (now,), (now + 1,)
         )[1]
 
     return over_records(derivative_of_recording, model, model.index.rows(x))
