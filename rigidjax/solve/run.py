@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Int
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.exact.diffrax_solver import FreeSolver
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of_force
@@ -33,7 +34,9 @@ from rigidjax.solve.adaptive import integrate
 from rigidjax.solve.adaptive_loop import NONFINITE, finite, result_of_body
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
+from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.momentum import by_momentum, momentum_changes, with_body_rates
+from rigidjax.solve.projection import Projected
 from rigidjax.solve.replay_adjoint import ReplayAdjoint
 from rigidjax.solve.sides import declared_jumps, on_sides
 from rigidjax.solve.splitting import AbstractSplitting
@@ -76,9 +79,11 @@ class DiffraxRun(eqx.Module):
     @property
     def seeks_stops(self) -> bool:
         """Return whether steps end where the law switches; if so, the run uses the time s = σt."""
-        # A splitting reads attributes of the vector field, which therefore cannot be replaced by a
+        # These solvers read attributes of the vector field, which therefore cannot be replaced by a
         # traced program.
-        return self.controller is None and not isinstance(self.solver, AbstractSplitting)
+        solver = self.solver.solver if isinstance(self.solver, Projected) else self.solver
+        reads_field = isinstance(solver, AbstractSplitting | Magnus4 | FreeSolver)
+        return self.controller is None and not reads_field
 
     @property
     def is_replayed(self) -> bool:

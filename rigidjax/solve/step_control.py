@@ -86,6 +86,13 @@ class StandardController(dfx.AbstractAdaptiveStepSizeController):
         error_order: RealLike | None,
         controller_state: PyTree,
     ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
+        if y_error is None:
+            raise ValueError(
+                "simulate: wanted a solver that estimates the error of its steps, as steps under "
+                "rtol and atol need, got one that does not; give dt0 and "
+                "stepsize_controller=diffrax.ConstantStepSize(), or take another solver"
+            )
+
         def over_tolerance(error: Array, left: Array, right: Array) -> Array:
             return error / (self.atol + self.rtol * jnp.maximum(jnp.abs(left), jnp.abs(right)))
 

@@ -1,9 +1,11 @@
 """The first step, and the next one by the error of the last: Hairer, Nørsett and Wanner, II.4."""
 
+import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import rigidjax as rj
 from rigidjax.solve.adaptive_loop import starting_step
 from rigidjax.solve.step_control import StandardController
 
@@ -61,3 +63,22 @@ def test_the_first_step_from_rest_is_short_and_from_nan_is_none():
     assert float(starting_step(jnp.asarray(1e9), jnp.asarray(0.0), ORDER)) == 1e-4
     for size, rate in ((1e9, jnp.nan), (jnp.nan, 1.0), (1e9, jnp.inf)):
         assert not float(starting_step(jnp.asarray(size), jnp.asarray(rate), ORDER)) > 0
+
+
+BODY, START = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Attitude([1.0, 0, 0, 0], [0.0, 1.0, 0.1])
+
+
+@pytest.mark.parametrize("solver", [dfx.Euler(), rj.solvers.Magnus4(), rj.solvers.Splitting4()])
+@pytest.mark.parametrize("dt0", [None, 0.1])
+def test_a_solver_without_an_estimate_of_its_error_is_told_what_it_needs(solver, dt0):
+    law = None if isinstance(solver, rj.solvers.Splitting4) else rj.torques.Damping([0.1, 0.1, 0.1])
+    with pytest.raises(ValueError, match=r"estimates the error .*ConstantStepSize"):
+        rj.simulate(BODY, START, [0.0, 1.0], law, solver=solver, dt0=dt0)
+
+
+@pytest.mark.parametrize("ts", [[0.0, 0.5, 2.0], [2.0, 0.5, 0.0]])
+def test_a_solver_that_looks_into_the_field_gets_it_under_tolerances_too(ts):
+    steps = rj.simulate(BODY, START, ts, solver=rj.solvers.FreeSolver()).ys
+    exact = rj.simulate(BODY, START, ts).ys
+    np.testing.assert_allclose(steps.omega, exact.omega, atol=1e-13)
+    np.testing.assert_allclose(steps.q, exact.q, atol=1e-13)
