@@ -10,7 +10,7 @@ neighbours round differently, and the differences between them grow as rounding 
 import dataclasses
 import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -27,6 +27,7 @@ from rigidjax.motion.manifold import minus, names, parts_by_name
 from rigidjax.solve import difference, validation
 from rigidjax.solve.linear_map import as_known
 from rigidjax.solve.run import ClosedFormRun, DiffraxRun, equations_of_motion, solve
+from rigidjax.solve.sides import with_constant_tables
 
 # The tolerance of the second run divided by the tolerance of the run. With this value a method of
 # order 8 takes 1.6 times as many steps.
@@ -44,9 +45,11 @@ _PARTS, _SAMPLES_OF_PART, _SUDDEN, _ROUGH = 32, 512, 20.0, 1e3
 # standard deviations over four runs (the run and its neighbours) exceed half of the true error in
 # all but a few of a thousand runs.
 _NEIGHBOURS, _DEVIATIONS = 3, 3.0
-# In float64 the neighbours are run at this tolerance or a larger one, so that they take fewer
-# steps.
-_LOOSE = 1.5e-8
+# In float64 the neighbours are run at the square root of the tolerance, but at `_LOOSE` at most, so
+# that they take fewer steps. If a run at this tolerance is farther than `_NEAR` from the run whose
+# error is wanted, errors grow along it in another way, and the tolerance is multiplied by
+# `_FARTHEST`.
+_LOOSE, _NEAR, _FARTHEST = 1e-4, 0.03, 1e-3
 # A state counts as lost if its error is above half a radian, or above half of the largest value in
 # the run: such errors no longer grow in proportion.
 _LOST = 0.5
@@ -54,17 +57,26 @@ _LOST = 0.5
 # `rtol`.
 _SMALL = 1e-3
 # One rounding is the relative rounding error of the dtype. Errors of steps and rounding errors grow
-# alike along a motion, so that round-off can be neglected if the errors of the steps are much
-# larger from the beginning. Round-off is therefore not measured if the tolerance is above `_COARSE`
-# roundings, and if the error of the steps is above `_ABOVE` times the round-off of all steps as it
-# would be without growth. For a function given to `error_of`, whose steps are not known, the second
-# limit is `_PLAIN` roundings.
-_ABOVE, _PLAIN, _COARSE = 300.0, 1e6, 1e5
-# The search for a tolerance multiplies the tolerance by at least `_FARTHEST` from one run to the
-# next. It aims at the wanted accuracy divided by `_AIM`, because errors are proportional to the
-# tolerance only up to a factor of eight, `_ALLOWED`. An error above `_FORESEEN` (0.1 rad) is not
-# proportional to the tolerance, and neither is the error of a run of fewer than `_FEW` steps.
-_FARTHEST, _AIM, _ALLOWED, _FORESEEN, _FEW = 1e-3, 20.0, 8.0, 0.1, 8
+# alike along most motions, so that round-off can be neglected if the errors of the steps are much
+# larger from the beginning. Beside an unstable rotation they do not: the errors of the steps vanish
+# there with the distance from the rotation, and the rounding errors stay. Round-off is therefore
+# measured by one neighbour only if the tolerance is above `_COARSE` roundings, and if the error of
+# the steps is above `_CLEAR` times two bounds of round-off: `_ABOVE` times the round-off of all
+# steps as it would be without growth, and `_ABOVE_ONE` times the round-off that this neighbour
+# shows. For a function given to `error_of`, whose steps are not known, the limit is `_PLAIN`
+# roundings.
+_ABOVE, _ABOVE_ONE, _CLEAR, _PLAIN, _COARSE = 100.0, 10.0, 3.0, 1e6, 1e5
+# The search for a tolerance starts with a run at the tolerance `_FIRST`. Its second run has the
+# tolerance that most scenes need, times `_SECOND`: the errors of 800 scenes of `bench_error` were
+# about n²/100 times the tolerance within a factor of ten, where n is the number of steps of the
+# first run. From the second run on, the error is measured. Errors are proportional to the tolerance
+# only up to a factor of four, `_ALLOWED`, by which the estimate of the error is multiplied. The
+# search aims at the wanted accuracy divided by `_AIM`. An error above `_FORESEEN` (0.1 rad) is not
+# proportional to the tolerance, and neither is the error of a run of fewer than `_FEW` steps, or of
+# a run whose number of steps grew by less than `_GROWTH` times what the order of the method
+# implies.
+_FIRST, _SECOND, _ALLOWED, _AIM = 1e-4, 20.0, 4.0, 2.0
+_FORESEEN, _FEW, _GROWTH = 0.1, 8, 0.9
 # The smallest tolerance, in roundings: `_FLOOR` in the search for a tolerance, and `_DEEPEST` for a
 # run that serves for comparison only.
 _FLOOR, _DEEPEST = 20.0, 4.0
@@ -81,7 +93,7 @@ class Error(eqx.Module):
     - `steps`: the error of the steps, one array (T,) for each name (`q`, `omega`, `x`, `v`,
       `own.0`, …). For a quaternion it is the angle of the turn, rad; for other arrays it is the
       length of the difference (rad/s, m, m/s). This error is accurate to some percent; after
-      `simulate(…, accuracy=…)` it may be too large by a factor of up to ten.
+      `simulate(…, accuracy=…)` it is too large by a factor of about four.
     - `round_off`: the error of rounding, three standard deviations, in arrays by name as in
       `steps`. It includes the effect of the last digits of body, torque and start (in closed form
       also of the times). If this error is far below `steps`, only an upper bound is given.
@@ -149,26 +161,47 @@ class Error(eqx.Module):
         return _largest(jax.tree.map(jnp.hypot, self.steps, self.round_off), self.sizes)
 
 
+class TriedRun(NamedTuple):
+    """Hold one run of the search for a tolerance: the tolerance, and the results of `solve`."""
+
+    rtol: Array
+    ys: Any
+    stats: dict[str, Array]
+    result: dfx.RESULTS
+
+    @property
+    def steps(self) -> Array:
+        """Return the number of accepted steps."""
+        return self.stats["num_accepted_steps"]
+
+
 @eqx.filter_jit
-def estimate_error_of_run(setup: Any, ts: Array, ys: Any, count: Array, tried: Any = None) -> Error:
+def estimate_error_of_run(
+    setup: Any,
+    ts: Array,
+    ys: Any,
+    count: Array,
+    search: tuple[TriedRun, TriedRun] | None = None,
+) -> Error:
     """Return the error of the states `ys`, which the run `setup` gave at `ts` in `count` steps.
 
     The error of the steps is the distance to a second, more accurate run; a run in closed form has
-    no error of steps. `tried`, if given, is a pair of the tolerance and the states of an earlier
-    run at a larger tolerance. This earlier run is then used instead of a second run, and the error
-    is too large by a factor of up to ten.
+    no error of steps. `search`, if given, holds two runs at larger tolerances: the first run of a
+    search for a tolerance, and the run before `ys`. The run before then serves instead of a second
+    run, and the error is too large by a factor of about four.
     """
-    setup, ts, ys, count, tried = _without_derivatives((setup, ts, ys, count, tried))
+    setup, ts, ys, count, search = _without_derivatives((setup, ts, ys, count, search))
     rtol, factor, others = jnp.zeros((), ts.dtype), 1.0, ys
-    if tried is not None:
-        rtol, (before, others) = setup.rtol, tried
+    if search is not None:
+        before = search[1]
+        rtol, others = setup.rtol, before.ys
         far = _largest(_distances(others, ys), _sizes(ys)) > _FORESEEN
-        factor = jnp.where(far, jnp.inf, _ALLOWED * rtol / before)
+        factor = jnp.where(far, jnp.inf, _ALLOWED * rtol / before.rtol)
     elif not isinstance(setup, ClosedFormRun):
         second, rtol, factor = _closer_run(setup, ts, _sudden_times(setup, ts, ys))
         others, *_ = solve(second, jax.tree.map(lambda leaf: leaf[0], ys), ts)
     steps = jax.tree.map(lambda part: factor * part, _distances(others, ys))
-    return _with_round_off(setup, ts, ys, count, steps, rtol)
+    return _with_round_off(setup, ts, ys, count, steps, rtol, search)
 
 
 def _without_derivatives(tree: Any) -> Any:
@@ -177,12 +210,18 @@ def _without_derivatives(tree: Any) -> Any:
 
 
 def _with_round_off(
-    setup: Any, ts: Array, ys: Any, count: Array, steps: dict[str, Array], rtol: Array
+    setup: Any,
+    ts: Array,
+    ys: Any,
+    count: Array,
+    steps: dict[str, Array],
+    rtol: Array,
+    search: tuple[TriedRun, TriedRun] | None,
 ) -> Error:
     """Measure the error of round-off of a run by neighbouring runs, and return the whole error.
 
-    `steps` is the known error of the steps, by name. `rtol` is the tolerance of the run, and
-    `count` its number of steps.
+    `steps` is the known error of the steps, by name. `rtol` is the tolerance of the run, `count`
+    its number of steps, and `search` holds two runs at larger tolerances, or is `None`.
     """
     sizes, start = _sizes(ys), jax.tree.map(lambda leaf: leaf[0], ys)
     reached = jnp.isfinite(_largest(_distances(ys, ys), sizes))
@@ -191,29 +230,37 @@ def _with_round_off(
     # the angle.
     eps = float(jnp.finfo(ts.dtype).eps)
     plain = {name: _ABOVE * eps * count.astype(ts.dtype) ** 1.5 * sizes[name] for name in sizes}
-    above = jnp.stack([(steps[name] > plain[name])[1:] for name in sizes])
-    clear = jnp.all(above | ~reached[None, 1:]) & (rtol > _COARSE * eps)
-    # If round-off is not measured, all times of the neighbours are the start, so that they take no
-    # step.
-    times = jnp.where(clear, ts[0], ts)
+    coarse = rtol > _COARSE * eps
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
-    setup, ys, more = _cheaper_run(setup, start, times, ys, count)
-
+    setup, ys, more = _cheaper_run(setup, start, ts, ys, count, search)
     free = isinstance(setup, ClosedFormRun)
 
-    def neighbour(numbers: Any, later: Array) -> Array:
+    def changes_of_neighbour(numbers: Any, times: Array) -> Array:
         body, torque, y0 = eqx.combine(numbers, rest)
         new = dict(body=body, throw=False) | ({} if free else dict(torque=torque))
-        return jax.vmap(minus)(solve(dataclasses.replace(setup, **new), y0, times * later)[0], ys)
+        return more * jax.vmap(minus)(solve(dataclasses.replace(setup, **new), y0, times)[0], ys)
+
+    def neighbour(clear: Array, inputs: Any) -> tuple[Array, tuple[Array, dict[str, Array]]]:
+        number, near, later = inputs
+        # If round-off is known to be small, all times of a neighbour are the start, so that it
+        # takes no step.
+        changes = changes_of_neighbour(near, jnp.where(clear, ts[0], ts * later))
+        shown = _lengths(start, _DEVIATIONS * _ABOVE_ONE * changes)
+        bounds = {name: jnp.maximum(plain[name], shown[name]) for name in sizes}
+        above = jnp.stack([(steps[name] > _CLEAR * bounds[name])[1:] for name in sizes])
+        small = coarse & jnp.all(above | ~reached[None, 1:])
+        return jnp.where(number == 0, small, clear), (changes, bounds)
 
     rng = np.random.default_rng(0)
     near = jax.tree.map(lambda leaf: _nudged(leaf, rng, jnp.abs(leaf)), numbers)
     # The closed form rounds its angle only once, and neighbours may get the same rounded angle. The
     # times of its neighbours are therefore changed, too.
     later = jnp.asarray(1.0 + eps * free * np.array([1.0, -1.0, 1.0]), ts.dtype)
-    changes = more * jax.vmap(neighbour)(near, later)
+    inputs = jnp.arange(_NEIGHBOURS), near, later
+    # The neighbours are run one after another: in lanes they would take as long.
+    clear, (changes, bounds) = lax.scan(neighbour, jnp.asarray(False), inputs)
     off = _lengths(start, _DEVIATIONS * jnp.sqrt(_spread(changes)))
-    off = {name: jnp.where(clear, plain[name], off[name]) for name in off}
+    off = {name: jnp.where(clear, bounds[name][0], off[name]) for name in off}
 
     def known(part: Array) -> Array:
         return jnp.where(reached, jnp.where(jnp.isnan(part), jnp.inf, part), jnp.nan)
@@ -222,22 +269,61 @@ def _with_round_off(
     return Error(ts, steps, off, sizes)
 
 
-def _cheaper_run(setup: Any, start: Any, ts: Array, ys: Any, count: Array) -> tuple[Any, Any, Any]:
+def _cheaper_run(
+    setup: Any, start: Any, ts: Array, ys: Any, count: Array, search: Any
+) -> tuple[Any, Any, Any]:
     """Return three things: a set-up that takes fewer steps, its states, and a factor for round-off.
 
     The round-off of the given set-up, which took `count` steps, is the round-off of the new set-up
-    times the factor. The factor is √(`count` / number of new steps): the round-off of n steps adds
-    up to about √n times that of one step, and it grows along the motion in the same way at any
-    tolerance. A run in float32 takes few steps anyway; its set-up and states `ys` are returned
-    unchanged, with the factor 1.
+    times the factor. The factor is the fourth root of `count` over the number of new steps: the
+    round-off of n steps adds up to about √n times that of one step, while the effect of the last
+    digits of the inputs does not depend on n. Both grow along the motion in the same way at any
+    tolerance at which the states stay near `ys`. `search` holds two runs at larger tolerances, one
+    of which serves; without it a run is made. A run in float32 takes few steps anyway; its set-up
+    and states `ys` are returned unchanged, with the factor 1.
     """
     replayed = isinstance(setup, DiffraxRun) and setup.is_replayed
     if not replayed or ts.dtype == jnp.float32:
         return setup, ys, 1.0
-    setup = _with_tolerance(setup, jnp.maximum(setup.rtol, _LOOSE).astype(ts.dtype))
-    ys, stats, _ = solve(setup, start, ts)
-    fewer = jnp.maximum(stats["num_accepted_steps"], 1)
-    return setup, ys, jnp.sqrt(jnp.maximum(count / fewer, 1.0)).astype(ts.dtype)
+    sizes = _sizes(ys)
+    unreached = jnp.isnan(_largest(_distances(ys, ys), sizes))
+
+    def is_near(run: TriedRun) -> Array:
+        return jnp.all((_largest(_distances(run.ys, ys), sizes) <= _NEAR) | unreached)
+
+    def closer(run: TriedRun) -> TriedRun:
+        return _tried(setup, start, ts, jnp.maximum(_FARTHEST * run.rtol, setup.rtol))
+
+    if search is None:
+        loosest = jnp.maximum(setup.rtol, jnp.minimum(jnp.sqrt(setup.rtol), _LOOSE)) / _FARTHEST
+        run = lax.while_loop(
+            lambda run: ~(is_near(run) | (run.rtol <= setup.rtol)),
+            closer,
+            _nothing_tried(setup, start, ts, loosest),
+        )
+    else:
+        near = is_near(search[0])
+        run = jax.tree.map(lambda first, last: jnp.where(near, first, last), *search)
+    fewer = jnp.maximum(run.steps, 1)
+    setup = _with_tolerance(setup, run.rtol)
+    return setup, run.ys, (jnp.maximum(count / fewer, 1.0) ** 0.25).astype(ts.dtype)
+
+
+def _tried(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) -> TriedRun:
+    """Return the run of a set-up at the tolerance `rtol`."""
+    rtol = jnp.asarray(rtol, ts.dtype)
+    return TriedRun(rtol, *solve(_with_tolerance(setup, rtol), state0, ts))
+
+
+def _nothing_tried(setup: DiffraxRun, state0: Any, ts: Array, rtol: Array) -> TriedRun:
+    """Return a run in the shapes of `_tried` that took no step: its states are NaN."""
+    run = eqx.filter_eval_shape(_tried, setup, state0, ts, rtol)
+
+    def empty(leaf: Any) -> Array:
+        inexact = jnp.issubdtype(leaf.dtype, jnp.inexact)
+        return jnp.full(leaf.shape, jnp.nan if inexact else 0, leaf.dtype)
+
+    return jax.tree.map(empty, run)._replace(rtol=jnp.asarray(rtol, ts.dtype))
 
 
 def _distances(others: Any, ys: Any) -> dict[str, Array]:
@@ -274,49 +360,54 @@ def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
 @eqx.filter_jit
 def solve_to(
     setup: DiffraxRun, state0: Any, ts: Array, accuracy: Array
-) -> tuple[DiffraxRun, Any, Any]:
+) -> tuple[DiffraxRun, Any, tuple[TriedRun, TriedRun]]:
     """Find a tolerance at which the global error of a run is below `accuracy`, if there is one.
 
     Runs are tried at smaller and smaller tolerances. The error of each run is estimated by its
-    distance to the next run, and scaled in proportion to the tolerance. **Returns** three things:
-    the set-up at the tolerance found; the results of `solve` for this set-up; and a pair of the
-    tolerance and the states of the run before.
+    distance from the run before, and scaled in proportion to the tolerance. **Returns** three
+    things: the set-up at the tolerance found; the results of `solve` for this set-up; and two of
+    the runs that were tried, the first one and the one before the last.
     """
     still = _without_derivatives((setup, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
-
     sudden = _sudden_times(still[0], ts, jax.tree.map(lambda leaf: leaf[None], still[1]))
-
-    def run(rtol: Array, times: Array) -> Any:
-        at_rtol = dataclasses.replace(_with_tolerance(still[0], rtol), cuts=sudden)
-        return solve(at_rtol, still[1], times)
+    cut = dataclasses.replace(still[0], cuts=sudden)
+    first_rtol = jnp.asarray(max(_FIRST, 100 * floor), ts.dtype)
 
     def closer(carry: Any) -> Any:
-        (others, stats, _), _, before, rtol, ended = carry
+        number, first, _, before, rtol, ended = carry
         # In a batch, a body whose search has ended is run with all times equal to the start, and
         # takes no step.
-        new = run(rtol, jnp.where(ended, ts[0], ts))
-        off = jnp.nanmax(_largest(_distances(others, new[0]), _sizes(new[0]))[1:])
-        wanted = before * still[3] / (_AIM * off)
-        least = jnp.maximum(_FARTHEST * rtol, floor)
+        new = _tried(cut, still[1], jnp.where(ended, ts[0], ts), rtol)
+        is_first = number == 0
+        count, counted = new.steps.astype(ts.dtype), before.steps.astype(ts.dtype)
+        off = jnp.nanmax(_largest(_distances(before.ys, new.ys), _sizes(new.ys))[1:])
+        foreseen = off < _FORESEEN
+        off = _ALLOWED * off * rtol / before.rtol
         # In two cases the error of a run does not predict the error of the next run: if the error
         # is so large that the run is lost; and if the steps are not limited by the tolerance, as in
         # a run so short that it ends before the steps have grown to their full length.
-        count, counted = (a["num_accepted_steps"].astype(ts.dtype) for a in (new[1], stats))
-        more = (before / rtol) ** (1 / setup.solver.tableau.order)
-        sound = (off < _FORESEEN) & (count >= _FEW) & (count >= 0.75 * more * counted)
-        good = sound & (_ALLOWED * off * rtol <= before * still[3])
-        following = jnp.where(sound, jnp.clip(wanted, least, jnp.maximum(rtol / 3, floor)), least)
+        more = (before.rtol / rtol) ** (1 / setup.solver.tableau.order)
+        sound = foreseen & (count >= _FEW) & (count >= _GROWTH * more * counted)
+        wanted = jnp.where(
+            sound, jnp.minimum(rtol * still[3] / (_AIM * off), rtol / 3), 0.01 * rtol
+        )
+        second = jnp.minimum(_SECOND * still[3] * 100 / count**2, rtol / 30)
+        following = jnp.maximum(jnp.where(is_first, second, wanted), floor)
         # A run that reached none of the times will reach none at a smaller tolerance either.
-        return new, (before, others), rtol, following, good | (rtol <= floor) | jnp.isnan(off)
+        none_reached = ~jnp.any(
+            jnp.isfinite(_largest(_distances(new.ys, new.ys), _sizes(new.ys)))[1:]
+        )
+        found = ~is_first & ((sound & (off <= still[3])) | (rtol <= floor))
+        first = jax.tree.map(lambda a, b: jnp.where(is_first, a, b), new, first)
+        return number + 1, first, before, new, following, found | none_reached
 
-    first = jnp.clip(jnp.sqrt(still[3]), 1e-6, 1e-4).astype(ts.dtype)
-    first = jnp.maximum(first, 100 * floor)
-    begun = run(first, ts)
-    carry = (begun, (first, begun[0]), first, 0.03 * first, jnp.asarray(False))
-    new, tried, rtol, *_ = lax.while_loop(lambda carry: ~carry[-1], closer, carry)
-    setup = dataclasses.replace(_with_tolerance(setup, lax.stop_gradient(rtol)), cuts=sudden)
-    return setup, (_as_solved(setup, state0, ts, new[0]), *new[1:]), tried
+    begun = _nothing_tried(cut, still[1], ts, first_rtol)
+    carry = (0, begun, begun, begun, first_rtol, jnp.asarray(False))
+    _, first, before, new, *_ = lax.while_loop(lambda carry: ~carry[-1], closer, carry)
+    setup = dataclasses.replace(_with_tolerance(setup, lax.stop_gradient(new.rtol)), cuts=sudden)
+    run = _as_solved(setup, state0, ts, new.ys), new.stats, new.result
+    return setup, run, (first, before)
 
 
 @eqx.filter_custom_jvp
@@ -344,10 +435,12 @@ def _sudden_times(setup: Any, ts: Array, ys: Any) -> Array:
     therefore sampled in time, at one saved state for each part of the run. A sample is sudden if
     its distance from the chord between its two neighbours is far greater than such distances
     elsewhere in the part. The start of the run is returned for a part without a sudden sample. If
-    the law does not depend on the time, no times are returned.
+    the law does not depend on the time except by tables, no times are returned.
     """
     state0 = jax.tree.map(lambda leaf: leaf[0], ys)
+    # Steps end at each row of a table, between which the table is a straight line.
     field = equations_of_motion(setup.body, state0, setup.torque)
+    field = with_constant_tables(field, ts[0])
     traced = jax.make_jaxpr(lambda t: field(t, state0, None))(ts[0]).jaxpr
     if not any(var is traced.invars[0] for equation in traced.eqns for var in equation.invars):
         return ts[:0]

@@ -22,7 +22,8 @@ from rigidjax.solve.switching import DECLARED
 
 # These laws of this package have jumps of their own; all other laws only pass on the jumps of the
 # laws inside them.
-_OWN = (Held, Linear, Pulses, Tabulated, Delayed, Lagged)
+_TABLES = (Held, Linear, Pulses, Tabulated)
+_OWN = (*_TABLES, Delayed, Lagged)
 
 
 class Sided(eqx.Module):
@@ -75,6 +76,34 @@ class Sided(eqx.Module):
             now = jnp.maximum(now, jnp.max(jnp.where(new, jumps, -jnp.inf)))
             now = jnp.minimum(now, jnp.min(jnp.where(new, jnp.inf, before)))
         return t + (now - still)
+
+
+class Constant(eqx.Module):
+    """Evaluate a law or function of time as it is at one time, `time`, s."""
+
+    law: Any
+    time: Array
+
+    def __getattr__(self, name: str) -> Any:
+        # All other attributes, such as `feels` or `rate_free`, are read from the law.
+        if name.startswith("__") or name in ("law", "time"):
+            raise AttributeError(name)
+        return getattr(self.law, name)
+
+    def __call__(self, t: Any, *args: Any) -> Any:
+        return self.law(self.time, *args)
+
+
+def with_constant_tables(field: Any, time: Array) -> Any:
+    """Return the field with each table of numbers over time (`Held`, `Linear`, `Tabulated`,
+    `Pulses`) constant at its value at `time`, s.
+
+    The returned field depends on time only through laws that may change between their jumps in
+    another way than by a straight line.
+    """
+    is_table = lambda node: isinstance(node, _TABLES)  # noqa: E731
+    constant = lambda node: Constant(node, time) if is_table(node) else node  # noqa: E731
+    return jax.tree.map(constant, field, is_leaf=is_table)
 
 
 def _declares(node: Any) -> bool:

@@ -229,10 +229,10 @@ def _adjoint(setup: DiffraxRun) -> dfx.AbstractAdjoint:
 
 def _accurate(setup: DiffraxRun, event: Any, state0: Any, times: Array, accuracy: Any) -> Solution:
     """Return the solution of a run, with its error, at a tolerance that gives the `accuracy`."""
-    found, run, tried = solve_to(setup, state0, times, jnp.asarray(accuracy, times.dtype))
+    found, run, search = solve_to(setup, state0, times, jnp.asarray(accuracy, times.dtype))
     found = dataclasses.replace(found, throw=setup.throw)
     sol = _solution(found, event, state0, times, None if event is not None else run)
-    error = estimate_error_of_run(found, times, sol._states, sol.stats["num_steps"], tried)
+    error = estimate_error_of_run(found, times, sol._states, sol.stats["num_steps"], search)
     return with_error(sol, error, accuracy)
 
 

@@ -311,6 +311,7 @@ def accuracies(kind, n, seed, dtype, table):
             yes & ~had,
             ~yes & had,
             ~yes & had & (off < 0.1 * asked),
+            (stated / np.maximum(true, 1e-300))[yes & (off < 0.1 * stated)],
         )
     )
     for i in np.flatnonzero(yes & ~had | ~yes & had & (off < 0.1 * asked)):
@@ -431,12 +432,14 @@ def show_ratios(what, table):
 
 def show_accuracy(what, table):
     print(
-        "\n| accuracy | said yes, and so | said yes, not so | said no, was had | of these 10 times above round-off |"
+        "\n| accuracy | said yes, and so | said yes, not so | said no, was had | of these 10 times above round-off | stated over true, median and quartiles |"
     )
-    print("| --- | --- | --- | --- | --- |")
-    table.append(("all", *(np.concatenate([row[i] for row in table]) for i in (1, 2, 3, 4))))
-    for name, *parts in table:
-        print(f"| {name} | " + " | ".join(str(np.sum(part)) for part in parts) + " |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    table.append(("all", *(np.concatenate([row[i] for row in table]) for i in range(1, 6))))
+    for name, *parts, ratios in table:
+        three = np.quantile(ratios, [0.25, 0.5, 0.75]) if ratios.size else np.full(3, np.nan)
+        counts = " | ".join(str(np.sum(part)) for part in parts)
+        print(f"| {name} | {counts} | " + "{1:.1f} ({0:.1f}–{2:.1f}) |".format(*three))
 
 
 if __name__ == "__main__":

@@ -78,6 +78,21 @@ def test_round_off_is_not_stated_too_small(rtol, dtype):
         assert stated.max() < 15 * right.max(), (name, stated, right)
 
 
+@pytest.mark.parametrize("rtol", [1e-7, 1e-9, 1e-11])
+@pytest.mark.parametrize("deviation", [3e-6, -7e-6])
+def test_round_off_beside_the_middle_axis(rtol, deviation):
+    # The errors of the steps vanish near the middle axis and the rounding errors do not: after some
+    # turns of the axis all tolerances give the same error, about a millionth of a radian or more.
+    body = rj.Inertia.from_principal(0.34, 0.7, 0.98)
+    state = start(omega=(17.0 * deviation, 17.0, 7.0 * deviation))
+    ts = jnp.array([0.0, 60.0, 120.0])
+    sol = rj.simulate(body, state, ts, solver=STEPS, rtol=rtol, atol=1e-3 * rtol)
+    true = truly(sol.ys, rj.simulate(body, state, ts).ys)
+    for name, right in true.items():
+        stated = np.asarray(sol.error.total[name])[1:]
+        assert np.all(stated > 0.5 * right[1:]), (name, stated, right)
+
+
 def test_closed_form_beside_mpmath():
     sol = rj.simulate(BODY, start(), jnp.array([0.0, 3.0, 30.0]))
     error = sol.error

@@ -70,6 +70,26 @@ def test_smooth_laws_of_time_have_no_sudden_times():
     assert _sudden_times(still._setup, still.ts, still._states).size == 0
 
 
+def test_tables_are_not_searched_for_sudden_times():
+    from rigidjax.solve.error import _sudden_times
+
+    edges, rows = (
+        jnp.linspace(0.0, 9.0, 31),
+        jnp.asarray(np.random.default_rng(3).normal(size=(31, 3))),
+    )
+    tables = {
+        "pulses": rj.torques.Pulses(edges, rows[:30]),
+        "tabulated": rj.torques.Tabulated(edges, rows),
+    }
+    for name, law in tables.items():
+        alone = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), [0.0, 8.0], law)
+        assert _sudden_times(alone._setup, alone.ts, alone._states).size == 0, name
+        both = rj.torques.Sum(law, gaussian)
+        sol = rj.simulate(BODY, rj.Spin([0.1, 0.2, 0.3]), [0.0, 8.0], both)
+        times = np.asarray(_sudden_times(sol._setup, sol.ts, sol._states))
+        assert np.min(np.abs(times - 7.3131)) < 0.05, (name, times)
+
+
 class Until(eqx.Module):
     end: jax.Array
     size: jax.Array
