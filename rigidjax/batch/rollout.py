@@ -3,15 +3,15 @@
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, overload
 
+import diffrax as dfx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.sharding import Mesh
 from jaxtyping import Array, ArrayLike, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.batch.sharding import CompiledFunction, Devices, chunk_of, map_bodies, mesh_of
+from rigidjax.batch.sharding import CompiledFunction, Devices, Division, division_of, map_bodies
 from rigidjax.batch.validation import TorqueAxes, check_batch, inputs_of_bodies, one_body, step_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -54,6 +54,7 @@ def rollout(
     torque_axes: TorqueAxes = None,
     chunk: int | None = None,
     devices: Devices = None,
+    progress_meter: dfx.AbstractProgressMeter | None = None,
 ) -> State: ...
 
 
@@ -74,6 +75,7 @@ def rollout(
     torque_axes: TorqueAxes = None,
     chunk: int | None = None,
     devices: Devices = None,
+    progress_meter: dfx.AbstractProgressMeter | None = None,
 ) -> tuple[State, Reduced]: ...
 
 
@@ -93,6 +95,7 @@ def rollout(
     torque_axes: TorqueAxes = None,
     chunk: int | None = None,
     devices: Devices = None,
+    progress_meter: dfx.AbstractProgressMeter | None = None,
 ) -> Any:
     """Take `num_steps` fixed steps of N bodies, each with its own state, inertia and torque.
 
@@ -133,6 +136,8 @@ def rollout(
     - `devices`: `None` for the default device, `"all"` for all devices of this process, or a
       sequence of devices. The devices get equal shares of the bodies. Another choice changes the
       last digits at most.
+    - `progress_meter`: a progress meter of diffrax, such as `diffrax.TextProgressMeter()`, which is
+      moved after each chunk; without `devices`.
 
     **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
     (N, num_steps // save_every); with `reduce` the pair (last states, carried
@@ -178,7 +183,7 @@ def rollout(
     begin = _checks.checked_time(t0, "t0").astype(batch.dtype)
     numbers = (batch.shared, (batch.per_body, samples), start, h, begin)
     steps = solver, count, every, save_every is not None and reduce is None
-    division = chunk_of(chunk, batch.dtype, batch.num_bodies), mesh_of(devices)
+    division = division_of(chunk, devices, progress_meter, batch.dtype, batch.num_bodies)
     out = _compiled(steps, division, reduce, batch.constants, numbers)
     batch.require()
     return out
@@ -186,7 +191,7 @@ def rollout(
 
 def _take_steps(
     steps: tuple[Solver, int, int, bool],
-    division: tuple[int, Mesh | None],
+    division: Division,
     reduce: Reduce | None,
     constants: PyTree,
     numbers: tuple[PyTree, ...],
@@ -194,9 +199,9 @@ def _take_steps(
     """Return what `rollout` returns, from its checked arguments.
 
     **Arguments:** `steps` the solver, the number of steps, the number of steps between two saved
-    states, and whether states are saved; `division` the size of a chunk and the mesh of devices;
-    `constants` the leaves of the batch that are no arrays; `numbers` five
-    things: the arrays that all bodies share; the arrays with a row for each body, with the inputs;
+    states, and whether states are saved; `division` the size of a chunk, the devices and the
+    progress meter; `constants` the leaves of the batch that are no arrays; `numbers` five things:
+    the arrays that all bodies share; the arrays with a row for each body, with the inputs;
     the first carried value; the step size, s; and t0, s.
     """
     (solver, count, every, keep), (shared, per_body, initial, h, t0) = steps, numbers
@@ -235,7 +240,7 @@ def _take_steps(
         # With this the reverse pass computes each chunk again, and stores the states of one chunk
         # only.
         step_body = jax.checkpoint(step_body)
-    return map_bodies(step_body, (shared, initial, h, t0), per_body, *division)
+    return map_bodies(step_body, (shared, initial, h, t0), per_body, division)
 
 
 _compiled = CompiledFunction(_take_steps)

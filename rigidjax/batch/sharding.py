@@ -4,8 +4,9 @@ cache.
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -87,6 +88,46 @@ def mesh_of(devices: Devices) -> Mesh | None:
     return Mesh(np.array(devices), (AXIS,), axis_types=(AxisType.Auto,))
 
 
+class Division(NamedTuple):
+    """Describe how the bodies of a batch are divided into chunks.
+
+    **Fields:** `chunk` the number of bodies that each device computes at a time; `mesh` the
+    devices, which exchange nothing, or `None` for the default device; `progress_meter` a meter that
+    is moved after each chunk.
+    """
+
+    chunk: int
+    mesh: Mesh | None
+    progress_meter: dfx.AbstractProgressMeter
+
+
+def division_of(
+    chunk: int | None,
+    devices: Devices,
+    progress_meter: dfx.AbstractProgressMeter | None,
+    dtype: np.dtype,
+    count: int,
+) -> Division:
+    """Return the division of `count` bodies with numbers of the given `dtype`.
+
+    **Arguments:** `chunk`, `devices` and `progress_meter` as in `rigidjax.batch.rollout`.
+
+    **Raises:** `ValueError` for a progress meter together with devices.
+    """
+    if progress_meter is not None and devices is not None:
+        raise ValueError(
+            "progress_meter: wanted devices=None, since several devices would move one meter; got "
+            f"devices={devices!r}"
+        )
+    meter = dfx.NoProgressMeter() if progress_meter is None else progress_meter
+    if not isinstance(meter, dfx.AbstractProgressMeter):
+        raise TypeError(
+            "progress_meter: wanted a diffrax.AbstractProgressMeter such as "
+            f"diffrax.TextProgressMeter(), got {type(meter).__name__}"
+        )
+    return Division(chunk_of(chunk, dtype, count), mesh_of(devices), meter)
+
+
 def chunk_of(chunk: int | None, dtype: np.dtype, count: int) -> int:
     """Return the number of bodies that are computed at a time, out of `count`.
 
@@ -104,15 +145,15 @@ def map_bodies(
     function: Callable[[Any, Any], Any],
     shared: PyTree,
     per_body: PyTree,
-    chunk: int,
-    mesh: Mesh | None,
+    division: Division,
 ) -> PyTree:
     """Return `function(shared, row)` of every body, stacked along a new first axis.
 
     **Arguments:** `shared` the arrays that all bodies share; `per_body` arrays with a leading axis
-    of bodies, of which `row` is one row; `chunk` the number of bodies that each device computes at
-    a time; `mesh` the devices, which exchange nothing, or `None` for the default device.
+    of bodies, of which `row` is one row; `division` the size of a chunk, the devices and the
+    progress meter.
     """
+    chunk, mesh, meter = division
     count = jax.tree.leaves(per_body)[0].shape[0]
     parts = 1 if mesh is None else mesh.devices.size
     share = -(-count // parts)
@@ -129,7 +170,17 @@ def map_bodies(
             # same results, to the last bit, in every chunk.
             return lax.optimization_barrier(function(*lax.optimization_barrier((shared, row))))
 
-        return lax.map(call, rows, batch_size=chunk)
+        chunks = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), rows)
+        total = jax.tree.leaves(chunks)[0].shape[0]
+
+        def call_chunk(state: PyTree, numbered: tuple[Array, PyTree]) -> tuple[PyTree, PyTree]:
+            number, rows = numbered
+            out = jax.vmap(call)(rows)
+            return meter.step(state, (number + 1) / total), out
+
+        state, out = lax.scan(call_chunk, meter.init(), (jnp.arange(total), chunks))
+        meter.close(state)
+        return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), out)
 
     def pad(a: Array) -> Array:
         # The rows that fill the last chunk repeat the last body.

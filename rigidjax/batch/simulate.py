@@ -9,13 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.batch.rollout import Inputs, rollout
-from rigidjax.batch.sharding import CompiledFunction, Devices, chunk_of, map_bodies, mesh_of
+from rigidjax.batch.sharding import CompiledFunction, Devices, Division, division_of, map_bodies
 from rigidjax.batch.validation import BodyBatch, TorqueAxes, check_batch, one_body, step_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -87,13 +86,14 @@ def simulate(
     torque_axes: TorqueAxes = None,
     chunk: int | None = None,
     devices: Devices = None,
+    progress_meter: dfx.AbstractProgressMeter | None = None,
 ) -> Batch[State]:
     """Return the motion of N bodies, each with its own initial state, inertia and torque.
 
     **Arguments:**
 
-    - `bodies`, `states0`, `torque`, `torque_axes`, `chunk`, `devices`, and `inputs` (with `Steps`
-      only): as for `rigidjax.batch.rollout`.
+    - `bodies`, `states0`, `torque`, `torque_axes`, `chunk`, `devices`, `progress_meter`, and
+      `inputs` (with `Steps` only): as for `rigidjax.batch.rollout`.
     - `ts_or_steps`: times (T,), s, increasing or decreasing, which begin with the time of
       `states0`; or `Steps(size, number)` for fixed steps.
     - `solver`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
@@ -121,7 +121,7 @@ def simulate(
         options: dict[str, Any] = dict(
             solver=solver, inputs=inputs, torque_axes=torque_axes, chunk=chunk
         )
-        options |= dict(save_every=every, t0=t0, devices=devices)
+        options |= dict(save_every=every, t0=t0, devices=devices, progress_meter=progress_meter)
         ys: Any = rollout(bodies, states0, size, number, torque, **options)
         batch = check_batch(bodies, states0, torque, torque_axes)
         h, count = step_of(size, number, batch.dtype)
@@ -144,7 +144,7 @@ def simulate(
         rtol, atol = validation.checked_tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if solver is None else solver
     options = dict(solver=solver, rtol=rtol, atol=atol, max_steps=max_steps, adjoint=adjoint)
-    division = chunk_of(chunk, batch.dtype, batch.num_bodies), mesh_of(devices)
+    division = division_of(chunk, devices, progress_meter, batch.dtype, batch.num_bodies)
     numbers = (batch.shared, batch.per_body, ts)
     out = Batch(ts, *_compiled(options, division, batch.constants, numbers))
     batch.require()
@@ -153,18 +153,18 @@ def simulate(
 
 def _simulate_bodies(
     options: dict[str, Any],
-    division: tuple[int, Mesh | None],
+    division: Division,
     constants: PyTree,
     numbers: tuple[PyTree, PyTree, Array],
 ) -> tuple[Any, ...]:
     """Return four things for all bodies: `ys`, `result`, `num_steps` and `own` of a `Batch`.
 
     **Arguments:** `options` keyword arguments of `rigidjax.simulate`, which runs for each body;
-    `division` the size of a chunk and the mesh of devices; `constants` the leaves of the batch that
-    are no arrays; `numbers` the arrays that all bodies share, the arrays with a row for each body,
-    and the times, s.
+    `division` the size of a chunk, the devices and the progress meter; `constants` the leaves of
+    the batch that are no arrays; `numbers` the arrays that all bodies share, the arrays with a row
+    for each body, and the times, s.
     """
-    (shared, per_body, ts), (chunk, mesh) = numbers, division
+    shared, per_body, ts = numbers
 
     def simulate_body(shared_numbers: PyTree, row: PyTree) -> tuple[Any, ...]:
         shared, ts = shared_numbers
@@ -173,7 +173,7 @@ def _simulate_bodies(
         return sol.ys, sol.result, jnp.asarray(sol.stats["num_steps"], jnp.int32), sol.own
 
     if options["solver"] is None:
-        return map_bodies(simulate_body, (shared, ts), per_body, chunk, mesh)
+        return map_bodies(simulate_body, (shared, ts), per_body, division)
 
     def initial_speed(row: PyTree) -> Array:
         # This is |Ω| + √|dΩ/dt| at the start, rad/s, to sort by: the number of steps grows with
@@ -184,10 +184,10 @@ def _simulate_bodies(
         rate, change = jnp.sum(state0.omega**2), jnp.sum(slope.omega**2)
         return lax.stop_gradient(jnp.sqrt(rate) + jnp.sqrt(jnp.sqrt(change)))
 
-    parts = 1 if mesh is None else mesh.devices.size
-    order, inverse = order_by_key(jax.vmap(initial_speed)(per_body), chunk, parts)
+    parts = 1 if division.mesh is None else division.mesh.devices.size
+    order, inverse = order_by_key(jax.vmap(initial_speed)(per_body), division.chunk, parts)
     rows = jax.tree.map(lambda a: a[order], per_body)
-    out = map_bodies(simulate_body, (shared, ts), rows, chunk, mesh)
+    out = map_bodies(simulate_body, (shared, ts), rows, division)
     return jax.tree.map(lambda a: a[inverse], out)
 
 

@@ -97,17 +97,15 @@ def test_a_gpu_takes_steps_in_pieces(monkeypatch):
 
 
 def test_bodies_of_an_odd_number(monkeypatch):
-    sizes, real = [], jax.lax.map
-
-    def mapped(f, a, batch_size):
-        sizes.append(batch_size)
-        return real(f, a, batch_size=batch_size)
-
     monkeypatch.setattr(sharding, "platform", lambda: "gpu")
-    monkeypatch.setattr(sharding.lax, "map", mapped)
-    there = sharding.map_bodies(lambda s, x: s * x, jnp.asarray(2.0), jnp.arange(4.0), 4, None)
-    np.testing.assert_array_equal(there, 2 * np.arange(4.0))
-    assert sizes == [5]
+    division = sharding.division_of(4, None, None, np.dtype(float), 4)
+
+    def doubled(x):
+        return sharding.map_bodies(lambda s, x: s * x, jnp.asarray(2.0), x, division)
+
+    np.testing.assert_array_equal(doubled(jnp.arange(4.0)), 2 * np.arange(4.0))
+    # One chunk of five bodies, of which the last one fills it up.
+    assert "f64[1,5]" in str(jax.make_jaxpr(doubled)(jnp.arange(4.0)))
 
 
 def test_many_rows_are_checked_where_they_are():

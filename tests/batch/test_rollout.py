@@ -9,7 +9,7 @@ import pytest
 from once import once
 
 import rigidjax as rj
-from rigidjax.batch.sharding import map_bodies
+from rigidjax.batch.sharding import division_of, map_bodies
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.solve import fixed
 
@@ -307,8 +307,49 @@ def test_words(unhooked):
 
 def test_chunks_cover_all():
     each = jnp.arange(7.0)
-    found = map_bodies(lambda s, x: s * x, jnp.asarray(2.0), each, 3, None)
+    division = division_of(3, None, None, each.dtype, 7)
+    found = map_bodies(lambda s, x: s * x, jnp.asarray(2.0), each, division)
     assert np.array_equal(found, 2 * np.arange(7.0))
+
+
+class Recorder(dfx.AbstractProgressMeter):
+    """Append each progress to a list."""
+
+    seen: list = eqx.field(static=True)
+
+    def init(self):
+        return jnp.zeros(())
+
+    def step(self, state, progress):
+        jax.debug.callback(lambda p: self.seen.append(float(p)), progress, ordered=True)
+        return progress
+
+    def close(self, state):
+        jax.debug.callback(lambda p: self.seen.append("closed"), state, ordered=True)
+
+
+class Log(list):
+    __hash__ = object.__hash__
+
+
+@pytest.mark.parametrize("how", ["steps", "times"])
+def test_a_meter_moves_after_each_chunk(how):
+    bodies, states = batch(7)
+    meter = Recorder(Log())
+
+    def run(**more):
+        if how == "steps":
+            return rj.batch.rollout(bodies, states, 0.1, 4, TOP, chunk=2, **more)
+        return rj.batch.simulate(bodies, states, [0.0, 0.4], TOP, chunk=2, **more).ys
+
+    with_meter = run(progress_meter=meter)
+    jax.effects_barrier()
+    assert meter.seen == [0.25, 0.5, 0.75, 1.0, "closed"]
+    assert np.array_equal(with_meter.q, run().q)
+    with pytest.raises(ValueError, match="progress_meter: wanted devices=None"):
+        run(progress_meter=meter, devices="all")
+    with pytest.raises(TypeError, match="progress_meter"):
+        run(progress_meter=True)
 
 
 def _temporary(count, steps):
