@@ -393,8 +393,7 @@ def _run_logs(options: argparse.Namespace) -> int:
     print()
     print(rj.identify.report.table(rj.identify.report.rows(fit, rate_unit)))
     for sensor, rms in zip(model.records.sensors, fit.rms, strict=True):
-        scale = 180 / 3.141592653589793 if sensor.unit == "rad/s" and rate_unit == "deg/s" else 1.0
-        unit = rate_unit if sensor.unit == "rad/s" else sensor.unit
+        scale, unit = rj.identify.report.shown_unit(sensor.unit, rate_unit)
         print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
     print()
     print(rj.identify.report.verdict(fit))

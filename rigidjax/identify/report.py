@@ -25,7 +25,8 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
     **Arguments:**
 
     - `fit`: a result of `rigidjax.identify.fit`.
-    - `rate_unit`: the unit of the initial body rate: `rad/s`, `deg/s` or `deg/day`.
+    - `rate_unit`: the unit of all angular rates, such as initial rates and biases of gyros:
+      `rad/s`, `deg/s` or `deg/day`.
 
     >>> result = rj.identify.fit(rj.datasets.toutatis.model())
     >>> name, value, low, high, unit = rows(result)[0]
@@ -33,18 +34,30 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
     ('Ix/Iz', 3.1, True)
     """
     require_one_fit(fit)
-    scale = _UNITS[_checks.require_option(rate_unit, tuple(_UNITS), "rate_unit")]
     bounds = fit.interval(0.95)
     out: list[Row] = []
     for quantity in fit.quantities:
         low, high = bounds[quantity.name]
-        row = (quantity.name, quantity.value, low, high, quantity.unit)
-        if quantity.name.startswith("Ω"):
-            axis, *where = quantity.name.split(" ", 1)
+        scale, unit = shown_unit(quantity.unit, rate_unit)
+        name = quantity.name
+        if name.startswith("Ω"):
+            axis, *where = name.split(" ", 1)
             name = " ".join([axis, "at the start", *where])
-            row = (name, quantity.value * scale, low * scale, high * scale, rate_unit)
-        out.append(row)
+        out.append((name, quantity.value * scale, low * scale, high * scale, unit))
     return out
+
+
+def shown_unit(unit: str, rate_unit: str) -> tuple[float, str]:
+    """Return the factor by which a value with `unit` is multiplied to be shown, and the unit then.
+
+    **Arguments:** `unit` of the value; `rate_unit` the unit in which angular rates are shown:
+    `rad/s`, `deg/s` or `deg/day`. Only values in rad/s are converted.
+
+    >>> shown_unit("N m", "deg/s"), shown_unit("rad/s", "rad/s")
+    ((1.0, 'N m'), (1.0, 'rad/s'))
+    """
+    scale = _UNITS[_checks.require_option(rate_unit, tuple(_UNITS), "rate_unit")]
+    return (float(scale), rate_unit) if unit == "rad/s" else (1.0, unit)
 
 
 def table(lines: list[Row]) -> str:
@@ -273,8 +286,10 @@ def write_html(
     '<!doctype html>'
     """
     require_one_fit(fit)
+    units = [shown_unit(unit, rate_unit) for *_, unit in _rms_of_axes(fit)]
     sizes = _cells(
-        (name, " ".join(f"{x:.3g}" for x in axes), unit) for name, axes, unit in _rms_of_axes(fit)
+        (name, " ".join(f"{scale * x:.3g}" for x in axes), unit)
+        for (name, axes, _), (scale, unit) in zip(_rms_of_axes(fit), units, strict=True)
     )
     starts = _cells(
         (

@@ -133,6 +133,16 @@ def test_names_of_columns_and_parameters_are_escaped_on_the_page(tmp_path):
     rj.identify.report.write_html(found, page, title="<script>", files=["<script>"])
     text = page.read_text()
     assert "<script>" not in text and text.count("&lt;script&gt;") >= 5
+    # Initial rates, biases of gyros and residuals of gyros have one unit.
+    plain, shown = (rj.identify.report.rows(found, unit) for unit in ("rad/s", "deg/s"))
+    rates = [index for index, row in enumerate(plain) if row[4] == "rad/s"]
+    assert {plain[index][0][:3] for index in rates} == {"Ωx ", "Ωy ", "Ωz ", "<sc"}
+    for index, (before, after) in enumerate(zip(plain, shown, strict=True)):
+        factor, unit = (180 / np.pi, "deg/s") if index in rates else (1.0, before[4])
+        np.testing.assert_allclose(after[1:4], factor * np.array(before[1:4]), rtol=1e-14)
+        assert (after[0], after[4]) == (before[0], unit)
+    rj.identify.report.write_html(found, page, rate_unit="deg/s")
+    assert "deg/s" in page.read_text() and "rad/s" not in page.read_text()
 
 
 @pytest.mark.parametrize("broken", ["fit", "residuals", "write_json", "write_html", "both"])
