@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 
 import rigidjax as rj
 from rigidjax import identify
+from rigidjax.workprecision.record import read_csv
 
 jax.config.update("jax_enable_x64", True)
 HERE = Path(__file__).parent
@@ -150,6 +151,51 @@ def simulators():
     save(figure, "simulators.png")
 
 
+def workprecision():
+    """Draw time against error on the heavy top, from the records stored beside this file."""
+    records = read_csv(HERE / "workprecision.csv")
+    # (label of the records, shown name, mark, line); what is ours is drawn full.
+    panels = {
+        "value": [
+            ("simulate", "simulate", "o", "-"),
+            ("DormandPrince8, equal steps", "equal steps (DormandPrince8)", "s", "-"),
+            ("diffrax Dopri8", "diffrax Dopri8", "^", "--"),
+            ("diffrax Tsit5", "diffrax Tsit5", "v", "--"),
+            ("heyoka Taylor", "heyoka", "D", ":"),
+            ("MuJoCo RK4", "MuJoCo RK4", "P", ":"),
+            ("scipy DOP853, numba", "SciPy DOP853 with numba", "X", ":"),
+        ],
+        "gradient": [
+            ("simulate, reverse", "simulate", "o", "-"),
+            ("diffrax Dopri8, checkpointed", "diffrax Dopri8, checkpointed", "^", "--"),
+            ("diffrax Dopri8, backsolve", "diffrax Dopri8, backsolve", "v", "--"),
+            ("gradsolve Vern7, replay", "gradsolve, replay", "*", "--"),
+            ("heyoka Taylor, variational", "heyoka, variational", "D", ":"),
+        ],
+    }
+    figure, axes = plt.subplots(1, 2, figsize=(9.2, 4.9), layout="constrained")
+    for ax, (kind, lines) in zip(axes, panels.items(), strict=True):
+        for place, (label, name, mark, line) in enumerate(lines):
+            of = [r for r in records if (r.scene, r.kind, r.label) == ("heavy-top", kind, label)]
+            of.sort(key=lambda r: r.setting)
+            ax.plot(
+                [r.error for r in of], [1e3 * r.time for r in of], marker=mark, ls=line, ms=5,
+                lw=2.2 if line == "-" else 1.2, color=rj.plot.COLOURS[place % len(rj.plot.COLOURS)],
+                label=name,
+            )  # fmt: skip
+        ax.set(xscale="log", yscale="log", ylabel="time of one run, ms")
+        ax.invert_xaxis()
+        ax.grid(alpha=0.3)
+        ax.legend(
+            fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncol=2, frameon=False
+        )
+    axes[0].set(xlabel="error of the attitude after 50 s, rad", title="a value")
+    axes[1].set(
+        xlabel="relative error of the gradient", title="a gradient with respect to 13 numbers"
+    )
+    save(figure, "workprecision.png")
+
+
 if __name__ == "__main__":
-    for draw in (frames, flip, start, fit, predict, simulators):
+    for draw in (frames, flip, start, fit, predict, simulators, workprecision):
         draw()
