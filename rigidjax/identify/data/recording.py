@@ -157,7 +157,7 @@ class Recording(eqx.Module):
         # A slice makes no copy of a long recording.
         kept = used if self.dropped else slice(None)
         self.t = jnp.asarray(t[kept])
-        _require_digits(t[kept], self.t.dtype)
+        _require_distinct_times(t[kept], self.t.dtype)
         self.readings = tuple(
             Reading(sensor, jnp.asarray(values[kept]), jnp.asarray(mask[kept]))
             for sensor, values, mask, _ in rows
@@ -251,7 +251,7 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
     return out
 
 
-def _require_digits(t: np.ndarray, dtype: np.dtype) -> None:
+def _require_distinct_times(t: np.ndarray, dtype: np.dtype) -> None:
     """Raise `ValueError` if rounding the times `t` to the `dtype` makes a step zero.
 
     The function warns if rounding changes a step by more than a tenth.

@@ -75,11 +75,11 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     known = s[:, 1] + np.sign(np.linalg.det(b)) * s[:, 2] > _DETERMINED * s[:, 0]
     if not known.any():
         return np.zeros(0), np.zeros((0, 4))
-    return t[mask][known], np.asarray(_attitudes_of(b[known]))
+    return t[mask][known], np.asarray(_attitudes_by_wahba(b[known]))
 
 
 @jax.jit
-def _attitudes_of(sums: ArrayLike) -> Array:
+def _attitudes_by_wahba(sums: ArrayLike) -> Array:
     """Return the attitudes (n, 4) that best turn directions in the body into directions in the
     world.
 
@@ -111,18 +111,18 @@ def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarr
     """
     if t.size < 2:
         return np.zeros(0), np.zeros((0, 3))
-    steps = np.linalg.norm(_rotation_vectors(q[:-1], q[1:]), axis=1)
+    steps = np.linalg.norm(_rotation_vectors_between(q[:-1], q[1:]), axis=1)
     turned = np.concatenate([[0.0], np.cumsum(steps)])
     first = np.arange(t.size - 1)
     last = np.searchsorted(turned, turned[first] + _TURN, side="right") - 1
     last = np.clip(np.maximum(last, first + 1), 1, t.size - 1)
     gap = t[last] - t[first]
-    turns = np.asarray(_rotation_vectors(q[first], q[last]))
+    turns = np.asarray(_rotation_vectors_between(q[first], q[last]))
     return 0.5 * (t[first] + t[last]), turns / gap[:, None]
 
 
 @jax.jit
-def _rotation_vectors(p: ArrayLike, q: ArrayLike) -> Array:
+def _rotation_vectors_between(p: ArrayLike, q: ArrayLike) -> Array:
     """Return the shortest rotation vectors (n, 3), rad, that turn attitudes p into attitudes q.
 
     The attitudes p and q (n, 4) are quaternions, whose signs do not matter. The vectors are given
@@ -169,7 +169,7 @@ def reference_of(recordings: Sequence[Recording], state_type: type) -> Reference
     reference state is zero.
     """
     turns = [[*attitudes(r)[1], np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
-    places = [_first_position(r) for r in recordings]
+    places = [_first_position_and_velocity(r) for r in recordings]
     dtype = recordings[0].t.dtype
     # Use arrays: with Python floats a program would be compiled for each recording.
     x, v, length = (jnp.asarray(np.stack(part), dtype) for part in zip(*places, strict=True))
@@ -198,7 +198,7 @@ def _typical_rate(recording: Recording) -> float:
     return rate if rate > 0 else 1.0
 
 
-def _first_position(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
+def _first_position_and_velocity(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the first position of a recording.
 
     Three things are returned: the first position (3,), m; the first velocity (3,), m/s; and a
@@ -212,12 +212,12 @@ def _first_position(recording: Recording) -> tuple[np.ndarray, np.ndarray, float
     if positions:
         when, x = t[positions[0].host_mask], np.asarray(positions[0].values)[positions[0].host_mask]
     elif markers:
-        when, x = _places_by_markers(recording, markers)
+        when, x = _origins_by_markers(recording, markers)
     elif ranges:
         mask = np.all([r.host_mask for r in ranges], axis=0)
         stations = np.stack([np.asarray(r.sensor.station) for r in ranges])
         lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[mask]
-        when, x = t[mask], _places_by_ranges(stations, lengths)
+        when, x = t[mask], _positions_by_ranges(stations, lengths)
     if speeds and (positions or not markers):
         v = np.asarray(speeds[0].values)[speeds[0].host_mask][0]
     else:
@@ -228,7 +228,7 @@ def _first_position(recording: Recording) -> tuple[np.ndarray, np.ndarray, float
     return x[0], v, float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
 
 
-def _places_by_markers(
+def _origins_by_markers(
     recording: Recording, markers: Sequence[Any]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return times (n,), s, and the positions (n, 3), m, of the origin of the body frame.
@@ -259,7 +259,7 @@ def _first_velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
 
 
-def _places_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+def _positions_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Return the positions x (n, 3) whose distances from k stations are `lengths` (n, k).
 
     `stations` (k, 3) holds the positions s of the stations. The equations `|x|² − 2 s·x + |s|² =

@@ -22,11 +22,11 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
     (the `Linear` and `Series` in inputs and sensors) are padded with their last value.
     """
     counts = np.array([r.t.shape[0] for r in recordings], np.int32)
-    rows = max(_count_rows(recording, 0) for recording in recordings)
+    rows = max(_count_table_rows(recording, 0) for recording in recordings)
     alike = [pad_recording(r, int(counts.max()), rows) for r in recordings]
     # An input may contain objects that are not numbers, such as functions. Such objects must be the
     # same for all recordings.
-    numbers, others = zip(*(eqx.partition(r, _is_number) for r in alike), strict=True)
+    numbers, others = zip(*(eqx.partition(r, _is_stackable) for r in alike), strict=True)
     shapes = [[np.shape(x) for x in jax.tree.leaves(r)] for r in numbers]
     for index, other in enumerate(others):
         if not (eqx.tree_equal(other, others[0]) is True and shapes[index] == shapes[0]):
@@ -38,7 +38,7 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
     return eqx.combine(jax.tree.map(_stack_leaves, *numbers), others[0]), counts
 
 
-def _is_number(leaf: PyTree) -> bool:
+def _is_stackable(leaf: PyTree) -> bool:
     """Return whether a `leaf` of a tree is an array or a Python float, which `stack` may stack."""
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | complex)
 
@@ -53,12 +53,15 @@ def pad_to_few_lengths(model: PyTree) -> Any:
     if model.clusters is not None:
         return model
     longer = pad_recording(
-        records, _padded_length(records.t.shape[1]), _padded_length(_count_rows(records, 1)), 1
+        records,
+        _padded_length(records.t.shape[1]),
+        _padded_length(_count_table_rows(records, 1)),
+        1,
     )
     return eqx.tree_at(lambda m: m.records, model, longer)
 
 
-def _count_rows(recording: Recording, axis: int) -> int:
+def _count_table_rows(recording: Recording, axis: int) -> int:
     """Return the number of rows of the longest table of time in the inputs and sensors.
 
     The result is 0 if the `recording` has no table. The rows of a table are along `axis`.
@@ -173,15 +176,15 @@ def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0
     parts = [(r.values, r.mask, r.jitter_error) for r in recording.readings]
     if missing:
         inputs = {
-            name: _repeat_last(source, missing, axis) if eqx.is_array(source) else source
+            name: _extend_at_end(source, missing, axis) if eqx.is_array(source) else source
             for name, source in inputs.items()
         }
-        t = _repeat_last(t, missing, axis)
+        t = _extend_at_end(t, missing, axis)
         parts = [
             (
-                _repeat_last(values, missing, axis),
-                _repeat_last(mask, missing, axis, False),
-                None if late is None else _repeat_last(late, missing, axis),
+                _extend_at_end(values, missing, axis),
+                _extend_at_end(mask, missing, axis, False),
+                None if late is None else _extend_at_end(late, missing, axis),
             )
             for values, mask, late in parts
         ]
@@ -201,9 +204,9 @@ def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
     missing = rows - table.values.shape[axis]
     if missing <= 0:
         return table
-    values = _repeat_last(table.values, missing, axis)
+    values = _extend_at_end(table.values, missing, axis)
     if isinstance(table, Series):
-        slopes = _repeat_last(table.slopes, missing, axis, 0.0)
+        slopes = _extend_at_end(table.slopes, missing, axis, 0.0)
         return eqx.tree_at(lambda s: (s.values, s.slopes), table, (values, slopes))
     last = table.times[..., -1:]
     more = last + (last - table.times[..., -2:-1]) * np.arange(1, missing + 1, dtype=last.dtype)
@@ -211,7 +214,7 @@ def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
     return eqx.tree_at(lambda s: (s.times, s.values), table, (times, values))
 
 
-def _repeat_last(
+def _extend_at_end(
     values: ArrayLike, count: int, axis: int, fill: float | bool | None = None
 ) -> Array:
     """Return `values` with `count` entries added at the end of `axis`.

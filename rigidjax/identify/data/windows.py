@@ -245,8 +245,8 @@ def windows(
     if not isinstance(inputs, Mapping | None):
         raise TypeError(f"inputs: wanted arrays by name, got {type(inputs).__name__}")
     inputs = {k: _checks.without_mask(v, f"inputs[{k!r}]") for k, v in (inputs or {}).items()}
-    _require_rows(times, states, inputs)
-    h, even = _step_of(times)
+    _require_finite_rows(times, states, inputs)
+    h, even = _sampling_step(times)
     broken = np.concatenate([[0], np.cumsum(~even)])
     begin = np.arange(before, times.size - length, stride)
     begin = begin[broken[begin + length] == broken[begin - before]]
@@ -270,7 +270,7 @@ def windows(
                 "starts: deviations of the starts need the noise of the readings: give noise={…}, "
                 "too"
             )
-        starts = _checked_by_kind(starts, kinds, "starts", _start_deviation)
+        starts = _checked_by_kind(starts, kinds, "starts", _checked_start_deviation)
     return Windows(
         round(h, 12),
         jax.tree.map(lambda a: jnp.asarray(a[begin]), arrays),
@@ -296,7 +296,7 @@ def _checked_by_kind(
     return {kind: float(check(by_kind[kind], f"{name}[{kind!r}]")) for kind in kinds}
 
 
-def _start_deviation(value: object, name: str) -> float:
+def _checked_start_deviation(value: object, name: str) -> float:
     """Return the standard deviation of a start as a float.
 
     A `ValueError`, which calls the deviation `name`, is raised unless it is positive or infinite.
@@ -310,7 +310,7 @@ def _start_deviation(value: object, name: str) -> float:
     return number
 
 
-def _require_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) -> None:
+def _require_finite_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) -> None:
     """Raise `ValueError` unless `states` and `inputs` have a row of finite numbers for each time.
 
     A `ValueError` is raised for quaternions that are not of unit length as well.
@@ -338,7 +338,7 @@ def _require_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) 
             )
 
 
-def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
+def _sampling_step(times: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the time between two samples, s, and a mask (T − 1,) of the intervals of this length.
 
     An interval between successive `times` (T,) at which the mask is false has missing samples.

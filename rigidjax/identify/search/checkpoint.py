@@ -92,7 +92,7 @@ class Checkpoint:
         self.print_of = print_of
         self.done: list[Attempt] = []
         if self.path is not None and self.path.exists():
-            self._read(self.path)
+            self._read_attempts(self.path)
 
     def save(self, attempts: Sequence[Attempt]) -> None:
         """Write the finished `attempts` to the file; the old file is replaced in one (atomic)
@@ -118,7 +118,7 @@ class Checkpoint:
             with contextlib.suppress(OSError):
                 part.unlink(missing_ok=True)
 
-    def _read(self, path: Path) -> None:
+    def _read_attempts(self, path: Path) -> None:
         """Read the results of the finished starts from a file; raise `ValueError` for a file of
         another search.
         """

@@ -37,7 +37,7 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
     errors = blocks[0]
     weights = reading_weights(model, errors, noise)
     groups, out = np.asarray(model.noise_groups), []
-    shares = _shares_left(model, x, blocks, noise)
+    shares = _remaining_shares(model, x, blocks, noise)
     readings = list(model.records.readings)
     for index, (reading, error, sigma, weight, share) in enumerate(
         zip(readings, errors, noise, weights, shares, strict=True)
@@ -66,7 +66,9 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
             size = np.asarray(sigma, float)
             e, u = (np.where(mask, np.asarray(x) / size[:, None], 0.0) for x in (error, change))
             tau = None if sensor.jitter.estimated else np.asarray(sensor.jitter.deviation)
-            both = _noise_and_jitter(e * root[..., None], u, mask.sum(axis=-1), groups, known, tau)
+            both = _most_likely_noise_and_jitter(
+                e * root[..., None], u, mask.sum(axis=-1), groups, known, tau
+            )
             grown, tau = (jnp.asarray(each, sigma.dtype) for each in both)
             sigma = sigma * grown[:, None]
             readings[index] = reading.with_jitter(tau[:, None, None] * change, tau)
@@ -119,7 +121,7 @@ def median_of_chi2(size: int) -> tuple[float, float]:
     return median, float(density)
 
 
-def _shares_left(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[np.ndarray]:
+def _remaining_shares(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[np.ndarray]:
     """Return, for each sensor, the shares (groups,) of the squared errors that remain after a fit.
 
     The share of a group is one minus the mean leverage of its errors, and at least 0.1.
@@ -138,7 +140,7 @@ def _shares_left(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[n
     return [np.maximum(1.0 - n / np.maximum(m, 1), 0.1) for n, m in zip(taken, sizes, strict=True)]
 
 
-def _noise_and_jitter(
+def _most_likely_noise_and_jitter(
     e: np.ndarray,
     u: np.ndarray,
     count: np.ndarray,

@@ -124,7 +124,7 @@ def least_squares_from(
     - `settings`: the settings of the search.
     """
     number, kind, places = model.size, x.dtype, model.index.places
-    model = _until_last_weight(model, weights)
+    model = _model_until_last_weight(model, weights)
     prior = terms.prior_weights(model)
     alone = np.asarray(model.index.alone, int) if model.count >= MANY else None
 
@@ -155,7 +155,7 @@ def least_squares_from(
         (jnp.zeros((places.shape[0], 0, 0, places.shape[1]), kind),), places, number, alone
     )
     windows = model.clusters is not None
-    by_noise = partial(_gain_of_noise, model) if windows else None
+    by_noise = partial(_expected_gain_of_noise, model) if windows else None
     order_one = is_order_one(model, kind)
     end = minimise(evaluate, x, order_one, settings, zeros, zero_normal, by_noise)
     # If the cost is finite at no point, not even at the start, the start stays the best point.
@@ -168,7 +168,9 @@ def least_squares_from(
     )
 
 
-def _gain_of_noise(model: Model, evaluation: Evaluation, normal: NormalMatrix) -> Float[Array, ""]:
+def _expected_gain_of_noise(
+    model: Model, evaluation: Evaluation, normal: NormalMatrix
+) -> Float[Array, ""]:
     """Return `½ tr(K G⁻¹)`, the expected gain in the cost of windows by a fit to noise alone.
 
     The gain is the excess of the cost at the true numbers over the least cost. G is the normal
@@ -217,7 +219,7 @@ def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
     return jnp.pad(rows, ((0, 0), (0, slope.size - rows.shape[1])))
 
 
-def _until_last_weight(model: Model, weights: Float[Array, "records times"]) -> Model:
+def _model_until_last_weight(model: Model, weights: Float[Array, "records times"]) -> Model:
     """Return the model with an integrator that stops soon after the last time with a positive
     weight.
 

@@ -125,7 +125,7 @@ def balance_of_momentum(
     t, w = rates(recording)
     w, pushed = w @ turn.T, np.zeros((t.size, 3))
     if torque is not None:
-        pushed = np.asarray(_torques(bind(torque, sources_of(recording)), t, w))
+        pushed = np.asarray(_torques_at(bind(torque, sources_of(recording)), t, w))
     momenta = np.einsum("kij,tj->tki", BASIS, w)
     turned = np.concatenate([np.cross(w[:, None, :], momenta), pushed[:, None, :]], axis=1)
     steps = 0.5 * (turned[1:] + turned[:-1]) * np.diff(t)[:, None, None]
@@ -142,7 +142,7 @@ def balance_of_momentum(
 
 
 @eqx.filter_jit
-def _torques(torque: Torque, t: ArrayLike, w: ArrayLike) -> Array:
+def _torques_at(torque: Torque, t: ArrayLike, w: ArrayLike) -> Array:
     """Return the torques (n, 3) at the times t (n,) and the body rates w (n, 3)."""
     body = Inertia(jnp.eye(3))
     return jax.vmap(lambda time, omega: evaluate(torque, time, Spin(omega), body))(t, w)
