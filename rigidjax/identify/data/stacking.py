@@ -39,15 +39,18 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
 
 
 def _is_stackable(leaf: PyTree) -> bool:
-    """Return whether a `leaf` of a tree is an array or a Python float, which `stack` may stack."""
+    """Return whether a `leaf` (an end) of a tree of JAX is an array or a Python float, so that
+    `stack` may stack it along a new axis.
+    """
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | complex)
 
 
 def pad_to_few_lengths(model: PyTree) -> Any:
-    """Return the model with its recordings padded by masked readings to one of few lengths.
+    """Return a `model` with its recordings padded by masked readings to one of few lengths.
 
     Between a length and its double there are about four such lengths, so that few programs are
-    compiled. A model of windows stays unchanged: all windows have one length already.
+    compiled. A model of windows (short parts of a record of measured states) stays unchanged: all
+    windows have one length already.
     """
     records = model.records
     if model.clusters is not None:
@@ -62,9 +65,11 @@ def pad_to_few_lengths(model: PyTree) -> Any:
 
 
 def _count_table_rows(recording: Recording, axis: int) -> int:
-    """Return the number of rows of the longest table of time in the inputs and sensors.
+    """Return the number of rows of the longest table of time (a `Linear` or `Series`) in the inputs
+    and sensors of a `recording`, or 0 without a table.
 
-    The result is 0 if the `recording` has no table. The rows of a table are along `axis`.
+    The rows of a table are along `axis`: 0 for one recording, 1 for several recordings with a
+    leading axis.
     """
     parts = recording.inputs, recording.sensors
     tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))
@@ -72,10 +77,11 @@ def _count_table_rows(recording: Recording, axis: int) -> int:
 
 
 def _padded_length(count: int) -> int:
-    """Return the padded length of a recording with `count` times.
+    """Return the number of times to which a recording with `count` times is padded, one of few
+    allowed numbers.
 
-    It is the least allowed length that is not below `count`. The allowed lengths are powers of
-    2^(1/4), rounded up to multiples of 16.
+    It is the least allowed number that is not below `count`. The allowed numbers are powers of
+    2^(1/4), rounded up to multiples of 16; 0 stays 0.
     """
     if not count:
         return 0
@@ -85,7 +91,9 @@ def _padded_length(count: int) -> int:
 
 
 def _stack_leaves(*leaves: PyTree) -> Any:
-    """Return the leaves stacked along a new first axis."""
+    """Return arrays of one shape (the leaves with the same place in several trees) stacked along a
+    new first axis.
+    """
     # Use NumPy if the numbers are not traced: JAX would compile a program for each shape.
     if _checks.is_known(leaves):
         return _constant_array(np.stack([np.asarray(leaf) for leaf in leaves]))
@@ -93,7 +101,8 @@ def _stack_leaves(*leaves: PyTree) -> Any:
 
 
 def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "*rows"]) -> PyTree:
-    """Return the tree `records` with each array picked at `index` of its leading axis.
+    """Return one or some of the recordings in a tree: the tree `records` with each array picked at
+    `index` of its leading axis.
 
     `index` is one index, a slice, or an array of indices. Leaves that are not arrays are unchanged.
     """
@@ -108,7 +117,9 @@ def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "
 
 
 def _constant_array(array: np.ndarray | np.generic) -> Array:
-    """Return a JAX array with the numbers of `array`, which is not traced even within `jit`."""
+    """Return a JAX array with the numbers of the NumPy `array`, which is not traced even within
+    `jit`.
+    """
     with jax.ensure_compile_time_eval():
         return jnp.asarray(array)
 
@@ -153,7 +164,9 @@ def take_rows(recording: Recording, end: int, begin: int = 0, axis: int = 0) -> 
 
 
 def _is_table(node: PyTree) -> bool:
-    """Return whether a `node` of a tree is a table of time, a `Linear` or a `Series`."""
+    """Return whether a `node` of a tree of JAX is a table of time: a `Linear` or a `Series`, which
+    interpolates values between times.
+    """
     return isinstance(node, Linear | Series)
 
 
@@ -197,9 +210,12 @@ def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0
 
 
 def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
-    """Return a table of time padded to `rows` rows along `axis`.
+    """Return a `table` of time (a `Linear` or `Series`, which interpolates values between times)
+    padded to `rows` rows along `axis`.
 
-    The last value of the table is repeated after its last time.
+    The last value of the table is repeated after its last time. A table with enough rows is
+    unchanged. `axis` is 0 for the table of one recording, 1 for stacked tables of several
+    recordings.
     """
     missing = rows - table.values.shape[axis]
     if missing <= 0:
@@ -217,7 +233,7 @@ def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
 def _extend_at_end(
     values: ArrayLike, count: int, axis: int, fill: float | bool | None = None
 ) -> Array:
-    """Return `values` with `count` entries added at the end of `axis`.
+    """Return the array `values` with `count` entries added at the end of `axis`.
 
     Each added entry is the last entry or, if `fill` is given, the number `fill`.
     """
