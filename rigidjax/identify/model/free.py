@@ -306,11 +306,11 @@ TOLERANCES = {"scale": "scale", "skew": "cross_axis", "bias": "bias", "offset": 
 
 
 def _tolerance_of_sensor(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
-    """Return the tolerance from a data sheet for the numbers of a sensor at a `path` in a `scene`,
-    or `None` if there is none.
+    """Return the tolerance of a sensor, from its data sheet, for the numbers at a `path` in a
+    `scene`, or `None` if there is none.
 
-    `path` is the path (a tuple of keys of JAX) of a leaf of the scene. The tolerance is a standard
-    deviation in the unit of the leaf; it serves as a prior of the leaf.
+    The tolerance is the standard deviation of these numbers, such as a bias in the sensor's unit;
+    it serves as their prior. `path` is the path (a tuple of keys of JAX) of a leaf of the scene.
     """
     if len(path) != 3 or getattr(path[0], "name", "") != "sensors":
         return None

@@ -45,8 +45,8 @@ class Index(eqx.Module):
     size: int = eqx.field(static=True)
 
     def rows(self, x: Float[Array, " n"]) -> Float[Array, "records row"]:
-        """Return the row of each recording: the free numbers (R, width) on which each of R
-        recordings depends, out of all n free numbers x of the model.
+        """Return the row of each recording: the numbers (R, width) on which each of R recordings
+        depends, taken from all n free numbers x (n,) of the model.
         """
         wide = jnp.append(x, jnp.zeros(1, x.dtype))[self.places]
         twice = np.asarray(self.columns[self.width :], int)

@@ -372,7 +372,7 @@ def polish(
     **Arguments:**
 
     - `begin`: the attempt at the first point.
-    - `task`: the task of the search.
+    - `task`: the model, its noise, the tolerance, and the largest number of steps.
     - `damping`: the damping of the first stride.
     - `aim`: the cost that another start reached; a search that is not likely to reach this cost
       ends early.
@@ -421,7 +421,7 @@ def fit_in_stages(
     **Arguments:**
 
     - `x`: (n,) the free numbers at the start.
-    - `task`: the task of the search.
+    - `task`: the model, its noise, the tolerance, and the largest number of steps.
     - `aim`: the cost that another start reached; a search that is not likely to reach this cost
       ends early.
     - `watch`: a function that is called with each `Attempt` at a fit to the whole of the records.
