@@ -17,12 +17,12 @@ MOST = 0.7
 
 
 def full_scale_of(values: np.ndarray) -> float | None:
-    """Return the full scale of the readings `values` (T,) of one channel of a sensor.
+    """Return the full scale of one channel of a sensor, the largest value that it can read, if its
+    readings `values` (T,) are cut off there; else `None`.
 
-    The result is `None` unless the largest readings are cut off. Readings are cut off if more
-    readings in a row have the largest value than at the top of a smooth wave: there about 2 √(2d/a)
-    readings in a row are equal, where d is the last digit of the readings and a the typical second
-    difference of successive readings.
+    Readings are cut off if more readings in a row have the largest value than at the top of a
+    smooth wave: there about 2 √(2d/a) readings in a row are equal, where d is the last digit of the
+    readings and a the typical second difference of successive readings.
     """
     size = np.abs(values)
     top = float(size.max(initial=0.0))

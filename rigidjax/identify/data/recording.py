@@ -51,7 +51,8 @@ class Reading(eqx.Module):
 
     @property
     def channel_mask(self) -> np.ndarray:
-        """Return a mask (…, T, k), true for each channel that was read and is not at full scale.
+        """Return a mask (…, T, k), true for each channel that was read and is not at full scale
+        (the largest value that it can read).
 
         T is the number of times and k the number of components of an error.
         """
@@ -64,11 +65,14 @@ class Reading(eqx.Module):
         return mask & (np.abs(self.values) < np.asarray(limit)[..., None, :] * (1 - 1e-6))
 
     def with_jitter(self, jitter_error: Array, deviation: Array) -> "Reading":
-        """Return these readings with a new `jitter_error`, and a sensor with a new jitter.
+        """Return these readings with another jitter (random error of the time stamps).
 
-        `deviation`, s, is the standard deviation of the time stamps of the new sensor. A search
-        holds `jitter_error` constant: if the search changed `jitter_error`, errors would count less
-        wherever a motion changes quickly, and the search would prefer such motions.
+        A search holds `jitter_error` constant: if the search changed `jitter_error`, errors would
+        count less wherever a motion changes quickly, and the search would prefer such motions.
+
+        - `jitter_error`: (…, T, k) the error that a time stamp makes if it is one standard
+          deviation late.
+        - `deviation`: s, the standard deviation of the time stamps of the sensor.
         """
 
         def parts(reading: PyTree) -> Any:
@@ -157,7 +161,7 @@ class Recording(eqx.Module):
         # A slice makes no copy of a long recording.
         kept = used if self.dropped else slice(None)
         self.t = jnp.asarray(t[kept])
-        _require_digits(t[kept], self.t.dtype)
+        _require_distinct_times(t[kept], self.t.dtype)
         self.readings = tuple(
             Reading(sensor, jnp.asarray(values[kept]), jnp.asarray(mask[kept]))
             for sensor, values, mask, _ in rows
@@ -179,7 +183,9 @@ class Recording(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return the number of numbers that all sensors read, as `count_of` counts them."""
+        """Return how many numbers all sensors read together: for each sensor the number of unmasked
+        readings times the number of components of its error.
+        """
         return sum(count_of(reading) for reading in self.readings)
 
     @property
@@ -192,6 +198,10 @@ def recording_of(t: Array, readings: tuple[Reading, ...], inputs: dict[str, Any]
     """Return a `Recording` with the fields `t`, `readings` and `inputs`, without checks.
 
     The arrays may have a leading axis over recordings.
+
+    - `t`: (T,) the times, s.
+    - `readings`: for each sensor a `Reading`.
+    - `inputs`: a dict of name → samples (T, *k), or a function of time.
     """
     record = object.__new__(Recording)
     parts = {"t": t, "readings": readings, "inputs": inputs, "dropped": 0}
@@ -206,9 +216,10 @@ def readings_of(recording: Recording, kind: type) -> list[Any]:
 
 
 def sources_of(recording: Recording) -> dict[str, Any]:
-    """Return the inputs of a `recording` as functions of time, in a dict of name → function.
+    """Return the inputs (logged quantities such as a motor command) of a `recording` as a dict of
+    name → function of time.
 
-    The samples of an input are held constant over each step and need evenly spaced times.
+    Samples of an input are held constant over each step and need evenly spaced times.
     """
     t, out = recording.t, {}
     for name, source in recording.inputs.items():
@@ -222,15 +233,19 @@ def sources_of(recording: Recording) -> dict[str, Any]:
 
 
 def count_of(reading: Reading) -> int:
-    """Return the number of unmasked readings times the number of components of an error."""
+    """Return how many numbers a sensor read: the number of its unmasked readings times the number
+    of components of its error.
+    """
     return reading.sensor.components * int(reading.host_mask.sum())
 
 
 def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
-    """Return the `inputs` as a dict of name → input, after checks.
+    """Return the inputs (logged quantities such as a motor command) of a recording as a dict of
+    name → input, after checks.
 
-    An input that is a function of time is unchanged. Samples (T, …), one for each time in `t` (T,),
-    become an array.
+    - `t`: (T,) the times of the recording, s.
+    - `inputs`: a mapping of name → input. A function of time is unchanged; samples (T, *k), one for
+      each time, become an array. An error is raised for anything else.
     """
     _checks.require_instance(
         inputs, Mapping, "inputs", requirement="samples or functions of time by name"
@@ -251,10 +266,11 @@ def _checked_inputs(t: np.ndarray, inputs: Any) -> dict[str, Any]:
     return out
 
 
-def _require_digits(t: np.ndarray, dtype: np.dtype) -> None:
-    """Raise `ValueError` if rounding the times `t` to the `dtype` makes a step zero.
+def _require_distinct_times(t: np.ndarray, dtype: np.dtype) -> None:
+    """Raise `ValueError` if increasing times `t` (T,), s, become equal when they are rounded to the
+    `dtype`, such as float32.
 
-    The function warns if rounding changes a step by more than a tenth.
+    A warning is given if rounding changes a step between two times by more than a tenth.
     """
     # Use NumPy: within a trace the numbers of a new JAX array are not known.
     steps, held = np.diff(t), np.diff(t.astype(dtype).astype(float))
@@ -273,10 +289,16 @@ def _require_digits(t: np.ndarray, dtype: np.dtype) -> None:
 def _checked_reading(
     t: np.ndarray, sensor: AbstractSensor, values: Any, mask: NumbersLike | None = None
 ) -> tuple[AbstractSensor, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the readings of a `sensor` at the times `t` (T,), after checks.
+    """Return the readings of a sensor after checks, as four things: the sensor; its readings (T,
+    *reading_shape); a mask (T,), true where there is a reading; and a mask (T,) of the rows that a
+    NumPy masked array hides.
 
-    Four things are returned: the sensor; its readings (T, …); a mask (T,), true where there is a
-    reading; and a mask (T,) of the rows that a NumPy masked array hides.
+    A masked reading is replaced by a valid one, so that no NaN is left.
+
+    - `t`: (T,) the times of the recording, s.
+    - `sensor`: the sensor.
+    - `values`: (T, …) the readings of the user, which may be a NumPy masked array.
+    - `mask`: (T,) true where there is a reading, or `None` if there is one at each time.
     """
     name = type(sensor).__name__
     if not isinstance(sensor, AbstractSensor):

@@ -38,7 +38,8 @@ _DETERMINED = 1e-3
 
 
 def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times (n,), s, and the attitudes (n, 4), body → world, that the readings show.
+    """Return the times (n,), s, and the attitudes (n, 4), quaternions body → world, that the
+    readings of a `recording` show.
 
     The attitudes are the readings of an attitude sensor. Without such a sensor they are computed
     from at least three markers or two directions, in the way of `rigidjax.so3.wahba`. If the
@@ -75,13 +76,13 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     known = s[:, 1] + np.sign(np.linalg.det(b)) * s[:, 2] > _DETERMINED * s[:, 0]
     if not known.any():
         return np.zeros(0), np.zeros((0, 4))
-    return t[mask][known], np.asarray(_attitudes_of(b[known]))
+    return t[mask][known], np.asarray(_attitudes_by_wahba(b[known]))
 
 
 @jax.jit
-def _attitudes_of(sums: ArrayLike) -> Array:
-    """Return the attitudes (n, 4) that best turn directions in the body into directions in the
-    world.
+def _attitudes_by_wahba(sums: ArrayLike) -> Array:
+    """Return the attitudes (n, 4), quaternions body → world, that best turn directions in the body
+    into directions in the world.
 
     `sums` (n, 3, 3) holds the sum Σ world bodyᵀ over the directions, at each of n times. This is
     `so3.wahba` without its check: a `Model` calls this function within
@@ -91,7 +92,8 @@ def _attitudes_of(sums: ArrayLike) -> Array:
 
 
 def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times (n,), s, and the body rates (n, 3), rad/s, that the readings show.
+    """Return the times (n,), s, and the body rates (n, 3), rad/s, that the readings of a
+    `recording` show.
 
     The rates are the readings of a gyro. Without a gyro they are computed from the turns between
     attitudes. If the readings show no rate, n is 0.
@@ -111,28 +113,29 @@ def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarr
     """
     if t.size < 2:
         return np.zeros(0), np.zeros((0, 3))
-    steps = np.linalg.norm(_rotation_vectors(q[:-1], q[1:]), axis=1)
+    steps = np.linalg.norm(_rotation_vectors_between(q[:-1], q[1:]), axis=1)
     turned = np.concatenate([[0.0], np.cumsum(steps)])
     first = np.arange(t.size - 1)
     last = np.searchsorted(turned, turned[first] + _TURN, side="right") - 1
     last = np.clip(np.maximum(last, first + 1), 1, t.size - 1)
     gap = t[last] - t[first]
-    turns = np.asarray(_rotation_vectors(q[first], q[last]))
+    turns = np.asarray(_rotation_vectors_between(q[first], q[last]))
     return 0.5 * (t[first] + t[last]), turns / gap[:, None]
 
 
 @jax.jit
-def _rotation_vectors(p: ArrayLike, q: ArrayLike) -> Array:
-    """Return the shortest rotation vectors (n, 3), rad, that turn attitudes p into attitudes q.
+def _rotation_vectors_between(first: ArrayLike, last: ArrayLike) -> Array:
+    """Return the shortest rotation vectors (n, 3), rad, in body axes, each of which turns one
+    attitude into another.
 
-    The attitudes p and q (n, 4) are quaternions, whose signs do not matter. The vectors are given
-    in body axes.
+    `first` and `last` (n, 4) are the attitudes before and after the turn, as quaternions whose
+    signs do not matter.
     """
 
     def turn(a: Array, b: Array) -> Array:
         return quaternion.log(quaternion.multiply(quaternion.conjugate(a), b))
 
-    return jax.vmap(turn)(jnp.asarray(p), jnp.asarray(q))
+    return jax.vmap(turn)(jnp.asarray(first), jnp.asarray(last))
 
 
 class ReferenceStates(eqx.Module):
@@ -155,7 +158,8 @@ class ReferenceStates(eqx.Module):
     units: Float[Array, "*records n"]
 
     def start_at(self, change: Float[Array, " n"]) -> PyTree:
-        """Return the initial state of one recording for the free numbers `change` (n,).
+        """Return the initial state of one recording: the reference state changed by the free
+        numbers `change` (n,), in `units`.
 
         If the initial state is known, `change` is empty, and the reference state is returned.
         """
@@ -163,13 +167,16 @@ class ReferenceStates(eqx.Module):
 
 
 def reference_of(recordings: Sequence[Recording], state_type: type) -> ReferenceStates:
-    """Return the reference states of the `recordings`, found from their first readings.
+    """Return the reference state of each recording, found from its first readings; the free numbers
+    of an initial state are changes of it.
 
-    `state_type` is the type of the states: `Spin`, `Attitude` or `Rigid`. The body rate of each
-    reference state is zero.
+    The body rate of each reference state is zero.
+
+    - `recordings`: R recordings; the result has a leading axis (R,).
+    - `state_type`: the type of the states: `Spin`, `Attitude` or `Rigid`.
     """
     turns = [[*attitudes(r)[1], np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
-    places = [_first_position(r) for r in recordings]
+    places = [_first_position_and_velocity(r) for r in recordings]
     dtype = recordings[0].t.dtype
     # Use arrays: with Python floats a program would be compiled for each recording.
     x, v, length = (jnp.asarray(np.stack(part), dtype) for part in zip(*places, strict=True))
@@ -183,7 +190,12 @@ def reference_of(recordings: Sequence[Recording], state_type: type) -> Reference
 
 
 def _typical_rate(recording: Recording) -> float:
-    """Return a typical length of the body rate, rad/s, or 1 if the readings show no rate."""
+    """Return the typical size of the body rate in a `recording`, rad/s, or 1 if its readings show
+    no rate.
+
+    With a gyro it is the root mean square of the readings, without a gyro the size of the first
+    rate between attitudes, or the estimate of a sensor that has one.
+    """
     _, w = rates(recording)
     if readings_of(recording, Gyro):
         return float(np.sqrt(np.mean(np.sum(w**2, axis=1)))) or 1.0
@@ -198,12 +210,12 @@ def _typical_rate(recording: Recording) -> float:
     return rate if rate > 0 else 1.0
 
 
-def _first_position(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the first position of a recording.
+def _first_position_and_velocity(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return three things that the readings of a `recording` show: the first position (3,), m; the
+    first velocity (3,), m/s; and a typical length of the positions, m.
 
-    Three things are returned: the first position (3,), m; the first velocity (3,), m/s; and a
-    typical length of the positions, m. Position and velocity belong to the centre of mass or, if
-    only markers were read, to the origin of the body frame.
+    Position and velocity belong to the centre of mass or, if only markers were read, to the origin
+    of the body frame. Position and velocity are zero, and the length is 1, if no sensor shows them.
     """
     t, when, x = np.asarray(recording.t), np.zeros(0), np.zeros((0, 3))
     positions, markers = readings_of(recording, Position), readings_of(recording, Marker)
@@ -212,12 +224,12 @@ def _first_position(recording: Recording) -> tuple[np.ndarray, np.ndarray, float
     if positions:
         when, x = t[positions[0].host_mask], np.asarray(positions[0].values)[positions[0].host_mask]
     elif markers:
-        when, x = _places_by_markers(recording, markers)
+        when, x = _origins_by_markers(recording, markers)
     elif ranges:
         mask = np.all([r.host_mask for r in ranges], axis=0)
         stations = np.stack([np.asarray(r.sensor.station) for r in ranges])
         lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[mask]
-        when, x = t[mask], _places_by_ranges(stations, lengths)
+        when, x = t[mask], _positions_by_ranges(stations, lengths)
     if speeds and (positions or not markers):
         v = np.asarray(speeds[0].values)[speeds[0].host_mask][0]
     else:
@@ -228,13 +240,17 @@ def _first_position(recording: Recording) -> tuple[np.ndarray, np.ndarray, float
     return x[0], v, float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
 
 
-def _places_by_markers(
+def _origins_by_markers(
     recording: Recording, markers: Sequence[Any]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (n,), s, and the positions (n, 3), m, of the origin of the body frame.
+    """Return the times (n,), s, and the positions (n, 3), m, of the origin of the body frame,
+    computed from the positions of markers on the body.
 
-    The positions are computed from the readings of the `markers`, at the times at which all markers
-    were read. If there is no such time, only the first marker is used.
+    If no time has readings of all markers, only the first marker is used. If the attitude is not
+    known at each time, the mean position of the markers takes the place of the origin.
+
+    - `recording`: the recording, which shows the times and the attitudes.
+    - `markers`: the `Reading` of each marker.
     """
     mask = np.all([r.host_mask for r in markers], axis=0)
     if not mask.any():
@@ -250,7 +266,8 @@ def _places_by_markers(
 
 
 def _first_velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the velocity (3,), m/s, at the start of positions x (n, 3), m, at times t (n,), s.
+    """Return the velocity (3,), m/s, of a body at the first of its positions x (n, 3), m, at the
+    times t (n,), s.
 
     It is the slope of the straight line that fits the first positions (at most five) best, or zero
     for fewer than two positions.
@@ -259,12 +276,15 @@ def _first_velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
 
 
-def _places_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Return the positions x (n, 3) whose distances from k stations are `lengths` (n, k).
+def _positions_by_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Return the positions x (n, 3), m, of a body from its distances to k stations.
 
-    `stations` (k, 3) holds the positions s of the stations. The equations `|x|² − 2 s·x + |s|² =
-    d²`, where d is a distance, become linear in x if their mean over all stations is subtracted. A
-    component of x that the linear equations do not determine is that of the centre of the stations.
+    The equations `|x|² − 2 s·x + |s|² = d²`, where s is the position of a station and d its
+    distance, become linear in x if their mean over all stations is subtracted. A component of x
+    that the linear equations do not determine is that of the centre of the stations.
+
+    - `stations`: (k, 3) the positions of the stations, m.
+    - `lengths`: (n, k) the distance to each station, m, at each of n times.
     """
     centre = stations.mean(axis=0)
     s = stations - centre
@@ -292,6 +312,8 @@ def first_rates(
 
 
 def first_rate(recording: Recording) -> np.ndarray:
-    """Return the first body rate (3,), rad/s, that `rates` finds, or zero if it finds no rate."""
+    """Return the first body rate (3,), rad/s, that the readings of a `recording` show, or zero if
+    they show no rate.
+    """
     _, w = rates(recording)
     return w[0] if len(w) else np.zeros(3)

@@ -22,11 +22,11 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
     (the `Linear` and `Series` in inputs and sensors) are padded with their last value.
     """
     counts = np.array([r.t.shape[0] for r in recordings], np.int32)
-    rows = max(_count_rows(recording, 0) for recording in recordings)
+    rows = max(_count_table_rows(recording, 0) for recording in recordings)
     alike = [pad_recording(r, int(counts.max()), rows) for r in recordings]
     # An input may contain objects that are not numbers, such as functions. Such objects must be the
     # same for all recordings.
-    numbers, others = zip(*(eqx.partition(r, _is_number) for r in alike), strict=True)
+    numbers, others = zip(*(eqx.partition(r, _is_stackable) for r in alike), strict=True)
     shapes = [[np.shape(x) for x in jax.tree.leaves(r)] for r in numbers]
     for index, other in enumerate(others):
         if not (eqx.tree_equal(other, others[0]) is True and shapes[index] == shapes[0]):
@@ -38,30 +38,38 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, np.ndarray]:
     return eqx.combine(jax.tree.map(_stack_leaves, *numbers), others[0]), counts
 
 
-def _is_number(leaf: PyTree) -> bool:
-    """Return whether a `leaf` of a tree is an array or a Python float, which `stack` may stack."""
+def _is_stackable(leaf: PyTree) -> bool:
+    """Return whether a `leaf` (an end) of a tree of JAX is an array or a Python float, so that
+    `stack` may stack it along a new axis.
+    """
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | complex)
 
 
 def pad_to_few_lengths(model: PyTree) -> Any:
-    """Return the model with its recordings padded by masked readings to one of few lengths.
+    """Return a `model` with its recordings padded by masked readings to one of few lengths.
 
     Between a length and its double there are about four such lengths, so that few programs are
-    compiled. A model of windows stays unchanged: all windows have one length already.
+    compiled. A model of windows (short parts of a record of measured states) stays unchanged: all
+    windows have one length already.
     """
     records = model.records
     if model.clusters is not None:
         return model
     longer = pad_recording(
-        records, _padded_length(records.t.shape[1]), _padded_length(_count_rows(records, 1)), 1
+        records,
+        _padded_length(records.t.shape[1]),
+        _padded_length(_count_table_rows(records, 1)),
+        1,
     )
     return eqx.tree_at(lambda m: m.records, model, longer)
 
 
-def _count_rows(recording: Recording, axis: int) -> int:
-    """Return the number of rows of the longest table of time in the inputs and sensors.
+def _count_table_rows(recording: Recording, axis: int) -> int:
+    """Return the number of rows of the longest table of time (a `Linear` or `Series`) in the inputs
+    and sensors of a `recording`, or 0 without a table.
 
-    The result is 0 if the `recording` has no table. The rows of a table are along `axis`.
+    The rows of a table are along `axis`: 0 for one recording, 1 for several recordings with a
+    leading axis.
     """
     parts = recording.inputs, recording.sensors
     tables = filter(_is_table, jax.tree.leaves(parts, is_leaf=_is_table))
@@ -69,10 +77,11 @@ def _count_rows(recording: Recording, axis: int) -> int:
 
 
 def _padded_length(count: int) -> int:
-    """Return the padded length of a recording with `count` times.
+    """Return the number of times to which a recording with `count` times is padded, one of few
+    allowed numbers.
 
-    It is the least allowed length that is not below `count`. The allowed lengths are powers of
-    2^(1/4), rounded up to multiples of 16.
+    It is the least allowed number that is not below `count`. The allowed numbers are powers of
+    2^(1/4), rounded up to multiples of 16; 0 stays 0.
     """
     if not count:
         return 0
@@ -82,7 +91,9 @@ def _padded_length(count: int) -> int:
 
 
 def _stack_leaves(*leaves: PyTree) -> Any:
-    """Return the leaves stacked along a new first axis."""
+    """Return arrays of one shape (the leaves with the same place in several trees) stacked along a
+    new first axis.
+    """
     # Use NumPy if the numbers are not traced: JAX would compile a program for each shape.
     if _checks.is_known(leaves):
         return _constant_array(np.stack([np.asarray(leaf) for leaf in leaves]))
@@ -90,7 +101,8 @@ def _stack_leaves(*leaves: PyTree) -> Any:
 
 
 def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "*rows"]) -> PyTree:
-    """Return the tree `records` with each array picked at `index` of its leading axis.
+    """Return one or some of the recordings in a tree: the tree `records` with each array picked at
+    `index` of its leading axis.
 
     `index` is one index, a slice, or an array of indices. Leaves that are not arrays are unchanged.
     """
@@ -105,7 +117,9 @@ def pick_records(records: PyTree, index: int | slice | Int[Array | np.ndarray, "
 
 
 def _constant_array(array: np.ndarray | np.generic) -> Array:
-    """Return a JAX array with the numbers of `array`, which is not traced even within `jit`."""
+    """Return a JAX array with the numbers of the NumPy `array`, which is not traced even within
+    `jit`.
+    """
     with jax.ensure_compile_time_eval():
         return jnp.asarray(array)
 
@@ -150,7 +164,9 @@ def take_rows(recording: Recording, end: int, begin: int = 0, axis: int = 0) -> 
 
 
 def _is_table(node: PyTree) -> bool:
-    """Return whether a `node` of a tree is a table of time, a `Linear` or a `Series`."""
+    """Return whether a `node` of a tree of JAX is a table of time: a `Linear` or a `Series`, which
+    interpolates values between times.
+    """
     return isinstance(node, Linear | Series)
 
 
@@ -173,15 +189,15 @@ def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0
     parts = [(r.values, r.mask, r.jitter_error) for r in recording.readings]
     if missing:
         inputs = {
-            name: _repeat_last(source, missing, axis) if eqx.is_array(source) else source
+            name: _extend_at_end(source, missing, axis) if eqx.is_array(source) else source
             for name, source in inputs.items()
         }
-        t = _repeat_last(t, missing, axis)
+        t = _extend_at_end(t, missing, axis)
         parts = [
             (
-                _repeat_last(values, missing, axis),
-                _repeat_last(mask, missing, axis, False),
-                None if late is None else _repeat_last(late, missing, axis),
+                _extend_at_end(values, missing, axis),
+                _extend_at_end(mask, missing, axis, False),
+                None if late is None else _extend_at_end(late, missing, axis),
             )
             for values, mask, late in parts
         ]
@@ -194,16 +210,19 @@ def pad_recording(recording: Recording, count: int, rows: int = 0, axis: int = 0
 
 
 def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
-    """Return a table of time padded to `rows` rows along `axis`.
+    """Return a `table` of time (a `Linear` or `Series`, which interpolates values between times)
+    padded to `rows` rows along `axis`.
 
-    The last value of the table is repeated after its last time.
+    The last value of the table is repeated after its last time. A table with enough rows is
+    unchanged. `axis` is 0 for the table of one recording, 1 for stacked tables of several
+    recordings.
     """
     missing = rows - table.values.shape[axis]
     if missing <= 0:
         return table
-    values = _repeat_last(table.values, missing, axis)
+    values = _extend_at_end(table.values, missing, axis)
     if isinstance(table, Series):
-        slopes = _repeat_last(table.slopes, missing, axis, 0.0)
+        slopes = _extend_at_end(table.slopes, missing, axis, 0.0)
         return eqx.tree_at(lambda s: (s.values, s.slopes), table, (values, slopes))
     last = table.times[..., -1:]
     more = last + (last - table.times[..., -2:-1]) * np.arange(1, missing + 1, dtype=last.dtype)
@@ -211,10 +230,10 @@ def _pad_table(table: Linear | Series, rows: int, axis: int) -> Linear | Series:
     return eqx.tree_at(lambda s: (s.times, s.values), table, (times, values))
 
 
-def _repeat_last(
+def _extend_at_end(
     values: ArrayLike, count: int, axis: int, fill: float | bool | None = None
 ) -> Array:
-    """Return `values` with `count` entries added at the end of `axis`.
+    """Return the array `values` with `count` entries added at the end of `axis`.
 
     Each added entry is the last entry or, if `fill` is given, the number `fill`.
     """

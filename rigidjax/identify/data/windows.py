@@ -52,10 +52,12 @@ class Horizons(NamedTuple):
 
 
 def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"]) -> Horizons:
-    """Return the mean `errors` over all windows, as functions of the horizon.
+    """Return the mean sizes of the `errors` of predictions over all windows, as functions of the
+    horizon (the number of steps from the start of a window).
 
-    `errors` holds an error vector for each window and step. `starts` is a tree of states of the
-    same type, which names the parts of an error vector.
+    - `starts`: a `Spin`, `Attitude` or `Rigid` with a leading axis, whose type names the parts of
+      an error vector.
+    - `errors`: (N, L, n) the error vector for each of N windows and L steps.
     """
     by_kind = parts_by_name(jax.tree.map(lambda leaf: leaf[0], starts), errors)
     absolute = {k: np.asarray(jnp.mean(jnp.abs(v), (0, 2))) for k, v in by_kind.items()}
@@ -67,9 +69,11 @@ def average_by_horizon(starts: HasSpin, errors: Float[Array, "windows steps n"])
 
 @jax.jit
 def held_errors(starts: HasSpin, measured: HasSpin) -> Float[Array, "windows steps n"]:
-    """Return the errors of a prediction that the state stays constant in each window.
+    """Return the errors (N, L, n) of a prediction that the state stays constant in each of N
+    windows of L steps: the start minus the measured state.
 
-    `starts` holds the state at the start of each window, and `measured` the states that follow.
+    - `starts`: the state at the start of each window, with a leading axis (N,).
+    - `measured`: the states that follow, with leading axes (N, L).
     """
     return jax.vmap(jax.vmap(minus_small, (None, 0)))(starts, measured)
 
@@ -245,8 +249,8 @@ def windows(
     if not isinstance(inputs, Mapping | None):
         raise TypeError(f"inputs: wanted arrays by name, got {type(inputs).__name__}")
     inputs = {k: _checks.without_mask(v, f"inputs[{k!r}]") for k, v in (inputs or {}).items()}
-    _require_rows(times, states, inputs)
-    h, even = _step_of(times)
+    _require_finite_rows(times, states, inputs)
+    h, even = _sampling_step(times)
     broken = np.concatenate([[0], np.cumsum(~even)])
     begin = np.arange(before, times.size - length, stride)
     begin = begin[broken[begin + length] == broken[begin - before]]
@@ -270,7 +274,7 @@ def windows(
                 "starts: deviations of the starts need the noise of the readings: give noise={…}, "
                 "too"
             )
-        starts = _checked_by_kind(starts, kinds, "starts", _start_deviation)
+        starts = _checked_by_kind(starts, kinds, "starts", _checked_start_deviation)
     return Windows(
         round(h, 12),
         jax.tree.map(lambda a: jnp.asarray(a[begin]), arrays),
@@ -285,10 +289,14 @@ def windows(
 def _checked_by_kind(
     numbers: object, kinds: tuple[str, ...], name: str, check: Callable[[Any, str], float]
 ) -> dict[str, float]:
-    """Return a dict of kind → number from the mapping `numbers`, after checks.
+    """Return the numbers of a user for the parts of a state as a dict of kind → number, after
+    checks.
 
-    The keys of `numbers` must be `kinds`. Each number is passed through `check`, which is given the
-    number and its name in an error.
+    - `numbers`: a mapping of kind → number, where the kinds are names of parts of a state, such as
+      `q` and `omega`.
+    - `kinds`: the kinds that must be in it.
+    - `name`: what `numbers` is called in an error.
+    - `check`: a function of a number and its name in an error, which returns the number or raises.
     """
     by_kind = _checks.require_instance(numbers, Mapping, name, requirement="numbers by kind")
     if set(by_kind) != set(kinds):
@@ -296,10 +304,12 @@ def _checked_by_kind(
     return {kind: float(check(by_kind[kind], f"{name}[{kind!r}]")) for kind in kinds}
 
 
-def _start_deviation(value: object, name: str) -> float:
-    """Return the standard deviation of a start as a float.
+def _checked_start_deviation(value: object, name: str) -> float:
+    """Return the standard deviation of the measured start of a window as a float, and raise
+    `ValueError` unless it is positive or infinite.
 
-    A `ValueError`, which calls the deviation `name`, is raised unless it is positive or infinite.
+    `value` is the number of the user, and `name` what it is called in the error. Infinity means a
+    start that is free.
     """
     number = _checks.known_float(value, name)
     if not number > 0:
@@ -310,10 +320,13 @@ def _start_deviation(value: object, name: str) -> float:
     return number
 
 
-def _require_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) -> None:
-    """Raise `ValueError` unless `states` and `inputs` have a row of finite numbers for each time.
+def _require_finite_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) -> None:
+    """Raise `ValueError` unless states and inputs have a row of finite numbers for each time, and
+    the quaternions of the states have unit length.
 
-    A `ValueError` is raised for quaternions that are not of unit length as well.
+    - `times`: (T,) the times, s.
+    - `states`: a `Spin`, `Attitude` or `Rigid` with a leading axis (T,).
+    - `inputs`: a dict of name → samples (T, *k).
     """
     rows = dict(zip(names(states), jax.tree.leaves(states), strict=True))
     rows |= {f"inputs[{k!r}]": v for k, v in inputs.items()}
@@ -338,10 +351,11 @@ def _require_rows(times: np.ndarray, states: PyTree, inputs: Mapping[str, Any]) 
             )
 
 
-def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the time between two samples, s, and a mask (T − 1,) of the intervals of this length.
+def _sampling_step(times: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return two things: the time between two successive samples, s; and a mask (T − 1,), false for
+    the intervals between successive `times` (T,) in which samples are missing.
 
-    An interval between successive `times` (T,) at which the mask is false has missing samples.
+    `ValueError` is raised for times that are not evenly spaced apart from such gaps.
     """
     gaps = np.diff(times)
     h = float(np.median(gaps))
@@ -357,7 +371,8 @@ def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def require_windows(windows: PyTree) -> None:
-    """Raise an error unless `windows` is a `Windows` of finite states.
+    """Raise an error unless `windows` is a `Windows` (parts of a record of measured states) whose
+    states are finite.
 
     A `TypeError` is raised for another class, a `ValueError` for wrong shapes, NaN and infinity.
     """
@@ -374,11 +389,12 @@ def require_windows(windows: PyTree) -> None:
 
 
 def mistakes_of_delays(law: PyTree, history: float, length: float) -> list[str]:
-    """Describe each delay with which a torque reads an input outside of the samples of a window.
+    """Describe each delay with which a torque reads an input outside of the samples that a window
+    has; return one text for each such delay.
 
-    **Arguments:**
+    An input is a logged quantity such as a motor command.
 
-    - `law`: the torque.
+    - `law`: the torque, a function of time, state and body, or `None`.
     - `history`: s, the time before the start of a window for which inputs are known.
     - `length`: s, the duration of a window.
     """
@@ -401,15 +417,16 @@ def mistakes_of_delays(law: PyTree, history: float, length: float) -> list[str]:
 def starts_of_windows(
     windows: Windows, stretches: int
 ) -> tuple[ReferenceStates, Float[Array, "windows m"] | None, Int[Array, " windows"]]:
-    """Return the starts of windows, their weights, and the stretch to which each window belongs.
+    """Return the starts of windows, their weights, and the stretch (group of neighbouring windows)
+    to which each window belongs.
 
     Three things are returned:
 
-    - The starts as `ReferenceStates`.
+    - The starts of the N `windows` as `ReferenceStates`.
     - The weights (N, m) of the m free numbers of each start, or `None` if the starts are known. A
       weight is the unit of a free number over the standard deviation of the start.
     - The index (N,) of the stretch of each window. The windows, in their order, are divided into at
-      most `stretches` stretches of neighbouring windows.
+      most `stretches` stretches.
     """
     count, scales = windows.count, np.asarray(windows.scales)
     dtype = windows.wanted.omega.dtype

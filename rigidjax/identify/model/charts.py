@@ -65,28 +65,36 @@ class AbstractBodyChart(eqx.Module):
 
     @abc.abstractmethod
     def body(self, vector: Numbers) -> Inertia | MassProperties:
-        """Return the body that the numbers `vector` represent."""
+        """Return the body that the numbers `vector` (size,) represent in this chart."""
 
     @abc.abstractmethod
     def vector(self, body: PyTree) -> Numbers:
-        """Return the numbers that represent a `body`, such as the initial guess of a fit."""
+        """Return the numbers (size,) that represent a `body` in this chart, such as the initial
+        guess of a fit.
+        """
 
     def bend(self, vector: Numbers, slope: Numbers) -> Rows:
-        """Return rows B such that BᵀB is the part of a misfit's second derivative that comes from
-        the curvature of the chart.
+        """Return rows B (j, size) such that BᵀB is the part of a misfit's second derivative that
+        comes from the curvature of the chart.
 
         The curvature matters if a body may be flat (`rigidjax.body.parameters.flat_bend`). A chart
-        that returns no rows leaves the curvature out. **Arguments:** `vector` the numbers; `slope`
-        the derivative of the misfit with respect to these numbers.
+        that returns no rows leaves the curvature out.
+
+        - `vector`: (size,) the numbers of the body in the chart.
+        - `slope`: (size,) the derivative of the misfit with respect to these numbers.
         """
         return jnp.zeros((0, self.size), vector.dtype)
 
     @abc.abstractmethod
     def logs(self, body: PyTree) -> Float[Array, " logs"]:
-        """Return the logarithms of the positive quantities that are reported."""
+        """Return the logarithms of the positive quantities of a `body` that are reported, in the
+        order of `log_names`.
+        """
 
     def plain(self, body: PyTree) -> Float[Array, " plain"]:
-        """Return the reported quantities of either sign."""
+        """Return the reported quantities of either sign of a `body`, in the order of `plain_names`;
+        none unless a chart says so.
+        """
         return jnp.zeros(0)
 
 
@@ -137,22 +145,24 @@ class PrincipalRatios(AbstractBodyChart):
     scale: ClassVar[str | None] = "arbitrary"
 
     def body(self, vector: Numbers) -> Inertia:
-        return Inertia(jnp.diag(charts.unpack_moments(_pad(vector, 1, 0)) / 3.0))
+        return Inertia(jnp.diag(charts.unpack_moments(_pad_with_zeros(vector, 1, 0)) / 3.0))
 
     def vector(self, body: Inertia) -> Numbers:
         return charts.pack_moments(jnp.diagonal(body.tensor))[1:]
 
     def bend(self, vector: Numbers, slope: Numbers) -> Rows:
-        return charts.flat_bend(_pad(vector, 0, 3), _pad(slope, 0, 3))[:, :2]
+        return charts.flat_bend(_pad_with_zeros(vector, 0, 3), _pad_with_zeros(slope, 0, 3))[:, :2]
 
     def logs(self, body: Inertia) -> Float[Array, "2"]:
         i = jnp.diagonal(body.tensor)
         return jnp.log(i[:2] / i[2])
 
 
-def _typical_moments(value: object) -> Array:
-    """Return the rough size of the moments as an array, and raise an error unless it is
-    positive.
+def _checked_typical_moment(value: object) -> Array:
+    """Return the rough size of the moments of inertia, kg m², as an array of shape ().
+
+    It raises `ValueError` unless the number `value` is positive. It raises `TypeError` if `value`
+    is a body, since a known body is given in another way.
     """
     if isinstance(value, Inertia | MassProperties):
         raise TypeError(
@@ -178,7 +188,7 @@ class Tensor(AbstractBodyChart):
     Array(0.001, dtype=float64)
     """
 
-    typical: Float[Array, ""] = eqx.field(converter=_typical_moments, default=1.0)
+    typical: Float[Array, ""] = eqx.field(converter=_checked_typical_moment, default=1.0)
     size: ClassVar[int] = 6
     log_names: ClassVar[tuple[str, ...]] = ("I1", "I2", "I3")
     plain_names: ClassVar[tuple[str, ...]] = ("Ixx", "Iyy", "Izz", "Iyz", "Ixz", "Ixy")
@@ -191,7 +201,7 @@ class Tensor(AbstractBodyChart):
         return charts.pack_second_moment(body.second_moment / (0.5 * self.typical))
 
     def bend(self, vector: Numbers, slope: Numbers) -> Rows:
-        return _pad(Ratios().bend(vector[1:], slope[1:]), 1, 0)
+        return _pad_with_zeros(Ratios().bend(vector[1:], slope[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(body.moments)
@@ -213,7 +223,7 @@ class Principal(AbstractBodyChart):
     Array(2., dtype=float64)
     """
 
-    typical: Float[Array, ""] = eqx.field(converter=_typical_moments, default=1.0)
+    typical: Float[Array, ""] = eqx.field(converter=_checked_typical_moment, default=1.0)
     size: ClassVar[int] = 3
     log_names: ClassVar[tuple[str, ...]] = ("Ix", "Iy", "Iz")
     unit: ClassVar[str] = "kg m²"
@@ -225,7 +235,7 @@ class Principal(AbstractBodyChart):
         return charts.pack_moments(jnp.diagonal(body.tensor) / (0.5 * self.typical))
 
     def bend(self, vector: Numbers, slope: Numbers) -> Rows:
-        return _pad(PrincipalRatios().bend(vector[1:], slope[1:]), 1, 0)
+        return _pad_with_zeros(PrincipalRatios().bend(vector[1:], slope[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(jnp.diagonal(body.tensor))
@@ -271,44 +281,48 @@ class Mass(AbstractBodyChart):
         if not chosen:
             raise ValueError("free: wanted mass, inertia or com, got none; see Known")
         self.free = tuple(name for name in _PARTS if name in chosen)
-        self.size = len(self._places)
+        self.size = len(self._free_indices)
         moments = ("I1", "I2", "I3") if "inertia" in chosen else ()
         self.log_names = ("mass", *moments) if "mass" in chosen else moments
         self.plain_names = ("com x", "com y", "com z") if "com" in chosen else ()
 
     @property
-    def _places(self) -> list[int]:
-        """Return the indices of the free numbers among the ten numbers of `pack`."""
+    def _free_indices(self) -> list[int]:
+        """Return the sorted indices of the free numbers among the ten numbers that
+        `rigidjax.body.parameters.pack` makes of mass, inertia and centre of mass.
+        """
         return sorted(place for name in self.free for place in _PARTS[name])
 
     @property
-    def _length(self) -> Array:
-        """Return the size of the body, m, which is the unit of the free numbers of the centre of
-        mass.
+    def _body_length(self) -> Array:
+        """Return the size of the body of the guess, m, as an array of shape ().
+
+        It is the root of the trace of the second moments over the mass. The free numbers of the
+        centre of mass are in units of this size.
         """
         return jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
 
     def body(self, vector: Numbers) -> MassProperties:
         if self.size < 10:
-            vector = jnp.zeros(10, vector.dtype).at[np.array(self._places)].set(vector)
-        step = jnp.concatenate([vector[:7], self._length * vector[7:]])
+            vector = jnp.zeros(10, vector.dtype).at[np.array(self._free_indices)].set(vector)
+        step = jnp.concatenate([vector[:7], self._body_length * vector[7:]])
         return charts.unpack(charts.pack(self.guess) + step)
 
     def vector(self, body: Inertia | MassProperties) -> Numbers:
         if isinstance(body, Inertia):
             return jnp.zeros(self.size, self.guess.mass.dtype)
         step = charts.pack(body) - charts.pack(self.guess)
-        step = jnp.concatenate([step[:7], step[7:] / self._length])
-        return step[np.array(self._places)]
+        step = jnp.concatenate([step[:7], step[7:] / self._body_length])
+        return step[np.array(self._free_indices)]
 
     def bend(self, vector: Numbers, slope: Numbers) -> Rows:
         if "inertia" not in self.free:
             return jnp.zeros((0, self.size), vector.dtype)
-        first = self._places.index(2)
+        first = self._free_indices.index(2)
         rows = charts.flat_bend(
             charts.pack(self.guess)[2:7] + vector[first : first + 5], slope[first : first + 5]
         )
-        return _pad(rows, first, self.size - first - 5)
+        return _pad_with_zeros(rows, first, self.size - first - 5)
 
     def logs(self, body: MassProperties) -> Float[Array, " logs"]:
         mass, moments = body.mass[None], body.inertia.moments
@@ -346,9 +360,11 @@ class Known(AbstractBodyChart):
         return jnp.zeros(0)
 
 
-def _pad(x: Float[Array, "*rows n"], leading: int, trailing: int) -> Float[Array, "*rows m"]:
-    """Return x with `leading` zeros before it and `trailing` zeros after it, along the last
-    axis.
+def _pad_with_zeros(
+    x: Float[Array, "*rows n"], leading: int, trailing: int
+) -> Float[Array, "*rows m"]:
+    """Return the array x (…, n) with `leading` zeros before and `trailing` zeros after its n
+    numbers, along the last axis.
     """
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(leading, trailing)])
 
@@ -394,17 +410,22 @@ class Bodies(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return the number of free numbers of all bodies."""
+        """Return how many free numbers describe all bodies together."""
         return sum(chart.size for chart in self.charts)
 
     def all(self, vector: Float[Array, " numbers"]) -> dict[str, Any]:
-        """Return every body by its name, from the numbers `vector` of all bodies."""
+        """Return a dict of name → body, from the numbers `vector` (size,) of all bodies, one body
+        after the other.
+        """
         rows = zip(self.names, self.charts, numbers_of(self, vector), strict=True)
         return {name: scaled_body(chart, numbers) for name, chart, numbers in rows}
 
     def body(self, vector: Numbers, body_index: Int[Array, ""]) -> Inertia | MassProperties:
-        """Return the body with the index `body_index` from its numbers `vector`, which are padded
-        with zeros.
+        """Return one of the bodies, from its numbers in its chart.
+
+        - `vector`: the numbers of this body, followed by further numbers if another chart has more;
+          the further numbers are not read.
+        - `body_index`: the index of the body among `names`, which may be traced by JAX.
         """
         kind, row = jnp.asarray(self.kind_of)[body_index], jnp.asarray(self.row_of)[body_index]
         chosen: Any = None
@@ -423,7 +444,12 @@ class Bodies(eqx.Module):
 
 
 def scaled_body(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProperties:
-    """Return the body of a chart as a user gets it, with the scale of the chart."""
+    """Return the body that the numbers `vector` represent in a `chart`, in the form in which a user
+    gets it.
+
+    If the chart finds the inertia only up to a factor, the `Inertia` is marked as of arbitrary
+    scale (`AbstractBodyChart.scale`).
+    """
     body = chart.body(vector)
     if chart.scale is None or isinstance(body, MassProperties):
         return body
@@ -431,45 +457,56 @@ def scaled_body(chart: AbstractBodyChart, vector: Numbers) -> Inertia | MassProp
 
 
 def places_of(
-    body: AbstractBodyChart | Bodies, body_indices: Int[Array, " records"] | None, count: int
+    chart: AbstractBodyChart | Bodies, body_indices: Int[Array, " records"] | None, count: int
 ) -> Int[np.ndarray, "records numbers"]:
     """Return the indices (R, K) of the numbers of each recording's body among the numbers of all
     bodies.
 
-    **Arguments:** `body` the chart or charts; `body_indices` (R,) the index of each recording's
-    body, or `None` for one body; `count` R. The rows of smaller charts are filled with −1.
+    K is the number of numbers of the largest chart; the rows of bodies with fewer numbers are
+    filled with −1.
+
+    - `chart`: the chart of one body, or the charts of several bodies.
+    - `body_indices`: (R,) the index of the body of each of R recordings, or `None` for one body.
+    - `count`: R.
     """
-    if not isinstance(body, Bodies):
-        return np.broadcast_to(np.arange(body.size), (count, body.size))
-    widest = max(chart.size for chart in body.charts)
-    parts = numbers_of(body, np.arange(body.size))
+    if not isinstance(chart, Bodies):
+        return np.broadcast_to(np.arange(chart.size), (count, chart.size))
+    widest = max(one.size for one in chart.charts)
+    parts = numbers_of(chart, np.arange(chart.size))
     rows = [np.pad(part, (0, widest - part.size), constant_values=-1) for part in parts]
     return np.stack(rows)[np.asarray(body_indices)]
 
 
 def body_of_recording(
-    body: AbstractBodyChart | Bodies, vector: Numbers, body_index: Int[Array, ""] | None
+    chart: AbstractBodyChart | Bodies, vector: Numbers, body_index: Int[Array, ""] | None
 ) -> Inertia | MassProperties:
-    """Return the body of one recording, from a `vector` that begins with the numbers of this body.
+    """Return the body of one recording, from the free numbers of this recording.
 
-    `body_index` is the index of the body among several, or `None` for one body.
+    - `chart`: the chart of one body, or the charts of several bodies.
+    - `vector`: the free numbers of the recording; the numbers of its body come first.
+    - `body_index`: the index of the body among several bodies, or `None` for one body.
     """
-    if not isinstance(body, Bodies):
-        return body.body(vector[: body.size])
+    if not isinstance(chart, Bodies):
+        return chart.body(vector[: chart.size])
     assert body_index is not None
-    return body.body(vector, body_index)
+    return chart.body(vector, body_index)
 
 
-def chart_list(body: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...]:
-    """Return the charts of one body or of several."""
-    return body.charts if isinstance(body, Bodies) else (body,)
-
-
-def numbers_of(body: AbstractBodyChart | Bodies, vector: Array | np.ndarray) -> list[Any]:
-    """Return the list of the numbers of each chart, from the numbers `vector` of one body or of
-    several bodies.
+def chart_list(chart: AbstractBodyChart | Bodies) -> tuple[AbstractBodyChart, ...]:
+    """Return a tuple of the charts of all bodies: of the one body that `chart` describes, or of
+    each of several `Bodies`.
     """
-    sizes = [chart.size for chart in chart_list(body)]
+    return chart.charts if isinstance(chart, Bodies) else (chart,)
+
+
+def numbers_of(chart: AbstractBodyChart | Bodies, vector: Array | np.ndarray) -> list[Any]:
+    """Return a list with the numbers of each body, cut out of the numbers `vector` of all bodies
+    one after the other.
+
+    `chart` is the chart of one body, or the charts of several bodies; it says how many numbers each
+    body has.
+    """
+    sizes = [one.size for one in chart_list(chart)]
     return [vector[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
 
 
@@ -481,6 +518,8 @@ def as_list(bodies: PyTree) -> list[Any]:
 
 
 def has_mass(chart: AbstractBodyChart) -> bool:
-    """Return whether the bodies of a chart have a mass."""
+    """Return whether a `chart` describes bodies with a mass (`MassProperties`), not only an
+    `Inertia`.
+    """
     sample: Any = eqx.filter_eval_shape(chart.body, jnp.zeros(chart.size))
     return isinstance(sample, MassProperties)

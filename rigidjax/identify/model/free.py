@@ -89,8 +89,11 @@ class Free(eqx.Module):
 
 
 def checked_labels(each: object, name: str) -> bool | str | tuple[Any, ...]:
-    """Return the argument `each` of a `Free`, with labels as a tuple; raise an error, in which the
-    argument is called `name`, if `each` is not valid.
+    """Return the argument `each` of a `Free`, which says which recordings share a value, after
+    checks.
+
+    `True`, `False` and `"body"` are returned as they are, and a sequence of labels (one for each
+    recording) as a tuple. Another `each` raises an error, in which the argument is called `name`.
     """
     if isinstance(each, bool):
         return each
@@ -143,19 +146,26 @@ class Slot(eqx.Module):
 
     @property
     def columns(self) -> slice:
-        """Return the columns that hold the steps of this slot in the row of a recording."""
+        """Return the slice of the steps of this slot in the free numbers of one recording."""
         return slice(self.column, self.column + int(np.prod(self.shape, dtype=int)))
 
     def move(self, start: Array, step: Array) -> Array:
-        """Return the value of the leaf that lies a `step` away from its value `start`, where `step`
-        is in units of the scale.
+        """Return the value of the leaf (the free array of the scene) after a change by `step` from
+        the value `start`.
+
+        `step` is in units of `scale`. For a `positive` leaf it changes the logarithm of the value.
+        `step` has the shape of `start`, or a shape that broadcasts to it.
         """
         if self.positive:
             return start * jnp.exp(step * self.scale)
         return start + step * self.scale
 
     def step(self, start: Array, value: Array) -> Array:
-        """Return the step that leads from `start` to `value`, which is the inverse of `move`."""
+        """Return the change from the value `start` to the value `value` of the leaf (the free array
+        of the scene), in units of `scale`.
+
+        For a `positive` leaf it is the change of the logarithm. This is the inverse of `move`.
+        """
         if self.positive:
             return jnp.log(value / start) / self.scale
         return (value - start) / self.scale
@@ -164,11 +174,17 @@ class Slot(eqx.Module):
 def group_of_each(
     each: str | tuple[Any, ...], bodies: Sequence[str], name: str
 ) -> tuple[Int[Array, " records"], tuple[str, ...]]:
-    """Return two things: the index (R,) of the group of each recording; and the labels of the
+    """Return two things: the index (R,) of the group of each of R recordings; and the labels of the
     groups.
 
-    The groups are the bodies of the recordings for `each` "body", else the labels in `each`.
-    `bodies` (R,) names the body of each recording.
+    The recordings of a group share the value of a free number. The index is that of the label of
+    the group.
+
+    - `each`: a tuple (R,) of labels, one for each recording: recordings with the same label are a
+      group. The text `"body"` makes a group of the recordings of each body.
+    - `bodies`: (R,) the name of the body of each recording.
+    - `name`: what the object with the labels is called in an error, which is raised unless there
+      are R labels.
     """
     row = list(bodies) if isinstance(each, str) else list(each)
     if len(row) != len(bodies):
@@ -181,8 +197,11 @@ def group_of_each(
 
 
 def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> list[Slot]:
-    """Return the slot of each `Free` in a scene, where `bodies` (R,) names the body of each
-    recording.
+    """Return a `Slot` for each `Free` in a list: the `Free` with the leaf (array of numbers) that
+    it frees in a `scene`.
+
+    `bodies` (R,) holds the name of the body of each of R recordings. An error is raised if a `Free`
+    picks no numbers, or numbers or a name that another `Free` has.
     """
     slots: list[Slot] = []
     for item in free:
@@ -202,14 +221,14 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
                 "give the spread as a number"
             )
         spread = item.scale if isinstance(item.spread, str) else item.spread
-        prior = _tolerance_at(scene, path) if item.prior is None else item.prior
+        prior = _tolerance_of_sensor(scene, path) if item.prior is None else item.prior
         prior, spread = (
             None if x is None else jnp.asarray(x / item.scale) for x in (prior, spread)
         )
         groups, labels = None, ()
         if not isinstance(item.each, bool):
             groups, labels = group_of_each(item.each, bodies, here)
-        unit = _implied_unit(scene, path) if item.unit is None else item.unit
+        unit = _unit_implied_by_name(scene, path) if item.unit is None else item.unit
         slots.append(
             Slot(
                 path,
@@ -232,11 +251,13 @@ def find_slots(free: Sequence[Free], scene: Scene, bodies: Sequence[str]) -> lis
 def leaf_at(
     where: Callable[[Any], Any], tree: PyTree, name: str, role: str
 ) -> tuple[tuple[Any, ...], Any]:
-    """Return two things: the path of the leaf of a tree that `where` picks; and the leaf, an array
-    of numbers.
+    """Return two things: the path of the leaf that the function `where` picks from a tree; and the
+    leaf, an array of numbers or a float.
 
-    `name` and `role` are words for error messages: the object that has `where`, and the object that
-    needs a starting value.
+    - `where`: a function of the `tree` that returns one of its leaves.
+    - `tree`: a tree of JAX, such as a `Scene`.
+    - `name`, `role`: words for errors: the object that has `where`, and the object that needs a
+      starting value. An error is raised if `where` does not pick one array of numbers.
     """
     pairs, structure = jax.tree.flatten_with_path(tree)
     paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
@@ -262,8 +283,13 @@ def leaf_at(
 _UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place": "m"}
 
 
-def _implied_unit(scene: Scene, path: tuple[Any, ...]) -> str:
-    """Return the unit of a leaf of a scene if its name implies one, else an empty text."""
+def _unit_implied_by_name(scene: Scene, path: tuple[Any, ...]) -> str:
+    """Return the unit of the numbers at a `path` in a `scene`, if their name implies one, else an
+    empty text.
+
+    A delay is in s, for instance, a mounting in rad, and the bias of a sensor in the unit of the
+    sensor. `path` is the path (a tuple of keys of JAX) of a leaf of the scene.
+    """
     *way, last = path
     name = getattr(last, "name", "")
     if name != "bias":
@@ -279,9 +305,12 @@ def _implied_unit(scene: Scene, path: tuple[Any, ...]) -> str:
 TOLERANCES = {"scale": "scale", "skew": "cross_axis", "bias": "bias", "offset": "clock"}
 
 
-def _tolerance_at(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
-    """Return the tolerance of a sensor for its member at `path` in the scene, or `None` if there is
-    none.
+def _tolerance_of_sensor(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
+    """Return the tolerance of a sensor, from its data sheet, for the numbers at a `path` in a
+    `scene`, or `None` if there is none.
+
+    The tolerance is the standard deviation of these numbers, such as a bias in the sensor's unit;
+    it serves as their prior. `path` is the path (a tuple of keys of JAX) of a leaf of the scene.
     """
     if len(path) != 3 or getattr(path[0], "name", "") != "sensors":
         return None
@@ -290,8 +319,12 @@ def _tolerance_at(scene: Scene, path: tuple[Any, ...]) -> Scalar | None:
 
 
 def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"]) -> Scene:
-    """Return the scene with the leaf of each slot moved by the steps in `row`, the free numbers of
-    a recording.
+    """Return the `scene` of a recording after the changes of its free leaves (arrays of numbers).
+
+    - `scene`: the scene with the starting value of each leaf.
+    - `slots`: for each free leaf its path, scale and columns.
+    - `row`: all free numbers of the recording; the columns of a slot hold the change of its leaf,
+      in units of the scale.
     """
     paths = [slot.path for slot in slots]
     values = []
@@ -302,13 +335,17 @@ def with_steps(scene: Scene, slots: Sequence[Slot], row: Float[Array, " columns"
 
 
 def leaves_at(scene: Scene, paths: Sequence[tuple[Any, ...]]) -> tuple[Array, ...]:
-    """Return the leaves of a scene at the `paths`, as arrays."""
+    """Return the leaves (arrays of numbers) of a `scene` at the `paths`, which are tuples of keys
+    of JAX, as JAX arrays.
+    """
     leaves = dict(jax.tree.leaves_with_path(scene))
     return tuple(jnp.asarray(leaves[path]) for path in paths)
 
 
 def with_leaves(scene: Scene, paths: Sequence[tuple[Any, ...]], values: Sequence[Array]) -> Scene:
-    """Return the scene with the leaves at `paths` replaced by `values`."""
+    """Return the `scene` with other leaves (arrays of numbers): the leaf at each of the `paths`,
+    which are tuples of keys of JAX, is replaced by the array in `values` with the same index.
+    """
     pairs, structure = jax.tree.flatten_with_path(scene)
     leaves = dict(pairs) | dict(zip(paths, values, strict=True))
     return jax.tree.unflatten(structure, [leaves[path] for path, _ in pairs])

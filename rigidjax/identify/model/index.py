@@ -45,7 +45,9 @@ class Index(eqx.Module):
     size: int = eqx.field(static=True)
 
     def rows(self, x: Float[Array, " n"]) -> Float[Array, "records row"]:
-        """Return the row of each recording for the free numbers x."""
+        """Return the row of each recording: the numbers (R, width) on which each of R recordings
+        depends, taken from all n free numbers x (n,) of the model.
+        """
         wide = jnp.append(x, jnp.zeros(1, x.dtype))[self.places]
         twice = np.asarray(self.columns[self.width :], int)
         if not twice.size:
@@ -96,7 +98,7 @@ def index_of(
                 twice.append(of_each.reshape(count, width))
                 columns += range(column, column + width)
         parts = (None if x is None else jnp.asarray(x, jnp.int32) for x in (of_all, of_each))
-        placed.append(_with_places(slot, column, *parts))
+        placed.append(_slot_with_places(slot, column, *parts))
         column += width
     blocks.append(start)
     width = column + start.shape[1]
@@ -116,6 +118,14 @@ def index_of(
     return index, tuple(placed)
 
 
-def _with_places(slot: Slot, column: int, shared: Array | None, own: Array | None) -> Slot:
-    """Return the slot with the fields `column`, `shared` and `own` replaced."""
+def _slot_with_places(slot: Slot, column: int, shared: Array | None, own: Array | None) -> Slot:
+    """Return a `slot` (a free leaf of the scene) that knows where its numbers are among the free
+    numbers of the model.
+
+    - `column`: the index of its first number among the free numbers of one recording.
+    - `shared`: (groups, …) the indices of the numbers that groups of recordings share, among all
+      free numbers of the model; or `None`.
+    - `own`: (R, …) the indices of the numbers that each of R recordings has alone, among all free
+      numbers of the model; or `None`.
+    """
     return dataclasses.replace(slot, column=column, shared=shared, own=own)

@@ -71,8 +71,10 @@ class AbstractPull(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-        """Return the residuals (j,) at the free numbers x (n,) of the `model`, in standard
-        deviations.
+        """Return j residuals, in standard deviations, whose half sum of squares is added to the
+        misfit of a fit.
+
+        `model` is the model that is fitted, and x (n,) its free numbers.
         """
 
 
@@ -201,7 +203,7 @@ class Model(eqx.Module):
             recordings, names = [], ("",) * windows.count
             charts: Any = Bodies(chart) if isinstance(chart, Mapping) else chart
         free = (free,) if isinstance(free, str) else free  # pyright: ignore[reportAssignmentType]
-        _require_parts(charts, free, loss, prior, integrator)
+        _require_argument_types(charts, free, loss, prior, integrator)
         if torque is not None:
             require_law(torque)
             require_known_torque(torque)
@@ -228,7 +230,7 @@ class Model(eqx.Module):
         scene = Scene(None, torque, process, data.sensors, None)
         self.walks = find_drifts(walks, scene)
         slots = find_slots(free, scene, names)
-        _require_own_names(slots, charts)
+        _require_unused_names(slots, charts)
         bodies = places_of(charts, self.body_indices, len(names))
         self.index, self.slots = index_of(bodies, charts.size, slots, data.kinds)
         turn = 1.5 * data.widest * float(np.max(np.asarray(self.reference.rate)))
@@ -237,7 +239,7 @@ class Model(eqx.Module):
                 "process: a filter follows one record from its beginning; give a Recording instead "
                 "of windows"
             )
-        if windows is not None or _samples_read(torque, self.records):
+        if windows is not None or _sampled_inputs_read(torque, self.records):
             _require_held_steps(integrator)
             integrator = HeldSteps()
         elif integrator is None and torque is not None:
@@ -250,7 +252,7 @@ class Model(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Return the number of free numbers."""
+        """Return the number n of the free numbers."""
         return self.index.size
 
     @property
@@ -260,7 +262,9 @@ class Model(eqx.Module):
 
     @property
     def recordings(self) -> tuple[Recording, ...]:
-        """Return the recordings as a tuple, each without the padding of the stacked recordings."""
+        """Return the recordings as a tuple, each with its own number of times, without the masked
+        readings that fill up shorter recordings in `records`.
+        """
         return tuple(
             stacking.take_rows(stacking.pick_records(self.records, index), count)
             for index, count in enumerate(np.asarray(self.counts).tolist())
@@ -330,16 +334,16 @@ class Model(eqx.Module):
         return jnp.asarray(xp.concatenate(parts))
 
     def unpack(self, x: Float[Array, " n"]) -> Unpacked:
-        """Return the quantities that the free numbers x represent: body, initial state, values of
-        the `Free`s.
+        """Return the quantities that the free numbers x (n,) represent: body, initial state, values
+        of the `Free`s.
 
         For several recordings the states have a leading axis.
         """
         return unpack_numbers(self, require_numbers(self, x))
 
     def bodies(self, x: Float[Array, " n"]) -> Any:
-        """Return the body that the free numbers x represent, or for several bodies a dict by
-        name.
+        """Return the body that the free numbers x (n,) represent, or for several bodies a dict of
+        name → body.
         """
         numbers = x[: self.index.bodies]
         if isinstance(self.chart, Bodies):
@@ -347,11 +351,14 @@ class Model(eqx.Module):
         return scaled_body(self.chart, numbers)
 
     def scenes(self, x: Float[Array, " n"]) -> Scene:
-        """Return the scene of each recording at the free numbers x, with a leading axis."""
+        """Return the scene (body, torques, sensors, initial state) of each recording at the free
+        numbers x (n,), with a leading axis of recordings.
+        """
         return scenes_of(self, require_numbers(self, x))
 
     def values(self, x: Float[Array, " n"]) -> dict[str, Array]:
-        """Return the value of each `Free` at the free numbers x, by name, in its unit.
+        """Return the values of all `Free`s at the free numbers x (n,), as a dict of name → array,
+        in their units.
 
         The shape is (R, …) if each recording has a value, and (groups, …) if each group of
         recordings has a value. For a `Free` named "drag" with a `spread` the shared value is under
@@ -360,7 +367,8 @@ class Model(eqx.Module):
         return values_of(self, require_numbers(self, x))
 
     def motion(self, x: Float[Array, " n"]) -> Any:
-        """Return the states at the times of the recording, with a leading time axis.
+        """Return the states at the times of the recording for the free numbers x (n,), with a
+        leading time axis.
 
         For several recordings an axis of recordings comes before the time axis.
         """
@@ -384,12 +392,21 @@ class Model(eqx.Module):
         return tuple(e[0] for e in out) if self.count == 1 else out
 
 
-class _Data(NamedTuple):
-    """Hold the parts of a model that come from its recordings or windows.
+class _RecordedData(NamedTuple):
+    """Hold the parts of a `Model` that come from its recordings, or from windows (short parts of a
+    record of measured states).
 
-    Fields with the name of a field of `Model` have the same meaning here. **Further fields:**
+    **Fields:**
 
+    - `records`: all R recordings, with a leading axis of recordings.
+    - `counts`: (R,) the number of times of each recording without padding.
     - `sensors`: the sensors of one recording.
+    - `state_kind`: the type of the states: `Spin`, `Attitude` or `Rigid`.
+    - `reference`: the states from which the free initial states are measured.
+    - `start_weight`: (R, n) one over the standard deviation of each of the n numbers of a free
+      initial state about the measured start of a window; `None` without such a prior.
+    - `clusters`: (R,) the index of the stretch (group of neighbouring windows) of each window;
+      `None` for recordings.
     - `kinds`: the number of three-vectors (such as attitude and rate) of a free initial state, 0 if
       the initial state is known.
     - `widest`: the longest time between two successive samples, s; 0 for windows.
@@ -408,8 +425,15 @@ class _Data(NamedTuple):
 
 def _data_of_recordings(
     recordings: list[Recording], torque: Torque | None, charts: AbstractBodyChart | Bodies
-) -> _Data:
-    """Return the `_Data` of recordings whose initial states are free."""
+) -> _RecordedData:
+    """Return the parts of a `Model` that come from recordings, after checks: the stacked readings,
+    and a reference state of each recording, whose initial state is free.
+
+    - `recordings`: the recordings, in their order.
+    - `torque`: the torque of the model, whose inputs every recording must have, or `None`.
+    - `charts`: the chart of one body, or the charts of several bodies; together with sensors and
+      torque it decides which type of state is needed.
+    """
     _require_recordings(recordings)
     recordings = with_limits(recordings)
     _require_inputs(torque, [recording.inputs for recording in recordings])
@@ -417,43 +441,55 @@ def _data_of_recordings(
         _require_even_times(torque, one, number)
     records, counts = stacking.stack(recordings)
     sensors = recordings[0].sensors
-    state_kind = _state_kind(sensors, torque, charts)
+    state_kind = _smallest_state_type(sensors, torque, charts)
     # The readings are concrete arrays even if the torque is traced by JAX. The reference states are
     # computed at compile time, so that they are concrete arrays, too.
     with jax.ensure_compile_time_eval():
         reference = reference_of(recordings, state_kind)
     kinds = dimension(stacking.pick_records(reference.state, 0)) // 3
     widest = max(float(np.diff(r.t).max()) for r in recordings)
-    return _Data(records, counts, sensors, state_kind, reference, None, None, kinds, widest)
+    return _RecordedData(records, counts, sensors, state_kind, reference, None, None, kinds, widest)
 
 
 def _data_of_windows(
     windows: Windows, torque: Torque | None, charts: AbstractBodyChart | Bodies, stretches: int
-) -> _Data:
-    """Return the `_Data` of windows, each of which starts in its measured state, or in a free state
-    about the measured state.
+) -> _RecordedData:
+    """Return the parts of a `Model` that come from windows, after checks.
+
+    Windows are short parts of a record of measured states. Each window starts in its measured
+    state, or in a free state about the measured state.
+
+    - `windows`: the windows.
+    - `torque`: the torque of the model, whose inputs the windows must have, or `None`.
+    - `charts`: the chart of one body, or the charts of several bodies.
+    - `stretches`: the number of groups of neighbouring windows, at least 2.
     """
     require_inputs_of_windows(torque, windows)
     records = windows.records()
     counts = np.full(windows.count, windows.length + 1, np.int32)
-    state_kind = _state_kind(records.sensors, torque, charts)
+    state_kind = _smallest_state_type(records.sensors, torque, charts)
     stretches = _checks.integer(stretches, "stretches", 2)
     reference, weight, clusters = starts_of_windows(windows, stretches)
-    _require_states(windows, state_kind)
+    _require_state_type(windows, state_kind)
     kinds = 0 if weight is None else dimension(stacking.pick_records(reference.state, 0)) // 3
-    return _Data(
+    return _RecordedData(
         records, counts, records.sensors, state_kind, reference, weight, clusters, kinds, 0.0
     )
 
 
-def _require_parts(
+def _require_argument_types(
     charts: AbstractBodyChart | Bodies,
     free: object,
     loss: object,
     prior: object,
     integrator: object,
 ) -> None:
-    """Raise `TypeError` unless the arguments of a `Model` have the right types."""
+    """Raise `TypeError` unless the arguments of a `Model` have the right types.
+
+    `charts` must be one `AbstractBodyChart` or several in a `Bodies`, `free` a sequence, `loss` an
+    `AbstractLoss`, `prior` an `Entropic` and `integrator` an `AbstractIntegrator`; the last three
+    may be `None`.
+    """
     for one in chart_list(charts):
         known = isinstance(one, Inertia | MassProperties)
         hint = "give a known body as Known(body)" if known else ""
@@ -470,8 +506,14 @@ def _require_parts(
             _checks.require_instance(value, kind, name)
 
 
-def _require_own_names(slots: Sequence[Slot], charts: AbstractBodyChart | Bodies) -> None:
-    """Raise `ValueError` for a `Free` with the name of a quantity of the body."""
+def _require_unused_names(slots: Sequence[Slot], charts: AbstractBodyChart | Bodies) -> None:
+    """Raise `ValueError` if a `Free` has the name of a quantity of the body that a fit reports,
+    such as "I1".
+
+    - `slots`: the `Free`s of a model, as `Slot`s.
+    - `charts`: the chart of one body, or the charts of several bodies, whose quantities are
+      reported.
+    """
     taken = {name for one in chart_list(charts) for name in (*one.log_names, *one.plain_names)}
     for slot in slots:
         if slot.name in taken | {"Ωx", "Ωy", "Ωz"}:
@@ -480,15 +522,20 @@ def _require_own_names(slots: Sequence[Slot], charts: AbstractBodyChart | Bodies
 
 
 def unpack_numbers(model: Model, x: Float[Array, " n"]) -> Unpacked:
-    """Return the result of `Model.unpack`, without a check of x."""
+    """Return the body, the initial state and the values of the `Free`s that the free numbers x (n,)
+    of a `model` represent, without a check of x.
+
+    For several recordings the initial states have a leading axis.
+    """
     starts = jax.vmap(ReferenceStates.start_at)(model.reference, x[model.index.start])
     state0 = stacking.pick_records(starts, 0) if model.count == 1 else starts
     return Unpacked(x, model.bodies(x), state0, values_of(model, x))
 
 
 def unpack_with_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
-    """Return two things: the quantities that x represents; and the derivatives of these quantities
-    with respect to x, along a new last axis of each array.
+    """Return two things: the quantities (body, initial state, values of the `Free`s) that the free
+    numbers x (n,) represent; and the derivatives of these quantities with respect to x, along a new
+    last axis of each array.
     """
     slopes, point = _unpack_with_jacobian(without_samples(model), x)
     return point, slopes
@@ -496,8 +543,9 @@ def unpack_with_slopes(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, U
 
 @eqx.filter_jit
 def _unpack_with_jacobian(model: Model, x: Float[Array, " n"]) -> tuple[Unpacked, Unpacked]:
-    """Return two things, computed in one program: the derivatives of `unpack_numbers(model, x)`
-    with respect to x; and its result.
+    """Return two things, computed in one compiled program: the derivatives of the quantities (body,
+    initial state, values of the `Free`s) that the free numbers x (n,) represent, along a new last
+    axis of each array; and these quantities.
     """
     return with_jacobian(lambda x: unpack_numbers(model, x), x)
 
@@ -513,7 +561,9 @@ def without_samples(model: Model) -> Model:
 
 
 def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
-    """Return the result of `Model.scenes`, without a check of x."""
+    """Return the scene (body, torques, sensors, initial state) of each recording of a `model` at
+    the free numbers x (n,), with a leading axis of recordings, without a check of x.
+    """
 
     def scene_of_recording(row: Array, *rest: PyTree) -> Scene:
         return scene_from_row(model, row, *rest)
@@ -525,7 +575,11 @@ def scenes_of(model: Model, x: Float[Array, " n"]) -> Scene:
 
 
 def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
-    """Return the result of `Model.values`, without a check of x."""
+    """Return the values of all `Free`s of a `model` at the free numbers x (n,), as a dict of name →
+    array, without a check of x.
+
+    The shapes are those of `Model.values`.
+    """
     rows, out = model.index.rows(x), {}
     starts = starting_values(model)
     for slot, start in zip(model.slots, starts, strict=True):
@@ -546,7 +600,9 @@ def values_of(model: Model, x: Float[Array, " n"]) -> dict[str, Array]:
 
 
 def starting_values(model: Model) -> list[Float[Array, "records ..."]]:
-    """Return, for each slot, its starting values (R, *shape) in the R recordings."""
+    """Return a list of the starting values of the `Free`s of a `model`: for each `Free` an array
+    (R, *shape) of its values in R recordings.
+    """
     leaves, out = dict(jax.tree.leaves_with_path(scene_template(model, model.records))), []
     for slot in model.slots:
         leaf = jnp.asarray(leaves[slot.path])
@@ -556,8 +612,11 @@ def starting_values(model: Model) -> list[Float[Array, "records ..."]]:
 
 
 def filter_steps_of(model: Model) -> int:
-    """Return the number of steps that a filter needs in the longest interval between two successive
-    times of a model.
+    """Return the number of integration steps that a filter takes between two successive times of
+    the recordings of a `model`.
+
+    The number is so large that a body at 1.5 times its typical rate turns by at most
+    `TURN_OF_A_FILTER_STEP` in a step, even in the longest interval.
     """
     widest = np.max(np.diff(np.asarray(model.records.t), axis=1), initial=0.0)
     turn = 1.5 * float(widest) * float(np.max(np.asarray(model.reference.rate)))
@@ -586,8 +645,10 @@ def require_one(model: PyTree) -> Model:
 
 
 def require_numbers(model: Model, x: NumbersLike) -> Float[Array, " n"]:
-    """Return the free numbers x as an array, and raise an error unless x has the shape and dtype of
-    the free numbers of this model, and is finite.
+    """Return the free numbers x (n,) of a `model` as an array, after checks.
+
+    An error is raised unless x has n numbers of the dtype of the recordings, and all of them are
+    finite. Traced numbers are not checked for being finite.
     """
     require_one(model)
     hint = "model.start(body) makes them"
@@ -619,9 +680,9 @@ def with_parts(model: Model, **parts: Any) -> Model:
     return new
 
 
-def _require_states(windows: Windows, kind: type) -> None:
-    """Raise `TypeError` unless the measured states of the windows are of the type `kind`, which the
-    torque needs.
+def _require_state_type(windows: Windows, kind: type) -> None:
+    """Raise `TypeError` unless the measured states in `windows` are of the type `kind` (`Spin`,
+    `Attitude` or `Rigid`), which the torque needs.
     """
     if not isinstance(windows.starts, kind):
         raise TypeError(
@@ -631,8 +692,11 @@ def _require_states(windows: Windows, kind: type) -> None:
 
 
 def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) -> None:
-    """Raise `ValueError` if the torque reads an input that is missing in the `inputs` of a
-    recording.
+    """Raise `ValueError` if a torque reads an input, such as the logged speed of a wheel, that a
+    recording lacks.
+
+    `inputs` holds for each recording a dict of name → samples or function of time. The `torque` may
+    be `None`.
     """
     for number, of_one in enumerate(inputs):
         missing = [name for name in inputs_of(torque) if name not in of_one]
@@ -645,8 +709,10 @@ def _require_inputs(torque: Torque | None, inputs: Sequence[Mapping[str, Any]]) 
 
 
 def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
-    """Raise `ValueError` if the windows lack an input that the torque reads, or samples before or
+    """Raise `ValueError` if `windows` lack an input that the `torque` reads, or samples before or
     after a window that a delayed input needs.
+
+    An input is a logged quantity such as a motor command. The `torque` may be `None`.
     """
     missing = [name for name in inputs_of(torque) if name not in windows.inputs]
     if missing:
@@ -661,36 +727,44 @@ def require_inputs_of_windows(torque: Torque | None, windows: Windows) -> None:
 
 
 def describe_delays(model: Model, x: Float[Array, " n"]) -> list[str]:
-    """Describe the delays that, at the free numbers x, read samples of the inputs outside of the
-    windows; return one text for each delay.
+    """Describe the delays that, at the free numbers x (n,), read samples of the inputs outside of
+    the windows of a `model`; return one text for each such delay.
+
+    A delay shifts an input (a logged quantity such as a motor command) in time. The list is empty
+    for a model of recordings.
     """
     if model.clusters is None or not delays_of(model.torque):
         return []
     t, rows = np.asarray(model.records.t)[0], max(len(a[0]) for a in model.records.inputs.values())
     step = float(t[1] - t[0])
     known, length = (rows - t.size) * step, (t.size - 1) * step
-    return mistakes_of_delays(_scenes_program(model, x).torque, known, length)
+    return mistakes_of_delays(_compiled_scenes(model, x).torque, known, length)
 
 
 @eqx.filter_jit
-def _scenes_program(model: Model, x: Float[Array, " n"]) -> Scene:
-    """Return the result of `scenes_of`, computed in one program.
+def _compiled_scenes(model: Model, x: Float[Array, " n"]) -> Scene:
+    """Return the scene (body, torques, sensors, initial state) of each recording at the free
+    numbers x (n,), computed in one compiled program.
 
     Outside of a trace each operation of JAX takes as long as a run of 100 steps.
     """
     return scenes_of(model, x)
 
 
-def _samples_read(torque: Torque | None, recording: Recording) -> list[str]:
-    """Return the names of the inputs that are samples and that the torque reads."""
+def _sampled_inputs_read(torque: Torque | None, recording: Recording) -> list[str]:
+    """Return the names of the inputs that the `torque` reads and that are samples in the
+    `recording`, not functions of time.
+    """
     return [name for name in inputs_of(torque) if not callable(recording.inputs[name])]
 
 
 def _require_even_times(torque: Torque | None, recording: Recording, number: int) -> None:
-    """Raise `ValueError` if the torque reads inputs that are samples, and the times of the
-    recording are not evenly spaced.
+    """Raise `ValueError` if the `torque` reads inputs that are samples, and the times of the
+    `recording` are not evenly spaced.
+
+    `number` is the index of the recording in the model, for the error.
     """
-    names, steps = _samples_read(torque, recording), np.diff(np.asarray(recording.t, float))
+    names, steps = _sampled_inputs_read(torque, recording), np.diff(np.asarray(recording.t, float))
     if names and not (np.abs(steps - steps[0]) <= EVEN * steps[0]).all():
         raise ValueError(
             f"inputs[{names[0]!r}]: samples are held through even steps, and the times of "
@@ -711,43 +785,50 @@ def _require_held_steps(integrator: object) -> None:
         )
 
 
-def _charts_and_names(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
-    """Return three things: the list of all recordings; the chart, or the `Bodies` of several
-    charts; and the name of the body of each recording.
+def _charts_and_names(recording: Any, chart: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
+    """Return three things: the list of all recordings; the chart of one body, or the `Bodies` of
+    several charts; and the name of the body of each recording.
+
+    - `recording`: one `Recording`, a sequence of recordings, or for several bodies a dict of name →
+      recordings.
+    - `chart`: the chart of the body, or for several bodies a dict of name → chart with the same
+      names; an error is raised for other names.
+
+    The names are empty texts for one body.
     """
-    if isinstance(recording, Mapping) or isinstance(body, Mapping):
-        if not (isinstance(recording, Mapping) and isinstance(body, Mapping)):
+    if isinstance(recording, Mapping) or isinstance(chart, Mapping):
+        if not (isinstance(recording, Mapping) and isinstance(chart, Mapping)):
             raise TypeError(
                 "Model: of several bodies wanted both recordings and charts by name, got "
-                f"{type(recording).__name__} and {type(body).__name__}"
+                f"{type(recording).__name__} and {type(chart).__name__}"
             )
-        if set(recording) != set(body) or not body:
+        if set(recording) != set(chart) or not chart:
             raise ValueError(
                 f"Model: wanted a chart for each body, got recordings of {sorted(recording)} and "
-                f"charts of {sorted(body)}"
+                f"charts of {sorted(chart)}"
             )
-        for chart in body.values():
+        for one in chart.values():
             _checks.require_instance(
-                chart, AbstractBodyChart, "body", requirement="a chart such as Tensor()"
+                one, AbstractBodyChart, "body", requirement="a chart such as Tensor()"
             )
-        rows, of = [], []
-        for name in body:
+        rows, names = [], []
+        for name in chart:
             of_body = recording[name]
             of_body = [of_body] if isinstance(of_body, Recording) else list(of_body)
             if not of_body:
                 raise ValueError(f"Model: wanted a recording of {name!r}, got none")
             rows += of_body
-            of += [name] * len(of_body)
-        return rows, Bodies(body), tuple(of)
+            names += [name] * len(of_body)
+        return rows, Bodies(chart), tuple(names)
     if isinstance(recording, Recording):
-        return [recording], body, ("",)
+        return [recording], chart, ("",)
     rows = list(recording) if isinstance(recording, Sequence) else [recording]
-    return rows, body, ("",) * len(rows)
+    return rows, chart, ("",) * len(rows)
 
 
 def _require_recordings(recordings: Sequence[Any]) -> None:
-    """Raise an error unless there is at least one recording, and each recording is concrete (not
-    traced by JAX) and not a batch.
+    """Raise an error unless there is at least one recording, and each is a single `Recording` (not
+    a batch) of known numbers (not traced by JAX).
     """
     if not recordings:
         raise ValueError("Model: wanted at least one Recording, got an empty sequence")
@@ -768,9 +849,13 @@ def _require_recordings(recordings: Sequence[Any]) -> None:
 
 
 def _numbers_in_chart(chart: AbstractBodyChart, body: Body | None) -> Float[Array, " chart"]:
-    """Return the numbers that represent a body in a chart, or zeros for `None`."""
+    """Return the free numbers (size,) that represent a `body` in a `chart`, or zeros for `None`.
+
+    An error is raised for a batch of bodies, and for a body that has no finite numbers in the
+    chart.
+    """
     if body is None:
-        return _host_zeros(chart.size)
+        return _zeros_by_numpy(chart.size)
     one = validation.require_single_body(body, (Inertia, MassProperties), "body")
     if _checks.is_known(one):
         jax.tree.map(lambda leaf: _checks.require_finite(leaf, "body"), one)
@@ -785,24 +870,29 @@ def _numbers_in_chart(chart: AbstractBodyChart, body: Body | None) -> Float[Arra
     return vector
 
 
-def _host_zeros(*shape: int) -> Array:
-    """Return zeros made by NumPy, since JAX would compile a program for each shape."""
+def _zeros_by_numpy(*shape: int) -> Array:
+    """Return an array of zeros of this `shape` in JAX's default float type.
+
+    NumPy makes the zeros, since JAX would compile a program for each shape.
+    """
     return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
 
 
-def _state_kind(
-    sensors: Sequence[AbstractSensor], torque: Torque | None, body: AbstractBodyChart | Bodies
+def _smallest_state_type(
+    sensors: Sequence[AbstractSensor], torque: Torque | None, charts: AbstractBodyChart | Bodies
 ) -> type:
-    """Return the smallest type of state that sensors and torque need.
+    """Return the smallest type of state (`Spin`, `Attitude` or `Rigid`) that the sensors and the
+    torque need.
 
-    It raises `ValueError` if a sensor or the torque needs a mass and the chart has none.
+    `Rigid` needs a mass: `ValueError` is raised if one of the `charts` (of one body, or of several)
+    describes an inertia alone.
     """
     needed = [sensor.feels for sensor in sensors]
     if torque is not None:
         needed.append(getattr(torque, "feels", HasAttitude))
     forced = any(isinstance(part, AbstractForce) for part in parts_of(torque))
     if HasPose in needed or forced:
-        for chart in chart_list(body):
+        for chart in chart_list(charts):
             if not has_mass(chart):
                 raise ValueError(
                     "Model: a sensor or force needs a body that moves, whose mass is known or "

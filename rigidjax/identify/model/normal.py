@@ -42,7 +42,7 @@ class NormalMatrix(eqx.Module):
 
     @property
     def diagonal(self) -> Float[Array, " n"]:
-        """Return the diagonal of the matrix."""
+        """Return the diagonal (n,) of the matrix."""
         own = self.own_blocks and jnp.diagonal(self.own_blocks.own, axis1=1, axis2=2)
         return self._join_rows(jnp.diagonal(self.core), own)
 
@@ -90,6 +90,8 @@ class NormalMatrix(eqx.Module):
     def solve(self, rhs: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
         """Return the solution x of `matrix @ x = rhs`, or NaN unless the matrix is positive
         definite.
+
+        `rhs` (n,) or (n, columns) holds one right-hand side or several; x has its shape.
         """
         alone, count = self.own_blocks, self.core.shape[0]
         if alone is None:
@@ -102,18 +104,21 @@ class NormalMatrix(eqx.Module):
         return self._join_rows(first, last).reshape(rhs.shape)
 
     def _split_rows(self, x: Array) -> tuple[Array, Array]:
-        """Return two parts of x (n, …): the rows (s, …) of the core; and the rows (R, k, …) that
-        belong to one recording alone.
+        """Return two parts of an array x (n, …): the rows (s, …) of the s numbers that recordings
+        share; and the rows (R, k, …) of the k numbers that each of R recordings has alone.
 
-        Without numbers of one recording alone both results are x.
+        If no recording has numbers alone, both parts are x.
         """
         return (
             (x, x) if self.own_blocks is None else (x[: self.core.shape[0]], x[self.own_blocks.at])
         )
 
     def _join_rows(self, shared: Array, own: Array | None) -> Array:
-        """Return all rows (n, …), from the rows `shared` (s, …) of the core and the rows `own` (R,
-        k, …) of one recording alone.
+        """Return an array (n, …) of the rows of all n numbers, the inverse of `_split_rows`.
+
+        - `shared`: (s, …) the rows of the s numbers that recordings share.
+        - `own`: (R, k, …) the rows of the k numbers that each of R recordings has alone; it is not
+          read if no recording has such numbers.
         """
         if self.own_blocks is None:
             return shared
@@ -123,7 +128,11 @@ class NormalMatrix(eqx.Module):
 
 
 def _solve_by_cholesky(matrix: Array, rhs: Array) -> Array:
-    """Solve `matrix x = rhs` by Cholesky's decomposition."""
+    """Return the solution x of `matrix @ x = rhs` by Cholesky's decomposition, or NaN unless the
+    symmetric `matrix` (n, n) is positive definite.
+
+    `rhs` (n,) or (n, columns) holds one right-hand side or several; x has its shape.
+    """
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), rhs)
 
 

@@ -65,9 +65,13 @@ class AbstractIntegrator(eqx.Module):
     def states(
         self, body: Body, state0: State, ts: Float[Array, " times"], torque: Torque
     ) -> PyTree:
-        """Return the states at `ts` from `state0` at the first time, with a leading time axis.
+        """Return the states of a forced motion at the times `ts` (T,), s, with a leading time axis.
 
         The states are a `motion.Coupled` if the torque has states of its own.
+
+        - `body`: the body.
+        - `state0`: the state at `ts[0]`.
+        - `torque`: the torque on the body.
         """
 
     def refine(self) -> "AbstractIntegrator | None":
@@ -115,10 +119,12 @@ class FixedSteps(AbstractIntegrator):
         return FixedSteps(2 * self.substeps, self.solver, self.last)
 
 
-def _tolerance_field(name: str) -> Callable[[ScalarLike], Array]:
-    """Return the converter of the dataclass field `name`, a tolerance: from a number to an array.
+def _tolerance_converter(name: str) -> Callable[[ScalarLike], Array]:
+    """Return a function that makes an array of shape () of a tolerance, as the `converter` of a
+    dataclass field.
 
-    A compiled program takes an array as an argument, so that another value needs no new
+    `name` is the name of the field, for the error if the tolerance is not a known number. A
+    compiled program takes an array as an argument, so that another tolerance needs no new
     compilation.
     """
     return lambda value: jnp.asarray(_checks.known_float(value, name), jnp.result_type(float))
@@ -134,8 +140,8 @@ class Adaptive(AbstractIntegrator):
     1e-09
     """
 
-    rtol: Float[Array, ""] = eqx.field(converter=_tolerance_field("rtol"), default=1e-9)
-    atol: Float[Array, ""] = eqx.field(converter=_tolerance_field("atol"), default=1e-12)
+    rtol: Float[Array, ""] = eqx.field(converter=_tolerance_converter("rtol"), default=1e-9)
+    atol: Float[Array, ""] = eqx.field(converter=_tolerance_converter("atol"), default=1e-12)
 
     def __check_init__(self):
         _checks.positive_float(self.rtol, "rtol")
@@ -168,8 +174,11 @@ class Adaptive(AbstractIntegrator):
 
 
 def integrator_for(turn: float) -> AbstractIntegrator:
-    """Return an integrator that suits a body that turns by at most `turn` rad between two
-    samples.
+    """Return an integrator that is precise enough for a body that turns by at most `turn` rad
+    between two samples.
+
+    It takes few fixed steps between two samples if `turn` is small, and adaptive steps if it is
+    large.
     """
     if turn <= TURN_OF_ORDER_4:
         return FixedSteps(1, solvers.RungeKutta4())
@@ -184,7 +193,14 @@ def states_at(
     ts: Float[Array, " times"],
     torque: Torque | None,
 ) -> PyTree:
-    """Return the states at `ts` from `state0` at `ts[0]`, by the closed form for a free body."""
+    """Return the states of a motion at the times `ts` (T,), s, with a leading time axis.
+
+    - `integrator`: the integrator of a forced motion; it is not used for a free body.
+    - `body`: the body.
+    - `state0`: the state at `ts[0]`.
+    - `torque`: the torque on the body, or `None` for a free body, whose motion is computed by the
+      closed form.
+    """
     if torque is not None:
         assert integrator is not None
         return integrator.states(body, state0, ts, torque)
@@ -217,12 +233,17 @@ class HeldSteps(AbstractIntegrator):
         torque: Torque,
         inputs: dict[str, Array],
     ) -> PyTree:
-        """Return the states at `ts` (T,) under a torque that is driven by `inputs`.
+        """Return the states at the times `ts` (T,), s, under a torque that reads sampled inputs,
+        with a leading time axis.
 
-        The inputs are arrays (before + T, *k) by name, where `before` is the number of samples
-        before the first time `ts[0]`. Row before + i is held constant in the step from `ts[i]` to
-        `ts[i + 1]`. The torque's own states (such as the state of a motor) are first integrated
-        over the rows before `ts[0]`, while the body is held at its initial state.
+        The torque's own states (such as the state of a motor) are first integrated over the samples
+        before `ts[0]`, while the body is held at its initial state.
+
+        - `body`, `state0`: the body, and its state at `ts[0]`.
+        - `torque`: the torque on the body.
+        - `inputs`: a dict of name → samples (before + T, *k), where `before` is the number of
+          samples before `ts[0]`. The sample in row before + i is held constant in the step from
+          `ts[i]` to `ts[i + 1]`.
         """
         count, size = ts.shape[0] - 1, (ts[1] - ts[0]).astype(state0.omega.dtype)
         before = max((len(rows) - ts.shape[0] for rows in inputs.values()), default=0)
@@ -252,8 +273,8 @@ class HeldSteps(AbstractIntegrator):
 def shift_in_time(field: Callable[..., Any], t: Array, state: PyTree, offset: Array) -> PyTree:
     """Return the state at the time t + `offset`, s, from the `state` at the time t, s.
 
-    It takes four equal steps of the classical Runge–Kutta method of order 4 along the vector field
-    `field`.
+    It takes four equal steps of the classical Runge–Kutta method of order 4 along the equations of
+    motion `field`, a function (t, state, args) that returns the time derivative of the state.
     """
     h = offset / 4.0
     for index in range(4):
@@ -262,7 +283,8 @@ def shift_in_time(field: Callable[..., Any], t: Array, state: PyTree, offset: Ar
 
 
 def body_of_equations(body: Body, state_type: type) -> Body:
-    """Return the body as the equations of motion of a state of type `state_type` need it.
+    """Return the part of a `body` that the equations of motion of a state of type `state_type`
+    need.
 
     Only the equations of motion of a `Rigid` state need the mass; for all other states the result
     is the `Inertia`.
@@ -320,13 +342,21 @@ def errors_along(
     states: PyTree,
     input_at: Callable[[Array, PyTree], SensorInput],
 ) -> Float[Array, "times k"]:
-    """Return the errors (T, k) of readings `values` (T, …) of a sensor.
+    """Return the errors (T, k), reading minus prediction, of the readings of a sensor along a
+    motion.
 
-    The arguments `times`, `states` and `input_at` are the three results of `sensor_inputs`.
+    - `sensor`: the sensor, whose error has k components.
+    - `values`: (T, …) the readings.
+    - `times`: (T,) the times at which the sensor reads, s.
+    - `states`: the states at these times, with a leading time axis.
+    - `input_at`: a function of a time and a state that returns the `SensorInput` from which the
+      sensor predicts its reading.
+
+    The last three are the results of `sensor_inputs`.
     """
 
     def error(t: Array, state: PyTree, value: Array) -> Array:
-        return _error_of(sensor, input_at(t, state), value)
+        return _checked_error(sensor, input_at(t, state), value)
 
     lowpass = getattr(sensor, "lowpass", None)
     if lowpass is None:
@@ -336,10 +366,13 @@ def errors_along(
     return values + lowpass(times, jax.vmap(error)(times, states, jnp.zeros_like(values)))
 
 
-def _error_of(sensor: AbstractSensor, motion: SensorInput, value: Array) -> Array:
-    """Return the error (k,) of the reading `value`, with a check of its shape and readable errors.
+def _checked_error(sensor: AbstractSensor, motion: SensorInput, value: Array) -> Array:
+    """Return the error (k,), reading minus prediction, of the reading `value` of a `sensor`, after
+    checks.
 
-    The checks are needed since a user may have written the sensor's method `error`.
+    The sensor predicts the reading from `motion`, which holds time, state, body and equations of
+    motion. A user may have written the sensor's method `error`: it is an error if this method reads
+    more of the state than the sensor says, or returns another shape than (k,).
     """
     name = type(sensor).__name__
     try:
@@ -410,12 +443,15 @@ def simulate_readings(
     count = len(sensors)
     keys = [None] * count if key is None else jax.random.split(_checks.random_key(key), count)
     motion = body, torque, sol.ts, start, states
-    out = tuple(_readings(one, *motion, key=own) for one, own in zip(sensors, keys, strict=True))
+    out = tuple(
+        _readings_along_motion(one, *motion, key=own)
+        for one, own in zip(sensors, keys, strict=True)
+    )
     return out if several else out[0]
 
 
 @eqx.filter_jit
-def _readings(
+def _readings_along_motion(
     sensor: AbstractSensor,
     body: Inertia | MassProperties,
     torque: Torque | None,
@@ -425,7 +461,17 @@ def _readings(
     *,
     key: PRNGKeyArray | None,
 ) -> Float[Array, "times ..."]:
-    """Return the readings of one sensor along a motion, computed in one program."""
+    """Return the readings (T, *reading_shape) of one sensor along a motion, in its unit, computed
+    in one compiled program.
+
+    - `sensor`: the sensor, with its bias, clock offset, low-pass filter and full scale.
+    - `body`, `torque`: the body, and the torque of the motion or `None`.
+    - `ts`: (T,) the time stamps of the readings, s.
+    - `state0`, `states`: the initial state, and the states at `ts`; `Coupled` if the torque has
+      states of its own.
+    - `key`: the random key of the noise and of the jitter of the time stamps; `None` for readings
+      without noise and jitter.
+    """
     jitter, late = getattr(sensor, "jitter", None), None
     if key is not None and jitter is not None:
         key, own = jax.random.split(key)
@@ -447,8 +493,10 @@ def _readings(
 
 
 def _require_sensor(sensor: PyTree, state0: State, key: object) -> None:
-    """Raise an error unless `sensor` is a sensor that can read the state `state0`, and has a known
-    noise if a random `key` is given.
+    """Raise an error unless `sensor` is a sensor whose readings of a motion can be simulated.
+
+    The sensor must be able to read the state `state0` of the motion. With a random `key` the sensor
+    must also have a known noise, and no jitter of unknown size.
     """
     name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
     _checks.require_instance(sensor, AbstractSensor, "sensor", requirement=wanted)

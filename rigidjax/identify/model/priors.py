@@ -92,7 +92,9 @@ class Huber(AbstractLoss):
 
 
 def _checked_weight(value: float) -> Scalar:
-    """Return the weight of a prior as an array, and raise `ValueError` unless it is positive."""
+    """Return the weight of a prior, a number, as an array of shape (), and raise `ValueError`
+    unless it is positive.
+    """
     return jnp.asarray(_checks.positive_float(value, "weight"), jnp.result_type(float))
 
 
@@ -123,10 +125,11 @@ class Entropic(eqx.Module):
     def residuals(
         self, body: Inertia | MassProperties, to_scale: bool = True
     ) -> Float[Array, " n"]:
-        """Return numbers whose squares add up to `2 w D`.
+        """Return residuals whose squares add up to `2 w D`, where D is the divergence of `body`
+        from the guess and w the weight.
 
-        If `to_scale` is false, each matrix is divided by its trace first, so that D compares only
-        the shapes of the two bodies.
+        If `to_scale` is false, each matrix of second moments is divided by its trace first, so that
+        D compares only the shapes of the two bodies.
         """
         if isinstance(body, MassProperties) and isinstance(self.guess, MassProperties):
             here, there = _pseudo_inertia(body), _pseudo_inertia(self.guess)
@@ -139,12 +142,19 @@ class Entropic(eqx.Module):
         factor = jnp.linalg.cholesky(jnp.linalg.solve(root, half.T))
         n = factor.shape[0]
         rows, columns = jnp.tril_indices(n, -1)
-        parts = jnp.concatenate([factor[rows, columns], _root_of_divergence(jnp.diagonal(factor))])
+        parts = jnp.concatenate(
+            [factor[rows, columns], _signed_root_of_divergence(jnp.diagonal(factor))]
+        )
         return jnp.sqrt(2.0 * self.weight) * parts
 
 
-def _root_of_divergence(c: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return `√(c² − 1 − 2 log c)` with the sign of c − 1, which is smooth through c = 1."""
+def _signed_root_of_divergence(c: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return `√(c² − 1 − 2 log c)` with the sign of c − 1 for each of n positive numbers c, which
+    is smooth through c = 1.
+
+    The square is the divergence between the variances c² and 1. Near c = 1 the root is computed by
+    a series, since the formula would lose its digits.
+    """
     x = c - 1.0
     near = jnp.abs(x) < 1e-2
     # This is the series in parentheses in (1 + x)² − 1 − 2 log(1 + x) = 2 x² (1 − x/3 + x²/4 − x³/5
@@ -156,7 +166,9 @@ def _root_of_divergence(c: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def _pseudo_inertia(body: MassProperties) -> Float[Array, "4 4"]:
-    """Return the pseudo-inertia J, which holds the second moments ∫ r̃ r̃ᵀ dm of r̃ = (r, 1)."""
+    """Return the pseudo-inertia J (4, 4) of a `body`: the second moments J = ∫ r̃ r̃ᵀ dm of the
+    vectors r̃ = (r, 1), where r is the position of a mass element in the body frame.
+    """
     m, c = body.mass, body.com
     upper = body.second_moment + m * c[:, None] * c[None, :]
     side = (m * c)[:, None]

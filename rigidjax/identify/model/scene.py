@@ -43,7 +43,9 @@ class Scene(eqx.Module):
 
 
 def require_process(process: PyTree) -> None:
-    """Raise `TypeError` unless `process` is an unknown torque or a `Sum` of unknown torques."""
+    """Raise `TypeError` unless `process` is an unknown torque (a `RandomTorque` or
+    `CorrelatedTorque`), or a `Sum` of unknown torques.
+    """
     wanted = "a RandomTorque, a CorrelatedTorque or a Sum of them"
     for part in parts_of(process) or (process,):
         _checks.require_instance(
@@ -52,8 +54,8 @@ def require_process(process: PyTree) -> None:
 
 
 def require_known_torque(torque: Torque | None) -> None:
-    """Raise `TypeError` if the torque or a summand of it is an unknown torque, which belongs in the
-    argument `process`.
+    """Raise `TypeError` if the `torque` or a summand of it is an unknown torque (a `RandomTorque`
+    or `CorrelatedTorque`), which belongs in the argument `process` of a `Model`.
     """
     for part in parts_of(torque):
         if isinstance(part, RandomTorque | CorrelatedTorque):

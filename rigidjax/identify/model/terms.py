@@ -42,14 +42,27 @@ Noise = tuple[Float[Array, "records _"], ...]
 
 
 def scene_template(model: "Model", record: Recording) -> Scene:
-    """Return the scene of a recording with the starting values of all free numbers."""
+    """Return the scene (torques and sensors) of a recording, in which all free numbers have their
+    starting values, still without body and initial state.
+
+    `model` has the torques, and `record` the sensors.
+    """
     return Scene(None, model.torque, model.process, record.sensors, None)
 
 
 def scene_from_row(
     model: "Model", row: Row, record: Recording, reference: ReferenceStates, body_index: BodyIndex
 ) -> Scene:
-    """Return the scene of one recording from the row of its free numbers."""
+    """Return the scene (body, torques, sensors, initial state) of one recording at given free
+    numbers.
+
+    - `row`: the free numbers of the recording: those of its body, of the `Free`s, and of its
+      initial state, as `Index` describes.
+    - `record`, `reference`: the recording, and the state from which its free initial state is
+      measured.
+    - `body_index`: the index of the body of the recording among several bodies, or `None` for one
+      body.
+    """
     scene = with_steps(scene_template(model, record), model.slots, row)
     body = body_of_recording(model.chart, row, body_index)
     start = reference.start_at(row[model.index.first :])
@@ -57,8 +70,12 @@ def scene_from_row(
 
 
 def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[Any, Any]:
-    """Return two things: the states at the times of a recording; and the torque with the inputs of
-    the recording bound to it.
+    """Return two things: the states at the times of a recording, with a leading time axis; and the
+    torque of the scene, with the inputs (logged quantities) of the recording bound to it.
+
+    - `model`: the model, whose integrator is used.
+    - `scene`: the body, the torque and the initial state.
+    - `record`: the recording, with the times and the inputs.
     """
     assert scene.body is not None and scene.start is not None
     body: Any = body_of_equations(scene.body, model.state_kind)
@@ -74,7 +91,9 @@ def motion_of_scene(model: "Model", scene: Scene, record: Recording) -> tuple[An
 
 
 def torque_of_scene(scene: Scene, record: Recording) -> Torque | None:
-    """Return the torque of a scene with the inputs of a recording bound to it, or `None`."""
+    """Return the torque of a `scene` that reads the inputs (logged quantities such as a motor
+    command) of the recording `record`, or `None` without a torque.
+    """
     return bind(scene.torque, sources_of(record))
 
 
@@ -104,9 +123,11 @@ def errors_in_sensor_units(
 def errors_of_scene(
     model: "Model", scene: Scene, record: Recording, delay: Array | None = None
 ) -> tuple[Array, ...]:
-    """Return the errors (T, k) of each sensor in its unit, for a given scene of the recording.
+    """Return the errors (T, k) of each sensor in its unit, for a given `scene` (body, torques,
+    sensors, initial state) of the recording `record`.
 
-    The errors are those of `errors_in_sensor_units`.
+    The error is reading minus prediction; it is zero for a masked reading. `delay` is a time, s,
+    that is added to the clock offset of each sensor; `None` for none.
     """
     states, torque = motion_of_scene(model, scene, record)
     assert scene.body is not None and scene.start is not None
@@ -124,6 +145,12 @@ def over_records(function: Callable[..., PyTree], model: "Model", *rows: PyTree)
     On a CPU the recordings are computed one after another. XLA compiles the loop of one recording,
     over a few dozen numbers, to one kernel; batched over recordings, this loop runs at half the
     speed.
+
+    - `function`: a function of one recording.
+    - `model`: the model, which has the R recordings, their reference states, and the index of the
+      body of each recording.
+    - `rows`: trees of arrays with a leading axis (R,), whose parts of one recording are given to
+      `function`, such as the free numbers of each recording.
     """
     trees = *rows, model.records, model.reference, model.body_indices
     arrays, rest = eqx.partition(trees, eqx.is_array)
@@ -142,7 +169,8 @@ def over_records(function: Callable[..., PyTree], model: "Model", *rows: PyTree)
 
 
 def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
-    """Return the errors (R, T, k) of each sensor at the free numbers x.
+    """Return the errors (R, T, k), reading minus prediction, of each sensor at the free numbers x
+    (n,) of a `model`, in the unit of the sensor.
 
     Derivatives with respect to x are computed recording by recording, in forward mode.
     """
@@ -153,10 +181,15 @@ def all_errors(model: "Model", x: Float[Array, " n"]) -> tuple[Array, ...]:
 def by_recording(
     rows: Float[Array, "records columns"], model: "Model", function: Callable[..., PyTree]
 ) -> Any:
-    """Return `function(model, row, record, reference, body_index)` of every recording.
+    """Return `function(model, row, record, reference, body_index)` of every recording, with a
+    leading axis of recordings.
 
     Only derivatives with respect to the rows are defined. They are computed as in
     `errors_and_jacobians`.
+
+    - `rows`: (R, columns) the free numbers of each of R recordings, one row for each recording.
+    - `function`: a function such as `errors_in_sensor_units`, which returns an array or a tree of
+      arrays for one recording.
     """
 
     def function_of_row(row: Row, *rest: PyTree) -> Any:
@@ -167,8 +200,11 @@ def by_recording(
 
 @by_recording.def_jvp
 def _by_recording_jvp(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
-    """Return two things: the value of `by_recording`; and its tangent along the tangent of the
-    rows.
+    """Return two things: the value of `by_recording`; and its derivative along a change of the rows
+    (the free numbers of each recording).
+
+    `primals` are the three arguments of `by_recording`, and `tangents` their changes. An error is
+    raised if anything but the rows changes.
     """
     (rows, model, function), (step, *rest) = primals, tangents
     if jax.tree.leaves(rest):
@@ -185,10 +221,14 @@ def errors_and_jacobians(
     model: "Model", x: Float[Array, " n"], function: Callable[..., PyTree] = errors_in_sensor_units
 ) -> tuple[Any, Any]:
     """Return two things: `function` of every recording (R, …); and its derivatives (R, …, m) with
-    respect to the free numbers.
+    respect to the m free numbers of the recording.
 
     The m columns are those of `model.index.places`. Derivatives of readings with respect to free
     numbers are computed by this function and nowhere else.
+
+    - `x`: (n,) the free numbers of the `model`.
+    - `function`: a function such as `errors_in_sensor_units`, with the same arguments, of one
+      recording.
     """
     out, slopes = _values_and_jacobians(model, model.index.rows(x), function)
     columns = jnp.asarray(model.index.columns, jnp.int32)
@@ -200,8 +240,12 @@ def errors_and_jacobians(
 def _values_and_jacobians(
     model: "Model", rows: Array, function: Callable[..., PyTree[Array]]
 ) -> tuple[PyTree[Array], PyTree[Array]]:
-    """Return two things: `function` of every recording; and its derivatives with respect to the
-    numbers in the row of the recording.
+    """Return two things: `function` of every recording, with a leading axis (R,); and its
+    derivatives with respect to the free numbers of the recording, along a new last axis.
+
+    - `rows`: (R, columns) the free numbers of each of the R recordings of the `model`.
+    - `function`: a function such as `errors_in_sensor_units`, with the same arguments, of one
+      recording.
     """
 
     def value_and_jacobian(row: Row, *rest: PyTree) -> tuple[PyTree, PyTree]:
@@ -215,8 +259,8 @@ def _values_and_jacobians(
 
 @eqx.filter_jit
 def delay_derivatives(model: "Model", x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
-    """Return the derivative (R, T, k) of the errors of each sensor with respect to a delay of its
-    clock.
+    """Return, for each sensor, the derivative (R, T, k) of its errors with respect to a delay of
+    its clock, in the sensor's unit per second, at the free numbers x (n,) of the `model`.
     """
 
     def derivative_of_recording(row: Row, *rest: PyTree) -> Any:
@@ -241,8 +285,12 @@ def with_jacobian(function: Callable[[Array], Any], x: Float[Array, " n"]) -> tu
 
 
 def whiten(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors (R, T, k) of each sensor in standard deviations, the first result of
-    `standardised_errors`.
+    """Return the errors (R, T, k) of each sensor in standard deviations, where errors due to jitter
+    are made independent, and readings at full scale are treated as limits (`standardised_errors`).
+
+    - `model`: the model, which has the readings of R recordings.
+    - `errors`: for each sensor the errors (R, T, k) in its unit.
+    - `noise`: for each sensor the standard deviations (R, k) of its noise.
     """
     out = []
     for reading, error, sigma in zip(model.records.readings, errors, noise, strict=True):
@@ -334,8 +382,12 @@ def reading_residuals(
 ) -> tuple[Array, ...]:
     """Return the residuals (R, T, k) of the readings of each sensor, for least squares.
 
-    The errors are divided by their standard deviations, shrunk by the robust loss, and multiplied
-    by the `weights` (R, T).
+    The errors are divided by their standard deviations, shrunk by the robust loss of the `model`,
+    and multiplied by the weights.
+
+    - `errors`: for each sensor the errors (R, T, k) in its unit.
+    - `noise`: for each sensor the standard deviations (R, k) of its noise.
+    - `weights`: (R, T) a factor of each reading, such as zero for a reading that is not fitted.
     """
     out = []
     for scaled in whiten(model, errors, noise):
@@ -348,8 +400,14 @@ def reading_residuals(
 def residuals_and_jacobians(
     function: Callable[[tuple], tuple], errors: tuple, slopes: tuple
 ) -> tuple[tuple, tuple]:
-    """Return two things: `function(errors)`; and its derivatives (R, T, k, n) with respect to n
-    numbers, from the derivatives `slopes` of the errors with respect to these numbers.
+    """Return two things: the residuals `function(errors)`; and their derivatives (R, T, k, n) with
+    respect to n numbers.
+
+    - `function`: a function of the errors of all sensors; each of its residuals depends only on the
+      errors of the same reading.
+    - `errors`: for each sensor the errors (R, T, k).
+    - `slopes`: for each sensor the derivatives (R, T, k, n) of its errors with respect to the n
+      numbers.
     """
     # Each residual depends only on the errors of the same reading, so that this product with the
     # derivative is cheap.
@@ -358,8 +416,8 @@ def residuals_and_jacobians(
 
 
 def prior_weights(model: "Model") -> Float[Array, " n"]:
-    """Return the weight (n,) of each free number: one over the standard deviation of its prior,
-    whose mean is zero.
+    """Return the weight (n,) of each free number of a `model`: one over the standard deviation of
+    its prior, whose mean is zero.
 
     The weight is zero for a number without a prior.
     """
@@ -375,8 +433,8 @@ def prior_weights(model: "Model") -> Float[Array, " n"]:
 
 
 def extra_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]:
-    """Return the residuals (j,) of the prior of the body and of an `AbstractPull`, each of which
-    may depend on several free numbers.
+    """Return the residuals (j,) that may depend on several of the free numbers x (n,) of a `model`:
+    those of the prior of the body, and of the model's `AbstractPull`.
     """
     out = [jnp.zeros(0, x.dtype)]
     if model.prior is not None:
@@ -389,16 +447,21 @@ def extra_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " j"]
 
 
 def prior_residuals(model: "Model", x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """Return all residuals that do not belong to readings: first n residuals of the priors of the n
-    free numbers, then the `extra_residuals`.
+    """Return all residuals of a `model` that do not belong to readings, at the free numbers x (n,):
+    first n residuals of the priors of the single free numbers, then the residuals of the prior of
+    the body and of an `AbstractPull`.
     """
     return jnp.concatenate([prior_weights(model) * x, extra_residuals(model, x)])
 
 
 def reading_weights(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """Return the weight (R, T) of each reading in the normal equations.
+    """Return, for each sensor, the weight (R, T) of each of its readings in the normal equations.
 
-    The weight is dρ/ds of the robust loss ρ, or 1 without a loss. It is zero for a masked reading.
+    The weight is dρ/ds of the robust loss ρ(s), where s is the squared length of the error in
+    standard deviations, or 1 without a loss. It is zero for a masked reading.
+
+    - `errors`: for each sensor the errors (R, T, k) in its unit.
+    - `noise`: for each sensor the standard deviations (R, k) of its noise.
     """
     masks = [reading.mask for reading in model.records.readings]
     if model.loss is None:
@@ -409,5 +472,7 @@ def reading_weights(model: "Model", errors: tuple, noise: Noise) -> tuple[Float[
 
 
 def half_sum(tree: PyTree) -> Float[Array, ""]:
-    """Return half the sum of the squares of all numbers in a tree of arrays."""
+    """Return half the sum of the squares of all numbers in a `tree` of arrays, such as the misfit
+    of a tree of residuals.
+    """
     return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

@@ -59,7 +59,12 @@ class Drift(eqx.Module):
 
 
 def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]:
-    """Return the `Drift` of each `Walk` in a scene."""
+    """Return the `Drift` of each `Walk` (sensor error that drifts): the `Walk` with the path of its
+    numbers in a `scene`.
+
+    An error is raised if a `Walk` picks something other than an array of numbers of a sensor, or
+    numbers that another `Walk` has.
+    """
     wanted = "a sequence of Walk(where, deviation)"
     _checks.require_instance(walks, (Walk, Sequence), "walks", requirement=wanted)
     drifts: list[Drift] = []
@@ -83,15 +88,15 @@ def find_drifts(walks: Walk | Sequence[Walk], scene: Scene) -> tuple[Drift, ...]
 
 
 def drifting_values(scene: Scene, drifts: Sequence[Drift]) -> tuple[Array, ...]:
-    """Return the values of the drifting sensor errors of a scene, one array for each of the
-    `drifts`.
+    """Return the values of the drifting sensor errors in a `scene`, one array for each of the
+    `drifts`, each of which knows the path of its error in the scene.
     """
     return leaves_at(scene, [drift.path for drift in drifts])
 
 
 def require_nonnegative(value: NumbersLike, name: str) -> Array:
-    """Return `value` as an array, and raise `ValueError` unless its numbers are finite and not
-    below zero.
+    """Return `value` (one number or several) as an array, and raise `ValueError`, in which it is
+    called `name`, unless its numbers are finite and not below zero.
     """
     array, wanted = _checks.numeric_array(value, name), "a finite number that is not below zero"
     if not array.size:
@@ -100,10 +105,11 @@ def require_nonnegative(value: NumbersLike, name: str) -> Array:
 
 
 def broadcast_to_shape(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
-    """Return `value`, one number or an array of shape `shape`, broadcast to `shape`.
+    """Return `value` as an array of the shape `shape`: one number is repeated, and an array of this
+    shape is unchanged.
 
-    It raises `ValueError`, in which the argument is called `name`, if `value` has another shape, or
-    a number below zero.
+    A `ValueError`, in which the argument is called `name`, is raised if `value` has another shape,
+    or a number that is not finite or below zero.
     """
     numbers = require_nonnegative(value, name)
     if numbers.shape not in ((), shape):

@@ -22,14 +22,17 @@ from rigidjax.identify.search.stages import Attempt
 
 
 def without_arrays(attempt: Attempt) -> Attempt:
-    """Return the attempt with `blocks` set to `None`: the errors and derivatives take much
-    memory.
+    """Return the `attempt` (the result of the search from one start) with `blocks` set to `None`,
+    since the errors and derivatives in it take much memory.
     """
     return attempt if attempt.blocks is None else dataclasses.replace(attempt, blocks=None)
 
 
 def report_progress(progress: Callable[[str], Any] | None, line: str) -> None:
-    """Call `progress` with a line, unless it is `None`; warn if the line cannot be written."""
+    """Call the function `progress` with a `line` of text, unless `progress` is `None`.
+
+    If the line cannot be written, a warning is given and the search goes on.
+    """
     if progress is None:
         return
     try:
@@ -92,11 +95,13 @@ class Checkpoint:
         self.print_of = print_of
         self.done: list[Attempt] = []
         if self.path is not None and self.path.exists():
-            self._read(self.path)
+            self._read_attempts(self.path)
 
     def save(self, attempts: Sequence[Attempt]) -> None:
-        """Write the finished `attempts` to the file; the old file is replaced in one (atomic)
-        step.
+        """Write the `attempts` (the results of the search from all finished starts) to the file.
+
+        The old file is replaced in one (atomic) step. A warning is given if the file cannot be
+        written.
         """
         if self.path is None:
             return
@@ -118,9 +123,10 @@ class Checkpoint:
             with contextlib.suppress(OSError):
                 part.unlink(missing_ok=True)
 
-    def _read(self, path: Path) -> None:
-        """Read the results of the finished starts from a file; raise `ValueError` for a file of
-        another search.
+    def _read_attempts(self, path: Path) -> None:
+        """Read the results of the search from all finished starts from the file `path` into `done`.
+
+        `ValueError` is raised for a damaged file, and for the file of another search.
         """
         try:
             with path.open("rb") as file:

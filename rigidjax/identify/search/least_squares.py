@@ -47,7 +47,7 @@ EXACT = 1e-6
 
 
 def _setting_as_array(value: ArrayLike) -> np.ndarray:
-    """Return a setting as a NumPy array.
+    """Return a setting of a search (one number) as a NumPy array of JAX's default float type.
 
     Outside of a trace each conversion by JAX takes as long as a run of 100 steps.
     """
@@ -82,14 +82,17 @@ class Settings(eqx.Module):
 
 
 class LMState(eqx.Module):
-    """Hold the state of a search by the method of Levenberg and Marquardt.
+    """Hold the state of a search for the least cost of n numbers by the method of Levenberg and
+    Marquardt.
 
     **Fields:**
 
     - `first`: the cost at the start.
-    - `point`: the best point so far.
-    - `cost`, `normal`, `slope`: the cost, its normal matrix and its gradient at the best point.
-    - `trial`, `hoped`: the next point to evaluate, and the predicted gain there.
+    - `point`: (n,) the best point so far.
+    - `cost`, `normal`, `slope`: the cost, its normal matrix (n, n) and its gradient (n,) at the
+      best point.
+    - `trial`, `hoped`: the next point (n,) to evaluate, and the predicted gain (fall of the cost)
+      there.
     - `damping`: the damping of the step to the next point.
     - `pace`: the mean fall of the logarithm of the cost in a step.
     - `taken`: the number of evaluations.
@@ -180,11 +183,20 @@ def _next_state(
     settings: Settings,
     gain_of_noise: Callable[[Any, NormalMatrix], Array] | None,
 ) -> LMState:
-    """Return the state of a search after an evaluation of its trial point.
+    """Return the state of a search by the method of Levenberg and Marquardt after one evaluation of
+    the cost of n numbers.
 
-    The new state holds the next trial point. **Arguments:** `state` the state before the
-    evaluation; `evaluation` the result of `evaluate` at the trial point of this state; all other
-    arguments as for `minimise`.
+    The point of the evaluation is accepted if its cost is lower than the lowest cost so far. The
+    damping is adapted to the ratio of actual to predicted gain, and the next point is computed.
+
+    - `state`: the state before the evaluation.
+    - `evaluation`: at the point `state.trial`: values to keep, the cost, the normal matrix (n, n)
+      and the gradient (n,).
+    - `order_one`: (n,) one for numbers of order one, which no step changes by more than `LONGEST`;
+      zero for other numbers.
+    - `settings`: the settings of the search.
+    - `gain_of_noise`: given the kept values and the normal matrix, this function returns the gain
+      of a fit from noise alone (see `Settings.level`); or `None`.
     """
     values, cost, normal, slope = evaluation
     parts = jax.tree.leaves((cost, normal, slope))
@@ -254,12 +266,15 @@ def _next_state(
 def _damped_step(
     normal: NormalMatrix, slope: Array, order_one: Array, damping: Array
 ) -> tuple[Array, Array]:
-    """Return two things: the damped step (n,) from a point; and the square root (n,) of the
-    diagonal of the normal matrix.
+    """Return two things: the damped step (n,) of Levenberg and Marquardt from a point; and the
+    square root (n,) of the diagonal of the normal matrix.
 
-    **Arguments:** `normal` and `slope` the normal matrix and the gradient at the point; `order_one`
-    as for `minimise`; `damping` in units of the diagonal of the normal matrix. The step is
-    shortened so that no number of order one changes by more than `LONGEST`.
+    The step is shortened so that no number of order one changes by more than `LONGEST`.
+
+    - `normal`, `slope`: the normal matrix (n, n) and the gradient (n,) of the cost at the point.
+    - `order_one`: (n,) one for numbers of order one, zero for other numbers.
+    - `damping`: in units of the diagonal of the normal matrix, at least of one for a number of
+      order one.
     """
     diagonal = normal.diagonal
     diagonal = jnp.maximum(diagonal, jnp.maximum(1e-12 * jnp.max(diagonal), 1e-300))

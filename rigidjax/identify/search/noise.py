@@ -37,7 +37,7 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
     errors = blocks[0]
     weights = reading_weights(model, errors, noise)
     groups, out = np.asarray(model.noise_groups), []
-    shares = _shares_left(model, x, blocks, noise)
+    shares = _remaining_shares(model, x, blocks, noise)
     readings = list(model.records.readings)
     for index, (reading, error, sigma, weight, share) in enumerate(
         zip(readings, errors, noise, weights, shares, strict=True)
@@ -66,7 +66,9 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
             size = np.asarray(sigma, float)
             e, u = (np.where(mask, np.asarray(x) / size[:, None], 0.0) for x in (error, change))
             tau = None if sensor.jitter.estimated else np.asarray(sensor.jitter.deviation)
-            both = _noise_and_jitter(e * root[..., None], u, mask.sum(axis=-1), groups, known, tau)
+            both = _most_likely_noise_and_jitter(
+                e * root[..., None], u, mask.sum(axis=-1), groups, known, tau
+            )
             grown, tau = (jnp.asarray(each, sigma.dtype) for each in both)
             sigma = sigma * grown[:, None]
             readings[index] = reading.with_jitter(tau[:, None, None] * change, tau)
@@ -77,7 +79,10 @@ def estimate_noise(model: Model, x: Array, blocks: Blocks, noise: Noise) -> tupl
 
 
 def initial_noise(model: Model) -> Noise:
-    """Return the noise (R, k) of each sensor; it is a tenth of the sensor's signal if it is to be
+    """Return, for each sensor of a `model`, a first value (R, k) of the standard deviation of its
+    noise, in its unit, for R recordings and k components.
+
+    It is the noise that the sensor states, or a tenth of the sensor's signal if the noise is to be
     estimated.
     """
     out = []
@@ -94,12 +99,15 @@ def initial_noise(model: Model) -> Noise:
 
 
 def _variance_by_median(squares: np.ndarray, mask: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Return the variance of each group's errors, by a median that outliers hardly change.
+    """Return the variance (groups,) of the errors of each group of recordings, by a median that
+    outliers hardly change.
 
     The median is taken over the readings of a group. An estimate with the weights of the robust
-    loss would be too small without outliers, and too large with many outliers. **Arguments:**
-    `squares` (R, T) the squared lengths of the errors; `mask` (R, T, k) true for the channels that
-    are used; `groups` (R,) the group of each recording.
+    loss would be too small without outliers, and too large with many outliers.
+
+    - `squares`: (R, T) the squared lengths of the errors, at T times of R recordings.
+    - `mask`: (R, T, k) true for the components of the errors that are used.
+    - `groups`: (R,) the index of the group of each recording.
     """
     half, _ = median_of_chi2(mask.shape[-1])
     whole = mask.all(axis=-1)
@@ -119,10 +127,18 @@ def median_of_chi2(size: int) -> tuple[float, float]:
     return median, float(density)
 
 
-def _shares_left(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[np.ndarray]:
-    """Return, for each sensor, the shares (groups,) of the squared errors that remain after a fit.
+def _remaining_shares(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[np.ndarray]:
+    """Return, for each sensor, the share (groups,) of the expected sum of squared errors that
+    remains after a fit, for each group of recordings.
 
-    The share of a group is one minus the mean leverage of its errors, and at least 0.1.
+    A fit makes the errors smaller than the noise. The share is one minus the mean leverage of the
+    errors of the group, and at least 0.1.
+
+    - `model`: the model, which says which recordings form a group.
+    - `x`: (n,) the free numbers after the fit.
+    - `blocks`: the errors of all readings at x, and their derivatives with respect to the free
+      numbers.
+    - `noise`: for each sensor the standard deviations (R, k) of its noise.
     """
     groups, readings = np.asarray(model.noise_groups), model.records.readings
     sizes = [np.bincount(groups, one.channel_mask.sum(axis=(1, 2))) for one in readings]
@@ -138,39 +154,41 @@ def _shares_left(model: Model, x: Array, blocks: Blocks, noise: Noise) -> list[n
     return [np.maximum(1.0 - n / np.maximum(m, 1), 0.1) for n, m in zip(taken, sizes, strict=True)]
 
 
-def _noise_and_jitter(
-    e: np.ndarray,
+def _most_likely_noise_and_jitter(
+    errors: np.ndarray,
     u: np.ndarray,
     count: np.ndarray,
     groups: np.ndarray,
     known_noise: bool,
     tau: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the most likely noise σ (R,) and jitter τ (R,) of errors of covariance `σ² 1 + τ² u
-    uᵀ`.
+    """Return two things: the most likely standard deviation σ (R,) of the noise of a sensor; and
+    the most likely standard deviation τ (R,), s, of its time stamps.
 
-    The iteration updates τ² and σ² alternately: τ² by Fisher scoring of the squared components of
-    the errors along u, whose mean is `σ² + τ² |u|²`; and σ² by a step of expectation and
-    maximisation (EM).
+    The errors of one reading have the covariance `σ² 1 + τ² u uᵀ`. The iteration updates τ² and σ²
+    alternately: τ² by Fisher scoring of the squared components of the errors along u, whose mean is
+    `σ² + τ² |u|²`; and σ² by a step of expectation and maximisation (EM).
 
-    **Arguments:**
-
-    - `e`: (R, T, k) the errors; `u`: (R, T, k) the time derivative of the prediction.
+    - `errors`: (R, T, k) the errors of a sensor with k channels, at T times of R recordings.
+    - `u`: (R, T, k) the time derivative of the prediction.
     - `count`: (R, T) the number of channels that were read.
     - `groups`: (R,) the group of each recording; the recordings of a group share σ and τ.
     - `known_noise`: whether σ is known; it is then 1.
     - `tau`: (R,) a known τ; `None` to estimate τ.
     """
-    size, total = np.sum(u**2, axis=-1), np.sum(e**2, axis=-1)
+    size, total = np.sum(u**2, axis=-1), np.sum(errors**2, axis=-1)
     is_read = total > 0
-    dot = np.sum(e * u, axis=-1)
+    dot = np.sum(errors * u, axis=-1)
     along = dot**2 / np.maximum(size, 1e-300)
 
     def ratio(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         x, y = (np.bincount(groups, np.sum(each * is_read, axis=1)) for each in (x, y))
         return (x / np.maximum(y, 1e-300))[groups][:, None]
 
-    p, q = np.ones((len(e), 1)), np.zeros((len(e), 1)) if tau is None else tau[:, None] ** 2
+    p, q = (
+        np.ones((len(errors), 1)),
+        np.zeros((len(errors), 1)) if tau is None else tau[:, None] ** 2,
+    )
     for _ in range(ROUNDS):
         before, weight = (p, q), (p + q * size) ** -2.0
         if tau is None:

@@ -124,7 +124,7 @@ def least_squares_from(
     - `settings`: the settings of the search.
     """
     number, kind, places = model.size, x.dtype, model.index.places
-    model = _until_last_weight(model, weights)
+    model = _model_until_last_weight(model, weights)
     prior = terms.prior_weights(model)
     alone = np.asarray(model.index.alone, int) if model.count >= MANY else None
 
@@ -155,7 +155,7 @@ def least_squares_from(
         (jnp.zeros((places.shape[0], 0, 0, places.shape[1]), kind),), places, number, alone
     )
     windows = model.clusters is not None
-    by_noise = partial(_gain_of_noise, model) if windows else None
+    by_noise = partial(_expected_gain_of_noise, model) if windows else None
     order_one = is_order_one(model, kind)
     end = minimise(evaluate, x, order_one, settings, zeros, zero_normal, by_noise)
     # If the cost is finite at no point, not even at the start, the start stays the best point.
@@ -168,15 +168,22 @@ def least_squares_from(
     )
 
 
-def _gain_of_noise(model: Model, evaluation: Evaluation, normal: NormalMatrix) -> Float[Array, ""]:
-    """Return `½ tr(K G⁻¹)`, the expected gain in the cost of windows by a fit to noise alone.
+def _expected_gain_of_noise(
+    model: Model, evaluation: Evaluation, normal: NormalMatrix
+) -> Float[Array, ""]:
+    """Return `½ tr(K G⁻¹)`, the mean amount by which a fit that follows only the noise lowers the
+    cost of windows.
 
-    The gain is the excess of the cost at the true numbers over the least cost. G is the normal
-    matrix of the shared numbers, from which the initial states of the windows are eliminated. K is
-    the sum of g gᵀ over stretches of windows, where g is the gradient of the cost of one stretch.
-    Errors may be correlated within a stretch (Takeuchi 1976; Burnham and Anderson 2002,
+    It is the excess of the cost at the true numbers over the least cost. G is the normal matrix of
+    the shared numbers, from which the initial states of the windows are eliminated. K is the sum of
+    g gᵀ over stretches (groups of neighbouring windows), where g is the gradient of the cost of one
+    stretch. Errors may be correlated within a stretch (Takeuchi 1976; Burnham and Anderson 2002,
     doi:10.1007/b97636, section 7.2). The gradient with respect to the initial states is left out:
     near the least cost each initial state is at its own optimum.
+
+    - `model`: the model, whose recordings are windows (short parts of a record of measured states).
+    - `evaluation`: the errors, and the gradient of the cost of each window.
+    - `normal`: the normal matrix of all free numbers.
     """
     assert model.clusters is not None
     # The array has a row for each window, although there are fewer stretches than windows: the
@@ -195,11 +202,11 @@ def _gain_of_noise(model: Model, evaluation: Evaluation, normal: NormalMatrix) -
 
 
 def is_order_one(model: Model, kind: DTypeLike) -> Float[Array, " n"]:
-    """Return an array (n,) with one for each free number of order one, and zero for each number of
-    a `Free`.
+    """Return an array (n,) with one for each free number of a `model` that is of order one, and
+    zero for each number of a `Free`.
 
-    The user chooses the unit of a `Free`, so that its numbers may have any size. **Arguments:**
-    `kind` the dtype of the result.
+    The user chooses the unit of a `Free`, so that its numbers may have any size. `kind` is the
+    dtype of the result.
     """
     ones = jnp.zeros(model.size, kind).at[: model.index.bodies].set(1.0)
     return ones.at[model.index.start].set(1.0)
@@ -207,9 +214,13 @@ def is_order_one(model: Model, kind: DTypeLike) -> Float[Array, " n"]:
 
 def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
     """Return the rows B (m, n) by which the curvature of the bodies' charts adds BᵀB to the normal
-    matrix at x.
+    matrix of the n free numbers of a `model`.
 
-    The `slope` (n,) is the gradient of the cost at x; see `AbstractBodyChart.bend`.
+    A chart maps free numbers to a body; its curvature matters for a flat body
+    (`AbstractBodyChart.bend`).
+
+    - `x`: (n,) the free numbers.
+    - `slope`: (n,) the gradient of the cost at x.
     """
     count = model.index.bodies
     parts = (chart_list(model.chart), *(numbers_of(model.chart, y[:count]) for y in (x, slope)))
@@ -217,12 +228,13 @@ def _curvature_rows(model: Model, x: Array, slope: Float[Array, " n"]) -> Array:
     return jnp.pad(rows, ((0, 0), (0, slope.size - rows.shape[1])))
 
 
-def _until_last_weight(model: Model, weights: Float[Array, "records times"]) -> Model:
-    """Return the model with an integrator that stops soon after the last time with a positive
-    weight.
+def _model_until_last_weight(model: Model, weights: Float[Array, "records times"]) -> Model:
+    """Return the `model` with an integrator that stops soon after the last time at which a reading
+    counts.
 
     The integrator goes on for `_BEYOND` more samples, if the record has so many. A model with an
-    adaptive integrator is returned unchanged.
+    adaptive integrator is returned unchanged. `weights` (R, T) holds the weight of each reading in
+    the fit of R recordings; zero for a reading that does not count.
     """
     steps = model.integrator
     if not isinstance(steps, FixedSteps | HeldSteps):
@@ -235,7 +247,8 @@ def _until_last_weight(model: Model, weights: Float[Array, "records times"]) -> 
 
 
 def _zeros_of_evaluation(model: Model, kind: DTypeLike) -> Evaluation:
-    """Return an `Evaluation` of zeros, of the dtype `kind`.
+    """Return an `Evaluation` (errors, their derivatives, and gradients of the cost) of zeros of the
+    dtype `kind`, in the shapes of a `model`.
 
     The shapes are computed from the shapes in the model, since tracing `terms.errors_and_jacobians`
     for its shapes would take seconds.
@@ -249,16 +262,19 @@ def _zeros_of_evaluation(model: Model, kind: DTypeLike) -> Evaluation:
 
 
 def whole_record(model: Model) -> Float[Array, "records times"]:
-    """Return the weights (R, T) for a fit to the whole of each record: ones."""
+    """Return the weights (R, T) of the readings for a fit of a `model` to the whole of each of its
+    R recordings: ones.
+    """
     # NumPy is used since, outside of a trace, each operation of JAX takes as long as a run of 100
     # steps.
     return jnp.asarray(np.ones(model.records.t.shape, model.records.t.dtype))
 
 
 def weights_of_beginning(model: Model, part: float) -> Float[Array, "records times"]:
-    """Return the weights (R, T) for a fit to the beginning of each record.
+    """Return the weights (R, T) of the readings for a fit of a `model` to the beginning of each of
+    its R recordings.
 
-    The weight is one in the first fraction `part` of the record's duration, then zero.
+    The weight is one in the first fraction `part` of the duration of the recording, then zero.
     """
     t = np.asarray(model.records.t)
     since, length = t - t[:, :1], t[:, -1:] - t[:, :1]
@@ -266,8 +282,10 @@ def weights_of_beginning(model: Model, part: float) -> Float[Array, "records tim
 
 
 def _attempt_of(state: LMState) -> Attempt:
-    """Return the best point of a search as an `Attempt`, with the errors there if they were
-    kept.
+    """Return the best point of a search as an `Attempt` (free numbers, cost, convergence), with the
+    errors and derivatives at this point if they were kept.
+
+    `state` is the last state of the search.
     """
     blocks = state.evaluation.blocks if bool(state.evaluated_at_best) else None
     return Attempt(state.point, state.cost, state.converged, blocks)
@@ -283,16 +301,21 @@ def _search_stride(
     steps: int | None = None,
     level: float | None = None,
 ) -> LMState:
-    """Return the last state of a search after one stride (one compiled run of a few steps) from x.
+    """Return the last state of a search after one stride (one compiled run of a few steps of
+    Levenberg and Marquardt) from the free numbers x.
 
     **Arguments:**
 
     - `x`: (n,) the free numbers at the start of the stride.
     - `task`: the model, its noise, and the tolerance.
     - `weights`: (R, T) the weights of the readings.
-    - `damping`, `aim`, `level`: as for `Settings`; `margin` is `Settings.near`.
-    - `steps`: the largest number of steps, `task.stride` unless given. Without a `level` the search
-      ends at a distance of about `TOLERANCES` tolerances from the minimum.
+    - `damping`: the damping of the first step.
+    - `aim`: a cost that another search reached; the search ends if it is not likely to reach this
+      cost. Zero for none.
+    - `margin`: the search ends at a cost of this value or less. Zero for none.
+    - `steps`: the largest number of steps, `task.stride` unless given.
+    - `level`: as for `Settings`. Without a `level` the search ends at a distance of about
+      `TOLERANCES` tolerances from the minimum.
     """
     steps, count = task.stride if steps is None else steps, nominal_count(task.model)
     level = (TOLERANCES * task.tolerance) ** 2 if level is None else level
@@ -301,16 +324,19 @@ def _search_stride(
 
 
 def _evaluate_at(model: Model, x: Float[Array, " n"], noise: Noise) -> LMState:
-    """Return the state of a search that evaluates the cost at x and takes no step.
+    """Return the state of a search that evaluates the cost of the whole records at the free numbers
+    x (n,) of a `model`, and takes no step.
 
-    The evaluation uses the compiled program of the search, so that no second program is compiled.
+    `noise` holds for each sensor the standard deviations (R, k) of its noise. The evaluation uses
+    the compiled program of the search, so that no second program is compiled.
     """
     return least_squares_from(model, x, noise, whole_record(model), Settings(0.0, 1.0, 0))
 
 
 def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Blocks:
-    """Return two things, as `terms.errors_and_jacobians` does: the errors of all readings at x; and
-    the derivatives of these errors with respect to the free numbers.
+    """Return two things, as `terms.errors_and_jacobians` does: the errors of all readings at the
+    free numbers x (n,) of a `model`; and the derivatives of these errors with respect to the free
+    numbers.
 
     The compiled program of the search computes the errors and derivatives, so that no second
     program is compiled.
@@ -321,7 +347,11 @@ def errors_and_slopes(model: Model, x: Float[Array, " n"]) -> Blocks:
 
 
 def cost_of(model: Model, x: Float[Array, " n"], noise: Noise) -> float:
-    """Return the misfit of a model at x over the whole of its records, for this `noise`."""
+    """Return the misfit of a `model` at the free numbers x (n,), half the sum of squared residuals
+    over the whole of its records.
+
+    `noise` holds for each sensor the standard deviations (R, k) of its noise.
+    """
     return float(_evaluate_at(model, x, noise).cost)
 
 
@@ -342,7 +372,7 @@ def polish(
     **Arguments:**
 
     - `begin`: the attempt at the first point.
-    - `task`: the task of the search.
+    - `task`: the model, its noise, the tolerance, and the largest number of steps.
     - `damping`: the damping of the first stride.
     - `aim`: the cost that another start reached; a search that is not likely to reach this cost
       ends early.
@@ -391,7 +421,7 @@ def fit_in_stages(
     **Arguments:**
 
     - `x`: (n,) the free numbers at the start.
-    - `task`: the task of the search.
+    - `task`: the model, its noise, the tolerance, and the largest number of steps.
     - `aim`: the cost that another start reached; a search that is not likely to reach this cost
       ends early.
     - `watch`: a function that is called with each `Attempt` at a fit to the whole of the records.
@@ -431,11 +461,17 @@ def fit_in_stages(
 def _fit_windows(
     x: Float[Array, " n"], task: Task, aim: float, watch: Callable[[Attempt], None]
 ) -> Attempt:
-    """Return the result of the search from one start over windows; arguments as for
-    `fit_in_stages`.
+    """Return the result of the search from one start over windows (short parts of a record of
+    measured states), in fits to longer and longer beginnings of each window.
 
     The first searches use the first ninth, then the first third of each window, since a prediction
     over a long time with poor numbers diverges.
+
+    - `x`: (n,) the free numbers at the start.
+    - `task`: the model, its noise, the tolerance, and the largest number of steps.
+    - `aim`: the cost that another start reached; a search that is not likely to reach this cost
+      ends early.
+    - `watch`: a function that is called with each `Attempt` at a fit to the whole windows.
     """
     model, begin = task.model, x
     length = model.records.t.shape[1] - 1
@@ -452,20 +488,23 @@ def _fit_windows(
 
 
 def has_unit_noise(reading: Reading) -> bool:
-    """Return whether the noise of a reading is only a unit for its errors, whose size is not
-    known.
+    """Return whether the noise of the sensor of a `reading` is only a unit for its errors, whose
+    size is not known.
     """
     return getattr(reading.sensor, "nominal", False)
 
 
 def nominal_count(model: Model) -> int:
-    """Return the number of errors if the noise of every reading is only a unit, else 0."""
+    """Return the number of errors of a `model` (readings times components) if the noise of every
+    sensor is only a unit for its errors, else 0.
+    """
     readings = model.records.readings
     return sum(map(count_of, readings)) if all(map(has_unit_noise, readings)) else 0
 
 
 def sufficient_misfit(model: Model) -> float:
-    """Return a misfit that is low enough to accept a fit: wrong minima have a larger misfit.
+    """Return a misfit of a `model` that is low enough to accept a fit: wrong minima have a larger
+    misfit.
 
     A sensor of known noise adds twice the expected value of half its χ². A sensor of unknown noise
     adds a term that allows errors of about 1 % of the signal.

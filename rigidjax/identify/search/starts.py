@@ -61,12 +61,15 @@ def starting_points(model: Model, count: int, key: PRNGKeyArray | None) -> list[
 def regress_inertia(recordings: tuple[Recording, ...], torque: Torque | None) -> Inertia | None:
     """Return the inertia of a body by a regression on Euler's equations in integral form.
 
-    The equation `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. With a torque τ
-    the components are found by least squares; without a torque they are, up to scale, the right
-    singular vector of the smallest singular value. Second moments that are too small or negative
-    are raised to 1 % of the largest, so that the result is a possible body. The result is `None` if
-    samples are too few or too far apart, if the torque depends on more than time and rate, or if
-    the tensor has no positive trace.
+    The equation `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I, where Ω is the
+    body rate. With a torque τ the components are found by least squares; without a torque they are,
+    up to scale, the right singular vector of the smallest singular value. Second moments that are
+    too small or negative are raised to 1 % of the largest, so that the result is a possible body.
+    The result is `None` if samples are too few or too far apart, if the torque depends on more than
+    time and rate, or if the tensor has no positive trace.
+
+    - `recordings`: recordings of this body, which show its rates.
+    - `torque`: the torque on the body, or `None`.
     """
     balances = []
     for recording in recordings:
@@ -108,24 +111,30 @@ def tensor_and_margin(matrix: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, 
 
 
 def depends_on_rate_only(torque: Torque | None) -> bool:
-    """Return whether a torque depends on time and body rate alone; true for no torque."""
+    """Return whether a `torque` depends on time and body rate alone, and has no states of its own;
+    true for `None`.
+    """
     return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
 
 
 def balance_of_momentum(
     recording: Recording, torque: Torque | None, turn: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Euler's equations integrated over a recording, as linear equations for the inertia.
+    """Return Euler's equations integrated over a recording, as n linear equations for the six
+    components of the inertia.
 
-    The rates in the equations are the recorded rates multiplied by the matrix `turn` (3, 3). The
-    three results are: the matrix (n, 6) of the equations for the six components of the inertia; the
-    right sides (n,), from the torque; and the part (n, 6) of the matrix that comes from the angular
-    momentum, without the integral of Ω × IΩ.
+    The three results are: the matrix (n, 6) of the equations; their right sides (n,), from the
+    torque; and the part (n, 6) of the matrix that comes from the angular momentum, without the
+    integral of Ω × IΩ, where Ω is the body rate and I the inertia.
+
+    - `recording`: the recording, which shows the body rates.
+    - `torque`: a torque that depends on time and body rate alone, or `None`.
+    - `turn`: (3, 3) a matrix by which the recorded rates are multiplied first.
     """
     t, w = rates(recording)
     w, pushed = w @ turn.T, np.zeros((t.size, 3))
     if torque is not None:
-        pushed = np.asarray(_torques(bind(torque, sources_of(recording)), t, w))
+        pushed = np.asarray(_torques_at(bind(torque, sources_of(recording)), t, w))
     momenta = np.einsum("kij,tj->tki", BASIS, w)
     turned = np.concatenate([np.cross(w[:, None, :], momenta), pushed[:, None, :]], axis=1)
     steps = 0.5 * (turned[1:] + turned[:-1]) * np.diff(t)[:, None, None]
@@ -142,7 +151,11 @@ def balance_of_momentum(
 
 
 @eqx.filter_jit
-def _torques(torque: Torque, t: ArrayLike, w: ArrayLike) -> Array:
-    """Return the torques (n, 3) at the times t (n,) and the body rates w (n, 3)."""
+def _torques_at(torque: Torque, t: ArrayLike, w: ArrayLike) -> Array:
+    """Return the values (n, 3) of a `torque` at the times t (n,), s, and the body rates w (n, 3),
+    rad/s.
+
+    The torque depends on time and body rate alone.
+    """
     body = Inertia(jnp.eye(3))
     return jax.vmap(lambda time, omega: evaluate(torque, time, Spin(omega), body))(t, w)

@@ -161,8 +161,15 @@ def descend_from(
 def _descent_steps(
     x: Float[Array, " n"], memory: PyTree, model: Model, noise: Noise, descent: Descent, keys: Array
 ) -> tuple[Float[Array, " n"], PyTree, Float[Array, " steps"]]:
-    """Return three things after one step for each of the random `keys`: the free numbers x; the
-    state of the optimiser, `memory`; and the misfit of each step.
+    """Return three things after several steps of stochastic gradient descent: the free numbers x
+    (n,); the state of the optimiser; and the misfit (steps,) before each step.
+
+    - `x`: (n,) the free numbers before the first step.
+    - `memory`: the state of the optimiser before the first step.
+    - `model`: the readings and the free numbers.
+    - `noise`: for each sensor the standard deviations (R, k) of its noise.
+    - `descent`: the optimiser, and the number of recordings in a step.
+    - `keys`: (steps,) a random key for each step, which draws its recordings.
     """
 
     def step(carry: tuple, key: Array) -> tuple[tuple, Array]:
@@ -184,8 +191,11 @@ def misfit_of(x: Float[Array, " n"], model: Model, noise: Noise, rows: Array) ->
     """Return the misfit of some recordings, scaled up to the number of all recordings, plus the
     misfit of the priors.
 
-    The `rows` are the indices of the recordings. The mean of this sum over random batches is the
-    misfit of the whole model.
+    The mean of this sum over random batches is the misfit of the whole model.
+
+    - `x`: (n,) the free numbers of the `model`.
+    - `noise`: for each sensor the standard deviations (R, k) of its noise.
+    - `rows`: the indices of the recordings.
     """
     few, sizes = chosen_recordings(model, rows), stacking.pick_records(noise, rows)
     weights = jnp.ones_like(few.records.t)
