@@ -16,8 +16,12 @@ RealOrArray = Float[Array, "..."]
 
 
 def to_common_dtype(**named: Real) -> tuple[RealOrArray, ...]:
-    """Convert the arguments to arrays of one dtype and shape; Python numbers take the dtype of the
-    arrays.
+    """Convert numbers or arrays to arrays of one dtype and one shape, and return the arrays in the
+    order of the arguments.
+
+    The keyword of an argument is its name in error messages. Python numbers take the dtype of the
+    arrays, and the shapes are broadcast. A `TypeError` is raised for half precision, a `ValueError`
+    for shapes that do not broadcast.
     """
     arrays = {
         name: _checks.array_of_shape(value, (), name, batched=True) for name, value in named.items()
@@ -32,10 +36,15 @@ def to_common_dtype(**named: Real) -> tuple[RealOrArray, ...]:
 
 
 def complement_pair(name: str, value: Real, complement: Real | None) -> dict[str, Any]:
-    """Return `value` and 1 − `value` as a dictionary with the keys `name` and `name` + "1".
+    """Return a number and its complement (1 minus the number), as a dictionary with the keys `name`
+    and `name` + "1".
 
-    If a `complement` is given it is the second number, and an error is raised unless it is 1 −
-    `value`.
+    - `name`: the name of the number, such as "m" for the parameter of an elliptic integral.
+    - `value`: the number, or an array.
+    - `complement`: 1 − `value`, given by a caller who knows it with more digits; or None, to
+      compute it.
+
+    A `ValueError` is raised if `complement` is not 1 − `value` to round-off.
     """
     value = _checks.array_of_shape(value, (), name, batched=True)
     if complement is None:
@@ -55,7 +64,7 @@ def complement_pair(name: str, value: Real, complement: Real | None) -> dict[str
 
 @jax.custom_jvp
 def exact_complement(value: RealOrArray, complement: RealOrArray) -> Any:
-    """Return `value` as a function of its `complement` (1 − `value`) alone.
+    """Return `value` as a function of its complement alone, where `complement` is 1 − `value`.
 
     The derivative with respect to `complement` is −1, and the derivative with respect to `value` is
     0.
@@ -67,4 +76,7 @@ def exact_complement(value: RealOrArray, complement: RealOrArray) -> Any:
 def _exact_complement_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
+    """Return the value of `exact_complement` and its tangent, minus the tangent of the complement:
+    the rule by which JAX differentiates `exact_complement`.
+    """
     return exact_complement(*primals), -tangents[1]

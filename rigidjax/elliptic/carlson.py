@@ -90,11 +90,16 @@ def rc(x: Real, y: Real) -> RealOrArray:
 
 
 @jax.custom_jvp
-def _rf(arguments: tuple[Array, ...]) -> Any:
+def _rf(arguments: tuple[Array, ...]) -> Array:
+    """Return Carlson's integral of the first kind, R_F(x, y, z), by duplication (DLMF 19.36.1).
+
+    `arguments` are x, y and z: three arrays of one shape and dtype, ≥ 0, at most one of them 0. Two
+    zeros give infinity, a negative argument gives NaN.
+    """
     scale = scale_of(arguments)
     x, y, z = (a / scale for a in arguments)
     for _ in range(_STEPS[np.dtype(x.dtype)]):
-        step = _lambda(x, y, z)
+        step = _duplication_shift(x, y, z)
         x, y, z = 0.25 * (x + step), 0.25 * (y + step), 0.25 * (z + step)
     mean = (x + y + z) / 3
     X, Y = 1 - x / mean, 1 - y / mean
@@ -108,6 +113,9 @@ def _rf(arguments: tuple[Array, ...]) -> Any:
 
 @partial(_rf.defjvp, symbolic_zeros=True)
 def _rf_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
+    """Return R_F and its tangent, from ∂R_F/∂z = −R_D(x, y, z)/6 for each argument in the place of
+    z (DLMF 19.18.1): the rule by which JAX differentiates R_F.
+    """
     (a,), (directions,) = primals, tangents
     tangent = jnp.zeros_like(a[0])
     for i, direction in enumerate(directions):
@@ -117,12 +125,17 @@ def _rf_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[
 
 
 @jax.custom_jvp
-def _rd(arguments: tuple[Array, ...]) -> Any:
+def _rd(arguments: tuple[Array, ...]) -> Array:
+    """Return Carlson's integral of the second kind, R_D(x, y, z), by duplication (DLMF 19.36.2).
+
+    `arguments` are x, y and z: three arrays of one shape and dtype, ≥ 0, at most one of x and y 0.
+    The result is infinite if z = 0 or x = y = 0, and NaN for a negative argument.
+    """
     scale = scale_of(arguments)
     x, y, z = (a / scale for a in arguments)
     total, weight = jnp.zeros_like(x), 3.0
     for _ in range(_STEPS[np.dtype(x.dtype)]):
-        step = _lambda(x, y, z)
+        step = _duplication_shift(x, y, z)
         total = total + weight / (jnp.sqrt(z) * (z + step))
         x, y, z = 0.25 * (x + step), 0.25 * (y + step), 0.25 * (z + step)
         weight = 0.25 * weight
@@ -144,19 +157,27 @@ def _rd(arguments: tuple[Array, ...]) -> Any:
 
 @partial(_rd.defjvp, symbolic_zeros=True)
 def _rd_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
+    """Return R_D and its tangent, a sum of integrals of the same kind, each with one exponent
+    raised by 1: the rule by which JAX differentiates R_D.
+    """
     (arguments,), (directions,) = primals, tangents
     return _rd(arguments), 1.5 * directional_derivative((0.5, 0.5, 1.5), arguments, directions)
 
 
-def _lambda(x: Array, y: Array, z: Array) -> Any:
-    """Return λ = √x√y + √x√z + √y√z, the shift of the duplication theorem (DLMF 19.26.18)."""
+def _duplication_shift(x: Array, y: Array, z: Array) -> Array:
+    """Return λ = √x√y + √x√z + √y√z, by which the duplication theorem for Carlson's integrals
+    shifts the arguments x, y, z ≥ 0, arrays of one shape (DLMF 19.26.18).
+    """
     a, b, c = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
     return a * b + b * c + c * a
 
 
-def _value_in_domain(value: Array, arguments: tuple[Array, ...]) -> Any:
-    """Return `value`, but infinity if two of the `arguments` are 0, and NaN if one is negative or
-    NaN.
+def _value_in_domain(value: Array, arguments: tuple[Array, ...]) -> Array:
+    """Return the value of a Carlson integral, but infinity where two of its arguments are 0, and
+    NaN where one is negative or NaN.
+
+    - `value`: the value that was computed without a look at the domain.
+    - `arguments`: the three arguments of the integral, arrays of the shape of `value`.
     """
     x, y, z = (a == 0 for a in arguments)
     return nan_below_zero(jnp.where((x & y) | (y & z) | (z & x), jnp.inf, value), arguments)

@@ -36,7 +36,8 @@ _UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 def r_integral(powers: tuple[float, ...], arguments: tuple[RealOrArray, ...]) -> RealOrArray:
     """Return ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt, where aᵢ are the `arguments` and bᵢ the `powers`.
 
-    The aᵢ must be ≥ 0, the bᵢ multiples of ½, and the sum of the bᵢ must be above 1.
+    - `powers`: numbers bᵢ, multiples of ½, with a sum above 1.
+    - `arguments`: arrays aᵢ ≥ 0 of one shape and dtype, one for each power.
 
     The result is infinite if the integral diverges at 0, NaN for a negative argument, and accurate
     to round-off for ratios of the aᵢ up to 1e35 (to 1e-13 at 1e60).
@@ -62,10 +63,10 @@ def r_integral(powers: tuple[float, ...], arguments: tuple[RealOrArray, ...]) ->
     # Begin the product with t: the product then stays between the sizes of its factors.
     product = t
     for a, power in zip(scaled, powers, strict=True):
-        product = _divide(product, t + a[None], power)
+        product = _divide_by_power(product, t + a[None], power)
     excess = sum(powers) - 1
     value = product.sum(0) * step * unit**excess
-    value = _divide(value, scale, excess)
+    value = _divide_by_power(value, scale, excess)
     value = jnp.where(at_zero > 0, value, jnp.inf)
     return nan_below_zero(value, arguments)
 
@@ -74,6 +75,9 @@ def r_integral(powers: tuple[float, ...], arguments: tuple[RealOrArray, ...]) ->
 def _r_integral_jvp(
     powers: tuple[float, ...], primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
+    """Return the value of `r_integral` and its tangent, in which each power is raised by 1 in turn:
+    the rule by which JAX differentiates `r_integral`.
+    """
     (arguments,), (directions,) = primals, tangents
     return r_integral(powers, arguments), directional_derivative(powers, arguments, directions)
 
@@ -82,8 +86,14 @@ def directional_derivative(
     powers: tuple[float, ...],
     arguments: tuple[Array, ...],
     directions: tuple[Array | SymbolicZero, ...],
-) -> Any:
-    """Return the derivative of `r_integral` with respect to the `arguments`, along `directions`."""
+) -> Array:
+    """Return the derivative of the integral ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt along a change of its
+    arguments aᵢ.
+
+    - `powers`: the exponents bᵢ.
+    - `arguments`: the arguments aᵢ, arrays of one shape.
+    - `directions`: the changes of the aᵢ; a `SymbolicZero` is a change that is known to be zero.
+    """
     tangent = jnp.zeros_like(arguments[0])
     for i, direction in enumerate(directions):
         if powers[i] and not isinstance(direction, SymbolicZero):
@@ -92,33 +102,38 @@ def directional_derivative(
     return tangent
 
 
-def nan_below_zero(value: Array, arguments: tuple[Array, ...]) -> Any:
-    """Return `value`, but NaN if one of the `arguments` is negative or NaN."""
+def nan_below_zero(value: Array, arguments: tuple[Array, ...]) -> Array:
+    """Return `value`, but NaN where one of the `arguments`, arrays of the shape of `value`, is
+    negative or NaN.
+    """
     good = functools.reduce(jnp.logical_and, (a >= 0 for a in arguments))
     return jnp.where(good, value, jnp.nan)
 
 
-def scale_of(arguments: tuple[Array, ...]) -> Any:
-    """Return the largest of the `arguments`, or 1 if all are 0.
+def scale_of(arguments: tuple[Array, ...]) -> Array:
+    """Return the largest of the `arguments` (arrays of one shape), or 1 where all are 0.
 
-    The integrals are homogeneous: if the arguments are divided by this number, no square overflows.
+    The integrals of Carlson are homogeneous: if the arguments are divided by this number, no square
+    overflows.
     """
     largest = functools.reduce(jnp.maximum, arguments)
     return jnp.where(largest > 0, largest, 1)
 
 
-def _divide(value: Array, x: Array, power: float) -> Any:
-    """Return `value` divided by x^power, where `power` is a multiple of ½.
+def _divide_by_power(value: Array, base: Array, power: float) -> Array:
+    """Return `value` / `base`^`power`, where `value` and `base` are arrays and `power` is a
+    multiple of ½.
 
-    The value is divided by one factor x or √x after the other.
+    The value is divided by one factor `base` or √`base` after the other; if `power` is negative, it
+    is multiplied by these factors.
     """
     whole = math.floor(power)
     if power > whole:
-        factor = jax.lax.rsqrt(x)
+        factor = jax.lax.rsqrt(base)
         for _ in range(abs(round(2 * power))):
-            value = value * (factor if power > 0 else factor * x)
+            value = value * (factor if power > 0 else factor * base)
         return value
-    factor = 1 / x if power > 0 else x
+    factor = 1 / base if power > 0 else base
     for _ in range(abs(whole)):
         value = value * factor
     return value

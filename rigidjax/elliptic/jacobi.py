@@ -31,7 +31,7 @@ from rigidjax.elliptic.arguments import (
     to_common_dtype,
 )
 from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, sncndn_near_one
-from rigidjax.elliptic.legendre import complete_integral, integral, mean_iterates
+from rigidjax.elliptic.legendre import complete_integral, incomplete_integral, mean_iterates
 from rigidjax.rotation.stumpff import parity, split_half_turns
 
 # If cn and dn are below this number, integrals over sd² depend on the ratio of cn and dn only, with
@@ -78,9 +78,15 @@ def am(u: Real, m: Real, m1: Real | None = None) -> RealOrArray:
     return jnp.arctan2(sign * s, sign * c) + math.pi * turns
 
 
-def _functions_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any, Any]:
-    """Return four things: sn, cn and dn for any real m, and the number of half turns in the
-    amplitude.
+def _functions_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array, Array]:
+    """Return four arrays: Jacobi's elliptic functions sn, cn and dn for any real parameter, and the
+    number of half turns in the amplitude.
+
+    - `u`: the argument.
+    - `m`: the parameter.
+    - `m1`: 1 − m.
+
+    For m > 1, where the amplitude oscillates, the number of half turns is 0.
     """
     # By DLMF 22.17.2–4, m > 1 becomes 1/m, and cn and dn change places.
     above = m1 < 0
@@ -96,8 +102,14 @@ def _functions_and_half_turns(u: Array, m: Array, m1: Array) -> tuple[Any, Any, 
 
 
 @jax.custom_jvp
-def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
-    """Return sn, cn and dn for m ≤ 1 as functions of u and m1, where m must be 1 − m1."""
+def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
+    """Return Jacobi's elliptic functions sn, cn and dn for a parameter m ≤ 1, three arrays.
+
+    - `u`: the argument.
+    - `m`: the parameter, which must be 1 − m1. Derivatives are taken with respect to u and m1
+      alone.
+    - `m1`: 1 − m.
+    """
     turns, angle, rows = _reduce_argument(u, m1)
     sign = parity(turns)
     theta = jnp.abs(angle)
@@ -131,6 +143,9 @@ def _sncndn(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
 
 @partial(_sncndn.defjvp, symbolic_zeros=True)
 def _sncndn_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
+    """Return sn, cn and dn and their tangents for changes of u and m1; the tangent of m is ignored
+    because m is 1 − m1. This is the rule by which JAX differentiates the three functions.
+    """
     (u, m, m1), (du, _, dm1) = primals, tangents
     s, c, d = _sncndn(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
@@ -144,8 +159,12 @@ def _sncndn_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tu
 
 
 @jax.custom_jvp
-def _derivatives_by_m(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
-    """Return the derivatives of sn, cn and dn with respect to m at a fixed u."""
+def _derivatives_by_m(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
+    """Return the derivatives of Jacobi's functions sn, cn and dn with respect to the parameter m at
+    a fixed argument u, three arrays.
+
+    `m` ≤ 1 must be 1 − `m1`.
+    """
     return _derivatives_from_integral(u, m, m1)
 
 
@@ -153,6 +172,9 @@ def _derivatives_by_m(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
 def _derivatives_by_m_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
+    """Return the derivatives of sn, cn and dn with respect to m, and their tangents: the rule by
+    which JAX takes second derivatives of the three functions.
+    """
     (u, m, m1), (du, _, dm1) = primals, tangents
     sm, cm, dm = slopes = _derivatives_by_m(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
@@ -179,12 +201,14 @@ def _derivatives_by_m_jvp(
     return slopes, (ds, dc, dd)
 
 
-def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Any, Any, Any]:
-    """Return the derivatives of sn, cn and dn with respect to m at a fixed u, from the derivative
-    dn X of the amplitude φ with respect to m.
+def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Array, Array, Array]:
+    """Return the derivatives of Jacobi's functions sn, cn and dn with respect to the parameter m at
+    a fixed argument u, from the derivative dn X of the amplitude φ with respect to m.
 
-    X is the integral in the docstring of this module; Carlson's R_D gives X for u reduced by half
-    periods.
+    - `u`: the argument.
+    - `m`, `m1`: the parameter m ≤ 1, and 1 − m.
+
+    Here X = −½ ∫₀^u sd²(v) dv. Carlson's integral R_D gives X for u reduced by half periods.
     """
     s, c, d = _sncndn(u, m, m1)
     turns = _reduce_argument(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
@@ -196,14 +220,17 @@ def _derivatives_from_integral(u: Array, m: Array, m1: Array) -> tuple[Any, Any,
     c, d, raised = c * up, d * up, m1 * up * up
     near = turns == 0
     whole = complete_integral((1, 1, 0), jnp.where(near, 1, raised))
-    x = integral((1, 1, 0), sign * s, sign * c, raised, jnp.ones_like(m1))
+    x = incomplete_integral((1, 1, 0), sign * s, sign * c, raised, jnp.ones_like(m1))
     x = -0.5 * (x + jnp.where(near, 0, 2 * turns * whole))
     return c * d * x, -s * d * x * up, -(0.5 * s * s / d + m * s * c * x) * up
 
 
-def _reduce_argument(u: Array, m1: Array) -> tuple[Any, Any, list[tuple[Any, Any]]]:
-    """Return three things for the reduced argument r in u = 2Kn + r: the number n of half periods;
-    the angle πr/(2K); and the iterates of the arithmetic and geometric means of 1 and √m1.
+def _reduce_argument(u: Array, m1: Array) -> tuple[Array, Array, list[tuple[Array, Array]]]:
+    """Return three things for the argument u = 2Kn + r of Jacobi's functions, where 2K is the half
+    period: the number n of half periods; the angle πr/(2K), rad; and the pairs of arithmetic and
+    geometric means of 1 and √m1, in the order of the iteration.
+
+    `m1` is 1 − m. For m1 = 0 the half period is infinite, and n is 0.
     """
     rows = mean_iterates(jnp.where(m1 == 0, 1, m1))
     turns, angle = split_half_turns(u * rows[-1][0])

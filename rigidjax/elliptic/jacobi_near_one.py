@@ -32,9 +32,12 @@ _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 def sncndn_near_one(
     u: RealOrArray, m: RealOrArray, m1: RealOrArray
 ) -> tuple[RealOrArray, RealOrArray, RealOrArray]:
-    """Return sn, cn and dn for 0 ≤ m1 ≤ 0.1, with an absolute error of the round-off of 1.
+    """Return Jacobi's functions sn, cn and dn for 0 ≤ m1 ≤ 0.1, with an absolute error of the
+    round-off of 1.
 
-    The tangents of m must be minus the tangents of m1 = 1 − m.
+    - `u`: the argument.
+    - `m`: the parameter 1 − m1. The tangents of m must be minus the tangents of m1.
+    - `m1`: 1 − m.
     """
     root = jnp.sqrt(m)
     fourth = jnp.sqrt(root)
@@ -57,7 +60,7 @@ def sncndn_near_one(
     side = jnp.where(
         jnp.where(offset == 0, beyond[..., None], jnp.broadcast_to(offset < 0, image.shape)), -1, 1
     ).astype(u.dtype)
-    z = _power_exp(nome[..., None], side * y[..., None], side * image)
+    z = _power_times_exp(nome[..., None], side * y[..., None], side * image)
     hyperbolic = 2 * z / (1 + z * z)
     # Take tanh without its limits ±1 on either side, which cancel in pairs.
     tangent = jnp.where(offset == 0, -side * (1 - z * z), side * 2 * z * z) / (1 + z * z)
@@ -68,18 +71,23 @@ def sncndn_near_one(
 
 
 @jax.custom_jvp
-def _power_exp(p: Array, y: Array, n: Array) -> Any:
-    """Return pⁿ e^y, with exact derivatives with respect to p.
+def _power_times_exp(base: Array, exponent: Array, power: Array) -> Array:
+    """Return `base`^`power` e^`exponent`, with exact derivatives with respect to `base` > 0.
 
-    For n = 1 the second derivative with respect to p is exactly 0; if JAX differentiated exp(y + n
-    ln p), round-off would be left.
+    `power` is a whole number. For `power` = 1 the second derivative with respect to `base` is
+    exactly 0; if JAX differentiated exp(exponent + power ln base), round-off would be left.
     """
-    return jnp.exp(y + jnp.where(n == 0, 0, n * jnp.log(p)))
+    return jnp.exp(exponent + jnp.where(power == 0, 0, power * jnp.log(base)))
 
 
-@_power_exp.defjvp
-def _power_exp_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
+@_power_times_exp.defjvp
+def _power_times_exp_jvp(
+    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[Any, Any]:
+    """Return the value of `_power_times_exp` and its tangent for changes of `base` and `exponent`:
+    the rule by which JAX differentiates this function.
+    """
     (p, y, n), (dp, dy, _) = primals, tangents
-    value = _power_exp(p, y, n)
-    slope = jnp.where(n == 0, 0, n * _power_exp(p, y, n - 1))
+    value = _power_times_exp(p, y, n)
+    slope = jnp.where(n == 0, 0, n * _power_times_exp(p, y, n - 1))
     return value, slope * dp + value * dy

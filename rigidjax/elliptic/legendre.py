@@ -138,11 +138,15 @@ def ellippiinc(
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def integral(orders: tuple[int, int, int], sine: Array, cosine: Array, m1: Array, n1: Array) -> Any:
-    """Return I_jkl for `orders` = (j, k, l), from the sine and cosine of φ with |φ| ≤ π/2.
+def incomplete_integral(
+    orders: tuple[int, int, int], sine: Array, cosine: Array, m1: Array, n1: Array
+) -> Array:
+    """Return Legendre's incomplete integral I_jkl(φ, m, n) = ∫₀^φ sin^{2j}θ Δ^{−(2k+1)} (1 − n
+    sin²θ)^{−l} dθ, with Δ = √(1 − m sin²θ), for an amplitude |φ| ≤ π/2.
 
-    The sine and the cosine are the arguments, not φ, so that no digit is lost near π/2. `m1` is 1 −
-    m and `n1` is 1 − n.
+    - `orders`: the three whole numbers (j, k, l).
+    - `sine`, `cosine`: of φ. They are the arguments, not φ, so that no digit is lost near π/2.
+    - `m1`, `n1`: 1 − m and 1 − n.
     """
     j, k, last = orders
     s, c2 = sine, cosine * cosine
@@ -154,21 +158,24 @@ def integral(orders: tuple[int, int, int], sine: Array, cosine: Array, m1: Array
     if orders == (1, 0, 0):
         return s**3 / 3 * rd(c2, delta2, one)
     if orders == (0, -1, 0):
-        return _second_kind(s, c2, delta2, m1)
+        return _incomplete_second_kind(s, c2, delta2, m1)
     powers, values = [j - k - last + 0.5, 0.5, k + 0.5], [one, c2, delta2]
     if last:
         powers, values = [*powers, float(last)], [*values, c2 + n1 * s * s]
     return 0.5 * s ** (2 * j + 1) * r_integral(tuple(powers), tuple(values))
 
 
-@partial(integral.defjvp, symbolic_zeros=True)
-def _integral_jvp(
+@partial(incomplete_integral.defjvp, symbolic_zeros=True)
+def _incomplete_integral_jvp(
     orders: tuple[int, int, int], primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
+    """Return the value of `incomplete_integral` and its tangent, from the formula for dI_jkl in the
+    head of this module: the rule by which JAX differentiates the integral.
+    """
     j, k, last = orders
     s, c, m1, n1 = primals
     ds, dc, dm1, dn1 = tangents
-    value = integral(orders, *primals)
+    value = incomplete_integral(orders, *primals)
     tangent = jnp.zeros_like(value)
     if not (isinstance(ds, SymbolicZero) and isinstance(dc, SymbolicZero)):
         ds = jnp.zeros_like(s) if isinstance(ds, SymbolicZero) else ds
@@ -179,20 +186,30 @@ def _integral_jvp(
             rate = rate / (c * c + n1 * s * s) ** last
         tangent = tangent + rate * (c * ds - s * dc)
     if not isinstance(dm1, SymbolicZero):
-        tangent = tangent - (k + 0.5) * integral((j + 1, k + 1, last), *primals) * dm1
+        tangent = tangent - (k + 0.5) * incomplete_integral((j + 1, k + 1, last), *primals) * dm1
     if last and not isinstance(dn1, SymbolicZero):
-        tangent = tangent - last * integral((j + 1, k, last + 1), *primals) * dn1
+        tangent = tangent - last * incomplete_integral((j + 1, k, last + 1), *primals) * dn1
     return value, tangent
 
 
-def complete_integral(orders: tuple[int, int, int], m1: Array, n1: Array | None = None) -> Any:
-    """Return I_jkl for `orders` = (j, k, l) at φ = π/2."""
+def complete_integral(orders: tuple[int, int, int], m1: Array, n1: Array | None = None) -> Array:
+    """Return Legendre's complete integral I_jkl = ∫₀^{π/2} sin^{2j}θ Δ^{−(2k+1)} (1 − n sin²θ)^{−l}
+    dθ, with Δ = √(1 − m sin²θ).
+
+    - `orders`: the three whole numbers (j, k, l).
+    - `m1`: 1 − m.
+    - `n1`: 1 − n, or None for n = 0.
+    """
     one = jnp.ones_like(m1)
-    return integral(orders, one, jnp.zeros_like(m1), m1, one if n1 is None else n1)
+    return incomplete_integral(orders, one, jnp.zeros_like(m1), m1, one if n1 is None else n1)
 
 
-def mean_iterates(m1: Array) -> list[tuple[Any, Any]]:
-    """Return the pairs of arithmetic and geometric means, from (1, √m1) to their common value."""
+def mean_iterates(m1: Array) -> list[tuple[Array, Array]]:
+    """Return the pairs of arithmetic and geometric means in the order of the iteration, from (1,
+    √m1) to their common value.
+
+    `m1` is 1 − m, where m is the parameter of an elliptic integral.
+    """
     rows = [(jnp.ones_like(m1), jnp.sqrt(m1))]
     for _ in range(_MEAN_STEPS[np.dtype(m1.dtype)]):
         a, b = rows[-1]
@@ -201,8 +218,10 @@ def mean_iterates(m1: Array) -> list[tuple[Any, Any]]:
 
 
 @jax.custom_jvp
-def _complete_first_kind(m1: Array) -> Any:
-    """Return K = π/(2 agm(1, √m1)), which is infinite for m1 = 0."""
+def _complete_first_kind(m1: Array) -> Array:
+    """Return Legendre's complete integral of the first kind, K = π/(2 agm(1, √m1)), where m1 = 1 −
+    m and agm is the arithmetic–geometric mean; K is infinite for m1 = 0.
+    """
     a, b = mean_iterates(m1)[-1]
     return jnp.where(m1 == 0, jnp.inf, math.pi / (a + b))
 
@@ -211,40 +230,59 @@ def _complete_first_kind(m1: Array) -> Any:
 def _complete_first_kind_jvp(
     primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
+    """Return K and its tangent for a change of m1: the rule by which JAX differentiates K."""
     (m1,), (dm1,) = primals, tangents
     return _complete_first_kind(m1), -0.5 * complete_integral((1, 1, 0), m1) * dm1
 
 
-def _second_kind(s: Array, c2: Array, delta2: Array, m1: Array) -> Any:
-    """Return E(φ|m) for |φ| ≤ π/2, from s = sin φ, c2 = cos²φ and delta2 = 1 − m s².
+def _incomplete_second_kind(
+    sine: Array, cosine_squared: Array, delta_squared: Array, m1: Array
+) -> Array:
+    """Return Legendre's incomplete integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ,
+    for |φ| ≤ π/2.
+
+    - `sine`, `cosine_squared`: sin φ and cos²φ.
+    - `delta_squared`: 1 − m sin²φ.
+    - `m1`: 1 − m.
 
     The formula is DLMF 19.25.10 for 0 ≤ m ≤ 1 and DLMF 19.25.9 for m < 0: with this choice every
     term is positive.
     """
-    m, one = 1 - m1, jnp.ones_like(s)
+    m, one = 1 - m1, jnp.ones_like(sine)
     # E(φ|1) is sin φ; at φ = π/2 the terms below are not defined.
-    end = delta2 == 0
-    c2, delta2 = jnp.where(end, one, c2), jnp.where(end, one, delta2)
+    end = delta_squared == 0
+    cosine_squared, delta_squared = (
+        jnp.where(end, one, cosine_squared),
+        jnp.where(end, one, delta_squared),
+    )
     above = m >= 0
-    first = jnp.where(above, m1, one) * s * rf(c2, delta2, one)
-    third = rd(c2, jnp.where(above, one, delta2), jnp.where(above, delta2, one))
-    second = jnp.where(above, m1 * m, -m) * s**3 / 3 * third
-    rest = jnp.where(above, m * s * jnp.sqrt(c2 / delta2), 0)
-    value = jnp.where(end, s, first + second + rest)
+    first = jnp.where(above, m1, one) * sine * rf(cosine_squared, delta_squared, one)
+    third = rd(
+        cosine_squared, jnp.where(above, one, delta_squared), jnp.where(above, delta_squared, one)
+    )
+    second = jnp.where(above, m1 * m, -m) * sine**3 / 3 * third
+    rest = jnp.where(above, m * sine * jnp.sqrt(cosine_squared / delta_squared), 0)
+    value = jnp.where(end, sine, first + second + rest)
     return jnp.where(m1 < 0, jnp.nan, value)
 
 
 def _integral_at_any_amplitude(
     orders: tuple[int, int, int], phi: Array, m1: Array, n1: Array | None = None
-) -> Any:
-    """Return the integral I_jkl for `orders` = (j, k, l) from 0 to any amplitude φ = `phi`.
+) -> Array:
+    """Return Legendre's incomplete integral I_jkl(φ, m, n) = ∫₀^φ sin^{2j}θ Δ^{−(2k+1)} (1 − n
+    sin²θ)^{−l} dθ, with Δ = √(1 − m sin²θ), for an amplitude φ of any size.
 
-    The module defines I_jkl; `m1` is 1 − m, and `n1` is 1 − n. Let φ be n π + r. The complete
-    integral gives the part of n π, and the sine and cosine of r give the part of r.
+    - `orders`: the three whole numbers (j, k, l).
+    - `phi`: the amplitude φ, rad.
+    - `m1`: 1 − m.
+    - `n1`: 1 − n, or None for n = 0.
+
+    Let φ be i π + r with a whole number i. The complete integral gives the part of i π, and the
+    sine and cosine of r give the part of r.
     """
     turns, remainder = split_half_turns(phi)
     n1 = jnp.ones_like(m1) if n1 is None else n1
-    part = integral(orders, jnp.sin(remainder), jnp.cos(remainder), m1, n1)
+    part = incomplete_integral(orders, jnp.sin(remainder), jnp.cos(remainder), m1, n1)
     # Within the first half turn the complete integral is not needed, and it may be infinite.
     near = turns == 0
     one = jnp.ones_like(m1)

@@ -17,7 +17,7 @@ from rigidjax.exact.jacobi_duplication import (
     Modulus,
     clip_at_rest,
     duplicate,
-    elliptic,
+    elliptic_functions,
     half_period,
 )
 from rigidjax.rotation.barrier import barrier, compiled_as_one_kernel
@@ -25,26 +25,29 @@ from rigidjax.rotation.barrier import barrier, compiled_as_one_kernel
 
 class Orbit(NamedTuple):
     """Hold the constants of a free motion, in principal axes that are labelled 1, 2, 3 in ascending
-    or descending order of their moments.
+    or descending order of their moments I₁, I₂, I₃.
     """
 
-    a: Scalar  # the reciprocal of the moment of axis 1
+    a: Scalar  # 1/I₁, the reciprocal of the moment of axis 1
     d12: Scalar  # 1/I₁ − 1/I₂
     d13: Scalar  # 1/I₁ − 1/I₃
     d23: Scalar  # 1/I₂ − 1/I₃
     P: Triple  # the initial momentum
     h: Scalar  # the length of the momentum
     modulus: Modulus
-    mu: Scalar  # the number μ of the phase ξ (see `elliptic`)
-    turn: Scalar  # the factor of the phase ξ (see `elliptic`)
+    mu: Scalar  # the number μ of the phase ξ (see `elliptic_functions`)
+    phase_factor: Scalar  # the factor of the phase ξ (see `elliptic_functions`)
     half: HalfPeriod
     swapped: Float[Array, ""]  # whether axis 1 has the largest moment
 
 
 @compiled_as_one_kernel
 def orbit(moments: Triple, momentum: Triple) -> Orbit:
-    """Return the constants of the motion of a body with the principal moments I₁ ≤ I₂ ≤ I₃, any of
-    which may be equal, and the initial body momentum `momentum`.
+    """Return the constants of a free motion, from which its body momentum and its rotation follow
+    at any time.
+
+    - `moments`: the principal moments I₁ ≤ I₂ ≤ I₃, any of which may be equal.
+    - `momentum`: the three components of the body momentum at time 0, in the principal axes.
     """
     (i1, i2, i3), (p1, p2, p3) = moments, momentum
     r1, r2, r3 = 1.0 / i1, 1.0 / i2, 1.0 / i3
@@ -53,7 +56,8 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
     A3 = d13 * p1 * p1 + d23 * p2 * p2
     A2 = d23 * p3 * p3 - d12 * p1 * p1
     p, q, gap = d23 * A1, d12 * A3, d13 * A2
-    # Label the axes such that the phase ξ, a correction to the turn about axis 1, stays small.
+    # Label the axes such that the phase ξ, a correction to the rotation about the momentum, stays
+    # small.
     swap = d12 * A1 > d23 * A3
     p, q, gap = jnp.where(swap, q, p), jnp.where(swap, p, q), jnp.where(swap, -gap, gap)
     a = jnp.where(swap, r3, r1)
@@ -62,124 +66,170 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
     mu = jnp.where(swap, d12 * -A3, d12 * A1)
     p1, p2, p3 = jnp.where(swap, p3, p1), jnp.where(swap, -p2, p2), jnp.where(swap, p1, p3)
     h = jnp.sqrt(p1 * p1 + p2 * p2 + p3 * p3)
-    turn = d13 * h * mu
+    phase_factor = d13 * h * mu
     m = Modulus(p, q, gap)
-    m, mu, turn, half = barrier((m, mu, turn, half_period(m, mu, turn)))
-    return Orbit(a, d12, d13, d23, (p1, p2, p3), h, m, mu, turn, half, swap)
+    m, mu, phase_factor, half = barrier((m, mu, phase_factor, half_period(m, mu, phase_factor)))
+    return Orbit(a, d12, d13, d23, (p1, p2, p3), h, m, mu, phase_factor, half, swap)
 
 
 class ReducedTime(NamedTuple):
-    """Hold a time from which a whole number of half periods was subtracted."""
+    """Hold a time from which a whole number of half periods of the elliptic functions was
+    subtracted.
+    """
 
     halves: Scalar  # the number of half periods that were subtracted
     rest: Scalar  # the time that is left
     near: Scalar  # equal to `rest`, but clipped on the separatrix where the motion is at rest
 
 
-def reduce_time(u: Scalar, half_period: Scalar, m: Modulus) -> ReducedTime:
-    """Return the time u reduced by a whole number of half periods of length `half_period`.
+def reduce_time(u: Scalar, half_period: Scalar, modulus: Modulus) -> ReducedTime:
+    """Return the time u reduced by a whole number of half periods of the elliptic functions.
 
-    The modulus `m` tells whether the motion is on the separatrix, where it comes to rest.
+    - `half_period`: the length of one half period, which is infinite on the separatrix.
+    - `modulus`: the parameters of the functions, which tell whether the motion is on the
+      separatrix, where it comes to rest.
     """
     count = jnp.round(u / half_period)
     rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half_period)
-    return ReducedTime(count, rest, clip_at_rest(rest, m))
+    return ReducedTime(count, rest, clip_at_rest(rest, modulus))
 
 
-def restore_periods(o: Orbit, f: Elliptic, u: ReducedTime) -> tuple[Elliptic, Scalar]:
-    """Return two things: the functions S, C, D at the time before it was reduced, and that part of
-    the phase ξ at this time which `f` does not contain.
+def restore_periods(
+    constants: Orbit, functions: Elliptic, half_time: ReducedTime
+) -> tuple[Elliptic, Scalar]:
+    """Return two things: the elliptic functions S, C, D at a time, from their values at the reduced
+    time; and that part of the phase ξ (an angle) at this time which `functions` does not contain.
 
-    `f` holds the functions at the reduced time `u.near`, and `o` the constants of the motion.
+    - `constants`: the constants of the motion.
+    - `functions`: S, C, D and ξ at the reduced time `half_time.near`.
+    - `half_time`: the reduced time, and the number of half periods that were subtracted.
+
+    The part of the phase belongs to the half periods that were subtracted and, on the separatrix,
+    to the time in which the momentum rests on the middle axis.
     """
-    big = jnp.maximum(o.modulus.p, o.modulus.q)
-    whole = jnp.where(u.halves == 0, 0.0, u.halves)
+    big = jnp.maximum(constants.modulus.p, constants.modulus.q)
+    whole = jnp.where(half_time.halves == 0, 0.0, half_time.halves)
     # After the time `u.near` on the separatrix the momentum rests on the middle axis, where S² =
     # 1/max(p, q): the body spins steadily.
-    spin = (u.rest - u.near) * o.turn / jnp.where(big > 0, big + o.mu, 1.0)
+    spin = (
+        (half_time.rest - half_time.near)
+        * constants.phase_factor
+        / jnp.where(big > 0, big + constants.mu, 1.0)
+    )
     odd = jnp.abs(whole - 2.0 * jnp.round(0.5 * whole)) > 0.5
     sign = jnp.where(odd, -1.0, 1.0)
-    around_three = o.modulus.gap > 0
+    around_three = constants.modulus.gap > 0
     return (
-        f._replace(
-            S=sign * f.S,
-            C=jnp.where(around_three, sign, 1.0) * f.C,
-            D=jnp.where(around_three, 1.0, sign) * f.D,
+        functions._replace(
+            S=sign * functions.S,
+            C=jnp.where(around_three, sign, 1.0) * functions.C,
+            D=jnp.where(around_three, 1.0, sign) * functions.D,
         ),
-        whole * jnp.where(u.halves == 0, 0.0, o.half.phase) + spin,
+        whole * jnp.where(half_time.halves == 0, 0.0, constants.half.phase) + spin,
     )
 
 
-def restore_identity(f: Elliptic, m: Modulus) -> Elliptic:
-    """Return `f` with the larger of C² and D² computed again from the smaller, by D² − C² = (p −
-    q)S².
+def restore_identity(functions: Elliptic, modulus: Modulus) -> Elliptic:
+    """Return the elliptic functions S, C, D with the larger of C² and D² computed again from the
+    smaller, by D² − C² = (p − q)S².
+
+    - `functions`: S, C and D, with errors of round-off from the doublings.
+    - `modulus`: the parameters p and q of the functions.
 
     Near the middle axis the terms of the momentum with C and with SD cancel. An equal error of C
     and D, from the doublings, then cancels as well; an error of C alone or of D alone does not
     cancel, and the identity removes this error.
     """
-    gs = m.gap * f.S * f.S
-    other = jnp.sqrt(jnp.where(gs > 0, f.C * f.C + gs, f.D * f.D - gs))
-    return f._replace(
-        C=jnp.where(gs > 0, f.C, jnp.copysign(other, f.C)),
-        D=jnp.where(gs > 0, jnp.copysign(other, f.D), f.D),
+    gs = modulus.gap * functions.S * functions.S
+    other = jnp.sqrt(
+        jnp.where(gs > 0, functions.C * functions.C + gs, functions.D * functions.D - gs)
+    )
+    return functions._replace(
+        C=jnp.where(gs > 0, functions.C, jnp.copysign(other, functions.C)),
+        D=jnp.where(gs > 0, jnp.copysign(other, functions.D), functions.D),
     )
 
 
-def momentum_at(o: Orbit, f: Elliptic) -> Triple:
-    """Return the body momentum at the time at which `f` holds S, C and D; the axes are labelled as
-    in `o`.
+def momentum_at(constants: Orbit, functions: Elliptic) -> Triple:
+    """Return the three components of the body momentum of a free motion at the time of the elliptic
+    functions.
+
+    - `constants`: the constants of the motion, which also fix the labels 1, 2, 3 of the principal
+      axes.
+    - `functions`: the elliptic functions S, C and D at the time that is meant.
     """
-    p1, p2, p3 = o.P
-    f = restore_identity(f, o.modulus)
-    y1 = p1 * f.C - o.d23 * p2 * p3 * f.S * f.D
-    y2 = p2 * f.C * f.D + o.d13 * p1 * p3 * f.S
-    y3 = p3 * f.D - o.d12 * p1 * p2 * f.S * f.C
+    p1, p2, p3 = constants.P
+    functions = restore_identity(functions, constants.modulus)
+    y1 = p1 * functions.C - constants.d23 * p2 * p3 * functions.S * functions.D
+    y2 = p2 * functions.C * functions.D + constants.d13 * p1 * p3 * functions.S
+    y3 = p3 * functions.D - constants.d12 * p1 * p2 * functions.S * functions.C
     size = jnp.maximum(jnp.maximum(jnp.abs(y1), jnp.abs(y2)), jnp.abs(y3))
     still = size <= 0
     size = jnp.where(still, 1.0, size)
     # For a steady spin the quotient of the only component by the size is exactly ±1, so that the
     # momentum stays the same to the last digit.
     y1, y2, y3 = y1 / size, y2 / size, y3 / size
-    r = o.h / jnp.sqrt(jnp.where(still, 1.0, y1 * y1 + y2 * y2 + y3 * y3))
+    r = constants.h / jnp.sqrt(jnp.where(still, 1.0, y1 * y1 + y2 * y2 + y3 * y3))
     return y1 * r, y2 * r, y3 * r
 
 
 @compiled_as_one_kernel
-def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
-    """Return the body momentum at the time t, and the quaternion of the turn from time 0 to t, in
-    principal axes.
+def momentum_and_turn(constants: Orbit, t: Scalar) -> tuple[Triple, Four]:
+    """Return two things: the body momentum at the time t; and the quaternion (w, x, y, z) of the
+    rotation of the body from time 0 to t. Both have components along the principal axes.
+
+    `constants` are the constants of the motion.
     """
-    u = reduce_time(0.5 * t, o.half.time, o.modulus)
-    return motion_from_functions(o, elliptic(u.near, o.modulus, o.mu, o.turn), u, t)
+    half_time = reduce_time(0.5 * t, constants.half.time, constants.modulus)
+    return motion_from_functions(
+        constants,
+        elliptic_functions(half_time.near, constants.modulus, constants.mu, constants.phase_factor),
+        half_time,
+        t,
+    )
 
 
-def motion_from_functions(o: Orbit, f: Elliptic, u: ReducedTime, t: Scalar) -> tuple[Triple, Four]:
-    """Return the body momentum at the time t and the quaternion of the turn from time 0 to t, from
-    the elliptic functions `f` at `u.near`, where `u` is the reduced time t/2.
+def motion_from_functions(
+    constants: Orbit, functions: Elliptic, half_time: ReducedTime, t: Scalar
+) -> tuple[Triple, Four]:
+    """Return two things: the body momentum at the time t; and the quaternion (w, x, y, z) of the
+    rotation of the body from time 0 to t. Both have components along the principal axes.
+
+    - `constants`: the constants of the motion.
+    - `functions`: the elliptic functions S, C, D and their phase ξ at the time `half_time.near`.
+    - `half_time`: the time t/2, reduced by whole half periods.
     """
-    f, phase = barrier(restore_periods(o, f, u))
-    full = barrier(duplicate(f, o.modulus, o.mu, o.turn))
-    _, k2, k3 = barrier(momentum_at(o, f))
-    m1, m2, m3 = barrier(momentum_at(o, full))
+    functions, phase = barrier(restore_periods(constants, functions, half_time))
+    full = barrier(duplicate(functions, constants.modulus, constants.mu, constants.phase_factor))
+    _, k2, k3 = barrier(momentum_at(constants, functions))
+    m1, m2, m3 = barrier(momentum_at(constants, full))
 
     # The turn is the product (c, s Π(0)) ⊗ b of two quaternions: the first turns about the initial
     # momentum, and b = (b0, 0, b2, b3) turns about an axis in the plane of axes 2 and 3.
-    b0, b2, b3 = f.C, -o.d12 * f.S * k2 * f.C, -o.d13 * f.S * k3
+    b0, b2, b3 = (
+        functions.C,
+        -constants.d12 * functions.S * k2 * functions.C,
+        -constants.d13 * functions.S * k3,
+    )
     size = jnp.maximum(jnp.maximum(jnp.abs(b0), jnp.abs(b2)), jnp.abs(b3))
     b0, b2, b3 = barrier((b0 / size, b2 / size, b3 / size))
-    r = 1.0 / jnp.sqrt((b0 * b0 + b2 * b2 + b3 * b3) * (f.x * f.x + f.y * f.y))
-    angle = 0.5 * o.a * o.h * t - phase
+    r = 1.0 / jnp.sqrt(
+        (b0 * b0 + b2 * b2 + b3 * b3) * (functions.x * functions.x + functions.y * functions.y)
+    )
+    angle = 0.5 * constants.a * constants.h * t - phase
     sine, cosine = jnp.sin(angle), jnp.cos(angle)
-    c, s = r * (cosine * f.x + sine * f.y), r * (sine * f.x - cosine * f.y)
-    still = o.h <= 0
-    c, s = barrier((c, jnp.where(still, 0.0, s / jnp.where(still, 1.0, o.h))))
-    p1, p2, p3 = o.P
+    c, s = (
+        r * (cosine * functions.x + sine * functions.y),
+        r * (sine * functions.x - cosine * functions.y),
+    )
+    still = constants.h <= 0
+    c, s = barrier((c, jnp.where(still, 0.0, s / jnp.where(still, 1.0, constants.h))))
+    p1, p2, p3 = constants.P
     w = c * b0 - s * (p2 * b2 + p3 * b3)
     x = s * (p1 * b0 + p2 * b3 - p3 * b2)
     y = c * b2 + s * (p2 * b0 - p1 * b3)
     z = c * b3 + s * (p3 * b0 + p1 * b2)
-    swap = o.swapped
+    swap = constants.swapped
     momentum = jnp.where(swap, m3, m1), jnp.where(swap, -m2, m2), jnp.where(swap, m1, m3)
     turn = w, jnp.where(swap, z, x), jnp.where(swap, -y, y), jnp.where(swap, x, z)
     return momentum, turn

@@ -20,25 +20,32 @@ Six = tuple[Scalar, ...]
 HALF = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
 
 
-def add(a: Triple, b: Triple) -> Triple:
-    """Return the sum of two vectors."""
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+def add(v: Triple, w: Triple) -> Triple:
+    """Return the sum of the two vectors v and w, each a tuple of three components."""
+    return v[0] + w[0], v[1] + w[1], v[2] + w[2]
 
 
-def matvec(m: Six, v: Triple) -> Triple:
-    """Return the product of a symmetric matrix m and a vector v."""
-    a, b, c, x, y, z = m
+def matvec(matrix: Six, vector: Triple) -> Triple:
+    """Return the product of a symmetric matrix and a vector, as three components.
+
+    - `matrix`: the entries (11, 22, 33, 12, 13, 23).
+    - `vector`: three components.
+    """
+    a, b, c, x, y, z = matrix
     return (
-        a * v[0] + x * v[1] + y * v[2],
-        x * v[0] + b * v[1] + z * v[2],
-        y * v[0] + z * v[1] + c * v[2],
+        a * vector[0] + x * vector[1] + y * vector[2],
+        x * vector[0] + b * vector[1] + z * vector[2],
+        y * vector[0] + z * vector[1] + c * vector[2],
     )
 
 
-def commuting_product(m: Six, n: Six) -> Six:
-    """Return the product of two symmetric matrices that commute, which is symmetric."""
-    a, b, c, x, y, z = m
-    d, e, f, u, v, w = n
+def commuting_product(left: Six, right: Six) -> Six:
+    """Return the product of two symmetric matrices that commute; the product is symmetric, too.
+
+    All three matrices are tuples of the entries (11, 22, 33, 12, 13, 23).
+    """
+    a, b, c, x, y, z = left
+    d, e, f, u, v, w = right
     return (
         a * d + x * u + y * v,
         x * u + b * e + z * w,
@@ -49,21 +56,25 @@ def commuting_product(m: Six, n: Six) -> Six:
     )
 
 
-def symmetric_rows(m: Six) -> tuple[Array, ...]:
-    """Return the rows of a symmetric matrix."""
-    a, b, c, x, y, z = m
+def symmetric_rows(matrix: Six) -> tuple[Array, ...]:
+    """Return the three rows, each (3,), of the symmetric matrix with the entries (11, 22, 33, 12,
+    13, 23).
+    """
+    a, b, c, x, y, z = matrix
     return jnp.stack([a, x, y]), jnp.stack([x, b, z]), jnp.stack([y, z, c])
 
 
-def determinant(m: Six) -> Scalar:
-    """Return the determinant of a symmetric matrix."""
-    a, b, c, x, y, z = m
+def determinant(matrix: Six) -> Scalar:
+    """Return the determinant of the symmetric matrix with the entries (11, 22, 33, 12, 13, 23)."""
+    a, b, c, x, y, z = matrix
     return a * b * c + 2.0 * x * y * z - a * z * z - b * y * y - c * x * x
 
 
-def adjugate(m: Six) -> Six:
-    """Return the adjugate of a symmetric matrix: its determinant times its inverse."""
-    a, b, c, x, y, z = m
+def adjugate(matrix: Six) -> Six:
+    """Return the adjugate of a symmetric matrix, which is its determinant times its inverse; both
+    matrices are tuples of the entries (11, 22, 33, 12, 13, 23).
+    """
+    a, b, c, x, y, z = matrix
     return (
         b * c - z * z,
         a * c - y * y,
@@ -74,10 +85,14 @@ def adjugate(m: Six) -> Six:
     )
 
 
-def half_product(q: Four, v: Triple) -> Four:
-    """Return ½ q ⊗ (0, v), where ⊗ is the product of quaternions."""
+def half_product(q: Four, vector: Triple) -> Four:
+    """Return the four components of ½ q ⊗ (0, v), where ⊗ is the product of quaternions (w, x, y,
+    z) and v = `vector`.
+
+    If v is the body rate, this is the rate of change of q.
+    """
     w, x, y, z = q
-    a, b, c = 0.5 * v[0], 0.5 * v[1], 0.5 * v[2]
+    a, b, c = 0.5 * vector[0], 0.5 * vector[1], 0.5 * vector[2]
     return (
         -x * a - y * b - z * c,
         w * a + y * c - z * b,
@@ -86,9 +101,11 @@ def half_product(q: Four, v: Triple) -> Four:
     )
 
 
-def change_by_inverse_rotation(q: Four, v: Triple) -> Triple:
-    """Return R(q)ᵀ v − v, computed without a difference of large numbers."""
+def change_by_inverse_rotation(q: Four, vector: Triple) -> Triple:
+    """Return the three components of R(q)ᵀ v − v, where v = `vector` and R(q) is the rotation by
+    the unit quaternion q; the change is computed without a difference of large numbers.
+    """
     w, *axis = q
-    first = cross(v, tuple(axis))
+    first = cross(vector, tuple(axis))
     second = cross(first, tuple(axis))
     return tuple(2.0 * (w * a + b) for a, b in zip(first, second, strict=True))

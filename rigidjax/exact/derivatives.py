@@ -22,7 +22,8 @@ series.
 """
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -73,54 +74,80 @@ _STILL = {jnp.dtype("float32"): 5e-3, jnp.dtype("float64"): 5e-6}
 # without derivatives.
 _LOOPED = 1000
 
+# The body momentum Π(t), the quaternion of the rotation from time 0 to t, and the body rate Ω(t).
+Motion = tuple[Triple, Four, Triple]
+# The derivatives of the three components of a vector with respect to ten variables.
+Rows = tuple[Float[Array, "10"], ...]
+
 
 @jax.custom_jvp
 def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
-    """Return two things: the body momentum Π(t), and the quaternion of the turn from time 0 to t.
+    """Return two things: the body momentum Π(t) of a free body; and the quaternion (w, x, y, z) of
+    its rotation from time 0 to t. Both have components along the principal axes.
 
-    `moments` are the entries (I11, I22, I33, I12, I13, I23) of the inertia tensor in principal
-    axes, with I11 ≤ I22 ≤ I33. The last three entries are zero in value, but their derivatives are
-    not. `momentum` is Π(0).
+    - `moments`: the entries (I11, I22, I33, I12, I13, I23) of the inertia tensor in principal axes,
+      with I11 ≤ I22 ≤ I33. The last three entries are zero in value, but their derivatives are not.
+    - `momentum`: the three components of Π(0).
+    - `t`: the time, of either sign.
     """
     return momentum_and_turn(orbit(moments[:3], momentum), t)
 
 
 @flow.defjvp
 def _flow_jvp(primals, tangents):
+    """Return the value of `flow` and its change for a change of the inputs: the rule by which JAX
+    differentiates `flow`.
+    """
     motion, rows, _ = motion_and_derivatives(*primals)
-    d_out, d_turn, _ = _change_of_motion(motion, rows, _variables(primals, tangents)[3])
+    d_out, d_turn, _ = _change_of_motion(motion, rows, _variables_and_changes(primals, tangents)[3])
     return motion[:2], (d_out, d_turn)
 
 
-def _variables(primals, tangents):
-    """Return four things: the result of `reciprocal`; the change of this result; the result of
-    `derivative_variables`; and the change of this result.
+def _variables_and_changes(primals: tuple, tangents: tuple) -> tuple:
+    """Return four things that the derivative rules of a free motion share: the inverse inertia
+    tensor and energy; the change of these; the ten variables of all derivatives; and the change of
+    these.
 
-    `primals` are (moments, momentum, t), as for `flow`, and `tangents` are the changes of these
-    three.
+    - `primals`: the three values (entries of the inertia tensor, body momentum Π(0), time t), as
+      for `flow`.
+    - `tangents`: the changes of these three values.
+
+    The first result is that of `inverse_inertia_and_energy`, and the third is that of
+    `derivative_variables`.
     """
-    parts, changes = jax.jvp(reciprocal, primals[:2], tangents[:2])
+    reciprocals, changes = jax.jvp(inverse_inertia_and_energy, primals[:2], tangents[:2])
     return (
-        parts,
+        reciprocals,
         changes,
-        derivative_variables(parts, *primals[1:]),
+        derivative_variables(reciprocals, *primals[1:]),
         derivative_variables(changes, *tangents[1:]),
     )
 
 
-def _change_of_motion(motion, derivative_rows, change):
-    """Return three things: the change of Π(t), the change of the quaternion of the turn, and the
-    change of Ω(t), if the result of `derivative_variables` changes by `change`.
+def _change_of_motion(
+    motion: Motion, derivative_rows: "MotionDerivatives", change: Float[Array, "10"]
+) -> Motion:
+    """Return three changes, of the body momentum Π(t), of the quaternion of the rotation from time
+    0 to t, and of the body rate Ω(t), for a change of the ten `derivative_variables`.
 
-    `motion` holds Π(t), the quaternion and Ω(t). `rows` holds the derivatives of Π(t), θ and Ω(t),
-    where θ is the small rotation vector that changes the turn.
+    - `motion`: the triple of Π(t), the quaternion and Ω(t).
+    - `derivative_rows`: the derivatives of Π(t), θ and Ω(t) with respect to the ten variables,
+      where θ is the small rotation vector that changes the rotation; three arrays (10,) for each
+      vector.
+    - `change`: (10,) the change of the variables.
     """
     out, theta, rate = (tuple(jnp.sum(row * change) for row in three) for three in derivative_rows)
     return out, half_product(motion[1], theta), rate
 
 
 class MotionConstants(NamedTuple):
-    """Hold the constants of a free motion as plain values, through which no derivative is taken."""
+    """Hold the constants of a free motion as plain values, through which no derivative is taken.
+
+    - `axes`: (3, 3) the matrix whose columns are the principal axes, in the body frame.
+    - `moments`: the three principal moments, ascending.
+    - `momentum`: the three components of the body momentum at time 0 along the principal axes.
+    - `orbit`: the constants from which the closed form is evaluated.
+    """
 
     axes: Mat3
     moments: Triple
@@ -130,8 +157,10 @@ class MotionConstants(NamedTuple):
 
 @compiled_as_one_kernel
 def set_up(tensor: Mat3, omega: Vec3) -> MotionConstants:
-    """Return the principal axes of the inertia `tensor`, and the constants, in these axes, of the
-    motion that begins with the body rate `omega`.
+    """Return the principal axes of a body, and the constants of its free motion in these axes.
+
+    - `tensor`: (3, 3) the inertia tensor, body frame.
+    - `omega`: (3,) the body rate at time 0, body frame.
     """
     moments, axes = principal_frame(tensor)
     momentum = matvec(moments, components_along(axes, omega))
@@ -140,28 +169,34 @@ def set_up(tensor: Mat3, omega: Vec3) -> MotionConstants:
 
 @jax.custom_jvp
 def body_motion(
-    tensor: Mat3, omega: Vec3, setting: MotionConstants, t: Float[Array, "*n"]
+    tensor: Mat3, omega: Vec3, constants: MotionConstants, t: Float[Array, "*n"]
 ) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 4"]]:
-    """Return two things: the body rate Ω(t), and the quaternion of the turn from time 0 to t, both
-    in body axes.
+    """Return two things, both in the body frame: the body rate Ω(t) of a free body; and the
+    quaternion (w, x, y, z) of its rotation from time 0 to t.
 
-    `t` is one time, or an array (n,) of times. `setting` is the result of `set_up` for the inertia
-    `tensor` and the initial body rate `omega`.
+    - `tensor`: (3, 3) the inertia tensor.
+    - `omega`: (3,) the body rate Ω(0).
+    - `constants`: the result of `set_up` for `tensor` and `omega`. The value comes from `constants`
+      alone, and the derivative goes to `tensor`, `omega` and `t`.
+    - `t`: one time, or an array (n,) of times; the results then are (n, 3) and (n, 4).
     """
     del tensor, omega
-    return _at_each_time(lambda time: _body_motion_at(setting, time), t)
+    return _at_each_time(lambda time: _body_motion_at(constants, time), t)
 
 
 @body_motion.defjvp
 def _body_motion_jvp(primals, tangents):
-    tensor, omega, setting, t = primals
+    """Return the value of `body_motion` and its change for a change of the inputs: the rule by
+    which JAX differentiates `body_motion`.
+    """
+    tensor, omega, constants, t = primals
     d_tensor, d_omega, _, d_t = tangents
     # The derivative is a product of two matrices, of which only the left one depends on time. The
     # part that is transposed for reverse mode is therefore short, and the right matrix is compiled
     # once.
-    first = _input_derivatives(jnp.concatenate([tensor.ravel(), omega]), setting)
+    first = _input_derivatives(jnp.concatenate([tensor.ravel(), omega]), constants)
     out, (rates, thetas) = _at_each_time(
-        lambda time: _body_motion_and_derivatives(tensor, omega, setting, time), t
+        lambda time: _body_motion_and_derivatives(tensor, omega, constants, time), t
     )
     # Sum products of entries: on a GPU a product of matrices is rounded to ten bits in float32.
     change = jnp.sum(first * jnp.concatenate([d_tensor.ravel(), d_omega])[None], axis=-1)
@@ -176,53 +211,71 @@ def _body_motion_jvp(primals, tangents):
 
 @functools.partial(jnp.vectorize, signature="(n),(m)->(n)")
 def _quaternion_change(turn: Quat, theta: Vec3) -> Quat:
-    """Return the change ½ q ⊗ (0, θ) of the quaternion q = `turn` for a small rotation θ."""
+    """Return the change ½ q ⊗ (0, θ) of the unit quaternion q = `turn` if the rotation is followed
+    by a small rotation with the rotation vector θ = `theta`, body frame.
+    """
     return jnp.stack(half_product(components(turn), components(theta)))
 
 
-def _at_each_time(function, t):
-    """Return the values of `function` at the time t, or at each of the times t."""
+def _at_each_time(function: Callable[[Scalar], Any], t: Float[Array, "*n"]) -> Any:
+    """Return the values of a function of time at the time t, or at each of the times t.
+
+    - `function`: takes one time and returns any tree of arrays.
+    - `t`: one time, or an array (n,) of times; with (n,) every array of the result begins with an
+      axis of length n.
+    """
     if t.ndim == 0:
         return function(t)
     return jax.lax.map(function, t) if t.size <= _LOOPED else jax.vmap(function)(t)
 
 
 @compiled_as_one_kernel
-def _body_motion_at(s: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
-    """Return the body rate Ω(t) and the quaternion of the turn from time 0 to t, both in body axes,
-    of the motion with the constants `s`.
+def _body_motion_at(constants: MotionConstants, t: Scalar) -> tuple[Vec3, Quat]:
+    """Return two things at the time t, both in the body frame: the body rate Ω(t) of a free body;
+    and the quaternion of its rotation from time 0 to t.
+
+    `constants` are the constants of the motion.
     """
-    momentum, (w, *axis) = momentum_and_turn(s.orbit, t)
-    rate = tuple(p / i for p, i in zip(momentum, s.moments, strict=True))
-    return jnp.stack(combine_columns(s.axes, rate)), jnp.stack(
-        [w, *combine_columns(s.axes, tuple(axis))]
+    momentum, (w, *axis) = momentum_and_turn(constants.orbit, t)
+    rate = tuple(p / i for p, i in zip(momentum, constants.moments, strict=True))
+    return jnp.stack(combine_columns(constants.axes, rate)), jnp.stack(
+        [w, *combine_columns(constants.axes, tuple(axis))]
     )
 
 
-def _moments_and_momentum(tensor: Mat3, omega: Vec3, s: MotionConstants) -> tuple[Six, Triple]:
-    """Return the entries of the inertia tensor, as for `flow`, and the momentum Π(0), both in the
-    principal axes of `s`.
+def _moments_and_momentum(
+    tensor: Mat3, omega: Vec3, constants: MotionConstants
+) -> tuple[Six, Triple]:
+    """Return two things in principal axes, as differentiable functions of the inputs: the six
+    entries (11, 22, 33, 12, 13, 23) of the inertia tensor; and the three components of the body
+    momentum Π(0).
 
-    The two results are differentiable functions of the inertia `tensor` and the body rate `omega`
-    at time 0. The principal axes are held fixed.
+    - `tensor`: (3, 3) the inertia tensor, body frame.
+    - `omega`: (3,) the body rate at time 0, body frame.
+    - `constants`: the constants of the motion, from which the principal axes are taken. The axes
+      are held fixed in derivatives.
     """
-    moments = tensor_in_axes(tensor, s.axes, s.moments)
-    return moments, matvec(moments, components_along(s.axes, omega))
+    moments = tensor_in_axes(tensor, constants.axes, constants.moments)
+    return moments, matvec(moments, components_along(constants.axes, omega))
 
 
 @compiled_as_one_kernel
-def _input_derivatives(body: Float[Array, "12"], s: MotionConstants) -> Float[Array, "9 12"]:
-    """Return the derivatives (9, 12) of the first nine `derivative_variables`, all except t, with
-    respect to `body`.
+def _input_derivatives(
+    body: Float[Array, "12"], constants: MotionConstants
+) -> Float[Array, "9 12"]:
+    """Return the derivatives (9, 12) of the first nine of the ten `derivative_variables`, which do
+    not contain the time, with respect to the inertia tensor and the body rate.
 
-    `body` (12,) holds the nine entries of the inertia tensor, then the three of Ω(0).
+    - `body`: (12,) the nine entries of the inertia tensor, then the three of the body rate Ω(0),
+      all in the body frame.
+    - `constants`: the constants of the motion, from which the principal axes are taken.
     """
-    tensor, omega, axes = body[:9].reshape(3, 3), body[9:], s.axes
-    moments, momentum = _moments_and_momentum(tensor, omega, s)
+    tensor, omega, axes = body[:9].reshape(3, 3), body[9:], constants.axes
+    moments, momentum = _moments_and_momentum(tensor, omega, constants)
     # In principal axes, δK = −K δI K is −BᵀδI B with B = A K, where the columns of A are the axes.
     # The products are written as sums of products of entries, for the reason given in
     # `_body_motion_jvp`.
-    k = jnp.stack(symmetric_rows(reciprocal(moments, momentum)[1]))
+    k = jnp.stack(symmetric_rows(inverse_inertia_and_energy(moments, momentum)[1]))
     b = jnp.sum(axes[:, :, None] * k[None], axis=1)
     d_k = lambda i, j: -(b[:, None, i] * b[None, :, j]).ravel()  # noqa: E731
     c1, c2, c3 = d_k(0, 0), d_k(1, 1), d_k(2, 2)
@@ -235,82 +288,120 @@ def _input_derivatives(body: Float[Array, "12"], s: MotionConstants) -> Float[Ar
 
 
 @compiled_as_one_kernel
-def _body_motion_and_derivatives(tensor: Mat3, omega: Vec3, s: MotionConstants, t: Scalar):
-    """Return two pairs, both in body axes: Ω(t) and the quaternion of the turn; and the derivatives
-    of Ω(t) and of θ with respect to `derivative_variables`.
+def _body_motion_and_derivatives(
+    tensor: Mat3, omega: Vec3, constants: MotionConstants, t: Scalar
+) -> tuple[tuple[Vec3, Quat], tuple[Rows, Rows]]:
+    """Return two pairs, both in the body frame: the body rate Ω(t) and the quaternion of the
+    rotation from time 0 to t; and the derivatives of Ω(t) and of θ with respect to the ten
+    `derivative_variables`, each as three arrays (10,), one for each component.
 
-    θ is the small rotation vector that changes the turn.
+    - `tensor`: (3, 3) the inertia tensor.
+    - `omega`: (3,) the body rate Ω(0).
+    - `constants`: the constants of the motion.
+    - `t`: the time.
+
+    θ is the small rotation vector that changes the rotation.
     """
-    moments, momentum = _moments_and_momentum(tensor, omega, s)
+    moments, momentum = _moments_and_momentum(tensor, omega, constants)
     (_, (w, *axis), rate), rows, _ = motion_and_derivatives(moments, momentum, t)
-    rate = combine_columns(s.axes, rate)
-    turn = jnp.stack([w, *combine_columns(s.axes, tuple(axis))])
+    rate = combine_columns(constants.axes, rate)
+    turn = jnp.stack([w, *combine_columns(constants.axes, tuple(axis))])
     # Return the derivatives as rows, not as matrices: in a batch, stacking the rows takes five
     # times as long as computing them.
-    in_body = jax.vmap(lambda *v: combine_columns(s.axes, v))
+    in_body = jax.vmap(lambda *v: combine_columns(constants.axes, v))
     return (jnp.stack(rate), turn), (in_body(*rows.rate), in_body(*rows.theta))
 
 
 class MotionDerivatives(NamedTuple):
-    """Hold the derivatives of Π(t), θ and Ω(t) with respect to `derivative_variables`: for each of
-    these vectors three rows of ten numbers.
+    """Hold the derivatives of three vectors of a free motion with respect to the ten
+    `derivative_variables`: of the body momentum Π(t), of θ and of the body rate Ω(t), each as three
+    arrays (10,), one for each component.
 
-    θ is the small rotation vector that changes the turn.
+    θ is the small rotation vector that changes the rotation R of the body from time 0 to t: δR = R
+    hat(θ).
     """
 
-    momentum: Triple
-    theta: Triple
-    rate: Triple
+    momentum: Rows
+    theta: Rows
+    rate: Rows
 
 
 @jax.custom_jvp
 @compiled_as_one_kernel
-def motion_and_derivatives(moments: Six, momentum: Triple, t: Scalar):
-    """Return three things: the motion, which is (Π(t), quaternion of the turn, Ω(t)); the
-    derivatives of the motion, as `MotionDerivatives`; and the pair (rows, G) from which these are
-    computed.
+def motion_and_derivatives(
+    moments: Six, momentum: Triple, t: Scalar
+) -> tuple[Motion, MotionDerivatives, tuple[Rows, Six]]:
+    """Return three things: the motion of a free body, which is (Π(t), quaternion of the rotation
+    from time 0 to t, body rate Ω(t)); the derivatives of the motion; and the pair (rows, G) from
+    which the derivatives are computed.
 
-    `_first_order` returns the pair: `rows` are the derivatives of Π(t) − Π(0), and G = ∫ Π Πᵀ dt
-    from 0 to t.
+    - `moments`: the six entries of the inertia tensor in principal axes, as for `flow`.
+    - `momentum`: the three components of the body momentum Π(0).
+    - `t`: the time.
+
+    In the pair, `rows` are the derivatives of Π(t) − Π(0) with respect to the ten
+    `derivative_variables`, as three arrays (10,), and G = ∫ Π Πᵀ dt from 0 to t, as six entries.
     """
-    (out, turn), rows, g = _first_order(orbit(moments[:3], momentum), moments, momentum, t)
-    _, k, energy2 = reciprocal(moments, momentum)
+    (out, turn), rows, g = _flow_and_first_derivatives(
+        orbit(moments[:3], momentum), moments, momentum, t
+    )
+    _, k, energy2 = inverse_inertia_and_energy(moments, momentum)
     motion = out, turn, matvec(k, out)
-    return motion, _derivative_columns(k, energy2, momentum, t, motion, rows, g), (rows, g)
+    return motion, _motion_derivatives(k, energy2, momentum, t, motion, rows, g), (rows, g)
 
 
 # The second derivatives come from `sigma_form`, where the motion is a function of the whole inertia
 # tensor: this function is smooth to any order.
 @motion_and_derivatives.defjvp
 def _motion_and_derivatives_jvp(primals, tangents):
+    """Return the value of `motion_and_derivatives` and its change for a change of the inputs: the
+    rule by which JAX takes second derivatives of a free motion.
+    """
     motion, rows, parts = motion_and_derivatives(*primals)
-    (body, *k), (_, *d_k), inputs, change = _variables(primals, tangents)
+    (body, *k), (_, *d_k), inputs, change = _variables_and_changes(primals, tangents)
     d_motion = _change_of_motion(motion, rows, change)
-    d_parts = _second_order(body, inputs, change)
+    d_parts = _changes_of_first_derivatives(body, inputs, change)
     at, changes = (*k, *primals[1:], motion, *parts), (*d_k, *tangents[1:], d_motion, *d_parts)
-    return (motion, rows, parts), (d_motion, jax.jvp(_derivative_columns, at, changes)[1], d_parts)
+    return (motion, rows, parts), (d_motion, jax.jvp(_motion_derivatives, at, changes)[1], d_parts)
 
 
-def _derivative_columns(
-    k: Six, energy2: Scalar, momentum: Triple, t: Scalar, motion, rows, g: Six
+def _motion_derivatives(
+    inverse_inertia: Six,
+    energy2: Scalar,
+    momentum: Triple,
+    t: Scalar,
+    motion: Motion,
+    momentum_rows: Rows,
+    momentum_integral: Six,
 ) -> MotionDerivatives:
-    """Return the derivatives of `motion`, the first result of `motion_and_derivatives`.
+    """Return the derivatives of a free motion with respect to the ten `derivative_variables`, from
+    the derivatives of its body momentum.
 
-    `k` (the matrix K) and `energy2` (E₂) come from `reciprocal`; `rows` (the derivatives of Π(t) −
-    Π(0)) and `g` (the matrix G) come from `_first_order`; `momentum` is Π(0).
+    - `inverse_inertia`: the six entries of K = I⁻¹, the inverse of the inertia tensor.
+    - `energy2`: E₂ = Π·KΠ, which is twice the energy.
+    - `momentum`: the three components of the body momentum Π(0).
+    - `t`: the time.
+    - `motion`: the triple of Π(t), the quaternion of the rotation from time 0 to t, and Ω(t).
+    - `momentum_rows`: the derivatives of Π(t) − Π(0) with respect to the ten variables, as three
+      arrays (10,).
+    - `momentum_integral`: the six entries of G = ∫ Π Πᵀ dt from 0 to t.
     """
     out, turn, _ = motion
     p1, p2, p3 = momentum
     h2 = p1 * p1 + p2 * p2 + p3 * p3
-    most = h2 * (k[0] * k[0] + k[1] * k[1] + k[2] * k[2])
+    most = h2 * (
+        inverse_inertia[0] * inverse_inertia[0]
+        + inverse_inertia[1] * inverse_inertia[1]
+        + inverse_inertia[2] * inverse_inertia[2]
+    )
     still = jax.lax.stop_gradient(most * (t * t)) <= _STILL[t.dtype] ** 2
     r = 1.0 / jnp.where(still, 1.0, h2)
-    rate = matvec(k, momentum)
+    rate = matvec(inverse_inertia, momentum)
     pull = cross(momentum, rate)
-    gain = matvec(k, pull)
+    gain = matvec(inverse_inertia, pull)
     pulled = add(cross(pull, rate), cross(momentum, gain))
     squares = (p1 * p1, p2 * p2, p3 * p3, p1 * p2, p1 * p3, p2 * p3)
-    weights = [c * (t * a + b) for c, a, b in zip(HALF, squares, g, strict=True)]
+    weights = [c * (t * a + b) for c, a, b in zip(HALF, squares, momentum_integral, strict=True)]
 
     def column(e, change):
         e12, e23, o12, o13, o23, e1, e2, e3, e33, et = e
@@ -323,66 +414,101 @@ def _derivative_columns(
         theta = tuple(r * (a + b * along) for a, b in zip(across, out, strict=True))
         # Near rest the derivative is a series in t, from θ' = δΩ − Ω × θ with Ω = KΠ and Π' = Π ×
         # Ω.
-        faster = add(matvec(d_k, momentum), matvec(k, start))
+        faster = add(matvec(d_k, momentum), matvec(inverse_inertia, start))
         d_pull = add(cross(start, rate), cross(momentum, faster))
-        gained = add(matvec(d_k, pull), matvec(k, d_pull))
+        gained = add(matvec(d_k, pull), matvec(inverse_inertia, d_pull))
         bent = add(gained, cross(faster, rate))
         d_jerk = add(add(cross(d_pull, rate), cross(pull, faster)), cross(start, gain))
         jerk = add(d_jerk, cross(momentum, gained))
-        third = add(matvec(d_k, pulled), matvec(k, jerk))
+        third = add(matvec(d_k, pulled), matvec(inverse_inertia, jerk))
         third = add(add(third, cross(add(faster, faster), gain)), cross(bent, rate))
-        near = zip(faster, bent, third, matvec(k, out), strict=True)
+        near = zip(faster, bent, third, matvec(inverse_inertia, out), strict=True)
         near = tuple(t * (a + t * (b / 2 + t * c / 6)) + et * d for a, b, c, d in near)
         theta = tuple(jnp.where(still, a, b) for a, b in zip(near, theta, strict=True))
-        return d_out, theta, add(matvec(k, d_out), matvec(d_k, out))
+        return d_out, theta, add(matvec(inverse_inertia, d_out), matvec(d_k, out))
 
-    return MotionDerivatives(*jax.vmap(column)(jnp.eye(10, dtype=t.dtype), rows))
+    return MotionDerivatives(*jax.vmap(column)(jnp.eye(10, dtype=t.dtype), momentum_rows))
 
 
-def derivative_variables(parts, momentum: Triple, t: Scalar) -> Float[Array, "10"]:
-    """Return d12, d23, k12, k13, k23, Π(0), k33 and t: all derivatives of this module are taken
-    with respect to these ten variables.
+def derivative_variables(
+    reciprocals: tuple[Differences, Six, Scalar], momentum: Triple, t: Scalar
+) -> Float[Array, "10"]:
+    """Return d12, d23, k12, k13, k23, Π(0), k33 and t (10,): all derivatives of this module are
+    taken with respect to these ten variables.
 
-    `parts` is the result of `reciprocal`, or the change of this result; `momentum` and t are then
-    changes, too. Here kij are the entries of K = I⁻¹, and dij = kii − kjj. The variable k33 is the
-    least diagonal entry. With k33, the thickness of a rod changes d12 alone; with k11 instead, the
-    thickness would change both k11 and d12 by a term of 1/I₁², and the two terms would cancel.
+    - `reciprocals`: the result of `inverse_inertia_and_energy`, or the change of this result.
+    - `momentum`, `t`: the body momentum Π(0) and the time, or their changes if `reciprocals` is a
+      change.
+
+    Here kij are the entries of K = I⁻¹, and dij = kii − kjj. The variable k33 is the least diagonal
+    entry. With k33, the thickness of a rod changes d12 alone; with k11 instead, the thickness would
+    change both k11 and d12 by a term of 1/I₁², and the two terms would cancel.
     """
-    body, k, _ = parts
-    return jnp.stack([body.d12, body.d23, body.k12, body.k13, body.k23, *momentum, k[2], t])
+    differences, k, _ = reciprocals
+    return jnp.stack(
+        [
+            differences.d12,
+            differences.d23,
+            differences.k12,
+            differences.k13,
+            differences.k23,
+            *momentum,
+            k[2],
+            t,
+        ]
+    )
 
 
 @compiled_as_one_kernel
-def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
-    """Return three things: the result of `flow`; the derivatives of Π(t) − Π(0) with respect to
-    `derivative_variables`, as three rows; and the matrix G = ∫ Π Πᵀ dt from 0 to t.
+def _flow_and_first_derivatives(
+    constants: Orbit, moments: Six, momentum: Triple, t: Scalar
+) -> tuple[tuple[Triple, Four], Rows, Six]:
+    """Return three things: the body momentum Π(t) and the quaternion of the rotation from time 0 to
+    t, as `flow` returns them; the derivatives of Π(t) − Π(0) with respect to the ten
+    `derivative_variables`, as three arrays (10,); and the six entries of the matrix G = ∫ Π Πᵀ dt
+    from 0 to t.
 
-    `o` holds the constants of the motion; `moments`, `momentum` and t are as for `flow`.
+    - `constants`: the constants of the motion.
+    - `moments`, `momentum`, `t`: the inertia tensor in principal axes, Π(0) and the time, as for
+      `flow`.
     """
-    u = reduce_time(0.5 * t, o.half.time, o.modulus)
-    at = integrals(u.near, o.modulus, o.mu, o.turn)
-    f = at.f._replace(
-        C=jnp.where(o.swapped, at.f.D, at.f.C), D=jnp.where(o.swapped, at.f.C, at.f.D)
+    half_time = reduce_time(0.5 * t, constants.half.time, constants.modulus)
+    half_time_integrals = integrals(
+        half_time.near, constants.modulus, constants.mu, constants.phase_factor
     )
-    none = u.halves == 0
-    whole = jnp.where(none, 0.0, 2.0 * u.halves) * jnp.where(none, 0.0, o.half.time)
-    body, _, _ = reciprocal(moments, momentum)
-    half = at._replace(f=f)
-    rows, g = jacobian_and_integral(body, momentum, t, half, u.halves, whole, o.half.mean)
-    return motion_from_functions(o, at.f, u, t), rows, g
+    f = half_time_integrals.f._replace(
+        C=jnp.where(constants.swapped, half_time_integrals.f.D, half_time_integrals.f.C),
+        D=jnp.where(constants.swapped, half_time_integrals.f.C, half_time_integrals.f.D),
+    )
+    none = half_time.halves == 0
+    whole = jnp.where(none, 0.0, 2.0 * half_time.halves) * jnp.where(none, 0.0, constants.half.time)
+    body, _, _ = inverse_inertia_and_energy(moments, momentum)
+    half = half_time_integrals._replace(f=f)
+    rows, g = jacobian_and_integral(
+        body, momentum, t, half, half_time.halves, whole, constants.half.mean
+    )
+    return motion_from_functions(constants, half_time_integrals.f, half_time, t), rows, g
 
 
-def _second_order(body: Differences, inputs, change):
-    """Return two changes to first order: of the derivatives that `_first_order` returns, and of G.
+def _changes_of_first_derivatives(
+    inverse_inertia: Differences, inputs: Float[Array, "10"], change: Float[Array, "10"]
+) -> tuple[Rows, Six]:
+    """Return two changes for a change of the ten `derivative_variables`: the change of the
+    derivatives of the body momentum Π(t) with respect to these variables, as three arrays (10,);
+    and the change of the six entries of G = ∫ Π Πᵀ dt from 0 to t.
 
-    G = ∫ Π Πᵀ dt is that of `sigma_form`. The motion is taken as a function of the whole inertia
-    tensor. `body` holds the matrix K, `inputs` is the result of `derivative_variables`, and
-    `change` is the change of these variables.
+    - `inverse_inertia`: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
+      inertia tensor.
+    - `inputs`: (10,) the variables.
+    - `change`: (10,) the change of the variables.
+
+    The motion is taken from `sigma_form`, where it is a smooth function of the whole inertia
+    tensor.
     """
 
     def of_inputs(x):
         d12, d23, k12, k13, k23, p1, p2, p3, _, time = x
-        d13 = body.d13 + ((d12 - body.d12) + (d23 - body.d23))
+        d13 = inverse_inertia.d13 + ((d12 - inverse_inertia.d12) + (d23 - inverse_inertia.d23))
         return sigma_form.momentum_and_integral(
             Differences(d12, d13, d23, k12, k13, k23), (p1, p2, p3), time
         )
@@ -396,9 +522,13 @@ def _second_order(body: Differences, inputs, change):
     return d_rows, tuple(jnp.sum(g * change) for g in by_inputs)
 
 
-def reciprocal(moments: Six, momentum: Triple):
-    """Return three things: the `Differences` of K = I⁻¹; the six entries of K; and E₂ = Π·KΠ, which
-    is twice the energy.
+def inverse_inertia_and_energy(moments: Six, momentum: Triple) -> tuple[Differences, Six, Scalar]:
+    """Return three things: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
+    inertia tensor, each with all its digits; the six entries of K; and E₂ = Π·KΠ, which is twice
+    the energy.
+
+    - `moments`: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes.
+    - `momentum`: the three components of the body momentum Π.
     """
     i1, i2, i3, i12, i13, i23 = moments
     r = 1.0 / determinant(moments)

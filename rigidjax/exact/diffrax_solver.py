@@ -15,7 +15,13 @@ from rigidjax.motion.equations import AttitudeEquations, EulerEquations
 
 
 class FreeInterpolation(dfx.AbstractLocalInterpolation):
-    """Evaluate the motion between two steps in closed form."""
+    """Evaluate the motion of a free body between the two ends of a diffrax step in closed form.
+
+    - `t0`, `t1`: the times of the two ends, in the time of diffrax.
+    - `y0`: the state at `t0`, a `Spin` or an `Attitude`.
+    - `inertia`: of the body about its centre of mass.
+    - `direction`: −1 if diffrax integrates backwards, in which case its times are −t; else 1.
+    """
 
     t0: Any
     t1: Any
@@ -26,6 +32,9 @@ class FreeInterpolation(dfx.AbstractLocalInterpolation):
     def evaluate(
         self, t0: RealLike, t1: RealLike | None = None, left: bool = True
     ) -> PyTree[Array]:
+        """Return the state at the time `t0`; if `t1` is given, return the state at `t1` minus the
+        state at `t0`.
+        """
         motion = FreeBody(self.inertia, self.y0)
         state = motion(self.direction * (t0 - self.t0))
         if t1 is None:
@@ -55,10 +64,13 @@ class FreeSolver(dfx.AbstractSolver):
     interpolation_cls: ClassVar[Callable[..., FreeInterpolation]] = FreeInterpolation
 
     def order(self, terms: PyTree[dfx.AbstractTerm]) -> int | None:
-        # An exact step needs no order, but some step size controllers ask for it.
+        """Return the order 1: an exact step needs no order, but some step size controllers ask for
+        it.
+        """
         return 1
 
     def error_order(self, terms: PyTree[dfx.AbstractTerm]) -> float | None:
+        """Return the order 1 of the error, which is zero in each step."""
         return 1.0
 
     def init(
@@ -69,7 +81,10 @@ class FreeSolver(dfx.AbstractSolver):
         y0: PyTree,
         args: PyTree,
     ) -> None:
-        _field(terms)
+        """Return no solver state; raise a `ValueError` unless `terms` are the equations of a free
+        body.
+        """
+        _free_euler_equations(terms)
         return None
 
     def step(
@@ -82,9 +97,13 @@ class FreeSolver(dfx.AbstractSolver):
         solver_state: None,
         made_jump: Bool[ArrayLike, ""],
     ) -> tuple[Any, Any, dict[str, Any], None, dfx.RESULTS]:
+        """Return the five results of a step from `t0` to `t1`, as diffrax asks for them: the exact
+        state at `t1`, an error of zero, the numbers for the dense output, no solver state, and
+        success.
+        """
         # The direction is −1 if diffrax integrates backwards, in which case its times are −t.
         inertia, direction = (
-            _field(terms).inertia,
+            _free_euler_equations(terms).inertia,
             jnp.asarray(field_of(terms)[1], jnp.result_type(t0)),
         )
         y1 = FreeBody(inertia, y0)(direction * (t1 - t0))
@@ -93,12 +112,15 @@ class FreeSolver(dfx.AbstractSolver):
         return y1, error, dense, None, dfx.RESULTS.successful
 
     def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealLike, y0: PyTree, args: PyTree) -> Any:
+        """Return the rate of change of the state `y0` at the time `t0`, from the equations in
+        `terms`.
+        """
         return terms.vf(t0, y0, args)
 
 
 def field_of(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
-    """Return two things: the vector field inside a term, and the direction of time, 1 or −1, with
-    which diffrax wraps the term.
+    """Return two things from inside the terms of a diffrax solver: the vector field; and the
+    direction of time, 1 or −1, with which diffrax wraps the term.
     """
     # Read attributes of the wrapped term: diffrax promises only the methods `vf` and `contr`, which
     # return numbers and not the inertia.
@@ -106,9 +128,11 @@ def field_of(terms: PyTree[dfx.AbstractTerm]) -> tuple[Any, Any]:
     return getattr(term, "vector_field", None), getattr(terms, "direction", 1)
 
 
-def _field(terms: PyTree[dfx.AbstractTerm]) -> EulerEquations:
-    """Return Euler's equations from inside a term; raise an error if the term holds other
-    equations, or equations with a torque.
+def _free_euler_equations(terms: PyTree[dfx.AbstractTerm]) -> EulerEquations:
+    """Return Euler's equations of a free body from inside the terms of a diffrax solver.
+
+    `terms` must be an `ODETerm` of the equations of motion of a `Spin` or an `Attitude`, with no
+    torque; a `ValueError` is raised for anything else.
     """
     field, _ = field_of(terms)
     euler = field.euler if isinstance(field, AttitudeEquations) else field

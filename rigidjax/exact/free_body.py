@@ -50,6 +50,7 @@ class FreeBody(eqx.Module):
         self.state0 = state0
 
     def __call__(self, t: ScalarLike) -> HasSpin:
+        """Return the state at the time `t`, a scalar, s since `state0`."""
         return self.at(_checked_time(t, self.state0.omega))
 
     def at(self, ts: Float[Array, "*n"]) -> HasSpin:
@@ -94,6 +95,7 @@ class FreeMotion(eqx.Module):
         self.turning = FreeBody(body if isinstance(body, Inertia) else body.inertia, turning)
 
     def __call__(self, since: Float[Array, "*n"]) -> Any:
+        """Return the states at the times `since`, one or (n,), s since `state0`."""
         turned: Any = self.turning.at(since)
         if not isinstance(self.state0, Rigid):
             return turned
@@ -150,8 +152,10 @@ _jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0).at(t))
 
 
 def _checked_time(t: ScalarLike, omega: Array) -> Scalar:
-    """Return the time t; raise an error if the body turns so far in this time that the dtype holds
-    no digit within one turn.
+    """Return the time t, s, as an array after a check of its shape and dtype.
+
+    `omega` (3,) is the body rate, rad/s. A `ValueError` is raised if the body turns so far in this
+    time that the dtype holds no digit within one turn; traced values are not checked for this.
     """
     t = _checks.checked_time(t)
     if not _checks.is_known((t, omega)):
@@ -168,8 +172,14 @@ def _checked_time(t: ScalarLike, omega: Array) -> Scalar:
 
 
 def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
-    """Return the inertia after checks of the body and the state; a traced inertia that no real body
-    has becomes NaN.
+    """Return the inertia of the body after checks of the body and of its state; a traced inertia
+    that no real body has becomes NaN.
+
+    - `inertia`: of the body about its centre of mass.
+    - `state0`: a `Spin` or an `Attitude`, of the dtype of the inertia; its body rate and quaternion
+      must be finite, and the quaternion a unit one.
+
+    An error is raised for anything else.
     """
     if isinstance(state0, HasPose) or not isinstance(state0, HasSpin):
         raise TypeError(
@@ -197,7 +207,9 @@ def _checked_inertia(inertia: Inertia, state0: HasSpin) -> Inertia:
 
 
 @functools.partial(jnp.vectorize, signature="(n),(n)->(n)")
-def _unit_product(q: Quat, other: Quat) -> Quat:
-    """Return the product of two quaternions, scaled to unit length."""
-    out = jnp.stack(product4(components(q), components(other)))
+def _unit_product(left: Quat, right: Quat) -> Quat:
+    """Return the product `left` ⊗ `right` of two quaternions (w, x, y, z), divided by its length;
+    arrays (…, 4) are multiplied pair by pair.
+    """
+    out = jnp.stack(product4(components(left), components(right)))
     return out / jnp.sqrt(jnp.sum(out * out))

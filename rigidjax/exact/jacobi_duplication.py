@@ -26,7 +26,12 @@ from rigidjax._types import Scalar
 
 
 class Elliptic(NamedTuple):
-    """Hold S, C, D, and the phase ξ as a direction (x, y) ∝ (cos ξ, sin ξ)."""
+    """Hold the elliptic functions S, C and D of a free body at some time, and the phase ξ as a
+    direction (x, y) ∝ (cos ξ, sin ξ).
+
+    S, C and D are sn, cn and dn in the scaling of the head of this module. The phase ξ is an angle,
+    rad: the correction to the rotation of the body about its momentum (see `elliptic_functions`).
+    """
 
     S: Scalar
     C: Scalar
@@ -36,7 +41,12 @@ class Elliptic(NamedTuple):
 
 
 class Modulus(NamedTuple):
-    """Hold p, q and `gap` = p − q, which is computed without subtracting q from p; all in 1/s²."""
+    """Hold the two parameters p and q of the elliptic functions S, C and D, where C² = 1 − p S² and
+    D² = 1 − q S², and `gap` = p − q.
+
+    All three are in 1/s². The caller computes `gap` without subtracting q from p, which would lose
+    digits.
+    """
 
     p: Scalar
     q: Scalar
@@ -44,7 +54,9 @@ class Modulus(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Hold the number of doublings and the limits of the motion for one dtype."""
+    """Hold the number of doublings, the number of steps of the arithmetic–geometric mean, and the
+    limits of the motion for one dtype.
+    """
 
     doublings: int  # the number of doublings from u/2^doublings to u
     agm: int  # steps of the arithmetic–geometric mean
@@ -53,59 +65,75 @@ class Limits(NamedTuple):
 
 
 def dtype_limits(dtype) -> Limits:
-    """Return the limits of a dtype, float32 or float64.
+    """Return the numbers of steps and the limits of the elliptic functions for the dtype float32 or
+    float64.
 
     The number of doublings is enough for the longest quarter period, `ln(4/√floor)` in units of
-    1/√max(p, q), and at this time C⁴ must not underflow.
+    1/√max(p, q), where p and q are the parameters of the elliptic functions; and at this time C⁴
+    must not underflow.
     """
     wide = dtype == jnp.float64
     return Limits(9, 11, 1e-64, 75.0) if wide else Limits(7, 9, 1e-33, 20.0)
 
 
-def is_endless(m: Modulus) -> Bool[Array, ""]:
-    """Return whether the motion has no period: on the separatrix, for a sphere, and at rest."""
-    return jnp.abs(m.gap) <= dtype_limits(m.p.dtype).floor * jnp.maximum(m.p, m.q)
-
-
-def clip_at_rest(u: Scalar, m: Modulus) -> Scalar:
-    """Return the reduced time u; on the separatrix it is clipped to the time after which the motion
-    is at rest.
+def is_endless(modulus: Modulus) -> Bool[Array, ""]:
+    """Return whether the motion with the parameters `modulus` has no period: on the separatrix, for
+    a sphere, and at rest.
     """
-    big = jnp.maximum(m.p, m.q)
+    return jnp.abs(modulus.gap) <= dtype_limits(modulus.p.dtype).floor * jnp.maximum(
+        modulus.p, modulus.q
+    )
+
+
+def clip_at_rest(u: Scalar, modulus: Modulus) -> Scalar:
+    """Return the time u, which was reduced by whole half periods, clipped on the separatrix to the
+    time after which the motion is at rest.
+
+    `modulus` holds the parameters of the elliptic functions, which tell whether the motion is on
+    the separatrix. For every other motion u is returned unchanged.
+    """
+    big = jnp.maximum(modulus.p, modulus.q)
     rest = dtype_limits(u.dtype).rest / jnp.sqrt(jnp.where(big > 0, big, 1.0))
-    return jnp.where(is_endless(m) & (big > 0), jnp.clip(u, -rest, rest), u)
+    return jnp.where(is_endless(modulus) & (big > 0), jnp.clip(u, -rest, rest), u)
 
 
-def duplicate(f: Elliptic, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
-    """Return S, C, D and ξ at the time 2u, from the values `f` of S, C, D and ξ at the time u.
+def duplicate(functions: Elliptic, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Elliptic:
+    """Return the elliptic functions S, C, D and the phase ξ at the time 2u, from their values at
+    the time u.
+
+    - `functions`: the values at the time u.
+    - `modulus`: the parameters p and q of S, C and D.
+    - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
 
     The phase is ξ(2u) = 2ξ + arctan(B/A), where A and B are `a` and `b` below; it is computed as a
-    product of complex numbers. For `mu` and `turn` see `elliptic`.
+    product of complex numbers.
     """
-    S, C, D, x, y = f
+    S, C, D, x, y = functions
     s, cc, dd = S * S, C * C, D * D
-    ps, qs = m.p * s, m.q * s
+    ps, qs = modulus.p * s, modulus.q * s
     den = cc + ps * dd
     r = 1.0 / den
-    gs = m.gap * s
+    gs = modulus.gap * s
     C2 = jnp.where(ps < 0.5, 1.0 - 2.0 * ps * dd * r, (cc * cc - ps * gs) * r)
     D2 = jnp.where(qs < 0.5, 1.0 - 2.0 * qs * cc * r, (dd * dd + qs * gs) * r)
     a = den + mu * s * (cc * dd + cc + dd)
-    b = 2.0 * turn * s * S * C * D
+    b = 2.0 * phase_factor * s * S * C * D
     xx, yy = x * x - y * y, 2.0 * x * y
     x2, y2 = xx * a - yy * b, xx * b + yy * a
     scale = 1.0 / (jnp.abs(x2) + jnp.abs(y2))
     return Elliptic(2.0 * S * C * D * r, C2, D2, x2 * scale, y2 * scale)
 
 
-def taylor_series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
-    """Compute S, C, D and ξ at a time h by Taylor series, exact to round-off for
-    `√max(p, q) |h| ≤ 0.15`.
+def taylor_series(time: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Elliptic:
+    """Compute the elliptic functions S, C, D and the phase ξ at a short time by Taylor series,
+    exact to round-off for `√max(p, q) |time| ≤ 0.15`.
 
-    In float32 the bound is 0.31. For `mu` and `turn` see `elliptic`.
+    - `time`: the time since S = 0. In float32 the bound is 0.31.
+    - `modulus`: the parameters p and q of S, C and D.
+    - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫ S²/(1 + μS²) du`.
     """
-    hh = h * h
-    p, q = m.p * hh, m.q * hh
+    hh = time * time
+    p, q = modulus.p * hh, modulus.q * hh
     e, f = p + q, p * q
     # The smallest term comes first, because it must be summed first.
     terms = [
@@ -118,23 +146,29 @@ def taylor_series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
         e * e / 120 + f / 10,
         -e / 6,
     ]
-    S = h * (functools.reduce(operator.add, terms) + 1.0)
+    S = time * (functools.reduce(operator.add, terms) + 1.0)
     s = S * S
-    xi = turn * growth_integral(S, m, mu)
+    xi = phase_factor * growth_integral(S, modulus, mu)
     z = xi * xi
     tangent = xi * (1.0 + z * (1 / 3 + z * (2 / 15 + z * (17 / 315))))
     one = jnp.ones_like(s)
-    return Elliptic(S, jnp.sqrt(1.0 - m.p * s), jnp.sqrt(1.0 - m.q * s), one, tangent)
+    return Elliptic(S, jnp.sqrt(1.0 - modulus.p * s), jnp.sqrt(1.0 - modulus.q * s), one, tangent)
 
 
-def growth_integral(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
-    """Return ∫ S²/(1 + μS²) du = ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)) for a small S.
+def growth_integral(S: Scalar, modulus: Modulus, mu: Scalar) -> Scalar:
+    """Return the integral ∫ S²/(1 + μS²) du over the time from 0 to u, for a small value `S` of the
+    elliptic function at u.
 
-    The result is a power series in S. The recurrence of Legendre's polynomials gives the terms of
+    - `S`: the value S(u).
+    - `modulus`: the parameters p and q of the elliptic functions.
+    - `mu`: the number μ.
+
+    With S as the variable, the integral is ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)), and the
+    result is a power series in S. The recurrence of Legendre's polynomials gives the terms of
     1/(√(1 − pS²) √(1 − qS²)), and a second recurrence multiplies this series by 1/(1 + μS²).
     """
     s = S * S
-    e, f, w = (m.p + m.q) * s, (m.p * m.q) * (s * s), mu * s
+    e, f, w = (modulus.p + modulus.q) * s, (modulus.p * modulus.q) * (s * s), mu * s
     older, root, term = jnp.zeros_like(s), jnp.ones_like(s), jnp.ones_like(s)
     total = term / 3
     for k in range(1, 9):
@@ -144,42 +178,51 @@ def growth_integral(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
     return S * s * total
 
 
-def elliptic(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
-    """Return S, C, D at u, and the phase `ξ = turn ∫₀ᵘ S²/(1 + μS²) du` with μ = `mu`.
+def elliptic_functions(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Elliptic:
+    """Return the elliptic functions S, C, D of a free body at the time u, and the phase `ξ = κ ∫₀ᵘ
+    S²/(1 + μS²) du`, an angle.
 
-    `mu` lies between 0 and √(pq), and `turn` is the constant factor of the integral;
-    `closed_form.orbit` computes both numbers. `u` is a reduced time: |u| is at most a quarter
-    period.
+    - `u`: a reduced time: |u| is at most a quarter period.
+    - `modulus`: the parameters p and q of S, C and D.
+    - `mu`: the number μ, between 0 and √(pq).
+    - `phase_factor`: the constant factor κ.
+
+    The function `closed_form.orbit` computes `modulus`, `mu` and `phase_factor` for a body.
     """
     n = dtype_limits(u.dtype).doublings
-    f = taylor_series(u * 2.0**-n, m, mu, turn)
+    f = taylor_series(u * 2.0**-n, modulus, mu, phase_factor)
     # A loop compiles eight times sooner than nine copies of its body.
-    return jax.lax.fori_loop(0, n, lambda _, g: duplicate(g, m, mu, turn), f)
+    return jax.lax.fori_loop(0, n, lambda _, g: duplicate(g, modulus, mu, phase_factor), f)
 
 
 class HalfPeriod(NamedTuple):
-    """Hold the time, the phase and the mean of S² of half a period."""
+    """Hold three numbers of half a period of the elliptic function S: the length in time, the phase
+    ξ at its end, and the mean of S² over it.
+    """
 
     time: Scalar  # infinite on the separatrix
     phase: Scalar  # the phase ξ at the end of the half period
     mean: Scalar  # the mean of S²
 
 
-def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
-    """Return three things: the least time T > 0 with S(T) = 0; the phase ξ at T; and the mean of S²
-    from 0 to T.
+def half_period(modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> HalfPeriod:
+    """Return three numbers of half a period of the elliptic function S: the least time T > 0 with
+    S(T) = 0; the phase ξ at T; and the mean of S² from 0 to T.
+
+    - `modulus`: the parameters p and q of the elliptic functions.
+    - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫ S²/(1 + μS²) du`.
 
     With λ² = max(p, q), a₀ = 1 and b₀ = √|p − q|/λ, the time is `T = π/(λ agm(a₀, b₀))` (DLMF
-    19.8.5). With `c₁ = (a₀ − b₀)/2` and `c_{n+1} = c_n²/(4 a_{n+1})`, the mean is
-    `⟨S²⟩ = (½ + Σ 2^{n−1} c_n²/w)/λ²`, where w = min(p, q)/λ² (DLMF 19.8.6 divided by w, so that w
-    = 0 is an ordinary value). The phase is the complete integral of the third kind, DLMF
-    19.8.7–19.8.9, with μ instead of −α².
+    19.8.5), where agm is the arithmetic–geometric mean. With `c₁ = (a₀ − b₀)/2` and `c_{n+1} =
+    c_n²/(4 a_{n+1})`, the mean is `⟨S²⟩ = (½ + Σ 2^{n−1} c_n²/w)/λ²`, where w = min(p, q)/λ² (DLMF
+    19.8.6 divided by w, so that w = 0 is an ordinary value). The phase is the complete integral of
+    the third kind, DLMF 19.8.7–19.8.9, with μ instead of −α².
     """
-    big, small = jnp.maximum(m.p, m.q), jnp.minimum(m.p, m.q)
+    big, small = jnp.maximum(modulus.p, modulus.q), jnp.minimum(modulus.p, modulus.q)
     at_rest = big <= 0
     big = jnp.where(at_rest, 1.0, big)
-    gap = jnp.abs(m.gap)
-    endless = is_endless(m)
+    gap = jnp.abs(modulus.gap)
+    endless = is_endless(modulus)
     # Compute in units of λ: XLA may multiply the divisors below into one product, which must not
     # underflow.
     w = small / big
@@ -192,19 +235,27 @@ def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
     point, half, one = jnp.sqrt(1.0 + mu / big), jnp.full_like(a, 0.5), jnp.ones_like(a)
     start = (a, b, c, ratio, half, point, one, one)
     a, *_, total, _, _, sum_parts = jax.lax.fori_loop(
-        0, dtype_limits(a.dtype).agm, _mean_step, start
+        0, dtype_limits(a.dtype).agm, _arithmetic_geometric_mean_step, start
     )
     time = math.pi / (a * jnp.sqrt(big))
     # With turn = κ μ, the phase ξ of a quarter period is κ (π/2a) ½ μ/(λ² + μ) Σ, where Σ is
     # `sum_parts`.
-    phase = turn * time * 0.5 / (big + mu) * sum_parts
+    phase = phase_factor * time * 0.5 / (big + mu) * sum_parts
     return HalfPeriod(jnp.where(endless, jnp.inf, time), phase, total / big)
 
 
-def _mean_step(_: Array, state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-    """Return the state after one step of the arithmetic–geometric mean and of its sums.
+def _arithmetic_geometric_mean_step(_: Array, state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+    """Return the state of the arithmetic–geometric mean, and of two sums over its steps, after one
+    more step n.
 
-    In the state, `ratio` contains the factor 2^{n−1} of step n.
+    The first argument is the number of the step, which is not used. The state has eight numbers:
+
+    - `a`, `b`: the arithmetic mean a_n and the geometric mean b_n.
+    - `c`, `ratio`: c_n, which is half the difference of the means of the step before, and 2^{n−1}
+      c_n²/w, where w is min(p, q)/max(p, q) for the parameters p and q of the elliptic functions.
+    - `total`: the sum of ½ and of all `ratio` so far, which gives the mean of S².
+    - `point`, `part`, `sum_parts`: the numbers p_n and Q_n of DLMF 19.8.7–19.8.9, and the sum of
+      Q_n, which gives the phase.
     """
     a, b, c, ratio, total, point, part, sum_parts = state
     square, product = point * point, a * b

@@ -33,7 +33,10 @@ from rigidjax.exact.sigma_form import Differences, invariants
 
 
 class Integrals(NamedTuple):
-    """Hold the elliptic functions at some time u, and the integrals Y₂ and Y from 0 to u."""
+    """Hold the elliptic functions S, C and D of a free body at some time u, and the integrals Y₂ =
+    ∫ S² and Y = ∫ S²/E² over the time from 0 to u, where E is the one of the functions D and C that
+    has no zero.
+    """
 
     f: Elliptic
     y2: Scalar
@@ -41,34 +44,42 @@ class Integrals(NamedTuple):
 
 
 def jacobian_and_integral(
-    body: Differences,
+    inverse_inertia: Differences,
     momentum: Triple,
     t: Scalar,
     half_time_integrals: Integrals,
     halves: Scalar,
     whole_periods: Scalar,
-    mean: Scalar,
+    mean_square: Scalar,
 ) -> tuple[tuple, Six]:
-    """Return two things: the derivatives of Π(t) − Π(0), as three rows of ten numbers; and the
-    matrix G = ∫ Π Πᵀ dt from 0 to t.
+    """Return two things: the derivatives of Π(t) − Π(0) with respect to ten variables, as three
+    arrays (10,), one for each component of the body momentum Π; and the six entries of the matrix G
+    = ∫ Π Πᵀ dt from 0 to t.
 
-    The ten columns are the derivatives with respect to d12, d23, k12, k13, k23, Π(0), k33 and t.
+    The ten variables are d12, d23, k12, k13, k23, the three components of Π(0), k33 and t, where
+    kij are the entries of K = I⁻¹ (the inverse of the inertia tensor) and dij = kii − kjj.
 
-    The off-diagonal entries in `body` must be zero; `momentum` is Π(0). The time t was reduced by
-    `halves` half periods, which together have the length `whole_periods`. `half_time_integrals`
-    holds the functions and the integrals at half of the reduced time; C and D belong to the axes as
-    `body` numbers them. `mean` is the mean of S² over a period.
+    - `inverse_inertia`: the differences dij, and the off-diagonal entries kij, which must be zero.
+    - `momentum`: the three components of Π(0).
+    - `t`: the time.
+    - `half_time_integrals`: the elliptic functions and integrals at half of the reduced time. C and
+      D belong to the axes as `inverse_inertia` numbers them.
+    - `halves`: the number of half periods by which the time t was reduced.
+    - `whole_periods`: the length of these half periods together.
+    - `mean_square`: the mean of S² over a period, where S is the first elliptic function.
     """
-    d12, d13, d23 = body[:3]
+    d12, d13, d23 = inverse_inertia[:3]
     p1, p2, p3 = momentum
-    _, A1, A2, A3, q, p, gap, *_ = invariants(body, momentum)
+    _, A1, A2, A3, q, p, gap, *_ = invariants(inverse_inertia, momentum)
     m = Modulus(p, q, gap)
     three = gap > 0
     top = jnp.where(three, p, q)
     after = double_argument(half_time_integrals, m, jnp.zeros_like(t), jnp.zeros_like(t))
     S, C, D, *_ = after.f
-    grown2 = after.y2 + whole_periods * mean
-    grown = after.y + whole_periods * (1.0 - top * mean) / jnp.where(halves == 0, 1.0, jnp.abs(gap))
+    grown2 = after.y2 + whole_periods * mean_square
+    grown = after.y + whole_periods * (1.0 - top * mean_square) / jnp.where(
+        halves == 0, 1.0, jnp.abs(gap)
+    )
 
     # These are the divided differences of T = diag(D, 1, C): the entries 12, 13 and 23 of T change
     # by these numbers times the changes of k12, k13 and k23.
@@ -152,23 +163,38 @@ def jacobian_and_integral(
     return rows, (g11, g22, g33, g12, g13, g23)
 
 
-def integrals(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
-    """Return the elliptic functions at the time u, as `elliptic` does, and the integrals Y₂ and Y
-    from 0 to u.
+def integrals(u: Scalar, modulus: Modulus, mu: Scalar, phase_factor: Scalar) -> Integrals:
+    """Return the elliptic functions S, C, D of a free body at the time u, as `elliptic_functions`
+    does, and the integrals of S² and of S²/E² from 0 to u, where E is the one of D and C that has
+    no zero.
+
+    - `u`: a reduced time: |u| is at most a quarter period.
+    - `modulus`: the parameters p and q of S, C and D.
+    - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
     """
     n = dtype_limits(u.dtype).doublings
-    f = taylor_series(u * 2.0**-n, m, mu, turn)
+    f = taylor_series(u * 2.0**-n, modulus, mu, phase_factor)
     # The functions S²/D² and S²/C² are S²/(1 + μS²) with μ = −q and μ = −p.
-    low = jnp.where(m.gap > 0, -m.q, -m.p)
-    first = Integrals(f, growth_integral(f.S, m, jnp.zeros_like(u)), growth_integral(f.S, m, low))
-    return jax.lax.fori_loop(0, n, lambda _, g: double_argument(g, m, mu, turn), first)
+    low = jnp.where(modulus.gap > 0, -modulus.q, -modulus.p)
+    first = Integrals(
+        f, growth_integral(f.S, modulus, jnp.zeros_like(u)), growth_integral(f.S, modulus, low)
+    )
+    return jax.lax.fori_loop(
+        0, n, lambda _, g: double_argument(g, modulus, mu, phase_factor), first
+    )
 
 
-def double_argument(g: Integrals, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
-    """Return the elliptic functions, Y₂ and Y at the time 2u, from the values `g` of the functions
-    and integrals at the time u.
+def double_argument(
+    start: Integrals, modulus: Modulus, mu: Scalar, phase_factor: Scalar
+) -> Integrals:
+    """Return the elliptic functions of a free body and their integrals at the time 2u, from their
+    values at the time u.
+
+    - `start`: the values at the time u.
+    - `modulus`: the parameters p and q of the elliptic functions.
+    - `mu`, `phase_factor`: the numbers μ and κ in the phase `ξ = κ ∫₀ᵘ S²/(1 + μS²) du`.
     """
-    f, three = g.f, m.gap > 0
-    after = duplicate(f, m, mu, turn)
+    f, three = start.f, modulus.gap > 0
+    after = duplicate(f, modulus, mu, phase_factor)
     a, b = f.S / jnp.where(three, f.D, f.C), after.S / jnp.where(three, after.D, after.C)
-    return Integrals(after, 2.0 * g.y2 + f.S * f.S * after.S, 2.0 * g.y + a * a * b)
+    return Integrals(after, 2.0 * start.y2 + f.S * f.S * after.S, 2.0 * start.y + a * a * b)

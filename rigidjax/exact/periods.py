@@ -12,7 +12,7 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.exact import sigma_form
 from rigidjax.exact.components3 import HALF, Six, Triple, matvec
-from rigidjax.exact.derivatives import motion_and_derivatives, reciprocal
+from rigidjax.exact.derivatives import inverse_inertia_and_energy, motion_and_derivatives
 from rigidjax.exact.jacobi_duplication import Modulus, half_period, is_endless
 from rigidjax.exact.principal_axes import components_along, principal_frame
 
@@ -42,7 +42,7 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> bool(abs(body_period(top, jnp.array([1.0, 0.5, 0.0])) - 4 * jnp.pi) < 1e-14)
     True
     """
-    return _periods(*_checked_tensor_and_rate(inertia, omega0))[0]
+    return _body_and_precession_periods(*_checked_tensor_and_rate(inertia, omega0))[0]
 
 
 def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
@@ -65,23 +65,33 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> precession_period(top, jnp.array([1.0, 0.5, 0.0]))  # 2π I₂/|L|
     Array(8.88576588, dtype=float64)
     """
-    return _periods(*_checked_tensor_and_rate(inertia, omega0))[1]
+    return _body_and_precession_periods(*_checked_tensor_and_rate(inertia, omega0))[1]
 
 
 def _checked_tensor_and_rate(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
-    """Return the inertia tensor, and Ω in the dtype of the tensor, after checks of both."""
+    """Return two things after checks of both: the inertia tensor (3, 3); and the body rate `omega0`
+    (3,), rad/s, in the dtype of the tensor.
+
+    A `ValueError` or `TypeError` is raised for a wrong shape or dtype, or a moment known to be
+    zero.
+    """
     _checks.require_single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     tensor = validation.check_body(inertia, inertia.tensor, None, throw=False).tensor
     return tensor, _checks.array_of_shape(omega0, (3,), "omega0").astype(tensor.dtype)
 
 
 @jax.jit
-def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
-    """Return the body period and the precession period, both computed in one program."""
+def _body_and_precession_periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
+    """Return two times, s, both computed in one program: the period of the body rates, and the mean
+    period in which the axis that the momentum circles turns about the momentum.
+
+    - `tensor`: (3, 3) the inertia tensor, kg m².
+    - `omega`: (3,) the body rate at any moment, rad/s.
+    """
     exponent = exponent_of(omega)
     moments, axes = principal_frame(times_power_of_two(tensor, -exponent_of(tensor)))
     momentum = matvec(moments, components_along(axes, times_power_of_two(omega, -exponent)))
-    body, _, _ = reciprocal(moments, momentum)
+    body, _, _ = inverse_inertia_and_energy(moments, momentum)
     v = sigma_form.invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
     endless = is_endless(jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap)))
@@ -92,9 +102,9 @@ def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
     safe_moments, safe_momentum = jax.tree.map(
         lambda a, b: jnp.where(endless, a, b), other, (moments, momentum)
     )
-    body, _, _ = reciprocal(safe_moments, safe_momentum)
+    body, _, _ = inverse_inertia_and_energy(safe_moments, safe_momentum)
     period = sigma_form.period(sigma_form.invariants(body, safe_momentum))
-    angle = _precession(safe_moments, safe_momentum, period)
+    angle = _precession_angle(safe_moments, safe_momentum, period)
     still = h == 0
     middle = 2.0 * math.pi * moments[1] / jnp.where(still, 1.0, h)
     precession = jnp.where(endless, middle, 2.0 * math.pi * period / angle)
@@ -103,11 +113,15 @@ def _periods(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
 
 
 @jax.custom_jvp
-def _precession(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
-    """Return the angle by which the circled axis turns about the momentum in one `period` of the
-    body rates.
+def _precession_angle(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
+    """Return the angle, rad, by which the axis of the body that the momentum circles turns about
+    the momentum in one period of the body rates.
+
+    - `moments`: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes.
+    - `momentum`: the three components of the body momentum.
+    - `period`: the period of the body rates, s.
     """
-    body, k, _ = reciprocal(moments, momentum)
+    body, k, _ = inverse_inertia_and_energy(moments, momentum)
     v = sigma_form.invariants(body, momentum)
     about_three, h = v.a2 > 0, jnp.sqrt(v.h2)
     mu = jnp.where(about_three, body.d23 * v.a3, body.d12 * v.a1)
@@ -117,12 +131,17 @@ def _precession(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
     return turn + jnp.where(about_three, 2.0 * math.pi, -2.0 * math.pi)
 
 
-@_precession.defjvp
-def _precession_jvp(primals, tangents):
+@_precession_angle.defjvp
+def _precession_angle_jvp(primals, tangents):
+    """Return the value of `_precession_angle` and its change for a change of the inputs: the rule
+    by which JAX differentiates `_precession_angle`.
+    """
     moments, momentum, period = primals
-    (_, _, energy2), (_, d_k, d_energy2) = jax.jvp(reciprocal, (moments, momentum), tangents[:2])
+    (_, _, energy2), (_, d_k, d_energy2) = jax.jvp(
+        inverse_inertia_and_energy, (moments, momentum), tangents[:2]
+    )
     _, _, (_, g) = motion_and_derivatives(moments, momentum, period)
     along = 0.5 * period * d_energy2 + energy2 * tangents[2]
     along = along + sum(w * a * b for w, a, b in zip(HALF, g, d_k, strict=True))
     h = jnp.sqrt(sum(p * p for p in momentum))
-    return _precession(*primals), along / h
+    return _precession_angle(*primals), along / h

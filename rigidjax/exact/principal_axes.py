@@ -4,6 +4,8 @@ In this frame the off-diagonal entries of the inertia tensor are exactly zero in
 tangents (the changes in a derivative) are not.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 
@@ -17,22 +19,28 @@ _SWEEPS = 6
 
 
 def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
-    """Return two things: the entries of the inertia tensor in principal axes, with the moments
-    ascending; and the rotation matrix A whose columns are these axes.
+    """Return two things: the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in
+    principal axes, with the moments ascending; and the rotation matrix A (3, 3) whose columns are
+    these axes.
 
-    The method is Jacobi's, in which small moments keep their digits. A is held fixed in
-    derivatives.
+    `tensor` (3, 3) is the inertia tensor in the body frame. The method is Jacobi's, in which small
+    moments keep their digits. A is held fixed in derivatives.
     """
-    columns, moments = _jacobi(jax.lax.stop_gradient(tensor))
+    columns, moments = _axes_and_moments(jax.lax.stop_gradient(tensor))
     axes = jnp.stack([jnp.stack(row) for row in columns])
     return tensor_in_axes(tensor, axes, moments), axes
 
 
 @jax.custom_jvp
 def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
-    """Return `AᵀIA`, where A = `axes` are principal axes of I = `tensor`.
+    """Return the six entries (11, 22, 33, 12, 13, 23) of the inertia tensor in principal axes,
+    `AᵀIA`.
 
-    Its value is the diagonal matrix of `moments`; its derivative is a full symmetric matrix.
+    - `tensor`: (3, 3) the inertia tensor I, body frame.
+    - `axes`: (3, 3) the matrix A whose columns are the principal axes of I.
+    - `moments`: the three principal moments.
+
+    The value is the diagonal matrix of `moments`; the derivative is a full symmetric matrix.
     """
     zero = jnp.zeros_like(tensor[0, 0])
     return batch_as((*moments, zero, zero, zero), (tensor, axes, moments))
@@ -40,6 +48,9 @@ def tensor_in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
 
 @tensor_in_axes.defjvp
 def _tensor_in_axes_jvp(primals, tangents):
+    """Return the value of `tensor_in_axes` and its change for a change of the tensor: the rule by
+    which JAX differentiates `tensor_in_axes`.
+    """
     # Take the change of a symmetric matrix, so that a gradient is symmetric.
     axes, change = primals[1], 0.5 * (tangents[0] + tangents[0].T)
     # Sum products of entries: on a GPU a product of matrices is rounded to ten bits in float32.
@@ -48,38 +59,45 @@ def _tensor_in_axes_jvp(primals, tangents):
     return tensor_in_axes(*primals), (m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2])
 
 
-def components_along(axes: Mat3, v: Vec3 | Triple) -> Triple:
-    """Return the components of `v` along the columns of `axes`."""
-    return tuple(axes[0, i] * v[0] + axes[1, i] * v[1] + axes[2, i] * v[2] for i in range(3))
+def components_along(axes: Mat3, vector: Vec3 | Triple) -> Triple:
+    """Return the three components of a vector along the columns of the matrix `axes` (3, 3)."""
+    return tuple(
+        axes[0, i] * vector[0] + axes[1, i] * vector[1] + axes[2, i] * vector[2] for i in range(3)
+    )
 
 
-def combine_columns(axes: Mat3, v: Triple) -> Triple:
-    """Return the vector with the components `v` along the columns of `axes`.
+def combine_columns(axes: Mat3, components: Triple) -> Triple:
+    """Return the three entries of the vector that has the given `components` along the columns of
+    the matrix `axes` (3, 3).
 
     This is the inverse of `components_along`.
     """
-    return tuple(axes[i, 0] * v[0] + axes[i, 1] * v[1] + axes[i, 2] * v[2] for i in range(3))
+    return tuple(
+        axes[i, 0] * components[0] + axes[i, 1] * components[1] + axes[i, 2] * components[2]
+        for i in range(3)
+    )
 
 
 @compiled_as_one_kernel
-def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
-    """Return the rows of the matrix whose columns are principal axes of m, and the moments, by
-    Jacobi's method.
+def _axes_and_moments(matrix: Mat3) -> tuple[list[list[Scalar]], Triple]:
+    """Return two things by Jacobi's method: the rows of the orthonormal matrix whose columns are
+    the principal axes of a symmetric `matrix` (3, 3); and the eigenvalues (the principal moments)
+    in ascending order.
     """
-    one, zero = jnp.ones_like(m[0, 0]), jnp.zeros_like(m[0, 0])
+    one, zero = jnp.ones_like(matrix[0, 0]), jnp.zeros_like(matrix[0, 0])
     # Subtract a shift from nearly equal moments: it is exact by Sterbenz' lemma, and so the moments
     # keep their differences.
-    least = jnp.minimum(jnp.minimum(m[0, 0], m[1, 1]), m[2, 2])
-    most = jnp.maximum(jnp.maximum(m[0, 0], m[1, 1]), m[2, 2])
+    least = jnp.minimum(jnp.minimum(matrix[0, 0], matrix[1, 1]), matrix[2, 2])
+    most = jnp.maximum(jnp.maximum(matrix[0, 0], matrix[1, 1]), matrix[2, 2])
     shift = jnp.where(2.0 * least >= most, least, zero)
-    d = (m[0, 0] - shift, m[1, 1] - shift, m[2, 2] - shift)
-    o = tuple(0.5 * (m[i, j] + m[j, i]) for i, j in ((1, 2), (0, 2), (0, 1)))
+    d = (matrix[0, 0] - shift, matrix[1, 1] - shift, matrix[2, 2] - shift)
+    o = tuple(0.5 * (matrix[i, j] + matrix[j, i]) for i, j in ((1, 2), (0, 2), (0, 1)))
     axes = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
 
     def rotate(_, state):
         # Always rotate the last two axes, then move each axis on by one place: only one rotation is
         # then compiled.
-        d, o, axes = _rotate(*state)
+        d, o, axes = _rotate_last_two_axes(*state)
         return tuple((x[1], x[2], x[0]) for x in (d, o, axes))
 
     # Each entry axes[i] is the i-th axis, a column of the matrix.
@@ -90,31 +108,39 @@ def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     return columns, tuple(c + shift for c in d)
 
 
-def _orthonormalise(a):
-    """Return the matrix A(3 − AᵀA)/2, which makes a product A of many rotations orthonormal to
-    round-off again (Higham 1986).
+def _orthonormalise(matrix: list[list[Scalar]]) -> list[list[Scalar]]:
+    """Return the matrix A(3 − AᵀA)/2, as a list of three rows, where A = `matrix` is a list of
+    three rows, too.
+
+    A is a product of many rotations; this makes it orthonormal to round-off again (Higham 1986).
     """
     excess = [
         [
-            a[0][i] * a[0][j] + a[1][i] * a[1][j] + a[2][i] * a[2][j] - float(i == j)
+            matrix[0][i] * matrix[0][j]
+            + matrix[1][i] * matrix[1][j]
+            + matrix[2][i] * matrix[2][j]
+            - float(i == j)
             for j in range(3)
         ]
         for i in range(3)
     ]
     return [
-        [a[i][j] - 0.5 * sum(a[i][k] * excess[k][j] for k in range(3)) for j in range(3)]
+        [matrix[i][j] - 0.5 * sum(matrix[i][k] * excess[k][j] for k in range(3)) for j in range(3)]
         for i in range(3)
     ]
 
 
-def _rotate(d, o, axes):
-    """Return the state after a rotation of the last two axes that makes their off-diagonal entry
-    zero.
+def _rotate_last_two_axes(
+    diagonal: Triple, off_diagonal: Triple, axes: tuple[Triple, ...]
+) -> tuple[Triple, Triple, tuple[Triple, ...]]:
+    """Return the three arguments of Jacobi's method after one rotation of the axes 2 and 3 that
+    makes the off-diagonal entry of these two axes zero.
 
-    `d` holds the diagonal entries, `o[k]` the off-diagonal entry of the two axes other than k, and
-    `axes` the axes.
+    - `diagonal`: the three diagonal entries of the symmetric matrix.
+    - `off_diagonal`: the entries (23, 13, 12).
+    - `axes`: the three axes found so far, each as three components.
     """
-    (first, second, third), (x, y, z), (u, v, w) = d, o, axes
+    (first, second, third), (x, y, z), (u, v, w) = diagonal, off_diagonal, axes
     none = x == 0
     cot = 0.5 * (third - second) / jnp.where(none, 1.0, x)
     size = jnp.abs(cot)
@@ -125,19 +151,27 @@ def _rotate(d, o, axes):
     s = t * c
     turned = [tuple(c * p - s * q for p, q in zip(v, w, strict=True))]
     turned.append(tuple(s * p + c * q for p, q in zip(v, w, strict=True)))
-    d = (first, second - t * x, third + t * x)
+    diagonal = (first, second - t * x, third + t * x)
     # The off-diagonal entry (first, second) is z, and the entry (first, third) is y.
-    return d, (jnp.zeros_like(x), s * z + c * y, c * z - s * y), (u, *turned)
+    return diagonal, (jnp.zeros_like(x), s * z + c * y, c * z - s * y), (u, *turned)
 
 
-def _exchange_to_ascending(d, axes, i, j):
-    """Return the diagonal `d` and the `axes`; if d[i] > d[j], the entries and axes i and j are
-    exchanged, and one of the two axes is reversed.
+def _exchange_to_ascending(
+    diagonal: Sequence[Scalar], axes: Sequence[Triple], i: int, j: int
+) -> tuple[Triple, tuple[Triple, ...]]:
+    """Return two things in ascending order of the entries i and j: the three eigenvalues
+    `diagonal`; and their `axes`, each as three components.
+
+    If diagonal[i] > diagonal[j], the eigenvalues and axes i and j are exchanged, and one of the two
+    axes is reversed, so that the axes stay right-handed.
     """
-    wrong = d[i] > d[j]
-    d, axes = list(d), list(axes)
-    d[i], d[j] = jnp.where(wrong, d[j], d[i]), jnp.where(wrong, d[i], d[j])
+    wrong = diagonal[i] > diagonal[j]
+    diagonal, axes = list(diagonal), list(axes)
+    diagonal[i], diagonal[j] = (
+        jnp.where(wrong, diagonal[j], diagonal[i]),
+        jnp.where(wrong, diagonal[i], diagonal[j]),
+    )
     a, b = axes[i], axes[j]
     axes[i] = tuple(jnp.where(wrong, y, x) for x, y in zip(a, b, strict=True))
     axes[j] = tuple(jnp.where(wrong, -x, y) for x, y in zip(a, b, strict=True))
-    return tuple(d), tuple(axes)
+    return tuple(diagonal), tuple(axes)

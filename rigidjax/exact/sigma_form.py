@@ -45,8 +45,11 @@ from rigidjax.rotation.barrier import barrier
 
 
 class Differences(NamedTuple):
-    """Hold the symmetric matrix K = I⁻¹ up to a multiple of the unit matrix: the differences dij =
-    kii − kjj of diagonal entries, and the off-diagonal entries kij.
+    """Hold the symmetric matrix K = I⁻¹ (the inverse of an inertia tensor, 1/(kg m²)) up to a
+    multiple of the unit matrix.
+
+    The numbers d12, d13 and d23 are the differences dij = kii − kjj of the diagonal entries kii,
+    and k12, k13 and k23 are the off-diagonal entries.
     """
 
     d12: Scalar
@@ -58,13 +61,18 @@ class Differences(NamedTuple):
 
 
 class Invariants(NamedTuple):
-    """Hold the entries of E − E₂₂ 1 (see the head of this module) and the numbers from which these
-    entries are computed.
+    """Hold the constants of a free motion that its sigma functions need: the entries of the matrix
+    E − E₂₂ 1, and the numbers from which these entries are computed.
 
-    The entries are `q` (11), `p` (33), `e12`, `e13` and `e23`; `gap` is p − q, and `h2` is |Π|².
+    Here E = E₂ K + |Π|² adj(K), with the inverse K of the inertia tensor, the body momentum Π and
+    E₂ = Π·KΠ, which is twice the energy; E₂₂ is the middle diagonal entry of E.
 
-    The numbers `a1`, `a2`, `a3` are a₁h² − E₂, a₂h² − E₂ and E₂ − a₃h², where aᵢ are the diagonal
-    entries of K.
+    - `h2`: |Π|².
+    - `a1`, `a2`, `a3`: a₁h² − E₂, a₂h² − E₂ and E₂ − a₃h², where h = |Π| and aᵢ are the diagonal
+      entries of K.
+    - `q`, `p`: the entries 11 and 33 of E − E₂₂ 1.
+    - `gap`: p − q, computed without a subtraction of q from p.
+    - `e12`, `e13`, `e23`: the off-diagonal entries of E.
     """
 
     h2: Scalar
@@ -80,8 +88,15 @@ class Invariants(NamedTuple):
 
 
 class Sigma(NamedTuple):
-    """Hold σ, T, adj T, det T and Y (see the head of this module) at some time, where σ and T are
-    scaled by one factor so that T₂₂ = 1.
+    """Hold Weierstrass's sigma functions of a free motion at some time u, in the form of a number σ
+    and of matrices, as the head of this module defines them.
+
+    Each matrix is symmetric and is the tuple of its entries (11, 22, 33, 12, 13, 23).
+
+    - `s`: the number σ. One factor is common to σ and T, and it is chosen so that T₂₂ = 1.
+    - `t`: the matrix T, which has the other three sigma functions as eigenvalues.
+    - `adjugate`, `det`: the adjugate and the determinant of T.
+    - `y`: the matrix Y = ∫₀ᵘ σ² T⁻² du.
     """
 
     s: Scalar
@@ -91,11 +106,14 @@ class Sigma(NamedTuple):
     y: Six
 
 
-def invariants(body: Differences, momentum: Triple) -> Invariants:
-    """Return the `Invariants` of a motion, from the entries of K in `body` and from Π(0) =
-    `momentum`.
+def invariants(inverse_inertia: Differences, momentum: Triple) -> Invariants:
+    """Return the constants of a free motion that its sigma functions need.
+
+    - `inverse_inertia`: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
+      inertia tensor.
+    - `momentum`: the three components of the body momentum Π(0).
     """
-    d12, d13, d23, k12, k13, k23 = body
+    d12, d13, d23, k12, k13, k23 = inverse_inertia
     p1, p2, p3 = momentum
     x1, x2, x3 = p1 * p1, p2 * p2, p3 * p3
     h2 = x1 + x2 + x3
@@ -125,28 +143,49 @@ def invariants(body: Differences, momentum: Triple) -> Invariants:
 _MORE = 10
 
 
-def sigma_near_zero(u: Scalar, v: Invariants) -> Sigma:
-    """Return σ, T and Y, which the module defines, at a tiny time `u`.
+def sigma_near_zero(u: Scalar, constants: Invariants) -> Sigma:
+    """Return the sigma functions of a free motion at a tiny time, from their Taylor series.
 
-    T = √(1 − X) is taken from its series to second order in the matrix X = σ² (E − E₂₂ 1), where E
-    is the matrix of the invariants `v`.
+    - `u`: the time, so small that two terms of the series are exact to round-off.
+    - `constants`: the invariants of the motion, which contain the matrix E of the head of this
+      module.
+
+    The matrix T = √(1 − X) is taken from its series to second order in the matrix X = σ² (E − E₂₂
+    1), where σ is the first sigma function.
     """
     uu, zero = u * u, jnp.zeros_like(u)
-    c1 = (v.p + v.q) * uu
+    c1 = (constants.p + constants.q) * uu
     s = barrier(u * (1.0 - c1 / 6))
-    x = barrier(_scale((v.q, zero, v.p, v.e12, v.e13, v.e23), s * s))
+    x = barrier(
+        _scaled_matrix(
+            (constants.q, zero, constants.p, constants.e12, constants.e13, constants.e23), s * s
+        )
+    )
     t = tuple(-0.5 * (a + 0.25 * b) for a, b in zip(x, commuting_product(x, x), strict=True))
     # The integral is Y = ⅓u³ (1 − c₁/5 + 3x/5).
-    y = _scale(_add_scalar(_scale(x, 0.6), 1.0 - 0.2 * c1), u * uu / 3)
-    return _scaled_sigma(s, _add_scalar(t, 1.0), y)
+    y = _scaled_matrix(_add_to_diagonal(_scaled_matrix(x, 0.6), 1.0 - 0.2 * c1), u * uu / 3)
+    return _normalised_sigma(s, _add_to_diagonal(t, 1.0), y)
 
 
-def double_sigma(f: Sigma, v: Invariants) -> Sigma:
-    """Return σ, T and Y at the time 2u, from the values `f` of σ, T and Y at the time u."""
-    t1, t2, t3, t12, t13, t23 = f.t
-    s = f.s
+def double_sigma(sigma: Sigma, constants: Invariants) -> Sigma:
+    """Return the sigma functions of a free motion at the time 2u, from their values at the time u.
+
+    - `sigma`: the values at the time u.
+    - `constants`: the invariants of the motion.
+
+    The formulas T(2u) = T⁴ − σ⁴ χ'(E) and σ(2u) = 2 σ det T are those of the head of this module.
+    """
+    t1, t2, t3, t12, t13, t23 = sigma.t
+    s = sigma.s
     ss = s * s
-    q, p, gap, e12, e13, e23 = v.q, v.p, v.gap, v.e12, v.e13, v.e23
+    q, p, gap, e12, e13, e23 = (
+        constants.q,
+        constants.p,
+        constants.gap,
+        constants.e12,
+        constants.e13,
+        constants.e23,
+    )
     s12, s13, s23 = t12 * t12, t13 * t13, t23 * t23
     # The off-diagonal entries of M = T² are exactly −σ²E.
     m11, m22, m33 = t1 * t1 + s12 + s13, t2 * t2 + s12 + s23, t3 * t3 + s13 + s23
@@ -172,22 +211,25 @@ def double_sigma(f: Sigma, v: Invariants) -> Sigma:
     n12 = 2.0 * (m12 * m33 - m13 * m23)
     n13 = 2.0 * (m13 * m22 - m12 * m23)
     n23 = 2.0 * (m23 * m11 - m12 * m13)
-    after = _scaled_sigma(2.0 * s * f.det, (n11, n22, n33, n12, n13, n23), f.y)
+    after = _normalised_sigma(2.0 * s * sigma.det, (n11, n22, n33, n12, n13, n23), sigma.y)
     # The integral doubles as Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u).
-    before = barrier(_scale(f.adjugate, s / f.det))
+    before = barrier(_scaled_matrix(sigma.adjugate, s / sigma.det))
     more = commuting_product(
-        barrier(commuting_product(before, before)), _scale(after.adjugate, after.s / after.det)
+        barrier(commuting_product(before, before)),
+        _scaled_matrix(after.adjugate, after.s / after.det),
     )
-    return after._replace(y=barrier(tuple(2.0 * a + b for a, b in zip(f.y, more, strict=True))))
+    return after._replace(y=barrier(tuple(2.0 * a + b for a, b in zip(sigma.y, more, strict=True))))
 
 
 class Divisor(NamedTuple):
-    """Hold the terms and factors that do not depend on Π in the divisor W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K
-    E₂ + |KΠ|²).
+    """Hold the terms and factors that do not depend on the body momentum Π in the divisor W of the
+    addition theorem.
 
-    The index i is 1 if `first` is true, else 3: with this choice W is a sum of positive terms. The
-    number `square` is (T²)ᵢᵢ. The factor of σ² is `d Πᵢ² + 2 d13 k Πᵢ Π₂ + 2 slant k13 Π₁ Π₃ +
-    |KΠ|² − less`, where K in KΠ is taken without its diagonal.
+    The divisor is `W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²)`, where σ, T, E, E₂ and K are those of
+    the head of this module. The index i is 1 if `first` is true, else 3: with this choice W is a
+    sum of positive terms. The number `square` is (T²)ᵢᵢ. The factor of σ² is `d Πᵢ² + 2 d13 k Πᵢ Π₂
+    + 2 slant k13 Π₁ Π₃ + |KΠ|² − less`, where K in KΠ is taken without its diagonal; d13 and k13
+    belong to `Differences`, and `d`, `k`, `slant` and `less` to this class.
     """
 
     first: Array
@@ -198,98 +240,153 @@ class Divisor(NamedTuple):
     less: Scalar
 
 
-def divisor(body: Differences, v: Invariants, f: Sigma) -> Divisor:
-    """Return the terms and factors of W that do not depend on Π, as a `Divisor`."""
-    one, three = (body.d12, body.d12, body.k12), (body.d23, -body.d23, -body.k23)
-    first, (t1, _, t3, t12, t13, t23) = v.gap > 0, f.t
+def divisor(inverse_inertia: Differences, constants: Invariants, sigma: Sigma) -> Divisor:
+    """Return the terms and factors that do not depend on the body momentum Π in the divisor W of
+    the addition theorem for Π.
+
+    - `inverse_inertia`: the differences and off-diagonal entries of K, the inverse of the inertia
+      tensor.
+    - `constants`: the invariants of the motion.
+    - `sigma`: the sigma functions at the time by which the theorem advances Π.
+    """
+    one, three = (
+        (inverse_inertia.d12, inverse_inertia.d12, inverse_inertia.k12),
+        (inverse_inertia.d23, -inverse_inertia.d23, -inverse_inertia.k23),
+    )
+    first, (t1, _, t3, t12, t13, t23) = constants.gap > 0, sigma.t
     d, slant, k = (jnp.where(first, a, b) for a, b in zip(one, three, strict=True))
     t, off = jnp.where(first, t1, t3), jnp.where(first, t12, t23)
-    less = jnp.where(first, body.k23, body.k12)
+    less = jnp.where(first, inverse_inertia.k23, inverse_inertia.k12)
     square = t * t + off * off + t13 * t13
-    return Divisor(first, square, body.d13 * d, slant, k, v.h2 * (less * less))
+    return Divisor(first, square, inverse_inertia.d13 * d, slant, k, constants.h2 * (less * less))
 
 
-def momentum_and_part(
-    body: Differences, w: Divisor, f: Sigma, momentum: Triple
+def momentum_and_integral_term(
+    inverse_inertia: Differences, terms: Divisor, sigma: Sigma, momentum: Triple
 ) -> tuple[Triple, Six]:
-    """Return two things: the momentum that `momentum` becomes after the time u of `f`; and the
-    matrix 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ, with Π = `momentum` and W from `w`.
+    """Return two things: the body momentum after a step of time u; and the first term of the
+    integral G = ∫ Π Πᵀ dt, as the six entries of a symmetric matrix.
+
+    - `inverse_inertia`: the differences and off-diagonal entries of K, the inverse of the inertia
+      tensor.
+    - `terms`: the terms of the divisor W that do not depend on Π.
+    - `sigma`: the sigma functions σ and T at the time u.
+    - `momentum`: the three components of the body momentum Π before the step.
+
+    The first term is 2σ/(W det T) (adj(T)Π)(adj(T)Π)ᵀ, with Π = `momentum`. It belongs to the
+    interval of length 2u whose mid point has the momentum Π; the head of this module has the other
+    term.
     """
     p1, p2, p3 = momentum
-    d12, d13, d23, k12, k13, k23 = body
+    d12, d13, d23, k12, k13, k23 = inverse_inertia
     # This is K without its diagonal, times Π.
     r1, r2, r3 = barrier((k12 * p2 + k13 * p3, k12 * p1 + k23 * p3, k13 * p1 + k23 * p2))
     u1 = -d23 * p2 * p3 + p2 * r3 - p3 * r2
     u2 = d13 * p1 * p3 + p3 * r1 - p1 * r3
     u3 = -d12 * p1 * p2 + p1 * r2 - p2 * r1
-    adj, turned = barrier((matvec(f.adjugate, momentum), matvec(f.t, barrier((u1, u2, u3)))))
-    end = jnp.where(w.first, p1, p3)
-    z = w.d * (end * end) + 2.0 * (d13 * (w.k * (end * p2)) + w.slant * (k13 * (p1 * p3)))
-    z = z + (r1 * r1 + r2 * r2 + r3 * r3 - w.less)
-    r, (a1, a2, a3) = barrier(1.0 / (w.square + f.s * f.s * z)), adj
-    c = barrier(2.0 * f.s * r / f.det)
+    adj, turned = barrier(
+        (matvec(sigma.adjugate, momentum), matvec(sigma.t, barrier((u1, u2, u3))))
+    )
+    end = jnp.where(terms.first, p1, p3)
+    z = terms.d * (end * end) + 2.0 * (
+        d13 * (terms.k * (end * p2)) + terms.slant * (k13 * (p1 * p3))
+    )
+    z = z + (r1 * r1 + r2 * r2 + r3 * r3 - terms.less)
+    r, (a1, a2, a3) = barrier(1.0 / (terms.square + sigma.s * sigma.s * z)), adj
+    c = barrier(2.0 * sigma.s * r / sigma.det)
     part = tuple(c * x for x in (a1 * a1, a2 * a2, a3 * a3, a1 * a2, a1 * a3, a2 * a3))
-    return barrier((tuple((a + f.s * b) * r for a, b in zip(adj, turned, strict=True)), part))
+    return barrier((tuple((a + sigma.s * b) * r for a, b in zip(adj, turned, strict=True)), part))
 
 
 def momentum_and_integral_by_quarters(
-    body: Differences, momentum: Triple, v: Invariants, span: Scalar
+    inverse_inertia: Differences, momentum: Triple, constants: Invariants, span: Scalar
 ) -> tuple[Triple, Six]:
-    """Return two things: Π after the time `span`, and the integral ∫ Π Πᵀ dt over this time.
+    """Return two things: the body momentum Π after the time `span`; and the integral ∫ Π Πᵀ dt over
+    this time, as the six entries of a symmetric matrix.
 
-    The time is divided into four equal parts, because T has no inverse at a quarter period.
+    - `inverse_inertia`: the differences and off-diagonal entries of K, the inverse of the inertia
+      tensor.
+    - `momentum`: the three components of Π(0).
+    - `constants`: the invariants of the motion.
+    - `span`: the time, of either sign.
+
+    The time is divided into four equal parts, because the matrix T of the sigma functions has no
+    inverse at a quarter period.
     """
-    f, hh = sigma_at(0.125 * span, v), v.h2
-    w = barrier(divisor(body, v, f))
-    k12, k13, k23 = (hh * c for c in body[3:])
+    sigma, hh = sigma_at(0.125 * span, constants), constants.h2
+    terms = barrier(divisor(inverse_inertia, constants, sigma))
+    k12, k13, k23 = (hh * c for c in inverse_inertia[3:])
     b = (
-        -v.a2 * v.a3 - k23 * k23,
-        -v.a1 * v.a3 - k13 * k13,
-        v.a1 * v.a2 - k12 * k12,
-        hh * v.e12,
-        hh * v.e13,
-        hh * v.e23,
+        -constants.a2 * constants.a3 - k23 * k23,
+        -constants.a1 * constants.a3 - k13 * k13,
+        constants.a1 * constants.a2 - k12 * k12,
+        hh * constants.e12,
+        hh * constants.e13,
+        hh * constants.e23,
     )
 
     def take_eighth(i, state):
         # The integral over each of the four parts is computed from Π at the middle of the part.
         point, total = state
-        point, part = momentum_and_part(body, w, f, point)
+        point, part = momentum_and_integral_term(inverse_inertia, terms, sigma, point)
         odd = i % 2 == 1
         return point, tuple(a + jnp.where(odd, c, 0.0) for a, c in zip(total, part, strict=True))
 
-    return jax.lax.fori_loop(0, 8, take_eighth, (momentum, _scale(commuting_product(b, f.y), -8.0)))
+    return jax.lax.fori_loop(
+        0, 8, take_eighth, (momentum, _scaled_matrix(commuting_product(b, sigma.y), -8.0))
+    )
 
 
-def sigma_at(u: Scalar, v: Invariants) -> Sigma:
-    """Return σ, T and Y at the time u, from Taylor series at u/2ⁿ and n doublings."""
+def sigma_at(u: Scalar, constants: Invariants) -> Sigma:
+    """Return the sigma functions of a free motion at the time u, from their Taylor series at the
+    time u/2ⁿ and n doublings.
+
+    `constants` are the invariants of the motion.
+    """
     n = dtype_limits(u.dtype).doublings + _MORE
-    f = sigma_near_zero(u * 2.0**-n, v)
-    return jax.lax.fori_loop(0, n, lambda _, g: double_sigma(g, v), f)
+    f = sigma_near_zero(u * 2.0**-n, constants)
+    return jax.lax.fori_loop(0, n, lambda _, g: double_sigma(g, constants), f)
 
 
-def period(v: Invariants) -> Scalar:
-    """Return the period of Π, `2π/agm(√(z − x), √(z − y))`, where x, y, z are the eigenvalues of E
-    and z is the largest.
+def period(constants: Invariants) -> Scalar:
+    """Return the time after which the body momentum Π of a free motion repeats, from the invariants
+    of the motion.
+
+    The period is `2π/agm(√(z − x), √(z − y))`, where agm is the arithmetic–geometric mean, and x,
+    y, z are the eigenvalues of the matrix E of the head of this module, of which z is the largest.
 
     One step of Newton's method from the diagonal entry gives the derivatives of z to third order.
     The other two eigenvalues, x and y, enter only through symmetric functions: the first step of
-    the arithmetic–geometric mean (agm) can be written in this way.
+    the arithmetic–geometric mean can be written in this way.
     """
-    three = v.gap > 0
-    top = jnp.where(three, v.p, v.q)
-    off = v.e12 * v.e12, v.e13 * v.e13, v.e23 * v.e23
+    three = constants.gap > 0
+    top = jnp.where(three, constants.p, constants.q)
+    off = (
+        constants.e12 * constants.e12,
+        constants.e13 * constants.e13,
+        constants.e23 * constants.e23,
+    )
 
     def differences(z):
         # Compute z − E₁₁ and z − E₃₃ without a subtraction if z is one of these two entries.
         extra = z - top
-        return jnp.where(three, v.gap, 0.0) + extra, z, jnp.where(three, 0.0, -v.gap) + extra
+        return (
+            jnp.where(three, constants.gap, 0.0) + extra,
+            z,
+            jnp.where(three, 0.0, -constants.gap) + extra,
+        )
 
     def slope(x1, x2, x3):
         return x1 * x2 + x1 * x3 + x2 * x3 - (off[0] + off[1] + off[2])
 
     x1, x2, x3 = differences(top)
-    f = x1 * x2 * x3 - x1 * off[2] - x2 * off[1] - x3 * off[0] - 2.0 * v.e12 * v.e13 * v.e23
+    f = (
+        x1 * x2 * x3
+        - x1 * off[2]
+        - x2 * off[1]
+        - x3 * off[0]
+        - 2.0 * constants.e12 * constants.e13 * constants.e23
+    )
     x1, x2, x3 = barrier(differences(barrier(top - f / slope(x1, x2, x3))))
     root = barrier(jnp.sqrt(slope(x1, x2, x3)))
     a, b = 0.5 * jnp.sqrt(x1 + x2 + x3 + 2.0 * root), jnp.sqrt(root)
@@ -298,12 +395,18 @@ def period(v: Invariants) -> Scalar:
     return 2.0 * jnp.pi / a
 
 
-def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tuple[Triple, Six]:
-    """Return two things: Π(t), and G = ∫₀ᵗ Π Πᵀ dt.
+def momentum_and_integral(
+    inverse_inertia: Differences, momentum: Triple, t: Scalar
+) -> tuple[Triple, Six]:
+    """Return two things: the body momentum Π(t) of a free body; and G = ∫₀ᵗ Π Πᵀ dt, as the six
+    entries of a symmetric matrix. Both are smooth functions of the whole inertia tensor.
 
-    `body` holds the entries of K = I⁻¹, and `momentum` is Π(0).
+    - `inverse_inertia`: the differences and off-diagonal entries of K = I⁻¹, the inverse of the
+      inertia tensor.
+    - `momentum`: the three components of Π(0).
+    - `t`: the time, of either sign and any size.
     """
-    v = barrier(invariants(body, momentum))
+    v = barrier(invariants(inverse_inertia, momentum))
     m = jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap))
     endless = is_endless(m)
     # If there is no period, dummy invariants keep NaN out of the derivatives.
@@ -318,23 +421,35 @@ def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
 
     # Compute the reduced time and one whole period in one loop.
     both = jax.tree.map(lambda *a: jnp.stack(a), (v, r), (usual, whole))
-    out, g = jax.lax.map(lambda a: momentum_and_integral_by_quarters(body, momentum, *a), both)
+    out, g = jax.lax.map(
+        lambda a: momentum_and_integral_by_quarters(inverse_inertia, momentum, *a), both
+    )
     g = tuple(c[0] + jnp.where(several, count * c[1], 0.0) for c in g)
     return tuple(p[0] for p in out), g
 
 
-def _scaled_sigma(s: Scalar, t: Six, y: Six) -> Sigma:
-    """Return a `Sigma` with σ and T scaled by one factor, so that T₂₂ = 1 in value."""
-    r = barrier(1.0 / jax.lax.stop_gradient(t[1]))
-    s, t = barrier((s * r, _scale(t, r)))
-    return Sigma(s, t, *barrier((adjugate(t), determinant(t))), y)
+def _normalised_sigma(sigma: Scalar, t_matrix: Six, integral: Six) -> Sigma:
+    """Return the sigma functions with the scale that `Sigma` asks for: σ and T are divided by one
+    number, so that T₂₂ = 1 in value.
+
+    - `sigma`: the number σ.
+    - `t_matrix`: the six entries of the symmetric matrix T.
+    - `integral`: the six entries of the matrix Y = ∫ σ² T⁻² du, which the division does not change.
+
+    The divisor T₂₂ has no derivative here: a factor common to σ and T changes no result.
+    """
+    factor = barrier(1.0 / jax.lax.stop_gradient(t_matrix[1]))
+    sigma, t_matrix = barrier((sigma * factor, _scaled_matrix(t_matrix, factor)))
+    return Sigma(sigma, t_matrix, *barrier((adjugate(t_matrix), determinant(t_matrix))), integral)
 
 
-def _scale(m: Six, r) -> Six:
-    """Return the symmetric matrix m times the number r."""
-    return tuple(c * r for c in m)
+def _scaled_matrix(matrix: Six, factor) -> Six:
+    """Return the six entries of a symmetric matrix, each multiplied by the number `factor`."""
+    return tuple(c * factor for c in matrix)
 
 
-def _add_scalar(m: Six, r) -> Six:
-    """Return the symmetric matrix m with the number r added to its diagonal."""
-    return (m[0] + r, m[1] + r, m[2] + r, *m[3:])
+def _add_to_diagonal(matrix: Six, number) -> Six:
+    """Return the six entries (11, 22, 33, 12, 13, 23) of a symmetric matrix after `number` has been
+    added to the three diagonal ones.
+    """
+    return (matrix[0] + number, matrix[1] + number, matrix[2] + number, *matrix[3:])
