@@ -216,16 +216,23 @@ class ReactionWheels(base.AbstractTorque):
 
     def internal_momentum(self, t: ScalarLike, own: Array) -> Vec3:
         """Return Σ h a, (3,), N m s, body frame."""
-        return self._along(own)
+        return self._sum_along_axes(own)
 
     def energy(self, t: ScalarLike, state: HasSpin, body: object, own: Array) -> Scalar:
         """Return the wheels' kinetic energy about their axes, Σ h²/2J, J."""
         return jnp.sum(own * own / (2.0 * self.inertia))
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object, own: Array) -> Vec3:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return cross(self._along(own), state.omega) - self._along(self.torques_of(t, own, state))
+        return cross(self._sum_along_axes(own), state.omega) - self._sum_along_axes(
+            self.torques_of(t, own, state)
+        )
 
-    def _along(self, numbers: Array) -> Vec3:
+    def _sum_along_axes(self, numbers: Array) -> Vec3:
+        """Return Σ xᵢ aᵢ (3,), body frame, for the unit vectors aᵢ along the axes of the wheels.
+
+        - `numbers`: x (R,), one number for each wheel, such as its momentum, N m s, or its torque,
+          N m
+        """
         # The sum is written out wheel by wheel: there are few wheels, and in a batch array sums are
         # slow.
         total = jnp.zeros(3, numbers.dtype)
@@ -235,8 +242,8 @@ class ReactionWheels(base.AbstractTorque):
 
 
 def _smooth_step(x: Array) -> Array:
-    """Return a smooth step from 0 at x = 0 to 1 at x = 1, whose first two derivatives vanish at x =
-    0 and at x = 1.
+    """Return the polynomial 6 x⁵ − 15 x⁴ + 10 x³ for numbers x from 0 to 1: a smooth step from 0 at
+    x = 0 to 1 at x = 1, whose first two derivatives vanish at both ends.
     """
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))
 
@@ -244,8 +251,13 @@ def _smooth_step(x: Array) -> Array:
 def _checked_one_or_each(
     value: NumbersLike | None, count: int, name: str, requirement: str
 ) -> Array | None:
-    """Return one number for all wheels, or one number for each, checked to be "> 0" or "≥ 0";
-    `None` for `None`.
+    """Return a property of the wheels, such as the largest torque, checked: a scalar array if it is
+    the same for all wheels, an array (count,) if each wheel has its own; `None` for `None`.
+
+    - `value`: the number or numbers
+    - `count`: the number of wheels
+    - `name`: the name of the argument, for messages
+    - `requirement`: "> 0" or "≥ 0", which the numbers must fulfil
     """
     if value is None:
         return None
