@@ -147,7 +147,12 @@ class EulerEquations(eqx.Module):
 
 
 class AttitudeEquations(eqx.Module):
-    """Evaluate Euler's equations and `dq/dt = ½ q ⊗ (0, Ω)` (notes, eq 50) as a vector field."""
+    """Evaluate the equations of motion of a body that turns, Euler's equations `I dΩ/dt = IΩ × Ω +
+    τ` and `dq/dt = ½ q ⊗ (0, Ω)` (notes, eq 50), as a vector field `f(t, y, args)`.
+
+    The state y is an `Attitude`: the quaternion q, body → world, and the body rate Ω. `inertia` I
+    is about the point that the body turns about; `torque` gives τ, N m, body frame, or is `None`.
+    """
 
     euler: EulerEquations
 

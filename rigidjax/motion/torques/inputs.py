@@ -145,11 +145,15 @@ class Lagged(eqx.Module):
         return jumps_of(self.source)
 
     def state0(self, t: ScalarLike, state: PyTree, body: Body) -> Array:
-        """Return the value at the start."""
+        """Return the value y at the start: the field `start`, or, without it, the value of the
+        source at the time `t`, s.
+        """
         return self.source(t) if self.start is None else self.start
 
     def rate(self, t: ScalarLike, own: Array, state: PyTree, body: Body) -> Array:
-        """Return dy/dt, in the source's unit per second."""
+        """Return dy/dt = (u − y)/T, in the unit of the source u per second, for the value y = `own`
+        at the time `t`, s; `state` and `body` are not used.
+        """
         wanted = _checks.numeric_array(self.source(t), "source(t)").astype(own.dtype)
         if wanted.shape != own.shape:
             raise ValueError(f"Lagged: start has the shape {own.shape}, the source {wanted.shape}")
