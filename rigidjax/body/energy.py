@@ -43,8 +43,8 @@ def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> S
     >>> kinetic_energy(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array(3., dtype=float64)
     """
-    omega = _omega(state)
-    energy = 0.5 * dot(omega, apply(_tensor(body), omega))
+    omega = _body_rate_of(state)
+    energy = 0.5 * dot(omega, apply(_checked_tensor(body), omega))
     if isinstance(body, MassProperties) and isinstance(state, HasPose):
         energy = energy + 0.5 * body.mass * dot(state.v, state.v)
     return energy
@@ -103,7 +103,7 @@ def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) ->
     >>> angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array([1., 2., 3.], dtype=float64)
     """
-    return apply(_tensor(body), _omega(state))
+    return apply(_checked_tensor(body), _body_rate_of(state))
 
 
 def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude) -> Vec3:
@@ -169,13 +169,17 @@ def ellipsoid(
     return (jnp.sqrt(2.0 * size / moments) if kind == "energy" else size / moments), q
 
 
-def _omega(state):
+def _body_rate_of(state: HasSpin | Vector) -> Vec3:
+    """Return the body rate Ω (3,), rad/s, of `state`: a state of motion, or Ω itself."""
     return _checks.array_of_shape(
         state.omega if isinstance(state, HasSpin) else state, (3,), "omega"
     )
 
 
-def _tensor(body: Inertia | MassProperties) -> Mat3:
+def _checked_tensor(body: Inertia | MassProperties) -> Mat3:
+    """Return the inertia tensor (3, 3), kg m², of one `body`, checked; of `MassProperties`, the one
+    about the centre of mass.
+    """
     return tensor_of(
         validation.require_single_body(body, (Inertia, MassProperties), "body", hint=_HINT)
     )

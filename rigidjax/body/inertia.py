@@ -314,8 +314,8 @@ Body = Inertia | MassProperties
 
 
 def tensor_of(body: Body) -> Float[Array, "*batch 3 3"]:
-    """Return the inertia tensor (3, 3), kg m²; of `MassProperties` the one about the centre of
-    mass.
+    """Return the inertia tensor (3, 3), kg m², of an `Inertia` or `MassProperties`; of
+    `MassProperties` the one about the centre of mass.
     """
     return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
 
@@ -324,15 +324,26 @@ OneBody = TypeVar("OneBody", bound=Body)
 
 
 def with_tensor(body: OneBody, tensor: Mat3) -> OneBody:
-    """Return the body with another inertia tensor, unchecked, since a part of a body need not be a
-    real body.
+    """Return `body`, an `Inertia` or `MassProperties`, with another inertia tensor. The tensor is
+    not checked, since a part of a body need not be a real body.
+
+    - `tensor`: (3, 3), kg m², body frame; of `MassProperties`, about the centre of mass
     """
     if isinstance(body, Inertia):
         return Inertia(tensor)  # pyright: ignore[reportReturnType]
     return eqx.tree_at(lambda b: b.second_moment, body, swap_trace_back(tensor))
 
 
-def _add_mass(body, mass, com, second_moment):
+def _add_mass(
+    body: MassProperties, mass: Array, com: Array, second_moment: Array
+) -> MassProperties:
+    """Return a body with more mass, or with less if `mass` and `second_moment` are negative.
+
+    - `body`: the body to start from
+    - `mass`: kg, of what is added
+    - `com`: (3,) m, its centre of mass, in the frame of `body`
+    - `second_moment`: (3, 3) kg m², its 𝔖 = ∫ r rᵀ dm about its own centre of mass
+    """
     total = body.mass + mass
     d = com - body.com
     # Start at the centre of the heavier part: a light and distant part moves this centre little, so

@@ -38,7 +38,7 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     ValueError: missing.urdf: no such file
     """
     path = _checks.file_path(path)
-    root, nodes = _open_file(path)
+    root, nodes = _read_bodies_by_name(path)
     read = _body_from_urdf if root.tag == "robot" else _body_from_mujoco
     bodies: dict[str, MassProperties] = {}
     faults = []
@@ -75,22 +75,26 @@ _CHANGES = {
 
 
 def _settings_warnings(root: Tree.Element) -> list[str]:
-    """Return warnings of settings that make MuJoCo use other masses than the inertials in the
-    file.
+    """Return a list of warnings, one for each setting in a file by which MuJoCo would use other
+    masses than the file's inertials.
+
+    - `root`: the root element of the XML file
     """
     words = []
     for compiler in root.iter("compiler"):
         for key, unchanged in _UNCHANGED.items():
             value = compiler.get(key)
-            if value is not None and not _is_one_of(value, unchanged):
+            if value is not None and not _is_among(value, unchanged):
                 words.append(f'{key}="{value}": MuJoCo {_CHANGES[key]}; read as written')
     if next(root.iter("include"), None) is not None:
         words.append("<include>: bodies in other files are not read")
     return words
 
 
-def _is_one_of(value: str, words: Sequence[str]) -> bool:
-    """Return whether the attribute `value` is one of `words`, as a word or as a number."""
+def _is_among(value: str, words: Sequence[str]) -> bool:
+    """Return whether `value`, an attribute in an XML file, equals one of `words`: as a number if it
+    is one, else as a text.
+    """
     try:
         return float(value) in map(float, words)
     except ValueError:
@@ -117,7 +121,7 @@ def write_inertials(
     )
     if not bodies:
         raise ValueError("bodies: wanted at least one name → MassProperties, got none")
-    root, nodes = _open_file(source)
+    root, nodes = _read_bodies_by_name(source)
     write = _write_to_urdf if root.tag == "robot" else _write_to_mujoco
     for name, body in bodies.items():
         _checks.require_single(body, MassProperties, f"bodies[{name!r}]")
@@ -131,8 +135,11 @@ def write_inertials(
     Tree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
 
-def _open_file(path: Path) -> tuple[Tree.Element, dict[str, Tree.Element]]:
-    """Return the file's root, `robot` or `mujoco`, and its links or bodies by name."""
+def _read_bodies_by_name(path: Path) -> tuple[Tree.Element, dict[str, Tree.Element]]:
+    """Read a robot description, and return two things: the root element of the XML file, `robot`
+    (URDF) or `mujoco`; and the element of each link or body, by its name. **Raises:** `ValueError`
+    for a file that is missing, of another format, or with two bodies of one name.
+    """
     if not path.exists():
         raise ValueError(f"{path}: no such file")
     try:
@@ -151,6 +158,9 @@ def _open_file(path: Path) -> tuple[Tree.Element, dict[str, Tree.Element]]:
 
 
 def _body_from_urdf(inertial: Tree.Element) -> MassProperties:
+    """Return the body that an `<inertial>` element of a URDF file describes, in the frame of its
+    link. **Raises:** `ValueError` for numbers that are missing or that no body has.
+    """
     origin, mass, inertia = (inertial.find(tag) for tag in ("origin", "mass", "inertia"))
     if mass is None or inertia is None:
         raise ValueError("wanted a <mass> and an <inertia>")
@@ -163,6 +173,10 @@ def _body_from_urdf(inertial: Tree.Element) -> MassProperties:
 
 
 def _body_from_mujoco(inertial: Tree.Element) -> MassProperties:
+    """Return the body that an `<inertial>` element of a MuJoCo file describes, in the frame of the
+    file's body. **Raises:** `ValueError` for numbers that are missing or that no body has, and for
+    an orientation that is no quaternion.
+    """
     other = [key for key in ("axisangle", "xyaxes", "zaxis", "euler") if key in inertial.attrib]
     if other:
         raise ValueError(f"its inertial is turned by {other[0]}; wanted quat")
@@ -180,6 +194,15 @@ def _body_from_mujoco(inertial: Tree.Element) -> MassProperties:
 def _body_from_parts(
     mass: float, place: np.ndarray, turn: ArrayLike, entries: Sequence[float] | np.ndarray
 ) -> MassProperties:
+    """Return a body from the numbers of a robot description. **Raises:** `ValueError` for a mass
+    that is not positive or moments that no body has; a violation of the triangle inequality by
+    rounding (1e-6) is corrected.
+
+    - `mass`: kg
+    - `place`: (3,) m, the centre of mass in the body frame
+    - `turn`: (3, 3), the rotation matrix from the frame of the inertia to the body frame
+    - `entries`: six numbers of the inertia about the centre of mass, kg m²: xx, yy, zz, xy, xz, yz
+    """
     xx, yy, zz, xy, xz, yz = entries
     turn = np.asarray(turn, float)
     tensor = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
@@ -199,6 +222,14 @@ def _body_from_parts(
 def _read_numbers(
     node: Tree.Element | None, key: str, count: int, default: list[float] | None = None
 ) -> np.ndarray:
+    """Return the numbers in an attribute of an XML element, (count,). **Raises:** `ValueError` for
+    an attribute that is missing without a default, or that does not hold `count` finite numbers.
+
+    - `node`: the element, or `None` if it is missing
+    - `key`: the name of the attribute
+    - `count`: how many numbers are wanted
+    - `default`: the numbers for a missing attribute, or `None`
+    """
     text = None if node is None else node.get(key)
     if text is None:
         if default is None:
@@ -214,10 +245,16 @@ def _read_numbers(
 
 
 def _numbers_as_text(numbers: ArrayLike | Numbers) -> str:
+    """Return the numbers as a text for an XML attribute, separated by spaces, with all their
+    digits.
+    """
     return " ".join(repr(float(number)) for number in np.ravel(numbers))
 
 
 def _write_to_urdf(inertial: Tree.Element, body: MassProperties) -> None:
+    """Write the mass, centre of mass and inertia of `body` into `inertial`, an empty `<inertial>`
+    element of a URDF file.
+    """
     tensor = np.asarray(body.inertia.tensor)
     Tree.SubElement(inertial, "origin", xyz=_numbers_as_text(body.com), rpy="0 0 0")
     Tree.SubElement(inertial, "mass", value=_numbers_as_text(body.mass))
@@ -226,6 +263,9 @@ def _write_to_urdf(inertial: Tree.Element, body: MassProperties) -> None:
 
 
 def _write_to_mujoco(inertial: Tree.Element, body: MassProperties) -> None:
+    """Write the mass, centre of mass and inertia of `body` into `inertial`, an empty `<inertial>`
+    element of a MuJoCo file.
+    """
     tensor = np.asarray(body.inertia.tensor)
     inertial.set("mass", _numbers_as_text(body.mass))
     inertial.set("pos", _numbers_as_text(body.com))

@@ -52,12 +52,12 @@ def mesh(
     _checks.check_if_known(_checks.require_sign, density, "density", "a positive number, kg/m³")
 
     centre = jax.lax.stop_gradient(corners.mean(axis=0))
-    six, (a, b, c) = _tetrahedra(corners - centre[None, :], faces)
+    six, (a, b, c) = _tetrahedra_from_origin(corners - centre[None, :], faces)
     com = (six[:, None] * (a + b + c)).sum(axis=0) / (4.0 * six.sum())
     volume = _require_outward(six.sum() / 6.0, corners, faces)
     # The second moments are summed about the centre of mass itself, so that no large term is
     # subtracted afterwards.
-    six, (a, b, c) = _tetrahedra(corners - (centre + com)[None, :], faces)
+    six, (a, b, c) = _tetrahedra_from_origin(corners - (centre + com)[None, :], faces)
     rows = (a, b, c, a + b + c)
     entries = ((six * sum(r[:, i] * r[:, j] for r in rows)).sum() / 120.0 for i, j in PAIRS)
     return MassProperties(density * volume, centre + com, density * from_components(*entries))
@@ -98,17 +98,25 @@ def mesh_file(
     return mesh(corners, np.asarray(surface.faces), density)
 
 
-def _tetrahedra(corners: Array, faces: Array) -> tuple[Array, list[Array]]:
-    """Return two things: six times the volumes (m,) of the tetrahedra from the origin to the faces;
-    and the three corners of each face, as three arrays (m, 3).
+def _tetrahedra_from_origin(corners: Array, faces: Array) -> tuple[Array, list[Array]]:
+    """Return two things about the tetrahedra between the origin and each face of a triangle mesh:
+    six times their signed volumes (m,), m³; and a list of three arrays (m, 3), m, with the first,
+    second and third corner of each face.
+
+    - `corners`: (n, 3) m, the vertices of the mesh
+    - `faces`: (m, 3) integers, the three vertex numbers of each face
     """
     a, b, c = rows = [corners[faces[:, k]] for k in range(3)]
     return (a * jnp.cross(b, c)).sum(axis=1), rows
 
 
-def _require_outward(volume, corners, faces):
-    """Return the `volume`; refuse a negative volume (a mesh that is inside out) and a volume that
-    is zero to round-off.
+def _require_outward(volume: Array, corners: Array, faces: Array) -> Array:
+    """Return the `volume` of a closed triangle mesh, m³, if it is positive. **Raises:**
+    `ValueError` for a negative volume (a mesh that is inside out), and for a volume that is zero to
+    round-off.
+
+    - `corners`: (n, 3) m, the vertices of the mesh
+    - `faces`: (m, 3) integers, the three vertex numbers of each face
     """
     # A mesh is flat to round-off if the thickness is as small as the last digit of the length.
     a, b, c = (jax.lax.stop_gradient(corners[faces[:, k]]) for k in range(3))
@@ -123,7 +131,13 @@ def _require_outward(volume, corners, faces):
 
 
 def faces_of(faces: Any, n: int) -> Array:
-    """Return the faces as an array (m, 3) of vertex numbers below n; known faces are checked."""
+    """Return the faces of a triangle mesh as an array (m, 3) of vertex numbers. **Raises:**
+    `ValueError` if known faces do not enclose a solid: a number beyond the vertices, a face with
+    one vertex twice, an open edge, or faces that disagree about which side is outside.
+
+    - `faces`: (m, 3) integers
+    - `n`: the number of vertices
+    """
     if not _checks.is_known(faces):
         return faces
     faces = _checks.without_mask(faces, "faces")
@@ -142,7 +156,7 @@ def faces_of(faces: Any, n: int) -> Array:
     if repeated.any():
         which = int(np.argmax(repeated))
         words = f"mesh: face {which} is degenerate, it names a vertex twice"
-        raise ValueError(f"{words}: {_tuple(table[which])}")
+        raise ValueError(f"{words}: {_ints(table[which])}")
     edges = np.concatenate([table[:, [0, 1]], table[:, [1, 2]], table[:, [2, 0]]])
     number, reverse = (edges[:, k] * np.int64(n) + edges[:, 1 - k] for k in (0, 1))
     unique, counts = np.unique(number, return_counts=True)
@@ -153,11 +167,11 @@ def faces_of(faces: Any, n: int) -> Array:
         if np.isin(number[alone], unique[twice]).any():
             raise ValueError(
                 f"mesh: its faces disagree about which side is outside: two of them run along the "
-                f"edge {_tuple(lonely)} in the same direction; turn one of them round"
+                f"edge {_ints(lonely)} in the same direction; turn one of them round"
             )
         raise ValueError(
             f"mesh: it is open: {int(alone.sum())} edges belong to one face only, the first is "
-            f"{_tuple(lonely)}; an open mesh has no inside. Vertices that coincide must have one "
+            f"{_ints(lonely)}; an open mesh has no inside. Vertices that coincide must have one "
             "number: merge them first (trimesh: merge_vertices)"
         )
     paired = dict(zip(unique.tolist(), counts.tolist(), strict=True)) if twice.any() else {}
@@ -165,11 +179,12 @@ def faces_of(faces: Any, n: int) -> Array:
         back = (edge % n) * n + edge // n
         if paired[edge] != paired.get(back, 0):
             raise ValueError(
-                f"mesh: the edge {_tuple((edge // n, edge % n))} is used {paired[edge]} times one "
+                f"mesh: the edge {_ints((edge // n, edge % n))} is used {paired[edge]} times one "
                 f"way and {paired.get(back, 0)} times the other; both numbers must be equal"
             )
     return jnp.asarray(table)
 
 
-def _tuple(numbers: Iterable) -> tuple[int, ...]:
+def _ints(numbers: Iterable[Any]) -> tuple[int, ...]:
+    """Return the integers as a tuple of Python, for messages."""
     return tuple(int(k) for k in numbers)

@@ -39,8 +39,8 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     """
     hint = "for an Inertia use pack_second_moment(body.second_moment), or pack_shape"
     _checks.require_single(body, MassProperties, "body", hint=hint)
-    alpha = _bend_exponent(0.5 * jnp.log(body.mass), jnp.expm1)
-    shape = _log_scale_and_stretch(body.second_moment / body.mass)
+    alpha = _limit_exponent(0.5 * jnp.log(body.mass), jnp.expm1)
+    shape = _pack_second_moment(body.second_moment / body.mass)
     return jnp.concatenate([alpha[None], shape, body.com])
 
 
@@ -55,9 +55,9 @@ def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     Array([2., 2., 2.], dtype=float64)
     """
     v = _checks.array_of_shape(vector, (10,), "vector")
-    alpha = _bend_exponent(v[0])
-    size = 3.0 * jnp.exp(2.0 * _bend_exponent(alpha + v[1]))
-    return MassProperties(jnp.exp(2.0 * alpha), v[7:10], size * _square_over_trace(v[2:7]))
+    alpha = _limit_exponent(v[0])
+    size = 3.0 * jnp.exp(2.0 * _limit_exponent(alpha + v[1]))
+    return MassProperties(jnp.exp(2.0 * alpha), v[7:10], size * _second_moment_from_shape(v[2:7]))
 
 
 def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
@@ -70,7 +70,7 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
     >>> pack_second_moment(jnp.eye(3))
     Array([0., 0., 0., 0., 0., 0.], dtype=float64)
     """
-    return _log_scale_and_stretch(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))
+    return _pack_second_moment(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))
 
 
 def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
@@ -81,7 +81,7 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
     Array([1., 0., 0.], dtype=float64)
     """
     v = _checks.array_of_shape(vector, (6,), "vector")
-    return 3.0 * jnp.exp(2.0 * _bend_exponent(v[0])) * _square_over_trace(v[1:])
+    return 3.0 * jnp.exp(2.0 * _limit_exponent(v[0])) * _second_moment_from_shape(v[1:])
 
 
 def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
@@ -96,9 +96,7 @@ def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
     >>> pack_shape(jnp.diag(jnp.array([4.0, 4.0, 0.0])))  # a plate
     Array([0.5, 0.5, 0. , 0. , 0. ], dtype=float64)
     """
-    return _log_scale_and_stretch(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))[
-        1:
-    ]
+    return _pack_second_moment(_checks.array_of_shape(second_moment, (3, 3), "second_moment"))[1:]
 
 
 def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
@@ -108,7 +106,7 @@ def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
     >>> float(jnp.trace(unpack_shape(jnp.ones(5))))
     1.0
     """
-    return _square_over_trace(_checks.array_of_shape(vector, (5,), "vector"))
+    return _second_moment_from_shape(_checks.array_of_shape(vector, (5,), "vector"))
 
 
 def pack_moments(moments: Vector) -> Float[Array, "3"]:
@@ -123,9 +121,9 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
     """
     i = require_real_moments(_checks.array_of_shape(moments, (3,), "moments"))
     s = 0.5 * jnp.stack([(i[1] - i[0]) + i[2], (i[2] - i[1]) + i[0], (i[0] - i[2]) + i[1]])
-    total = _refuse_point(s[0] + s[1] + s[2])
-    root = jnp.sqrt(jnp.maximum(_quotient(s, total), 0.0))
-    size = _bend_exponent(0.5 * jnp.log(total / 3.0), jnp.expm1)
+    total = _require_positive_trace(s[0] + s[1] + s[2])
+    root = jnp.sqrt(jnp.maximum(_divide_large(s, total), 0.0))
+    size = _limit_exponent(0.5 * jnp.log(total / 3.0), jnp.expm1)
     return jnp.stack([size, *(3.0 * root[:2] / (root[0] + root[1] + root[2]) - 1.0)])
 
 
@@ -140,7 +138,7 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
     root = jnp.stack([1.0 + v[1], 1.0 + v[2], 1.0 - v[1] - v[2]])
     root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
     a, b, c = root * root / jnp.sum(root * root)
-    s = 3.0 * jnp.exp(2.0 * _bend_exponent(v[0]))
+    s = 3.0 * jnp.exp(2.0 * _limit_exponent(v[0]))
     return s * jnp.stack([b + c, c + a, a + b])
 
 
@@ -165,7 +163,7 @@ def flat_bend(
     """
     shape = _checks.array_of_shape(shape, (5,), "shape")
     slope = _checks.array_of_shape(slope, (5,), "slope")
-    root = _root_of_trace_three(shape)
+    root = _root_from_shape(shape)
     # For a flat body the columns of the adjugate of A are along n: in every step of a fit, this is
     # cheaper than eigenvectors.
     rows = root[0], root[1], root[2]
@@ -190,11 +188,13 @@ def flat_bend(
     return size * jnp.stack([jnp.stack(row) for row in rows])
 
 
-def _square_over_trace(v: Float[Array, "5"]) -> Mat3:
-    """Return the matrix (1 + V)² divided by the trace of (1 + V)²; the five numbers v are the
-    entries of V, as in `pack_shape`.
+def _second_moment_from_shape(shape: Float[Array, "5"]) -> Mat3:
+    """Return the second moment (3, 3), scaled to trace 1, that five unconstrained numbers describe:
+    (1 + V)²/Tr (1 + V)² with a symmetric matrix V of trace zero.
+
+    - `shape`: (5,), the entries V₁₁, V₂₂, V₁₂, V₂₃, V₁₃
     """
-    root = _root_of_trace_three(v)
+    root = _root_from_shape(shape)
     # The root is scaled first: after a step of an optimiser that is much too long, squares of the
     # entries would overflow.
     root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
@@ -202,26 +202,36 @@ def _square_over_trace(v: Float[Array, "5"]) -> Mat3:
     return square / (square[0, 0] + square[1, 1] + square[2, 2])
 
 
-def _root_of_trace_three(shape: Float[Array, "5"]) -> Mat3:
-    """Return the symmetric root 1 + V, with trace 3, that the five numbers `shape` describe."""
+def _root_from_shape(shape: Float[Array, "5"]) -> Mat3:
+    """Return the symmetric matrix 1 + V (3, 3), of trace 3, whose square is proportional to a
+    second moment.
+
+    - `shape`: (5,), the entries V₁₁, V₂₂, V₁₂, V₂₃, V₁₃ of V, whose trace is zero
+    """
     d1, d2, s12, s23, s13 = shape
     return from_components(1.0 + d1, 1.0 + d2, 1.0 - d1 - d2, s12, s13, s23)
 
 
-def _log_scale_and_stretch(s: Mat3) -> Float[Array, "6"]:
-    """Return the six numbers (ρ, d1, d2, s12, s23, s13) of a second moment s = 3 e^{2ρ} (1 + V)² /
-    Tr (1 + V)².
+def _pack_second_moment(s: Mat3) -> Float[Array, "6"]:
+    """Return six unconstrained numbers that describe a second moment: (ρ, V₁₁, V₂₂, V₁₂, V₂₃, V₁₃)
+    with s = 3 e^{2ρ} (1 + V)²/Tr (1 + V)², where V is symmetric and has the trace zero. **Raises:**
+    `ValueError` for a matrix that is zero, or not symmetric and positive semi-definite.
+
+    - `s`: (3, 3), kg m² or any other unit, the second moment 𝔖 = ∫ r rᵀ dm
     """
-    total = _refuse_point(s[0, 0] + s[1, 1] + s[2, 2])
-    root = _square_root(_quotient(require_real_second_moment(s), total))
+    total = _require_positive_trace(s[0, 0] + s[1, 1] + s[2, 2])
+    root = _square_root(_divide_large(require_real_second_moment(s), total))
     v = 3.0 * root / (root[0, 0] + root[1, 1] + root[2, 2]) - jnp.eye(3, dtype=s.dtype)
-    size = _bend_exponent(0.5 * jnp.log(total / 3.0), jnp.expm1)
+    size = _limit_exponent(0.5 * jnp.log(total / 3.0), jnp.expm1)
     return jnp.stack([size, v[0, 0], v[1, 1], v[0, 1], v[1, 2], v[0, 2]])
 
 
 @jax.custom_jvp
 def _square_root(s: Mat3) -> Mat3:
-    """Return the symmetric, positive semi-definite root A of a second moment, A A = 𝔖."""
+    """Return the symmetric, positive semi-definite square root A of a second moment s (3, 3), any
+    unit: A A = s. Its derivative is finite also at equal eigenvalues, where the eigenvectors have
+    none.
+    """
     values, axes = eigensystem(s)
     return product(axes * jnp.sqrt(jnp.maximum(values, 0.0))[None], axes.T)
 
@@ -236,24 +246,30 @@ def _square_root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3,
     return root, jnp.linalg.solve(sums, change.reshape(9)).reshape(3, 3)
 
 
-def _refuse_point(total: Scalar) -> Scalar:
-    words = "pack: the second moment is zero (a point has no shape) or beyond the dtype"
-    return _checks.error_if(total, ~((total > 0) & (total < jnp.inf)), words)
-
-
-def _quotient(part: Array, total: Scalar) -> Array:
-    """Return the quotient `part / total`, with both divided by 4 first.
-
-    XLA multiplies by the reciprocal of `total`, which is zero for the Earth in float32.
+def _require_positive_trace(trace: Scalar) -> Scalar:
+    """Return the trace of a second moment. **Raises:** `ValueError` if it is not positive (the
+    second moment of a point is zero) or not finite.
     """
-    return (0.25 * part) / (0.25 * total)
+    words = "pack: the second moment is zero (a point has no shape) or beyond the dtype"
+    return _checks.error_if(trace, ~((trace > 0) & (trace < jnp.inf)), words)
 
 
-def _bend_exponent(exponent: Array, bend: Callable[[Array], Array] = jnp.log1p) -> Array:
-    """Return the exponent, changed only beyond the range of the dtype: there `bend` is applied to
-    the excess over the limit.
+def _divide_large(numerator: Array, denominator: Scalar) -> Array:
+    """Return the quotient `numerator / denominator`, correct also for a large denominator: both are
+    divided by 4 first.
 
-    With `log1p` the excess is compressed to a logarithm; `expm1` is the inverse.
+    XLA multiplies by the reciprocal of the denominator, and the reciprocal of the second moment of
+    the Earth is zero in float32.
+    """
+    return (0.25 * numerator) / (0.25 * denominator)
+
+
+def _limit_exponent(exponent: Array, bend: Callable[[Array], Array] = jnp.log1p) -> Array:
+    """Return an exponent that `exp` can take without overflow: unchanged within the range of the
+    dtype (±330 in float64, ±31 in float32), and beyond it the limit plus `bend` of the excess.
+
+    - `exponent`: any array of exponents
+    - `bend`: `log1p`, which compresses the excess to a logarithm; or `expm1`, which undoes this
     """
     limit = 31.0 if exponent.dtype == jnp.float32 else 330.0
     beyond = jnp.maximum(jnp.abs(exponent) - limit, 0.0)

@@ -95,7 +95,10 @@ def quadrature(
     dtype = jnp.result_type(float)
     cube, weight = jnp.asarray(cube, dtype), jnp.asarray(weight, dtype)
 
-    def mass_and_place_at(u):
+    def mass_and_place_at(u: Array) -> tuple[Array, Array]:
+        """Return two things: the mass for each unit of volume of the cube at its point `u` (3,),
+        that is, density times |det ∂r/∂u|, kg; and the place r (3,), m, of this point in the body.
+        """
         r = _checks.array_of_shape(place(u), (3,), "place(u)")
         volume = determinant(jax.jacfwd(place)(u))
         return _checks.array_of_shape(density(r), (), "density(r)") * jnp.abs(volume), r
@@ -107,7 +110,12 @@ def quadrature(
 
 
 def sum_masses(masses: Float[Array, "n"], positions: Float[Array, "n 3"]) -> MassProperties:
-    """Return the body made of point masses; the single masses are not checked, only the sums."""
+    """Return the body made of point masses. The single masses and positions are not checked; the
+    sums are, when the body is made.
+
+    - `masses`: (n,) kg
+    - `positions`: (n, 3) m, body frame
+    """
     # Positions are taken from the first point: far from the origin the sums would lose digits.
     start = jax.lax.stop_gradient(positions[0])
     from_start = positions - start[None, :]

@@ -5,7 +5,8 @@ and for every symmetric top, and in JAX also for distinct moments above 1e16 kg 
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -60,13 +61,14 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
     moments, axes = eigensystem(
         validation.check_symmetric(_checks.array_of_shape(tensor, (3, 3), "tensor"), "tensor")
     )
-    return moments, _quaternion_near_identity(axes)
+    return moments, _quaternion_of_small_turn(axes)
 
 
 @jax.custom_jvp
 @jax.jit
 def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
-    """Return the ascending eigenvalues and a right-handed matrix of eigenvectors, as columns.
+    """Return two things about a symmetric matrix `a` (3, 3), any unit: the eigenvalues (3,),
+    ascending; and a right-handed matrix (3, 3) with the unit eigenvectors as columns.
 
     The method is cyclic Jacobi rotations (Golub and Van Loan 2013, section 8.5). In a batch it is
     eight times as fast as LAPACK's `eigh`, and it is accurate for the small moment of a slender
@@ -81,13 +83,19 @@ def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
         (b[1, 2], b[0, 2], b[0, 1]),  # the entry opposite each diagonal one
         ((one, nil, nil), (nil, one, nil), (nil, nil, one)),
     )
-    values, _, axes = jax.lax.fori_loop(0, _SWEEPS, _sweep, start)
+    values, _, axes = jax.lax.fori_loop(0, _SWEEPS, _jacobi_sweep, start)
     values, axes = _sort_ascending(values, axes)
-    return times_power_of_two(jnp.stack(values), exponent), _choose_nearest_signs(axes)
+    return times_power_of_two(jnp.stack(values), exponent), _reverse_axes_towards_identity(axes)
 
 
 @eigensystem.defjvp
-def _eigensystem_jvp(primals, tangents):
+def _eigensystem_jvp(
+    primals: tuple[Mat3], tangents: tuple[Mat3]
+) -> tuple[tuple[Vec3, Mat3], tuple[Vec3, Mat3]]:
+    """Return the eigenvalues (3,) and eigenvectors (3, 3) of a symmetric matrix, and their
+    derivatives along the change of the matrix in `tangents`, which are finite also at equal
+    eigenvalues: eigenvectors do not turn within a space of equal eigenvalues.
+    """
     (a,), (da,) = primals, tangents
     values, axes = eigensystem(a)
     turned = product(axes.T, product(0.5 * (da + da.T), axes))
@@ -98,7 +106,15 @@ def _eigensystem_jvp(primals, tangents):
     return (values, axes), (jnp.diagonal(turned), product(axes, turning))
 
 
-def _sweep(_, state):
+def _jacobi_sweep(_: Any, state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+    """Apply three Jacobi rotations to a symmetric 3×3 matrix, each of which makes one entry off the
+    diagonal zero, and return the new `state`: the three diagonal entries; the three entries off the
+    diagonal, number k in the row and the column other than k; and the three axes (the columns of
+    the rotation so far) as triples of scalars.
+
+    - `_`: the number of the sweep, which the loop passes and which is not used
+    - `state`: the state before, in the same form as the new state
+    """
     values, opposite, axes = map(list, state)
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
@@ -116,9 +132,13 @@ def _sweep(_, state):
     return tuple(values), tuple(opposite), tuple(axes)
 
 
-def _sort_ascending(values, axes):
-    """Sort the eigenvalues and axes by exchanges; each exchange also reverses one axis, so that the
-    axes stay right-handed.
+def _sort_ascending(values: Sequence[Scalar], axes: Sequence[Any]) -> tuple[list, list]:
+    """Return two lists, sorted by ascending eigenvalue: the three eigenvalues; and the three
+    eigenvectors. With each exchange of two eigenvectors one of them is reversed, so that they stay
+    right-handed.
+
+    - `values`: three scalars, the eigenvalues
+    - `axes`: three triples of scalars, the eigenvectors
     """
     values, axes = list(values), list(axes)
     for i, j in ((0, 1), (1, 2), (0, 1)):
@@ -130,9 +150,12 @@ def _sort_ascending(values, axes):
     return values, axes
 
 
-def _choose_nearest_signs(axes) -> Mat3:
-    """Return the matrix with the `axes` as columns, after two axes, or none, are reversed so that
-    the trace is largest.
+def _reverse_axes_towards_identity(axes: Sequence[Any]) -> Mat3:
+    """Return the rotation matrix (3, 3) with three orthonormal `axes` as columns, after two of the
+    axes, or none, are reversed: the one of the four right-handed choices that turns least, which
+    has the largest trace.
+
+    - `axes`: three triples of scalars, right-handed
     """
     d0, d1, d2 = axes[0][0], axes[1][1], axes[2][2]
     traces = jnp.stack([d0 + d1 + d2, d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1])
@@ -140,10 +163,9 @@ def _choose_nearest_signs(axes) -> Mat3:
     return jnp.stack([jnp.stack(axis) for axis in axes], axis=1) * signs[jnp.argmax(traces)][None]
 
 
-def _quaternion_near_identity(m: Mat3) -> Quat:
-    """Return the quaternion of a rotation matrix m with trace ≥ 0.
-
-    For such a matrix one formula is enough.
+def _quaternion_of_small_turn(m: Mat3) -> Quat:
+    """Return the unit quaternion (w, x, y, z) of a rotation matrix m (3, 3) whose trace is not
+    negative, that is, of a turn by at most 120°; one formula is then enough.
     """
     w = 0.5 * jnp.sqrt(1.0 + m[0, 0] + m[1, 1] + m[2, 2])
     f = 0.25 / w
@@ -175,7 +197,8 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     unit = times_power_of_two(jnp.ones((), a.dtype), exponent_of(a) - 1)
     a = 0.5 * (a + a.T) / unit
 
-    def scaled_function(value):
+    def scaled_function(value: Scalar) -> Scalar:
+        """Return f(λ) of one eigenvalue, given as `value` = λ/`unit`."""
         return _checks.array_of_shape(function(unit * value), (), "function(λ)", hint="one number")
 
     values, axes = eigensystem(jax.lax.stop_gradient(a))
@@ -192,11 +215,14 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     return product(axes, product(inner, axes.T))
 
 
-def _divided_difference(f, x, y, close):
-    """Return the divided difference f[x, y] = (f(y) − f(x))/(y − x) of a function f, for x ≤ y.
+def _divided_difference(
+    f: Callable[[Scalar], Scalar], x: Scalar, y: Scalar, close: Scalar
+) -> Scalar:
+    """Return the divided difference f[x, y] = (f(y) − f(x))/(y − x) of a smooth function f of one
+    number, for x ≤ y.
 
-    If y − x is at most the length `close`, the result is the mean of f' between x and y
-    (Hermite–Genocchi), by quadrature.
+    If y − x is at most the length `close`, the quotient would lose digits: the result is then the
+    mean of f' between x and y (Hermite–Genocchi), by quadrature.
     """
     near = y - x <= close
     end = jnp.where(near, y, x)
@@ -205,12 +231,14 @@ def _divided_difference(f, x, y, close):
     return jnp.where(near, mean, (f(y) - f(x)) / jnp.where(near, 1.0, y - x))
 
 
-def _second_divided_difference(f, x, y, z, close):
-    """Return the second divided difference f[x, y, z] = (f[y, z] − f[x, y])/(z − x) of a function
-    f, for x ≤ y ≤ z.
+def _second_divided_difference(
+    f: Callable[[Scalar], Scalar], x: Scalar, y: Scalar, z: Scalar, close: Scalar
+) -> Scalar:
+    """Return the second divided difference f[x, y, z] = (f[y, z] − f[x, y])/(z − x) of a smooth
+    function f of one number, for x ≤ y ≤ z, with f[x, y] = (f(y) − f(x))/(y − x).
 
-    If z − x is at most the length `close`, the result is the integral of f'' over all weighted
-    means of x, y and z (Hermite–Genocchi), by quadrature.
+    If z − x is at most the length `close`, the quotient would lose digits: the result is then the
+    integral of f'' over all weighted means of x, y and z (Hermite–Genocchi), by quadrature.
     """
     near = z - x <= close
     middle, end = jnp.where(near, y, x), jnp.where(near, z, x)

@@ -11,13 +11,15 @@ from jaxtyping import Array, Float, Int
 
 
 def exponent_of(x: Float[Array, "..."]) -> Int[Array, ""]:
-    """Return the integer n with 2ⁿ⁻¹ ≤ max |x| < 2ⁿ, a constant in derivatives; 0 for x = 0."""
+    """Return the integer n with 2ⁿ⁻¹ ≤ max |x| < 2ⁿ for the largest entry of an array `x`; 0 for x
+    = 0. In derivatives n is constant.
+    """
     return jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(x))))[1]
 
 
 def times_power_of_two(x: Float[Array, "..."], n: Int[Array, ""]) -> Float[Array, "..."]:
-    """Return `x 2ⁿ`, |n| ≤ 2044 (float32: 252), exact with its derivatives if the result is a
-    normal number.
+    """Return the array `x` times 2ⁿ, for an integer n with |n| ≤ 2044 (float32: 252); it is exact,
+    with its derivatives, if the result is a normal number.
     """
     half = n // 2
     # Without the barrier, XLA would first multiply the two powers where it knows n, and the product
@@ -28,8 +30,8 @@ def times_power_of_two(x: Float[Array, "..."], n: Int[Array, ""]) -> Float[Array
 
 
 def _power_of_two(n: Int[Array, ""], dtype: jnp.dtype) -> Float[Array, ""]:
-    """Return 2ⁿ, a normal number, from its bits: `jnp.ldexp` would be fifty operations to
-    compile.
+    """Return the number 2ⁿ of the given `dtype`, made from its bits, for an integer n with which 2ⁿ
+    is a normal number: `jnp.ldexp` would be fifty operations to compile.
     """
     info = jnp.finfo(dtype)
     bits = (n.astype(f"int{info.bits}") + (info.maxexp - 1)) << info.nmant

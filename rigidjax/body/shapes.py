@@ -11,11 +11,11 @@ moments of inertia are `I1 = λ2 + λ3`, … (eqs 76–78).
 """
 
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._names import show
-from rigidjax._types import Numbers, ScalarLike, Vector
+from rigidjax._types import Numbers, NumbersLike, ScalarLike, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.meshes import mesh as mesh, mesh_file as mesh_file
 from rigidjax.body.point_masses import points as points, quadrature as quadrature, voxels as voxels
@@ -62,7 +62,7 @@ def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> Mas
     >>> hollow_sphere(3.0, 1.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
     """
-    r, R = _require_nested(inner, outer)
+    r, R = _checked_radii(inner, outer)
     # The formula is homogeneous of degree 2: written in u = r/R nothing overflows, and thin shells
     # lose no digit.
     u = r / R
@@ -102,7 +102,7 @@ def hollow_cylinder(
     >>> hollow_cylinder(2.0, 1.0, 1.0, 0.0).inertia.moments
     Array([1., 1., 2.], dtype=float64)
     """
-    (r, R), h = _require_nested(inner, outer), _checked_lengths(height, (), "height")
+    (r, R), h = _checked_radii(inner, outer), _checked_lengths(height, (), "height")
     return _body_at_centre(mass, _axisymmetric_diagonal((r * r + R * R) / 4.0, h * h / 12.0))
 
 
@@ -147,7 +147,7 @@ def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassPropert
     >>> torus(2.0, 1.0, 0.0).inertia.moments
     Array([1., 1., 2.], dtype=float64)
     """
-    r, R = _require_nested(minor, major, names=("minor", "major"))
+    r, R = _checked_radii(minor, major, names=("minor", "major"))
     return _body_at_centre(
         mass, _axisymmetric_diagonal(R * R / 2.0 + 3.0 * r * r / 8.0, r * r / 4.0)
     )
@@ -174,12 +174,26 @@ def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProper
     return _body_at_centre(mass, jnp.concatenate([edges * edges / 12.0, jnp.zeros_like(edges[:1])]))
 
 
-def _checked_lengths(value, shape, name):
+def _checked_lengths(value: NumbersLike, shape: tuple[int, ...], name: str) -> Array:
+    """Return lengths, m, as an array of the given `shape`. **Raises:** `ValueError` for a known
+    length below zero or NaN.
+
+    - `value`: one number or several
+    - `shape`: () or (n,)
+    - `name`: the name of the argument, for messages
+    """
     lengths = _checks.finite_array(value, shape, name, unit="m")
     return _checks.check_if_known(_checks.require_sign, lengths, name, "lengths ≥ 0 (m)", zero=True)
 
 
-def _require_nested(inner, outer, names=("inner", "outer")):
+def _checked_radii(
+    inner: ScalarLike, outer: ScalarLike, names: tuple[str, str] = ("inner", "outer")
+) -> tuple[Array, Array]:
+    """Return two radii, m, as scalar arrays: the inner and the outer. **Raises:** `ValueError` for
+    a known radius below zero, and for a known inner radius above the outer.
+
+    - `names`: the names of the two arguments, for messages
+    """
     r, R = _checked_lengths(inner, (), names[0]), _checked_lengths(outer, (), names[1])
     if _checks.is_known((r, R)):
         _checks.error_if(
@@ -188,13 +202,23 @@ def _require_nested(inner, outer, names=("inner", "outer")):
     return r, R
 
 
-def _axisymmetric_diagonal(transverse, axial):
+def _axisymmetric_diagonal(transverse: Array, axial: Array) -> Array:
+    """Return the diagonal (3,) of a matrix that is symmetric about the z axis: `transverse` for x
+    and y, `axial` for z.
+    """
     return jnp.stack([transverse, transverse, axial])
 
 
-def _body_at_centre(mass, per_mass):
+def _body_at_centre(mass: ScalarLike, moments_per_mass: Array) -> MassProperties:
+    """Return the body with its centre of mass at the origin and its principal axes along x, y and
+    z.
+
+    - `mass`: kg
+    - `moments_per_mass`: (3,) m², the principal second moments ∫ x² dm, ∫ y² dm, ∫ z² dm, divided
+      by the mass
+    """
     m = _checks.array_of_shape(mass, (), "mass")
-    return MassProperties(m, jnp.zeros_like(per_mass), jnp.diag(m * per_mass))
+    return MassProperties(m, jnp.zeros_like(moments_per_mass), jnp.diag(m * moments_per_mass))
 
 
 __all__ = [

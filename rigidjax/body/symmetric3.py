@@ -30,6 +30,9 @@ def inverse(a: Mat3) -> Mat3:
 
 @inverse.defjvp
 def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
+    """Return the inverse of a symmetric 3×3 matrix A, and its derivative −A⁻¹ dA A⁻¹ along the
+    change dA in `tangents`.
+    """
     (a,), (da,) = primals, tangents
     out = inverse(a)
     scale = a[0, 0] + a[1, 1] + a[2, 2]
@@ -48,12 +51,14 @@ def from_components(
     xz: Float[ArrayLike, ""],
     yz: Float[ArrayLike, ""],
 ) -> Mat3:
-    """Return the symmetric matrix of six components: the diagonal first, then xy, xz, yz."""
+    """Return the symmetric matrix (3, 3) of six scalars: the diagonal entries first, then the
+    entries xy, xz, yz.
+    """
     return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
 
 
 def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
-    """Return the matrix `a bᵀ`."""
+    """Return the matrix a bᵀ (3, 3), with the entries a_i b_j, of two vectors (3,)."""
     return a[:, None] * b[None, :]
 
 
@@ -61,18 +66,27 @@ def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
 # its own.
 @jax.jit
 def swap_trace(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Return `Tr(A) 1 − A` without the cancellation: `[A22 + A33, −A12, …]` (notes, eqs 76–78)."""
+    """Return `Tr(A) 1 − A` of symmetric 3×3 matrices A = `a` (..., 3, 3): the inertia tensor of a
+    second moment (notes, eqs 76–78). The diagonal is computed as A22 + A33, …, so that no digit
+    cancels.
+    """
     x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
-    return _negate(a, jnp.stack([y + z, z + x, x + y], axis=-1))
+    return _negate_with_diagonal(a, jnp.stack([y + z, z + x, x + y], axis=-1))
 
 
 def swap_trace_back(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Return `½ Tr(A) 1 − A`, the inverse of `swap_trace`."""
+    """Return `½ Tr(A) 1 − A` of symmetric 3×3 matrices A = `a` (..., 3, 3): the second moment of an
+    inertia tensor, the inverse of `swap_trace`.
+    """
     x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
-    return _negate(a, 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1))
+    return _negate_with_diagonal(
+        a, 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1)
+    )
 
 
-def _negate(a: Array, diagonal: Array) -> Array:
-    """Return −A, in which the diagonal entries are replaced by `diagonal`."""
+def _negate_with_diagonal(a: Array, diagonal: Array) -> Array:
+    """Return the matrices −A for A = `a` (..., 3, 3), with their diagonal entries replaced by
+    `diagonal` (..., 3).
+    """
     eye = jnp.broadcast_to(jnp.eye(3, dtype=bool), a.shape)
     return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)

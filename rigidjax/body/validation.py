@@ -26,18 +26,24 @@ _FORGIVEN = 64.0
 
 
 def require_real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Refuse a mass that is not positive and finite."""
+    """Return the mass (...), kg. **Raises:** `ValueError` (`equinox` error under `jit`) if it is
+    not positive and finite.
+    """
     return _checks.require_sign(mass, "mass", "a positive mass (kg)")
 
 
 def require_real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Refuse an inertia tensor that is not symmetric, or whose moments no real body has."""
+    """Return the inertia tensor (..., 3, 3), kg m². **Raises:** `ValueError` (`equinox` error under
+    `jit`) if it is not symmetric, or if no real body has its principal moments.
+    """
     tensor = _require_symmetric(_checks.require_finite(tensor, "inertia tensor"), "inertia tensor")
-    return _moments_of_a_body(tensor, _eigenvalues(tensor))
+    return _require_moments_of_a_body(tensor, _eigenvalues(tensor))
 
 
 def require_real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Refuse principal moments, in any order, that no real body has."""
+    """Return the principal moments (3,), kg m², which may be in any order. **Raises:** `ValueError`
+    (`equinox` error under `jit`) if no real body has these moments.
+    """
     if not _checks.is_known(moments) and _checks.is_known(plain := lax.stop_gradient(moments)):
         # The numbers are known, and are traced only to be differentiated: check them once by NumPy,
         # instead of by twenty compiled programs.
@@ -45,11 +51,13 @@ def require_real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
         return moments
     moments = _checks.require_finite(moments, "principal moments")
     xp = np if _checks.is_known(moments) else jnp
-    return _moments_of_a_body(moments, xp.sort(_without_derivatives(moments)))
+    return _require_moments_of_a_body(moments, xp.sort(_without_derivatives(moments)))
 
 
 def require_real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Refuse a second moment that is not symmetric and positive semi-definite."""
+    """Return the second moment s = ∫ r rᵀ dm (..., 3, 3), kg m². **Raises:** `ValueError`
+    (`equinox` error under `jit`) if it is not symmetric and positive semi-definite.
+    """
     s = _require_symmetric(_checks.require_finite(s, "second moment"), "second moment")
     least, largest = (e := _eigenvalues(s))[..., 0], e[..., 2]
     got = (
@@ -71,11 +79,12 @@ def require_single_body(
     requirement: str = "",
     hint: str = "",
 ) -> Any:
-    """Return `value` if it is one body of one of `kinds`, and if a real body can have these
-    numbers.
+    """Return `value` if it is one body (not a batch) of one of the classes `kinds`, and if a real
+    body can have its mass and inertia.
 
     Known numbers that no real body has are refused; a traced body with such numbers becomes NaN. A
-    moment may be zero: a function that divides by the moments calls `check_body`.
+    moment may be zero: a function that divides by the moments calls `check_body`. The texts `name`
+    (of the argument), `requirement` (what was wanted) and `hint` are for messages.
     """
     body = _checks.require_single(value, kinds, name, requirement=requirement, hint=hint)
     has_mass = hasattr(body, "mass")
@@ -84,8 +93,9 @@ def require_single_body(
 
 
 def check_symmetric(a: Float[Array, "3 3"], name: str) -> Float[Array, "3 3"]:
-    """Return a symmetric matrix; refuse a known matrix that is not symmetric, and make such a
-    traced matrix NaN.
+    """Return the matrix `a` (3, 3) if it is symmetric to round-off. A known matrix that is not
+    symmetric raises `ValueError`, and a traced one becomes NaN; the text `name` names the matrix in
+    the message.
     """
     if _checks.is_known(a):
         return _require_symmetric(a, name)
@@ -100,11 +110,17 @@ def check_body(
     *,
     allow_thin: bool = False,
 ) -> Any:
-    """Return `body` if a real body can have the inertia `tensor` and the `mass`, and if no moment
-    is zero.
+    """Return `body` if a real body can have the inertia `tensor` and the `mass`, and if no
+    principal moment is zero.
 
-    `mass` may be `None`; if `allow_thin`, moments may be zero. Other numbers raise an error if they
-    are known, or if `throw` is true; else the traced body becomes NaN.
+    If not, an error is raised if the numbers are known, or if `throw` is true; else the traced body
+    becomes NaN.
+
+    - `body`: any tree of arrays, which is returned
+    - `tensor`: (..., 3, 3) kg m², body frame
+    - `mass`: (...) kg, or `None`
+    - `throw`: whether wrong traced numbers raise an error
+    - `allow_thin`: whether a moment may be zero, as that of a rod about its axis
     """
     tensor = _checks.numeric_array(tensor, "inertia tensor")
     is_known = _checks.is_known((tensor, mass))
@@ -136,15 +152,23 @@ def check_body(
 
 
 def first_impossible_row(tensors: Float[Array, "n 3 3"]) -> Any:
-    """Return the index of the first of the known `tensors` that no body has, or −1 if there is
-    none.
+    """Return the index of the first matrix of a stack that is the inertia tensor of no body, or −1
+    if there is none.
 
-    A tensor with a NaN is skipped: in a batch of bodies such a body gets another status.
+    A matrix with a NaN is skipped: in a batch of bodies such a body gets another status.
+
+    - `tensors`: (n, 3, 3) kg m², known numbers
     """
-    return _checks.first_bad_row(_are_impossible, tensors)
+    return _checks.first_bad_row(_are_not_of_a_body, tensors)
 
 
-def _are_impossible(xp: ModuleType, tensors: Array | np.ndarray) -> Any:
+def _are_not_of_a_body(xp: ModuleType, tensors: Array | np.ndarray) -> Any:
+    """Return, for each matrix of a stack, whether it is not the inertia tensor of a body without a
+    zero moment, (...), of truth values; false for a matrix with a NaN.
+
+    - `xp`: the module that computes, `numpy` or `jax.numpy`
+    - `tensors`: (..., 3, 3) kg m²
+    """
     flat, broken, skew = _faults(xp, tensors, allow_thin=False)
     return (flat | broken | skew) & ~xp.isnan(xp.asarray(tensors)).any(axis=(-1, -2))
 
@@ -165,11 +189,15 @@ _THIN = (
 
 
 def _faults(xp: ModuleType, tensor: Array | np.ndarray, allow_thin: bool) -> tuple[Any, Any, Any]:
-    """Return three answers: whether a moment is zero or NaN; whether no real body has these
-    moments; and whether I ≠ Iᵀ.
+    """Return three truth values (...) for each inertia tensor: whether a principal moment is zero
+    or NaN; whether no real body has its principal moments; and whether it is not symmetric.
 
-    The first answer is never true if `allow_thin`. The second answer comes from the minors of the
-    second moment 𝔖, in units of the trace.
+    The second answer comes from the minors (subdeterminants) of the second moment 𝔖 = ½ Tr(I) 1 − I
+    divided by the trace of I: a real body has an 𝔖 that is positive semi-definite.
+
+    - `xp`: the module that computes, `numpy` or `jax.numpy`
+    - `tensor`: (..., 3, 3) kg m²
+    - `allow_thin`: whether a moment may be zero; the first answer is then always false
     """
     slack = _round_off_bound(tensor)
     # The nine entries are split by one operation: NumPy needs a tenth of the time of nine slices.
@@ -214,7 +242,13 @@ def attitude_quaternion(q: Quaternion) -> Quat:
     return quaternion.normalise(require_near_unit(q, "q", tolerance(q.dtype)))
 
 
-def _moments_of_a_body(value, moments):
+def _require_moments_of_a_body(value: Any, moments: Any) -> Any:
+    """Return `value`. **Raises:** `ValueError` (`equinox` error under `jit`) if a principal moment
+    is negative, or if the moments break the triangle inequality I1 + I2 ≥ I3.
+
+    - `value`: the array to return: an inertia tensor (..., 3, 3) or principal moments, kg m²
+    - `moments`: (..., 3) kg m², its principal moments, ascending
+    """
     m1, m2, m3 = moments[..., 0], moments[..., 1], moments[..., 2]
     moments_text = f" {_moments_as_text(moments)} kg m²" if _checks.is_known(value) else ""
     slack = _round_off_bound(value) * abs(m3)
@@ -235,9 +269,9 @@ def _moments_of_a_body(value, moments):
     )
 
 
-def _asymmetry(a):
-    """Return two things: the largest entry of |A − Aᵀ|, for the matrix A = a; and whether this
-    entry exceeds round-off.
+def _asymmetry(a: Any) -> tuple[Any, Any]:
+    """Return two things about matrices A = `a` (..., 3, 3), any unit: the largest entry of |A −
+    Aᵀ|, (...); and whether this entry exceeds round-off in any of the matrices.
     """
     difference = abs(_without_derivatives(a) - _without_derivatives(a).swapaxes(-1, -2)).max(
         axis=(-1, -2)
@@ -247,7 +281,10 @@ def _asymmetry(a):
     ).any()
 
 
-def _require_symmetric(a, name):
+def _require_symmetric(a: Any, name: str) -> Any:
+    """Return the matrices `a` (..., 3, 3). **Raises:** `ValueError` (`equinox` error under `jit`)
+    if they are not symmetric to round-off; the text `name` names the matrices in the message.
+    """
     difference, bad = _asymmetry(a)
     difference_text = (
         f" (largest difference {float(difference.max()):.3g})" if _checks.is_known(a) else ""
@@ -259,14 +296,17 @@ def _require_symmetric(a, name):
     )
 
 
-def _without_derivatives(a):
-    """Return the numbers without derivatives, by NumPy if they are known: a check then costs
-    microseconds.
+def _without_derivatives(a: Any) -> Any:
+    """Return the array `a` as constants, whose derivatives are zero; as an array of NumPy if the
+    numbers are known, so that a check costs microseconds.
     """
     return np.asarray(a) if _checks.is_known(a) else lax.stop_gradient(a)
 
 
-def _eigenvalues(a):
+def _eigenvalues(a: Any) -> Any:
+    """Return the eigenvalues (..., 3), ascending, of symmetric matrices `a` (..., 3, 3), as
+    constants in derivatives; by NumPy if the numbers are known.
+    """
     if _checks.is_known(a):
         return np.linalg.eigvalsh(np.asarray(a))
     scale = jnp.abs(a).max(axis=(-1, -2), keepdims=True)
@@ -274,11 +314,17 @@ def _eigenvalues(a):
     return jnp.linalg.eigvalsh(lax.stop_gradient(a) / scale) * scale[..., 0]
 
 
-def _round_off_bound(a) -> float:
+def _round_off_bound(a: Any) -> float:
+    """Return the relative error that a check forgives in an array `a`: 64 units of round-off of its
+    dtype.
+    """
     return float(_FORGIVEN * jnp.finfo(a.dtype).eps)
 
 
-def _moments_as_text(moments) -> str:
+def _moments_as_text(moments: Any) -> str:
+    """Return principal moments as a text for messages, such as "(1, 2, 3)"; of a batch (n, 3), the
+    first three rows.
+    """
     return "; ".join(
         "(" + ", ".join(f"{float(x):.6g}" for x in row) + ")"
         for row in np.asarray(moments).reshape(-1, 3)[:3]

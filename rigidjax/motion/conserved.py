@@ -43,7 +43,7 @@ def energy(
         if not hasattr(part, "energy"):
             words = f"energy: wanted torques with a potential, got {type(part).__name__}, which has"
             raise TypeError(f"{words} no method energy(t, state, body); or take kinetic_energy")
-    return _energy(in_precision(body, turning.omega.dtype), turning, parts, t)
+    return _total_energy(in_precision(body, turning.omega.dtype), turning, parts, t)
 
 
 def conserved(
@@ -80,9 +80,9 @@ def conserved(
     body = in_precision(body, dtype)
     quantities: dict[str, Float[Array, "..."]] = {}
     if all(hasattr(part, "energy") and getattr(part, "steady", False) for part in parts):
-        quantities["energy"] = _energy(body, turning, parts, t)
+        quantities["energy"] = _total_energy(body, turning, parts, t)
     outside = [part for part in parts if not hasattr(part, "internal_momentum")]
-    momentum = _momentum(body, turning, parts, t)
+    momentum = _total_angular_momentum(body, turning, parts, t)
     if not outside:
         quantities["momentum_squared"] = dot(momentum, momentum)
     if isinstance(turning, HasAttitude):
@@ -139,14 +139,14 @@ def drift(
             raise ValueError(f"{words}, got shape {leaf.shape}")
     at_all = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
     kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(turning)
-    spin = jax.vmap(lambda t, y: _spin_size(body, y, torque, t))(ts, ys)
+    spin = jax.vmap(lambda t, y: _angular_momentum_size(body, y, torque, t))(ts, ys)
     drifts = {}
     for name, values in at_all.items():
-        away = _row_lengths(values - jax.lax.slice_in_dim(values, 0, 1))
+        away = _lengths_over_time(values - jax.lax.slice_in_dim(values, 0, 1))
         if name == "energy":
             scale = kinetic
         elif name in ("linear_momentum", "momentum_about_origin"):
-            scale = _row_lengths(values)
+            scale = _lengths_over_time(values)
         else:
             scale = spin**2 if name == "momentum_squared" else spin
         scale = jnp.max(scale)
@@ -157,8 +157,19 @@ def drift(
 def _state_and_torques(
     body: Body, state: PyTree, torque: Torque | None, t: ScalarLike
 ) -> tuple[Any, tuple[Any, ...], Scalar]:
-    """Return three things: the state of the body; the torques, with the states of the torques
-    inserted; and the time.
+    """Check a state, a torque and a time, and return the three things from which conserved
+    quantities are computed: the state of motion (a `Spin`, `Attitude` or `Rigid`); a tuple of the
+    single torques and forces; and the time, as a scalar array, s.
+
+    A `Sum` of torques is taken apart into its members. A torque with states of its own (such as the
+    speed of a reaction wheel) is returned with the values of these states inserted, so that it can
+    be called as a torque without states.
+
+    - `body`: an `Inertia` or `MassProperties`
+    - `state`: a state of motion, or a `Coupled`: a state of motion together with the states of the
+      torques
+    - `torque`: a torque, a force, a `Sum` of several, or `None`
+    - `t`: s, the time of the state
     """
     if isinstance(state, Coupled):
         state, torque = state.motion, freeze(torque, state.own)
@@ -168,30 +179,61 @@ def _state_and_torques(
     return state, parts, _checks.array_of_shape(t, (), "t")
 
 
-def _energy(body: Body, state: HasSpin, parts: tuple[Any, ...], t: Scalar) -> Scalar:
+def _total_energy(body: Body, state: HasSpin, torques: tuple[Any, ...], t: Scalar) -> Scalar:
+    """Return the total energy of a body, J: its kinetic energy plus the potential energy of each
+    torque.
+
+    - `body`: an `Inertia` or `MassProperties`
+    - `state`: the state of motion
+    - `torques`: the torques and forces, each with a method `energy(t, state, body)`
+    - `t`: s, the time
+    """
     dtype, total = state.omega.dtype, kinetic_energy(body, state)
-    for part in parts:
-        value = in_precision(part, dtype).energy(t.astype(dtype), state, body)
+    for torque in torques:
+        value = in_precision(torque, dtype).energy(t.astype(dtype), state, body)
         total = total + value.astype(dtype)
     return total
 
 
-def _momentum(body: Body, state: HasSpin, parts: tuple[Any, ...], t: ScalarLike) -> Vec3:
-    """Return the whole angular momentum, (3,), kg m²/s, body frame: the sum of the momenta of the
-    body and of the wheels.
+def _total_angular_momentum(
+    body: Body, state: HasSpin, torques: tuple[Any, ...], t: ScalarLike
+) -> Vec3:
+    """Return the angular momentum (3,), kg m²/s, body frame, of the body and of the wheels inside
+    it.
+
+    - `body`: an `Inertia` or `MassProperties`
+    - `state`: the state of motion, with the body rate
+    - `torques`: the torques and forces; each with a method `internal_momentum(t)`, as wheels have,
+      adds the momentum that this method returns
+    - `t`: s, the time
     """
     momentum = angular_momentum(body, state)
-    for part in parts:
-        if hasattr(part, "internal_momentum"):
-            momentum = momentum + part.internal_momentum(t).astype(momentum.dtype)
+    for torque in torques:
+        if hasattr(torque, "internal_momentum"):
+            momentum = momentum + torque.internal_momentum(t).astype(momentum.dtype)
     return momentum
 
 
-def _spin_size(body: Body, state: PyTree, torque: Torque | None, t: ScalarLike) -> Scalar:
+def _angular_momentum_size(
+    body: Body, state: PyTree, torque: Torque | None, t: ScalarLike
+) -> Scalar:
+    """Return the length of the angular momentum of the body and of the wheels inside it, kg m²/s.
+
+    - `body`: an `Inertia` or `MassProperties`
+    - `state`: the state of motion, or a `Coupled`: a state of motion together with the states of
+      the torques
+    - `torque`: a torque, a force, a `Sum` of several, or `None`
+    - `t`: s, the time
+    """
     state, parts, t = _state_and_torques(body, state, torque, t)
-    return length_or_zero(_momentum(in_precision(body, state.omega.dtype), state, parts, t))
+    return length_or_zero(
+        _total_angular_momentum(in_precision(body, state.omega.dtype), state, parts, t)
+    )
 
 
-def _row_lengths(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:
-    """Return the length of each row, or the absolute values of plain numbers."""
+def _lengths_over_time(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:
+    """Return, for each time, the length of a vector or the absolute value of a number, (n,).
+
+    - `values`: (n, 3), a vector for each of n times; or (n,), a number for each time
+    """
     return jnp.abs(values) if values.ndim == 1 else jnp.sqrt(jnp.sum(values**2, axis=-1))

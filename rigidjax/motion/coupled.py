@@ -45,7 +45,16 @@ class Coupled(eqx.Module):
 
 
 class CoupledEquations(eqx.Module):
-    """Evaluate the equations of a body, `field`, and of its torques' states as one vector field."""
+    """Evaluate the equations of motion of a body and of the states of its torques as one vector
+    field `f(t, y, args)`.
+
+    The state y is a `Coupled`: the state of motion, and the states that torques have of their own,
+    such as the momentum of a wheel.
+
+    - `field`: the vector field of the body alone, such as `EulerEquations`, which contains the
+      torque
+    - `body`: the `Inertia` or `MassProperties`, which the torque may read
+    """
 
     field: Callable[..., Any]
     body: Any
@@ -59,12 +68,22 @@ class CoupledEquations(eqx.Module):
 
 
 def with_own_states(body: Body | None, state0: PyTree, torque: PyTree, t: ScalarLike) -> Any:
-    """Return `state0`, as a `Coupled` if the torque has states of its own."""
+    """Return the start of an integration: `state0` itself, or, if the torque has states of its own
+    (such as the speed of a wheel), a `Coupled` of `state0` and the initial values of the states of
+    the torque.
+
+    - `body`: an `Inertia` or `MassProperties`
+    - `state0`: a `Spin`, `Attitude` or `Rigid`; a `Coupled` is returned unchanged
+    - `torque`: a torque, a force or `None`
+    - `t`: s, the time of the start
+    """
     if isinstance(state0, Coupled) or not has_states(torque):
         return state0
     return Coupled.start(body, state0, torque, t)
 
 
 def motion_of(y: PyTree) -> Any:
-    """Return the body's part of the state `y`, which may be a `Coupled`."""
+    """Return the state of motion (a `Spin`, `Attitude` or `Rigid`) in `y`, which is a `Coupled` (a
+    state of motion together with the states of the torques), or is a state of motion itself.
+    """
     return y.motion if isinstance(y, Coupled) else y

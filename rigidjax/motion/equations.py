@@ -120,14 +120,24 @@ class EulerEquations(eqx.Module):
         return Spin(self.rate_of(t, y))
 
     def rate_of(self, t: ScalarLike, state: HasSpin) -> Vec3:
-        """Return dΩ/dt (3,), rad/s², body frame, of any state with a body rate."""
+        """Return dΩ/dt (3,), rad/s², body frame: the derivative of the body rate under the torque
+        of the equations.
+
+        - `t`: s, the time
+        - `state`: any state with a body rate Ω and with what else the torque reads
+        """
         torque = None
         if self.torque is not None:
             torque = evaluate(self.torque, t, state, self.inertia)
         return self.rate_under_torque(torque, state)
 
     def rate_under_torque(self, torque: Vec3 | None, state: HasSpin) -> Vec3:
-        """Return dΩ/dt (3,), rad/s², body frame, under a known torque (3,), N m, body frame."""
+        """Return dΩ/dt = I⁻¹ (IΩ × Ω + τ), (3,), rad/s², body frame: the derivative of the body
+        rate under a known torque.
+
+        - `torque`: τ (3,), N m, body frame, or `None` for no torque
+        - `state`: any state with a body rate Ω
+        """
         dtype = state.omega.dtype
         momentum = apply(self.inertia.tensor.astype(dtype), state.omega)
         turning = cross(momentum, state.omega)
@@ -137,7 +147,12 @@ class EulerEquations(eqx.Module):
 
 
 class AttitudeEquations(eqx.Module):
-    """Evaluate Euler's equations and `dq/dt = ½ q ⊗ (0, Ω)` (notes, eq 50) as a vector field."""
+    """Evaluate the equations of motion of a body that turns, Euler's equations `I dΩ/dt = IΩ × Ω +
+    τ` and `dq/dt = ½ q ⊗ (0, Ω)` (notes, eq 50), as a vector field `f(t, y, args)`.
+
+    The state y is an `Attitude`: the quaternion q, body → world, and the body rate Ω. `inertia` I
+    is about the point that the body turns about; `torque` gives τ, N m, body frame, or is `None`.
+    """
 
     euler: EulerEquations
 
@@ -176,8 +191,11 @@ class NewtonEuler(eqx.Module):
 
 
 def project_to_group(state: State) -> State:
-    """Return the state with its quaternion, if it has one, scaled to length 1; refuse a quaternion
-    of zero.
+    """Return the state with its quaternion, if it has one, scaled to length 1; other numbers of the
+    state do not change. **Raises:** `ValueError` if the known quaternion is zero.
+
+    - `state`: a `Spin`, `Attitude`, `Rigid` or any other tree of arrays, or a `Coupled`: a state of
+      motion together with the states of the torques
     """
     if isinstance(state, Coupled):
         return eqx.tree_at(lambda s: s.motion, state, project_to_group(state.motion))
@@ -188,16 +206,18 @@ def project_to_group(state: State) -> State:
             _checks.error_if(
                 q, length**2 == 0, f"state.q: wanted a length near 1, got {length:.3g}"
             )
-        return eqx.tree_at(lambda s: s.q, state, _normalise(state.q))
+        return eqx.tree_at(lambda s: s.q, state, _normalise_reproducibly(state.q))
     return state
 
 
-def _normalise(q: Quat) -> Quat:
-    """Return q/|q|, with equal rounding in every program.
+def _normalise_reproducibly(q: Quat) -> Quat:
+    """Return the quaternion `q` (4,) divided by its length, rounded to the same digits in every
+    compiled program.
 
-    XLA replaces q/√n by a product with 1/√n in some programs. Reverse mode runs steps again in
-    another program: a different last digit changes step lengths, and the gradient would belong to
-    another discretisation (an error of 7e-6 at a tolerance of 1e-11). A root and a quotient that
-    are separate operations round equally everywhere.
+    XLA replaces q/√n, where n is the squared length of q, by a product with 1/√n in some programs.
+    Reverse-mode differentiation computes the steps of a solver again in another program: a
+    different last digit changes the step lengths, and the gradient would belong to another
+    discretisation (an error of 7e-6 at a tolerance of 1e-11). A root and a quotient that are
+    separate operations round equally everywhere.
     """
     return q / lax.optimization_barrier(jnp.sqrt(square4(components(q))))

@@ -22,14 +22,17 @@ from rigidjax.rotation.linalg3 import components
 
 
 def dimension(state: PyTree) -> int:
-    """Return the size of a change of `state`: the count of its numbers, less one for each
-    quaternion.
+    """Return the length n of the vector that describes a small change of `state` (a tree of
+    arrays): the count of its numbers, less one for each quaternion, whose change is a rotation
+    vector of three numbers.
     """
-    return max((place.stop for place in _places(state)), default=0)
+    return max((place.stop for place in _slices_of_leaves(state)), default=0)
 
 
 def names(state: PyTree) -> tuple[str, ...]:
-    """Return the names of the leaves, in the order of their numbers in a change."""
+    """Return the names of the leaves (arrays) of `state`, such as "q" and "omega", in the order in
+    which their numbers stand in the vector of a change of the state.
+    """
     paths = jax.tree.leaves_with_path(state)
     return tuple(jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths)
 
@@ -37,35 +40,47 @@ def names(state: PyTree) -> tuple[str, ...]:
 def parts_by_name(
     state: PyTree, change: Float[Array, "*batch n"]
 ) -> dict[str, Float[Array, "*batch _"]]:
-    """Return those numbers of a change that belong to each leaf, by the name of the leaf; a
-    quaternion has three numbers in a change.
+    """Return, by the name of each leaf (array) of `state`, the numbers of a change of the state
+    that belong to this leaf; a quaternion has three numbers in a change.
+
+    - `state`: a tree of arrays
+    - `change`: (..., n), the changes of all leaves one after another, n = `dimension(state)`
     """
-    cut = (change[..., place] for place in _places(state))
+    cut = (change[..., place] for place in _slices_of_leaves(state))
     return dict(zip(names(state), cut, strict=True))
 
 
 def rotation_slices(state: PyTree) -> tuple[slice, ...]:
-    """Return the slices of the rotation vectors in a change, one for each quaternion."""
-    pairs = zip(_places(state), _is_quaternion(state), strict=True)
+    """Return the slices of the rotation vectors (three numbers each) in the vector of a change of
+    `state` (a tree of arrays), one slice for each quaternion of the state.
+    """
+    pairs = zip(_slices_of_leaves(state), _quaternion_flags(state), strict=True)
     return tuple(place for place, turned in pairs if turned)
 
 
 def plus(state: PyTree, change: Float[Array, " n"]) -> Any:
-    """Return `state ⊕ change`: q exp(δθ) for quaternions, sums for other leaves; exactly `state` at
-    0.
+    """Return the state after a small change, `state ⊕ change`: q exp(δθ) for a quaternion q, the
+    sum for any other leaf (array); exactly `state` if the change is zero.
+
+    - `state`: a tree of arrays
+    - `change`: (n,), the changes of all leaves one after another; for a quaternion, the rotation
+      vector δθ (3,), rad, body frame
     """
 
     def rotate(q: Array, part: Array) -> Array:
         return quaternion.multiply(q, vector_to_quaternion(part))
 
-    return _leaf_by_leaf(state, change, rotate, jnp.add)
+    return _map_leaves(state, change, rotate, jnp.add)
 
 
 def minus(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
-    """Return `state ⊖ reference`: the change with `plus(reference, change) = state`, a turn of up
-    to π.
+    """Return the change (n,) from one state to another, `state ⊖ reference`: the vector with
+    `plus(reference, change) = state`.
+
+    - `state`, `reference`: two trees of arrays with one structure; the quaternions of the two may
+      differ by a turn of up to π
     """
-    return _vector(
+    return _concatenate_over_leaves(
         state,
         reference,
         lambda q, q0: quaternion_to_vector(quaternion.multiply(quaternion.conjugate(q0), q)),
@@ -74,9 +89,10 @@ def minus(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
 
 
 def minus_small(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
-    """Return `state ⊖ reference` for a near state, without an arctangent.
+    """Return the change (n,) from one state to another near it, `state ⊖ reference`, computed
+    without an arctangent: a turn by the angle θ gives 2 sin(θ/2), not θ.
 
-    A turn by θ gives 2 sin(θ/2), not θ.
+    - `state`, `reference`: two trees of arrays with one structure
     """
 
     def turn(q: Array, q0: Array) -> Array:
@@ -84,20 +100,28 @@ def minus_small(state: PyTree, reference: PyTree) -> Float[Array, " n"]:
         twice = jnp.where(w < 0, -2.0, 2.0).astype(w.dtype)
         return jnp.stack([twice * part for part in u])
 
-    return _vector(state, reference, turn, jnp.subtract)
+    return _concatenate_over_leaves(state, reference, turn, jnp.subtract)
 
 
 def tangent(state: PyTree, change: Float[Array, " n"]) -> Any:
-    """Return the derivative of `plus(state, ·)` at zero along `change`: a tangent vector of JAX."""
-    return _leaf_by_leaf(state, change, quaternion.rate, lambda _, part: part)
+    """Return the derivative of `plus(state, s change)` with respect to s at s = 0: a tree like
+    `state`, which JAX takes as a tangent.
+
+    - `state`: a tree of arrays
+    - `change`: (n,), the changes of all leaves one after another; for a quaternion, a rotation
+      vector (3,), body frame
+    """
+    return _map_leaves(state, change, quaternion.rate, lambda _, part: part)
 
 
 def tangent_to_vector(state: PyTree, tangent_vector: PyTree) -> Float[Array, " n"]:
-    """Return the change whose `tangent` at `state` is `tangent_vector`.
+    """Return the vector (n,) of the change whose tangent is given: the inverse of `tangent`.
 
-    This function is the inverse of `tangent`.
+    - `state`: a tree of arrays
+    - `tangent_vector`: a tree like `state`, with the derivative of each leaf; dq (4,) for a
+      quaternion q
     """
-    return _vector(
+    return _concatenate_over_leaves(
         tangent_vector,
         state,
         lambda dq, q: 2.0 * quaternion.multiply(quaternion.conjugate(q), dq)[1:],
@@ -105,8 +129,10 @@ def tangent_to_vector(state: PyTree, tangent_vector: PyTree) -> Float[Array, " n
     )
 
 
-def _is_quaternion(state: PyTree) -> list[bool]:
-    """Return, for each leaf, whether it is the quaternion of a state with an attitude."""
+def _quaternion_flags(state: PyTree) -> list[bool]:
+    """Return one flag for each leaf (array) of `state`, a tree of arrays: true if the leaf is the
+    quaternion `q` of an `Attitude`, a `Rigid` or another state with an attitude.
+    """
     out = []
     for node in jax.tree.leaves(state, is_leaf=lambda node: isinstance(node, HasAttitude)):
         q = node.q if isinstance(node, HasAttitude) else None
@@ -114,46 +140,62 @@ def _is_quaternion(state: PyTree) -> list[bool]:
     return out
 
 
-def _places(state: PyTree) -> list[slice]:
-    """Return the slice of each leaf's numbers in a change."""
+def _slices_of_leaves(state: PyTree) -> list[slice]:
+    """Return, for each leaf (array) of `state`, the slice of the vector of a change that belongs to
+    the leaf.
+
+    The vector holds the changes of all leaves one after another: three numbers (a rotation vector)
+    for a quaternion, and as many numbers as the leaf has for any other leaf.
+    """
     end, out = 0, []
-    for leaf, turned in zip(jax.tree.leaves(state), _is_quaternion(state), strict=True):
+    for leaf, turned in zip(jax.tree.leaves(state), _quaternion_flags(state), strict=True):
         begin, end = end, end + math.prod(jnp.shape(leaf)) - turned
         out.append(slice(begin, end))
     return out
 
 
-def _leaf_by_leaf(
+def _map_leaves(
     state: PyTree,
     change: Array,
     of_quaternion: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> Any:
-    """Return a tree like `state`, whose leaves are `of_quaternion(leaf, part)` for quaternions and
-    `of_others(leaf, part)` for other leaves.
+    """Return a tree like `state`, changed leaf by leaf: one function changes quaternions, another
+    all other arrays.
 
-    Here `part` holds the numbers of `change` that belong to the leaf.
+    - `state`: a tree of arrays
+    - `change`: (n,), the changes of all leaves one after another
+    - `of_quaternion`: a function (q, part) of a quaternion (4,) and its rotation vector (3,)
+    - `of_others`: a function (leaf, part) of any other array and its change, of equal shape
     """
     (leaves, tree), out = jax.tree.flatten(state), []
-    for leaf, place, turned in zip(leaves, _places(state), _is_quaternion(state), strict=True):
+    for leaf, place, turned in zip(
+        leaves, _slices_of_leaves(state), _quaternion_flags(state), strict=True
+    ):
         part = change[place] if turned else change[place].reshape(jnp.shape(leaf))
         out.append(of_quaternion(leaf, part) if turned else of_others(leaf, part))
     return jax.tree.unflatten(tree, out)
 
 
-def _vector(
+def _concatenate_over_leaves(
     first: PyTree,
     second: PyTree,
     of_quaternions: Callable[[Array, Array], Array],
     of_others: Callable[[Array, Array], Array],
 ) -> Array:
-    """Return one vector, made of `of_quaternions(a, b)` for quaternions and `of_others(a, b)` for
-    other leaves.
+    """Return one vector (n,), computed leaf by leaf from two trees: one function is applied to each
+    quaternion of a state and the array at the same place of the other tree, another function to all
+    other pairs of arrays.
 
-    Here a is a leaf of the tree `first`, and b the leaf at the same place of the tree `second`.
+    - `first`, `second`: two trees of arrays with one structure; `second` is a state, and says which
+      leaves are quaternions
+    - `of_quaternions`: a function (a, b) of the array (4,) in `first` and the quaternion (4,) in
+      `second`, which returns three numbers
+    - `of_others`: a function (a, b) of two arrays of equal shape, which returns an array of this
+      shape
     """
     pairs = zip(
-        jax.tree.leaves(first), jax.tree.leaves(second), _is_quaternion(second), strict=True
+        jax.tree.leaves(first), jax.tree.leaves(second), _quaternion_flags(second), strict=True
     )
     out = [
         of_quaternions(a, b) if turned else of_others(a, b).reshape(-1) for a, b, turned in pairs

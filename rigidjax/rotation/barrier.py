@@ -33,7 +33,8 @@ def platform() -> str:
 
 
 def barrier(tree: Tree) -> Tree:
-    """Return the numbers of `tree` unchanged, such that XLA computes them once for all their uses.
+    """Return the arrays of `tree` unchanged, such that XLA on CPU computes each once for all its
+    uses, instead of repeating its operations at each use.
 
     This is `lax.optimization_barrier`, or `compute_once` where XLA drops barriers.
 
@@ -88,7 +89,7 @@ def compiled_as_one_kernel(function: Function) -> Function:
         return lax.while_loop(lambda c: c[0] < 1, turn, (jnp.zeros_like(step), args, blank))[2]
 
     @call_unbatched.def_vmap
-    def _call_batched(size: int, batched: PyTree, *args: PyTree) -> Any:
+    def _call_under_vmap(size: int, batched: PyTree, *args: PyTree) -> Any:
         del size
         axes = jax.tree.map(lambda b: 0 if b else None, tuple(batched))
         # JAX before 0.12 calls this rule also where only tangents are batched; no argument is
@@ -107,28 +108,42 @@ def compiled_as_one_kernel(function: Function) -> Function:
 
 @jax.custom_jvp
 def batch_as(tree: PyTree, args: PyTree) -> Any:
-    """Return `tree` with every leaf batched if any leaf of `args` is batched.
+    """Return `tree` with every array batched by `jax.vmap` if any array of `args` is batched.
 
     This repeats what the batching rule of `compiled_as_one_kernel` returns. Under `jit`, JAX takes
     the axes of a batch from the function, and the values from the rule for the derivative. If the
     function and the rule batch differently, arrays have wrong shapes, and no error is raised.
     """
-    return _broadcast(tree, args)
+    return _batch_like(tree, args)
 
 
 @batch_as.defjvp
 def _batch_as_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
+    """Return `batch_as` of the two arguments, and its derivative: the change of the first argument,
+    unchanged.
+    """
     return batch_as(*primals), tangents[0]
 
 
 @jax.custom_batching.custom_vmap
-def _broadcast(tree: PyTree, args: PyTree) -> Any:
+def _batch_like(tree: PyTree, args: PyTree) -> Any:
+    """Return `tree` unchanged. Under `jax.vmap` every array of `tree` is batched if any array of
+    `args` is batched.
+    """
     del args
     return tree
 
 
-@_broadcast.def_vmap
-def _broadcast_batched(size: int, batched: PyTree, tree: PyTree, args: PyTree) -> Any:
+@_batch_like.def_vmap
+def _batch_like_under_vmap(size: int, batched: PyTree, tree: PyTree, args: PyTree) -> Any:
+    """Return what `jax.vmap` wants of a function that returns `tree` unchanged: the tree, with
+    every array batched if any argument is batched; and for each array whether it is batched.
+
+    - `size`: the number of members of the batch
+    - `batched`: a pair of trees of truth values: which arrays of `tree`, and which of `args`, have
+      a batch axis in front
+    - `tree`, `args`: two trees of arrays; `args` serves only to say whether there is a batch
+    """
     del args
     if not any(jax.tree.leaves(batched)):
         return tree, batched[0]

@@ -40,7 +40,7 @@ def to_quaternion(angles: Vec3Like, sequence: str = "ZXZ") -> Quat:
     >>> to_quaternion(jnp.array([0.0, jnp.pi, 0.0])).round(12).tolist()
     [0.0, 1.0, 0.0, 0.0]
     """
-    axes, reverse = _axis_numbers(sequence)
+    axes, reverse = _axes_of_sequence(sequence)
     first, second, third = map(_rotation_about, axes, _reverse_if(_checked_angles(angles), reverse))
     return quaternion.multiply(quaternion.multiply(first, second), third)
 
@@ -83,7 +83,7 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     >>> from_quaternion(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
     [0.0, 0.0, 0.0]
     """
-    (i, j, k), reverse = _axis_numbers(sequence)
+    (i, j, k), reverse = _axes_of_sequence(sequence)
     q = quaternion.canonical(require_direction(_checks.array_of_shape(q, (4,), "q"), "q"))
     q = power_of_two_scale(*components(q)) * q
     symmetric = i == k
@@ -109,7 +109,11 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     s, c = jnp.sqrt(jnp.where(low, 1, flat)), jnp.sqrt(jnp.where(high, 1, up))
     s, c = jnp.where(low, 0, s), jnp.where(high, 0, c)
     middle = 2 * jnp.arctan2(s, c) if symmetric else handed * 2 * jnp.arctan2(c - s, c + s)
-    angles = [_wrap(half_sum + half_difference), middle, _wrap(half_sum - half_difference)]
+    angles = [
+        _wrap_to_half_turn(half_sum + half_difference),
+        middle,
+        _wrap_to_half_turn(half_sum - half_difference),
+    ]
     return jnp.stack(angles[::-1] if reverse else angles)
 
 
@@ -122,8 +126,8 @@ def is_singular(angles: Vec3Like, sequence: str = "ZXZ") -> Bool[Array, ""]:
     >>> bool(is_singular(jnp.array([0.1, 0.0, 0.0]), "ZXZ"))
     True
     """
-    axes, _ = _axis_numbers(sequence)
-    return _singularity(_checked_angles(angles)[1], axes)[1]
+    axes, _ = _axes_of_sequence(sequence)
+    return _triple_product_of_axes(_checked_angles(angles)[1], axes)[1]
 
 
 def rates_to_omega(
@@ -143,9 +147,9 @@ def rates_to_omega(
     [0.0, 0.0, 2.0]
     """
     _checks.require_option(frame, ("body", "world"), "frame")
-    axes, reverse = _axis_numbers(sequence)
+    axes, reverse = _axes_of_sequence(sequence)
     angles, rates = _checked_angles(angles), _checks.array_of_shape(rates, (3,), "rates")
-    first, second, third = _turning_axes(axes, _reverse_if(angles, reverse))
+    first, second, third = _turn_axes_in_body(axes, _reverse_if(angles, reverse))
     a, b, c = _reverse_if(rates, reverse)
     omega = a * first + b * second + c * third
     return omega if frame == "body" else apply(to_matrix(angles, sequence), omega)
@@ -168,12 +172,12 @@ def omega_to_rates(
     [0.0, 0.0, 2.0]
     """
     _checks.require_option(frame, ("body", "world"), "frame")
-    axes, reverse = _axis_numbers(sequence)
+    axes, reverse = _axes_of_sequence(sequence)
     angles, omega = _checked_angles(angles), _checks.array_of_shape(omega, (3,), "omega")
     if frame == "world":
         omega = apply(to_matrix(angles, sequence).T, omega)
-    first, second, third = _turning_axes(axes, _reverse_if(angles, reverse))
-    reach, singular = _singularity(angles[1], axes)
+    first, second, third = _turn_axes_in_body(axes, _reverse_if(angles, reverse))
+    reach, singular = _triple_product_of_axes(angles[1], axes)
     # `second` is normal to `first` and `third`; `aside`, `second` and `third` are an orthonormal
     # frame.
     aside, along = cross(third, second), dot(first, third)
@@ -184,21 +188,32 @@ def omega_to_rates(
     return jnp.stack([c, b, a] if reverse else [a, b, c])
 
 
-def _axis_numbers(sequence: str) -> tuple[tuple[int, int, int], bool]:
-    """Return the axis numbers of the three intrinsic turns, and whether the angles are listed in
-    reverse.
+def _axes_of_sequence(sequence: str) -> tuple[tuple[int, int, int], bool]:
+    """Return two things about a sequence of Euler angles: the axis numbers (0 for x, 1 for y, 2 for
+    z) of the three intrinsic turns, each about the axis that the turns before it have moved; and
+    whether the angles are listed in the opposite order, as they are for an extrinsic sequence
+    (lower case). **Raises:** `ValueError` for an unknown sequence.
+
+    - `sequence`: three letters such as "ZXZ" or "xyz"
     """
     extrinsic = isinstance(sequence, str) and sequence.islower()
     letters = "xyz" if extrinsic else "XYZ"
     if not isinstance(sequence, str) or len(sequence) != 3 or not set(sequence) <= set(letters):
-        raise ValueError(_unknown_sequence(sequence, "three letters of one case are wanted"))
+        raise ValueError(
+            _unknown_sequence_message(sequence, "three letters of one case are wanted")
+        )
     i, j, k = (letters.index(letter) for letter in sequence)
     if i == j or j == k:
-        raise ValueError(_unknown_sequence(sequence, "two turns in a row are about one axis"))
+        raise ValueError(
+            _unknown_sequence_message(sequence, "two turns in a row are about one axis")
+        )
     return ((k, j, i) if extrinsic else (i, j, k)), extrinsic
 
 
-def _unknown_sequence(sequence: object, reason: str) -> str:
+def _unknown_sequence_message(sequence: object, reason: str) -> str:
+    """Return the message that refuses `sequence` as the name of a sequence of Euler angles, with
+    the `reason`.
+    """
     return (
         f"sequence: unknown {sequence!r}, {reason}; capitals are intrinsic (moving axes) as in "
         "'ZXZ' or 'ZYX', lower case is extrinsic (fixed axes) as in 'xyz'"
@@ -206,6 +221,9 @@ def _unknown_sequence(sequence: object, reason: str) -> str:
 
 
 def _checked_angles(angles: Vec3Like) -> Vec3:
+    """Return three Euler angles (3,), rad, as an array. **Warns** if a known angle is beyond four
+    turns: it may be in degrees.
+    """
     angles = require_turn(_checks.array_of_shape(angles, (3,), "angles"), "angles")
     if _checks.is_known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
         words = "are over four turns: are they degrees? use jnp.deg2rad"
@@ -214,30 +232,43 @@ def _checked_angles(angles: Vec3Like) -> Vec3:
 
 
 def _reverse_if(numbers: Vec3, reverse: bool) -> tuple[Scalar, Scalar, Scalar]:
+    """Return the three `numbers` as a tuple of scalars, in the opposite order if `reverse` is
+    true.
+    """
     a, b, c = numbers
     return (c, b, a) if reverse else (a, b, c)
 
 
 def _handedness(i: int, j: int) -> int:
-    """Return +1 if e_i × e_j is the third basis vector, −1 if it is the opposite vector."""
+    """Return +1 if e_i × e_j is the third of the basis vectors e_0, e_1, e_2 (x, y, z), and −1 if
+    it is the opposite vector, for two axis numbers `i` ≠ `j`.
+    """
     return 1 if (j - i) % 3 == 1 else -1
 
 
 def _rotation_about(axis: int, angle: Scalar) -> Quat:
+    """Return the unit quaternion of a turn by `angle`, rad, about the basis vector number `axis` (0
+    for x, 1 for y, 2 for z).
+    """
     parts = [jnp.cos(0.5 * angle)] + [jnp.zeros_like(angle)] * 3
     parts[1 + axis] = jnp.sin(0.5 * angle)
     return jnp.stack(parts)
 
 
-def _wrap(angle: Scalar) -> Scalar:
-    """Return an angle in (−2π, 2π) shifted by a full turn into (−π, π]."""
+def _wrap_to_half_turn(angle: Scalar) -> Scalar:
+    """Return an angle, rad, in (−2π, 2π), shifted by a full turn into (−π, π] if it lies
+    outside.
+    """
     angle = jnp.where(angle > np.pi, angle - 2 * np.pi, angle)
     return jnp.where(angle <= -np.pi, angle + 2 * np.pi, angle)
 
 
-def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3, Vec3]:
-    """Return the axes of the three turns in the body frame: each axis is what a unit rate of the
-    angle adds to Ω.
+def _turn_axes_in_body(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3, Vec3]:
+    """Return the axes of the three turns of Euler angles as unit vectors (3,) in the body frame:
+    the angular velocity of the body is the sum of these axes, each times the rate of its angle.
+
+    - `axes`: the axis numbers of the three intrinsic turns (0 for x, 1 for y, 2 for z)
+    - `angles`: the three angles of these turns, rad
     """
     _, j, k = axes
     first, second, third = (jnp.eye(3, dtype=angles[0].dtype)[axis] for axis in axes)
@@ -246,9 +277,15 @@ def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3
     return first, quaternion.rotate_inverse(last, second), third
 
 
-def _singularity(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
-    """Return two things: the product first · (third × second) of the three axes; and whether this
-    product is 0 to round-off.
+def _triple_product_of_axes(
+    middle: Scalar, axes: tuple[int, int, int]
+) -> tuple[Scalar, Bool[Array, ""]]:
+    """Return two things that tell how near Euler angles are to the singular case ("gimbal lock"):
+    the product first · (third × second) of the unit axes of the three turns; and whether this
+    product is zero to round-off.
+
+    - `middle`: the middle angle, rad
+    - `axes`: the axis numbers of the three intrinsic turns (0 for x, 1 for y, 2 for z)
     """
     i, j, k = axes
     size = jnp.sin(middle) if i == k else -_handedness(i, j) * jnp.cos(middle)

@@ -97,12 +97,12 @@ def wahba(
     # weight.
     closer = jnp.where(heavy > 0, jnp.maximum(heavy, _LIGHT * jnp.max(heavy)), 0)
     try:
-        best = nearest_rotation(_weighted_sum(closer, those, these))
+        best = nearest_rotation(_weighted_outer_products(closer, those, these))
         for _ in range(4):
-            best = _newton_step(best, heavy, those, these)
+            best = _newton_step_of_wahba(best, heavy, those, these)
         # Each Newton step from the solution doubles the order to which derivatives are right.
         for _ in range(2):
-            best = _newton_step(best, w, world, body)
+            best = _newton_step_of_wahba(best, w, world, body)
     except ValueError:
         raise ValueError(words) from None
     # The determinant `firmness` is (σ1 + σ2)(σ2 + σ3)(σ3 + σ1) with the singular values σ of b,
@@ -112,37 +112,48 @@ def wahba(
     # The first two rows test the directions of each frame alone, without weights, at the identity:
     # `best` is the best rotation of the weighted pairs only.
     for turn, b, least in (
-        (one, _weighted_sum(seen, those, those), 4 * np.sqrt(eps)),
-        (one, _weighted_sum(seen, these, these), 4 * np.sqrt(eps)),
-        (lax.stop_gradient(best), _weighted_sum(heavy, those, these), 64 * eps),
+        (one, _weighted_outer_products(seen, those, those), 4 * np.sqrt(eps)),
+        (one, _weighted_outer_products(seen, these, these), 4 * np.sqrt(eps)),
+        (lax.stop_gradient(best), _weighted_outer_products(heavy, those, these), 64 * eps),
     ):
-        firmness = determinant(_curvature(turn, b / jnp.sqrt((b * b).sum())))
+        firmness = determinant(_curvature_of_gain(turn, b / jnp.sqrt((b * b).sum())))
         loose = loose | ~(firmness > least)
     return _checks.error_if(best, loose, words)
 
 
-def _weighted_sum(
-    w: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
+def _weighted_outer_products(
+    weights: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
 ) -> Mat3:
-    """Return Σ w_i world_i body_iᵀ."""
-    return (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
+    """Return the matrix Σ wᵢ world_i body_iᵀ (3, 3) of pairs of directions.
+
+    - `weights`: w (n,)
+    - `world`, `body`: (n, 3), each direction in the world frame and in the body frame
+    """
+    return (weights[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
 
 
-def _newton_step(
+def _newton_step_of_wahba(
     best: Mat3, w: Float[Array, "n"], world: Float[Array, "n 3"], body: Float[Array, "n 3"]
 ) -> Mat3:
-    """Return the rotation M after one Newton step from `best` towards the largest Σ w_i world_i · M
-    body_i.
+    """Return the rotation matrix M (3, 3), body → world, after one Newton step towards the largest
+    Σ w_i world_i · M body_i, the best fit to pairs of directions.
 
     The cross product of `world_i` and `M body_i` is computed from the small difference of the two
     vectors, so that its rounding error is small, too. Otherwise the rounding of a direction with a
     large weight would turn the body about this direction.
+
+    - `best`: (3, 3), the rotation matrix to start from
+    - `w`: (n,), the weights
+    - `world`, `body`: (n, 3), each direction in the world frame and in the body frame
     """
     moved = (best[None] * body[:, None, :]).sum(-1)
     lengths = [jnp.sqrt((x * x).sum(-1)) for x in lax.stop_gradient((moved, world))]
     ratio = lengths[0] / jnp.where(lengths[1] > 0, lengths[1], 1)
     moment = (w[:, None] * jax.vmap(cross)(moved - ratio[:, None] * world, world)).sum(0)
-    turn = solve(_curvature(jnp.eye(3, dtype=w.dtype), _weighted_sum(w, moved, world)), moment)
+    turn = solve(
+        _curvature_of_gain(jnp.eye(3, dtype=w.dtype), _weighted_outer_products(w, moved, world)),
+        moment,
+    )
     return product(quaternion.to_matrix(quaternion.exp(turn)), best)
 
 
@@ -206,13 +217,18 @@ def mean_quaternion(
     """
     q = _checks.array_of_rows(quaternions, (4,), "quaternions")
     _checks.check_if_known(require_unit_quaternion, q, "quaternions")
-    return _karcher(q, scale_to_order_one(checked_weights(weights, q[:, 0], "quaternions")))
+    return _karcher_mean(q, scale_to_order_one(checked_weights(weights, q[:, 0], "quaternions")))
 
 
 # Compiled once: outside of `jit` the loop would be compiled again at each call.
 @partial(jax.jit, inline=True)
-def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
-    """Return the Karcher mean of the quaternions `q` with weights `w`, by Newton's method."""
+def _karcher_mean(quaternions: Float[Array, "n 4"], weights: Float[Array, "n"]) -> Quat:
+    """Return the Karcher mean, the unit quaternion (4,) that minimises the weighted sum of the
+    squared angles to several rotations, by Newton's method.
+
+    - `quaternions`: (n, 4), unit, each of either sign
+    - `weights`: (n,), not negative
+    """
 
     def newton(_: Array | int, start: Quat, q: Array, w: Array) -> Quat:
         apart = jax.vmap(lambda each: quaternion.multiply(quaternion.conjugate(start), each))(q)
@@ -220,18 +236,19 @@ def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
         slope = (w[:, None, None] * jax.vmap(left_jacobian_inverse)(v)).sum(0)
         return quaternion.multiply(start, quaternion.exp(solve(slope, (w[:, None] * v).sum(0))))
 
-    fixed_q, fixed_w = lax.stop_gradient((q, w))
+    fixed_q, fixed_w = lax.stop_gradient((quaternions, weights))
     chord = (fixed_w[:, None, None] * jax.vmap(quaternion.to_matrix)(fixed_q)).sum(0)
     start = matrix_to_quaternion(nearest_rotation(chord))
     start = lax.fori_loop(0, 6, lambda i, s: newton(i, s, fixed_q, fixed_w), start)
     # Each Newton step from the solution doubles the order to which derivatives are right.
     for i in range(2):
-        start = newton(i, lax.stop_gradient(start) if i == 0 else start, q, w)
+        start = newton(i, lax.stop_gradient(start) if i == 0 else start, quaternions, weights)
     return quaternion.canonical(quaternion.normalise(start))
 
 
 def scale_to_order_one(x: Array) -> Array:
-    """Return the array multiplied by a power of two that brings its largest entry near 1.
+    """Return an array `x` of any shape multiplied by a power of two that brings its largest entry
+    near 1.
 
     Formulas of ratios, in which the scale cancels, use this function: no product then overflows.
     """
@@ -239,8 +256,12 @@ def scale_to_order_one(x: Array) -> Array:
 
 
 def checked_weights(weights: ArrayLike | None, rows: Array, description: str) -> Array:
-    """Return one weight for each row of `rows`: `weights`, or ones if `weights` is `None`; known
-    weights must have a positive sum.
+    """Return one weight (n,) for each of n items. **Raises:** `ValueError` if there is no item, and
+    if known weights are negative or all zero.
+
+    - `weights`: (n,), or `None` for ones
+    - `rows`: (n,), an array with the dtype of the result and one entry for each item
+    - `description`: the name of the items, for messages
     """
     if rows.shape[0] == 0:
         raise ValueError(f"{description}: wanted at least one row, got none")
@@ -254,10 +275,12 @@ def checked_weights(weights: ArrayLike | None, rows: Array, description: str) ->
     return w
 
 
-def _quartic(b: Mat3) -> tuple[Scalar, Scalar]:
-    """Return two numbers of a matrix `b` of Frobenius norm 1 (Markley 1993): λ, the sum of the
-    singular values, in which the smallest has the sign of the determinant; and ζ = ½ (λ² − 1) λ −
-    det b.
+def _signed_singular_value_sum(b: Mat3) -> tuple[Scalar, Scalar]:
+    """Return two scalars from which the rotation nearest to a matrix follows (Markley 1993): λ, the
+    sum of the singular values, in which the smallest has the sign of the determinant; and ζ = ½ (λ²
+    − 1) λ − det b. λ is the largest root of a quartic equation, found by Newton's method.
+
+    - `b`: (3, 3), of Frobenius norm 1
     """
     det, adjugate = determinant(b), cofactors(b)
     flat = 4 * (adjugate * adjugate).sum()
@@ -272,19 +295,27 @@ def _quartic(b: Mat3) -> tuple[Scalar, Scalar]:
     return root, 0.5 * (root * root - 1) * root - det
 
 
-def _curvature(r: Mat3, b: Mat3) -> Mat3:
-    """Return Tr(S) 1 − S with S = sym(Rᵀb), the curvature of the gain Tr(Rᵀb) around R."""
-    m = product(r.T, b)
+def _curvature_of_gain(rotation: Mat3, b: Mat3) -> Mat3:
+    """Return the matrix Tr(S) 1 − S (3, 3) with S = sym(Rᵀb): for a rotation vector x, the gain
+    Tr(R exp(x)ᵀ b), which the rotation nearest to b maximises, has the second derivative −(Tr(S) 1
+    − S) at x = 0.
+
+    - `rotation`: R (3, 3)
+    - `b`: (3, 3), any matrix
+    """
+    m = product(rotation.T, b)
     s = 0.5 * (m + m.T)
-    return (s[0, 0] + s[1, 1] + s[2, 2]) * jnp.eye(3, dtype=r.dtype) - s
+    return (s[0, 0] + s[1, 1] + s[2, 2]) * jnp.eye(3, dtype=rotation.dtype) - s
 
 
 @jax.custom_jvp
 def nearest_rotation(b: Mat3) -> Mat3:
-    """Return the rotation R with the largest Tr(Rᵀb), for a matrix of any size."""
+    """Return the rotation matrix R (3, 3) nearest to a matrix b (3, 3) of any size: the one with
+    the largest Tr(Rᵀb).
+    """
     b = scale_to_order_one(b)
     b = b / jnp.sqrt((b * b).sum())
-    root, zeta = _quartic(b)
+    root, zeta = _signed_singular_value_sum(b)
     kappa = 0.5 * (root * root - 1)
     rough = ((kappa + 1) * b + root * cofactors(b) - product(b, product(b.T, b))) / zeta
     q = matrix_to_quaternion(rough)
@@ -292,16 +323,21 @@ def nearest_rotation(b: Mat3) -> Mat3:
     # digits.
     for _ in range(3):
         r = quaternion.to_matrix(q)
-        turn = solve(_curvature(r, b), 2 * vee(product(r.T, b)))
+        turn = solve(_curvature_of_gain(r, b), 2 * vee(product(r.T, b)))
         q = quaternion.normalise(quaternion.multiply(q, quaternion.exp(turn)))
     return quaternion.to_matrix(q)
 
 
 @nearest_rotation.defjvp
-def _best_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
+def _nearest_rotation_jvp(
+    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[Any, Any]:
+    """Return the rotation R nearest to a matrix b, and its derivative R hat(x) along the change db
+    in `tangents`, where x solves (Tr(S) 1 − S) x = 2 vee(Rᵀ db) with S = sym(Rᵀb).
+    """
     (b,), (db,) = primals, tangents
     r = nearest_rotation(b)
     # `b` may have any size: a common factor for `b` and `db` leaves the derivative unchanged.
     scale = power_of_two_scale(jnp.max(jnp.abs(b)))
     b, db = scale * b, scale * db
-    return r, product(r, hat(solve(_curvature(r, b), 2 * vee(product(r.T, db)))))
+    return r, product(r, hat(solve(_curvature_of_gain(r, b), 2 * vee(product(r.T, db)))))

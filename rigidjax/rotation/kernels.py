@@ -29,7 +29,9 @@ _compiled = partial(jax.jit, inline=True)
 
 @_compiled
 def vector_to_quaternion(v: Vec3) -> Quat:
-    """Return the unit quaternion (cos θ/2, ½ v sin(θ/2)/(θ/2)) of a rotation vector v, θ = |v|."""
+    """Return the unit quaternion (cos θ/2, ½ v sin(θ/2)/(θ/2)), (4,), of a rotation vector v (3,),
+    rad, with the angle θ = |v|.
+    """
     x, y, z = parts = components(v)
     s = 0.25 * square(parts)
     half = 0.5 * stumpff(1, s)
@@ -38,8 +40,8 @@ def vector_to_quaternion(v: Vec3) -> Quat:
 
 @_compiled
 def vector_to_matrix(v: Vec3) -> Mat3:
-    """Return the rotation matrix 1 + A hat v + B (hat v)², A = sin θ/θ, B = (1 − cos θ)/θ², θ =
-    |v|.
+    """Return the rotation matrix 1 + A hat v + B (hat v)², (3, 3), of a rotation vector v (3,),
+    rad, with A = sin θ/θ, B = (1 − cos θ)/θ² and the angle θ = |v|.
     """
     parts = components(v)
     s = 0.25 * square(parts)
@@ -51,8 +53,8 @@ def vector_to_matrix(v: Vec3) -> Mat3:
 
 @_compiled
 def matrix_to_quaternion(m: Mat3) -> Quat:
-    """Return the canonical unit quaternion q of a rotation matrix m, computed from the largest row
-    of 4 q qᵀ.
+    """Return the unit quaternion q (w, x, y, z) of a rotation matrix m (3, 3), with its first
+    nonzero component positive, computed from the largest row of the matrix 4 q qᵀ (4, 4).
     """
     a, b, c, d, e, f, g, h, i = entries(m)
     w, x, y, z = 1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i
@@ -68,8 +70,10 @@ def matrix_to_quaternion(m: Mat3) -> Quat:
 
 
 @jax.custom_jvp
-def _log(q: Quat) -> Vec3:
-    """Return the shortest rotation vector of the quaternion q, which is also that of −q."""
+def _log_of_quaternion(q: Quat) -> Vec3:
+    """Return the rotation vector (3,), rad, of the shortest turn that a quaternion q (4,), of any
+    length, describes; −q has the same rotation vector.
+    """
     w, x, y, z = parts = components(power_of_two_scale(*components(q)) * q)
     n2 = x * x + y * y + z * z
     # With n² = x² + y² + z², the tangent of θ/2 is n/|w|, of θ/4 n/a, of θ/8 n times `inverse`:
@@ -81,10 +85,15 @@ def _log(q: Quat) -> Vec3:
     return jnp.stack([scale * x, scale * y, scale * z])
 
 
-@_log.defjvp
-def _log_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Any, Any]:
+@_log_of_quaternion.defjvp
+def _log_of_quaternion_jvp(
+    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[Any, Any]:
+    """Return the rotation vector (3,), rad, of a quaternion q of any length, and its derivative
+    along the change dq in `tangents`, by the inverse of the right Jacobian.
+    """
     (q,), (dq,) = primals, tangents
-    v = _log(q)
+    v = _log_of_quaternion(q)
     # q may have any length: a common factor for q and dq leaves the derivative unchanged.
     scale = power_of_two_scale(*components(q))
     w, *u = parts = components(scale * q)
@@ -99,18 +108,23 @@ def _log_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple
     return v, jnp.stack([turn[i] + 0.5 * across[i] + g * twice[i] for i in range(3)])
 
 
-quaternion_to_vector = _compiled(_log)
+quaternion_to_vector = _compiled(_log_of_quaternion)
 
 
 @_compiled
 def to_unit_length(q: Quat) -> Quat:
-    """Return the quaternion of length 1 in the direction of q."""
+    """Return the quaternion q (4,), of any length but zero, scaled to length 1."""
     q = power_of_two_scale(*components(q)) * q
     return q / jnp.sqrt(square4(components(q)))
 
 
 def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar | float) -> Mat3:
-    """Return the matrix 1 + a hat v + b (hat v)²."""
+    """Return the matrix 1 + a hat v + b (hat v)², (3, 3), where hat v is the matrix with hat(v) y =
+    v × y.
+
+    - `v`: three scalars
+    - `a`, `b`: the two coefficients
+    """
     x, y, z = v
     xx, yy, zz = b * x * x, b * y * y, b * z * z
     xy, yz, zx = b * x * y, b * y * z, b * z * x
@@ -120,18 +134,23 @@ def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar | float) -> Mat3:
 
 
 def left_jacobian_inverse(v: Vec3) -> Mat3:
-    """Return the matrix 1 − ½ hat v + g (hat v)², where g is `inverse_kernel(|v|²)`."""
+    """Return the inverse of the left Jacobian of a rotation vector v (3,), rad: the matrix 1 − ½
+    hat v + g (hat v)², with g = (1 − (θ/2) cot(θ/2))/θ² and θ = |v|.
+    """
     t = square(parts := components(v))
     return hat_polynomial(parts, jnp.full_like(t, -0.5), inverse_kernel(t))
 
 
 def square4(q: Sequence[Scalar]) -> Scalar:
-    """Return the squared length of four scalars."""
+    """Return the squared length of a quaternion `q`, given as four scalars."""
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
 
 
 def product4(p: Iterable[Any], q: Iterable[Any]) -> tuple[Any, ...]:
-    """Return the quaternion product p q; p and q are four scalars each, of JAX or NumPy."""
+    """Return the product p q of two quaternions as a tuple of four scalars.
+
+    - `p`, `q`: four scalars each, (w, x, y, z), of JAX or NumPy
+    """
     a, b, c, d = p
     e, f, g, h = q
     return (
@@ -143,7 +162,9 @@ def product4(p: Iterable[Any], q: Iterable[Any]) -> tuple[Any, ...]:
 
 
 def is_noncanonical(q: Sequence[Scalar]) -> Array:
-    """Return whether −q, and not q, is canonical (see `quaternion.canonical`)."""
+    """Return whether the first nonzero component of a quaternion `q`, given as four scalars, is
+    negative: −q is then the canonical one of the two quaternions of this rotation.
+    """
     w, x, y, z = q
     lead = jnp.where(w != 0, w, jnp.where(x != 0, x, jnp.where(y != 0, y, z)))
     return lead < 0

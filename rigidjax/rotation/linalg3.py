@@ -20,8 +20,8 @@ from rigidjax.rotation.barrier import compute_once
 
 
 def components(v: Float[Array, "n"]) -> tuple[Scalar, ...]:
-    """Return the entries of a vector as scalars; one `lax.split` is faster in gradients than
-    indices.
+    """Return the entries of a vector `v` (n,) as a tuple of scalars; one `lax.split` is faster in
+    gradients than indices.
     """
     return tuple(part.reshape(()) for part in lax.split(v, (1,) * v.shape[0]))
 
@@ -42,25 +42,28 @@ def cross(a: Vec3Like, b: Vec3Like) -> Vec3:
 
 
 def cross_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> tuple[Scalar, ...]:
-    """Return the vector product of two triples of scalars."""
+    """Return the vector product a × b as a tuple of three scalars, for `a` and `b` given as three
+    scalars each.
+    """
     (ax, ay, az), (bx, by, bz) = a, b
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
 def dot_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
-    """Return the scalar product of two triples of scalars."""
+    """Return the scalar product a · b, for `a` and `b` given as three scalars each."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def square(v: Sequence[Scalar]) -> Scalar:
-    """Return the squared length of a triple of scalars; it is computed once, because costly
-    functions use the result.
+    """Return the squared length of a vector `v`, given as three scalars; it is computed once,
+    because costly functions use the result.
     """
     return compute_once(dot_components(v, v))
 
 
 def power_of_two_scale(*parts: Scalar) -> Scalar:
-    """Return a power of two that brings the largest of some scalars near 1, with derivative zero.
+    """Return a power of two that, multiplied by the largest of the scalars `parts`, is near 1; its
+    derivative is zero.
 
     Formulas that do not depend on the length of an argument use this function. The argument
     multiplied by the power of two keeps all digits, and the squares of its components do not
@@ -155,7 +158,9 @@ def determinant(a: Mat3Like) -> Scalar:
 
 
 def cofactors(a: Mat3) -> Mat3:
-    """Return the matrix of cofactors, det a · a⁻ᵀ; a need not have an inverse."""
+    """Return the matrix of cofactors (3, 3) of a matrix `a` (3, 3), det a · a⁻ᵀ; a need not have an
+    inverse.
+    """
     m = entries(a)
     p, q, r = m[:3], m[3:6], m[6:]
     return jnp.stack([jnp.stack(cross_components(*two)) for two in ((q, r), (r, p), (p, q))])

@@ -68,7 +68,9 @@ def shadow(sigma: Vec3Like) -> Vec3:
     >>> shadow(jnp.array([0.0, 0.5, 0.0])).tolist()
     [-0.0, -2.0, -0.0]
     """
-    return _shadow(require_direction(_checks.array_of_shape(sigma, (3,), "sigma"), "sigma"))
+    return _shadow_unchecked(
+        require_direction(_checks.array_of_shape(sigma, (3,), "sigma"), "sigma")
+    )
 
 
 def switch(sigma: Vec3Like) -> Vec3:
@@ -79,10 +81,13 @@ def switch(sigma: Vec3Like) -> Vec3:
     """
     sigma = _checks.array_of_shape(sigma, (3,), "sigma")
     beyond = dot(sigma, sigma) > 1
-    return jnp.where(beyond, _shadow(jnp.where(beyond, sigma, 1)), sigma)
+    return jnp.where(beyond, _shadow_unchecked(jnp.where(beyond, sigma, 1)), sigma)
 
 
-def _shadow(sigma: Vec3) -> Vec3:
+def _shadow_unchecked(sigma: Vec3) -> Vec3:
+    """Return the shadow −σ/|σ|² of modified Rodrigues parameters `sigma` (3,), not zero: the other
+    parameters of the same rotation.
+    """
     scale = power_of_two_scale(*components(sigma))
     near = scale * sigma
     return -scale * (near / dot(near, near))

@@ -120,7 +120,7 @@ def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
     [-1.0, -2.0, 3.0]
     """
     w, *u = components(_checks.array_of_shape(q, (4,), "q", hint=_HINT))
-    return _rotate_by(w, u, components(_checks.array_of_shape(y, (3,), "y")))
+    return _rotate_components(w, u, components(_checks.array_of_shape(y, (3,), "y")))
 
 
 def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
@@ -131,7 +131,7 @@ def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
     [-1.0, -2.0, 3.0]
     """
     w, *u = components(_checks.array_of_shape(q, (4,), "q", hint=_HINT))
-    return _rotate_by(-w, u, components(_checks.array_of_shape(y, (3,), "y")))
+    return _rotate_components(-w, u, components(_checks.array_of_shape(y, (3,), "y")))
 
 
 def check(
@@ -316,8 +316,12 @@ def from_matrix(matrix: Mat3Like) -> Quat:
     return matrix_to_quaternion(_checks.check_if_known(require_rotation_matrix, matrix, "matrix"))
 
 
-def _rotate_by(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
-    """Return the vector y turned by the quaternion (w, u): y + 2 (w u×y + u×(u×y))."""
+def _rotate_components(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
+    """Return a vector turned by a unit quaternion, y + 2 (w u × y + u × (u × y)), (3,).
+
+    - `w`, `u`: the scalar part of the quaternion, and the three scalars of its vector part
+    - `y`: the three components of the vector, any unit
+    """
     across = cross_components(u, y)
     again = cross_components(u, across)
     # Each component is computed once: otherwise XLA would compute all three again for each

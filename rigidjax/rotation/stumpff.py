@@ -27,21 +27,22 @@ _PI_PARTS = {
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)! for t = θ² ≥ 0 (Battin 1999, eq 4.80).
+    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)! of the order k = 0, 1, 2, …, for t =
+    θ² ≥ 0, any shape (Battin 1999, eq 4.80).
 
     c_0 is cos θ, c_1 sin θ/θ, c_2 (1 − cos θ)/θ², c_3 (θ − sin θ)/θ³. Values and derivatives of
     every order are right to a few units of round-off of 1/k!.
     """
     if k < 2:
-        return _cosine_or_sinc(k, t)
+        return _cosine_or_sinc_of_square(k, t)
     # From t = π² on, the recurrence c_{j+2} = (1/j! − c_j)/t loses no digit that matters.
     limit = math.pi**2
     far = t > limit
     divisor = jnp.where(far, t, 1)
-    value = _cosine_or_sinc(k % 2, t)
+    value = _cosine_or_sinc_of_square(k % 2, t)
     for j in range(k % 2, k - 2, 2):
         value = (1 / math.factorial(j) - value) / divisor
-    near = _polynomial(k, jnp.where(far, 0, t), limit)
+    near = _stumpff_series(k, jnp.where(far, 0, t), limit)
     return jnp.where(far, 1 / math.factorial(k - 2) - value, near) / divisor
 
 
@@ -49,14 +50,17 @@ def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
 def _stumpff_jvp(
     k: int, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[Any, Any]:
+    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, and its derivative along the change
+    dt in `tangents`, by c_k' = ½ (k c_{k+2} − c_{k+1}).
+    """
     (t,), (dt,) = primals, tangents
     slope = k * stumpff(k + 2, t) - stumpff(k + 1, t) if k else -stumpff(1, t)
     return stumpff(k, t), 0.5 * slope * dt
 
 
 def inverse_kernel(t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return (1 − (θ/2) cot(θ/2))/θ², the kernel of the inverse Jacobians, for t = θ² < (2π)²; it
-    is 1/12 at 0.
+    """Return (1 − (θ/2) cot(θ/2))/θ² as a smooth function of t = θ² < (2π)², any shape; it is 1/12
+    at 0. The inverses of the left and right Jacobians of a rotation vector have this coefficient.
     """
     return (stumpff(3, t) - 2 * stumpff(4, t)) / stumpff(1, 0.25 * t) ** 2
 
@@ -67,18 +71,24 @@ def arctan_ratio(z: Float[Array, "..."]) -> Float[Array, "..."]:
     """
     tiny = jnp.finfo(z.dtype).eps / 4
     terms = next(n for n in range(1, 40) if _REACH**n / (2 * n + 1) < tiny)
-    return _horner([(-1) ** n / (2 * n + 1) for n in range(terms)], z)
+    return _evaluate_polynomial([(-1) ** n / (2 * n + 1) for n in range(terms)], z)
 
 
-def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the cosine (k = 0) or sin θ/θ (k = 1) of t = θ²; a θ beyond π/2 is reduced first."""
+def _cosine_or_sinc_of_square(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return cos θ (for k = 0) or sin θ/θ (for k = 1) of an angle θ, rad, given by its square.
+
+    An angle beyond π/2 is first reduced by half turns; below, a polynomial in θ² is used.
+
+    - `k`: 0 or 1
+    - `t`: θ² ≥ 0, any shape
+    """
     limit = (math.pi / 2) ** 2
     far = t > limit
     theta = jnp.sqrt(jnp.where(far, t, 1))
     turns, remainder = split_half_turns(theta)
     # A θ beyond 1/ε has no correct digit; its remainder must stay in the range of the polynomials.
     remainder = jnp.clip(remainder, -2.0, 2.0)
-    value = _polynomial(k, jnp.where(far, remainder * remainder, t), limit)
+    value = _stumpff_series(k, jnp.where(far, remainder * remainder, t), limit)
     value = value * jnp.where(far, remainder, 1) if k else value
     # The value is divided by the sign, not multiplied: XLA on CPU computes a quotient once, but
     # repeats a polynomial for each use.
@@ -87,7 +97,9 @@ def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def split_half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Return n and r with angle = nπ + r, |r| ≤ π/2; in derivatives n is constant."""
+    """Return n and r, in the shape of `angle` (rad), with angle = nπ + r, an integer n and |r| ≤
+    π/2; in derivatives n is constant.
+    """
     turns = jax.lax.stop_gradient(jnp.round(angle * (1 / math.pi)))
     # Cody & Waite 1980: n × head and n × middle are exact, so that r keeps the digits of the angle.
     head, middle, tail = _PI_PARTS[np.dtype(angle.dtype)]
@@ -95,21 +107,28 @@ def split_half_turns(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], F
 
 
 def parity(n: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return (−1)ⁿ."""
+    """Return (−1)ⁿ for integers `n`, given as floating-point numbers of any shape."""
     return 1 - 2 * (n - 2 * jnp.floor(0.5 * n))
 
 
-def _polynomial(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, "..."]:
-    """Return the Taylor polynomial of c_k that is exact to round-off for t up to `limit`."""
+def _stumpff_series(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, "..."]:
+    """Return the Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, by the first terms of this series;
+    later terms are below round-off.
+
+    - `k`: the order, 0, 1, 2, …
+    - `t`: from 0 to `limit`, any shape
+    - `limit`: the largest t, which determines the number of terms
+    """
     tiny = jnp.finfo(t.dtype).eps / 8
     size = 1 / math.factorial(k)
     terms = next(n for n in range(1, 40) if limit**n / math.factorial(k + 2 * n) < tiny * size)
-    return _horner([(-1) ** n / math.factorial(k + 2 * n) for n in range(terms)], t)
+    return _evaluate_polynomial([(-1) ** n / math.factorial(k + 2 * n) for n in range(terms)], t)
 
 
-def _horner(coefficients: list[float], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the polynomial of x with the given `coefficients`, of which the constant is the first
-    (Horner's scheme).
+def _evaluate_polynomial(coefficients: list[float], x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the value of a polynomial at `x`, an array of any shape, by Horner's scheme.
+
+    - `coefficients`: of 1, x, x², …
     """
     value = jnp.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:

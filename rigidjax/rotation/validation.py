@@ -13,12 +13,16 @@ from rigidjax import _checks
 
 
 def tolerance(dtype: object) -> float:
-    """Return the tolerance for a rotation as input: 1e-6 in float64, 1e-3 in float32."""
+    """Return how far a rotation that a user gives may be from a rotation: 1e-6 for the `dtype`
+    float64, 1e-3 for float32. This is the largest error of the length of a quaternion, or of an
+    entry of MᵀM for a matrix M.
+    """
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
 def require_direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
-    """Refuse a known vector without a direction: zero, NaN, infinity.
+    """Return the vector `v` (n,), any unit. **Raises:** `ValueError` if it is known and has no
+    direction: zero, NaN, infinity; the text `name` names it in the message.
 
     XLA takes a number below the least normal number, 2e-308, for zero on some machines.
     """
@@ -37,7 +41,9 @@ def require_direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
 
 
 def require_turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
-    """Refuse a known rotation vector or angle that is so large that no digit is correct."""
+    """Return the rotation vector or angle `v`, rad. **Raises:** `ValueError` if it is known and so
+    large that no digit of the rotation is correct; the text `name` names it in the message.
+    """
     if _checks.is_known(v) and not _largest_component(v) <= (
         limit := 1 / float(jnp.finfo(v.dtype).eps)
     ):
@@ -51,13 +57,19 @@ def require_turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
 
 
 def _largest_component(v: Float[Array, "*n"]) -> float:
+    """Return the largest absolute value of the entries of a known array `v`; NaN if an entry is
+    NaN.
+    """
     # The result is NaN if an entry is NaN. The function makes one call of NumPy only, because it
     # runs before every conversion that is called outside of `jit`.
     return float(np.abs(np.asarray(v)).max())
 
 
 def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
-    """Refuse any matrix but a rotation; the message shows the determinant or the error."""
+    """Return the matrices m (..., 3, 3). **Raises:** `ValueError` (under `jit` `equinox.error_if`)
+    if any of them is no rotation, with its determinant or its error; the text `name` names the
+    matrix in the message.
+    """
     m = _checks.require_finite(m, name)
     known = _checks.is_known(m)
     xp, values = (np, np.asarray(m)) if known else (jnp, m)
@@ -78,7 +90,9 @@ def require_rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[A
 
 
 def require_near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"]:
-    """Refuse a known quaternion whose length differs from 1 by more than `limit`."""
+    """Return the quaternion `q` (4,). **Raises:** `ValueError` if it is known and its length
+    differs from 1 by more than `limit`; the text `name` names it in the message.
+    """
     if _checks.is_known(q):
         length = float(np.linalg.norm(np.asarray(q, float)))
         words = f"{name}: wanted a unit quaternion (w, x, y, z), got one of length {length:.6g}"
@@ -88,8 +102,9 @@ def require_near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Ar
 
 
 def require_unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
-    """Return a quaternion scaled to length 1 if its length is nearly 1; refuse any other
-    quaternion.
+    """Return quaternions `q` (..., 4) scaled to length 1. **Raises:** `ValueError` (under `jit`
+    `equinox.error_if`) if a length is not nearly 1; the text `name` names the quaternion in the
+    message.
     """
     q = _checks.require_finite(q, name)
     # Use NumPy for known numbers: under `jit`, JAX would trace what is computed from known numbers,

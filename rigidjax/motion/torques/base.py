@@ -126,7 +126,12 @@ WORLD = "a vector in world axes, such as [0, 0, -9.81]"
 
 
 def require_law(torque: object, name: str = "torque") -> None:
-    """Raise `TypeError` unless `torque` can be called."""
+    """Raise `TypeError` unless `torque` is an object that can be called as a torque, `(t, state,
+    body)`.
+
+    - `torque`: any object that a user gave as a torque or force
+    - `name`: the name of the argument, for the message
+    """
     if isinstance(torque, type):
         made = f"{torque.__name__}(...)"
         raise TypeError(f"{name}: wanted an object, got the class {torque.__name__}; make {made}")
@@ -145,8 +150,9 @@ def require_law(torque: object, name: str = "torque") -> None:
 
 
 def sees_attitude(torque: Torque | None) -> bool:
-    """Return whether a torque may read the attitude, by `feels`; true for a torque without
-    `feels`.
+    """Return whether a torque, or any torque in a `Sum`, may read the attitude of the body. The
+    attribute `feels` tells: a torque with `feels = HasSpin` reads the body rate only, and a torque
+    without this attribute may read anything; `None` reads nothing.
     """
     if hasattr(torque, "parts"):
         return any(sees_attitude(part) for part in torque.parts)  # pyright: ignore
@@ -154,15 +160,15 @@ def sees_attitude(torque: Torque | None) -> bool:
 
 
 def sees_rate(torque: Torque | None) -> bool:
-    """Return whether a torque may read the body rate, that is, unless it is declared
-    `rate_free`.
+    """Return whether a torque may read the body rate: true unless the torque is `None` or declares
+    `rate_free = True`.
     """
     return torque is not None and not getattr(torque, "rate_free", False)
 
 
 def require_state_type(torque: Torque, state: object) -> None:
-    """Raise `TypeError` unless `torque` can be called and `state` has the parts that the torque
-    reads.
+    """Raise `TypeError` unless `torque` can be called, and `state` has the parts (body rate,
+    attitude, position) that the torque declares in `feels`.
     """
     require_law(torque)
     feels = getattr(torque, "feels", None)
@@ -174,8 +180,12 @@ def require_state_type(torque: Torque, state: object) -> None:
 
 
 def require_scene(law: Torque | None, state: object, body: object) -> None:
-    """Raise an error unless the arguments are a torque or `None`, a state that the torque can act
-    on, and a body.
+    """Raise an error unless the arguments can be evaluated together.
+
+    - `law`: a torque or force, or `None`; a torque with states of its own must have their values
+      inserted (see `freeze`)
+    - `state`: one state of motion with the parts that the torque reads
+    - `body`: one `Inertia` or `MassProperties`
     """
     _checks.require_single(state, HasSpin, "state", requirement="a Spin, an Attitude or a Rigid")
     if law is not None:
@@ -186,8 +196,13 @@ def require_scene(law: Torque | None, state: object, body: object) -> None:
 
 
 def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
-    """Return the value of the torque (3,), N m, body frame. **Raises:** `TypeError` for a force,
-    which needs a `Rigid`.
+    """Return the value (3,), N m, body frame, of a torque at one time. **Raises:** `TypeError` for
+    a force, which needs a `Rigid`.
+
+    - `torque`: a callable (t, state, body)
+    - `t`: s, the time
+    - `state`: the state of motion, with the parts that the torque reads
+    - `body`: an `Inertia` or `MassProperties`
     """
     force, value = force_and_torque(torque, t, state, body)
     if force is not None:
@@ -201,8 +216,15 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
 def force_and_torque(
     law: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> tuple[Vec3 | None, Vec3]:
-    """Return two things: the force on the centre of mass (N, world frame, or `None`); and the
-    torque about the centre of mass (N m, body frame).
+    """Evaluate a torque or force model at one time, and return two things: the force (3,) on the
+    centre of mass, N, world frame, or `None` for a pure torque; and the torque (3,) about the
+    centre of mass, N m, body frame.
+
+    - `law`: a callable (t, state, body) that returns a torque (3,) or a `Wrench`
+    - `t`: s, the time
+    - `state`: the state of motion, with the parts that `law` reads; its precision is that of the
+      result
+    - `body`: an `Inertia` or `MassProperties`
     """
     require_scene(law, state, body)
     dtype = state.omega.dtype
@@ -226,7 +248,7 @@ def force_and_torque(
     return None, value.astype(dtype)
 
 
-# What a part of a state is called, and the state that has it.
+# For a part of a state: what it is called, and the class of state that has it.
 _HIGHER = {
     "q": ("attitude", "Attitude(q, omega)"),
     "x": ("position", "Rigid(x, v, q, omega)"),
@@ -235,8 +257,11 @@ _HIGHER = {
 
 
 def missing_state_message(caller: str, error: AttributeError) -> str | None:
-    """Return the message for the `error` of a user's function that read a part which the state
-    lacks; return `None` for any other error.
+    """Return the message for a user's function that read a part which its state lacks, such as the
+    attitude of a `Spin`; return `None` for any other error.
+
+    - `caller`: the name of the function, for the message
+    - `error`: the `AttributeError` that the function raised
     """
     if error.name not in _HIGHER or not isinstance(error.obj, HasSpin):
         return None
@@ -262,7 +287,9 @@ def require_one_law(law: Torque) -> None:
 
 
 def in_precision(tree: PyTree, dtype: DTypeLike) -> Any:
-    """Return the tree with every floating array in `dtype`."""
+    """Return `tree` (any tree of arrays and other objects) with every floating-point array
+    converted to `dtype`; integers, functions and other objects do not change.
+    """
 
     def cast(leaf: PyTree) -> Any:
         if eqx.is_array_like(leaf) and hasattr(leaf, "dtype"):
@@ -273,44 +300,66 @@ def in_precision(tree: PyTree, dtype: DTypeLike) -> Any:
 
 
 def vector_at(source: PyTree, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:
-    """Return `source`, if it is a constant vector, or the value of `source` at `t`, if it is a
-    function of time.
+    """Return a vector (size,) at the time `t`, s, from a source that is constant or depends on
+    time.
+
+    - `source`: a vector (size,), or a function of time to such a vector
+    - `name`: the name of the source, for messages
+    - `size`: the number of components
     """
     return _checks.array_of_shape(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
 def vector_converter(name: str, *, hint: str = "") -> Callable[[Any], Array]:
-    """Return a converter to a field of three numbers, for `equinox.field(converter=…)`."""
+    """Return a function that checks a value and converts it to an array of three finite numbers,
+    for `equinox.field(converter=…)`.
+
+    - `name`: the name of the field, for messages
+    - `hint`: advice that a message ends with
+    """
     return lambda value: _checks.finite_array(value, (3,), name, hint=hint)
 
 
 def number_converter(name: str) -> Callable[[Any], Array]:
-    """Return a converter to a field of one number."""
+    """Return a function that checks a value and converts it to a scalar array, one finite number,
+    for `equinox.field(converter=…)`; `name` is the name of the field, for messages.
+    """
     return lambda value: _checks.finite_array(value, (), name)
 
 
 def source_converter(name: str) -> Callable[[Any], Any]:
-    """Return a converter to a field that is a vector, or a function of time to a vector."""
+    """Return a function that checks a value and converts it to a vector (3,), or leaves it
+    unchanged if it is a function of time to such a vector, for `equinox.field(converter=…)`; `name`
+    is the name of the field, for messages.
+    """
     return lambda value: constant_or_callable(value, name)
 
 
 def constant_or_callable(source: object, name: str, size: int = 3) -> Any:
-    """Return `source` unchanged if it can be called with a time; otherwise as a vector (size,)."""
+    """Return a quantity that is constant or depends on time, checked: a function of time is
+    returned unchanged, and anything else as a vector (size,) of finite numbers.
+
+    - `source`: a function of time to (size,), or the numbers
+    - `name`: the name of the quantity, for messages
+    - `size`: the number of components
+    """
     if callable(source):
         return _checks.require_function(source, name, f"of time to ({size},)")
     return _checks.finite_array(source, (size,), name)
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:
-    """Return the times at which a torque or a function of time jumps, s; an empty array if there
-    are no jumps.
+    """Return the times (n,), s, at which a torque or a function of time jumps or has a kink, as its
+    attribute `jump_times` says; an empty array if it has none.
     """
     times = getattr(source, "jump_times", None)
     return jnp.zeros(0) if times is None else times
 
 
 def jumps_in(*sources: object) -> Float[Array, " n"]:
-    """Return the times at which any of several torques or functions of time jumps, s, in order."""
+    """Return the times (n,), s, at which any of the `sources` (torques or functions of time) jumps
+    or has a kink, in ascending order.
+    """
     times = [found for source in sources if (found := jumps_of(source)).shape[0]]
     if len(times) < 2:
         return times[0] if times else jnp.zeros(0)
@@ -319,12 +368,20 @@ def jumps_in(*sources: object) -> Float[Array, " n"]:
 
 
 def jumps_of_parts(law: object) -> Float[Array, " n"]:
-    """Return the times, s, at which any field of `law` jumps or has a kink, in order."""
+    """Return the times (n,), s, at which any field of the torque `law`, such as a function of time
+    or another torque inside it, jumps or has a kink, in ascending order.
+    """
     return jumps_in(*vars(law).values())
 
 
 def unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array, "n 3"]:
-    """Return directions (count, 3); known directions must be unit vectors."""
+    """Return an array (count, 3) of directions, one a row. **Raises:** `ValueError` if a known row
+    is not a unit vector.
+
+    - `value`: the directions, as an array or nested lists
+    - `name`: the name of the argument, for messages
+    - `count`: the number of rows that is wanted
+    """
     rows = _checks.finite_array(value, (count, 3), name)
     if _checks.is_known(rows):
         lengths = np.linalg.norm(np.asarray(rows, float), axis=1)
@@ -333,25 +390,37 @@ def unit_rows(value: NumbersLike, name: str, count: int) -> Float[Array, "n 3"]:
     return rows
 
 
-def row_count(value: NumbersLike, name: str, one: str) -> int:
-    """Return the number of rows (x, y, z) in `value`, one row for each `one`; at least one row is
-    wanted.
+def row_count(value: NumbersLike, name: str, item: str) -> int:
+    """Return the number of rows of an array (R, 3), such as the number of wheels from their axes.
+    **Raises:** `ValueError` for another shape, or without rows.
+
+    - `value`: the array, or nested lists
+    - `name`: the name of the argument, for messages
+    - `item`: what a row belongs to, such as "wheel", for messages
     """
     shape = _checks.numeric_array(value, name).shape
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
-        raise ValueError(f"{name}: wanted (R, 3), one row for each {one}, got shape {shape}")
+        raise ValueError(f"{name}: wanted (R, 3), one row for each {item}, got shape {shape}")
     return shape[0]
 
 
 def broadcast_to_each(value: NumbersLike, count: int, name: str) -> Array:
-    """Return one number for all, or one number for each of `count`, by the shape of `value`."""
+    """Return a quantity that is the same for all items (wheels, rotors), as a scalar array, or that
+    has one number for each item, as an array (count,); the shape of `value` decides.
+
+    - `value`: one number, or `count` numbers
+    - `count`: the number of items
+    - `name`: the name of the argument, for messages
+    """
     return _checks.finite_array(
         value, (count,) if _checks.numeric_array(value, name).ndim else (), name
     )
 
 
 def length_or_zero(v: Vec3) -> Scalar:
-    """Return |v|, with the derivative 0 at v = 0; this is right for |v| as a factor in |v| v."""
+    """Return the length |v| of a vector (3,), any unit, with the derivative 0 at v = 0; this
+    derivative is right where |v| is a factor, as in |v| v.
+    """
     v = _checks.array_of_shape(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

@@ -73,7 +73,9 @@ class Sum(eqx.Module):
 
 
 def parts_of(torque: base.Torque | None) -> tuple[Any, ...]:
-    """Return the torques in a sum, and in sums inside it; an empty tuple for `None`."""
+    """Return the single torques and forces in `torque`, as a tuple: the members of a `Sum` and of
+    every `Sum` inside it; the torque alone if it is no `Sum`; an empty tuple for `None`.
+    """
     if isinstance(torque, Sum):
         return tuple(inner for part in torque.parts for inner in parts_of(part))
     return () if torque is None else (torque,)
@@ -170,8 +172,8 @@ class ChangingInertia(eqx.Module):
 
 
 def tensor_or_nan(tensor: Mat3) -> Mat3:
-    """Return the inertia tensor (3, 3) of a body, kg m²; return NaN for any other numbers, which
-    end a run.
+    """Return `tensor` (3, 3), kg m², if it is the inertia tensor of a body; otherwise return NaN,
+    which ends a run of a solver.
     """
     return jnp.where(is_real(tensor), tensor, jnp.full_like(tensor, jnp.nan))
 

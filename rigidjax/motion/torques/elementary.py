@@ -52,7 +52,9 @@ class InSpace(base.AbstractTimeTorque):
 
 
 class _AbstractRateTorque(base.AbstractTorque):
-    """Define a torque against the body rate, with a coefficient for each body axis."""
+    """Define a torque against the body rate Ω, such as damping, with one coefficient for each body
+    axis, (3,).
+    """
 
     feels: ClassVar[type] = HasSpin
     steady: ClassVar[bool] = True

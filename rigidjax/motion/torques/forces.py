@@ -67,11 +67,11 @@ class CentralGravity(base.AbstractForce):
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
         """Return the potential energy, J, which is zero at infinity."""
-        r, up, pull, trace = _seen_from_centre(state, body.inertia.tensor)
+        r, up, pull, trace = _direction_and_inertia_along(state, body.inertia.tensor)
         return -(self.mu / r) * (body.mass + 0.5 * (trace - 3 * dot(up, pull)) / r / r)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
-        r, up, pull, trace = _seen_from_centre(state, body.inertia.tensor)
+        r, up, pull, trace = _direction_and_inertia_along(state, body.inertia.tensor)
         strength, along = self.mu / r / r, dot(up, pull)
         # The force is −∂U/∂x in body axes: the sum of a vector along r̂ and a vector along I r̂.
         radial = -strength * (body.mass + 1.5 * (trace - 5 * along) / r / r)
@@ -79,9 +79,13 @@ class CentralGravity(base.AbstractForce):
         return base.Wrench(quaternion.rotate(state.q, force), cross(3 * strength / r * up, pull))
 
 
-def _seen_from_centre(state: HasPose, tensor: Mat3) -> tuple[Scalar, Vec3, Vec3, Scalar]:
-    """Return four things: the distance r from the origin; the unit vector r̂ in body axes; I r̂;
-    and Tr I.
+def _direction_and_inertia_along(state: HasPose, tensor: Mat3) -> tuple[Scalar, Vec3, Vec3, Scalar]:
+    """Return the four quantities of MacCullagh's formula for gravity from the world's origin: the
+    distance r of the centre of mass from the origin, m; the unit vector r̂ from the origin to the
+    body, (3,), body axes; I r̂, (3,), kg m²; and the trace of I, kg m².
+
+    - `state`: a state with the position of the centre of mass (m, world frame) and the attitude
+    - `tensor`: I (3, 3), kg m², body frame, about the centre of mass
     """
     r = jnp.sqrt(dot(state.x, state.x))
     up = quaternion.rotate_inverse(state.q, state.x / r)

@@ -43,7 +43,9 @@ class Input(eqx.Module):
 
 
 class _ConstantFunction(eqx.Module):
-    """Hold a value that does not depend on time."""
+    """Evaluate to one value at every time: the function of time that replaces an `Input` of
+    constant value.
+    """
 
     value: Array
 
@@ -143,11 +145,15 @@ class Lagged(eqx.Module):
         return jumps_of(self.source)
 
     def state0(self, t: ScalarLike, state: PyTree, body: Body) -> Array:
-        """Return the value at the start."""
+        """Return the value y at the start: the field `start`, or, without it, the value of the
+        source at the time `t`, s.
+        """
         return self.source(t) if self.start is None else self.start
 
     def rate(self, t: ScalarLike, own: Array, state: PyTree, body: Body) -> Array:
-        """Return dy/dt, in the source's unit per second."""
+        """Return dy/dt = (u − y)/T, in the unit of the source u per second, for the value y = `own`
+        at the time `t`, s; `state` and `body` are not used.
+        """
         wanted = _checks.numeric_array(self.source(t), "source(t)").astype(own.dtype)
         if wanted.shape != own.shape:
             raise ValueError(f"Lagged: start has the shape {own.shape}, the source {wanted.shape}")
@@ -158,10 +164,11 @@ class Lagged(eqx.Module):
 
 
 def require_no_jumps(source: PyTree, name: str) -> None:
-    """Raise `TypeError` for held samples: a torque that uses the derivative of its source would
-    lose the jumps.
+    """Raise `TypeError` if `source`, a function of time or a tree of them, holds samples constant
+    between times: a torque that uses the derivative of its source would lose the jumps.
 
-    An `Input` is checked when it has a value: `bind` may give it a smooth function of time.
+    An `Input` is checked when it has a value: `bind` may give it a smooth function of time. The
+    text `name` names the argument in the message.
     """
     jumping = (Held, _ConstantFunction)
     nodes = jax.tree.leaves(source, is_leaf=lambda node: isinstance(node, jumping))
@@ -179,6 +186,12 @@ def require_no_jumps(source: PyTree, name: str) -> None:
 
 
 def _checked_channels(value: NumbersLike, name: str) -> Array:
+    """Return one number, or one number for each channel of a signal, as an array of finite numbers.
+    **Raises:** `ValueError` for an empty array.
+
+    - `value`: the numbers
+    - `name`: the name of the argument, for messages
+    """
     array = _checks.numeric_array(value, name)
     if not array.size:
         raise ValueError(f"{name}: wanted one number, or one a channel, got none")
@@ -186,8 +199,10 @@ def _checked_channels(value: NumbersLike, name: str) -> Array:
 
 
 class InputRow(NamedTuple):
-    """Hold the inputs during a step, or a part of a step: `values` by name, and in `delayed` the
-    value of each `Delayed` input.
+    """Hold the values of all inputs of a torque during one step, or during a part of a step.
+
+    - `values`: the value of each `Input`, by name
+    - `delayed`: the value of each delayed input, in the order of these inputs in the torque
     """
 
     values: Mapping[str, Any]
@@ -211,7 +226,7 @@ def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
     queue = list(later or ())
 
     def value(node: PyTree) -> Any:
-        if _is_delayed(node):
+        if _is_delayed_input(node):
             if later is not None:
                 return _ConstantFunction(jnp.asarray(queue.pop(0)))
             bound = value(node.source)
@@ -224,30 +239,33 @@ def bind(law: Law, inputs: Mapping[str, Any] | InputRow | None) -> Law:
         bound = values[node.name]
         return bound if callable(bound) else _ConstantFunction(jnp.asarray(bound))
 
-    return jax.tree.map(value, law, is_leaf=lambda n: isinstance(n, Input) or _is_delayed(n))
+    return jax.tree.map(value, law, is_leaf=lambda n: isinstance(n, Input) or _is_delayed_input(n))
 
 
-def _is_delayed(node: PyTree) -> bool:
+def _is_delayed_input(node: PyTree) -> bool:
+    """Return whether `node` (a torque or a part of one) is a `Delayed` whose source is an
+    `Input`.
+    """
     return isinstance(node, Delayed) and isinstance(node.source, Input)
 
 
 def delays_of(law: PyTree) -> list[tuple[str, Array]]:
-    """Return the name and the delay of each delayed input, in the order of these inputs in the
-    torque.
+    """Return a pair for each delayed input of the torque `law`, in the order of these inputs in the
+    torque: the name of the input; and its delay, a scalar array, s.
     """
-    nodes = jax.tree.leaves(law, is_leaf=_is_delayed)
-    return [(node.source.name, node.delay) for node in nodes if _is_delayed(node)]
+    nodes = jax.tree.leaves(law, is_leaf=_is_delayed_input)
+    return [(node.source.name, node.delay) for node in nodes if _is_delayed_input(node)]
 
 
 def inputs_of(law: PyTree) -> list[str]:
-    """Return the names of the inputs that a torque reads."""
+    """Return the names of the inputs (`Input`) that the torque `law` reads, each name once."""
     nodes = jax.tree.leaves(law, is_leaf=lambda node: isinstance(node, Input))
     return list(dict.fromkeys(node.name for node in nodes if isinstance(node, Input)))
 
 
 def require_inputs(law: PyTree, inputs: object) -> Mapping[str, Any]:
-    """Return `inputs` as a mapping, empty for `None`. **Raises:** `ValueError` unless the names are
-    exactly the names that the torque reads.
+    """Return `inputs` as a mapping from names to values, empty for `None`. **Raises:** `ValueError`
+    unless the names are exactly the names of the inputs (`Input`) that the torque `law` reads.
     """
     read, mapping = inputs_of(law), {} if inputs is None else inputs
     if not isinstance(mapping, Mapping):

@@ -17,17 +17,21 @@ Rows = Float[ArrayLike, "rows 3"] | Sequence[Any]
 
 
 class _Table(eqx.Module):
-    """Hold rows of numbers against time."""
+    """Hold a table of a quantity over time: `times` (n,), s, and `values` (n, *k), one row of
+    numbers for each time.
+    """
 
     times: Float[Array, " n"]
     values: Float[Array, "n *k"]
 
     def __init__(self, times: Times, values: Float[ArrayLike, "rows *k"] | Sequence[Any]):
-        self.times, self.values = _checked_rows("times", times, "values", values)
+        self.times, self.values = _checked_times_and_rows("times", times, "values", values)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Return the times of the rows, s: the value jumps, or has a kink, at each."""
+        """Return the times (n,) of the rows, s: the value of the table jumps, or has a kink, at
+        each.
+        """
         return self.times
 
 
@@ -50,7 +54,7 @@ class Linear(_Table):
     def __call__(self, t: ScalarLike) -> Array:
         """Return the value at the time `t`, s; its shape (*k) is that of a row of `values`."""
         t = jnp.asarray(t, self.times.dtype)
-        return _interpolate_line(
+        return _interpolate_linearly(
             self.times, self.values, jnp.clip(t, self.times[0], self.times[-1])
         )
 
@@ -69,7 +73,7 @@ class Held(_Table):
 
     def __call__(self, t: ScalarLike) -> Array:
         """Return the value at the time `t`, s; its shape (*k) is that of a row of `values`."""
-        i = _row_index(self.times, jnp.asarray(t, self.times.dtype))
+        i = _index_of_row_at(self.times, jnp.asarray(t, self.times.dtype))
         return self.values[jnp.clip(i, 0, self.times.shape[0] - 1)]
 
 
@@ -94,7 +98,9 @@ class Tabulated(AbstractTorque):
     torques: Float[Array, "n 3"]
 
     def __init__(self, times: Times, torques: Rows):
-        self.times, self.torques = _checked_rows("times", times, "torques", torques, extra=0)
+        self.times, self.torques = _checked_times_and_rows(
+            "times", times, "torques", torques, extra=0
+        )
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -104,7 +110,7 @@ class Tabulated(AbstractTorque):
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         t = jnp.asarray(t, self.times.dtype)
         inside = (t >= self.times[0]) & (t < self.times[-1])
-        value = _interpolate_line(self.times, self.torques, t)
+        value = _interpolate_linearly(self.times, self.torques, t)
         return jnp.where(inside, value, jnp.zeros_like(value))
 
 
@@ -129,7 +135,9 @@ class Pulses(AbstractTorque):
     torques: Float[Array, "n 3"]
 
     def __init__(self, edges: Times, torques: Rows):
-        self.edges, self.torques = _checked_rows("edges", edges, "torques", torques, extra=1)
+        self.edges, self.torques = _checked_times_and_rows(
+            "edges", edges, "torques", torques, extra=1
+        )
 
     @property
     def jump_times(self) -> Float[Array, " edges"]:
@@ -144,13 +152,17 @@ class Pulses(AbstractTorque):
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         t = jnp.asarray(t, self.edges.dtype)
         inside = (t >= self.edges[0]) & (t < self.edges[-1])
-        value = self.torques[jnp.clip(_row_index(self.edges, t), 0, self.torques.shape[0] - 1)]
+        value = self.torques[
+            jnp.clip(_index_of_row_at(self.edges, t), 0, self.torques.shape[0] - 1)
+        ]
         return jnp.where(inside, value, jnp.zeros_like(value))
 
 
-def _row_index(times: Float[Array, " n"], t: Scalar) -> Any:
-    """Return the index of the last row whose time is not after t: at a jump, this is the row that
-    begins.
+def _index_of_row_at(times: Float[Array, " n"], t: Scalar) -> Any:
+    """Return the index of the row of a table that applies at the time `t`, s: the last row whose
+    time is not after t, or −1 before the first row. At a jump this is the row that begins.
+
+    - `times`: (n,) s, increasing, the times of the rows
     """
     # For a short table a comparison with all rows stays inside the solver's one kernel; a binary
     # search would be a loop of its own.
@@ -158,21 +170,31 @@ def _row_index(times: Float[Array, " n"], t: Scalar) -> Any:
     return jnp.searchsorted(times, t, side="right", method=method) - 1
 
 
-def _interpolate_line(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar) -> Array:
-    """Return the value at `t` of the straight line between the rows before and after `t`."""
-    i = jnp.clip(_row_index(times, t), 0, times.shape[0] - 2)
+def _interpolate_linearly(
+    times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar
+) -> Array:
+    """Return the value (*k) of a table at the time `t`, s, on the straight line between the rows
+    before and after t; beyond the ends the first or the last line is continued.
+
+    - `times`: (n,) s, increasing, the times of the rows
+    - `rows`: (n, *k), the row of numbers at each time
+    """
+    i = jnp.clip(_index_of_row_at(times, t), 0, times.shape[0] - 2)
     part = (t - times[i]) / (times[i + 1] - times[i])
     return rows[i] + part * (rows[i + 1] - rows[i])
 
 
-def _checked_rows(
+def _checked_times_and_rows(
     name: str, times: NumbersLike, other: str, values: NumbersLike, extra: int | None = None
 ) -> tuple[Array, Array]:
-    """Return `times` and `values` as checked arrays; a row of `values` belongs to a time.
+    """Check a table over time, and return two things as arrays of finite numbers: the times,
+    increasing, s; and the rows of numbers.
 
-    If `extra` is a number, each row has the shape (3,), and there are `extra` more times than rows.
-    If it is `None`, there are as many times as rows, and rows may have any shape. The texts `name`
-    and `other` name the two arguments in messages.
+    - `name`, `other`: the names of the arguments `times` and `values`, for messages
+    - `times`: (n,) s, the times of the rows, or the edges between constant pieces
+    - `values`: the rows of numbers
+    - `extra`: `None` for as many rows, of any shape, as times; a number for rows of shape (3,), of
+      which there are `extra` fewer than times
     """
     edges, rows = _checks.array_of_rows(times, (), name), _checks.numeric_array(values, other)
     count = edges.shape[0]

@@ -132,9 +132,16 @@ class GravityGradient(base.AbstractTimeTorque):
             pull = pull - slope
         return cross(u, pull)
 
-    def _point_mass_in_body(self, t, state):
-        """Return three things: the direction of the point mass in body axes; μ/r³; and (μ/rⁿ⁺¹) ∇Hₙ
-        for each degree n.
+    def _point_mass_in_body(
+        self, t: ScalarLike, state: HasAttitude
+    ) -> tuple[Vec3, Scalar, list[Vec3]]:
+        """Return three things about the far point mass: the unit vector u (3,) towards it, in body
+        axes; μ/r³, 1/s², with its gravitational parameter μ and its distance r; and, for each
+        degree n = 3, 4, …, the gradient (3,) of the solid harmonic Hₙ of the body's gravity at u,
+        times μ/rⁿ⁺¹.
+
+        - `t`: s, the time
+        - `state`: a state with the attitude of the body
         """
         r = base.vector_at(self.position, t, "position")
         distance = jnp.sqrt(dot(r, r))
@@ -142,14 +149,21 @@ class GravityGradient(base.AbstractTimeTorque):
         strength = self.mu / distance / distance / distance
         u = quaternion.rotate_inverse(state.q, r / distance)
         slopes, factor = [], strength
-        for slope in _harmonic_gradients(self.harmonics, u):
+        for slope in _solid_harmonic_gradients(self.harmonics, u):
             factor = factor / distance
             slopes.append(factor * slope)
         return u, strength, slopes
 
 
-def _harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
-    """Return ∇Hₙ at a unit vector, n = 3, 4, … (Cunningham 1970, doi:10.1007/BF01229495)."""
+def _solid_harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
+    """Return the gradients (3,) of the solid harmonics Hₙ = Σ rⁿ Pₙₘ (C cos mλ + S sin mλ) at a
+    unit vector, one for each degree n = 3, 4, …, by Cunningham's recurrence (1970,
+    doi:10.1007/BF01229495).
+
+    - `harmonics`: for each degree n the coefficients (2n + 1,) in the order Cn0, Cn1, Sn1, Cn2,
+      Sn2, …
+    - `u`: (3,), the unit vector at which the gradients are taken
+    """
     x, y, z = components(u)
     zero = jnp.zeros_like(z)
     # Real and imaginary parts of rⁿ Pₙₘ exp(imλ), m = 0 … n + 1, of this degree and of the degree
@@ -158,7 +172,7 @@ def _harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
     out = []
     for n in range(1, len(harmonics) + 3):
         if n >= 3:
-            out.append(_harmonic_gradient(components(harmonics[n - 3]), n, here))
+            out.append(_solid_harmonic_gradient(components(harmonics[n - 3]), n, here))
         k = 2 * n - 1
         (re, im), following = here[n - 1], []
         for m in range(n):
@@ -169,15 +183,20 @@ def _harmonic_gradients(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
     return out
 
 
-def _harmonic_gradient(
-    row: Sequence[Scalar], n: int, lower: Sequence[tuple[Scalar, Scalar]]
+def _solid_harmonic_gradient(
+    coefficients: Sequence[Scalar], n: int, lower: Sequence[tuple[Scalar, Scalar]]
 ) -> Vec3:
-    """Return ∇Hₙ from the coefficients of one degree and the solid harmonics of the degree
-    below.
+    """Return the gradient (3,) of one solid harmonic Hₙ = Σ rⁿ Pₙₘ (C cos mλ + S sin mλ).
+
+    - `coefficients`: the 2n + 1 numbers Cn0, Cn1, Sn1, Cn2, Sn2, …
+    - `n`: the degree
+    - `lower`: the real and imaginary parts of rⁿ⁻¹ Pₙ₋₁,ₘ exp(imλ), the solid harmonics of the
+      degree below, at the point, for m = 0, 1, …, n
     """
-    along, flat_x, flat_y = n * row[0] * lower[0][0], -row[0] * lower[1][0], -row[0] * lower[1][1]
+    zonal = coefficients[0]
+    along, flat_x, flat_y = n * zonal * lower[0][0], -zonal * lower[1][0], -zonal * lower[1][1]
     for m in range(1, n + 1):
-        c, s = row[2 * m - 1 : 2 * m + 1]
+        c, s = coefficients[2 * m - 1 : 2 * m + 1]
         (a, b), (p, q) = lower[m - 1], lower[m + 1] if m < n else (0.0, 0.0)
         half = 0.5 * (n + m) * (n + m - 1)
         along = along + (n + m) * (c * lower[m][0] + s * lower[m][1])
@@ -219,7 +238,10 @@ class MagneticDipole(base.AbstractTimeTorque):
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
         return cross(self.moment, self._field_in_body(t, state))
 
-    def _field_in_body(self, t, state):
+    def _field_in_body(self, t: ScalarLike, state: HasAttitude) -> Vec3:
+        """Return the magnetic field (3,), T, body axes, at the time `t`, s, from the attitude of
+        `state`.
+        """
         return quaternion.rotate_inverse(state.q, base.vector_at(self.field, t, "field"))
 
 
@@ -249,11 +271,12 @@ class FromPotential(base.AbstractTorque):
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
         """Return the potential energy, J."""
-        return self._value(state.q)
+        return self._potential_at(state.q)
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
-        slope = jax.grad(self._value)(state.q)
+        slope = jax.grad(self._potential_at)(state.q)
         return -0.5 * quaternion.multiply(quaternion.conjugate(state.q), slope)[1:]
 
-    def _value(self, q):
+    def _potential_at(self, q: Array) -> Scalar:
+        """Return the potential energy, J, at the attitude `q` (4,), checked to be one number."""
         return _checks.array_of_shape(self.potential(q), (), "potential", hint="one number, J")

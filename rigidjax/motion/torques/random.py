@@ -72,8 +72,12 @@ class CorrelatedTorque(AbstractTorque):
 
 
 def density_of(value: NumbersLike, name: str = "density", size: int = 3) -> Array:
-    """Return a spectral density (size,) from one number or `size` numbers, none of them
-    negative.
+    """Return the spectral density (size,) of a white noise, one number for each axis, from one
+    number for all axes or `size` numbers. **Raises:** `ValueError` for a density below zero.
+
+    - `value`: the number or numbers
+    - `name`: the name of the argument, for messages
+    - `size`: the number of axes
     """
     density = _checks.numeric_array(value, name)
     if density.shape not in ((), (size,)):

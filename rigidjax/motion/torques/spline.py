@@ -43,7 +43,10 @@ class Series(eqx.Module):
     slopes: Float[Array, "n *channels"]
 
     def __init__(self, times: Float[ArrayLike, " n"] | Sequence[Any], values: Samples):
-        t, rows = _known_numbers(times, "times"), _known_numbers(values, "values")
+        t, rows = (
+            _numbers_in_full_precision(times, "times"),
+            _numbers_in_full_precision(values, "values"),
+        )
         if t.ndim != 1 or t.size < 4 or rows.shape[:1] != t.shape:
             words = f"got shapes {t.shape} and {rows.shape}"
             raise ValueError(f"Series: wanted at least four times and as many rows, {words}")
@@ -62,7 +65,7 @@ class Series(eqx.Module):
         self.start, self.step = jnp.asarray(t[0], dtype), jnp.asarray(step, dtype)
         self.values = jnp.asarray(rows, dtype)
         self.slopes = _checks.require_finite(
-            _slopes_at_samples(self.values), "Series: slopes of the values"
+            _spline_slopes(self.values), "Series: slopes of the values"
         )
 
     def __call__(self, t: ScalarLike) -> Any:
@@ -84,20 +87,23 @@ class Series(eqx.Module):
         return left + s * (out + s * (bend + s * twist))
 
 
-def _known_numbers(value: NumbersLike, name: str) -> Any:
-    """Return the numbers, as NumPy's float64 if they are known: times of a log have more than seven
-    digits.
+def _numbers_in_full_precision(value: NumbersLike, name: str) -> Any:
+    """Return `value` as an array of numbers: in float64 of NumPy if the numbers are known, because
+    the times of a log have more than the seven digits of float32; in the default precision of JAX
+    if they are traced. The text `name` names the argument in messages.
     """
     if _checks.is_known(value):
         return _checks.host_array(value, f"Series: {name}")
     return _checks.numeric_array(value, f"Series: {name}").astype(jnp.result_type(float))
 
 
-def _slopes_at_samples(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
-    """Return the change per step at each sample, s_i.
+def _spline_slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
+    """Return the slope of a cubic spline at each sample, as the change per step between samples, in
+    the shape of `values` (n, *channels).
 
-    The changes solve s₋ + 4 s + s₊ = 3 (v₊ − v₋), where − and + are the neighbours of each sample
-    and v the values; at the ends the condition is "not a knot".
+    With vᵢ the sample and sᵢ the slope at sample i, the slopes solve sᵢ₋₁ + 4 sᵢ + sᵢ₊₁ = 3 (vᵢ₊₁ −
+    vᵢ₋₁): the second derivative is then continuous. At the two ends the condition is "not a knot":
+    the third derivative does not jump at the sample next to the end.
     """
     n = values.shape[0]
     v = values.reshape(n, -1)

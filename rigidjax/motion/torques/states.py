@@ -25,7 +25,10 @@ _OF_STATES = ("energy", "internal_momentum")
 
 
 class FrozenLaw(eqx.Module):
-    """Wrap a torque or function of time `law` with its states inserted; `freeze` makes it."""
+    """Wrap a torque or function of time `law` that has states of its own (such as the speed of a
+    wheel), with the values `own` of these states inserted, so that it can be called without them;
+    `freeze` makes it.
+    """
 
     law: Any
     own: tuple[Any]
@@ -43,17 +46,24 @@ class FrozenLaw(eqx.Module):
 
 
 def has_own_states(node: object) -> bool:
-    """Return whether this torque, or function of time, itself has states: `state0` and `rate`."""
+    """Return whether `node`, a torque or a function of time, has states of its own, such as the
+    speed of a wheel: it then has the members `state0` (the initial states) and `rate` (their
+    derivative).
+    """
     return not isinstance(node, type) and hasattr(node, "state0") and hasattr(node, "rate")
 
 
 def has_states(law: PyTree) -> bool:
-    """Return whether a torque, or any part of it, has states of its own."""
-    return any(map(has_own_states, jax.tree.leaves(law, is_leaf=_holds_states)))
+    """Return whether the torque `law`, or any torque or function of time inside it, has states of
+    its own, such as the speed of a wheel.
+    """
+    return any(map(has_own_states, jax.tree.leaves(law, is_leaf=_has_states_or_is_frozen)))
 
 
 def require_stateless(law: PyTree, user: str) -> None:
-    """Raise `ValueError` for a torque with states: `user` does not integrate them."""
+    """Raise `ValueError` if the torque `law` has states of its own, such as the speed of a wheel,
+    which the caller does not integrate; the text `user` names the caller in the message.
+    """
     if has_states(law):
         raise ValueError(
             f"{user}: wanted a torque without states of its own, got one that has some (such as "
@@ -85,7 +95,15 @@ def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
 
 
 def initial_states(law: PyTree, t: ScalarLike, state: PyTree, body: Body) -> tuple[Any, ...]:
-    """Return the initial states of a torque, in the precision of the body's state: see `freeze`."""
+    """Return the initial states of a torque, as a tuple with a tree of arrays for each part of the
+    torque that has states of its own (inner parts first), in the precision of the state of the
+    body.
+
+    - `law`: the torque
+    - `t`: s, the time of the start
+    - `state`: the state of motion at the start
+    - `body`: an `Inertia` or `MassProperties`
+    """
     states: list[Any] = []
 
     def initial_state_of(node: PyTree) -> Any:
@@ -103,8 +121,16 @@ def initial_states(law: PyTree, t: ScalarLike, state: PyTree, body: Body) -> tup
 def rates_of_own_states(
     law: PyTree, t: ScalarLike, own: tuple[Any, ...], state: PyTree, body: Body
 ) -> tuple[Any, ...]:
-    """Return the derivative of each state in `own`. **Raises:** `ValueError` for a shape other than
-    that of `state0`.
+    """Return the derivatives with respect to time of the states that a torque has of its own, as a
+    tuple of trees like `own`. **Raises:** `ValueError` for a derivative whose shape is not that of
+    the state.
+
+    - `law`: the torque
+    - `t`: s, the time
+    - `own`: for each part of the torque that has states, inner parts first, a tree with their
+      values
+    - `state`: the state of motion
+    - `body`: an `Inertia` or `MassProperties`
     """
     queue, rates = list(own), []
 
@@ -123,7 +149,9 @@ def rates_of_own_states(
 
 
 def require_frozen(law: PyTree) -> None:
-    """Raise `TypeError` for a torque with states that is called without the states."""
+    """Raise `TypeError` if the torque `law` has states of its own, such as the speed of a wheel,
+    but is called without the values of these states.
+    """
     if has_own_states(law):
         words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate and "
         words += "identify.fit integrate them; elsewhere call it with its states last"
@@ -131,14 +159,15 @@ def require_frozen(law: PyTree) -> None:
 
 
 def _insert_states(tree: PyTree, own_of: Callable[[Any], Any]) -> Any:
-    """Return `tree` in which each torque with states of its own holds their values.
+    """Return `tree`, a torque or a tree of torques, in which each torque with states of its own is
+    replaced by a `FrozenLaw`: the torque together with the values of its states.
 
-    `own_of(torque)` returns the states of one torque. It is called for a torque inside another
-    torque before the other torque.
+    - `own_of`: a function (torque) that returns the values of the states of one torque; it is
+      called for a torque inside another torque before the other torque
     """
 
     def is_leaf(node: PyTree) -> bool:
-        return node is not tree and _holds_states(node)
+        return node is not tree and _has_states_or_is_frozen(node)
 
     def insert_in_node(node: PyTree) -> Any:
         return _insert_states(node, own_of) if node is not tree and has_own_states(node) else node
@@ -147,9 +176,15 @@ def _insert_states(tree: PyTree, own_of: Callable[[Any], Any]) -> Any:
     return FrozenLaw(inserted, (own_of(inserted),)) if has_own_states(tree) else inserted
 
 
-def _holds_states(node: PyTree) -> bool:
+def _has_states_or_is_frozen(node: PyTree) -> bool:
+    """Return whether `node` is a torque or function of time with states of its own, or a
+    `FrozenLaw`, in which the values of such states are already inserted.
+    """
     return isinstance(node, FrozenLaw) or has_own_states(node)
 
 
 def _checked_numbers(tree: PyTree, name: str, dtype: DTypeLike) -> Any:
+    """Return `tree`, a tree of arrays that a user's torque returned, with each array checked to be
+    numeric and converted to `dtype`; the text `name` names the tree in messages.
+    """
     return jax.tree.map(lambda leaf: _checks.numeric_array(leaf, name).astype(dtype), tree)

@@ -174,8 +174,10 @@ class ReactionWheels(base.AbstractTorque):
         return with_tensor(body, tensor_of(body) - taken)
 
     def speeds_of(self, own: Array, state: HasSpin) -> Float[Array, " wheels"]:
-        """Return the speeds (R,) relative to the body, rad/s, from the momenta `own` and the
-        state.
+        """Return the speeds (R,) of the wheels relative to the body, rad/s.
+
+        - `own`: (R,) N m s, the axial momenta of the wheels, which are the states of this torque
+        - `state`: a state of motion, with the body rate
         """
         own = _checks.array_of_shape(own, self.inertia.shape, "own")
         omega = _checks.require_single(
@@ -185,7 +187,12 @@ class ReactionWheels(base.AbstractTorque):
         return own / self.inertia - along
 
     def torques_of(self, t: ScalarLike, own: Array, state: HasSpin) -> Float[Array, " wheels"]:
-        """Return the torque of motor and bearing on each wheel about its axis, (R,), N m."""
+        """Return the torque of motor and bearing on each wheel about its axis, (R,), N m.
+
+        - `t`: s, the time
+        - `own`: (R,) N m s, the axial momenta of the wheels, which are the states of this torque
+        - `state`: a state of motion, with the body rate
+        """
         speeds, t = self.speeds_of(own, state), _checks.array_of_shape(t, (), "t")
         count, total = self.inertia.shape[0], jnp.zeros_like(speeds)
         if self.motor is not None:
@@ -206,26 +213,46 @@ class ReactionWheels(base.AbstractTorque):
         return total
 
     def state0(self, t: ScalarLike, state: HasSpin, body: object) -> Array:
-        """Return the momenta at the start, (R,), N m s."""
+        """Return the axial momenta of the wheels at the start, (R,), N m s, from their speeds and
+        the body rate in `state`; `t` and `body` are not used.
+        """
         still = self.speeds_of(jnp.zeros_like(self.inertia), state)
         return self.inertia * (self.speeds - still)
 
     def rate(self, t: ScalarLike, own: Array, state: HasSpin, body: object) -> Array:
-        """Return the derivatives of the momenta, (R,), N m."""
+        """Return the derivatives of the axial momenta of the wheels with respect to time, (R,), N
+        m: the torques of motors and bearings.
+
+        - `t`: s, the time
+        - `own`: (R,) N m s, the axial momenta of the wheels
+        - `state`: a state of motion, with the body rate
+        - `body`: not used
+        """
         return self.torques_of(t, own, state)
 
     def internal_momentum(self, t: ScalarLike, own: Array) -> Vec3:
-        """Return Σ h a, (3,), N m s, body frame."""
-        return self._along(own)
+        """Return the momentum of the wheels Σ h a, (3,), N m s, body frame, with the axes a of the
+        wheels and their axial momenta h = `own` (R,), N m s.
+        """
+        return self._sum_along_axes(own)
 
     def energy(self, t: ScalarLike, state: HasSpin, body: object, own: Array) -> Scalar:
-        """Return the wheels' kinetic energy about their axes, Σ h²/2J, J."""
+        """Return the kinetic energy of the wheels about their axes, Σ h²/2J, J, with their axial
+        momenta h = `own` (R,), N m s, and their moments of inertia J.
+        """
         return jnp.sum(own * own / (2.0 * self.inertia))
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object, own: Array) -> Vec3:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return cross(self._along(own), state.omega) - self._along(self.torques_of(t, own, state))
+        return cross(self._sum_along_axes(own), state.omega) - self._sum_along_axes(
+            self.torques_of(t, own, state)
+        )
 
-    def _along(self, numbers: Array) -> Vec3:
+    def _sum_along_axes(self, numbers: Array) -> Vec3:
+        """Return Σ xᵢ aᵢ (3,), body frame, for the unit vectors aᵢ along the axes of the wheels.
+
+        - `numbers`: x (R,), one number for each wheel, such as its momentum, N m s, or its torque,
+          N m
+        """
         # The sum is written out wheel by wheel: there are few wheels, and in a batch array sums are
         # slow.
         total = jnp.zeros(3, numbers.dtype)
@@ -235,8 +262,8 @@ class ReactionWheels(base.AbstractTorque):
 
 
 def _smooth_step(x: Array) -> Array:
-    """Return a smooth step from 0 at x = 0 to 1 at x = 1, whose first two derivatives vanish at x =
-    0 and at x = 1.
+    """Return the polynomial 6 x⁵ − 15 x⁴ + 10 x³ for numbers x from 0 to 1: a smooth step from 0 at
+    x = 0 to 1 at x = 1, whose first two derivatives vanish at both ends.
     """
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))
 
@@ -244,8 +271,13 @@ def _smooth_step(x: Array) -> Array:
 def _checked_one_or_each(
     value: NumbersLike | None, count: int, name: str, requirement: str
 ) -> Array | None:
-    """Return one number for all wheels, or one number for each, checked to be "> 0" or "≥ 0";
-    `None` for `None`.
+    """Return a property of the wheels, such as the largest torque, checked: a scalar array if it is
+    the same for all wheels, an array (count,) if each wheel has its own; `None` for `None`.
+
+    - `value`: the number or numbers
+    - `count`: the number of wheels
+    - `name`: the name of the argument, for messages
+    - `requirement`: "> 0" or "≥ 0", which the numbers must fulfil
     """
     if value is None:
         return None
