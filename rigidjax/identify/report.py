@@ -103,10 +103,10 @@ def numbers(value: float, low: float, high: float) -> list[str]:
     def shown(number: float, gap: float) -> str:
         if not np.isfinite(number):
             return str(number)
-        top = _place(size if fixed else number)
+        top = _power_of_ten(size if fixed else number)
         # The number is shown to two digits after the first digit of the uncertainty, or with six
         # digits if there is no uncertainty.
-        last = _place(2 * min(gap, 8e307)) - 2 if 0 < gap < np.inf else top - 5
+        last = _power_of_ten(2 * min(gap, 8e307)) - 2 if 0 < gap < np.inf else top - 5
         last = min(max(last, top - 12), top - 2)
         return f"{number:.{max(-last, 0)}f}" if fixed else f"{number:.{top - last}e}"
 
@@ -114,14 +114,15 @@ def numbers(value: float, low: float, high: float) -> list[str]:
     return [shown(number, gap) for number, gap in zip((value, low, high), ends, strict=True)]
 
 
-def _place(number: float) -> int:
-    """Return the power of ten (such as 2 for 345) of the first digit of `number`; 0 for zero."""
+def _power_of_ten(number: float) -> int:
+    """Return the power of ten of the first digit of `number`, such as 2 for 345; 0 for zero."""
     return int(np.floor(np.log10(abs(number)))) if number else 0
 
 
 def _interval_as_text(texts: list[str]) -> str:
-    """Return the interval as text, from the three `texts` that `numbers` returns; "not determined"
-    for NaN.
+    """Return an interval as text, such as "1.2 … 1.3", or "not determined" if an end is NaN.
+
+    The list `texts` holds the value and the low and the high end of the interval, as text.
     """
     return "not determined" if "nan" in texts[1:] else f"{texts[1]} … {texts[2]}"
 
@@ -220,9 +221,10 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
 
 
 def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
-    """Return the name of each sensor, the rms error of each of its components, and its unit.
+    """Return, for each sensor of a `fit`, its name, its root mean square errors, and its unit.
 
-    Readings at full scale are left out.
+    There is one root mean square error for each component of the sensor. Readings at full scale are
+    left out.
     """
     out = []
     for error, reading in zip(fit.residuals, fit.model.records.readings, strict=True):
@@ -287,11 +289,11 @@ def write_html(
     """
     require_one_fit(fit)
     units = [shown_unit(unit, rate_unit) for *_, unit in _rms_of_axes(fit)]
-    sizes = _cells(
+    sizes = _table_rows_as_html(
         (name, " ".join(f"{scale * x:.3g}" for x in axes), unit)
         for (name, axes, _), (scale, unit) in zip(_rms_of_axes(fit), units, strict=True)
     )
-    starts = _cells(
+    starts = _table_rows_as_html(
         (
             str(number),
             f"{start.cost:.6g}",
@@ -337,7 +339,7 @@ def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str
     >>> as_html(result).startswith("<p") and "Ix/Iz" in as_html(result)
     True
     """
-    lines = _cells(
+    lines = _table_rows_as_html(
         (name, (shown := numbers(*three))[0], _interval_as_text(shown), unit)
         for name, *three, unit in (*rows(fit, rate_unit), *more)
     )
@@ -350,8 +352,10 @@ def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str
 <ul>{said}</ul>"""
 
 
-def _cells(lines: Iterable[tuple[str, ...]]) -> str:
-    """Return the `lines` of a table, each a tuple of cells, as rows of HTML."""
+def _table_rows_as_html(lines: Iterable[tuple[str, ...]]) -> str:
+    """Return the `lines` of a table, each a tuple of the texts of its cells, as rows (`tr`) of
+    HTML.
+    """
     cells = ("".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in lines)
     return "".join(f"<tr>{line}</tr>" for line in cells)
 

@@ -51,7 +51,7 @@ def allowance(
         out.append(f"They allow for {describe_considered(parts, sensors)}.")
     for index, by_kind in moves:
         clauses = [
-            f"{_WAYS[kind]} would move {_list_shifts(named, sizes)}"
+            f"{_WAYS[kind]} would move {_describe_shifts(named, sizes)}"
             for kind, sizes in by_kind.items()
         ]
         name = type(sensors[index]).__name__
@@ -65,11 +65,11 @@ def allowance(
 
 
 def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
-    """Describe the free biases without a prior that are not small beside the readings.
+    """Describe the sensor biases without a prior that a fit made large beside the readings.
 
-    The text is empty if there is no such bias. Such a bias stands for a part of the motion that the
-    model lacks: in one fit the bias of a pendulum's gyro came out as 1.6 rad/s. `model` is the
-    fitted model, and `quantities` are the reported quantities of the fit.
+    Such a bias stands for a part of the motion that the model lacks: in one fit the bias of a
+    pendulum's gyro came out as 1.6 rad/s. The text is empty if there is no such bias.
+    **Arguments:** `model` the fitted model; `quantities` the reported quantities of the fit.
     """
     out = []
     for index, reading in enumerate(model.records.readings):
@@ -91,11 +91,15 @@ def describe_large_biases(model: Model, quantities: Sequence[Quantity]) -> str:
     return " ".join(out)
 
 
-def _list_shifts(named: Sequence[Quantity], sizes: Float[np.ndarray, " quantities"]) -> str:
-    """Return the words that say by how much each quantity in `named` would move.
+def _describe_shifts(named: Sequence[Quantity], sizes: Float[np.ndarray, " quantities"]) -> str:
+    """Return words such as "I1 by 0.02 (interval ±0.1)", which say how far each quantity would
+    move.
 
-    `sizes` holds the size of each move, which is relative for a positive quantity. The words also
-    give half the width of the interval of each quantity, if this width is finite.
+    Half the width of the 95 % interval is given if it is finite. At most `MOST` quantities are
+    named.
+
+    **Arguments:** `named` the reported quantities; `sizes` (q,) the size of the move of each
+    quantity, relative to its value for a positive quantity.
     """
     words = []
     for quantity, size in list(zip(named, sizes, strict=True))[:MOST]:

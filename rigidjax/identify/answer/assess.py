@@ -135,14 +135,15 @@ def _describe_errors(
     share: float | None,
     span: float | None,
 ) -> str:
-    """Describe how large the errors of a sensor are, and at which times.
+    """Describe in words how large the errors of a sensor are, and at which times.
 
     **Arguments:**
 
     - `model`, `reading`: the fitted model, and the readings of the sensor.
-    - `error`: (R, T, k) the errors in R recordings, at T times, of k components.
+    - `error`: (R, T, k) reading minus prediction in the unit of the sensor, for R recordings, T
+      times and k components.
     - `mask`: (R, T, k) true for the errors that count.
-    - `factor`: the size of the errors over the noise; 1 is not reported.
+    - `factor`: the root mean square error over the known noise; 1 is not written.
     - `share`: the squared errors over the variance of the readings, or `None` if the readings are
       constant or have another unit than the errors.
     - `span`: the number of samples over which the errors are autocorrelated, or `None` for white
@@ -168,8 +169,10 @@ def _describe_errors(
 def _describe_interval(model: Model, error: np.ndarray, mask: np.ndarray) -> str:
     """Describe the shortest interval of time that contains half of the sum of squared errors.
 
-    The interval is taken from the recording with the largest sum. `error` (R, T, k) are the errors
-    of a sensor, and `mask` (R, T, k) is true for the errors that count.
+    It is taken from the recording with the largest sum; the words are "all along" if it is longer
+    than 40 % of the recording. The arguments are the fitted `model`, which holds the times of R
+    recordings; the errors `error` (R, T, k) of one sensor at T times; and `mask` (R, T, k), true
+    for the errors that count.
     """
     squares = np.sum(np.where(mask, error, 0.0) ** 2, axis=-1)
     row = int(np.argmax(squares.sum(axis=1)))
@@ -188,8 +191,12 @@ def _describe_interval(model: Model, error: np.ndarray, mask: np.ndarray) -> str
 def _sums_of_squares(
     reading: Reading, error: np.ndarray, mask: np.ndarray
 ) -> tuple[float, float, float]:
-    """Return three sums of squares: of the errors that `mask` (R, T, k) selects; of the readings
-    about their mean; and of the round-off of the readings.
+    """Return three sums of squares of one sensor: of its errors; of its readings about their mean;
+    and of the round-off of its readings.
+
+    **Arguments:** `reading` the readings of the sensor with their mask; `error` (R, T, k) reading
+    minus prediction, for R recordings, T times and k components; `mask` (R, T, k) true for the
+    errors that count.
     """
     values = np.asarray(reading.values)[reading.host_mask]
     varies = float(np.sum((values - values.mean(axis=0)) ** 2))
@@ -199,10 +206,12 @@ def _sums_of_squares(
 def _excess_by_median(squares: np.ndarray, size: int) -> float:
     """Return the factor by which whitened errors are larger than noise of unit variance.
 
-    `squares` (N,) are the squared lengths of N errors of `size` components each. The factor is the
-    root of their median over the median for unit noise; it is 1 if the median of the squares is
-    less than five standard deviations above the median for unit noise. The median is taken because
-    outliers are expected under a robust loss, and outliers would dominate χ².
+    The factor is the root of the median of the squared lengths over the median for unit noise. It
+    is 1 if the median is less than five standard deviations above that for unit noise. The median
+    is taken because outliers are expected under a robust loss, and outliers would dominate χ².
+
+    **Arguments:** `squares` (N,) the squared length of each of N errors, in standard deviations of
+    the noise; `size` the number of components of an error.
     """
     if not squares.size:
         return 1.0
@@ -215,9 +224,9 @@ def _excess_by_median(squares: np.ndarray, size: int) -> float:
 
 
 def _is_white(
-    e: np.ndarray, used: np.ndarray, slope: np.ndarray, covariance: np.ndarray, has_noise: bool
+    errors: np.ndarray, used: np.ndarray, slope: np.ndarray, covariance: np.ndarray, has_noise: bool
 ) -> bool:
-    """Return whether the whitened errors `e` (R, T, k) are white, by Ljung and Box's test.
+    """Return whether the errors of a sensor are not autocorrelated, by Ljung and Box's test.
 
     The fit removes the covariance `slope covariance slopeᵀ` from white errors and so makes the
     errors correlated, which shows in many short recordings (Box and Pierce 1970,
@@ -225,7 +234,8 @@ def _is_white(
 
     **Arguments:**
 
-    - `e`: (R, T, k) the errors in R recordings, at T times, of k components.
+    - `errors`: (R, T, k) the whitened errors (in standard deviations) in R recordings, at T times,
+      of k components.
     - `used`: (R, T, k) true for the errors that count.
     - `slope`: (R, T, k, m) the derivatives of the errors with respect to the m free numbers of each
       recording.
@@ -237,11 +247,11 @@ def _is_white(
     from scipy.special import chdtrc
 
     total, degrees = 0.0, 0
-    for channel in range(e.shape[-1]):
+    for channel in range(errors.shape[-1]):
         long = used[..., channel].sum(axis=1) >= 2 * LAGS
         mask = used[long, :, channel]
-        x = _packed_about_mean(e[long, :, channel, None], mask)[..., 0]
-        j = _packed_about_mean(slope[long, :, channel], mask)
+        x = _masked_entries_about_mean(errors[long, :, channel, None], mask)[..., 0]
+        j = _masked_entries_about_mean(slope[long, :, channel], mask)
         taken, count = j @ covariance[long], len(mask)
         size, own = int(mask.sum()), float(np.sum(x * x))
         squares = max(own, float(size)) if has_noise else own
@@ -256,11 +266,11 @@ def _is_white(
     return degrees == 0 or bool(chdtrc(degrees, total) > RARE)
 
 
-def _packed_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return the masked entries of each row, moved to the front of the row, minus their mean.
+def _masked_entries_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return the selected entries of each row minus their mean, moved to the front of the row.
 
-    `rows` (R, T, m) are R rows of T entries. The entries at which `mask` (R, T) is true come first,
-    in their order, and zeros follow.
+    The entries of `rows` (R, T, m), in R rows of T times, are selected where `mask` (R, T) is true.
+    They keep their order, and zeros follow them, so that the result has the shape (R, T, m), too.
     """
     order = np.argsort(~mask, axis=1, kind="stable")
     valid = np.take_along_axis(mask, order, axis=1)[..., None]
@@ -274,18 +284,19 @@ def _packed_about_mean(rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
 AT_THE_END = 0.05
 
 
-def _search_answer(
+def _answer_on_search(
     best_cost: float, ended: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
 ) -> Answer:
-    """Return the answer on the search.
+    """Return the answer of a fit on its search: found, not alone (another motion fits too), or not
+    ended.
 
     **Arguments:**
 
-    - `best_cost`: the least cost of all starts.
+    - `best_cost`: the least cost (half the sum of squared residuals) of all starts.
     - `ended`: whether the search reached a minimum.
-    - `rivals`: a description of the starts that ended at other points and fit as well, or "".
+    - `rivals`: a sentence on the starts that ended at other points and fit as well, or "".
     - `interrupted`: what was interrupted, in words.
-    - `remarks`: other remarks for the answer, in words.
+    - `remarks`: other reasons for the answer, in words.
     """
     if not np.isfinite(best_cost):
         return Answer(NOT_ENDED, ("no start gave a finite misfit",))
@@ -300,11 +311,20 @@ def _search_answer(
 def _count_rivals(
     starts: Sequence[Start], best_cost: float, margin: float, linear: Linearisation, x: Array
 ) -> int:
-    """Return the number of `starts` that converged to another point than the best point x.
+    """Return how many searches ended at another point than the best one and fit the readings as
+    well.
 
-    Another point is one to which the linearised errors `linear` change, from x, by a sum of squares
-    of more than twice the `margin`. A start is not counted if its cost exceeds `best_cost` by at
-    most a hundredth of the `margin`.
+    **Arguments:**
+
+    - `starts`: the ends of those searches that fit as well as the best one. One that has not
+      converged is not counted, nor one whose cost exceeds `best_cost` by at most a hundredth of the
+      `margin`.
+    - `best_cost`: the least cost (half the sum of squared residuals) of all searches.
+    - `margin`: the growth of the cost below which two points fit equally well. A point counts as
+      another one if the linearised errors differ, from those at x, by a sum of squares of more than
+      twice this margin.
+    - `linear`: the errors at the best point, with their derivatives.
+    - `x`: (n,) the free numbers at the best point.
     """
     count = 0
     for item in starts:
@@ -394,7 +414,9 @@ def assess(
         limits,
         freedom.degrees(numbers[1]),
     )
-    words = _allowance(model, linear, noise, white.determined, parts, quantities, numbers[1])
+    words = _sentences_on_allowance(
+        model, linear, noise, white.determined, parts, quantities, numbers[1]
+    )
     words = f"{words} {describe_large_biases(model, quantities)}".rstrip()
     return Fit(
         original,
@@ -411,7 +433,7 @@ def assess(
         jnp.asarray(covariance.singular_values),
         jnp.asarray(covariance.null_directions),
         quantities,
-        _search_answer(best_cost, done, rival, interrupted, remarks),
+        _answer_on_search(best_cost, done, rival, interrupted, remarks),
         explanation,
         left,
         limits,
@@ -424,7 +446,7 @@ def assess(
     )
 
 
-def _allowance(
+def _sentences_on_allowance(
     model: Model,
     linear: Linearisation,
     noise: Noise,
@@ -433,18 +455,21 @@ def _allowance(
     quantities: Sequence[Quantity],
     slopes: np.ndarray,
 ) -> str:
-    """Return the sentences of `allowance` on the intervals of the moments and ratios of a fit.
+    """Return sentences on the sensor errors that the intervals of a fit allow for and do not allow
+    for.
 
-    If no moment is reported, the sentences are on the intervals of the `Free`s.
+    They say how far such errors move the moments and ratios of the body or, if none is reported,
+    the values of the `Free`s.
 
     **Arguments:**
 
     - `model`, `noise`: the fitted model, and the standard deviations of the errors of its sensors.
     - `linear`: the errors and their derivatives at the best point.
     - `covariance`: (n, n) the covariance of the free numbers for white errors.
-    - `parts`: the considered errors of the sensors with a `Tolerance`.
-    - `quantities`: the m reported quantities.
-    - `slopes`: (m, n) the derivatives of the quantities with respect to the free numbers.
+    - `parts`: the considered errors, which the sensors with a `Tolerance` may have.
+    - `quantities`: the q reported quantities.
+    - `slopes`: (q, n) the derivatives of the quantities with respect to the free numbers; further
+      rows, for the flatness of bodies, are not used.
     """
     bodies = {log + name for name, chart in charts_by_suffix(model) for log in chart.log_names}
     free = {slot.name for slot in model.slots}
@@ -459,9 +484,12 @@ def _allowance(
 def _with_considered(
     covariance: uncertainty.Covariance, parts: tuple[considered.Consideration, ...], model: Model
 ) -> uncertainty.Covariance:
-    """Return the `covariance` of a fit plus the covariance that the considered errors make.
+    """Return the `covariance` of a fit plus the covariance that the considered errors of sensors
+    make.
 
-    `parts` are the considered errors, which are the errors of the sensors with a `Tolerance`.
+    A considered error is one that a sensor with a `Tolerance` may have, and that the fit does not
+    estimate. **Arguments:** `covariance` the covariance of the free numbers; `parts` the considered
+    errors, with the change of the free numbers by each; `model` the fitted model.
     """
     if not parts:
         return covariance

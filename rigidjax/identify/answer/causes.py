@@ -107,11 +107,19 @@ def misreading(recordings: Sequence[Recording], torque: Torque | None) -> Cause 
 def _euler_residual(
     recordings: Sequence[Recording], torque: Torque | None, turn: np.ndarray, sign: float = 1.0
 ) -> tuple[float, float]:
-    """Return the relative residual of Euler's equations for the inertia that fits best.
+    """Return two numbers: the relative residual of Euler's equations, for the inertia tensor that
+    fits the recorded body rates best; and the margin of this tensor, positive if a body can have
+    it.
 
-    The second result is the margin of this inertia, which is positive for a real body
-    (`tensor_and_margin`). The rates of the `recordings` are multiplied by the matrix `turn` (3, 3),
-    and the `torque` is multiplied by `sign`.
+    The margin is the smallest second moment over the largest one in magnitude.
+
+    **Arguments:**
+
+    - `recordings`: the recordings of one body, with its gyro.
+    - `torque`: the torque on the body, or `None`.
+    - `turn`: (3, 3) the matrix by which the recorded rates are multiplied, to try a permutation or
+      a mirror of the axes, or another unit.
+    - `sign`: the factor by which the torque is multiplied.
     """
     balances = [balance_of_momentum(recording, torque, turn) for recording in recordings]
     matrix, side, momentum = (np.concatenate(part) for part in zip(*balances, strict=True))
@@ -125,10 +133,17 @@ def _rate_difference(
     attitudes: Sequence[tuple[np.ndarray, np.ndarray]],
     turn: np.ndarray,
 ) -> float:
-    """Return the relative difference between the rates of gyros and the rates between attitudes.
+    """Return how far the body rates of a gyro differ from those between successive recorded
+    attitudes.
 
-    The rates that the gyros of the `recordings` read are multiplied by the matrix `turn` (3, 3).
-    `attitudes` holds the times (n,) and the quaternions (n, 4) of each recording.
+    The result is the root mean square difference, relative to the rates between attitudes.
+
+    **Arguments:**
+
+    - `recordings`: the recordings of one body, with its gyro.
+    - `attitudes`: for each recording the times (n,), s, and the quaternions (n, 4).
+    - `turn`: (3, 3) the matrix by which the rates of the gyro are multiplied, to try a permutation
+      or a mirror of the axes, or another unit.
     """
     left, size = 0.0, 1e-300
     for recording, (t, q) in zip(recordings, attitudes, strict=True):
@@ -233,16 +248,25 @@ def time_stamp_cause(model: Model, noise: Noise, linear: Linearisation, index: i
     if not share > chance + 0.5 * (1.0 - chance) + 1.0 / np.sqrt(moving.sum()):
         return None
     scatter = 1e3 * np.sqrt(along / moved[moving].sum())
-    return _cause(
+    return _cause_with_share(
         "clock", sensor, share, f"time stamps that scatter by {scatter:.2g} ms",
         "take times from the sensor's own count of samples, or give it jitter=\"estimated\"",
     )  # fmt: skip
 
 
-def _cause(name: str, sensor: AbstractSensor, share: float, words: str, remedy: str) -> Cause:
-    """Return a `Cause` whose words end with the share of the squared errors that it explains.
+def _cause_with_share(
+    name: str, sensor: AbstractSensor, share: float, words: str, remedy: str
+) -> Cause:
+    """Return a likely cause of the errors of a sensor, whose words say how much of them it
+    explains.
 
-    The arguments are the fields of `Cause`, except that `sensor` is the sensor itself.
+    **Arguments:**
+
+    - `name`: a short name of the cause, such as "drag".
+    - `sensor`: the sensor that has the errors.
+    - `share`: the share of the sum of squared errors that the cause explains, 0 to 1.
+    - `words`: the cause in words.
+    - `remedy`: what to do about the cause, in words.
     """
     kind = type(sensor).__name__
     explained = f"{100 * share:.0f} % of the squared errors of the {kind}"
@@ -254,11 +278,16 @@ def _largest_cause(
 ) -> Cause | None:
     """Return the cause that explains the largest share of the squared errors of a `sensor`.
 
-    Causes that explain nearly as large a share are joined to this cause by "or". The result is
-    `None` if the largest share is too small.
+    Causes that explain nearly as large a share are joined to it by "or". The result is `None` if
+    the largest share is too small. A cause that is linear only while it is small is left out if its
+    size is large.
 
-    **Arguments:** `rows` is the result of `_candidate_causes`, and `shares` holds the result of
-    `_explained_share` for each row.
+    **Arguments:**
+
+    - `sensor`: the sensor that has the errors.
+    - `rows`: for each possible cause its name, its direction (R, T, 3, c) in the readings, its
+      words and its remedy, as `_candidate_causes` returns them.
+    - `shares`: for each possible cause the share that it explains, and its size (c,).
     """
     candidates = [
         (share, name, words.format(size=", ".join(f"{x:.2g}" for x in size)), remedy)
@@ -274,7 +303,7 @@ def _largest_cause(
         return None
     best = [row for share, *row in candidates if share >= NEARLY * most]
     names, words, remedies = (" or ".join(column) for column in zip(*best, strict=True))
-    return _cause(names, sensor, most, words, remedies)
+    return _cause_with_share(names, sensor, most, words, remedies)
 
 
 def _is_vector_error(sensor: AbstractSensor) -> bool:
@@ -285,21 +314,28 @@ def _is_vector_error(sensor: AbstractSensor) -> bool:
 def _candidate_causes(
     model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearisation, index: int
 ) -> tuple[tuple[str, np.ndarray, str, str], ...]:
-    """Return a row for each possible cause of the errors of the sensor with this `index`.
+    """Return the possible causes of the errors of a sensor, with the change of the readings by
+    each.
 
-    A row holds the name, the direction (R, T, 3, c), the words and the remedy of a cause. The
-    direction is the change of the readings in R recordings, at T times, along three axes. A cause
-    with c numbers, such as a bias with three components, has c directions.
+    **Arguments:**
 
-    **Arguments:** `model` is the fitted model, `x` the free numbers at the best point, `noise` the
-    standard deviations of the errors, and `linear` the errors and their derivatives at x.
+    - `model`: the fitted model.
+    - `x`: (n,) the free numbers at the best point.
+    - `noise`: the standard deviations of the errors of each sensor.
+    - `linear`: the errors and their derivatives at x.
+    - `index`: the index of the sensor.
+
+    **Returns** for each cause its name, such as "bias"; the change (R, T, 3, c) of the readings in
+    R recordings, at T times, along three axes, if the cause has unit size; the cause in words; and
+    the remedy in words. A cause with c numbers, such as a bias with three components, makes c
+    changes.
     """
     reading = model.records.readings[index]
     t, shown = np.asarray(model.records.t), np.asarray(reading.values) - linear.raw[index]
     axes = np.broadcast_to(np.eye(3), (*shown.shape, 3))
     turned = np.cross(shown[..., None, :], axes).swapaxes(-1, -2)
     unit, itself = reading.sensor.unit, shown[..., None] * axes
-    response = _response(model, x, noise, linear, index)
+    response = _rate_response(model, x, noise, linear, index)
     return (
         ("lag", slope_in_time(model, shown)[..., None], "a clock offset of {size} s",
          "let a Free move the sensor's offset, or the delay of the torque's log"),
@@ -323,16 +359,24 @@ def _candidate_causes(
     )  # fmt: skip
 
 
-def _response(
+def _rate_response(
     model: Model, x: Float[Array, " n"], noise: Noise, linear: Linearisation, index: int
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that maps torques to the changes of the body rate that the torques make.
 
-    Torques τ and changes have the shape (R, T, 3, c), for R recordings, T times and c torques. The
-    change is `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt`, where I is the inertia tensor and Φ = dΩ/dΩ₀ the derivative of
-    the body rate Ω with respect to the initial rate Ω₀ along the fitted motion. The change is zero
-    if the sensor with this `index` is not a `Gyro`. The other arguments are those of
-    `_candidate_causes`.
+    Torques τ, N m, and changes, rad/s, have the shape (R, T, 3, c), for R recordings, T times and c
+    torques in the body frame. The change is `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt`, where I is the inertia tensor
+    and Φ = dΩ/dΩ₀ the derivative of the body rate Ω with respect to the initial rate Ω₀ along the
+    fitted motion.
+
+    **Arguments:**
+
+    - `model`: the fitted model.
+    - `x`: (n,) the free numbers at the best point.
+    - `noise`: the standard deviations of the errors of each sensor, on which the response does not
+      depend.
+    - `linear`: the errors at x with their derivatives, which hold Φ.
+    - `index`: the index of the sensor. The change is zero if this sensor is not a `Gyro`.
     """
     if not isinstance(model.records.readings[index].sensor, Gyro):
         return np.zeros_like
@@ -361,10 +405,11 @@ def _explained_share(
     free_columns: np.ndarray,
     direction: np.ndarray,
 ) -> tuple[float, np.ndarray]:
-    """Return the share of a sensor's squared errors that a cause explains, and the size of the
-    cause.
+    """Return two things: the share of a sensor's squared errors that a cause explains, 0 to 1; and
+    the size (c,) of the cause.
 
-    The size (c,) holds the least-squares coefficients of the errors on the directions of the cause.
+    The size holds the least-squares coefficients of the errors on the c directions of the cause
+    (the changes of the readings by a cause of unit size).
 
     **Arguments:**
 
@@ -372,9 +417,9 @@ def _explained_share(
       errors and their derivatives at the best point.
     - `index`: the index of the sensor.
     - `free_columns`: (R, N, m) orthonormal columns. They span all changes of the N errors of each
-      recording that a change of the free numbers can make. These changes are subtracted from the
-      direction and from the errors.
-    - `direction`: (R, T, k, c) the directions of the cause.
+      of R recordings that a change of the free numbers can make. These changes are subtracted from
+      the directions and from the errors.
+    - `direction`: (R, T, k, c) the directions, for T times and k components of a reading.
     """
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]

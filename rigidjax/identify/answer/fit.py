@@ -165,7 +165,7 @@ def fit(
     if descent is not None:
         points = _descend_from_each(points, task, descent, key, progress, interrupts)
     attempts = _search_from_each(points, task, checkpoint, progress, interrupts)
-    best = min(attempts, key=_cost)
+    best = min(attempts, key=_finite_cost)
     lowest = float(best.cost)
     for estimated in (_estimate_noise_in_turn, _estimate_widths_in_turn):
         best, task = estimated(best, task)
@@ -183,9 +183,10 @@ _ON_CPU = "computed on the CPU, which is faster than a GPU for so few readings"
 
 
 def _faster_device(model: Model) -> Any:
-    """Return the CPU if a fit of the `model` is faster there than on the default device.
+    """Return the CPU if a fit of the `model` is faster there than on the default device, else
+    `None`.
 
-    Otherwise the result is `None`: for a large model, on a machine without a GPU, and if the user
+    The result is `None` for a model with many numbers, on a machine without a GPU, and if the user
     chose a device by `jax.default_device` or put arrays of the model on a device.
     """
     chosen: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
@@ -198,9 +199,11 @@ def _faster_device(model: Model) -> Any:
 
 
 def _with_original_readings(original: Model, fitted: Model) -> Model:
-    """Return the `fitted` model with the readings of the `original` model, which are not padded.
+    """Return the `fitted` model with the readings of the `original` model in place of its padded
+    ones.
 
-    The estimated jitter of the `fitted` model is kept.
+    A fit pads readings by masked rows, so that recordings of similar length share one program. The
+    jitter (errors of time stamps) that the fit estimated is kept.
     """
     records = original.records
     for index, r in enumerate(fitted.records.readings):
@@ -211,8 +214,13 @@ def _with_original_readings(original: Model, fitted: Model) -> Model:
     return eqx.tree_at(lambda m: m.records, fitted, records)
 
 
-def _cost(attempt: Attempt) -> float:
-    """Return the cost of an attempt, or infinity for NaN, so that the least cost is a good one."""
+def _finite_cost(attempt: Attempt) -> float:
+    """Return the cost at the end of a search, or infinity for NaN, so that the least cost is a good
+    one.
+
+    The cost is half the sum of squared residuals. The `attempt` is the end of the search from one
+    start.
+    """
     cost = float(attempt.cost)
     return cost if np.isfinite(cost) else np.inf
 
@@ -220,8 +228,9 @@ def _cost(attempt: Attempt) -> float:
 def _estimate_noise_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     """Estimate the unknown noise of sensors and the best point alternately, until both settle.
 
-    `best` is the best point for the noise of the `task`. The result is the new best point, and the
-    task with the new noise.
+    **Arguments:** `best` the best point for the present noise; `task` the model and the noise of
+    its sensors, with the tolerance and the largest number of steps of a search. **Returns** two
+    things: the new best point; and the task with the new noise.
     """
     if all(reading.known_noise for reading in task.model.records.readings):
         return best, task
@@ -250,10 +259,18 @@ def _descend_from_each(
     progress: Callable[[str], Any] | None,
     interrupts: list[str],
 ) -> list[Array]:
-    """Return the end of the stochastic gradient descent from each of the starting `points`.
+    """Return the free numbers (n,) to which stochastic gradient descent leads from each starting
+    point.
 
-    After an interrupt (Ctrl-C) a line is added to the list `interrupts`, and the remaining points
-    are left out. `progress` is called with a line of text; the random batches come from `key`.
+    **Arguments:**
+
+    - `points`: the free numbers (n,) at each start.
+    - `task`: the model, and the noise of its sensors.
+    - `descent`: the settings of the descent (optimiser, steps and batch).
+    - `key`: the key of the random batches, or `None` for the same batches at each call.
+    - `progress`: a function that is called with a line of text, or `None`.
+    - `interrupts`: a list, to which a line is added after an interrupt (Ctrl-C). The remaining
+      starts are then left out.
     """
     keys = jax.random.split(jax.random.key(1) if key is None else key, len(points))
     out: list[Array] = []
@@ -273,11 +290,18 @@ def _search_from_each(
     progress: Callable[[str], Any] | None,
     interrupts: list[str],
 ) -> list[Attempt]:
-    """Return the end of the search from each of the starting `points`.
+    """Return the end of the least-squares search from each starting point.
 
-    Searches whose end is in the file `checkpoint` are not repeated. After an interrupt (Ctrl-C) a
-    line is added to the list `interrupts`, and the remaining points are left out. `progress` is
-    called with a line of text after each search.
+    **Arguments:**
+
+    - `points`: the free numbers (n,) at each start.
+    - `task`: the model and the noise of its sensors, with the tolerance and the largest number of
+      steps of a search.
+    - `checkpoint`: the file that holds the ends of earlier searches, which are not repeated, and in
+      which each new end is saved; `None` for no file.
+    - `progress`: a function that is called with a line of text after each search, or `None`.
+    - `interrupts`: a list, to which a line is added after an interrupt (Ctrl-C). The remaining
+      starts are then left out.
     """
     like, print_of = Attempt(points[0]), ""
     if checkpoint is not None:
@@ -303,10 +327,10 @@ def _search_from_each(
             attempts.append(fit_in_stages(point, task, aim=aim, watch=watch))
             latest = like
             # Only the best start keeps its derivatives, which need memory.
-            best = min(attempts, key=_cost)
+            best = min(attempts, key=_finite_cost)
             attempts[:] = [one if one is best else without_arrays(one) for one in attempts]
             keep.save(attempts)
-            words = f"misfit {float(attempts[-1].cost):.6g}, best {_cost(best):.6g}"
+            words = f"misfit {float(attempts[-1].cost):.6g}, best {_finite_cost(best):.6g}"
             report_progress(progress, f"start {number}/{len(points)}: {words}")
     except KeyboardInterrupt:
         interrupts.append(f"interrupted after {len(attempts)} of {len(points)} starts")
@@ -318,9 +342,9 @@ def _search_from_each(
 
 
 def _with_blocks(best: Attempt, model: Model) -> Attempt:
-    """Return the attempt `best` with the errors of the `model` and their derivatives.
+    """Return the end of a search with the errors of the `model` there, and with their derivatives.
 
-    The errors and derivatives are computed only if the attempt does not hold them already.
+    They are computed only if `best`, the end of the search, does not hold them already.
     """
     if best.blocks is not None:
         return best
@@ -328,10 +352,14 @@ def _with_blocks(best: Attempt, model: Model) -> Attempt:
 
 
 @eqx.filter_jit
-def _errors_alone(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors of all sensors at the free numbers x, without derivatives.
+def _errors_without_derivatives(
+    model: Model, x: Float[Array, " n"]
+) -> tuple[Float[Array, "..."], ...]:
+    """Return the errors of all sensors at the free numbers x (n,) of a `model`, without
+    derivatives.
 
-    A program without derivatives takes less time to compile.
+    There is one array (R, T, k) for each sensor, for R recordings, T times and k components. A
+    program without derivatives takes less time to compile.
     """
     return all_errors(model, x)
 
@@ -348,9 +376,16 @@ def _converged_integrator(
 ) -> AbstractIntegrator | None:
     """Return an integrator with steps so short that shorter steps do not change the predictions.
 
-    The predictions are those of the model of the `task` at the point `best`. The result is `None`
-    if the present integrator of the model is accurate enough. If even the shortest steps still
-    change the predictions, a line is added to the list `remarks`.
+    The result is `None` if the present integrator of the model is accurate enough.
+
+    **Arguments:**
+
+    - `best`: the end of a search, with the errors at its free numbers; the predictions are compared
+      there.
+    - `task`: the model with its integrator, and the noise of its sensors, which is the measure of a
+      change.
+    - `remarks`: a list, to which a line is added if even the shortest steps still change the
+      predictions.
     """
     model, (errors, _) = task.model, best.blocks
     steps, apart = model.integrator, 0.0
@@ -359,7 +394,7 @@ def _converged_integrator(
         if jax.tree.structure(finer) == jax.tree.structure(model.integrator):
             exact, _ = errors_and_slopes(closer, best.x)
         else:
-            exact = _errors_alone(closer, best.x)
+            exact = _errors_without_derivatives(closer, best.x)
         apart = max(
             float(np.max(np.abs(np.asarray(a) - np.asarray(b)) / np.asarray(sigma)[:, None]))
             for a, b, sigma in zip(errors, exact, task.noise, strict=True)
@@ -384,8 +419,11 @@ def _estimate_widths_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
     """Estimate the unknown spreads of `Free`s and the best point alternately, until both settle.
 
     The spread of a `Free` is the standard deviation, between recordings, of its value about the
-    value that the recordings share. `best` is the best point for the spreads in the model of the
-    `task`. The result is the new best point, and the task with the new spreads.
+    value that the recordings share.
+
+    **Arguments:** `best` the best point for the present spreads; `task` the model with these
+    spreads and the noise of its sensors, with the tolerance and the largest number of steps of a
+    search. **Returns** two things: the new best point; and the task with the new spreads.
     """
     indices = [index for index, slot in enumerate(task.model.slots) if slot.estimated]
     if not indices:
@@ -406,11 +444,15 @@ def _estimate_widths_in_turn(best: Attempt, task: Task) -> tuple[Attempt, Task]:
 
 
 def _expected_widths(best: Attempt, task: Task, indices: list[int]) -> np.ndarray:
-    """Return the expected root mean square, over recordings, of the deviations of some `Free`s.
+    """Return the expected spread (k,) of each of k `Free`s whose value differs between recordings.
 
-    `indices` are the indices of the slots of these `Free`s in the model of the `task`. The
-    expectation is over the posterior density at the point `best`, which Laplace's method takes as
-    normal.
+    The spread is the root mean square, over recordings, of the deviation of the value from the
+    value that the recordings share. The expectation is over the posterior density at the point
+    `best`, which Laplace's method takes as normal.
+
+    **Arguments:** `best` the end of a search, with the errors and their derivatives there; `task`
+    the model and the noise of its sensors; `indices` the indices of the k `Free`s in
+    `task.model.slots`.
     """
     linear = linearise(task.model, best.x, task.noise, best.blocks)
     variance, x = np.diag(white_covariance(linear).determined), np.asarray(best.x)

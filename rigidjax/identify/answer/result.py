@@ -166,6 +166,9 @@ class Fit(eqx.Module):
         return f"{report.table(report.rows(self))}\n\n{report.verdict(self)}"
 
     def _repr_html_(self) -> str:
+        """Return the fit as HTML, with its status, its quantities and its verdict, as a notebook
+        shows it.
+        """
         from rigidjax.identify import report
 
         return report.as_html(self)
@@ -223,14 +226,17 @@ class Fit(eqx.Module):
         The residual of a masked reading is zero. For several recordings the residuals have a
         leading axis.
         """
-        errors = self._errors
+        errors = self._unpadded_errors
         return tuple(e[0] for e in errors) if self.model.count == 1 else errors
 
     @property
-    def _errors(self) -> tuple[Float[Array, "records times _"], ...]:
-        """Return the residuals of each sensor with a leading axis of recordings.
+    def _unpadded_errors(self) -> tuple[Float[Array, "records times _"], ...]:
+        """Return the residuals (R, T, k) of each sensor, reading minus prediction, in the sensor's
+        unit.
 
-        The rows with which a fit pads the readings are left out.
+        R is the number of recordings, T the number of times and k the number of components. The
+        rows with which a fit pads the readings are left out. **Raises** `ValueError` for a fit
+        without its errors.
         """
         if self.linear is None:
             raise ValueError(
@@ -246,7 +252,7 @@ class Fit(eqx.Module):
         Readings at full scale are left out.
         """
         out = []
-        errors = self._errors
+        errors = self._unpadded_errors
         for error, reading in zip(errors, self.model.records.readings, strict=True):
             mask = reading.channel_mask.all(axis=-1)
             lengths = np.sum(np.asarray(error) ** 2, axis=-1)[

@@ -155,10 +155,10 @@ def undetermined_combinations(fit: "Fit") -> tuple[Combination, ...]:
 def _readings_change(fit: "Fit", direction: np.ndarray) -> bool:
     """Return whether readings change along a `direction` (n,) although their derivatives are zero.
 
-    This happens if a torque switches at a time or a state that changes along the direction. The
-    change is half the difference of the readings after a step forwards and a step backwards. A
-    number on which the readings depend only by its square has zero derivatives, too, but it does
-    not change this difference.
+    The direction is one of the n free numbers of a `fit`. Readings change so if a torque switches
+    at a time, or at a state, that changes along the direction. The change is half the difference of
+    the readings after a step forwards and a step backwards. A number on which the readings depend
+    only by its square has zero derivatives, too, but it does not change this difference.
     """
     if fit.model.torque is None:
         return False
@@ -178,12 +178,15 @@ def _combination_of_row(
     values: np.ndarray,
     switch: bool,
 ) -> Combination:
-    """Return the `Combination` that a row of the reduced echelon form of all directions describes.
+    """Return the combination of numbers, which the data leave undetermined, that one row describes.
+
+    The row is one of the reduced row echelon form of all undetermined directions.
 
     **Arguments:**
 
-    - `row`: (M,) for each of the M free numbers, its change divided by the size of the number.
-    - `names`: the name and unit of each number, and whether its change is relative.
+    - `row`: (M,) for each of M numbers, its change divided by the size of the number.
+    - `names`: the name and unit of each number, and whether its change is given as a relative
+      change.
     - `size`: (M,) the size of each number.
     - `values`: (M,) the value of each number.
     - `switch`: whether the readings change along the combination after all, although their
@@ -209,10 +212,11 @@ def _combination_of_row(
 
 
 def _names_and_units(model: Model) -> list[tuple[str, str, bool]]:
-    """Return a row for each number that `_values_and_slopes` returns for this `model`.
+    """Return the name, the unit, and whether changes are relative, of all numbers that a report may
+    name.
 
-    A row holds the name of the number, its unit, and whether its changes are given as relative
-    changes.
+    The numbers are, in the order of `_values_and_slopes`, the reported quantities of the `model`,
+    the components of its inertia tensors, and the initial attitudes, positions and velocities.
     """
     out = labels(model)
     for name, chart in charts_by_suffix(model):
@@ -232,10 +236,11 @@ def _names_and_units(model: Model) -> list[tuple[str, str, bool]]:
 
 @eqx.filter_jit
 def _values_and_slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Return the derivatives (M, n) and the values (M,) of all numbers that a report may name.
+    """Return the derivatives (M, n) and the values (M,) of all M numbers that a report may name.
 
-    The numbers are the reported quantities, the components of the inertia tensors and the initial
-    states. The derivatives are taken with respect to the n free numbers, at `point` (n,).
+    The numbers are the reported quantities of the `model`, the components of its inertia tensors
+    and the initial attitudes, positions and velocities. A positive quantity is given by its
+    logarithm. The derivatives are taken with respect to the n free numbers, at `point` (n,).
     """
     reference = model.reference
     start = jax.vmap(ReferenceStates.start_at)(reference, point[model.index.start])
@@ -262,10 +267,14 @@ def _values_and_slopes(model: Model, point: Float[Array, " n"]) -> tuple[Array, 
 
 
 def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
-    """Return a mask (M,) of the numbers whose `changes` (k, M) along k directions are reported.
+    """Return a mask (M,), true for the numbers whose changes along undetermined directions are
+    reported.
 
     The changes of an inertia tensor are reported as changes of its moments, or as changes of its
-    components if some change turns its principal axes. `names` holds the names of the M numbers.
+    components if some change turns its principal axes.
+
+    **Arguments:** `fit` the fit; `names` the names of the M numbers; `changes` (k, M) the changes
+    of the numbers along k directions that the data do not determine.
     """
     rows = bodies_of(fit.model, fit.derivative_point)
     mask = np.ones(len(names), bool)
@@ -276,14 +285,15 @@ def _mask_to_report(fit: "Fit", names: list[str], changes: np.ndarray) -> np.nda
         places = [some[-1] for some in every]
         mask[[i for some in every for i in some]] = False
         moments = [names.index(f"{log}{where}") for log in chart.log_names if log != "mass"]
-        if moments and _turn_axes(np.asarray(tensor_of(body)), changes[:, places]):
+        if moments and _turns_principal_axes(np.asarray(tensor_of(body)), changes[:, places]):
             mask[moments], mask[places] = False, True
     return mask
 
 
-def _turn_axes(tensor: np.ndarray, changes: np.ndarray) -> bool:
-    """Return whether any of the `changes` (k, 6) of the components of a `tensor` (3, 3) turns its
-    principal axes.
+def _turns_principal_axes(tensor: np.ndarray, changes: np.ndarray) -> bool:
+    """Return whether any of k changes of an inertia `tensor` (3, 3) turns its principal axes.
+
+    Each row of `changes` (k, 6) changes the components of the tensor, in the order of `BASIS`.
     """
     steps = np.einsum("mk,kij->mij", changes, BASIS)
     _, axes = np.linalg.eigh(tensor)
@@ -293,10 +303,11 @@ def _turn_axes(tensor: np.ndarray, changes: np.ndarray) -> bool:
 
 
 def _reduced_echelon_form(rows: np.ndarray) -> np.ndarray:
-    """Return the reduced row echelon form of a matrix, computed with complete pivoting.
+    """Return the reduced row echelon form of the matrix `rows` (k, M), by elimination with complete
+    pivoting.
 
-    `rows` (k, M) is the matrix. Rows that are zero up to round-off are left out, and small entries
-    are set to zero.
+    Rows that are zero up to round-off are left out, and entries that are small beside the largest
+    of their row are set to zero.
     """
     rows = np.array(rows)
     size, done = np.abs(rows).max(), 0
@@ -323,7 +334,7 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
             "best point found, and say nothing about the body."
         ]
         # Undetermined directions are the likely reason why a search did not end: name them.
-        out += [] if lost else _list_undetermined(fit)
+        out += [] if lost else _describe_undetermined(fit)
         return (*out, *describe_full_scale(fit.model.records.readings))
     out = []
     moments, first = [], 0
@@ -331,7 +342,7 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         moments += fit.quantities[first : first + len(chart.log_names)]
         first += len(chart.log_names) + len(chart.plain_names)
     for quantity in moments:
-        wide = _half_width(quantity)
+        wide = _half_width_of_interval(quantity)
         # `wide` is half the width of the interval of the logarithm. If it is small, it is the
         # relative half-width; if it is large, the ends of the interval are exp(±wide) times the
         # value.
@@ -354,7 +365,7 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
     count = fit.model.count
     if reports_starts(fit.model):
         out.append(_describe_rates(fit.quantities[first : first + 3 * count], count))
-    out += _list_undetermined(fit)
+    out += _describe_undetermined(fit)
     out += correlations(fit)
     if fit.model.torque is None:
         out.append(
@@ -370,8 +381,8 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
     return tuple(out)
 
 
-def _half_width(quantity: Quantity) -> float:
-    """Return half the width of the 95 % interval of a quantity.
+def _half_width_of_interval(quantity: Quantity) -> float:
+    """Return half the width of the 95 % interval of a reported `quantity`.
 
     For a positive quantity it is half the width of the interval of its logarithm.
     """
@@ -379,15 +390,16 @@ def _half_width(quantity: Quantity) -> float:
 
 
 def _describe_rates(rates: Sequence[Quantity], count: int) -> str:
-    """Describe how well the initial body rates of `count` recordings are determined.
+    """Describe in a sentence how well the data determine the initial body rates of all recordings.
 
-    `rates` holds the three components of each initial body rate, one after another.
+    **Arguments:** `rates` the three components of each initial body rate, with their deviations,
+    one recording after another; `count` the number of recordings.
     """
     shares = []
     for index in range(count):
         three = rates[3 * index : 3 * index + 3]
         length = np.linalg.norm([q.value for q in three])
-        shares.append(np.max([_half_width(q) for q in three]) / max(length, 1e-300))
+        shares.append(np.max([_half_width_of_interval(q) for q in three]) / max(length, 1e-300))
     wide = np.max(shares)
     what = "The initial body rate is" if count == 1 else "The initial body rates are"
     if not wide < 1.0:
@@ -397,10 +409,12 @@ def _describe_rates(rates: Sequence[Quantity], count: int) -> str:
     return f"{what} {grade} determined, to ±{wide:.2g} of {its}."
 
 
-def _list_undetermined(fit: "Fit") -> list[str]:
-    """Describe each combination of numbers that the data of a fit do not determine, in a sentence.
+def _describe_undetermined(fit: "Fit") -> list[str]:
+    """Describe, each in a sentence, the combinations of numbers that the data of a `fit` do not
+    determine.
 
-    The list is empty if the data determine all numbers.
+    At most `SEVERAL` combinations are described, and the rest is counted. The list is empty if the
+    data determine all numbers.
     """
     combinations = undetermined_combinations(fit)
     if not combinations:

@@ -35,8 +35,8 @@ from rigidjax.motion.manifold import names, plus
 
 
 class Belief(eqx.Module):
-    """Hold an estimate of the state at a time, and a root S of the covariance `S Sᵀ` of the errors
-    of the estimate.
+    """Hold an estimate of the state at one time, and a root S of the covariance `S Sᵀ` of its
+    errors.
 
     `first_belief` makes the belief before the first reading. In the result of `filter` all fields
     have a leading time axis.
@@ -147,16 +147,20 @@ def belief_at(
     scene: Scene,
     drifts: Sequence[Drift],
 ) -> Belief:
-    """Return the `Belief` at the time t whose errors are independent, in the dtype of the `state`.
+    """Return the `Belief` (an estimated state with a root of its covariance) at the time t, with
+    independent errors.
+
+    All arrays except the time get the dtype of the `state`.
 
     **Arguments:**
 
     - `t`: the time, s.
-    - `state`: the estimated state.
-    - `deviations`: (k,) the standard deviations of the errors of the state.
-    - `scene`: the scene, with the correlated torques, which begin at zero with their stationary
-      deviation.
-    - `drifts`: the walks, which begin at their values in the scene.
+    - `state`: the estimated motion, a `Spin`, `Attitude` or `Rigid`.
+    - `deviations`: (k,) the standard deviations of the k components of an error of `state`.
+    - `scene`: the body, torques and sensors. Each `CorrelatedTorque` in it begins at zero, with the
+      standard deviation of its stationary distribution.
+    - `drifts`: the walks, which are numbers of the scene that drift randomly, such as the bias of a
+      gyro. They begin at their values in the scene.
     """
     dtype = state.omega.dtype
     coloured = coloured_parts(scene.process)
@@ -170,9 +174,14 @@ def belief_at(
 
 
 def _require_shown_attitude(recording: Recording, state: HasSpin | None) -> None:
-    """Raise an error if the `state` has an attitude that the readings of `recording` do not show.
+    """Raise an error if a filter cannot take its initial attitude from the readings alone.
 
-    A `TypeError` is raised for a traced recording, and a `ValueError` if no attitude is shown.
+    An attitude sensor, two directions or three markers show the attitude.
+
+    **Arguments:** `recording` the readings of all sensors; `state` the initial state, which has an
+    attitude to be found if it is an `Attitude` or a `Rigid`. **Raises:** `TypeError` for a traced
+    recording, whose readings cannot be looked at; `ValueError` if `state` has an attitude and no
+    reading shows it.
     """
     if not _checks.is_known(recording):
         raise TypeError("state: wanted a state; a traced recording shows none")
@@ -184,11 +193,16 @@ def _require_shown_attitude(recording: Recording, state: HasSpin | None) -> None
 
 
 def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recording]:
-    """Return the scene of the only recording of a `model`, and the recording.
+    """Return the scene of the only recording of a `model`, and the recording (its times and
+    readings).
 
-    A scene holds the body, torque, process, sensors and initial state at the free numbers x (n,).
-    With `None` for x the body must be known. The torque of the scene reads the inputs of the
-    recording.
+    A scene holds all on which readings depend: the body, the torques, the sensors and the initial
+    state. The torque in the returned scene reads the inputs that the recording holds, such as a log
+    of thrust.
+
+    **Arguments:** `model` a `Model` of one recording; `x` (n,) its free numbers, at which the scene
+    is taken, or `None` for a model whose body is known. **Raises** `ValueError` for several
+    recordings, for a missing x, and for a sensor that a filter cannot use.
     """
     require_one(model)
     if model.count != 1:
@@ -210,9 +224,11 @@ def scene_at(model: Model, x: Float[Array, " n"] | None) -> tuple[Scene, Recordi
 
 @eqx.filter_jit
 def _scene_at(model: Model, x: Float[Array, " n"]) -> Scene:
-    """Return the scene of the first recording of a `model` at the free numbers x.
+    """Return the scene of the first recording of a `model`, computed in one compiled program.
 
-    The torque of the scene reads the inputs of the recording.
+    A scene holds all on which readings depend: the body, the torques, the sensors and the initial
+    state. The torque in the returned scene reads the inputs that the recording holds, such as a log
+    of thrust. The scene is taken at the free numbers x (n,) of the model.
     """
     row = model.index.rows(x)[0]
     record, reference, body_index = stacking.pick_records(
@@ -253,10 +269,20 @@ class Grid(NamedTuple):
 def grid_of(
     process: Process | None, recording: Recording, belief: Belief, substeps: int | None
 ) -> Grid:
-    """Return the `Grid` of the steps from the time of the `belief` to the end of the `recording`.
+    """Return the times at which the steps of a filter end, from the time of a `belief` to the last
+    reading.
 
-    `substeps` is the number of steps from one time to the next; `None` chooses this number by the
-    body rate and by the correlation times of the `process`.
+    These are the times of the `recording`, and equally spaced times between them if the body turns
+    much from one reading to the next.
+
+    **Arguments:**
+
+    - `process`: the unknown torque, or `None`. A step is at most a quarter of each of its
+      correlation times.
+    - `recording`: the times and readings.
+    - `belief`: the estimate from which the filter starts, at or before the first reading.
+    - `substeps`: the number of steps from one time to the next; `None` chooses this number by the
+      body rate and the correlation times.
     """
     xp = _checks.namespace((recording.t, belief.t))
     t, t0 = xp.asarray(recording.t), xp.asarray(belief.t)
@@ -500,7 +526,18 @@ def step(
 
 @eqx.filter_jit
 def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) -> Belief:
-    """Return the `belief` after one step and the readings in `stop`, in one compiled program."""
+    """Return the estimate after one step of a filter to a new time and its readings, in one
+    compiled program.
+
+    **Arguments:**
+
+    - `scene`: the body, torques and sensors.
+    - `drifts`: the walks, which are numbers of the scene that drift randomly, such as the bias of a
+      gyro.
+    - `belief`: the estimated state, with a root of its covariance, before the step.
+    - `stop`: the new time, s, and for each sensor its reading at this time and whether there is
+      one.
+    """
     # Replace missing readings by a unit vector: derivatives at a zero quaternion are NaN.
     units = (jnp.eye(1, v.size, dtype=v.dtype).reshape(v.shape) for v in stop.values)
     values = tuple(map(jnp.where, stop.masks, stop.values, units))
@@ -512,9 +549,21 @@ def _step(scene: Scene, drifts: tuple[Drift, ...], belief: Belief, stop: Stops) 
 def _predict_and_update(
     dynamics: Dynamics, belief: Belief, stop: Stops
 ) -> tuple[Belief, ReadNumbers]:
-    """Return the belief after one step to the time in `stop` and the readings at this time.
+    """Return two things: the estimate after one step of a filter; and its readings beside their
+    predictions.
 
-    The second result is the `ReadNumbers` of all sensors at this time.
+    The step first predicts the state at the new time by the equations of motion. Then it corrects
+    the state by the readings at this time.
+
+    **Arguments:**
+
+    - `dynamics`: the equations of motion, the noise of the torques, and the sensors.
+    - `belief`: the estimated state, with a root of its covariance, before the step.
+    - `stop`: the new time, s, and for each sensor its reading at this time and whether there is
+      one.
+
+    **Returns** the new `Belief`, and the `ReadNumbers` with the arrays (k,) of the innovations
+    (reading minus prediction), their variances and a mask, for the k components of all sensors.
     """
     dtype = belief.root.dtype
     # Subtract times before they are rounded to the dtype of the state: after a thousand seconds the
@@ -533,11 +582,16 @@ def _predict_and_update(
 def scan_filter(
     run: FilterInput, keep: Callable[[Belief, ReadNumbers], PyTree[Array]]
 ) -> tuple[Dynamics, Stops, PyTree[Array]]:
-    """Run the filter over all times of its grid by `lax.scan`.
+    """Run the filter over all its times, with `lax.scan`, and store what `keep` picks at each time.
 
-    Three things are returned: the equations of the filter; the times with their readings, as
-    `Stops`; and the results of `keep(belief, read)` at each time, stacked. `keep` is given the
-    `Belief` after the readings and the `ReadNumbers` at a time.
+    **Arguments:**
+
+    - `run`: the checked arguments of the filter.
+    - `keep`: a function of the `Belief` after the readings at a time and of the `ReadNumbers` at
+      this time (each reading minus its prediction). It returns the arrays to store.
+
+    **Returns** three things: the equations of the filter; the times with their readings, as
+    `Stops`; and the stored arrays, with a leading axis of times.
     """
     scene, drifts, recording, first, grid = run
     dtype = first.root.dtype
@@ -557,7 +611,12 @@ def scan_filter(
 
 @eqx.filter_jit
 def _filter(run: FilterInput) -> Filtered:
-    """Return the result of `filter` from its checked arguments, computed in one program."""
+    """Return the result of the Kalman filter `filter`, computed in one compiled program.
+
+    The argument `run` holds the checked arguments of `filter`: the scene (body, torques and
+    sensors), the walks, the readings, the belief before the first reading, and the times of the
+    steps.
+    """
     both = scan_filter(run, lambda belief, read: (belief, read))[2]
     beliefs, read = run.grid.at_rows(both)
     reads = steps.split_by_sensor(run.scene.sensors, read)
@@ -567,15 +626,31 @@ def _filter(run: FilterInput) -> Filtered:
 
 @eqx.filter_jit
 def _log_likelihood(run: FilterInput) -> Scalar:
-    """Return the result of `log_likelihood` from its checked arguments, computed in one program."""
+    """Return the logarithm of the density of all readings, by a Kalman filter in one compiled
+    program.
+
+    The argument `run` holds the checked arguments of `log_likelihood`: the scene (body, torques and
+    sensors), the walks, the readings, the belief before the first reading, and the times of the
+    steps.
+    """
     return roots.innovation_terms(*scan_filter(run, lambda _, read: read)[2]).log_density
 
 
 def status_of(beliefs: Belief, reads: tuple[ReadNumbers, ...], t0: Array) -> tuple[Array, Array]:
-    """Return the status of a run of a filter, and the time at which the filter was lost, else NaN.
+    """Return two things: whether a filter followed the readings; and the time, s, at which it was
+    lost.
 
-    `beliefs` and `reads` are the results at the times of the recording, and `t0`, s, is the time of
-    the first belief. The status is 0, 1 or 2, as in `Filtered`.
+    The status is 0 if the filter followed the readings, 1 if it was lost, and 2 if an estimate is
+    NaN or infinite. The filter is lost if for a second, and for three readings of one sensor, no
+    reading was within six standard deviations of its prediction. The time is NaN if the filter was
+    not lost.
+
+    **Arguments:**
+
+    - `beliefs`: the estimates at the T times of the recording.
+    - `reads`: for each sensor the innovations, (T, k) for k components, their variances, and a
+      mask.
+    - `t0`: the time of the belief before the first reading, s.
     """
     t, times = beliefs.t, jnp.arange(beliefs.t.shape[0])
     lost = jnp.zeros(t.shape, bool)
@@ -597,7 +672,13 @@ def status_of(beliefs: Belief, reads: tuple[ReadNumbers, ...], t0: Array) -> tup
 def checked_input(
     model: Model, belief: Belief, x: Float[Array, " n"] | None, substeps: int | None
 ) -> FilterInput:
-    """Return the arguments of `filter` and `smooth` after checks."""
+    """Return the arguments of `filter` and `smooth` after checks, with the scene and the times of
+    the steps.
+
+    **Arguments:** `model`, `belief`, `x` and `substeps` are as for `filter`. **Raises:**
+    `TypeError` for a `belief` without the parts of the state that a sensor reads, such as an
+    attitude; and the errors of `scene_at` and `grid_of`.
+    """
     scene, recording = scene_at(model, x)
     _checks.require_instance(belief, Belief, "first", hint="identify.first_belief makes it")
     for sensor in scene.sensors:

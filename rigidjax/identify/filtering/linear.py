@@ -170,7 +170,7 @@ def linear_filter(
     >>> estimate.mean[0].tolist(), estimate.innovation[0].tolist()
     ([0.5], [1.0])
     """
-    return linear_estimate(*_checked_parts(model, readings, mean, root, mask), smooth=False)
+    return linear_estimate(*_checked_arguments(model, readings, mean, root, mask), smooth=False)
 
 
 def linear_smooth(
@@ -191,15 +191,24 @@ def linear_smooth(
     >>> bool(estimate.mean[0, 0] > 0.5), estimate.kicks.shape
     (True, (2, 1))
     """
-    return linear_estimate(*_checked_parts(model, readings, mean, root, mask), smooth=True)
+    return linear_estimate(*_checked_arguments(model, readings, mean, root, mask), smooth=True)
 
 
-def _checked_parts(
+def _checked_arguments(
     model: LinearModel, readings: Readings, mean: Mean, root: Root, mask: Mask
 ) -> tuple[Parts, Array, Array, Array, Array]:
     """Return the arguments of `linear_filter` as checked arrays.
 
-    The `model` is returned as a dict of field name → array. Masked readings are replaced by zero.
+    **Arguments:**
+
+    - `model`: the linear model, with n entries of the state and k numbers read at a time.
+    - `readings`: (T, k) the numbers read at each of T times.
+    - `mean`, `root`: (n,) the mean of the first state, and (n, n) a root of its covariance.
+    - `mask`: (T, k) true for the numbers that count; `None` if all count.
+
+    **Returns** five things: the arrays of the `model` as a dict of field name → array; the
+    readings, with zeros in place of masked ones; the `mean`; the `root`; and the mask (T, k).
+    **Raises** `ValueError` for shapes that do not fit, and for NaN that is not masked.
     """
     _checks.require_instance(model, LinearModel, "model")
     n, k = model.size, model.deviation.shape[-1]
@@ -220,17 +229,19 @@ def _checked_parts(
     words = "readings: contains NaN or infinity; mask it if it is a gap"
     readings = jnp.where(mask, _checks.error_if(readings, bad.any(), words), 0)
     parts = {name: getattr(model, name) for name in _AXES}
-    for name, part in _time_varying(parts).items():
+    for name, part in _time_varying_arrays(parts).items():
         wanted = times - 1 if name in _STEPS else times
         if part.shape[0] != wanted:
             raise ValueError(f"{name}: wanted {wanted} rows for {times} times, got {part.shape[0]}")
     return parts, readings, mean, root, mask
 
 
-def _time_varying(parts: Parts) -> Parts:
-    """Return the entries of `parts` that have a leading axis, over the steps or over the times.
+def _time_varying_arrays(parts: Parts) -> Parts:
+    """Return the arrays of a linear model that change from step to step or from time to time.
 
-    `parts` is a dict of field name → array of a `LinearModel`.
+    Such an array has one more axis, its first, than a constant one. The argument `parts` and the
+    result are dicts of field name of a `LinearModel` → array; an entry `None` of `parts` is left
+    out.
     """
     return {n: part for n, part in parts.items() if part is not None and part.ndim > _AXES[n]}
 
@@ -239,13 +250,21 @@ def _time_varying(parts: Parts) -> Parts:
 def linear_estimate(
     parts: Parts, readings: Array, mean: Array, root: Array, mask: Array, *, smooth: bool
 ) -> LinearEstimate:
-    """Return the estimate of the Kalman filter or, with `smooth`, of the smoother.
+    """Return the states of a linear model at T times, estimated by the Kalman filter or the
+    smoother.
 
-    `parts` is a dict of field name → array of a `LinearModel`; all other arguments are those of
-    `linear_filter`, checked.
+    **Arguments:**
+
+    - `parts`: the arrays of a `LinearModel`, as a dict of field name → array.
+    - `readings`: (T, k) the numbers read at each time.
+    - `mean`, `root`: (n,) the mean of the first state, and (n, n) a root of its covariance, before
+      the first readings.
+    - `mask`: (T, k) true for the numbers that count.
+    - `smooth`: whether each state is estimated from all readings (the smoother of Rauch, Tung and
+      Striebel), and not only from the readings up to its time.
     """
-    steps = {name: part for name, part in _time_varying(parts).items() if name in _STEPS}
-    times = {name: part for name, part in _time_varying(parts).items() if name not in _STEPS}
+    steps = {name: part for name, part in _time_varying_arrays(parts).items() if name in _STEPS}
+    times = {name: part for name, part in _time_varying_arrays(parts).items() if name not in _STEPS}
 
     def read(row: tuple, mean: Array, root: Array) -> roots.Update:
         times, y, mask = row

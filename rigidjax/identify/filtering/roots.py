@@ -13,35 +13,36 @@ from jaxtyping import Array, Bool, Float
 from rigidjax._types import Scalar, ScalarLike
 
 
-def triangular_root(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
-    """Return the lower triangular matrix L with `L Lᵀ = a aᵀ` and no negative diagonal entry.
+def triangular_root(rows: Float[Array, "n m"]) -> Float[Array, "n n"]:
+    """Return the lower triangular matrix L with `L Lᵀ = A Aᵀ` and no negative diagonal entry.
 
-    L is computed by the modified Gram–Schmidt process on the rows of a (n, m), whose triangular
+    L is computed by the modified Gram–Schmidt process on the `rows` A (n, m), whose triangular
     factor is as accurate as that of Householder's method (Björck 1967, doi:10.1007/BF01934122). If
     a row depends linearly on earlier rows, to a few units of round-off, its diagonal entry is zero
     with zero derivatives; the derivatives of `jnp.linalg.qr` would be NaN. A state that is known
     without error has such rows.
     """
-    n = a.shape[0]
+    n = rows.shape[0]
     below = jnp.arange(n)
-    least = (4 * float(jnp.finfo(a.dtype).eps)) ** 2 * jnp.sum(a * a, 1)
+    least = (4 * float(jnp.finfo(rows.dtype).eps)) ** 2 * jnp.sum(rows * rows, 1)
 
-    def gram_schmidt_step(a: Array, k: Array) -> tuple[Array, Array]:
-        row = lax.dynamic_index_in_dim(a, k, keepdims=False)
+    def gram_schmidt_step(rows: Array, k: Array) -> tuple[Array, Array]:
+        row = lax.dynamic_index_in_dim(rows, k, keepdims=False)
         unit = row * inverse_root(jnp.sum(row * row), least[k])
-        column = jnp.where(below >= k, jnp.sum(a * unit[None], 1), 0)
-        return a - column[:, None] * unit[None], column
+        column = jnp.where(below >= k, jnp.sum(rows * unit[None], 1), 0)
+        return rows - column[:, None] * unit[None], column
 
-    return lax.scan(gram_schmidt_step, a, below)[1].T
+    return lax.scan(gram_schmidt_step, rows, below)[1].T
 
 
 def predicted_root(
     transition: Float[Array, "k n"], root: Float[Array, "n n"], noise: Float[Array, "k m"]
 ) -> Float[Array, "k k"]:
-    """Return the triangular root of the predicted covariance, `F P Fᵀ + G Gᵀ`.
+    """Return a triangular root (k, k) of the predicted covariance, `F P Fᵀ + G Gᵀ`.
 
-    F (k, n) is the `transition`, G (k, m) the `noise`, and `P = S Sᵀ` the covariance with the root
-    S (n, n), the argument `root`.
+    **Arguments:** `transition` F (k, n), which maps errors before a step to errors after it; `root`
+    S (n, n), a root of the covariance `P = S Sᵀ` before the step; `noise` G (k, m), a root of the
+    covariance that the noise of the step adds.
     """
     return triangular_root(jnp.concatenate([matrix_product(transition, root), noise], 1))
 
@@ -52,9 +53,11 @@ def inverse_root(x: Array, threshold: ScalarLike = 0.0) -> Array:
     return jnp.where(there, 1 / jnp.sqrt(jnp.where(there, x, 1)), 0)
 
 
-def matrix_product(a: Float[Array, "n m"], b: Float[Array, "m k"]) -> Float[Array, "n k"]:
-    """Return the matrix product `a b` in full precision, in a way that is cheap for a few rows."""
-    return jnp.sum(a[:, :, None] * b[None], 1)
+def matrix_product(left: Float[Array, "n m"], right: Float[Array, "m k"]) -> Float[Array, "n k"]:
+    """Return the matrix product `left right` in full precision, in a way that is cheap for a few
+    rows.
+    """
+    return jnp.sum(left[:, :, None] * right[None], 1)
 
 
 class Update(NamedTuple):
@@ -134,9 +137,13 @@ class Terms(NamedTuple):
 
 
 def innovation_terms(innovation: Array, variance: Array, mask: Array) -> Terms:
-    """Return the `Terms` of innovations with the variances `variance`.
+    """Return the terms of the log-density of readings, from their innovations (reading minus
+    prediction).
 
-    The terms are zero where `mask` is false.
+    **Arguments:** `innovation` the innovations, `variance` their variances, and `mask` true for the
+    numbers read, three arrays of one shape. **Returns** the `Terms`, arrays of this shape too: each
+    innovation over its standard deviation, and the logarithm of 2π times its variance. Both are
+    zero where `mask` is false.
     """
     error = jnp.where(mask, innovation * lax.rsqrt(variance), 0)
     return Terms(error, jnp.where(mask, jnp.log(2 * math.pi * variance), 0))

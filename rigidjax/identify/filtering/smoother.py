@@ -134,7 +134,17 @@ def smooth(
 
 @eqx.filter_jit
 def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
-    """Return the result of `smooth` from its checked arguments, computed in one program."""
+    """Return the most probable motion, given all readings, by an iterated smoother in one compiled
+    program.
+
+    **Arguments:**
+
+    - `run`: the checked arguments of `smooth`: the scene (body, torques and sensors), the walks,
+      the readings, the belief before the first reading, and the times of the steps.
+    - `iterations`: the largest number of iterations.
+    - `tolerance`: the iteration ends when no number moves by more than this part of its standard
+      deviation.
+    """
     sensors, first, grid = run.scene.sensors, run.first, run.grid
     dynamics, stops, kept = scan_filter(run, lambda belief, read: (belief, read))
     beliefs, read = grid.at_rows(kept)
@@ -178,27 +188,37 @@ def _smooth(run: FilterInput, iterations: int, tolerance: float) -> Smoothed:
 def _iterate(
     dynamics: Dynamics, belief: Belief, stops: Stops, path: ExtendedState, kicks: Array
 ) -> tuple[ExtendedState, LinearEstimate, Scalar]:
-    """Return the result of one iteration of `smooth`, which solves a linearised problem exactly.
+    """Return the most probable motion of the problem linearised about a `path`: one Gauss–Newton
+    iteration.
 
-    Three things are returned: the new states; the estimate of the changes of the states; and the
-    largest change, in standard deviations.
+    The linear problem is solved exactly by a Kalman filter and a backward pass.
 
     **Arguments:**
 
-    - `dynamics`: the equations of the filter.
-    - `belief`: the belief before the first reading.
-    - `stops`: the N times with their readings.
+    - `dynamics`: the equations of motion, the noise of the torques, and the sensors.
+    - `belief`: the estimated state, with a root of its covariance, before the first reading.
+    - `stops`: the N times at which steps end, with their readings.
     - `path`: the N + 1 states about which the problem is linearised, at the time of the `belief`
-      and at the stops.
-    - `kicks`: (N, m) the noise of the steps between the states of `path`.
+      and at the N times.
+    - `kicks`: (N, m) the m unit normal numbers that make the noise of the torques in each step from
+      a state of `path` to the next.
+
+    **Returns** three things: the N + 1 new states; the estimate of the changes of the states, with
+    their covariances; and the largest change of a number, in standard deviations.
     """
     dtype = belief.root.dtype
 
     def linearise(row: tuple) -> tuple:
-        """Return the linearised step to a stop, and the linearised readings at the stop.
+        """Return two things: one step of the motion, linearised; and the linearised readings at its
+        end.
 
-        A `row` holds the time before the step, the stop, the states of `path` before and after the
-        step, and the noise of the step.
+        The `row` holds five things: the time t0 before the step, s; the time and the readings at
+        its end (`Stops`); the states of the path before and after the step; and the unit normal
+        numbers (m,) that make its noise.
+
+        The linearised step is three arrays F, G and d: an error e of the state before the step
+        becomes `F e + d + G u` after the step, with the unit normal noise u. The linearised
+        readings are those of `linearise_readings`.
         """
         t0, stop, x, y, kick = row
         after, grown, noise = dynamics.predict(

@@ -130,13 +130,15 @@ class Dynamics(eqx.Module):
         return eqx.tree_at(lambda s: s.omega, change, spin)
 
     def advance(self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array) -> ExtendedState:
-        """Return the state at the time t + h, for the state x at the time t.
+        """Return the state at the time t + h, s, for the state x at the time t, with a random
+        torque between.
 
-        The unit normal numbers `kicks` make the noise: each white noise is replaced by
+        The step is one of the classical Runge–Kutta method of order 4. The `kicks` are unit normal
+        numbers, six for each random torque, which make its noise: each white noise is replaced by
         `√(density/h) (k₀ + √3 (1 − 2s/h) k₁)` at a time s after t, where k₀ and k₁ (3,) are kicks.
         These are the first two terms of its expansion in Legendre polynomials. For a body at rest
         rate and angle get their exact joint covariance (Foster, Lyons and Oberhauser 2020,
-        doi:10.1137/19M1261912). The step is one of the classical Runge–Kutta method of order 4.
+        doi:10.1137/19M1261912).
         """
         safe = jnp.where(h > 0, h, 1)
         pairs = kicks.reshape(-1, 2, 3) * roots.inverse_root(h)
@@ -163,11 +165,13 @@ class Dynamics(eqx.Module):
     def predict(
         self, t: Scalar, h: Scalar, x: ExtendedState, kicks: Array | None = None
     ) -> tuple[ExtendedState, Float[Array, "n n"], Float[Array, "n m"]]:
-        """Return the state at the time t + h, for the state x at the time t, and two matrices.
+        """Return the state at the time t + h, s, for the state x at the time t, and two matrices of
+        its errors.
 
-        The matrix F (n, n) maps errors of x to errors of the new state. The matrix G (n, m) is a
-        root of the covariance that the noise of the step adds; its last columns belong to the
-        walks. F and G are the derivatives at the noise `kicks`, which is zero for `None`.
+        The matrix F (n, n) maps an error of x to the error of the new state. The matrix G (n, m) is
+        a root of the covariance that the noise of the step adds; its last columns belong to the
+        walks, which are numbers that drift randomly. F and G are the derivatives at the noise
+        `kicks` (unit normal numbers, six for each random torque), which is zero for `None`.
         """
         kicks = jnp.zeros(self.kicks, x.motion.omega.dtype) if kicks is None else kicks
         after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
@@ -190,9 +194,16 @@ class Dynamics(eqx.Module):
 
 
 def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: ExtendedState) -> Dynamics:
-    """Return the equations of a filter for a `scene` whose torque reads no `Input`.
+    """Return the equations of motion, the noise of the torques and the sensors, in the form a
+    filter uses.
 
-    `drifts` are the walks of the model. The equations have the dtype and the type of the state x.
+    **Arguments:**
+
+    - `scene`: the body, torques, sensors and initial state of a recording. Its torque must not read
+      an `Input`.
+    - `drifts`: the walks of the model, which are numbers of the scene that drift randomly, such as
+      the bias of a gyro.
+    - `x`: a state, whose dtype and type (`Spin`, `Attitude` or `Rigid`) the equations get.
     """
     dtype = x.motion.omega.dtype
     body: Any = body_of_equations(in_precision(scene.body, dtype), type(x.motion))
@@ -211,14 +222,15 @@ def dynamics_of(scene: Scene, drifts: Sequence[Drift], x: ExtendedState) -> Dyna
 
 
 def white_parts(process: Process | None) -> tuple[RandomTorque, ...]:
-    """Return the torques of a `process` that are white noise."""
+    """Return the torques of a `process` (the unknown torque of a model) that are white noise."""
     return tuple(part for part in parts_of(process) if isinstance(part, RandomTorque))
 
 
 def coloured_parts(process: Process | None) -> tuple[CorrelatedTorque, ...]:
-    """Return the torques of a `process` that are correlated in time.
+    """Return the torques of a `process` (the unknown torque of a model) that are correlated in
+    time.
 
-    A filter estimates such torques as states.
+    A filter estimates such torques as additional states.
     """
     return tuple(part for part in parts_of(process) if isinstance(part, CorrelatedTorque))
 
@@ -226,12 +238,13 @@ def coloured_parts(process: Process | None) -> tuple[CorrelatedTorque, ...]:
 def moved_root(
     x: ExtendedState, e: Float[Array, " n"], root: Float[Array, "n m"], *, inverse: bool = False
 ) -> Float[Array, "n m"]:
-    """Return the root of a covariance of errors, for errors about another state.
+    """Return the root of a covariance of errors about the state x, for errors about a neighbouring
+    state.
 
-    `root` belongs to errors about the state x. The result belongs to errors about the state x
-    changed by the vector e (n,). Only errors of a turn differ: an error e + δ about x is the error
-    `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ` about the new state, where J_r is the right Jacobian, here
-    to second order in e (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848).
+    The neighbouring state is x changed by the vector e (n,); `root` (n, m) belongs to errors about
+    x. Only errors of a turn differ: an error e + δ about x is the error `log(exp(−e) exp(e + δ)) ≈
+    J_r(e) δ` about the new state, where J_r is the right Jacobian, here to second order in e
+    (Mueller, Hehn and D'Andrea 2017, doi:10.2514/1.G000848).
 
     With `inverse` the root is multiplied by `J_r(e)⁻¹`, to third order, which is the derivative of
     `log(exp(e) exp(δ))` with respect to δ.
@@ -263,10 +276,16 @@ def linearise_readings(
 ) -> tuple[Float[Array, "k n"], Float[Array, " k"], Float[Array, " k"], Bool[Array, " k"]]:
     """Return the readings of all sensors at one time, linearised about the state x.
 
-    Four things are returned, for all k components of the errors of the sensors: the derivatives
-    (k, n) of the predictions with respect to the n components of an error of x; the errors (k,),
-    reading minus prediction; their standard deviations (k,); and a mask (k,), true for a component
-    that was read. `stop` holds the time and the readings.
+    **Arguments:**
+
+    - `dynamics`: the equations of motion and the sensors.
+    - `stop`: the time, s, and for each sensor its reading and whether there is one.
+    - `x`: the predicted state at this time.
+
+    **Returns** four things, for the k components of the errors of all sensors: the derivatives (k,
+    n) of the predicted readings with respect to the n components of an error of x; the errors (k,),
+    reading minus prediction; the standard deviations (k,) of their noise; and a mask (k,), true for
+    a component that was read and is below full scale.
     """
     dtype = x.motion.omega.dtype
     t = stop.t.astype(dtype)
@@ -314,9 +333,10 @@ class ReadNumbers(NamedTuple):
 def split_by_sensor(
     sensors: Sequence[AbstractSensor], numbers: ReadNumbers
 ) -> tuple[ReadNumbers, ...]:
-    """Return a `ReadNumbers` for each sensor.
+    """Return, for each sensor, the numbers that a filter read from it, beside their predictions.
 
-    The last axis of the arrays in `numbers` holds the components of all sensors one after another.
+    The argument `numbers` holds the innovations, their variances and the mask of all `sensors`, one
+    after another along the last axis.
     """
     ends = np.cumsum([sensor.components for sensor in sensors])[:-1]
     return tuple(
@@ -335,11 +355,19 @@ def steps_of(
     substeps: int | None,
     recording: Recording | None = None,
 ) -> np.ndarray:
-    """Return the number of fixed steps from each of the times `ts` to the next.
+    """Return the number of fixed steps of a filter from each of the T times `ts` to the next, (T −
+    1,).
 
-    The number is `substeps` if this is given. Otherwise it follows from the body rate (the larger
-    one of the rate in `state` and the rates that gyros read) and from the correlation times of the
-    `process`. It is one if these numbers are traced.
+    **Arguments:**
+
+    - `process`: the unknown torque, or `None`. A step is at most a quarter of each of its
+      correlation times.
+    - `ts`: (T,) the times, s.
+    - `state`: the initial state. The body turns only little in a step, at the body rate in `state`
+      or at the rates that gyros read, whichever is larger.
+    - `substeps`: the number of steps; `None` chooses it by these rates and correlation times, and
+      takes 1 if they are traced.
+    - `recording`: the readings of the gyros, or `None`.
     """
     if substeps is not None:
         return np.full(ts.shape[0] - 1, _checks.integer(substeps, "substeps", 1))
@@ -429,8 +457,17 @@ def sample(
 def _sample(
     key: PRNGKeyArray | UInt32[Array, "2"], scene: Scene, ts: Array, pieces: int
 ) -> Sampled:
-    """Return the result of `sample` with `pieces` steps between two times, computed in one
-    program.
+    """Draw one motion under a random torque, in one compiled program.
+
+    **Arguments:**
+
+    - `key`: a key of `jax.random`.
+    - `scene`: the body, the known torque, the random torque and the initial state.
+    - `ts`: (T,) the times, s.
+    - `pieces`: the number of equal steps from each time to the next.
+
+    **Returns** a `Sampled`: the times, the T states, and the T values of each random torque that is
+    correlated in time.
     """
     state0: Any = scene.start
     dtype, coloured = state0.omega.dtype, coloured_parts(scene.process)

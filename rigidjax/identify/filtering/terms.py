@@ -39,16 +39,21 @@ def terms_of_recording(
 ) -> Terms:
     """Return the terms of the log-density of the readings of one recording.
 
-    The readings are normal about the motion. If the model has an unknown torque or a walk, a Kalman
-    filter integrates it out, and the readings are normal about the predictions of the filter.
+    The readings are normal about the motion. If the model has an unknown torque, or numbers that
+    drift as random walks, a Kalman filter integrates these out, and the readings are normal about
+    the predictions of the filter.
 
     **Arguments:**
 
     - `model`: the model.
-    - `row`: the free numbers of the recording.
-    - `record`: the recording.
-    - `reference`: the reference state of the recording.
-    - `body_index`: the index of the body of the recording.
+    - `row`: (m,) the free numbers on which this recording depends.
+    - `record`: the times and readings of the recording.
+    - `reference`: the state about which the initial state of the recording is parametrised.
+    - `body_index`: the index of the body of the recording among several bodies, or `None` for one
+      body.
+
+    **Returns** the `Terms`, two arrays with an entry for each component of each reading: its error
+    over its standard deviation; and the logarithm of 2π times its variance.
     """
     scene = scene_from_row(model, row, record, reference, body_index)
     if scene.process is None and not model.walks:
@@ -65,9 +70,21 @@ def terms_of_recording(
 
 
 def _terms_of_motion(model: Model, scene: Scene, record: Recording) -> Terms:
-    """Return the terms of the log-density of one recording without a random torque or a walk.
+    """Return the terms of the log-density of one recording if no torque is random and no number
+    drifts.
 
-    The readings in `record` are independent and normal about the motion of the `scene`.
+    The readings are then independent, and normal about the motion that the equations of motion
+    give.
+
+    **Arguments:**
+
+    - `model`: the model, which holds the integrator.
+    - `scene`: the body, torque, sensors and initial state of the recording.
+    - `record`: the times and readings of the recording.
+
+    **Returns** the `Terms`, two arrays with an entry for each component of each reading: its error
+    over its standard deviation; and the logarithm of 2π times its variance. A masked entry is zero.
+    A reading at full scale contributes the logarithm of a probability to the first array alone.
     """
     errors = errors_of_scene(model, scene, record)
     scaled, log_variance = [], []

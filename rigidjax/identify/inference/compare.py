@@ -75,7 +75,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
         size = one.x.size
         size += groups * sum(jitter is not None and jitter.estimated for jitter in jitters)
         independent_readings = np.array(counts[name]) / shortest
-        misfit = independent_readings @ _log_squares(one)
+        misfit = independent_readings @ _log_mean_square_errors(one)
         penalty = size * np.log(max(independent_readings.sum(), 2.0))
         rows.append((misfit + penalty, name, size, one))
     rows.sort(key=lambda row: row[0])
@@ -86,12 +86,13 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     )
 
 
-def _log_squares(fit: Fit) -> np.ndarray:
-    """Return the logarithm of the mean square error of each sensor of a `fit`.
+def _log_mean_square_errors(fit: Fit) -> np.ndarray:
+    """Return the logarithm of the mean square error of each sensor of a `fit`, (sensors,).
 
-    Jitter of time stamps correlates the errors of a sensor. Such errors are first whitened, so that
-    they have the variance of the noise alone; then the mean logarithm of the factor by which jitter
-    raises their variance is added. White errors with this mean square have the same likelihood.
+    Jitter (errors of time stamps) correlates the errors of a sensor. Such errors are first
+    whitened, so that they have the variance of the noise alone; then the mean logarithm of the
+    factor by which jitter raises their variance is added. White errors with this mean square have
+    the same likelihood.
     """
     out, model = 2.0 * np.log(np.maximum(fit.rms, 1e-300)), fit.model
     errors, _ = errors_and_slopes(model, fit.x)
@@ -142,16 +143,17 @@ def cross_validate(
     for index, left_out in enumerate(recordings):
         others = [r for k, r in enumerate(recordings) if k != index]
         of_others = fit(build(others), **options)
-        test_model = _with_shared(build([left_out]), of_others)
+        test_model = _with_shared_fixed(build([left_out]), of_others)
         out.append(fit(test_model, **{**options, "starts": 1}).rms)
     return tuple(out)
 
 
-def _with_shared(model: Model, of_others: Fit) -> Model:
-    """Return a `model` of one recording with known body and known shared numbers.
+def _with_shared_fixed(model: Model, of_others: Fit) -> Model:
+    """Return a `model` whose body and shared numbers have the values of the fit `of_others`, fixed.
 
-    The body, and the numbers that recordings share, get the values of the fit `of_others` and are
-    no longer free.
+    It is used to predict one recording by a fit of all other recordings. The `model` holds this
+    recording alone. In the result only its initial state, and the `Free`s with a value for each
+    recording, are free.
     """
     x = model.start()
     for slot, fitted in zip(model.slots, of_others.model.slots, strict=True):

@@ -172,11 +172,12 @@ def map_draws(
 
 
 def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
-    """Return the slots of the factors of unknown noises, and the variances of the logarithms of
-    these factors.
+    """Return two things: a slot for each sensor of a `model` whose noise is unknown; and variances.
 
-    A slot holds the description of a `Free` in a model. There is a slot for each sensor whose noise
-    is not given, with one factor for each group of recordings that share their noise.
+    A slot is the description of a `Free`, a number that the data determine. Here it is a factor of
+    the noise of the sensor, one for each group of recordings that share their noise, and the free
+    number is its logarithm. The variances (groups,), one array for each slot, are those of these
+    logarithms.
     """
     groups, slots, variances = np.asarray(model.noise_groups), [], []
     for index, reading in enumerate(model.records.readings):
@@ -188,15 +189,20 @@ def _noise_slots(model: Model) -> tuple[list[Slot], list[np.ndarray]]:
         path = _path_of(model, lambda s, index=index: s.sensors[index].noise)
         name = f"noise of {type(reading.sensor).__name__} {index}"
         labels = tuple(str(group) for group in range(rows.size))
-        slots.append(_factor(path, name, (1,), reading.sensor.unit, labels, model.noise_groups))
+        slots.append(
+            _slot_of_factor(path, name, (1,), reading.sensor.unit, labels, model.noise_groups)
+        )
     return slots, variances
 
 
 def _process_slots(process: Process | None, prior: Array) -> list[Slot]:
-    """Return a slot for the factor of each number of a `process`.
+    """Return a slot for the factor of each number of a random torque, such as its spectral density.
 
-    A slot holds the description of a `Free` in a model. The prior of the logarithm of each factor
-    is normal, with mean zero and standard deviation `prior`.
+    A slot is the description of a `Free`, a number that the data determine; the free number is the
+    logarithm of the factor.
+
+    **Arguments:** `process` the random torque, or `None`, which has no numbers; `prior` the
+    standard deviation of the normal prior of each logarithm, about zero.
     """
     scene, slots = Scene(None, None, process, (), None), []
     several, number = len(parts_of(process)) > 1, -1
@@ -204,11 +210,11 @@ def _process_slots(process: Process | None, prior: Array) -> list[Slot]:
         # The first number of each torque in a process is its density: count the torques by it.
         number += path[-1].name == "density"
         name = f"{path[-1].name} {number}" if several else path[-1].name
-        slots.append(_factor(path, name, (1,) * jnp.ndim(leaf), "", (), None, prior))
+        slots.append(_slot_of_factor(path, name, (1,) * jnp.ndim(leaf), "", (), None, prior))
     return slots
 
 
-def _factor(
+def _slot_of_factor(
     path: tuple[Any, ...],
     name: str,
     shape: tuple[int, ...],
@@ -217,12 +223,16 @@ def _factor(
     groups: Array | None,
     prior: Array | None = None,
 ) -> Slot:
-    """Return the slot of a factor of one leaf of a scene; the free number is its logarithm.
+    """Return the slot of a positive factor of one number of a scene; the free number is its
+    logarithm.
+
+    A slot is the description of a `Free`, a number that the data determine. A scene is the body,
+    torques, sensors and initial state of a recording.
 
     **Arguments:**
 
-    - `path`: the path of the leaf in the scene.
-    - `name`, `unit`: the name of the factor in reports, and the unit of the leaf.
+    - `path`: the path of the number (a leaf) in the tree of the scene.
+    - `name`, `unit`: the name of the factor in reports, and the unit of the number.
     - `shape`: the shape of the factor.
     - `labels`, `groups`: the names of the groups of recordings with a factor each, and the index of
       the group of each recording; `()` and `None` for a factor that all recordings share.
@@ -235,7 +245,8 @@ def _factor(
 def _path_of(model: Model, where: Callable[[Scene], Any]) -> tuple[Any, ...]:
     """Return the path, in the tree of a scene of the `model`, of the leaf that `where` picks.
 
-    The leaf may be `None`.
+    A scene is the body, torques, sensors and initial state of a recording. The function `where`
+    picks a leaf of it, such as `lambda s: s.sensors[0].noise`. The leaf may be `None`.
     """
     scene = scene_template(model, model.records)
     marked = eqx.tree_at(where, scene, 0.0, is_leaf=lambda node: node is None)
@@ -249,16 +260,17 @@ _MARK = object()
 def _with_slots(
     model: Model, noises: Noise, process: Process | None, slots: list[Slot]
 ) -> tuple[Model, np.ndarray]:
-    """Return a model with additional free numbers, and the new indices of its old free numbers.
+    """Return two things: a model with additional free numbers; and the new indices of its old ones.
 
     **Arguments:**
 
     - `model`: the old model with n free numbers.
-    - `noises`: the standard deviations of the errors of each sensor, which the new model gets.
-    - `process`: the process of the new model.
-    - `slots`: the slots of the additional free numbers, which all recordings share.
+    - `noises`: for each sensor the standard deviations of its errors, which the new model gets.
+    - `process`: the random torque of the new model, or `None`.
+    - `slots`: the slots (descriptions of a `Free`) of the additional free numbers, which no single
+      recording has alone.
 
-    **Returns** the new model, and the index (n,) of each old free number among the new ones.
+    The indices (n,) say which of the new free numbers each old one is.
     """
     bodies = places_of(model.chart, model.body_indices, model.count)
     kinds = model.index.start.shape[1] // 3
@@ -286,10 +298,11 @@ def _with_slots(
 def _covariance_of_white_errors(fit: Fit, follows_the_motion: bool) -> np.ndarray:
     """Return the covariance (n, n) of a `fit` without the parts that a posterior density lacks.
 
-    The density takes errors as white. Therefore a covariance that allows for considered sensor
-    errors is replaced by the covariance for white errors. A sandwich covariance is replaced if it
-    is singular, or if `follows_the_motion` is true: the density then has no process and no walk,
-    and readings are normal about the motion.
+    The density takes errors as white. Therefore a covariance that allows for considered errors
+    (those within the `Tolerance` of a sensor) is replaced by the covariance for white errors. So is
+    a sandwich covariance, which allows for autocorrelated errors, if it is singular or if
+    `follows_the_motion` is true: the density then has no random torque and no walk, and readings
+    are normal about the motion.
     """
     covariance = np.asarray(fit.covariance)
     if fit.considered and fit.linear is not None:

@@ -72,7 +72,12 @@ def fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
 
 @eqx.filter_jit
 def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """Return the result of `fisher` without its checks, computed in one program."""
+    """Return Fisher's information matrix (n, n) of the free numbers x (n,), in one compiled
+    program.
+
+    It is `Jᵀ Σ⁻¹ J` with the derivatives J of all predictions of the `model`, and the covariance Σ
+    of the noise of its sensors, which must be known.
+    """
     sensors = model.records.sensors
     noises: list[Any] = [sensor.noise for sensor in sensors]
     _, slopes = errors_and_jacobians(model, x)
@@ -86,9 +91,9 @@ def _fisher(model: Model, x: Float[Array, " n"]) -> Float[Array, "n n"]:
 
 
 def _require_noise(model: Model, x: Float[Array, " n"]) -> None:
-    """Raise `ValueError` if a sensor of the `model` has unknown noise or jitter to be estimated.
+    """Raise `ValueError` if a sensor of the `model` has unknown noise, or jitter to be estimated.
 
-    It is also raised unless x is a vector of the free numbers of the `model`.
+    It is also raised unless x is a vector (n,) of the free numbers of the `model`.
     """
     require_numbers(model, x)
     for sensor in model.records.sensors:
@@ -101,7 +106,9 @@ def _require_noise(model: Model, x: Float[Array, " n"]) -> None:
 
 
 def _require_known(model: Model, motion: PyTree) -> None:
-    """Raise `TypeError` if the `model` or the tree `motion` has traced numbers."""
+    """Raise `TypeError` if the `model`, or one of the arrays in the tree `motion`, is traced by
+    JAX.
+    """
     if not _checks.is_known((model, motion)):
         raise TypeError(
             "model, x, body, omega: wanted known numbers, got traced ones; call it outside of "
@@ -145,11 +152,18 @@ def best_first_rate(
 
 @eqx.filter_jit
 def _best_direction(model: Model, body: PyTree, start: Array, size: Array, max_steps: int) -> Array:
-    """Return the direction (3,) of the initial rate at which `_log_uncertainty` is smallest.
+    """Return the direction (3,) of the initial body rate that determines the body best, by BFGS.
 
-    **Arguments:** `model` and `body` are as for `best_first_rate`; `start` (3,) is the unit vector
-    from which the search starts, `size` the length of the rate in rad/s, and `max_steps` the
-    largest number of steps.
+    The direction minimises the mean logarithm of the standard deviations of the body's numbers,
+    near the direction `start`. Its length is only near 1.
+
+    **Arguments:**
+
+    - `model`: the planned recordings and sensors.
+    - `body`: the expected body.
+    - `start`: (3,) the unit vector from which the search starts.
+    - `size`: the length of the initial rate, rad/s.
+    - `max_steps`: the largest number of steps of the search.
     """
     minimise: Any = optx.minimise
     out = minimise(
@@ -165,11 +179,14 @@ def _best_direction(model: Model, body: PyTree, start: Array, size: Array, max_s
 
 
 def _log_uncertainty(direction: Array, args: tuple[Model, PyTree, Array]) -> Scalar:
-    """Return a measure of the uncertainty of the body for one `direction` (3,) of the initial rate.
+    """Return the mean logarithm of the standard deviations of the body's numbers, with a penalty.
 
-    The measure is ½ log det C / n, where C (n, n) is the covariance of the n free numbers of the
-    body. A penalty is added that keeps the length of `direction` near 1. `args` holds the model,
-    the body and the length of the rate.
+    It is ½ log det C / n, where C (n, n) is the covariance of the n free numbers of the body in
+    planned recordings, for one direction of the initial body rate. The penalty keeps the length of
+    `direction` near 1.
+
+    **Arguments:** `direction` (3,) the direction, in the body frame; `args` the model with the
+    planned recordings, the expected body, and the length of the initial rate, rad/s.
     """
     model, body, size = args
     length = jnp.sqrt(jnp.sum(direction**2))

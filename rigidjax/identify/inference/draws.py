@@ -244,17 +244,24 @@ def posterior(
     if isinstance(sample, Nuts):
         _checks.import_library(*_BLACKJAX)
     root = jnp.linalg.cholesky(density.covariance)
-    x = _draw(density, root, jax.random.split(key, chains), sample)
+    x = _draw_chains(density, root, jax.random.split(key, chains), sample)
     return Posterior(density, x)
 
 
 @eqx.filter_jit
-def _draw(density: LogDensity, root: Array, keys: Array, sampler: Sampler) -> Array:
-    """Return the draws (chains, samples, n) of one chain for each of the `keys`.
+def _draw_chains(density: LogDensity, root: Array, keys: Array, sampler: Sampler) -> Array:
+    """Draw from a posterior density by Markov chains, one for each key, in one compiled program.
 
-    All chains are computed in one compiled program. The `sampler` draws the vector z (n,) with
-    `x = x0 + root z`, where x0 is the start of the `density` and `root` (n, n) a root of the
-    covariance of x.
+    **Arguments:**
+
+    - `density`: the logarithm of the density of x (n,), with a central point x0.
+    - `root`: (n, n) a root of the covariance of x. The sampler draws z (n,), with `x = x0 + root
+      z`.
+    - `keys`: a key of `jax.random` for each chain.
+    - `sampler`: a function of a key, a log-density of z and the first z, which returns draws of z
+      (samples, n).
+
+    **Returns** the draws of x, (chains, samples, n).
     """
 
     def to_numbers(z: Array) -> Array:
@@ -415,7 +422,17 @@ def refit(
 
 @eqx.filter_jit
 def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: int) -> Refit:
-    """Return the result of `refit` with `count` draws, computed in one compiled program."""
+    """Return the maximum of a posterior density and weighted draws about it, in one compiled
+    program.
+
+    **Arguments:**
+
+    - `density`: the logarithm of the density, as a function of n free numbers, with a starting
+      point.
+    - `settings`: the tolerance and the largest number of steps of the search.
+    - `key`: a key of `jax.random`.
+    - `count`: the number of draws.
+    """
 
     def evaluate(x: Array) -> tuple[None, Array, NormalMatrix, Array]:
         cost, gram, slope = curvature(density.model, x)
@@ -432,10 +449,18 @@ def _refit(density: LogDensity, settings: Settings, key: PRNGKeyArray, count: in
 def _weighted_draws(
     density: LogDensity, mode: Array, covariance: Array, key: PRNGKeyArray, count: int
 ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-    """Return draws (m, n) from Student's t distribution, and the weights (m,) of the draws.
+    """Return draws (m, n) about the maximum of a posterior density, and their weights (m,).
 
-    The distribution has its maximum at `mode` (n,), the maximum of the posterior `density`, and the
-    shape of `covariance` (n, n). `count` is m. With their weights the draws represent the density.
+    The draws come from Student's t distribution. With their weights, whose sum is 1, they represent
+    the posterior density (importance sampling).
+
+    **Arguments:**
+
+    - `density`: the logarithm of the density, as a function of n numbers.
+    - `mode`: (n,) the maximum of the density, and of the t distribution.
+    - `covariance`: (n, n) the shape of the t distribution.
+    - `key`: a key of `jax.random`.
+    - `count`: the number m of draws.
     """
     size, kind = mode.size, mode.dtype
     normal, square = jax.random.split(key)

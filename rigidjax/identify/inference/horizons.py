@@ -62,18 +62,22 @@ def predict_windows(fit: Fit, windows: Windows) -> Horizons:
         )
     _checks.require_instance(windows.starts, type(model.reference.state), "windows.starts")
     require_inputs_of_windows(model.torque, windows)
-    model_on_windows, x = _on_windows(model, fit.x, windows)
+    model_on_windows, x = _model_on_windows(model, fit.x, windows)
     errors = _errors_by_sensor(model_on_windows, x)[0]
     return average_by_horizon(windows.starts, errors[:, 1:])
 
 
-def _on_windows(
+def _model_on_windows(
     model: Model, x: Float[Array, " n"], windows: Windows
 ) -> tuple[Model, Float[Array, " m"]]:
-    """Return the fitted `model` with other `windows` as its recordings, and its free numbers.
+    """Return two things: a fitted model with other windows as its recordings; and its free numbers
+    (m,).
 
-    The starts of the windows are taken as known. The free numbers of the new model are the numbers
-    in x (n,) that all windows share.
+    A window is a short piece of a record. Its measured start is taken as known, so that the free
+    numbers of the new model are those that all windows share.
+
+    **Arguments:** `model` the fitted model of windows; `x` (n,) its free numbers at the best point;
+    `windows` the other windows.
     """
     reference, _, clusters = starts_of_windows(windows, 1)
     body_indices = None
@@ -95,5 +99,10 @@ def _on_windows(
 
 @eqx.filter_jit
 def _errors_by_sensor(model: Model, x: Float[Array, " n"]) -> tuple[Float[Array, "..."], ...]:
-    """Return the errors of all sensors at the free numbers x, computed in one compiled program."""
+    """Return the errors of all sensors of a `model` at its free numbers x (n,), in one compiled
+    program.
+
+    There is one array (R, T, k) for each sensor, reading minus prediction, for R recordings, T
+    times and k components.
+    """
     return all_errors(model, x)

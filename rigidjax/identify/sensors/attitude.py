@@ -59,7 +59,7 @@ class AttitudeSensor(ClockedSensor):
 
     def readings(self, values: np.ndarray) -> np.ndarray:
         """Return `values`, quaternions (T, 4) or matrices (T, 3, 3), as readings (T, 4)."""
-        return _quaternions(values) if values.shape[1:] == (3, 3) else values
+        return _quaternions_of_matrices(values) if values.shape[1:] == (3, 3) else values
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         """Return two things: a mask (T,) of the rows of `values` that are not unit quaternions; and
@@ -69,10 +69,11 @@ class AttitudeSensor(ClockedSensor):
         return _has_wrong_length(values), f"the quaternion at index {{index}} is not unit; {wanted}"
 
 
-def _quaternions(matrices: np.ndarray) -> np.ndarray:
-    """Return the quaternions (T, 4) of rotation matrices (T, 3, 3); NaN for a matrix with NaN.
+def _quaternions_of_matrices(matrices: np.ndarray) -> np.ndarray:
+    """Return the unit quaternions (T, 4), scalar first, of rotation `matrices` (T, 3, 3).
 
-    **Raises** `ValueError` for a matrix that is no rotation.
+    The quaternion of a matrix with NaN is NaN. **Raises** `ValueError` for a matrix that is no
+    rotation.
     """
     finite = np.isfinite(matrices).all(axis=(1, 2))
     filled = np.where(finite[:, None, None], matrices, np.eye(3))
@@ -89,15 +90,21 @@ def _quaternions(matrices: np.ndarray) -> np.ndarray:
 
 
 def _mounted_attitude(q: Array, mounting: Vec3 | None) -> Array:
-    """Return the attitude (quaternion) of the axes of a sensor on a body of attitude q.
+    """Return the attitude (4,) of the axes of a sensor that is mounted on a body of attitude q
+    (4,).
 
-    The rotation vector `mounting` (3,), rad, turns the body's axes into the sensor's axes.
+    Both attitudes are quaternions to the world frame. The rotation vector `mounting` (3,), rad,
+    turns the body's axes into the sensor's axes; with `None` these are the same axes.
     """
     return q if mounting is None else quaternion.multiply(q, quaternion.exp(mounting))
 
 
 def _unit_vector(world: NumbersLike) -> Vec3:
-    """Return the unit vector along `world` (3,); raise `ValueError` for a length of zero."""
+    """Return the unit vector (3,) along the direction `world` (3,), of any length, in the world
+    frame.
+
+    **Raises** `ValueError` for a length of zero.
+    """
     vector = base.array_field("world")(world)
     length = jnp.sqrt(dot(vector, vector))
     words = "world: wanted a direction, got a vector of length zero"
@@ -158,7 +165,12 @@ class Direction(ClockedSensor):
         return (1.0 - 0.5 * square) * predicted + half * (error[0] * first + error[1] * second)
 
     def _predict(self, motion: SensorInput) -> Vec3:
-        """Return the predicted direction (3,) in the sensor's axes."""
+        """Return the predicted reading of the sensor for a `motion`: the direction (3,) in the
+        sensor's axes.
+
+        It is the unit vector `world` of the sensor, turned from the world frame by the attitude of
+        the body and the mounting of the sensor.
+        """
         return quaternion.rotate_inverse(
             _mounted_attitude(motion.state.q, self.mounting), self.world
         )
@@ -171,7 +183,10 @@ class Direction(ClockedSensor):
 
 
 def _has_wrong_length(rows: np.ndarray) -> np.ndarray:
-    """Return a mask (T,), true where the length of a row of `rows` (T, k) differs from 1."""
+    """Return a mask (T,), true where the length of a row of `rows` (T, k) differs from 1.
+
+    A difference of 1e-6 is allowed. The rows are unit vectors or unit quaternions.
+    """
     return np.abs(np.linalg.norm(rows, axis=1) - 1) > 1e-6
 
 

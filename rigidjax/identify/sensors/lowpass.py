@@ -105,8 +105,10 @@ def lowpass_of(lowpass: object) -> LowPass | None:
 
 
 def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
-    """Raise `ValueError` for numbers that are NaN or whose cubes overflow, and for times that do
-    not increase.
+    """Raise `ValueError` for samples that a low-pass filter cannot use.
+
+    **Arguments:** `t` (T,) the times, s, which must be finite and increase; `values` (T, k) the
+    samples, which must be finite, with cubes that do not overflow.
     """
     if not np.isfinite(values).all() or np.abs(values).max(initial=0.0) > _LARGEST:
         raise ValueError(f"values: wanted finite numbers up to {_LARGEST:g}, got NaN or more")
@@ -117,16 +119,16 @@ def _require_in_range(t: np.ndarray, values: np.ndarray) -> None:
 
 
 def _end_slopes(gaps: Array, steps: Array, after_gap: Array, is_last: Array) -> tuple[Array, Array]:
-    """Return two arrays (n, k): the slope du/dt of the input u at the begin, and at the end, of
-    each of n intervals between samples.
+    """Return two arrays (n, k): the time derivatives of a sampled input at the begin, and at the
+    end, of each of n intervals between samples.
 
-    A slope is computed from the parabola through three neighbouring samples, or from the straight
-    line through two samples next to a gap (a hole in the log).
+    A derivative is that of the parabola through three neighbouring samples, or of the straight line
+    through two samples next to a gap (a hole in the log).
 
     **Arguments:**
 
     - `gaps`: (n,) the lengths of the intervals, s.
-    - `steps`: (n, k) the changes of u over the intervals.
+    - `steps`: (n, k) the changes of the k channels of the input over the intervals.
     - `after_gap`: (n,) true for an interval that is a gap.
     - `is_last`: (n,) true for the padding after the last sample.
     """
@@ -142,11 +144,12 @@ def _end_slopes(gaps: Array, steps: Array, after_gap: Array, is_last: Array) -> 
 
 
 def _first_derivatives(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
-    """Return the first, second and third derivative, (1, k) each, of the cubic through the first
-    four samples, at the first sample.
+    """Return the first, second and third time derivative of a sampled input at its first sample.
+
+    They are those of the cubic through the first four samples, three arrays (1, k) for k channels.
 
     **Arguments:** `gaps` (n,) the lengths of the intervals between samples, s; `chord` (n, k) the
-    mean slope in each interval.
+    mean slope of the input in each interval.
     """
     a, b = gaps[0], gaps[0] + gaps[1]
     one = (chord[1] - chord[0]) / b
@@ -158,12 +161,19 @@ def _first_derivatives(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
 def _particular_solution(
     order: int, w: Array, u: Array, du: tuple[ArrayLike, ArrayLike, ArrayLike]
 ) -> Array:
-    """Return the particular solution of the filter's equation that is a cubic in time: y, and ẏ/w
-    for a filter of order 2, along a new last axis.
+    """Return the state of a low-pass filter on the particular solution for an input that is a cubic
+    in time.
 
-    **Arguments:** `order` the order of the filter; `w` its angular frequency, rad/s; `u` the value
-    of the input, a cubic in time, at the time of the result; `du` the first three time derivatives
-    of the input at this time.
+    The state is the output y and, for a filter of order 2, ẏ/w, along a new last axis. The equation
+    is `ẏ = w(u − y)` for order 1 and `ÿ + √2 w ẏ + w² y = w² u` for order 2; its particular
+    solution is a cubic, too.
+
+    **Arguments:**
+
+    - `order`: the order of the filter, 1 or 2.
+    - `w`: the angular frequency of the filter, 2π times its cutoff, rad/s.
+    - `u`: (…) the value of the input at the time of the result.
+    - `du`: the first three time derivatives of the input at this time.
     """
     # With x = (d/dt)/w: 1/(1 + x) = 1 − x + x² − x³ …, 1/(1 + √2 x + x²) = 1 − √2 x + x² + 0 x³ …
     if order == 1:
@@ -172,39 +182,47 @@ def _particular_solution(
     return jnp.stack([y, (du[0] - _ROOT * du[1] / w + du[2] / w**2) / w], axis=-1)
 
 
-def _propagator(order: int, w: Array, h: Array) -> Array:
-    """Return the matrix of the homogeneous solution: multiplied by the difference of the filter's
-    state from the particular solution, it gives this difference after a time h.
+def _propagator(order: int, w: Array, duration: Array) -> Array:
+    """Return the matrix (order, order) by which a transient of a low-pass filter decays over a
+    time.
 
-    **Arguments:** `order` the order of the filter; `w` its angular frequency, rad/s; `h` the time,
-    s.
+    The transient is the difference of the filter's state (the output y and, for order 2, ẏ/w) from
+    the particular solution for its input. The equation is `ẏ = w(u − y)` for order 1 and `ÿ + √2 w
+    ẏ + w² y = w² u` for order 2.
+
+    **Arguments:** `order` the order of the filter, 1 or 2; `w` its angular frequency, 2π times its
+    cutoff, rad/s; `duration` the time, s.
     """
     if order == 1:
-        return jnp.exp(-w * h)[None, None]
-    a = w * h / _ROOT
+        return jnp.exp(-w * duration)[None, None]
+    a = w * duration / _ROOT
     c, s, e = jnp.cos(a), jnp.sin(a), jnp.exp(-a)
     return e * jnp.stack([jnp.stack([c + s, _ROOT * s]), jnp.stack([-_ROOT * s, c - s])])
 
 
 def _filter_samples(
-    begin: Array,
-    y0: Array,
-    y1: Array,
+    start: Array,
+    solution_at_begin: Array,
+    solution_at_end: Array,
     propagator: Callable[[Array], Array],
     gaps: Array,
     after_gap: Array,
 ) -> Array:
-    """Return the filtered samples (n + 1, k), computed in a scan over the n intervals between
-    samples.
+    """Return the output (n + 1, k) of a low-pass filter at all samples, by a scan over n intervals.
+
+    The state of the filter (the output y and, for order 2, ẏ/w) is the particular solution for the
+    input, a cubic in each interval between samples, plus a transient that decays.
 
     **Arguments:**
 
-    - `begin`: the state of the filter at the first sample.
-    - `y0`, `y1`: the particular solutions at the begin and at the end of each interval.
-    - `propagator`: given the length of an interval, it returns the matrix of `_propagator`.
+    - `start`: (k, order) the state of the filter at the first sample, for k channels.
+    - `solution_at_begin`, `solution_at_end`: (n, k, order) the particular solutions at the begin
+      and at the end of each interval.
+    - `propagator`: a function of the length of an interval, s, that returns the matrix (order,
+      order) by which a transient decays.
     - `gaps`: (n,) the lengths of the intervals, s.
-    - `after_gap`: (n,) true for an interval that is a gap (a hole in the log); after a gap the
-      state is the particular solution at the begin of the next interval.
+    - `after_gap`: (n,) true for an interval that is a gap (a hole in the log). After a gap the
+      state is the particular solution at the begin of the next interval, without a transient.
     """
 
     def step(state: Array, row: tuple[Array, ...]) -> tuple[Array, Array]:
@@ -213,6 +231,8 @@ def _filter_samples(
         state = jnp.where(gap, following, after)
         return state, state[:, 0]
 
-    following = jnp.concatenate([y0[1:], y1[-1:]])
-    _, rest = lax.scan(step, begin, (y0, y1, following, gaps, after_gap))
-    return jnp.concatenate([begin[None, :, 0], rest])
+    following = jnp.concatenate([solution_at_begin[1:], solution_at_end[-1:]])
+    _, rest = lax.scan(
+        step, start, (solution_at_begin, solution_at_end, following, gaps, after_gap)
+    )
+    return jnp.concatenate([start[None, :, 0], rest])

@@ -9,7 +9,10 @@ from rigidjax._types import NumbersLike, Scalar
 
 
 def _tolerance_value(value: NumbersLike | None) -> Scalar | None:
-    """Return a positive standard deviation as an array; `None` stays `None`."""
+    """Return a standard deviation of a `Tolerance` as an array; `None` stays `None`.
+
+    **Raises** `ValueError` unless the `value` is positive.
+    """
     if value is None:
         return None
     wanted = "a positive standard deviation"

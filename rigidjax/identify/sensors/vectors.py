@@ -37,9 +37,12 @@ class VectorSensor(ClockedSensor):
     tolerance: Tolerance | None = None
 
     def _predict(self, vector: Vec3) -> Vec3:
-        """Return the predicted reading (3,) of a `vector` v (3,), body frame.
+        """Return the predicted reading (3,) of a `vector` v (3,) in the body frame, in the unit of
+        v.
 
-        The matrix S is `[[1, a, b], [0, 1, c], [0, 0, 1]]` for the `skew` (a, b, c).
+        It is `scale · S exp(−mounting) v + bias`: exp turns v to the axes of the sensor, and the
+        matrix S is `[[1, a, b], [0, 1, c], [0, 0, 1]]` for the `skew` (a, b, c) of axes that are
+        not orthogonal.
         """
         reading = vector
         if self.mounting is not None:

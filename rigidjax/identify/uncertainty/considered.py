@@ -58,11 +58,19 @@ class Consideration(eqx.Module):
 def considerations(
     model: Model, linear: Linearisation, noise: Noise, covariance: np.ndarray
 ) -> tuple[Consideration, ...]:
-    """Return the considered errors of all sensors: errors with a tolerance that no `Free` moves.
+    """Return the considered errors of all sensors, with the change of a fit that each of them
+    makes.
 
-    **Arguments:** `model`, `linear` and `noise`, the model, its linearisation and the noise of its
-    sensors; `covariance` (n, n) the covariance for white errors, within the directions (of the n
-    numbers) that the data determine.
+    A considered error is one that a sensor may have within its `Tolerance`, and that no `Free` of
+    the model estimates.
+
+    **Arguments:**
+
+    - `model`: the fitted model with n free numbers.
+    - `linear`: the errors of the readings at the best point, with their derivatives.
+    - `noise`: the standard deviations of the noise of the sensors.
+    - `covariance`: (n, n) the covariance of the free numbers for white errors, within the
+      directions that the data determine.
     """
     out = []
     for index, sensor in enumerate(model.records.sensors):
@@ -80,8 +88,10 @@ def considerations(
 
 
 def slot_of(model: Model, index: int, member: str) -> Slot | None:
-    """Return the slot that moves the `member` of the sensor with the `index`; `None` if no slot
-    does.
+    """Return the slot that moves one `member`, such as "bias", of a sensor; `None` if no slot does.
+
+    A slot is the description of a `Free`, a number that the fit estimates. **Arguments:** `model`
+    the model; `index` the index of the sensor; `member` the name of the attribute of the sensor.
     """
     for slot in model.slots:
         path = tuple(getattr(key, "name", getattr(key, "idx", None)) for key in slot.path)
@@ -98,14 +108,25 @@ def shifts_of(
     index: int,
     kind: str,
 ) -> Float[np.ndarray, "n ways"]:
-    """Return the changes (n, c) of the n free numbers if a sensor has unit errors of one `kind`.
+    """Return the changes (n, c) of the n free numbers of a fit if a sensor has unit errors of one
+    `kind`.
 
-    An error with c components changes the readings of the sensor with the `index` by D, (R, T, k,
-    c). It changes the least-squares solution by `−H⁻¹ Jᵀ W D`, where H⁻¹ is the `covariance`, J
-    holds the derivatives of the errors with respect to the free numbers, and W the weights of the
-    readings.
+    An error with c components changes the readings of the sensor by D, (R, T, k, c), for R
+    recordings, T times and k components of a reading. It changes the least-squares solution by
+    `−H⁻¹ Jᵀ W D`, where J holds the derivatives of the errors of the readings with respect to the
+    free numbers, and W the weights of the readings.
+
+    **Arguments:**
+
+    - `model`: the fitted model.
+    - `linear`: the errors of the readings at the best point, with their derivatives J and weights
+      W.
+    - `noise`: the standard deviations of the noise of the sensors.
+    - `covariance`: H⁻¹ (n, n), the covariance of the free numbers for white errors.
+    - `index`: the index of the sensor.
+    - `kind`: "scale", "cross_axis", "bias" or "clock", the name of the error.
     """
-    direction = _directions(model, linear, index, kind)
+    direction = _changes_by_unit_errors(model, linear, index, kind)
     jitter_error = model.records.readings[index].jitter_error
     # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
     scaled = np.asarray(in_deviations(direction, np.asarray(noise[index]), jitter_error))
@@ -117,13 +138,22 @@ def shifts_of(
     return -covariance @ rows[:-1]
 
 
-def _directions(
+def _changes_by_unit_errors(
     model: Model, linear: Linearisation, index: int, kind: str
 ) -> Float[np.ndarray, "records times 3 ways"]:
-    """Return the changes (R, T, 3, c) of the readings of a sensor if it has unit errors of one
+    """Return the changes (R, T, 3, c) of the readings of a sensor if it has a unit error of one
     `kind`.
 
-    The sensor has the index `index`; c is the number of components of the error.
+    The changes are for R recordings and T times of a reading of three components.
+
+    **Arguments:**
+
+    - `model`: the fitted model with its readings.
+    - `linear`: the errors of the readings at the best point; reading minus error is the prediction.
+    - `index`: the index of the sensor.
+    - `kind`: the name of the error. It has c components: "scale" three relative errors of scale;
+      "bias" three, in the unit of the sensor; "clock" one delay of 1 s; "cross_axis" six, one for
+      each pair of axes (i, j), where axis i also reads what axis j reads.
     """
     reading = model.records.readings[index]
     shown = np.asarray(reading.values) - linear.raw[index]
@@ -141,8 +171,11 @@ def _directions(
 def slope_in_time(
     model: Model, prediction: Float[np.ndarray, "records times k"]
 ) -> Float[np.ndarray, "records times k"]:
-    """Return the time derivative (R, T, k) of the predictions of a sensor; zero after the end of a
-    recording.
+    """Return the time derivative (R, T, k) of the `prediction` (R, T, k) of the readings of a
+    sensor.
+
+    It is computed by differences for R recordings, T times and k components, and is zero after the
+    last time of a recording. The `model` holds the times and the number of times of each recording.
     """
     t, counts = np.asarray(model.records.t)[..., None], np.asarray(model.counts)
     gap = np.diff(t, axis=1)
@@ -160,10 +193,12 @@ def slope_in_time(
 
 
 def stacked_shifts(parts: tuple[Consideration, ...], size: int) -> Float[np.ndarray, "n ways"]:
-    """Return the matrix S, whose columns are the shifts of the n = `size` free numbers by one
-    standard deviation of each considered error.
+    """Return the matrix S (n, c) of the shifts of the free numbers by all considered errors.
 
-    S Sᵀ is the covariance that the considered errors add.
+    S Sᵀ is the covariance that these errors add to a fit.
+
+    **Arguments:** `parts` the considered errors, each with its shifts by one standard deviation;
+    `size` the number n of free numbers.
     """
     return np.concatenate([np.zeros((size, 0)), *(part.shifts for part in parts)], axis=1)
 
@@ -193,12 +228,21 @@ def unit_moves(
     covariance: np.ndarray,
     slopes: Float[np.ndarray, "quantities n"],
 ) -> list[tuple[int, dict[str, Float[np.ndarray, " quantities"]]]]:
-    """Return how far errors of the size `USUAL` of each sensor without a tolerance would change
-    quantities.
+    """Return how far usual errors of each sensor without a tolerance would change `quantities` of a
+    fit.
 
-    The quantities have the derivatives `slopes` with respect to the n free numbers. For each sensor
-    without a tolerance the result holds two things: the index of the sensor; and, for each kind of
-    error, the largest change of each quantity that one component of the error makes.
+    The usual errors, `USUAL`, are 1 % of scale and 1° between two axes.
+
+    **Arguments:**
+
+    - `model`, `linear`: the fitted model; and its errors with their derivatives at the best point.
+    - `noise`: the standard deviations of the noise of the sensors.
+    - `covariance`: (n, n) the covariance of the n free numbers for white errors.
+    - `slopes`: (q, n) the derivatives of q quantities with respect to the free numbers.
+
+    **Returns** two things for each sensor without a tolerance: the index of the sensor; and a dict
+    of kind of error → the largest change (q,) of each quantity that one component of the error
+    makes.
     """
     out = []
     for index, sensor in enumerate(model.records.sensors):

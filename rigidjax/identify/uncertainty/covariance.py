@@ -105,14 +105,23 @@ class Linearisation(eqx.Module):
         return tuple(rows.swapaxes(1, 2) @ rows for rows in self.rows)
 
     def squared_change(self, step: np.ndarray) -> float:
-        """Return the sum of the squared changes of all residuals by a `step` (n,)."""
+        """Return the sum of the squared changes of all residuals if the n free numbers change by
+        `step` (n,).
+
+        The residuals are linear in the step; they include those of the priors.
+        """
         moved = np.append(step, 0.0)[self.places]
         readings = np.einsum("rim,rm->ri", self.dense, moved)
         rest = self.prior_weights * step, self.extra_slopes @ step
         return float(sum(np.sum(part**2) for part in (readings, *rest)))
 
     def to_all_numbers(self, blocks: np.ndarray) -> np.ndarray:
-        """Return rows (R, n) for all numbers, from `blocks` (R, m) for each recording's numbers."""
+        """Return rows (R, n) for all n free numbers of a fit, from rows for the numbers of each
+        recording.
+
+        The argument `blocks` (R, m) holds, for each of R recordings, one entry for each of the m
+        numbers on which this recording depends. All other entries of the result are zero.
+        """
         wide = np.zeros((len(blocks), self.size + 1))
         np.add.at(wide, (np.arange(len(blocks))[:, None], self.places), blocks)
         return wide[:, :-1]
@@ -120,7 +129,8 @@ class Linearisation(eqx.Module):
     def blocks(self, covariance: np.ndarray) -> np.ndarray:
         """Return the blocks (R, m, m) of a `covariance` (n, n) for the numbers of each recording.
 
-        The blocks are zero unless the covariance is finite.
+        Each of R recordings depends on m of the n free numbers. The blocks are zero unless the
+        covariance is finite.
         """
         known = covariance if np.isfinite(covariance).all() else np.zeros_like(covariance)
         wide = np.pad(known, (0, 1))
@@ -139,17 +149,31 @@ class Linearisation(eqx.Module):
 
 
 def _flatten_rows(slopes: np.ndarray) -> np.ndarray:
-    """Return derivatives `slopes` (R, T, k, m) as rows (R, T k, m), one row for each error."""
+    """Return derivatives of errors as one matrix for each recording, with one row for each error.
+
+    The argument `slopes` (R, T, k, m) holds the derivatives for R recordings, T times and k
+    components, with respect to m numbers; the result has the shape (R, T k, m).
+    """
     return slopes.reshape(len(slopes), -1, slopes.shape[-1])
 
 
 @eqx.filter_jit
 def _linearise_parts(model: Model, x: Array, noise: Noise, blocks: Blocks) -> PyTree[Array]:
-    """Return three parts of a `Linearisation`, computed by one compiled program.
+    """Return the weighted errors of a model, with their derivatives, in one compiled program.
 
-    The parts are: the whitened errors of the readings, their derivatives and weights; the places of
-    the recordings' numbers; and the residuals, weights and derivatives of priors and further
-    residuals.
+    **Arguments:**
+
+    - `model`: the model, with R recordings.
+    - `x`: (n,) the free numbers.
+    - `noise`: the standard deviations of the noise of the sensors.
+    - `blocks`: for each sensor the errors (R, T, k) at x, and their derivatives (R, T, k, m) with
+      respect to the m numbers of each recording.
+
+    **Returns** three tuples, which are the fields of a `Linearisation`: the errors of the readings
+    in standard deviations, their derivatives, and the weights of the robust loss; the indices (R,
+    m) of the numbers of each recording among all n; and the residuals of the priors of the free
+    numbers (n,), their derivatives (n,), all further residuals (j,), and the derivatives (j, n) of
+    these.
     """
     errors, slopes = blocks
     out, slopes = residuals_and_jacobians(lambda e: whiten(model, e, noise), errors, slopes)
@@ -165,15 +189,16 @@ def linearise(
     blocks: Blocks,
     thickened: tuple[Array, Blocks] | None = None,
 ) -> Linearisation:
-    """Return errors, derivatives and weights at x as NumPy arrays, in a `Linearisation`.
+    """Return the errors of a model at the free numbers x, with their derivatives and weights.
 
     **Arguments:**
 
-    - `model`, `noise`: the model, and the noise of its sensors.
+    - `model`, `noise`: the model, and the standard deviations of the noise of its sensors.
     - `x`: (n,) the free numbers.
-    - `blocks`: the errors and derivatives at x, as `terms.errors_and_jacobians` returns them.
-    - `thickened`: if a body is flat at x, a point with a thicker body, at which the derivatives are
-      computed, and the `blocks` at that point.
+    - `blocks`: for each sensor the errors and the derivatives of the errors at x, as
+      `terms.errors_and_jacobians` returns them.
+    - `thickened`: `None`, or, if a body is flat (I1 + I2 = I3) at x, two things: the free numbers
+      with a thicker body, at which the derivatives are computed; and the `blocks` at these numbers.
     """
     (errors, slopes, weights), places, others = jax.tree.map(
         np.asarray, _linearise_parts(model, x, noise, blocks)
@@ -242,7 +267,7 @@ class Root(eqx.Module):
         out = self.lift @ total @ self.lift.T + both + both.T
         for (mine, *_), block in zip(self.own, blocks, strict=True):
             out[np.ix_(mine, mine)] += block
-        return self._in_units(out)
+        return self._in_units_of_numbers(out)
 
     @property
     def covariance(self) -> np.ndarray:
@@ -253,11 +278,14 @@ class Root(eqx.Module):
         out = half @ half.T
         for mine, root, _ in self.own:
             out[np.ix_(mine, mine)] += root @ root.T
-        return self._in_units(out)
+        return self._in_units_of_numbers(out)
 
-    def _in_units(self, covariance: np.ndarray) -> np.ndarray:
-        """Return a `covariance` (n, n) of the scaled numbers converted to the units of the numbers,
-        with undetermined directions projected out.
+    def _in_units_of_numbers(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the covariance (n, n) of n free numbers in their own units, from the one of scaled
+        numbers.
+
+        The argument `covariance` (n, n) is that of the numbers multiplied by `size`, which are of
+        order one. The directions `null`, which the data do not determine, are projected out.
         """
         if len(self.null):
             covariance = covariance - self.null.T @ (self.null @ covariance)
@@ -266,7 +294,10 @@ class Root(eqx.Module):
 
 
 def _indices_in(columns: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Return the index in `columns` of each number of `numbers`."""
+    """Return the indices (k,) at which the entries of `numbers` (k,) are found in `columns` (m,).
+
+    Each entry of `numbers` must occur in `columns`; both hold indices of free numbers.
+    """
     order = np.argsort(columns)
     return order[np.searchsorted(columns[order], numbers)]
 
@@ -305,7 +336,7 @@ def white_covariance(linear: Linearisation) -> Covariance:
     if not (np.isfinite(dense).all() and np.isfinite(linear.extra_slopes).all()):
         lost, kind = np.full((n, n), np.nan), "none: the motion is not finite"
         return Covariance(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)), None)
-    triangles, owner = np.linalg.qr(dense, mode="r"), _owners(linear)
+    triangles, owner = np.linalg.qr(dense, mode="r"), _owning_recordings(linear)
     shared = np.flatnonzero(owner < 0)
     # Columns are scaled to order one, so that a bias in rad/s does not look undetermined next to a
     # moment of inertia. The lower bound of the size keeps round-off from being scaled up.
@@ -322,7 +353,7 @@ def white_covariance(linear: Linearisation) -> Covariance:
     all_shared = ~np.isin(np.arange(len(triangles)), owner)
     no_own = np.zeros(0, int), np.zeros((0, 0)), np.zeros((0, shared.size))
     rest, own, values, null = (
-        [ties, _rows_of_shared(linear, triangles, size, all_shared, shared)],
+        [ties, _factor_of_shared_numbers(linear, triangles, size, all_shared, shared)],
         [],
         [],
         [],
@@ -336,7 +367,7 @@ def white_covariance(linear: Linearisation) -> Covariance:
         wide[:, columns], held[np.arange(mine.size), mine] = triangle, prior[mine]
         priors = np.concatenate([extra[of == record], held])
         rows = np.concatenate([wide[:, :-1] / size, priors])
-        range_, root, blind, singular = _decompose(rows[:, mine])
+        range_, root, blind, singular = _range_and_null_space(rows[:, mine])
         taken = range_.T @ rows[:, shared]
         lift[mine] = -root @ taken
         rest.append(np.linalg.qr(rows[:, shared] - range_ @ taken, mode="r"))
@@ -344,7 +375,7 @@ def white_covariance(linear: Linearisation) -> Covariance:
         values.append(singular)
         null.append(np.zeros((len(blind), n)))
         null[-1][:, mine] = blind
-    _, core, blind, singular = _decompose(np.concatenate(rest))
+    _, core, blind, singular = _range_and_null_space(np.concatenate(rest))
     null.append(blind @ lift.T)
     root = Root(size, lift, core, tuple(own), ties, np.linalg.qr(np.concatenate(null).T)[0].T)
     directions = root.null / size
@@ -360,23 +391,26 @@ def white_covariance(linear: Linearisation) -> Covariance:
     )
 
 
-def _rows_of_shared(
+def _factor_of_shared_numbers(
     linear: Linearisation,
     triangles: np.ndarray,
     size: np.ndarray,
     selected: np.ndarray,
     shared: np.ndarray,
 ) -> np.ndarray:
-    """Return the triangular factor (QR) of the derivatives of the selected recordings with respect
-    to the s shared numbers.
+    """Return a triangular matrix (QR) that replaces all errors of recordings without own numbers.
+
+    The errors of such recordings depend only on the s numbers that recordings share. The matrix (q,
+    s) has the same Gram matrix as the derivatives of the errors with respect to these numbers.
 
     **Arguments:**
 
-    - `linear`: the linearisation of all recordings.
-    - `triangles`: (R, q, m) for each recording the triangular factor of its weighted derivatives.
-    - `size`: (n,) the factor by which each number is multiplied.
+    - `linear`: the derivatives of the errors of all R recordings.
+    - `triangles`: (R, q, m) for each recording the triangular factor (QR) of the weighted
+      derivatives with respect to its m numbers.
+    - `size`: (n,) the factors of the n free numbers that scale their columns to order one.
     - `selected`: (R,) true for recordings whose errors depend on shared numbers only.
-    - `shared`: (s,) the places of the shared numbers.
+    - `shared`: (s,) the indices of the shared numbers among all n.
     """
     wide = np.zeros((int(selected.sum()), triangles.shape[1], linear.size + 1))
     columns = np.broadcast_to(linear.places[selected][:, None, :], triangles[selected].shape)
@@ -385,12 +419,13 @@ def _rows_of_shared(
     return np.linalg.qr(rows[:, shared], mode="r")
 
 
-def _owners(linear: Linearisation) -> np.ndarray:
-    """Return, for each number (n,), the index of the only recording that depends on the number; −1
-    if several recordings depend on it.
+def _owning_recordings(linear: Linearisation) -> np.ndarray:
+    """Return, for each of n free numbers, the index of the only recording that depends on it.
 
-    The result is −1, too, for the own numbers of several recordings if one of the `extra` residuals
-    depends on more than one of them.
+    The index is −1 for a number on which several recordings depend. It is −1, too, for numbers of
+    different recordings that occur together in one of the residuals `extra`, such as a prior that
+    ties them. The argument `linear` holds the numbers of each recording, and the derivatives of
+    these residuals.
     """
     records, n = len(linear.places), linear.size
     owner, used = np.full(n + 1, -1), np.zeros((records, n + 1), bool)
@@ -404,13 +439,18 @@ def _owners(linear: Linearisation) -> np.ndarray:
     return owner[:-1]
 
 
-def _decompose(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the range of `rows` (q, k), whose columns are of order one, by a singular value
-    decomposition.
+def _range_and_null_space(
+    rows: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Compute the range and the null space of a matrix by a singular value decomposition.
 
-    It returns four things: an orthonormal basis (q, r) of the range; a root (k, r) of the inverse
-    of the Gram matrix `rowsᵀ rows`; the directions (j, k) that the rows do not determine; and the
-    singular values.
+    The argument `rows` (q, k) holds derivatives of q residuals with respect to k numbers, with
+    columns of order one. A direction counts as null if its singular value is below 1e-8 of the
+    largest one (of 1 if all are smaller than 1).
+
+    **Returns** four things: an orthonormal basis (q, r) of the range; a root (k, r) of the inverse
+    of the Gram matrix `rowsᵀ rows`, within the determined directions; the null directions (j, k),
+    which the rows do not determine; and all singular values.
     """
     u, singular, directions = np.linalg.svd(rows, full_matrices=False)
     determined = singular > BLIND * singular.max(initial=1.0)
@@ -439,15 +479,18 @@ def covariance_of(
     white = white_covariance(linear) if white is None else white
     if times.longest <= 1.5 or not np.isfinite(white.determined).all():
         return white
-    covariance = _sandwich(linear, white, times)
+    covariance = _sandwich_covariance(linear, white, times)
     kind = f"sandwich: the errors are autocorrelated over {times.longest:.0f} samples"
     shown = with_infinite_variance(white.null_directions, covariance)
     return dataclasses.replace(white, covariance=shown, determined=covariance, kind=kind)
 
 
 def with_infinite_variance(null: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the `covariance` with an infinite variance for each number that changes along a
-    direction of `null` (k, n).
+    """Return the `covariance` (n, n) with an infinite variance for each number that is not
+    determined.
+
+    Such a number changes along a direction of `null` (k, n), the directions that the data do not
+    determine.
     """
     shown = covariance.copy()
     blind = np.abs(null).max(axis=0, initial=0.0) > 1e-6
@@ -486,20 +529,31 @@ def distance_to_minimum(
     return float(np.sqrt(max(linear.slope @ covariance @ linear.slope, 0.0)))
 
 
-def _sandwich(linear: Linearisation, white: Covariance, times: "CorrelationTimes") -> np.ndarray:
-    """Return the sandwich covariance of `covariance_of`, for errors that are not independent.
+def _sandwich_covariance(
+    linear: Linearisation, white: Covariance, times: "CorrelationTimes"
+) -> np.ndarray:
+    """Return the covariance (n, n) of a fit for errors that are correlated in time.
 
-    The derivatives are first written in orthonormal columns (QR), since round-off in products of
-    the derivatives themselves could make variances negative.
+    It is the sandwich `H⁻¹ M H⁻¹` of `covariance_of`, where H⁻¹ is the covariance for white errors,
+    and M is `Jᵀ C J` with the covariance C of the errors in time, plus the information of priors.
+    Each number gets the largest of its variances for several decay times of the autocorrelation and
+    for white errors. The derivatives J are first written in orthonormal columns (QR), since
+    round-off in products of the derivatives themselves could make variances negative.
+
+    **Arguments:**
+
+    - `linear`: the errors at the best point, with their derivatives J and weights.
+    - `white`: the covariance for white errors, with a root of it.
+    - `times`: the correlation times of the errors, and the number of independent errors.
     """
     columns, triangles = np.linalg.qr(linear.dense)
     longest = max(int(np.median((linear.weights[0] > 0).sum(axis=1))) // 2, 2)
     spans = 2.0 ** np.arange(1, np.log2(longest) + 1)
     n, records = linear.size, len(linear.places)
     grown = times.independent / max(times.independent - n, 0.1 * times.independent)
-    channels, root = _spectra(linear, columns), white.root
+    channels, root = _spectra_in_time(linear, columns), white.root
     assert root is not None
-    meats = [grown * _meat(*channels, span) for span in spans]
+    meats = [grown * _correlated_information(*channels, span) for span in spans]
     estimates = [root.sandwich(triangles, linear.places, meat) for meat in meats]
     if records > n // 2 and records > 5:
         # The scatter between many recordings gives the variance without a model of the errors.
@@ -515,13 +569,18 @@ def _sandwich(linear: Linearisation, white: Covariance, times: "CorrelationTimes
     return out * np.outer(factor, factor)
 
 
-def _spectra(linear: Linearisation, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays for all k channels: the spectra in time of the `columns`; and the smooth
-    share of the errors.
+def _spectra_in_time(linear: Linearisation, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two arrays for all k channels: the spectra in time of the derivatives of a fit; and
+    the part of the variance of the errors that is not white.
 
-    The spectra (R, k, 2, T + 1, m) hold real and imaginary parts at each frequency, multiplied by
-    the standard deviation of the errors of the channel. The smooth shares (k, 1, 1) are results of
-    `smooth_share`.
+    A channel is one component of one sensor.
+
+    **Arguments:** `linear` the errors of R recordings at T times, with their weights; `columns` (R,
+    N, m) orthonormal columns that span the derivatives of the N errors of each recording.
+
+    **Returns** the spectra (R, k, 2, T + 1, m), with the real and the imaginary part at each of T +
+    1 frequencies, multiplied by the standard deviation of the errors of the channel; and the
+    fractions (k, 1, 1) of the variance, from `smooth_share`.
     """
     first, slopes, shares = 0, [], []
     for error, weight in zip(linear.errors, linear.weights, strict=True):
@@ -543,35 +602,49 @@ def _spectra(linear: Linearisation, columns: np.ndarray) -> tuple[np.ndarray, np
     return parts, np.array(shares)[:, None, None]
 
 
-def _meat(spectra: np.ndarray, share: np.ndarray, time: float) -> np.ndarray:
-    """Return `Jᵀ C J` (R, m, m) for errors with an autocorrelated and a white part.
+def _correlated_information(
+    spectra: np.ndarray, smooth_shares: np.ndarray, decay_time: float
+) -> np.ndarray:
+    """Return `Jᵀ C J` (R, m, m), for errors whose covariance C in time has a white and a smooth
+    part.
 
-    The fraction `share` of the variance has an autocorrelation that decays over `time` samples; the
-    remaining variance is white. The arguments `spectra` and `share` are the results of `_spectra`.
+    The smooth part has an autocorrelation that decays exponentially over `decay_time` samples; the
+    rest of the variance is white. J holds the derivatives of the errors of R recordings.
+
+    **Arguments:**
+
+    - `spectra`: (R, k, 2, T + 1, m) the spectra in time of J for k channels (components of
+      sensors), multiplied by the standard deviation of the errors, as `_spectra_in_time` returns
+      them.
+    - `smooth_shares`: (k, 1, 1) the fraction of the variance of each channel that is smooth.
+    - `decay_time`: the decay time, in samples.
     """
     size = 2 * spectra.shape[3] - 2
     lags = np.arange(size)
-    decay = np.exp(-np.minimum(lags, size - lags) / time)
-    power = share * np.fft.rfft(decay).real[:, None] + (1.0 - share)
+    decay = np.exp(-np.minimum(lags, size - lags) / decay_time)
+    power = smooth_shares * np.fft.rfft(decay).real[:, None] + (1.0 - smooth_shares)
     weighed = spectra * power[:, None]
     flat = (*spectra.shape[:2], -1, spectra.shape[-1])
     return np.sum(weighed.reshape(flat).swapaxes(2, 3) @ spectra.reshape(flat), axis=1)
 
 
-def smooth_share(e: np.ndarray, mask: np.ndarray) -> float:
-    """Return the fraction of the variance of errors e (R, T) that is not white noise.
+def smooth_share(errors: np.ndarray, mask: np.ndarray) -> float:
+    """Return the fraction of the variance of `errors` (R, T) that is not white noise, between 0 and
+    1.
 
-    The white noise is estimated from the second differences of the errors (`scatter`). Only the
-    errors where `mask` (R, T) is true are used.
+    The white noise of the R rows of T samples is estimated from the second differences of the
+    errors. Only the errors where `mask` (R, T) is true are used.
     """
-    rows = [x[kept] for x, kept in zip(e, mask, strict=True)]
+    rows = [x[kept] for x, kept in zip(errors, mask, strict=True)]
     total = sum(float(row @ row) for row in rows) / max(sum(row.size for row in rows), 1)
     return float(np.clip(1.0 - scatter(rows) / total, 0.0, 1.0)) if total > 0 else 1.0
 
 
 def scatter(rows: list[np.ndarray]) -> float:
-    """Return the variance of white noise whose second differences have the mean square of the
-    second differences of `rows`.
+    """Return the variance of the white noise in `rows`, estimated from second differences in time.
+
+    Each entry of `rows` is an array of samples, such as the errors of one recording. A smooth
+    signal hardly changes the second differences. The variance is 0 if no row has three samples.
     """
     bends = np.concatenate([row[2:] - 2.0 * row[1:-1] + row[:-2] for row in rows])
     # The second difference of white noise has six times the variance of the noise.
@@ -600,17 +673,20 @@ class CorrelationTimes(eqx.Module):
 
 
 def correlation_times(linear: Linearisation) -> CorrelationTimes:
-    """Return the autocorrelation time of each channel, `1 + 2 Σ ρ_l` over lags l.
+    """Return over how many samples the errors of each channel (one component of a sensor) are
+    correlated.
 
-    The sum ends at the first correlation ρ that is below twice its standard deviation, or that has
-    fewer than ten pairs of errors. Readings at full scale are left out.
+    The autocorrelation time is `1 + 2 Σ ρ_l`, with the correlation ρ_l of errors that are l samples
+    apart. The sum ends at the first ρ_l that is below twice its standard deviation, or that has
+    fewer than ten pairs of errors. Readings at full scale are left out. The argument `linear` holds
+    the errors with their weights.
     """
     spans, longest, closest, independent = [], 1.0, 0.0, 0.0
     for error, weight, kept in zip(linear.errors, linear.weights, linear.mask, strict=True):
         weighted, of_sensor = error * np.sqrt(weight)[..., None], []
         for channel in range(error.shape[-1]):
             mask = kept[..., channel]
-            span, first = _channel_time(weighted[..., channel], mask)
+            span, first = _autocorrelation_time(weighted[..., channel], mask)
             if span > longest:
                 longest, closest = span, first
             of_sensor.append(span)
@@ -619,21 +695,26 @@ def correlation_times(linear: Linearisation) -> CorrelationTimes:
     return CorrelationTimes(tuple(spans), closest, independent)
 
 
-def _channel_time(e: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
-    """Return two numbers: the autocorrelation time of errors e (R, T) in samples; and the
-    correlation of neighbouring errors.
+def _autocorrelation_time(errors: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
+    """Return two numbers: the autocorrelation time of errors, in samples; and the correlation of
+    neighbouring errors.
 
-    Only the errors where `mask` (R, T) is true are used.
+    The autocorrelation time is `1 + 2 Σ ρ_l`, with the correlation ρ_l of errors that are l samples
+    apart; it is 1 for white errors. **Arguments:** `errors` (R, T) for R recordings and T times,
+    the errors of one component of a sensor; `mask` (R, T) true for the errors to use.
     """
     counts = mask.sum(axis=1, keepdims=True)
-    mean = e.sum(axis=1, keepdims=True) / np.maximum(counts, 1)
-    centred = np.where(mask, e - mean, 0.0)
+    mean = errors.sum(axis=1, keepdims=True) / np.maximum(counts, 1)
+    centred = np.where(mask, errors - mean, 0.0)
     variance = np.sum(centred**2)
     if not variance > 0:
         return 1.0, 0.0
     lags = np.arange(1, max(2, int(np.max(np.nonzero(mask)[1], initial=0) + 1) // 3))
     # The sum at each lag is divided by its number of pairs, which is smaller than at lag zero.
-    pairs, products = np.round(_lagged_products(mask)[lags]), _lagged_products(centred)[lags]
+    pairs, products = (
+        np.round(_sums_of_lagged_products(mask)[lags]),
+        _sums_of_lagged_products(centred)[lags],
+    )
     rho = products / variance * (counts.sum() / np.maximum(pairs, 1))
     ends = (pairs < 10) | (rho < 2.0 / np.sqrt(max(counts.sum(), 1)))
     last = int(np.argmax(ends)) if ends.any() else lags.size
@@ -641,11 +722,12 @@ def _channel_time(e: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
     return 1.0 + 2.0 * float(rho[:last].sum()), float(first)
 
 
-def _lagged_products(x: np.ndarray) -> np.ndarray:
-    """Return, for each lag l, the sum of x[r, i] x[r, i + l] over all rows r and times i of x (R,
-    T).
+def _sums_of_lagged_products(rows: np.ndarray) -> np.ndarray:
+    """Return, for each lag l from 0 to T − 1, the sum of the products of entries that are l times
+    apart.
 
-    The sums (T,) are computed by FFT.
+    The argument `rows` (R, T) holds x[r, i] for R rows and T times. The sums (T,) of x[r, i] x[r, i
+    + l] over all r and i are computed by FFT.
     """
-    size = x.shape[1]
-    return np.fft.irfft(np.sum(np.abs(np.fft.rfft(x, 2 * size)) ** 2, axis=0), 2 * size)[:size]
+    size = rows.shape[1]
+    return np.fft.irfft(np.sum(np.abs(np.fft.rfft(rows, 2 * size)) ** 2, axis=0), 2 * size)[:size]

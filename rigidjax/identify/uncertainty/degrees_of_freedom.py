@@ -92,14 +92,17 @@ def freedom_of(
     covariance: np.ndarray,
     considered: np.ndarray,
 ) -> Freedom:
-    """Return the `Freedom` of a fit.
+    """Return what the degrees of freedom of variances of a fit are computed from.
 
     **Arguments:**
 
-    - `model`, `linear`, `times`: the model, its linearisation, and the correlation times of its
-      errors.
-    - `covariance`: (n, n) the covariance of the free numbers, for white errors.
-    - `considered`: (n, c) the shifts of these numbers by considered errors.
+    - `model`: the fitted model.
+    - `linear`: the errors at the best point, with their derivatives and weights.
+    - `times`: the correlation times of the errors. Correlated errors count as fewer independent
+      ones.
+    - `covariance`: (n, n) the covariance of the n free numbers, for white errors.
+    - `considered`: (n, c) the changes of the free numbers by one standard deviation of each error
+      that a sensor may have and that the fit does not estimate.
     """
     groups, left, blocks = np.asarray(model.noise_groups), [], linear.information
     if model.clusters is not None:
@@ -128,11 +131,14 @@ def freedom_of(
 def leverages(
     linear: Linearisation, information: tuple[np.ndarray, ...], covariance: np.ndarray
 ) -> list[np.ndarray]:
-    """Return, for each sensor, how many free numbers its readings determine in each recording (R,).
+    """Return, for each sensor, how many free numbers its readings determine in each of R recordings
+    (R,).
+
+    A number that readings and priors determine together counts in part.
 
     **Arguments:** `linear` the linearisation of the model; `information` for each sensor the
     information (R, m, m) in its readings on the m numbers of each recording; `covariance` (n, n)
-    the covariance of all free numbers.
+    the covariance of all n free numbers.
     """
     known = linear.blocks(covariance)
     return [np.sum(block * known, axis=(1, 2)) for block in information]

@@ -91,12 +91,14 @@ def interval_ends(
 
 
 def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
-    """Return the free numbers x with each flat body made thicker; `None` if no body is flat.
+    """Return the free numbers x (n,) with each flat body made thicker; `None` if no body is flat.
 
-    The derivative of a chart is zero at a flat body. The information on the inertia tensor itself
-    is regular at a flat body, and is hardly different at the slightly thicker body.
+    A flat body has the moments I1 + I2 = I3, or nearly so. The derivative of the body with respect
+    to x is zero there. The information on the inertia tensor itself is regular at a flat body, and
+    is hardly different at the slightly thicker body. The `model` gives the chart (the
+    parametrisation by x) of each body.
     """
-    thick = list(map(_thicken_chart, chart_list(model.chart), bodies_of(model, x)))
+    thick = list(map(_numbers_of_thicker_body, chart_list(model.chart), bodies_of(model, x)))
     if all(one is None for one in thick):
         return None
     pairs = zip(numbers_of(model.chart, x[: model.index.bodies]), thick, strict=True)
@@ -105,22 +107,33 @@ def thicken(model: Model, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
 
 
 def bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
-    """Return the bodies of a fit with the free numbers x, in the order of their charts."""
+    """Return the bodies of a `model` at its free numbers x (n,), in the order of their charts.
+
+    A chart is the parametrisation of one body by free numbers.
+    """
     return _bodies_of(without_samples(model), x)
 
 
 @eqx.filter_jit
 def _bodies_of(model: Model, x: Float[Array, " n"]) -> list[Any]:
-    """Return the result of `bodies_of`, computed by one compiled program."""
+    """Return the bodies of a `model` at its free numbers x (n,), computed in one compiled program.
+
+    They are in the order of the charts (the parametrisations of the bodies).
+    """
     # Compile one program: outside of a trace each operation of JAX takes as long as a run of 100
     # steps.
     return as_list(model.bodies(x))
 
 
-def _thicken_chart(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
-    """Return the numbers, in the `chart`, of a thicker body; `None` for a body that is not flat.
+def _numbers_of_thicker_body(
+    chart: AbstractBodyChart, body: Inertia | MassProperties
+) -> Array | None:
+    """Return the numbers of a slightly thicker body in its chart; `None` for a body that is not
+    flat.
 
-    The result is `None`, too, for a chart that a user wrote, whose limit is not known.
+    A flat body has the moments I1 + I2 = I3, or nearly so. The result is a vector of the numbers of
+    the `chart` (the parametrisation of the body). It is `None`, too, for a `body` with NaN, and for
+    a chart that a user wrote, whose limit is not known.
     """
     # Use NumPy: outside of a trace each operation of JAX takes as long as a run of 100 steps.
     if isinstance(body, MassProperties):
@@ -128,7 +141,7 @@ def _thicken_chart(chart: AbstractBodyChart, body: Inertia | MassProperties) -> 
     else:
         tensor = np.asarray(body.tensor)
         second = 0.5 * np.trace(tensor) * np.eye(3) - tensor
-    if not _has_limit(chart) or not np.isfinite(second).all():
+    if not _ends_at_flat_bodies(chart) or not np.isfinite(second).all():
         return None
     values, axes = np.linalg.eigh(second)
     least = THIN * values.sum()
@@ -140,19 +153,28 @@ def _thicken_chart(chart: AbstractBodyChart, body: Inertia | MassProperties) -> 
     return chart.vector(Inertia(swap_trace(second)))
 
 
-def _has_limit(chart: AbstractBodyChart) -> bool:
-    """Return whether the chart is one of this package, and moves moments of inertia."""
+def _ends_at_flat_bodies(chart: AbstractBodyChart) -> bool:
+    """Return whether the bodies of a `chart` end at flat bodies, those with the moments I1 + I2 =
+    I3.
+
+    It is true if the chart (the parametrisation of a body by free numbers) is one of this package
+    and changes moments of inertia, not the mass alone.
+    """
     return type(chart).__module__ == AbstractBodyChart.__module__ and any(
         name != "mass" for name in chart.log_names
     )
 
 
 def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
-    """Return (I1 + I2 − I3) / I3 of each body; 1 for a body whose moments are not free."""
+    """Return the flatness (I1 + I2 − I3) / I3 of each body of a `model` at the free numbers x (n,).
+
+    I1 ≤ I2 ≤ I3 are the principal moments of the body; a flat body has the flatness 0. The flatness
+    is set to 1 for a body whose moments are not free.
+    """
     out = []
     bodies = as_list(model.bodies(x))
     for chart, body in zip(chart_list(model.chart), bodies, strict=True):
-        if not _has_limit(chart):
+        if not _ends_at_flat_bodies(chart):
             out.append(jnp.ones((), x.dtype))
             continue
         # The last logarithms belong to the three moments, or to the ratios of two moments to the
@@ -168,19 +190,20 @@ def flatness(model: Model, x: Float[Array, " n"]) -> Float[Array, " bodies"]:
 def flat_limits(
     model: Model, numbers: tuple[np.ndarray, np.ndarray], step: np.ndarray, names: list[str]
 ) -> tuple[Limit, ...]:
-    """Return the `Limit` of each body whose moments are free.
+    """Return, for each body whose moments are free, how far it is from a flat body, I1 + I2 = I3.
 
     **Arguments:**
 
-    - `model`: the model.
+    - `model`: the fitted model.
     - `numbers`: two arrays, as `quantities.values_and_slopes` returns them: the reported numbers,
-      with the flatness of each body at the end; and the derivatives of these numbers.
+      with the flatness of each body at the end; and their derivatives with respect to the n free
+      numbers.
     - `step`: (n,) the step of the free numbers from the best point to the minimum of the linear
       model.
     - `names`: for each body the suffix of the names of its quantities.
     """
     rows = zip(names, *(part[-len(names) :] for part in numbers), strict=True)
-    have_limits = [_has_limit(chart) for chart in chart_list(model.chart)]
+    have_limits = [_ends_at_flat_bodies(chart) for chart in chart_list(model.chart)]
     return tuple(
         Limit(name, float(value), float(value + min(slope @ step, 0.0)), slope)
         for (name, value, slope), has_limit in zip(rows, have_limits, strict=True)

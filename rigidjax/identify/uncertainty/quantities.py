@@ -70,7 +70,7 @@ class Quantity(eqx.Module):
 
 
 def reported_deviation(quantity: Quantity) -> float:
-    """Return the standard deviation of a quantity, or of its logarithm if the quantity is
+    """Return the standard deviation of a reported `quantity`, or that of its logarithm if it is
     positive.
     """
     if not quantity.positive:
@@ -94,8 +94,10 @@ def cut_ends(reach: np.ndarray | float, cuts: Sequence[tuple[Any, float]]) -> tu
 
 
 def labels(model: Model) -> list[tuple[str, str, bool]]:
-    """Return three things for each quantity of `quantity_vector`, in the same order: its name; its
-    unit; and whether it is positive.
+    """Return the name, the unit and the sign of each quantity that a fit of the `model` reports.
+
+    For each quantity there is a tuple of its name, its unit, and whether it is always positive, in
+    the order of `quantity_vector`.
     """
     out = []
     for name, chart in charts_by_suffix(model):
@@ -106,7 +108,7 @@ def labels(model: Model) -> list[tuple[str, str, bool]]:
         out += [(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]
     for slot in model.slots:
         shape = slot.shape
-        parts = [""] if not shape else [f" {_component(i)}" for i in np.ndindex(shape)]
+        parts = [""] if not shape else [f" {_component_name(i)}" for i in np.ndindex(shape)]
         ends = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
         ends = ends if slot.spread is None else [*ends, *(f", own{where}" for where in names)]
         called = [f"{slot.name}{part}{end}" for end in ends for part in parts]
@@ -120,7 +122,10 @@ def reports_starts(model: Model) -> bool:
 
 
 def charts_by_suffix(model: Model) -> list[tuple[str, AbstractBodyChart]]:
-    """Return for each body the suffix of the names of its quantities, and its chart."""
+    """Return, for each body of a `model`, the suffix of the names of its quantities, and its chart.
+
+    A chart is the parametrisation of a body by free numbers. The suffix is empty for a single body.
+    """
     if not isinstance(model.chart, Bodies):
         return [("", model.chart)]
     return [(f" [{n}]", c) for n, c in zip(model.chart.names, model.chart.charts, strict=True)]
@@ -141,13 +146,17 @@ def recording_names(model: Model) -> list[str]:
     return out
 
 
-def _component(index: tuple[int, ...]) -> str:
-    """Return the name of a component of an array: x, y or z for a vector, else its index."""
+def _component_name(index: tuple[int, ...]) -> str:
+    """Return the name of one component of an array: x, y or z for a vector, else its `index`."""
     return "xyz"[index[0]] if len(index) == 1 and index[0] < 3 else str(index)
 
 
 def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
-    """Return the reported quantities as a vector, with the logarithms of positive quantities."""
+    """Return the quantities (q,) that a fit reports, at the free numbers x (n,) of a `model`.
+
+    They are, in the order of `labels`, the moments and other numbers of each body, the initial body
+    rates (rad/s), and the values of each `Free`. A positive quantity is given by its logarithm.
+    """
     parts, bodies = [jnp.zeros(0, x.dtype)], as_list(model.bodies(x))
     for (_, chart), body in zip(charts_by_suffix(model), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
@@ -163,15 +172,23 @@ def quantity_vector(model: Model, x: Float[Array, " n"]) -> Array:
 
 
 def value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Return two arrays at x: the reported quantities, with the flatness of each body at the end;
-    and their derivatives with respect to the free numbers x.
+    """Return the reported quantities (q,) of a `model` at the free numbers x (n,), and their
+    derivatives (q, n).
+
+    Both arrays have further entries at the end for the flatness (I1 + I2 − I3) / I3 of each body. A
+    positive quantity is given by its logarithm.
     """
     return _value_and_slope(without_samples(model), x)
 
 
 @eqx.filter_jit
 def _value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Return the result of `value_and_slope`, computed by one compiled program."""
+    """Return the reported quantities (q,) of a `model` at the free numbers x (n,), and their
+    derivatives (q, n).
+
+    Both arrays, computed in one compiled program, have further entries at the end for the flatness
+    (I1 + I2 − I3) / I3 of each body. A positive quantity is given by its logarithm.
+    """
 
     def value(x: Array) -> Array:
         return jnp.concatenate([quantity_vector(model, x), flat_limit.flatness(model, x)])
@@ -183,10 +200,12 @@ def _value_and_slope(model: Model, x: Float[Array, " n"]) -> tuple[Array, Array]
 def values_and_slopes(
     model: Model, x: Float[Array, " n"], derivative_point: Float[Array, " n"] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays: the reported quantities, with the flatness of each body at the end; and
-    their derivatives with respect to the free numbers.
+    """Return the reported quantities (q,) of a `model` at the free numbers x (n,), and their
+    derivatives (q, n), in NumPy.
 
-    The derivatives are computed at x or, if a body is flat at x, at the point `derivative_point`.
+    Both arrays have further entries at the end for the flatness (I1 + I2 − I3) / I3 of each body.
+    The derivatives are computed at x or, if a body is flat at x, at `derivative_point` (n,), the
+    free numbers with a thicker body.
     """
     values, slopes = (np.asarray(part) for part in value_and_slope(model, x))
     if derivative_point is not None:
@@ -243,11 +262,16 @@ def interval_about(
     reach: np.ndarray | float,
     limits: tuple[flat_limit.Limit, ...] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the interval (low, high) of functions with the values `value` and the derivatives
-    `slope` with respect to the free numbers.
+    """Return the low and the high end of the interval of functions of the n free numbers of a fit.
 
-    **Arguments:** `reach` the half-width in standard deviations; `covariance`, `null` and `limits`
-    as for `quantities`.
+    **Arguments:**
+
+    - `value`: (…) the best values of the functions.
+    - `slope`: (…, n) their derivatives with respect to the free numbers.
+    - `covariance`: (n, n) the covariance of the free numbers within the determined directions.
+    - `null`: (k, n) the directions that the data do not determine.
+    - `reach`: the half-width of the interval in standard deviations.
+    - `limits`: the flat bodies at which intervals end.
     """
     wide = standard_deviations(slope, covariance, null)
     low, high = cut_ends(reach, cuts_of(slope, covariance, wide, limits))
@@ -260,11 +284,20 @@ def cuts_of(
     deviations: np.ndarray,
     limits: tuple[flat_limit.Limit, ...],
 ) -> list[tuple[np.ndarray, float]]:
-    """Return, for each of the `limits` (flat bodies), two things: the correlations of functions
-    with the flatness of the body; and the flatness in standard deviations.
+    """Return how functions of the free numbers of a fit depend on the flatness of each body.
 
-    The functions have the derivative `slope` and the standard deviations `deviations`; `covariance`
-    and `limits` are as for `quantities`.
+    The flatness (I1 + I2 − I3) / I3 of a body cannot be negative, and so cuts the intervals of
+    numbers that are correlated with it.
+
+    **Arguments:**
+
+    - `slope`: (…, n) the derivatives of the functions with respect to the n free numbers.
+    - `covariance`: (n, n) the covariance of the free numbers.
+    - `deviations`: (…) the standard deviations of the functions.
+    - `limits`: the distance of each body from a flat body.
+
+    **Returns** two things for each body with a flatness of finite deviation: the correlations (…)
+    of the functions with the flatness; and the flatness in standard deviations.
     """
     out = []
     for limit in limits:
@@ -303,15 +336,17 @@ def standard_deviations(slope: np.ndarray, covariance: np.ndarray, null: np.ndar
         alike.setdefault((row != 0).tobytes(), []).append(index)
     for key, mine in alike.items():
         used = np.frombuffer(key, bool)
-        deviations = _deviations(rows[mine][:, used], scaled[np.ix_(used, used)])
+        deviations = _standard_deviations(rows[mine][:, used], scaled[np.ix_(used, used)])
         out[mine] = np.nan if beyond[used].any() else deviations
     return np.where(undetermined, np.inf, out.reshape(slope.shape[:-1]))
 
 
-def _deviations(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (m,) of functions with derivative `slope` (m, n).
+def _standard_deviations(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the standard deviations (m,) of linear functions of n numbers of a given `covariance`
+    (n, n).
 
-    A deviation is NaN if its variance is negative or round-off.
+    The argument `slope` (m, n) holds the derivatives of the functions. A deviation is NaN if its
+    variance is negative or as small as round-off.
     """
     values, axes = np.linalg.eigh(covariance)
     along = slope @ axes

@@ -100,10 +100,14 @@ def stretches_of(model: Model, linear: Linearisation) -> Stretches | None:
 
 
 def jackknife(stretches: Stretches, white: Covariance) -> Covariance:
-    """Return the jackknife `Covariance`: the variances of the shared numbers come from the scatter
-    of their steps between stretches.
+    """Return the covariance of a fit of windows from its changes if one stretch of windows is left
+    out.
 
-    The covariance `white`, for white errors, is kept for the numbers that one window alone has.
+    The jackknife gives the covariance of the numbers that windows share. The numbers that one
+    window alone has, such as its initial state, keep their covariance for white errors.
+
+    **Arguments:** `stretches` the changes of the shared numbers if each stretch (a run of
+    neighbouring windows) is left out; `white` the covariance for white errors.
     """
     count, places = len(stretches.steps), stretches.places
     covariance = np.array(white.determined)
@@ -141,8 +145,8 @@ def remarks_on_stretches(
     steps = stretches.steps @ slopes[:, stretches.places].T
     squares = steps**2
     hanging = squares.max(axis=0) > HANGS * np.maximum(squares.sum(axis=0), 1e-300)
-    unseen = _changes_along(white.null_directions, slopes)
-    alone = np.stack([_changes_along(null, slopes) & ~unseen for null in stretches.null])
+    unseen = _change_along(white.null_directions, slopes)
+    alone = np.stack([_change_along(null, slopes) & ~unseen for null in stretches.null])
     edges = -(-np.arange(count + 1) * model.count // count)
     out = []
     for index, (name, _, positive) in enumerate(names):
@@ -158,12 +162,14 @@ def remarks_on_stretches(
     return out
 
 
-def _changes_along(
+def _change_along(
     null: Float[np.ndarray, "k n"], slopes: Float[np.ndarray, "q n"]
 ) -> Bool[np.ndarray, " q"]:
-    """Return whether each of q quantities changes along a direction of `null` (k, n).
+    """Return a mask (q,), true for each quantity that changes along one of the directions `null`
+    (k, n).
 
-    The quantities have the derivatives `slopes` (q, n) with respect to the n free numbers.
+    The directions are those of the n free numbers of a fit that its data do not determine; `slopes`
+    (q, n) holds the derivatives of the q quantities with respect to these numbers.
     """
     size = np.abs(slopes).max(axis=-1, initial=1e-300)
     return np.abs(slopes @ null.T).max(axis=-1, initial=0.0) > 1e-6 * size
