@@ -53,7 +53,6 @@ class AbstractScene(eqx.Module):
 
         **Arguments:** `ts` (T,) times, s; `ys` the states at these times, with a leading axis T.
 
-
         >>> still = Point(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
         >>> float(rj.scenes.earth(0.8).drift(jnp.arange(2.0), still)["jacobi"])
         0.0

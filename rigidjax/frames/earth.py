@@ -151,7 +151,6 @@ class Foucault(AbstractScene):
         `east_speed`, `north_speed` the horizontal velocity, m/s. The height and the vertical
         velocity follow from the constant length.
 
-
         >>> foucault(0.5, 10.0).state(6.0, 0.0, 4.0, 0.0).v.tolist()
         [4.0, 0.0, 3.0]
         """

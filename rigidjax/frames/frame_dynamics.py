@@ -80,8 +80,10 @@ class InFrame(AbstractScene):
 
 
 def scene_of_force(force: object) -> AbstractScene:
-    """Return the scene that `simulate` solves for `force`: a scene, a moving frame or a plain
-    force.
+    """Return the scene that `simulate` solves for the motion of a particle under `force`.
+
+    `force` is a scene, which is returned unchanged; a `MovingFrame`, in which the particle moves
+    freely; a force per mass `(t, state, body) → (3,)`, m/s²; or `None` for a free particle.
     """
     if isinstance(force, AbstractScene):
         return force

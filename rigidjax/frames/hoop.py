@@ -108,9 +108,10 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
     return Hoop(r, _checks.require_finite(w, "rate"), _checks.require_finite(g, "gravity"))
 
 
-class _Angle(eqx.Module):
-    """Compute the angle Ωt + ½αt², rad, at time t, s; Ω is `rate`, rad/s, and α `growth`,
-    rad/s².
+class _QuadraticAngle(eqx.Module):
+    """Compute the angle Ωt + ½αt², rad, of a uniformly accelerated turn at time t, s.
+
+    **Fields:** `rate` Ω at t = 0, rad/s; `growth` α = dΩ/dt, rad/s².
     """
 
     rate: Scalar
@@ -133,4 +134,4 @@ def turntable(rate: ScalarLike, growth: ScalarLike = 0.0) -> InFrame:
     rate = _checks.require_finite(_checks.array_of_shape(rate, (), "rate"), "rate")
     growth = _checks.require_finite(_checks.array_of_shape(growth, (), "growth"), "growth")
     up = jnp.eye(3, dtype=rate.dtype)[2]
-    return InFrame(MovingFrame(AboutAxis(up, _Angle(rate, growth))))
+    return InFrame(MovingFrame(AboutAxis(up, _QuadraticAngle(rate, growth))))

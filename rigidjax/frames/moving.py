@@ -220,7 +220,7 @@ class MovingFrame(eqx.Module):
         >>> half.compose(half).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
-        both = _Composed(self, require_frame(inner, "inner"))
+        both = _ComposedMotion(self, require_frame(inner, "inner"))
         return MovingFrame(both.rotation, both.origin, both.rate)
 
     def inverse(self) -> "MovingFrame":
@@ -228,7 +228,7 @@ class MovingFrame(eqx.Module):
 
         `frame.compose(frame.inverse())` does not move.
         """
-        back = _Inverse(self)
+        back = _InverseMotion(self)
         return MovingFrame(back.rotation, back.origin, back.rate)
 
     def place(self, t: ScalarLike) -> Vec3:
@@ -247,7 +247,13 @@ def require_frame(frame: object, name: str) -> Any:
     )
 
 
-class _Composed(eqx.Module):
+class _ComposedMotion(eqx.Module):
+    """Describe the motion of a frame that moves as `inner` does within the moving frame `outer`.
+
+    The methods `rotation`, `rate` and `origin` are functions of the time, s, for a `MovingFrame`:
+    the rotation matrix (3, 3), the angular velocity (3,), rad/s, and the origin (3,), m.
+    """
+
     outer: MovingFrame
     inner: MovingFrame
 
@@ -264,7 +270,13 @@ class _Composed(eqx.Module):
         return self.outer.place(t) + linalg3.apply(self.outer.matrix(t), self.inner.place(t))
 
 
-class _Inverse(eqx.Module):
+class _InverseMotion(eqx.Module):
+    """Describe the motion of the inertial frame S relative to the moving frame S' = `frame`.
+
+    The methods `rotation`, `rate` and `origin` are functions of the time, s, for a `MovingFrame`:
+    the rotation matrix (3, 3), the angular velocity (3,), rad/s, and the origin (3,), m.
+    """
+
     frame: MovingFrame
 
     def rotation(self, t: ScalarLike) -> Any:
