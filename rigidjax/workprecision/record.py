@@ -119,8 +119,8 @@ def differences(
     more than a factor of 2.
     """
     records, stored = list_records(records), list_records(stored, "stored")
-    now = {_key(r): r for r in records if r.group != "peer"}
-    then = {_key(r): r for r in stored if r.group != "peer"}
+    now = {_run_key(r): r for r in records if r.group != "peer"}
+    then = {_run_key(r): r for r in stored if r.group != "peer"}
     wrong, paced = [], []
     scenes = {r.scene for r in now.values()}
     for key, old in then.items():
@@ -134,7 +134,7 @@ def differences(
             wrong.append(f"{_scene_and_label(old)}: error was {old.error:.2g}, is {new.error:.2g}")
         if not math.isnan(old.steps) and abs(new.steps - old.steps) > max(STEPS * old.steps, 1):
             wrong.append(f"{_scene_and_label(old)}: steps were {old.steps:g}, are {new.steps:g}")
-    before, after = _ratios(then, set(now)), _ratios(now, set(then))
+    before, after = _time_ratios(then, set(now)), _time_ratios(now, set(then))
     for label, ratio in after.items():
         if label in before and not 1 / SLOWER <= ratio / before[label] <= SLOWER:
             change = f"was {before[label]:.2g}, is {ratio:.2g}"
@@ -159,16 +159,24 @@ def records_to_store(records: Iterable[Measurement]) -> list[Measurement]:
     ]  # fmt: skip
 
 
-def _key(record: Measurement) -> tuple[str, ...]:
+def _run_key(record: Measurement) -> tuple[str, ...]:
+    """Return the scene, kind, label and setting of a record, which identify one line in two tables
+    of measurements.
+    """
     return (record.scene, record.kind, record.label, f"{record.setting:.6g}")
 
 
 def _scene_and_label(record: Measurement) -> str:
+    """Return the scene, kind, label and setting of a record as text for a message."""
     return f"{record.scene}, {record.kind}, {record.label} at {record.setting:g}"
 
 
 def _median_times(records: Iterable[Measurement]) -> dict[tuple[str, str, str], float]:
-    """Return the median time, s, of each (scene, kind, label), over its settings."""
+    """Return the median time of a run, s, of each (scene, kind, label), over the settings in the
+    `records`.
+
+    The kind is `value` or `gradient`; the label names the method and the adjoint.
+    """
     times: dict[tuple[str, str, str], list[float]] = {}
     for r in records:
         if r.time == r.time:
@@ -176,10 +184,12 @@ def _median_times(records: Iterable[Measurement]) -> dict[tuple[str, str, str], 
     return {label: sorted(spent)[len(spent) // 2] for label, spent in times.items()}
 
 
-def _ratios(table: dict, common: set) -> dict[tuple[str, str, str], float]:
-    """Return, by (scene, kind, label), the ratio of the median time to the median time of `BASE`.
+def _time_ratios(table: dict, common: set) -> dict[tuple[str, str, str], float]:
+    """Return, by (scene, kind, label), the median time of a method divided by the median time of
+    the method `BASE` on the same scene.
 
-    The medians are over the records of `table` with a key in `common`.
+    - `table`: records of measurements, by their keys (`_run_key`).
+    - `common`: the keys of the records over which the medians are taken.
     """
     middle = _median_times(record for key, record in table.items() if key in common)
     return {
