@@ -101,7 +101,7 @@ def polhode(
     # If all moments are equal, the energy is constant on the sphere, and there are no lines to
     # draw.
     if i[2] - i[0] > 1e-9 * i[2]:
-        _draw_other_energies(ax, i, energies)
+        _draw_energy_curves(ax, i, energies)
     how = dict(hidden_style={"ls": (0, (1, 1)), "lw": 1.8}, label="this motion", zorder=5)
     style.draw_around_ball(ax, pi, color=COLOURS[1], lw=2.6, **how)
     ax.plot(*pi[:1].T, color=COLOURS[1], marker="o", ms=6, ls="", label="start", zorder=6)
@@ -117,11 +117,13 @@ def polhode(
     return ax
 
 
-def _draw_other_energies(ax: Any, i: np.ndarray, energies: int) -> None:
-    """Draw curves of equal energy, and the separatrix, on the unit momentum sphere.
+def _draw_energy_curves(ax: Any, i: np.ndarray, energies: int) -> None:
+    """Draw curves of equal energy, and the separatrix (the curve through the middle axis), on the
+    unit sphere of the angular momentum.
 
-    **Arguments:** `ax` 3-D axes; `i` (3,) ascending principal moments; `energies` the number of
-    curves without the separatrix.
+    - `ax`: 3-D axes of matplotlib.
+    - `i`: (3,) the principal moments, ascending.
+    - `energies`: the number of curves without the separatrix.
     """
     import contourpy
 

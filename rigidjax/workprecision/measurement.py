@@ -284,7 +284,7 @@ def drifts(scene: BenchmarkScene, end: np.ndarray | Array) -> tuple[float, float
 
 
 def _time_runs(jobs: list[_TimedRun], rounds: int) -> None:
-    """Time the runs `jobs` in turn, and append the times, s, to each run.
+    """Measure the times of the runs `jobs` in turn, and append them, s, to each run.
 
     A run is timed in `rounds` rounds; a short run in three times as many, and a long run in three.
     """
