@@ -44,9 +44,8 @@ class Moon(eqx.Module):
     """Hold some years of the ephemeris, as functions of the time, s, since the start of `first`.
 
     **Arguments:** `first`, `last` Julian years, such as 1970.0 and 1976.0; 2000.0 is the Julian
-    date
-    2451545.0. The tables begin at least ten days before `first` and end at least ten days after
-    `last`.
+    date 2451545.0. The tables begin at least ten days before `first` and end at least ten days
+    after `last`.
 
     **Fields:** `earth`, `sun` Chebyshev tables of the positions of Earth and Sun relative to the
     Moon, m, ICRF; `angles` a Chebyshev table of the 3-1-3 Euler angles (φ, θ, ψ) of the Moon, rad,
@@ -117,8 +116,7 @@ class Moon(eqx.Module):
         """Return the inertia of the Moon, kg m², with the oblateness J2 of DE421.
 
         **Arguments:** `beta` β = (C − A)/B and `gamma` γ = (B − A)/C, with the principal moments A
-        ≤
-        B ≤ C; by default the values of DE421. With `core` the result is the inertia of the mantle
+        ≤ B ≤ C; by default the values of DE421. With `core` the result is the inertia of the mantle
         alone, for use with `torque(core=True)`.
         """
         c = self.constants
@@ -139,14 +137,12 @@ class Moon(eqx.Module):
         """Return the torque of Earth and Sun on the Moon.
 
         **Arguments:** `degree` the highest degree of the Moon's gravity field that the Earth acts
-        on, 2 to
-        4; `tide` whether
-        the Earth and the spin deform the Moon; `core` whether a liquid core turns in the mantle;
-        `figure` whether the Earth is oblate. DE421 gives the
-        core's angular velocity at `EPOCH`; the initial value, at `first`, is integrated from
-        `EPOCH` with the mantle moving as in the ephemeris. **Raises:** `ValueError` for a core in
-        float32 (unless `first` is `EPOCH`): a time of decades, in s, has rounding errors of minutes
-        in float32.
+        on, 2 to 4; `tide` whether the Earth and the spin deform the Moon; `core` whether a liquid
+        core turns in the mantle; `figure` whether the Earth is oblate. DE421 gives the core's
+        angular velocity at `EPOCH`; the initial value, at `first`, is integrated from `EPOCH` with
+        the mantle moving as in the ephemeris. **Raises:** `ValueError` for a core in float32
+        (unless `first` is `EPOCH`): a time of decades, in s, has rounding errors of minutes in
+        float32.
         """
         c = self.constants
         rows = []

@@ -115,8 +115,7 @@ def rows(fit: Fit) -> list[Row]:
     """Return the periods and the direction of the angular momentum as rows for `report.table`.
 
     **Arguments:** `fit` of `model()`. **Returns** rows (name, value, low, high, unit), where low
-    and
-    high are the ends of the 95 % interval: two periods, days, and the ecliptic longitude and
+    and high are the ends of the 95 % interval: two periods, days, and the ecliptic longitude and
     latitude (J2000) of the angular momentum, degrees.
     """
 

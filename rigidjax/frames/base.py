@@ -22,8 +22,8 @@ class AbstractScene(eqx.Module):
     is the term of the scene in plain diffrax. A scene that ends a run, for example at a collision,
     has two more methods: `ends(t, state)`, true at the end, and `end_words(t, state)`, the reason.
     Under `jit` the state is traced, so that the reason cannot contain its numbers. `stats` of the
-    solution then has `ended`, `end_time`
-    and `end_state`. Only scenes of a particle can end a run in this way.
+    solution then has `ended`, `end_time` and `end_state`. Only scenes of a particle can end a run
+    in this way.
 
     >>> class Spring(AbstractScene):
     ...     def acceleration(self, t, state):

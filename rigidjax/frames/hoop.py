@@ -20,8 +20,7 @@ class Hoop(AbstractScene):
     `scenes.hoop` makes this scene.
 
     The axes turn with the hoop: x is in the plane of the hoop, y across this plane, z up; the
-    centre of the hoop is the origin. **Fields:**
-    `radius` m, `rate` rad/s, `gravity` m/s².
+    centre of the hoop is the origin. **Fields:** `radius` m, `rate` rad/s, `gravity` m/s².
 
     >>> scene = hoop(2.0, 0.0)
     >>> float(scene.radius), float(scene.gravity)
@@ -97,8 +96,7 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
 
     **Arguments:** `radius` R, m; `rate` Ω, rad/s; `gravity` m/s². Source: Goldstein, Mechanics,
     sec. 2.7 (θ'' = sin θ (Ω² cos θ − g/R) for the angle θ from the lowest place); notes, eq 91.
-    **Raises:** `ValueError` for a radius
-    that is not positive.
+    **Raises:** `ValueError` for a radius that is not positive.
 
     >>> hoop(1.0, 5.0).acceleration(0.0, Point([0.0, 0, -1], [0.0, 0, 0])).tolist()
     [0.0, 0.0, 0.0]

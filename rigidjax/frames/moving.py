@@ -30,9 +30,8 @@ class MovingFrame(eqx.Module):
     - `origin`: a function of the time that returns the origin X (3,) of S', m, axes of S; `None` if
       the origins of S and S' coincide.
     - `rate`: a function of the time that returns the angular velocity Ω (3,), rad/s, **axes of
-      S'**;
-      if it is `None`, Ω = vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation. dΩ/dt always
-      comes from automatic differentiation.
+      S'**; if it is `None`, Ω = vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation. dΩ/dt
+      always comes from automatic differentiation.
 
     The numbers of a frame may be traced: motions in the frame can be differentiated with respect to
     them. **Raises:** `TypeError` for a `rotation` that cannot be called; `ValueError`, when the
@@ -160,8 +159,7 @@ class MovingFrame(eqx.Module):
         corrected).
 
         d²x'/dt² = f − Ω×(Ω×x') − 2Ω×v' − dΩ/dt×x' − Mᵀ d²X/dt². (The notes have no moving origin,
-        and
-        eq 91 prints one more x'' inside its bracket, a slip: see eq 90.)
+        and eq 91 prints one more x'' inside its bracket, a slip: see eq 90.)
 
         **Arguments:** `x`, `v` (3,) position x' and velocity v' in S', m and m/s; `t` the time, s;
         `force` the force per mass f = MᵀF (3,), m/s², **axes of S'** (`force_from_inertial` makes f

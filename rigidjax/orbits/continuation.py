@@ -38,13 +38,12 @@ def family(
     predict the next member, which Newton's method corrects as in `periodic_orbit`.
 
     **Arguments:** `orbit` a `PeriodicOrbit` near the first member; `values` (N,), each near the
-    value
-    before it; `hold` `"x"`, `"z"`, `"vy"` or `"period"`, a quantity that must be monotone along the
-    family (use `follow` past a fold). **Returns** a `PeriodicOrbit` with a leading axis N. It can
-    be differentiated with respect to μ and `values` in forward and reverse mode; the derivatives
-    are exact (implicit function theorem). **Raises:** `ValueError`
-    (`EquinoxRuntimeError` under `jit`) with the first value at which Newton's method
-    found no member.
+    value before it; `hold` `"x"`, `"z"`, `"vy"` or `"period"`, a quantity that must be monotone
+    along the family (use `follow` past a fold). **Returns** a `PeriodicOrbit` with a leading axis
+    N. It can be differentiated with respect to μ and `values` in forward and reverse mode; the
+    derivatives are exact (implicit function theorem). **Raises:** `ValueError`
+    (`EquinoxRuntimeError` under `jit`) with the first value at which Newton's method found no
+    member.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> start = moon.lyapunov_guess(1, 0.01)
@@ -145,9 +144,9 @@ def family_slope(
     `hold`.
 
     **Arguments:** `orbit` a member of the family; `hold` as in `family`. **Returns** a
-    `PeriodicOrbit`
-    that holds derivatives: `.period` is d period/d hold, for example. The derivatives are exact
-    (implicit function theorem). **Raises:** `ValueError` at a fold of the family in `hold`.
+    `PeriodicOrbit` that holds derivatives: `.period` is d period/d hold, for example. The
+    derivatives are exact (implicit function theorem). **Raises:** `ValueError` at a fold of the
+    family in `hold`.
 
     >>> hill, start = rj.orbits.hill(), rj.Point([0.3, 0, 0], [0.0, 1.6, 0])
     >>> orbit = hill.periodic_orbit(rj.orbits.PeriodicOrbit(start, 1.2))
@@ -212,13 +211,11 @@ def follow(
     Applications of Bifurcation Theory).
 
     **Arguments:** `orbit` a member, which is not returned; `step` the arclength from each member to
-    the
-    next, negative for the opposite direction; `count` the number of members; `rising` `"x"`, `"z"`,
-    `"vy"` or `"period"`, the quantity that grows in the first step if `step` is positive.
+    the next, negative for the opposite direction; `count` the number of members; `rising` `"x"`,
+    `"z"`, `"vy"` or `"period"`, the quantity that grows in the first step if `step` is positive.
     **Returns** a `PeriodicOrbit` with a leading axis; to differentiate a member, give it to
-    `periodic_orbit` first. **Raises:**
-    `ValueError` (`EquinoxRuntimeError` under `jit`) with the number of members found before the
-    family was lost.
+    `periodic_orbit` first. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) with the
+    number of members found before the family was lost.
     """
     start, index = crossing(orbit), index_of_held(rising)
     length = _checks.array_of_shape(step, (), "step").astype(start.dtype)
@@ -316,13 +313,12 @@ def bifurcation(
     motion out of the plane, and the halo orbits branch off where this index is 1.
 
     **Arguments:** `orbit`, `other` two members near each other, with `value` between their
-    stability
-    indices; `index` 0 or 1, an index into `stability_indices`; `value` the wanted stability index;
-    `hold` the quantity that the search varies along the family, `"x"`, `"z"`, `"vy"` or `"period"`.
-    The search runs in Python, not under `jit`. Source:
-    Howell 1984, doi:10.1007/BF01358403; Robin and Markellos 1980, doi:10.1007/BF01231183.
-    **Raises:** `ValueError` if `value` does not lie between the two stability indices, or if the
-    indices are complex.
+    stability indices; `index` 0 or 1, an index into `stability_indices`; `value` the wanted
+    stability index; `hold` the quantity that the search varies along the family, `"x"`, `"z"`,
+    `"vy"` or `"period"`. The search runs in Python, not under `jit`. Source: Howell 1984,
+    doi:10.1007/BF01358403; Robin and Markellos 1980, doi:10.1007/BF01231183. **Raises:**
+    `ValueError` if `value` does not lie between the two stability indices, or if the indices are
+    complex.
     """
     from scipy.optimize import brentq
 

@@ -50,22 +50,18 @@ def periodic_orbit(
 
     The method finds orbits that are symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and
     most others in use. Such an orbit crosses the plane at a right angle (y = v_x = v_z = 0) twice a
-    period
-    T. Newton's method changes three of (x, z, v_y, T/2) at the first crossing until y, v_x, v_z
-    vanish at T/2.
+    period T. Newton's method changes three of (x, z, v_y, T/2) at the first crossing until y, v_x,
+    v_z vanish at T/2.
 
     **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right angle;
     `hold` the quantity that stays fixed, `"x"`, `"z"`, `"vy"` or `"period"`, and so selects one
-    orbit
-    of the family (use `"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` the largest
-    accepted |y|, |v_x|, |v_z| at the half period, by default 1e-12 (1e-4 in float32).
+    orbit of the family (use `"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` the
+    largest accepted |y|, |v_x|, |v_z| at the half period, by default 1e-12 (1e-4 in float32).
 
     **Returns** a `PeriodicOrbit`. It can be differentiated, in forward and reverse mode, with
-    respect to
-    the numbers of the scene (μ) and the held quantity: the derivatives come from the implicit
-    function theorem. Source: Howell 1984,
-    doi:10.1007/BF01358403. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton's
-    method does not converge.
+    respect to the numbers of the scene (μ) and the held quantity: the derivatives come from the
+    implicit function theorem. Source: Howell 1984, doi:10.1007/BF01358403. **Raises:** `ValueError`
+    (`EquinoxRuntimeError` under `jit`) if Newton's method does not converge.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
@@ -136,8 +132,8 @@ def insert_held(unknown: Float[Array, "3"], held_value: Scalar, index: int) -> F
 
 
 def usual_tolerance(numbers: Array) -> float:
-    """Return the default tolerance for y, v_x, v_z at the half period: 1e-12, or 1e-4 in
-    float32.
+    """Return the default tolerance for |y|, |v_x| and |v_z| at the half period of an orbit with
+    these `numbers`: 1e-12, or 1e-4 in float32.
     """
     return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
 

@@ -169,12 +169,10 @@ def manifold(
       of the manifold is of the order of the square of this distance.
 
     The start lies off the orbit in the direction of the eigenvector of the monodromy matrix with
-    the
-    largest multiplier, moved along the orbit by the transition matrix. The stable manifold is the
-    mirror image, in y → −y, of the unstable manifold. **Returns** a `Manifold`. Source: Koon, Lo,
-    Marsden and Ross 2011, Dynamical
-    Systems, the Three-Body Problem and Space Mission Design, sec. 7.4. **Raises:** `ValueError` for
-    an orbit without a real multiplier of size above 1.
+    the largest multiplier, moved along the orbit by the transition matrix. The stable manifold is
+    the mirror image, in y → −y, of the unstable manifold. **Returns** a `Manifold`. Source: Koon,
+    Lo, Marsden and Ross 2011, Dynamical Systems, the Three-Body Problem and Space Mission Design,
+    sec. 7.4. **Raises:** `ValueError` for an orbit without a real multiplier of size above 1.
 
     >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))

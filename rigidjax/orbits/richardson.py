@@ -65,9 +65,8 @@ def orbit_guess(
     xz-plane.
 
     Either `along_x`, the amplitude of a planar Lyapunov orbit, or `along_z`, the amplitude of a
-    halo
-    orbit, whose sign selects the branch, is a number; the other argument is `None`. The amplitude
-    is small compared with the distance from the point to the nearer body. Source:
+    halo orbit, whose sign selects the branch, is a number; the other argument is `None`. The
+    amplitude is small compared with the distance from the point to the nearer body. Source:
     Richardson 1980, Celest. Mech. 22, 241, doi:10.1007/BF01229511, at τ = 0.
     """
     if point not in (1, 2, 3):

@@ -59,8 +59,7 @@ class Film(eqx.Module):
 
         **Arguments:** `path` ends in `.gif` or `.html`, or in `.mp4` if the program ffmpeg is
         installed; for the page of `player` it must end in `.html`. **Raises** `ValueError` for
-        another suffix,
-        `FileNotFoundError` if ffmpeg is missing.
+        another suffix, `FileNotFoundError` if ffmpeg is missing.
         """
         path = Path(path)
         suffix = path.suffix.lower()
@@ -204,9 +203,9 @@ def player(
     """Return a page that plays the motion in 3-D; you can turn and zoom the view while it plays.
 
     The box is that of `tumble`; the line is the path of its longest axis. The page contains
-    everything, also viser's program (0.8 MB): a notebook shows it without a
-    network or a running kernel, and `.save("tumble.html")` writes it to a file. **Arguments:** as
-    `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises** as `tumble`.
+    everything, also viser's program (0.8 MB): a notebook shows it without a network or a running
+    kernel, and `.save("tumble.html")` writes it to a file. **Arguments:** as `tumble`; `height` px
+    in a notebook. **Returns** a `Film`. **Raises** as `tumble`.
     """
     seconds, pictures = _duration_and_picture_count(ts, seconds, fps)
     _, q = evenly_spaced_attitudes(ts, states, pictures)

@@ -33,8 +33,7 @@ def inertia_ellipsoid(
     **Arguments:** `body` an `Inertia`, a `MassProperties` or a `rigidjax.identify.Fit`; `truth` a
     body to compare with, as a broken line; `samples` the number of sampled bodies; `title`; `ax`
     three axes. **Returns** the axes (3,), for the planes xy, xz and yz of the body frame.
-    **Raises** `ValueError`
-    for a body without extension.
+    **Raises** `ValueError` for a body without extension.
 
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
     ['x, m', 'x, m', 'y, m']

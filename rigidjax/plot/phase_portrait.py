@@ -29,17 +29,15 @@ def phase_portrait(
     energy.
 
     `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ` with I₁ the moment of inertia
-    across the axis, the mass m, gravity g, the distance l of the centre
-    of mass from the pivot, and two momenta of the initial state: p_φ about the vertical and p_ψ
-    about
-    the axis of the top. The cross marks steady precession, where the energy is least. Source:
-    Landau and Lifshitz, Mechanics, § 35, problem 1.
+    across the axis, the mass m, gravity g, the distance l of the centre of mass from the pivot, and
+    two momenta of the initial state: p_φ about the vertical and p_ψ about the axis of the top. The
+    cross marks steady precession, where the energy is least. Source: Landau and Lifshitz,
+    Mechanics, § 35, problem 1.
 
     **Arguments:** `inertia` about the pivot; `top` the weight and the centre of mass, which is on
     the axis of symmetry; `states` of one body with a leading time axis; `levels` the number of thin
-    curves; `title`; `ax`. **Returns** the axes. **Raises** `ValueError` for a
-    body that is not symmetric about the axis through the centre of mass, and for one without
-    weight.
+    curves; `title`; `ax`. **Returns** the axes. **Raises** `ValueError` for a body that is not
+    symmetric about the axis through the centre of mass, and for one without weight.
 
     >>> body = rj.Inertia.from_principal(2.0, 2.0, 1.0)
     >>> top = rj.torques.HeavyTop(1.0, [0.0, 0, 1.0], [0, 0, -9.81])

@@ -41,8 +41,8 @@ class Brightness(AbstractSensor):
     **Arguments:**
 
     - `sun`, `observer`: the directions from the body to sun and observer, world frame, of any
-      length: (3,), or a callable Module of time, t → (3,), such as
-      `torques.Linear(times, directions)`.
+      length: (3,), or a callable Module of time, t → (3,), such as `torques.Linear(times,
+      directions)`.
     - `scattering`: the law, `LommelSeeliger()` (also for `None`), `Geometric()` or `Lambert()` of
       `rj.tumblers.brightness`.
     - `noise`: the standard deviation of a reading, in its unit; `None` to estimate it.

@@ -18,11 +18,10 @@ def draw(records: Iterable[Measurement], *, title: str | None = None) -> Any:
     """Draw the time against the error, log–log, for values and gradients, with the Pareto front.
 
     Each scene has a row of panels, from left to right: the time of a run; the time of a first
-    answer
-    (compilation and one run), if it is known; and the error of each value against the tolerance or
-    accuracy that was asked for. The grey band is the Pareto front of error and time of all methods;
-    rings mark the points on this front. The coloured band is the Pareto front of the methods in
-    JAX alone. Error bars are the quartiles of the time.
+    answer (compilation and one run), if it is known; and the error of each value against the
+    tolerance or accuracy that was asked for. The grey band is the Pareto front of error and time of
+    all methods; rings mark the points on this front. The coloured band is the Pareto front of the
+    methods in JAX alone. Error bars are the quartiles of the time.
 
     **Arguments:** `records` as `measure` returns them; `title` of the figure.
 

@@ -246,8 +246,8 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Ti
     The solver runs on the handwritten equations of the scene (`plain`), or on our vector field for
     a scene without such equations.
 
-    **Arguments:** `solver` with an error estimate; `gradients` whether gradients are
-    measured, too, by the adjoints `forward`, `checkpointed` and `backsolve` of diffrax.
+    **Arguments:** `solver` with an error estimate; `gradients` whether gradients are measured, too,
+    by the adjoints `forward`, `checkpointed` and `backsolve` of diffrax.
 
     >>> diffrax_method(dfx.Heun()).name
     'diffrax Heun'

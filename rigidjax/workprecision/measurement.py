@@ -82,8 +82,7 @@ def measure(
 
     **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more methods;
     `gradients` whether gradients are measured, too; `thin` a number k to use every k-th setting;
-    `rounds`
-    the least number of timings of each run; `progress` is called with a line of text.
+    `rounds` the least number of timings of each run; `progress` is called with a line of text.
 
     **Raises:** `TypeError` for a `scene` that is no `BenchmarkScene`, or a method that is no
     `TimedMethod`.
@@ -316,8 +315,7 @@ def long_drift(
     drift is bounded if both drifts are about equal, and grows with time if the drift of the whole
     run is a hundred times that of the first hundredth. In a record `setting` is the length of a
     step, s, and `error` is the drift of the energy, since the motion forgets its start long before
-    the
-    end, where no reference is possible.
+    the end, where no reference is possible.
     """
     body = Inertia.from_principal(*BODY)
     start = Attitude([0.955336489125606, 0.29552020666133955, 0.0, 0.0], [0.4, 0.3, 1.2])

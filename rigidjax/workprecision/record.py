@@ -23,17 +23,15 @@ class Measurement:
 
     **Fields:** `scene`, `method` names; `group` `ours`, `jax` or `peer`; `kind` `value` or
     `gradient`; `adjoint` the way a gradient is computed; `setting` the tolerance, or the number of
-    equal
-    steps; `error` of the attitude, an angle in rad (for a point the relative error of its
+    equal steps; `error` of the attitude, an angle in rad (for a point the relative error of its
     position), and for a gradient the relative error |g − g*|/|g*|; `error_rate` the error of Ω
-    relative to |Ω0| (for a point the relative
-    error of the velocity); `energy`, `momentum` the relative drift of the energy,
-    and the larger drift of the conserved momenta; `by_inertia`, `by_rate`, `by_attitude` the
-    relative errors
-    of the gradient with respect to the inertia, the initial rate and the initial attitude (for a
-    point `by_rate` is for the velocity and `by_attitude` for the position); `steps`; `time`,
-    `time_low`, `time_high` median and quartiles, s; `compile` s;
-    `memory` bytes of the compiled run's temporaries. A field that does not apply is NaN.
+    relative to |Ω0| (for a point the relative error of the velocity); `energy`, `momentum` the
+    relative drift of the energy, and the larger drift of the conserved momenta; `by_inertia`,
+    `by_rate`, `by_attitude` the relative errors of the gradient with respect to the inertia, the
+    initial rate and the initial attitude (for a point `by_rate` is for the velocity and
+    `by_attitude` for the position); `steps`; `time`, `time_low`, `time_high` median and quartiles,
+    s; `compile` s; `memory` bytes of the compiled run's temporaries. A field that does not apply is
+    NaN.
 
     >>> Measurement("free-top", "closed form", "ours", "value", "", 0.0, error=1e-15).time
     nan
